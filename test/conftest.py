@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from node_helpers import Bench
+    from node_helpers import Bench, Rig, Stranger
     from rclpy.context import Context
 
 pytest_plugins = ("hexapod_comp.testing",)  # where the package is not installed
@@ -87,3 +87,35 @@ def bench(ros_context: Context, capfd: pytest.CaptureFixture[str]) -> Iterator[B
 
     with Bench(ros_context, capfd) as made:
         yield made
+
+
+@pytest.fixture
+def rig(
+    module_context: Context,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
+) -> Iterator[Rig]:
+    """Give a bench without DDS, on a clock of its own, which is the test module's ``time`` too."""
+    from node_helpers import Rig
+
+    with Rig(module_context, capfd, monkeypatch) as made:
+        if hasattr(request.module, "time"):
+            monkeypatch.setattr(request.module, "time", made.clock)
+        yield made
+
+
+@pytest.fixture
+def stranger(rig: Rig) -> Stranger:
+    """Give another node beside the rig's."""
+    from node_helpers import Stranger
+
+    return Stranger(rig, "stranger")
+
+
+@pytest.fixture
+def twin(rig: Rig) -> Stranger:
+    """Give another node with the name of the one that sends commands and readings."""
+    from node_helpers import Stranger
+
+    return Stranger(rig, "witness")

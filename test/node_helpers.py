@@ -2,15 +2,32 @@
 
 from __future__ import annotations
 
+import math
+import sys
+import time
+from collections import defaultdict, deque
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import pytest
 import yaml
+from rclpy.clock import ClockType
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.service import Service
+from rclpy.subscription import Subscription
+from rclpy.time import Time
 from scipy.spatial.transform import Rotation
+from std_srvs.srv import Trigger
 
+from hexapod_comp.compensation.guards import StampClock
 from hexapod_comp.pose import Pose
+from hexapod_comp.ros import rclpy_compat, worker
 from hexapod_comp.ros.compensator import CompensatorNode
-from hexapod_comp.testing.bench import BEST_EFFORT, RELIABLE, SENT, TRANSITIONS, Answer
+from hexapod_comp.testing.bench import BEST_EFFORT, RELIABLE, SENT, TRANSITIONS, WATCHED, Answer
 from hexapod_comp.testing.bench import Bench as BareBench
 
 __all__ = ["BEST_EFFORT", "RELIABLE", "SENT", "TRANSITIONS", "Answer"]
@@ -33,6 +50,258 @@ class Bench(BareBench):
     def compensator(self, start: bool = True, **parameters: object) -> CompensatorNode:
         defaults = {"model_file": "paper_machine.yaml", "start_without_feedback_after": AT_ONCE}
         return super().compensator(start, **{**defaults, **parameters})
+
+
+class FakeTime:
+    """Stands for the module ``time``: a clock of the test's own."""
+
+    def __init__(self) -> None:
+        self.passed, self.set_by = 0, 0  # ns; the second: how far the system's clock was set
+        self._began, self._steady = time.time_ns(), time.monotonic_ns()
+        self.perf_counter = self.monotonic
+
+    def monotonic_ns(self) -> int:
+        return self._steady + self.passed
+
+    def time_ns(self) -> int:
+        return self._began + self.passed + self.set_by
+
+    def monotonic(self) -> float:
+        return self.monotonic_ns() * 1e-9
+
+    def time(self) -> float:
+        return self.time_ns() * 1e-9
+
+
+class Voice:
+    """A publisher of the rig: of a node's name, with sequence numbers of its own."""
+
+    def __init__(self, rig: Rig, topic: str, kind: type, name: str) -> None:
+        self.rig, self.topic_name, self.kind, self.name, self.number = rig, "/" + topic.lstrip("/"), kind, name, 0
+        rig.voices.append(self)
+        rig.matched_anew(self.topic_name)
+
+    def publish(self, message: Any) -> None:
+        data = message if isinstance(message, bytes) else bytes(serialize_message(message))
+        self.rig.step(self.rig.TRANSPORT)
+        self.number += 1
+        self.rig.route(self.topic_name, data, self.number)
+
+    def close(self) -> None:
+        self.rig.voices.remove(self)
+        self.rig.matched_anew(self.topic_name)
+
+    def get_subscription_count(self) -> int:
+        return sum(end.topic_name == self.topic_name for node in self.rig.nodes for end in node.subscriptions)
+
+
+class Stranger:
+    """A node beside those under test, of a name, that publishes and subscribes."""
+
+    def __init__(self, rig: Rig, name: str) -> None:
+        self._rig, self._name = rig, name
+        self.get_clock = lambda: rig.ros_clock
+
+    def get_name(self) -> str:
+        return self._name
+
+    def create_publisher(self, kind: type, topic: str, *_: object) -> Voice:
+        return Voice(self._rig, topic, kind, f"/{self._name}")
+
+    def destroy_publisher(self, publisher: Voice) -> None:
+        publisher.close()
+
+    def create_subscription(self, kind: type, topic: str, callback: Any, *_: object, **__: object) -> tuple[str, Any]:
+        subscription = "/" + topic.lstrip("/"), callback
+        self._rig.listeners.append(subscription)
+        return subscription
+
+    def destroy_subscription(self, subscription: tuple[str, Any]) -> None:
+        self._rig.listeners.remove(subscription)
+
+    def count_publishers(self, topic: str) -> int:
+        return len(self._rig.speakers("/" + topic.lstrip("/")))
+
+    def count_subscribers(self, topic: str) -> int:
+        return sum(end.topic_name == f"/{topic}" for node in self._rig.nodes for end in node.subscriptions)
+
+
+class Rig(Bench):
+    """A bench without DDS, threads and waiting: nodes are called with messages directly, on a clock of the rig's own.
+
+    What a node publishes is kept in ``seen`` and handed to the other nodes; timers and alarms ring when the clock,
+    which :meth:`until` and :meth:`step` advance, has got there. Jobs for the process beside a node are done at once.
+    """
+
+    TRANSPORT, TICK = 2e-4, 2e-3
+    """How long a message travels, and the longest step of the clock, s."""
+
+    def __init__(self, context: Any, capture: Any, patch: pytest.MonkeyPatch) -> None:
+        self.context, self.namespace, self._capture, self._log = context, "", capture, ""
+        self.clock, self.nodes, self.voices, self._alarms = FakeTime(), [], [], []
+        self.seen = defaultdict(list)
+        self.listeners = [("/" + topic.lstrip("/"), self.seen[topic].append) for topic in WATCHED]
+        self._waiting: deque[tuple[Any, Any]] = deque()
+        self._due: dict[Any, float] = {}
+        self._handling, self._publishers, self._numbers = False, {}, dict[Any, int]()
+        self._matched: dict[Any, Any] = {}
+        rig = self
+
+        class Alarm(rclpy_compat.Alarm):
+            def __init__(self, *arguments: Any) -> None:
+                rig._alarms.append(self)
+                super().__init__(*arguments)
+
+        class Helper:  # instead of a process
+            process, ended = None, False
+
+            def __init__(self) -> None:
+                done, answers = worker.Jobs(), deque()
+                self.jobs = SimpleNamespace(
+                    put=lambda job: answers.append(job.result(done.answer(job.line(job.machine))))
+                )
+                self.answers = SimpleNamespace(get_nowait=answers.popleft)
+
+        for name, module in list(sys.modules.items()):
+            if name.startswith("hexapod_comp.ros.") or name == "hexapod_comp.testing.bench":
+                for what, stand_in in (("time", self.clock), ("Alarm", Alarm)):
+                    if hasattr(module, what) and name != "hexapod_comp.ros.rclpy_compat":
+                        patch.setattr(module, what, stand_in)
+        patch.setattr(rclpy_compat, "time", self.clock)
+        patch.setattr(rclpy_compat, "Thread", lambda **_: SimpleNamespace(start=lambda: None, join=lambda: None))
+        patch.setattr(worker, "_Helper", Helper)
+        base, clock = "hexapod_comp.ros.base", self.clock
+        patch.setattr(f"{base}.StampClock", lambda simulated: StampClock(simulated, clock.time_ns, clock.monotonic_ns))
+        patch.setattr(f"{base}.publishers", lambda node, topic: (tuple(sorted(set(self.speakers(topic)))), ""))
+        patch.setattr("hexapod_comp.ros.requests.callers", lambda node, service: "/witness")
+        make = Node.create_subscription
+        self.ros_clock = SimpleNamespace(now=lambda: Time(nanoseconds=clock.time_ns(), clock_type=ClockType.ROS_TIME))
+        self.witness = Stranger(self, "witness")
+
+        def create_subscription(
+            node: Node, *arguments: Any, event_callbacks: Any = None, **options: Any
+        ) -> Subscription:
+            made = make(node, *arguments, **options)
+            self._matched[made] = event_callbacks
+            return made
+
+        patch.setattr(Node, "create_subscription", create_subscription)
+        patch.setattr(Node, "get_clock", lambda node: self.ros_clock)
+        patch.setattr(Node, "count_publishers", lambda node, topic: len(self.speakers(topic)))
+        patch.setattr(Subscription, "get_publisher_count", lambda end: len(self.speakers(end.topic_name)))
+        patch.setattr(
+            Publisher, "get_subscription_count", lambda end: sum(topic == end.topic_name for topic, _ in self.listeners)
+        )
+        patch.setattr(Publisher, "publish", lambda end, message: self._published(end, message))
+        patch.setattr(Service, "send_response", lambda service, response, header: header.append(response))
+        for topic in SENT.keys() - {"strut_commands", "strut_setpoints"}:
+            self.speak(topic)
+
+    def __exit__(self, *_: object) -> None:
+        for node in self.nodes:
+            node.destroy_node()
+
+    # ---- who publishes what ----
+
+    def speakers(self, topic: str) -> list[str]:
+        """Return the full name of each publisher's node."""
+        ours = [f"/{node.get_name()}" for node in self.nodes for end in node.publishers if end.topic_name == topic]
+        return ours + [voice.name for voice in self.voices if voice.topic_name == topic]
+
+    def speak(self, topic: str) -> None:
+        self._publishers[topic] = Voice(self, topic, SENT[topic], "/witness")
+
+    def hush(self, topic: str) -> None:
+        if topic in self._publishers:
+            self._publishers.pop(topic).close()
+
+    def matched_anew(self, topic: str) -> None:
+        """Let the nodes notice that a publisher has come or gone."""
+        for node in self.nodes:
+            for end in node.subscriptions:
+                if end.topic_name == topic and self._matched.get(end) is not None:
+                    self._matched[end].matched(None)
+
+    # ---- messages ----
+
+    def _published(self, publisher: Publisher, message: Any) -> None:
+        data = message if isinstance(message, bytes) else bytes(serialize_message(message))
+        for topic, callback in list(self.listeners):
+            if topic == publisher.topic_name:
+                callback(deserialize_message(data, publisher.msg_type))
+        self._numbers[publisher] = self._numbers.get(publisher, 0) + 1
+        self.route(publisher.topic_name, data, self._numbers[publisher])
+
+    def route(self, topic: str, data: bytes, number: int | None) -> None:
+        """Hand a message to the nodes that hear it, after those that came before."""
+        for node in self.nodes:
+            self._waiting += [(end, (data, number)) for end in node.subscriptions if end.topic_name == topic]
+        self._handle()
+
+    def _handle(self) -> None:
+        if self._handling:
+            return
+        self._handling = True
+        try:
+            while self._waiting:
+                end, (data, number) = self._waiting.popleft()
+                if end._callback_type.name == "WithMessageInfo":
+                    end.callback(data, {"publication_sequence_number": number})
+                else:
+                    end.callback(data if end.raw else deserialize_message(data, end.msg_type))
+        finally:
+            self._handling = False
+
+    # ---- time ----
+
+    def step(self, seconds: float) -> None:
+        """Let time pass: what is due on the way is called in its turn."""
+        end = self.clock.passed + round(seconds * 1e9)
+        while self.clock.passed < end:
+            self.clock.passed = min(end, self.clock.passed + round(self.TICK * 1e9))
+            now = self.clock.monotonic()
+            for timer in [timer for node in self.nodes for timer in node.timers]:
+                period = timer.timer_period_ns * 1e-9
+                if self._due.setdefault(timer, now + period) <= now:
+                    self._due[timer] = max(self._due[timer] + period, now)
+                    timer.callback()
+            for alarm in [alarm for alarm in self._alarms if alarm._open and alarm._due <= now]:
+                alarm._due = math.inf
+                (alarm._tick if alarm._rate else alarm._callback)()
+            self._handle()
+
+    def until(self, condition: Any, what: str = "", timeout: float = 10.0) -> None:
+        end = self.clock.monotonic() + timeout
+        while not condition():
+            if self.clock.monotonic() > end:
+                raise TimeoutError(f"waited {timeout} s in vain for: {what}")
+            self.step(self.TICK)
+
+    def barrier(self) -> None:
+        self._handle()
+
+    def matched(self) -> bool:
+        return True
+
+    # ---- nodes and services ----
+
+    def host(self, node: Node) -> Node:
+        self.nodes.append(node)
+        return node
+
+    def begin(self, name: str) -> Any:
+        return self._request(Trigger, f"compensator/{name}", Trigger.Request())
+
+    def call(self, kind: Any, name: str, request: Any = None) -> Any:
+        future = self._request(kind, name, kind.Request() if request is None else request)
+        self.until(future.done, f"answer of {name}", timeout=30.0)
+        return future.result()
+
+    def _request(self, kind: Any, name: str, request: Any) -> Any:
+        answers: list[Any] = []
+        (service,) = [one for node in self.nodes for one in node.services if one.service_name == f"/{name}"]
+        service.send_response(service.callback(request, kind.Response()), answers)
+        return SimpleNamespace(done=lambda: bool(answers), result=lambda: answers[0])
 
 
 def closed_form_lengths(pose: Pose, a: float = 0.3, b: float = 0.572, d: float = 0.243) -> np.ndarray:

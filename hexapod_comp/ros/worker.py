@@ -52,17 +52,31 @@ class WorkerError(HexapodError):
 
 @dataclass
 class Job:
-    """What is asked: one of :data:`TASKS`, and its arguments, for JSON."""
+    """What the process is asked for."""
 
-    task: str
-    arguments: dict[str, Any]
+    task: str  # load_model, predict or travel
+    arguments: dict[str, Any]  # for JSON
     done: Callable[[Any], None]  # called with the result, from Worker.look
     failed: Callable[[WorkerError], None]
     machine: dict[str, Any] | None = None  # which one, as Machine takes it
     read: Callable[[Any], Any] = lambda answer: answer  # makes the result of the answer, in a thread of its own
     within: float = float("inf")  # s, from its beginning; then the process is given up
-    late: str = ""  # what is said then
+    late: str = ""  # the error's text then
     began: float = float("inf")
+
+    def line(self, machine: dict[str, Any] | None) -> str:
+        """Return the job as a line of JSON; `machine`: None where the process knows it already."""
+        return json.dumps({"task": self.task, "machine": machine, "asked": self.arguments}) + "\n"
+
+    def result(self, line: str) -> Any:
+        """Return what an answer holds, or its error."""
+        answer = json.loads(line)
+        if "problem" in answer:
+            return WorkerError(answer["problem"])
+        try:
+            return self.read(answer)
+        except HexapodError as error:
+            return WorkerError(str(error))
 
 
 class Worker:
@@ -166,17 +180,10 @@ class _Helper:
         into, out = self.process.stdin, self.process.stdout  # type: ignore[union-attr]
         machine = None if job.machine == self._machine else job.machine
         self._machine = job.machine or self._machine
-        into.write(json.dumps({"task": job.task, "machine": machine, "asked": job.arguments}) + "\n")  # type: ignore[union-attr]
+        into.write(job.line(machine))  # type: ignore[union-attr]
         into.flush()  # type: ignore[union-attr]
-        if not (line := out.readline()):  # type: ignore[union-attr]
-            return None
-        answer = json.loads(line)
-        if "problem" in answer:
-            return WorkerError(answer["problem"])
-        try:
-            return job.read(answer)
-        except HexapodError as error:
-            return WorkerError(str(error))
+        line = out.readline()  # type: ignore[union-attr]
+        return job.result(line) if line else None
 
 
 def model_json(model: MachineModel) -> str:
@@ -267,7 +274,30 @@ class Machine:
         return Temperatures.restored(values, lags, len(self.model.late_growth.time_constants))
 
 
-TASKS = ("load_model", "predict", "travel")
+class Jobs:
+    """Does one job after another; the machine that they are about stays until another is given."""
+
+    def __init__(self) -> None:
+        self._made_of: dict[str, Any] = {}
+        self._machine: Machine | None = None
+
+    def answer(self, line: str) -> str:
+        """Return the answer to a job, each a line of JSON."""
+        job = json.loads(line)
+        task, asked = job["task"], job["asked"]
+        if job["machine"] is not None:
+            self._made_of, self._machine = job["machine"], None
+        try:
+            if task == "load_model":
+                answer = load_model(**asked)
+            else:
+                self._machine = self._machine or Machine(**self._made_of)
+                answer = (self._machine.predict if task == "predict" else self._machine.travel)(**asked)
+        except (HexapodError, OSError) as error:
+            answer = {"problem": str(error)}
+        except Exception as error:  # else the process would end, and nobody know why
+            answer = {"problem": f"{task}: {type(error).__name__}: {error}"}
+        return json_text(answer, indent=None).replace("\n", " ") + "\n"
 
 
 def main() -> int:
@@ -275,24 +305,9 @@ def main() -> int:
     os.nice(NICENESS)
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what a library prints is no answer
-    made_of: dict[str, Any] | None = None
-    machine: Machine | None = None
+    jobs = Jobs()
     for line in sys.stdin:
-        job = json.loads(line)
-        task, given, asked = job["task"], job["machine"], job["asked"]
-        if given is not None:
-            made_of, machine = given, None
-        try:
-            if task == TASKS[0]:
-                answer = load_model(**asked)
-            else:
-                machine = machine or Machine(**(made_of or {}))
-                answer = getattr(machine, TASKS[TASKS.index(task)])(**asked)
-        except (HexapodError, OSError) as error:
-            answer = {"problem": str(error)}
-        except Exception as error:  # else the process would end, and nobody know why
-            answer = {"problem": f"{task}: {type(error).__name__}: {error}"}
-        answers.write(json_text(answer, indent=None).replace("\n", " ") + "\n")
+        answers.write(jobs.answer(line))
         answers.flush()
     return 0
 

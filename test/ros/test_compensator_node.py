@@ -1,4 +1,4 @@
-"""The compensator node over real DDS: every sentence of its contract, seen from outside.
+"""The compensator node: every sentence of its contract, seen from outside, without DDS but where that is the matter.
 
 Lengths are compared with a closed form of the paper's machine or with the paper's tables, never with what
 the package computes, except where a test says that the node must send exactly what the core computes.
@@ -66,138 +66,138 @@ def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guards, "SHOWN_FOR", 0.2)
 
 
-def values_of(bench: Bench, key: str, value: str) -> dict[str, str]:
+def values_of(rig: Bench, key: str, value: str) -> dict[str, str]:
     """Wait until a diagnostics value is there and return all."""
-    bench.until(lambda: bench.values().get(key) == value, f"{key} = {value}, not {bench.values().get(key)}")
-    return bench.values()
+    rig.until(lambda: rig.values().get(key) == value, f"{key} = {value}, not {rig.values().get(key)}")
+    return rig.values()
 
 
 # ---- commands in, struts out ----
 
 
-def test_commands_are_the_papers_table_2(bench, tmp_path):
+def test_commands_are_the_papers_table_2(rig, tmp_path):
     """Table 1 in, Table 2 out at its printed digits (0.001 mm), with no model; the truth is the paper's."""
     wide = geometry_file(tmp_path, {"step_mm": 500.0, "speed_mm_s": 1e6})
-    bench.compensator(geometry_file=wide, model_file="ideal")
-    sent = np.array([bench.ask(pose).lengths for pose in table_poses()])
+    rig.compensator(geometry_file=wide, model_file="ideal")
+    sent = np.array([rig.ask(pose).lengths for pose in table_poses()])
     np.testing.assert_allclose(sent, table_lengths(), rtol=0.0, atol=0.5001e-6)
 
 
-def test_answer_is_named_stamped_and_in_metres(bench):
-    bench.compensator()
-    command = bench.send(HOME)
-    bench.until(lambda: bench.seen["strut_commands"] and bench.seen["strut_corrections"], "an answer")
+def test_answer_is_named_stamped_and_in_metres(rig):
+    rig.compensator()
+    command = rig.send(HOME)
+    rig.until(lambda: rig.seen["strut_commands"] and rig.seen["strut_corrections"], "an answer")
     for topic in ("strut_commands", "strut_corrections"):
-        (message,) = bench.seen[topic]
+        (message,) = rig.seen[topic]
         assert message.name == [f"strut_{i}" for i in range(1, 7)]
         assert message.header.stamp == command.header.stamp
         assert len(message.position) == 6
         assert len(message.velocity) == 6, "an empty velocity makes bags that some readers refuse"
         assert np.isfinite(message.velocity).all()
-    lengths = np.array(bench.seen["strut_commands"][0].position)
+    lengths = np.array(rig.seen["strut_commands"][0].position)
     np.testing.assert_allclose(lengths, 0.509192, rtol=0.0, atol=2e-4)  # Table 2, row 1, ± the correction
 
 
-def test_correction_is_command_minus_nominal(bench):
+def test_correction_is_command_minus_nominal(rig):
     """Nominal lengths by the closed form; the difference of two lengths is exact to rounding."""
-    bench.compensator()
+    rig.compensator()
     for pose in (HOME, near(HOME, STEP_BACK, 0.05)):
-        answer = bench.ask(pose)
+        answer = rig.ask(pose)
         nominal = closed_form_lengths(pose)
         np.testing.assert_allclose(answer.corrections, answer.lengths - nominal, rtol=0.0, atol=ROUNDING)
         assert np.abs(answer.corrections).max() > 20e-6, "the shipped machine is wrong by some 100 µm"
 
 
-def test_node_sends_exactly_what_the_core_computes(bench):
-    bench.compensator()
+def test_node_sends_exactly_what_the_core_computes(rig):
+    rig.compensator()
     geometry = load_geometry(CONFIG / "paper.yaml")
     core = Compensator(geometry, load_model(CONFIG / "paper_machine.yaml", geometry))
     for step in range(5):
         pose = near(HOME, (2e-4 * step, -1e-4 * step, 1e-4 * step), 0.03 * step)
-        answer, record = bench.ask(pose), core.correct(pose)
+        answer, record = rig.ask(pose), core.correct(pose)
         np.testing.assert_allclose(answer.lengths, record.command, rtol=0.0, atol=ROUNDING)
         np.testing.assert_allclose(answer.corrections, record.correction, rtol=0.0, atol=ROUNDING)
 
 
-def test_zero_stamp_means_now(bench):
-    bench.compensator()
-    before = bench.now()
-    bench.send(pose_message(HOME, "base"))
-    bench.until(lambda: bench.seen["strut_commands"], "an answer")
-    stamp, after = bench.seen["strut_commands"][0].header.stamp, bench.now()
+def test_zero_stamp_means_now(rig):
+    rig.compensator()
+    before = rig.now()
+    rig.send(pose_message(HOME, "base"))
+    rig.until(lambda: rig.seen["strut_commands"], "an answer")
+    stamp, after = rig.seen["strut_commands"][0].header.stamp, rig.now()
     assert (before.sec, before.nanosec) <= (stamp.sec, stamp.nanosec) <= (after.sec, after.nanosec)
 
 
-def test_command_velocity_is_the_change_per_time(bench):
+def test_command_velocity_is_the_change_per_time(rig):
     """v = Δ/t with one t for all struts, which lies between what the witness measured around it."""
-    bench.compensator()
-    first, second = bench.ask(HOME), bench.ask(near(HOME, (0.0, 0.0, 1e-3)))
+    rig.compensator()
+    first, second = rig.ask(HOME), rig.ask(near(HOME, (0.0, 0.0, 1e-3)))
     assert list(first.command.velocity) == [0.0] * 6
     change, speed = second.lengths - first.lengths, np.array(second.command.velocity)
     np.testing.assert_allclose(change / speed, change[0] / speed[0], rtol=1e-9)
     assert second.sent_at - first.answered_at <= change[0] / speed[0] <= second.answered_at - first.sent_at
 
 
-def test_unnormalised_within_tolerance_is_the_rotation_it_means(bench):
+def test_unnormalised_within_tolerance_is_the_rotation_it_means(rig):
     """A float32 sender's quaternion has a norm of 1 ± 1e-7: the rotation is the same, only scaled."""
-    bench.compensator(model_file="ideal")
+    rig.compensator(model_file="ideal")
     message = pose_message(near(HOME, tilt_deg=0.1), "base")
     for axis in "xyzw":
         setattr(message.pose.orientation, axis, getattr(message.pose.orientation, axis) * 1.0005)
-    message.header.stamp = bench.now()
+    message.header.stamp = rig.now()
     expected = closed_form_lengths(near(HOME, tilt_deg=0.1))
-    np.testing.assert_allclose(bench.ask(message).lengths, expected, rtol=0.0, atol=ROUNDING)
+    np.testing.assert_allclose(rig.ask(message).lengths, expected, rtol=0.0, atol=ROUNDING)
 
 
-def test_minus_q_is_the_same_rotation(bench):
-    bench.compensator(model_file="ideal")
+def test_minus_q_is_the_same_rotation(rig):
+    rig.compensator(model_file="ideal")
     message = pose_message(near(HOME, tilt_deg=0.1), "base")
     for axis in "xyzw":
         setattr(message.pose.orientation, axis, -getattr(message.pose.orientation, axis))
-    message.header.stamp = bench.now()
+    message.header.stamp = rig.now()
     expected = closed_form_lengths(near(HOME, tilt_deg=0.1))
-    np.testing.assert_allclose(bench.ask(message).lengths, expected, rtol=0.0, atol=ROUNDING)
+    np.testing.assert_allclose(rig.ask(message).lengths, expected, rtol=0.0, atol=ROUNDING)
 
 
 # ---- frames ----
 
 
-def test_work_frame_and_base_frame(bench, tmp_path):
+def test_work_frame_and_base_frame(rig, tmp_path):
     """A work frame 50 mm along x, turned by 90° about z: worked out by hand below."""
     work = {"position_mm": [50.0, 0.0, 0.0], "rotation_deg": [0.0, 0.0, 90.0]}
-    bench.compensator(geometry_file=geometry_file(tmp_path, work=work), model_file="ideal")
+    rig.compensator(geometry_file=geometry_file(tmp_path, work=work), model_file="ideal")
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     # Work's x is base's y: (0.002, 0.05, 0.4) in work is 0.05 − 0.05 along base's x, 0.002 along its y.
     in_work = Pose([0.002, 0.05, 0.4], quarter.T)
     in_base = Pose([0.0, 0.002, 0.4], np.eye(3))
-    by_work, by_base = bench.ask(in_work, "work"), bench.ask(in_base, "base")
+    by_work, by_base = rig.ask(in_work, "work"), rig.ask(in_base, "base")
     np.testing.assert_allclose(by_work.lengths, closed_form_lengths(in_base), rtol=0.0, atol=ROUNDING)
     np.testing.assert_allclose(by_base.lengths, by_work.lengths, rtol=0.0, atol=ROUNDING)
-    estimate = bench.estimate(by_base.command)
+    estimate = rig.estimate(by_base.command)
     assert estimate.header.frame_id == "base"
     np.testing.assert_allclose(message_pose(estimate).position, in_base.position, rtol=0.0, atol=1e-11)
 
 
-def test_frames_may_have_other_names(bench):
-    bench.compensator(base_frame="machine_3/base", work_frame="fixture")
-    bench.ask(HOME, "machine_3/base")
-    answer = bench.ask(HOME, "fixture")
-    assert bench.estimate(answer.command).header.frame_id == "machine_3/base"
-    bench.send(HOME, "base")
-    bench.until_status(ERROR, "refusing commands: frame_id")
-    assert "machine_3/base, fixture" in bench.values()["last_refusal"]
+def test_frames_may_have_other_names(rig):
+    rig.compensator(base_frame="machine_3/base", work_frame="fixture")
+    rig.ask(HOME, "machine_3/base")
+    answer = rig.ask(HOME, "fixture")
+    assert rig.estimate(answer.command).header.frame_id == "machine_3/base"
+    rig.send(HOME, "base")
+    rig.until_status(ERROR, "refusing commands: frame_id")
+    assert "machine_3/base, fixture" in rig.values()["last_refusal"]
 
 
-def test_tool_offset(bench, tmp_path):
+def test_tool_offset(rig, tmp_path):
     """A tool 80 mm long and 10 mm aside, turned by 90° about x; the platform is where it must be for it."""
     tool = {"position_mm": [0.0, 10.0, 80.0], "rotation_deg": [90.0, 0.0, 0.0]}
-    bench.compensator(geometry_file=geometry_file(tmp_path, tool=tool), model_file="ideal")
+    rig.compensator(geometry_file=geometry_file(tmp_path, tool=tool), model_file="ideal")
     turned = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # Rx(90°)
     platform = near(HOME, (0.001, 0.0, 0.0))
     tip = Pose(platform.position + np.array([0.0, 0.01, 0.08]), turned)
-    answer = bench.ask(tip)
+    answer = rig.ask(tip)
     np.testing.assert_allclose(answer.lengths, closed_form_lengths(platform), rtol=0.0, atol=ROUNDING)
-    estimate = message_pose(bench.estimate(answer.command))
+    estimate = message_pose(rig.estimate(answer.command))
     np.testing.assert_allclose(estimate.position, tip.position, rtol=0.0, atol=1e-11)
     np.testing.assert_allclose(estimate.rotation, tip.rotation, rtol=0.0, atol=1e-11)
 
@@ -222,7 +222,7 @@ def set_frame(name: str) -> Callable[[PoseStamped, Bench], None]:
 
 
 def set_stamp(seconds_from_now: float) -> Callable[[PoseStamped, Bench], None]:
-    return lambda message, bench: setattr(message.header, "stamp", bench.stamp(seconds_from_now))
+    return lambda message, rig: setattr(message.header, "stamp", rig.stamp(seconds_from_now))
 
 
 BAD = {
@@ -252,27 +252,27 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_command_is_refused_and_the_last_good_one_stands(bench, case):
+def test_bad_command_is_refused_and_the_last_good_one_stands(rig, case):
     """Refused, logged once, counted, shown as an error; the next small step from the last good is taken."""
     change, reason, text = BAD[case]
-    bench.compensator()
-    good = bench.ask(HOME)
+    rig.compensator()
+    good = rig.ask(HOME)
     bad = pose_message(HOME, "base")
-    bad.header.stamp = bench.now()
-    change(bad, bench)
-    bench.send(bad)
+    bad.header.stamp = rig.now()
+    change(bad, rig)
+    rig.send(bad)
 
-    values = bench.until_status(ERROR, f"refusing commands: {reason}")
+    values = rig.until_status(ERROR, f"refusing commands: {reason}")
     assert text in values["last_refusal"]
     assert (values["refused"], values[f"refused.{reason}"], values["commands"]) == ("1", "1", "1")
-    (line,) = bench.logged("command refused")
+    (line,) = rig.logged("command refused")
     assert line.startswith(f"command refused ({reason}): ")
     assert text in line
 
-    after = bench.ask(near(HOME, STEP_BACK))
-    stamps = [message.header.stamp for message in bench.seen["strut_commands"]]
+    after = rig.ask(near(HOME, STEP_BACK))
+    stamps = [message.header.stamp for message in rig.seen["strut_commands"]]
     assert stamps == [good.command.header.stamp, after.command.header.stamp], "nothing in between"
-    assert len(bench.seen["strut_corrections"]) == 2
+    assert len(rig.seen["strut_corrections"]) == 2
     nominal = closed_form_lengths(near(HOME, STEP_BACK))
     np.testing.assert_allclose(after.lengths - after.corrections, nominal, rtol=0.0, atol=ROUNDING)
 
@@ -301,96 +301,96 @@ LIMITS = {
 
 
 @pytest.mark.parametrize("case", LIMITS)
-def test_every_limit_refuses(bench, tmp_path, case):
+def test_every_limit_refuses(rig, tmp_path, case):
     limits, pose, reason, text = LIMITS[case]
-    bench.compensator(geometry_file=geometry_file(tmp_path, limits))
-    bench.ask(HOME)
-    bench.send(pose)
-    values = bench.until_status(ERROR, f"refusing commands: {reason}")
+    rig.compensator(geometry_file=geometry_file(tmp_path, limits))
+    rig.ask(HOME)
+    rig.send(pose)
+    values = rig.until_status(ERROR, f"refusing commands: {reason}")
     assert text in values["last_refusal"]
-    bench.ask(near(HOME, (0.0, 0.0, 1e-5)))
-    assert len(bench.seen["strut_commands"]) == 2
+    rig.ask(near(HOME, (0.0, 0.0, 1e-5)))
+    assert len(rig.seen["strut_commands"]) == 2
 
 
-def test_field_that_refuses_extrapolation(bench, tmp_path):
+def test_field_that_refuses_extrapolation(rig, tmp_path):
     lines = [{"axis": "x", "at": [i, j], "direction": "both", "dx_um": [1.0]} for i in (0, 1) for j in (0, 1)]
     grid = {"grid_x_mm": [-1.0, 1.0], "grid_y_mm": [-1.0, 1.0], "grid_z_mm": [399.0, 401.0]}
     field = {**grid, "outside": "refuse", "lines": lines}
-    bench.compensator(model_file=model_file(tmp_path, field=field))
-    bench.ask(HOME)
-    bench.send(near(HOME, (0.0015, 0.0, 0.0)))
-    assert "(1.500, 0.000, 400.000) mm" in bench.until_status(ERROR, "refusing commands: outside_field")["last_refusal"]
+    rig.compensator(model_file=model_file(tmp_path, field=field))
+    rig.ask(HOME)
+    rig.send(near(HOME, (0.0015, 0.0, 0.0)))
+    assert "(1.500, 0.000, 400.000) mm" in rig.until_status(ERROR, "refusing commands: outside_field")["last_refusal"]
 
 
-def test_stamps_may_be_off_and_any(bench):
-    bench.compensator(max_command_age=0.0)
+def test_stamps_may_be_off_and_any(rig):
+    rig.compensator(max_command_age=0.0)
     message = pose_message(HOME, "base")
     message.header.stamp.sec = 12
-    assert bench.ask(message).command.header.stamp.sec == 12
+    assert rig.ask(message).command.header.stamp.sec == 12
 
 
-def test_after_a_pause_stamps_may_start_earlier(bench, monkeypatch):
+def test_after_a_pause_stamps_may_start_earlier(rig, monkeypatch):
     """The sender or its clock was restarted; the pause is half a second, here 0.1 s."""
     monkeypatch.setattr(guards, "FORGET_ORDER_AFTER", 0.1)
-    bench.compensator(max_command_age=0.0, command_timeout=0.15)
-    bench.ask(HOME)
-    bench.until_status(WARN, "no new command")
+    rig.compensator(max_command_age=0.0, command_timeout=0.15)
+    rig.ask(HOME)
+    rig.until_status(WARN, "no new command")
     message = pose_message(HOME, "base")
     message.header.stamp.sec = 12
-    assert list(bench.ask(message).command.velocity) == [0.0] * 6, "nobody knows how long it took"
+    assert list(rig.ask(message).command.velocity) == [0.0] * 6, "nobody knows how long it took"
 
 
-def test_same_stamp_again_is_taken(bench):
+def test_same_stamp_again_is_taken(rig):
     """A controller that holds a pose may repeat the very message."""
-    bench.compensator()
-    message = bench.ask(HOME).command
+    rig.compensator()
+    message = rig.ask(HOME).command
     again = pose_message(HOME, "base")
     again.header.stamp = message.header.stamp
-    bench.send(again)
-    bench.until(lambda: len(bench.seen["strut_commands"]) == 2, "the answer to the repeated command")
+    rig.send(again)
+    rig.until(lambda: len(rig.seen["strut_commands"]) == 2, "the answer to the repeated command")
 
 
-def test_refused_command_does_not_count_as_the_last_one(bench):
+def test_refused_command_does_not_count_as_the_last_one(rig):
     """Its stamp, a little ahead of time, must not shut out the good ones that follow."""
-    bench.compensator()
-    bench.ask(HOME)
+    rig.compensator()
+    rig.ask(HOME)
     bad = pose_message(near(HOME, (0.0, 0.0, 0.05)), "base")
-    bad.header.stamp = bench.stamp(0.4)
-    bench.send(bad)
-    bench.until_status(ERROR, "refusing commands: step")
-    bench.ask(near(HOME, STEP_BACK))
+    bad.header.stamp = rig.stamp(0.4)
+    rig.send(bad)
+    rig.until_status(ERROR, "refusing commands: step")
+    rig.ask(near(HOME, STEP_BACK))
 
 
-def test_several_reasons_are_counted_apart(bench):
+def test_several_reasons_are_counted_apart(rig):
     """States change, so each is published at once; the log has one line per cause and second."""
-    bench.compensator()
-    bench.ask(HOME)
+    rig.compensator()
+    rig.ask(HOME)
     for _ in range(3):
         for reason, frame, z in (("frame_id", "map", 0.4), ("step", "base", 0.41)):
-            bench.send(Pose([0.0, 0.0, z], np.eye(3)), frame)
-            values = bench.until_status(ERROR, f"refusing commands: {reason}")
-            bench.seen["/diagnostics"].clear()
+            rig.send(Pose([0.0, 0.0, z], np.eye(3)), frame)
+            values = rig.until_status(ERROR, f"refusing commands: {reason}")
+            rig.seen["/diagnostics"].clear()
     assert (values["refused"], values["refused.frame_id"], values["refused.step"]) == ("6", "3", "3")
-    assert len(bench.logged("command refused (frame_id)")) == 1
-    assert len(bench.logged("command refused (step)")) == 1
+    assert len(rig.logged("command refused (frame_id)")) == 1
+    assert len(rig.logged("command refused (step)")) == 1
 
 
-def test_status_recovers(bench, short_memory):
-    bench.compensator(command_timeout=0.0)
-    bench.ask(HOME)
-    bench.send(HOME, "map")
-    bench.until_status(ERROR, "refusing commands")
-    bench.ask(HOME)
-    values = bench.until_status(OK, "running")
+def test_status_recovers(rig, short_memory):
+    rig.compensator(command_timeout=0.0)
+    rig.ask(HOME)
+    rig.send(HOME, "map")
+    rig.until_status(ERROR, "refusing commands")
+    rig.ask(HOME)
+    values = rig.until_status(OK, "running")
     assert values["refused"] == "1", "the counter stays"
     assert "not 'map'" in values["last_refusal"]
 
 
-def test_nothing_out_of_limits_is_ever_published(bench):
+def test_nothing_out_of_limits_is_ever_published(rig):
     """A rough sender: whatever gets through is finite, in the stroke and within one step of the last."""
     rng = np.random.default_rng(20)
-    bench.compensator()
-    bench.ask(HOME)
+    rig.compensator()
+    rig.ask(HOME)
     extremes = [math.nan, math.inf, -1.0, 0.0, 1e9]
     begin = time.monotonic()
     for n in range(60):
@@ -399,11 +399,11 @@ def test_nothing_out_of_limits_is_ever_published(bench):
         if rng.uniform() < 0.4:
             setattr(message.pose.position, "xyz"[rng.integers(3)], float(rng.choice(extremes)))
         # 10 ms apart the speed limit lets through what the step limit does, however quick the computer.
-        bench.until(lambda due=begin + 0.01 * n: time.monotonic() >= due, "the next command to be due")
-        message.header.stamp = bench.now()
-        bench.send(message)
-        bench.barrier()
-    lengths = np.array([message.position for message in bench.seen["strut_commands"]])
+        rig.until(lambda due=begin + 0.01 * n: time.monotonic() >= due, "the next command to be due")
+        message.header.stamp = rig.now()
+        rig.send(message)
+        rig.barrier()
+    lengths = np.array([message.position for message in rig.seen["strut_commands"]])
     assert 5 < len(lengths) < 61
     assert np.isfinite(lengths).all()
     assert (np.abs(np.diff(lengths, axis=0)) <= 2e-3).all()
@@ -413,56 +413,56 @@ def test_nothing_out_of_limits_is_ever_published(bench):
 # ---- feedback and estimate ----
 
 
-def test_estimate_from_measured_struts_by_name(bench):
+def test_estimate_from_measured_struts_by_name(rig):
     """Closed-form lengths of a pose in, the pose out; the names in any order, the stamp copied."""
-    bench.compensator(model_file="ideal", feedback_timeout=60.0)
+    rig.compensator(model_file="ideal", feedback_timeout=60.0)
     pose = near(HOME, (0.01, -0.02, 0.03), 5.0)
     lengths, order = closed_form_lengths(pose), [3, 5, 0, 1, 4, 2]
-    message = bench.feed(lengths[order], tuple(STRUT_NAMES[i] for i in order))
-    estimate = bench.estimate(message)
+    message = rig.feed(lengths[order], tuple(STRUT_NAMES[i] for i in order))
+    estimate = rig.estimate(message)
     # Newton ends below 1e-13 m of strut length; the inverse Jacobian of this machine is below 3.
     np.testing.assert_allclose(message_pose(estimate).position, pose.position, rtol=0.0, atol=1e-11)
     np.testing.assert_allclose(message_pose(estimate).rotation, pose.rotation, rtol=0.0, atol=1e-11)
-    values_of(bench, "pose_estimated_from", "strut_states")
+    values_of(rig, "pose_estimated_from", "strut_states")
 
 
-def test_estimate_runs_through_the_model(bench):
+def test_estimate_runs_through_the_model(rig):
     """Measured struts that stand on their commands: the tool is where it was commanded, not elsewhere."""
-    bench.compensator(feedback_timeout=60.0)
+    rig.compensator(feedback_timeout=60.0)
     pose = near(HOME, STEP_BACK, 0.1)
-    lengths = bench.ask(pose).lengths
-    estimate = message_pose(bench.estimate(bench.feed(lengths)))
+    lengths = rig.ask(pose).lengths
+    estimate = message_pose(rig.estimate(rig.feed(lengths)))
     np.testing.assert_allclose(estimate.position, pose.position, rtol=0.0, atol=1e-11)
     np.testing.assert_allclose(estimate.rotation, pose.rotation, rtol=0.0, atol=1e-11)
 
 
-def test_without_feedback_the_estimate_comes_from_own_commands(bench):
-    bench.compensator(command_timeout=0.0)
+def test_without_feedback_the_estimate_comes_from_own_commands(rig):
+    rig.compensator(command_timeout=0.0)
     pose = near(HOME, STEP_BACK, 0.1)
-    estimate = bench.estimate(bench.ask(pose).command)
+    estimate = rig.estimate(rig.ask(pose).command)
     np.testing.assert_allclose(message_pose(estimate).position, pose.position, rtol=0.0, atol=1e-11)
-    values = bench.until_status(OK, "running, pose estimated from own commands")
+    values = rig.until_status(OK, "running, pose estimated from own commands")
     assert values["pose_estimated_from"] == "own commands"
     assert values["feedback_age_s"] == "never"
 
 
-def test_with_feedback_own_commands_are_not_taken_for_measured(bench):
-    bench.compensator(feedback_timeout=60.0, command_timeout=0.0)
-    bench.estimate(bench.feed(closed_form_lengths(HOME)))
-    bench.ask(near(HOME, STEP_BACK))
-    bench.barrier()
-    assert len(bench.seen["tool_pose_estimate"]) == 1
-    assert bench.until_status(OK, "running, a change is ramping in")["pose_estimated_from"] == "strut_states"
+def test_with_feedback_own_commands_are_not_taken_for_measured(rig):
+    rig.compensator(feedback_timeout=60.0, command_timeout=0.0)
+    rig.estimate(rig.feed(closed_form_lengths(HOME)))
+    rig.ask(near(HOME, STEP_BACK))
+    rig.barrier()
+    assert len(rig.seen["tool_pose_estimate"]) == 1
+    assert rig.until_status(OK, "running, a change is ramping in")["pose_estimated_from"] == "strut_states"
 
 
-def test_lost_feedback_is_said_and_compensation_goes_on(bench):
-    bench.compensator(feedback_timeout=0.2, command_timeout=0.0)
-    bench.feed(closed_form_lengths(HOME))
-    bench.ask(HOME)
-    bench.until_status(WARN, "feedback lost, pose estimated from own commands")
-    bench.ask(near(HOME, STEP_BACK))
-    bench.feed(closed_form_lengths(HOME))
-    values = values_of(bench, "pose_estimated_from", "strut_states")
+def test_lost_feedback_is_said_and_compensation_goes_on(rig):
+    rig.compensator(feedback_timeout=0.2, command_timeout=0.0)
+    rig.feed(closed_form_lengths(HOME))
+    rig.ask(HOME)
+    rig.until_status(WARN, "feedback lost, pose estimated from own commands")
+    rig.ask(near(HOME, STEP_BACK))
+    rig.feed(closed_form_lengths(HOME))
+    values = values_of(rig, "pose_estimated_from", "strut_states")
     assert float(values["feedback_age_s"]) < 0.2
 
 
@@ -491,79 +491,79 @@ BAD_FEEDBACK = {
 
 
 @pytest.mark.parametrize("case", BAD_FEEDBACK)
-def test_bad_feedback_is_ignored_counted_and_logged(bench, case):
+def test_bad_feedback_is_ignored_counted_and_logged(rig, case):
     lengths, names, reason, text = BAD_FEEDBACK[case]
-    bench.compensator()
-    bench.feed(lengths, names)
-    values = bench.until_status(ERROR, f"bad feedback: {reason}")
+    rig.compensator()
+    rig.feed(lengths, names)
+    values = rig.until_status(ERROR, f"bad feedback: {reason}")
     assert values["bad_feedback"] == "1"
     assert values["last_bad_feedback"]
     assert values["refused"] == "0", "no command has been refused"
-    (line,) = bench.logged(text)
+    (line,) = rig.logged(text)
     assert values["last_bad_feedback"] in line
-    assert not bench.seen["tool_pose_estimate"]
+    assert not rig.seen["tool_pose_estimate"]
 
 
 @pytest.mark.parametrize("value", [math.nan, 0.05])
-def test_first_command_after_bad_feedback(bench, value):
+def test_first_command_after_bad_feedback(rig, value):
     """Lengths that are no numbers, or that no strut can have, are as none at all."""
-    bench.compensator(feedback_timeout=60.0)
-    bench.feed(lengths_with(4, value))
-    assert bench.until_status(ERROR, "bad feedback")["feedback_age_s"] == "never"
-    bench.ask(HOME)
+    rig.compensator(feedback_timeout=60.0)
+    rig.feed(lengths_with(4, value))
+    assert rig.until_status(ERROR, "bad feedback")["feedback_age_s"] == "never"
+    rig.ask(HOME)
 
 
-def test_require_feedback(bench, short_memory):
-    bench.compensator(require_feedback=True, feedback_timeout=0.3, command_timeout=0.0)
-    bench.send(HOME)
-    assert "no strut_states yet" in bench.until_status(ERROR, "refusing commands: no_feedback")["last_refusal"]
-    bench.feed(closed_form_lengths(HOME))
-    bench.ask(HOME)
-    bench.until_status(WARN, "feedback lost")
-    bench.send(HOME)
-    assert bench.until_status(ERROR, "refusing commands: no_feedback")["refused.no_feedback"] == "2"
-    assert len(bench.seen["strut_commands"]) == 1
+def test_require_feedback(rig, short_memory):
+    rig.compensator(require_feedback=True, feedback_timeout=0.3, command_timeout=0.0)
+    rig.send(HOME)
+    assert "no strut_states yet" in rig.until_status(ERROR, "refusing commands: no_feedback")["last_refusal"]
+    rig.feed(closed_form_lengths(HOME))
+    rig.ask(HOME)
+    rig.until_status(WARN, "feedback lost")
+    rig.send(HOME)
+    assert rig.until_status(ERROR, "refusing commands: no_feedback")["refused.no_feedback"] == "2"
+    assert len(rig.seen["strut_commands"]) == 1
 
 
-def test_first_command_is_at_most_one_step_from_the_measured_struts(bench):
+def test_first_command_is_at_most_one_step_from_the_measured_struts(rig):
     """The step allowed is 2 mm; 5 mm along z change every strut by some 4 mm."""
-    bench.compensator(feedback_timeout=60.0)
+    rig.compensator(feedback_timeout=60.0)
     measured = near(HOME, (0.0, 0.0, 0.05))
-    bench.estimate(bench.feed(closed_form_lengths(measured)))
-    bench.send(near(measured, (0.0, 0.0, 0.005)))
-    values = bench.until_status(ERROR, "refusing commands: step")
+    rig.estimate(rig.feed(closed_form_lengths(measured)))
+    rig.send(near(measured, (0.0, 0.0, 0.005)))
+    values = rig.until_status(ERROR, "refusing commands: step")
     assert "allowed 2 mm" in values["last_refusal"]
     assert values["what_to_do"].startswith("go on from the last answered command")
     assert values["last_answered"] == "0.000000000"
-    answer = bench.ask(near(measured, (0.0, 0.0, 0.001)))
+    answer = rig.ask(near(measured, (0.0, 0.0, 0.001)))
     stamp = answer.command.header.stamp
-    bench.until(lambda: bench.values()["last_answered"] == f"{stamp.sec}.{stamp.nanosec:09d}", "the stamp")
-    assert len(bench.seen["strut_commands"]) == 1
+    rig.until(lambda: rig.values()["last_answered"] == f"{stamp.sec}.{stamp.nanosec:09d}", "the stamp")
+    assert len(rig.seen["strut_commands"]) == 1
 
 
-def test_first_command_after_every_activation_starts_from_the_measured_struts(bench):
+def test_first_command_after_every_activation_starts_from_the_measured_struts(rig):
     """Also when the struts were moved, and measured, while the node was inactive."""
-    bench.compensator(feedback_timeout=60.0)
-    bench.feed(closed_form_lengths(HOME))
-    bench.ask(HOME)
-    assert bench.change("deactivate")
+    rig.compensator(feedback_timeout=60.0)
+    rig.feed(closed_form_lengths(HOME))
+    rig.ask(HOME)
+    assert rig.change("deactivate")
     elsewhere = near(HOME, (0.0, 0.0, 0.05))
-    bench.feed(closed_form_lengths(elsewhere), later=0.3)  # 45 mm take the struts a while
-    bench.barrier()
-    assert bench.change("activate")
-    bench.send(HOME)
-    bench.until_status(ERROR, "refusing commands: step")
-    bench.ask(elsewhere)
+    rig.feed(closed_form_lengths(elsewhere), later=0.3)  # 45 mm take the struts a while
+    rig.barrier()
+    assert rig.change("activate")
+    rig.send(HOME)
+    rig.until_status(ERROR, "refusing commands: step")
+    rig.ask(elsewhere)
 
 
 # ---- changes ramp ----
 
 
-def stream(bench: Bench, pose: Pose, last: Answer, until: Callable[[Answer], bool]) -> list[Answer]:
+def stream(rig: Bench, pose: Pose, last: Answer, until: Callable[[Answer], bool]) -> list[Answer]:
     """Send a pose again and again until an answer satisfies a condition; return all from `last` on."""
     answers = [last]
     while not until(answers[-1]):
-        answers.append(bench.ask(pose))
+        answers.append(rig.ask(pose))
         assert len(answers) < 2000, "the ramp does not end"
     return answers
 
@@ -584,62 +584,62 @@ def assert_ramp(answers: list[Answer], rate: float) -> None:
     assert (steps * direction >= -ROUNDING).all(), "a strut went back on its way"
 
 
-def test_switching_off_and_on_ramps(bench):
+def test_switching_off_and_on_ramps(rig):
     """From the full correction to none and back, at 2 mm/s: 164 µm, at most 40 µm of them after a pause."""
     rate = 0.002
-    bench.compensator(ramp_rate=rate, command_timeout=0.0)
-    full = bench.ask(HOME)
-    assert "ramps out" in bench.enable(False).message
-    off = stream(bench, HOME, full, lambda answer: not answer.corrections.any())
+    rig.compensator(ramp_rate=rate, command_timeout=0.0)
+    full = rig.ask(HOME)
+    assert "ramps out" in rig.enable(False).message
+    off = stream(rig, HOME, full, lambda answer: not answer.corrections.any())
     assert_ramp(off, rate)
     np.testing.assert_allclose(off[-1].lengths, closed_form_lengths(HOME), rtol=0.0, atol=ROUNDING)
-    assert values_of(bench, "largest_correction_m", "0.000000000")["compensation"] == "off"
-    assert "ramps in" in bench.enable(True).message
-    back = stream(bench, HOME, off[-1], lambda answer: np.abs(answer.corrections - full.corrections).max() < ROUNDING)
+    assert values_of(rig, "largest_correction_m", "0.000000000")["compensation"] == "off"
+    assert "ramps in" in rig.enable(True).message
+    back = stream(rig, HOME, off[-1], lambda answer: np.abs(answer.corrections - full.corrections).max() < ROUNDING)
     assert_ramp(back, rate)
     assert len(off) > 3
     assert len(back) > 3
-    values_of(bench, "compensation", "on")
+    values_of(rig, "compensation", "on")
 
 
-def test_a_ramp_is_said(bench):
-    bench.compensator(ramp_rate=1e-6, command_timeout=0.0)
-    bench.ask(HOME)
-    bench.enable(False)
-    bench.ask(HOME)
-    assert bench.until_status(OK, "running, a change is ramping in")["ramping"] == "true"
+def test_a_ramp_is_said(rig):
+    rig.compensator(ramp_rate=1e-6, command_timeout=0.0)
+    rig.ask(HOME)
+    rig.enable(False)
+    rig.ask(HOME)
+    assert rig.until_status(OK, "running, a change is ramping in")["ramping"] == "true"
 
 
-def test_a_pause_does_not_become_a_step(bench):
+def test_a_pause_does_not_become_a_step(rig):
     """After a pause, a strut may go 20 ms × 1 mm/s = 20 µm at once, not the whole 164 µm."""
-    bench.compensator(ramp_rate=1e-3, command_timeout=0.05)
-    before = bench.ask(HOME)
-    bench.enable(False)
-    bench.until_status(WARN, "no new command")
-    step = np.abs(bench.ask(HOME).corrections - before.corrections).max()
+    rig.compensator(ramp_rate=1e-3, command_timeout=0.05)
+    before = rig.ask(HOME)
+    rig.enable(False)
+    rig.until_status(WARN, "no new command")
+    step = np.abs(rig.ask(HOME).corrections - before.corrections).max()
     assert 0.0 < step <= 20e-6 + ROUNDING
 
 
-def test_switched_off_from_the_start(bench):
-    bench.compensator(enable_compensation=False)
-    answer = bench.ask(HOME)
+def test_switched_off_from_the_start(rig):
+    rig.compensator(enable_compensation=False)
+    answer = rig.ask(HOME)
     assert not answer.corrections.any()
     np.testing.assert_allclose(answer.lengths, closed_form_lengths(HOME), rtol=0.0, atol=ROUNDING)
-    assert bench.enable(True).success
-    assert np.abs(bench.ask(HOME).corrections).max() < 20e-6
+    assert rig.enable(True).success
+    assert np.abs(rig.ask(HOME).corrections).max() < 20e-6
 
 
-def test_reload_ramps_to_the_new_model(bench, tmp_path):
+def test_reload_ramps_to_the_new_model(rig, tmp_path):
     """Two models of strut offsets only: actual = command + offset, so the correction is −offset."""
     rate, path = 0.005, model_file(tmp_path, struts={"offset_um": 100.0})
-    bench.compensator(model_file=path, ramp_rate=rate, command_timeout=0.0)
-    before = bench.ask(HOME)
+    rig.compensator(model_file=path, ramp_rate=rate, command_timeout=0.0)
+    before = rig.ask(HOME)
     np.testing.assert_allclose(before.corrections, -100e-6, rtol=0.0, atol=ROUNDING)
     offsets = [-50.0, 0.0, 50.0, 100.0, 150.0, 200.0]
     model_file(tmp_path, name="model.yaml", struts={"offset_um": offsets})
-    assert bench.trigger("reload_model").success
+    assert rig.trigger("reload_model").success
     wanted = -1e-6 * np.array(offsets)
-    answers = stream(bench, HOME, before, lambda answer: np.abs(answer.corrections - wanted).max() < ROUNDING)
+    answers = stream(rig, HOME, before, lambda answer: np.abs(answer.corrections - wanted).max() < ROUNDING)
     assert_ramp(answers, rate)
 
 
@@ -652,11 +652,11 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("case", BROKEN)
-def test_reload_of_a_broken_file_keeps_the_old_model_and_says_why(bench, tmp_path, case):
+def test_reload_of_a_broken_file_keeps_the_old_model_and_says_why(rig, tmp_path, case):
     what, text = BROKEN[case]
     path = Path(model_file(tmp_path, struts={"offset_um": 100.0}))
-    bench.compensator(model_file=str(path))
-    bench.ask(HOME)
+    rig.compensator(model_file=str(path))
+    rig.ask(HOME)
     if what is None:
         path.unlink()
     elif what == "machine":
@@ -665,122 +665,122 @@ def test_reload_of_a_broken_file_keeps_the_old_model_and_says_why(bench, tmp_pat
         model_file(tmp_path, struts={"offset_um": "a lot"})
     else:
         path.write_text(what, encoding="utf-8")
-    response = bench.trigger("reload_model")
+    response = rig.trigger("reload_model")
     assert not response.success
     assert response.message.startswith("the old model stays: ")
     assert text in response.message
     assert str(path) in response.message
-    np.testing.assert_allclose(bench.ask(HOME).corrections, -100e-6, rtol=0.0, atol=ROUNDING)
+    np.testing.assert_allclose(rig.ask(HOME).corrections, -100e-6, rtol=0.0, atol=ROUNDING)
 
 
-def test_reset_starts_from_the_measured_struts(bench):
-    bench.compensator(feedback_timeout=60.0)
-    bench.ask(HOME)
+def test_reset_starts_from_the_measured_struts(rig):
+    rig.compensator(feedback_timeout=60.0)
+    rig.ask(HOME)
     elsewhere = near(HOME, (0.0, 0.0, 0.05))
-    bench.send(elsewhere)
-    bench.until_status(ERROR, "refusing commands: step")
-    bench.feed(closed_form_lengths(elsewhere))
-    assert bench.trigger("reset").success
-    bench.send(HOME)
-    bench.barrier()
-    bench.ask(elsewhere)
-    assert len(bench.seen["strut_commands"]) == 2, "home is not one step away from there"
+    rig.send(elsewhere)
+    rig.until_status(ERROR, "refusing commands: step")
+    rig.feed(closed_form_lengths(elsewhere))
+    assert rig.trigger("reset").success
+    rig.send(HOME)
+    rig.barrier()
+    rig.ask(elsewhere)
+    assert len(rig.seen["strut_commands"]) == 2, "home is not one step away from there"
 
 
-def test_reset_in_the_middle_of_a_ramp_does_not_step(bench):
+def test_reset_in_the_middle_of_a_ramp_does_not_step(rig):
     """Changes ramp, they never step: at 1 mm/s and at most 20 ms, a strut may go 20 µm."""
-    bench.compensator(ramp_rate=1e-3)
-    bench.ask(HOME)
-    bench.enable(False)
-    before = bench.ask(HOME)
-    bench.trigger("reset")
-    assert np.abs(bench.ask(HOME).corrections - before.corrections).max() <= 20e-6 + ROUNDING
+    rig.compensator(ramp_rate=1e-3)
+    rig.ask(HOME)
+    rig.enable(False)
+    before = rig.ask(HOME)
+    rig.trigger("reset")
+    assert np.abs(rig.ask(HOME).corrections - before.corrections).max() <= 20e-6 + ROUNDING
 
 
-def test_after_a_reset_stamps_may_start_earlier(bench):
-    bench.compensator(max_command_age=0.0)
+def test_after_a_reset_stamps_may_start_earlier(rig):
+    rig.compensator(max_command_age=0.0)
     earlier = pose_message(HOME, "base")
-    earlier.header.stamp = bench.stamp(-0.3)
-    bench.ask(HOME)
-    bench.trigger("reset")
-    bench.ask(earlier)
+    earlier.header.stamp = rig.stamp(-0.3)
+    rig.ask(HOME)
+    rig.trigger("reset")
+    rig.ask(earlier)
 
 
 # ---- temperatures ----
 
 
-def test_strut_temperature_changes_its_correction(bench, tmp_path):
+def test_strut_temperature_changes_its_correction(rig, tmp_path):
     """Closed form: a strut that grows by g must be commanded L/(1 + g); only the warm one."""
     path = model_file(tmp_path, struts={"expansion_ppm_per_K": 12.0})
-    bench.compensator(model_file=path, ramp_rate=1.0, command_timeout=0.0)
-    assert not bench.ask(HOME).corrections.any()
-    bench.warm("strut_3", 25.0)
+    rig.compensator(model_file=path, ramp_rate=1.0, command_timeout=0.0)
+    assert not rig.ask(HOME).corrections.any()
+    rig.warm("strut_3", 25.0)
     growth = np.array([0.0, 0.0, 12e-6 * 5.0, 0.0, 0.0, 0.0])
     nominal = closed_form_lengths(HOME)
     expected = nominal / (1.0 + growth) - nominal
-    np.testing.assert_allclose(bench.ask(HOME).corrections, expected, rtol=0.0, atol=ROUNDING)
+    np.testing.assert_allclose(rig.ask(HOME).corrections, expected, rtol=0.0, atol=ROUNDING)
     assert expected[2] == pytest.approx(-30.55e-6, abs=1e-8), "0.509192 m · 12e-6/K · 5 K"
-    values_of(bench, "temperature.strut_3_degC", "25.00")
+    values_of(rig, "temperature.strut_3_degC", "25.00")
 
 
 @pytest.mark.parametrize(("part", "sides"), [("base", "bd"), ("platform", "a")])
-def test_body_temperature_changes_all_corrections(bench, tmp_path, part, sides):
+def test_body_temperature_changes_all_corrections(rig, tmp_path, part, sides):
     """A body that grows about its origin is the paper's machine with larger sides."""
     path = model_file(tmp_path, thermal={f"{part}_expansion_ppm_per_K": 10.0})
-    bench.compensator(model_file=path, ramp_rate=1.0)
-    bench.ask(HOME)
-    bench.warm(part, 30.0)
+    rig.compensator(model_file=path, ramp_rate=1.0)
+    rig.ask(HOME)
+    rig.warm(part, 30.0)
     grown = {side: {"a": 0.3, "b": 0.572, "d": 0.243}[side] * (1.0 + 100e-6) for side in sides}
     expected = closed_form_lengths(HOME, **grown)
-    np.testing.assert_allclose(bench.ask(HOME).lengths, expected, rtol=0.0, atol=ROUNDING)
+    np.testing.assert_allclose(rig.ask(HOME).lengths, expected, rtol=0.0, atol=ROUNDING)
 
 
-def test_temperatures_ramp(bench, tmp_path):
+def test_temperatures_ramp(rig, tmp_path):
     """60 K · 12e-6/K · 0.5 m = 367 µm at 5 mm/s."""
     path = model_file(tmp_path, struts={"expansion_ppm_per_K": 12.0})
-    bench.compensator(model_file=path, ramp_rate=0.005, temperature_spread_limit=0.0)
-    before = bench.ask(HOME)
-    bench.warm("strut_1", 80.0)
+    rig.compensator(model_file=path, ramp_rate=0.005, temperature_spread_limit=0.0)
+    before = rig.ask(HOME)
+    rig.warm("strut_1", 80.0)
     nominal = closed_form_lengths(HOME)[0]
     wanted = nominal / (1.0 + 60.0 * 12e-6) - nominal
-    answers = stream(bench, HOME, before, lambda answer: abs(answer.corrections[0] - wanted) < ROUNDING)
+    answers = stream(rig, HOME, before, lambda answer: abs(answer.corrections[0] - wanted) < ROUNDING)
     assert_ramp(answers, 0.005)
     assert len(answers) > 3
 
 
 @pytest.mark.parametrize(("time_constant", "taken"), [(3600.0, 26.0), (0.0, 27.0)], ids=["filtered", "off"])
-def test_readings_are_filtered(bench, tmp_path, time_constant, taken):
+def test_readings_are_filtered(rig, tmp_path, time_constant, taken):
     """Two readings within a few seconds count alike in an hour's mean; 1 nm is 0.6 s out of that."""
     path = model_file(tmp_path, struts={"expansion_ppm_per_K": 12.0})
-    bench.compensator(
+    rig.compensator(
         model_file=path, ramp_rate=1.0, temperature_time_constant_s=time_constant, temperature_rate_limit=0.0
     )
-    bench.warm("strut_3", 25.0)
-    bench.warm("strut_3", 27.0)
-    values_of(bench, "temperature.strut_3_degC", f"{taken:.2f}")
+    rig.warm("strut_3", 25.0)
+    rig.warm("strut_3", 27.0)
+    values_of(rig, "temperature.strut_3_degC", f"{taken:.2f}")
     nominal = closed_form_lengths(HOME)[2]
     expected = nominal / (1.0 + 12e-6 * (taken - 20.0)) - nominal
-    assert bench.ask(HOME).corrections[2] == pytest.approx(expected, rel=0.0, abs=10e-9)
+    assert rig.ask(HOME).corrections[2] == pytest.approx(expected, rel=0.0, abs=10e-9)
 
 
-def test_temperatures_of_an_inactive_node_act_on_activation(bench, tmp_path):
+def test_temperatures_of_an_inactive_node_act_on_activation(rig, tmp_path):
     """The first command after it finds the strut as warm as it is; one that has moved before ramps to it."""
     path = model_file(tmp_path, struts={"expansion_ppm_per_K": 12.0})
     settings = {"ramp_rate": 0.005, "max_command_age": 0.0, "temperature_time_constant_s": 0.0}
     settings |= {"temperature_rate_limit": 0.0, "temperature_spread_limit": 0.0}
-    bench.compensator(start=False, model_file=path, **settings)
-    assert bench.change("configure")
-    bench.until(bench.matched, "discovery")
-    bench.warm("strut_3", 25.0)
-    assert bench.change("activate")
+    rig.compensator(start=False, model_file=path, **settings)
+    assert rig.change("configure")
+    rig.until(rig.matched, "discovery")
+    rig.warm("strut_3", 25.0)
+    assert rig.change("activate")
     nominal = closed_form_lengths(HOME)[2]
     warm, hot = (nominal / (1.0 + 12e-6 * kelvin) - nominal for kelvin in (5.0, 60.0))
-    first = bench.ask(HOME)
+    first = rig.ask(HOME)
     assert first.corrections[2] == pytest.approx(warm, rel=0.0, abs=ROUNDING)
-    assert bench.change("deactivate")
-    bench.warm("strut_3", 80.0)
-    assert bench.change("activate")
-    answers = stream(bench, HOME, first, lambda answer: abs(answer.corrections[2] - hot) < ROUNDING)
+    assert rig.change("deactivate")
+    rig.warm("strut_3", 80.0)
+    assert rig.change("activate")
+    answers = stream(rig, HOME, first, lambda answer: abs(answer.corrections[2] - hot) < ROUNDING)
     assert_ramp(answers, 0.005)
 
 
@@ -793,90 +793,90 @@ def test_temperatures_of_an_inactive_node_act_on_activation(bench, tmp_path):
         ("base", 293.15, "must lie within -40…120 °C (found 293.15)"),
     ],
 )
-def test_bad_temperature_is_ignored_and_counted(bench, tmp_path, part, temperature, text):
+def test_bad_temperature_is_ignored_and_counted(rig, tmp_path, part, temperature, text):
     """An unknown part, no number, and kelvins."""
     path = model_file(tmp_path, struts={"expansion_ppm_per_K": 12.0})
-    bench.compensator(model_file=path, ramp_rate=1.0)
-    bench.ask(HOME)
-    bench.warm(part, temperature)
-    values = bench.until_status(ERROR, "bad feedback: temperature")
+    rig.compensator(model_file=path, ramp_rate=1.0)
+    rig.ask(HOME)
+    rig.warm(part, temperature)
+    values = rig.until_status(ERROR, "bad feedback: temperature")
     assert values["bad_feedback"] == "1"
     assert text in values["last_bad_feedback"]
-    assert len(bench.logged("temperature ignored")) == 1
-    assert not bench.ask(HOME).corrections.any()
+    assert len(rig.logged("temperature ignored")) == 1
+    assert not rig.ask(HOME).corrections.any()
 
 
 # ---- lifecycle ----
 
 
-def test_inactive_node_ignores_commands_and_replays_nothing(bench):
-    bench.compensator(start=False, feedback_timeout=60.0)
-    assert bench.state() == "unconfigured"
-    assert bench.change("configure")
-    assert bench.state() == "inactive"
-    bench.until(bench.matched, "discovery")
-    bench.send(near(HOME, (0.0, 0.0, 0.05)))
-    bench.barrier()
-    assert bench.until_status(WARN, "not active")["commands"] == "0"
-    assert bench.change("activate")
-    bench.until_status(OK, "waiting for the first command")
-    first = bench.ask(HOME)
-    assert [m.header.stamp for m in bench.seen["strut_commands"]] == [first.command.header.stamp]
-    assert bench.values()["refused"] == "0"
+def test_inactive_node_ignores_commands_and_replays_nothing(rig):
+    rig.compensator(start=False, feedback_timeout=60.0)
+    assert rig.state() == "unconfigured"
+    assert rig.change("configure")
+    assert rig.state() == "inactive"
+    rig.until(rig.matched, "discovery")
+    rig.send(near(HOME, (0.0, 0.0, 0.05)))
+    rig.barrier()
+    assert rig.until_status(WARN, "not active")["commands"] == "0"
+    assert rig.change("activate")
+    rig.until_status(OK, "waiting for the first command")
+    first = rig.ask(HOME)
+    assert [m.header.stamp for m in rig.seen["strut_commands"]] == [first.command.header.stamp]
+    assert rig.values()["refused"] == "0"
 
 
-def test_deactivated_node_is_silent(bench):
-    bench.compensator()
-    bench.ask(HOME)
-    assert bench.change("deactivate")
-    said = {topic: len(bench.seen[topic]) for topic in ("strut_commands", "tool_pose_estimate")}
-    bench.send(HOME)
-    bench.feed(closed_form_lengths(HOME))
-    bench.warm("nonsense", math.nan)
-    assert {topic: len(bench.seen[topic]) for topic in said} == said
-    assert bench.until_status(WARN, "not active")["bad_feedback"] == "0"
+def test_deactivated_node_is_silent(rig):
+    rig.compensator()
+    rig.ask(HOME)
+    assert rig.change("deactivate")
+    said = {topic: len(rig.seen[topic]) for topic in ("strut_commands", "tool_pose_estimate")}
+    rig.send(HOME)
+    rig.feed(closed_form_lengths(HOME))
+    rig.warm("nonsense", math.nan)
+    assert {topic: len(rig.seen[topic]) for topic in said} == said
+    assert rig.until_status(WARN, "not active")["bad_feedback"] == "0"
 
 
-def test_lifecycle_goes_round(bench):
+def test_lifecycle_goes_round(rig):
     """Three rounds by service while measured struts stream in; the topics come and go with it."""
-    bench.compensator(start=False)
+    rig.compensator(start=False)
     for _ in range(3):
-        assert bench.change("configure")
-        assert bench.change("activate")
-        bench.until(bench.matched, "discovery")
-        bench.feed(closed_form_lengths(HOME))
-        bench.ask(HOME)
-        assert bench.change("deactivate")
-        bench.feed(closed_form_lengths(HOME))
-        assert bench.change("cleanup")
-        bench.until(lambda: not bench.witness.count_publishers("strut_corrections"), "the publisher to go")
-        assert bench.witness.count_subscribers("tool_pose_command") == 0
-    assert bench.state() == "unconfigured"
+        assert rig.change("configure")
+        assert rig.change("activate")
+        rig.until(rig.matched, "discovery")
+        rig.feed(closed_form_lengths(HOME))
+        rig.ask(HOME)
+        assert rig.change("deactivate")
+        rig.feed(closed_form_lengths(HOME))
+        assert rig.change("cleanup")
+        rig.until(lambda: not rig.witness.count_publishers("strut_corrections"), "the publisher to go")
+        assert rig.witness.count_subscribers("tool_pose_command") == 0
+    assert rig.state() == "unconfigured"
 
 
-def test_configure_with_a_bad_file_fails_and_names_file_and_key(bench, tmp_path):
+def test_configure_with_a_bad_file_fails_and_names_file_and_key(rig, tmp_path):
     """The file is mended, and then the node can be configured."""
     path = Path(geometry_file(tmp_path, {"step_mm": -1.0}))
-    bench.compensator(start=False, geometry_file=str(path))
-    assert not bench.change("configure")
-    assert bench.state() == "unconfigured"
-    (line,) = bench.logged("cannot configure")
+    rig.compensator(start=False, geometry_file=str(path))
+    assert not rig.change("configure")
+    assert rig.state() == "unconfigured"
+    (line,) = rig.logged("cannot configure")
     assert str(path) in line
     assert "limits.step" in line
     assert "-1" in line or "-0.001" in line
     geometry_file(tmp_path)
-    assert bench.change("configure")
-    assert bench.change("activate")
-    bench.until(bench.matched, "discovery")
-    bench.ask(HOME)
+    assert rig.change("configure")
+    assert rig.change("activate")
+    rig.until(rig.matched, "discovery")
+    rig.ask(HOME)
 
 
-def test_home_out_of_limits_fails_and_says_why(bench, tmp_path):
+def test_home_out_of_limits_fails_and_says_why(rig, tmp_path):
     """The shipped model corrects 164 µm at home: with 100 µm allowed, the machine cannot even stand there."""
-    node = bench.compensator(start=False, geometry_file=geometry_file(tmp_path, {"correction_um": 100.0}))
-    assert not bench.change("configure")
-    assert bench.state() == "unconfigured"
-    (line,) = bench.logged("cannot configure")
+    node = rig.compensator(start=False, geometry_file=geometry_file(tmp_path, {"correction_um": 100.0}))
+    assert not rig.change("configure")
+    assert rig.state() == "unconfigured"
+    (line,) = rig.logged("cannot configure")
     assert "larger than ±100 µm" in line
     node.say_goodbye()
 
@@ -884,11 +884,11 @@ def test_home_out_of_limits_fails_and_says_why(bench, tmp_path):
 # ---- parameters ----
 
 
-def test_parameters_describe_themselves(bench):
-    bench.compensator()
+def test_parameters_describe_themselves(rig):
+    rig.compensator()
     names = [parameter.name for parameter in compensator_module.PARAMETERS]
     request = DescribeParameters.Request(names=names)
-    answer = bench.call(DescribeParameters, "compensator/describe_parameters", request)
+    answer = rig.call(DescribeParameters, "compensator/describe_parameters", request)
     described = {descriptor.name: descriptor for descriptor in answer.descriptors}
     assert all(described[name].description for name in names)
     for parameter in compensator_module.PARAMETERS:
@@ -897,22 +897,22 @@ def test_parameters_describe_themselves(bench):
             assert bounds.from_value <= parameter.default <= bounds.to_value
 
 
-def test_int_is_taken_for_a_double(bench):
-    bench.compensator(command_timeout=1, ramp_rate=1, marker_rate=5)
-    bench.ask(HOME)
+def test_int_is_taken_for_a_double(rig):
+    rig.compensator(command_timeout=1, ramp_rate=1, marker_rate=5)
+    rig.ask(HOME)
 
 
-def test_misspelt_parameter_is_warned_of(bench):
-    bench.compensator(comand_timeout=1.0)
-    (line,) = bench.logged("comand_timeout")
+def test_misspelt_parameter_is_warned_of(rig):
+    rig.compensator(comand_timeout=1.0)
+    (line,) = rig.logged("comand_timeout")
     assert line == "there is no parameter comand_timeout, it is ignored; did you mean command_timeout?"
 
 
-def test_known_parameters_are_not_warned_of(bench):
+def test_known_parameters_are_not_warned_of(rig):
     override = {"qos_overrides./tool_pose_command.subscription.depth": 3}
-    bench.compensator(use_sim_time=False, command_timeout=1.0, **override)
-    assert bench.logged("ready")
-    assert not bench.logged("there is no parameter")
+    rig.compensator(use_sim_time=False, command_timeout=1.0, **override)
+    assert rig.logged("ready")
+    assert not rig.logged("there is no parameter")
 
 
 @pytest.mark.parametrize(
@@ -928,46 +928,46 @@ def test_known_parameters_are_not_warned_of(bench):
         ({"model_file": 3}, "model_file: must be str, not 3"),
     ],
 )
-def test_parameter_out_of_range_or_of_another_type_is_refused(bench, parameter, text):
+def test_parameter_out_of_range_or_of_another_type_is_refused(rig, parameter, text):
     with pytest.raises(ParameterError, match=r"^parameter ") as caught:
-        bench.add(CompensatorNode, False, parameter)
+        rig.add(CompensatorNode, False, parameter)
     assert text in str(caught.value)
 
 
-def test_autostart_is_a_wish_of_the_node(bench):
-    assert bench.compensator(start=False).wants_autostart is True
+def test_autostart_is_a_wish_of_the_node(rig):
+    assert rig.compensator(start=False).wants_autostart is True
 
 
 # ---- diagnostics ----
 
 
-def test_diagnostics_once_a_second_and_complete(bench):
+def test_diagnostics_once_a_second_and_complete(rig):
     """With nothing going on: the state at once, then every second (looked at every 50 ms)."""
-    bench.compensator()
-    bench.until(lambda: len(bench.statuses()) >= 3, "three statuses")
-    stamps = [array.header.stamp for array in bench.seen["/diagnostics"][-2:]]
+    rig.compensator()
+    rig.until(lambda: len(rig.statuses()) >= 3, "three statuses")
+    stamps = [array.header.stamp for array in rig.seen["/diagnostics"][-2:]]
     first, second = (stamp.sec + 1e-9 * stamp.nanosec for stamp in stamps)
     assert 0.95 < second - first < 1.5, "on a machine under load"
-    status = bench.status()
+    status = rig.status()
     assert (status.name, status.hardware_id) == ("compensator: state", "paper")
     assert (status.level, status.message) == (OK, "waiting for the first command")
     expected = {"model": "virtual machine", "compensation": "on", "ramping": "false", "commands": "0", "refused": "0"}
-    assert expected.items() <= bench.values().items()
+    assert expected.items() <= rig.values().items()
     for key in ("command_rate_hz", "command_age_s", "feedback_rate_hz", "feedback_age_s", "pose_estimated_from"):
-        assert key in bench.values()
+        assert key in rig.values()
 
 
-def test_stale_commands_are_said(bench):
-    bench.compensator(command_timeout=0.1)
-    bench.ask(HOME)
-    values = bench.until_status(WARN, "no new command")
+def test_stale_commands_are_said(rig):
+    rig.compensator(command_timeout=0.1)
+    rig.ask(HOME)
+    values = rig.until_status(WARN, "no new command")
     assert float(values["command_age_s"]) >= 0.1  # said in milliseconds: more than the timeout may read 0.100
 
     def running() -> bool:
-        bench.ask(HOME)  # again and again: a node that gets no processor for 0.1 s never sees one alone
-        return bench.message().startswith("running")
+        rig.ask(HOME)  # again and again: a node that gets no processor for 0.1 s never sees one alone
+        return rig.message().startswith("running")
 
-    bench.until(running, "the state to be running")
+    rig.until(running, "the state to be running")
 
 
 def test_log_lets_one_line_per_cause_and_second_through(monkeypatch):
@@ -1021,14 +1021,14 @@ def test_report_is_due_on_change_and_once_a_second():
 # ---- markers and mirror ----
 
 
-def test_markers_show_the_machine_as_it_stands(bench):
+def test_markers_show_the_machine_as_it_stands(rig):
     """Struts run from base joints to platform joints: their drawn lengths are the closed form's."""
-    bench.compensator(model_file="ideal")
+    rig.compensator(model_file="ideal")
     pose = near(HOME, (0.01, 0.0, 0.02), 3.0)
-    bench.ask(pose)
-    bench.seen["compensator/markers"].clear()
-    bench.until(lambda: bench.seen["compensator/markers"], "markers")
-    markers = bench.seen["compensator/markers"][0].markers
+    rig.ask(pose)
+    rig.seen["compensator/markers"].clear()
+    rig.until(lambda: rig.seen["compensator/markers"], "markers")
+    markers = rig.seen["compensator/markers"][0].markers
     assert len({(marker.ns, marker.id) for marker in markers}) == len(markers) == 5
     for marker in markers:
         assert marker.header.frame_id == "base"
@@ -1044,53 +1044,53 @@ def test_markers_show_the_machine_as_it_stands(bench):
     assert all((c.r, c.g, c.b) == (1.0, 1.0, 1.0) for c in struts.colors), "no correction is white"
 
 
-def test_strut_markers_are_coloured_by_correction(bench, tmp_path):
+def test_strut_markers_are_coloured_by_correction(rig, tmp_path):
     """Correction −offset: −100 µm is blue, +100 µm red, +50 µm half way, beyond as at the end."""
     path = model_file(tmp_path, struts={"offset_um": [100.0, -100.0, -50.0, 0.0, 300.0, 0.0]})
-    bench.compensator(model_file=path)
-    bench.ask(HOME)
-    bench.seen["compensator/markers"].clear()
-    bench.until(lambda: bench.seen["compensator/markers"], "markers")
-    struts = bench.seen["compensator/markers"][0].markers[0]
+    rig.compensator(model_file=path)
+    rig.ask(HOME)
+    rig.seen["compensator/markers"].clear()
+    rig.until(lambda: rig.seen["compensator/markers"], "markers")
+    struts = rig.seen["compensator/markers"][0].markers[0]
     colours = np.array([[c.r, c.g, c.b] for c in struts.colors[::2]])
     expected = [[0, 0, 1], [1, 0, 0], [1, 0.5, 0.5], [1, 1, 1], [0, 0, 1], [1, 1, 1]]
     np.testing.assert_allclose(colours, expected, atol=1e-6)  # float32 on the wire
 
 
-def test_markers_come_at_most_ten_times_a_second(bench):
+def test_markers_come_at_most_ten_times_a_second(rig):
     """Stamps of the node, not arrival times; a timer that was late may catch up, hence over four periods."""
-    bench.compensator()
-    bench.until(lambda: len(bench.seen["compensator/markers"]) >= 5, "five markers")
-    stamps = [array.markers[0].header.stamp for array in bench.seen["compensator/markers"][:5]]
+    rig.compensator()
+    rig.until(lambda: len(rig.seen["compensator/markers"]) >= 5, "five markers")
+    stamps = [array.markers[0].header.stamp for array in rig.seen["compensator/markers"][:5]]
     times = [stamp.sec + 1e-9 * stamp.nanosec for stamp in stamps]
     assert times[4] - times[0] > 0.3
 
 
-def test_no_markers_when_switched_off(bench):
-    bench.compensator(marker_rate=0.0, command_timeout=0.1)
-    bench.ask(HOME)
-    bench.until_status(WARN, "no new command")
-    assert not bench.seen["compensator/markers"]
+def test_no_markers_when_switched_off(rig):
+    rig.compensator(marker_rate=0.0, command_timeout=0.1)
+    rig.ask(HOME)
+    rig.until_status(WARN, "no new command")
+    assert not rig.seen["compensator/markers"]
 
 
-def test_array_mirror(bench):
-    bench.compensator(publish_array=True)
-    answer = bench.ask(HOME)
-    bench.until(lambda: bench.seen["strut_commands_array"], "the mirror")
-    assert list(bench.seen["strut_commands_array"][0].data) == list(answer.command.position)
+def test_array_mirror(rig):
+    rig.compensator(publish_array=True)
+    answer = rig.ask(HOME)
+    rig.until(lambda: rig.seen["strut_commands_array"], "the mirror")
+    assert list(rig.seen["strut_commands_array"][0].data) == list(answer.command.position)
 
 
-def test_no_array_mirror_unless_asked_for(bench):
-    bench.compensator()
-    assert bench.witness.count_publishers("strut_commands_array") == 0
+def test_no_array_mirror_unless_asked_for(rig):
+    rig.compensator()
+    assert rig.witness.count_publishers("strut_commands_array") == 0
 
 
 # ---- topics ----
 
 
-def test_quality_of_service(bench):
+def test_quality_of_service(rig):
     """Commands reliable, in a queue of a hundred; states the newest only; estimates for every listener."""
-    node = bench.compensator(publish_array=True)
+    node = rig.compensator(publish_array=True)
     ends = {end.topic_name: end.qos_profile for end in (*node.publishers, *node.subscriptions)}
     reliable = {"tool_pose_command", "strut_commands", "strut_corrections", "strut_commands_array"}
     for name in reliable | {"strut_states", "tool_pose_estimate"}:
@@ -1104,12 +1104,12 @@ def test_quality_of_service(bench):
         assert ends[f"/{name}"].reliability == ReliabilityPolicy.RELIABLE, name
 
 
-def test_quality_of_service_can_be_overridden(bench):
+def test_quality_of_service_can_be_overridden(rig):
     overrides = {
         "qos_overrides./strut_states.subscription.reliability": "reliable",
         "qos_overrides./strut_commands.publisher.depth": 7,
     }
-    node = bench.compensator(**overrides)
+    node = rig.compensator(**overrides)
     ends = {end.topic_name: end.qos_profile for end in (*node.publishers, *node.subscriptions)}
     assert ends["/strut_states"].reliability == ReliabilityPolicy.RELIABLE
     assert ends["/strut_commands"].depth == 7
@@ -1165,20 +1165,20 @@ def test_standard_messages_on_the_topics_of_the_readme(bench):
     assert bench.call(GetState, "compensator/get_state").current_state.label == "active"
 
 
-def test_a_bare_start_corrects_nothing_and_says_so(bench):
+def test_a_bare_start_corrects_nothing_and_says_so(rig):
     """Somebody else's errors must not move a machine whose model was not named."""
-    bench.hush("strut_commands")
-    bench.add(CompensatorNode, True, {"start_without_feedback_after": AT_ONCE})
-    assert bench.logged("with the ideal model, which corrects nothing (parameter model_file)")
-    answer = bench.settle(near(HOME, (0.01, 0.02, 0.03), 3.0))
+    rig.hush("strut_commands")
+    rig.add(CompensatorNode, True, {"start_without_feedback_after": AT_ONCE})
+    assert rig.logged("with the ideal model, which corrects nothing (parameter model_file)")
+    answer = rig.settle(near(HOME, (0.01, 0.02, 0.03), 3.0))
     np.testing.assert_array_equal(answer.corrections, 0.0)
-    bench.until_status(OK, "running")
-    assert bench.values()["model"] == "ideal"
+    rig.until_status(OK, "running")
+    assert rig.values()["model"] == "ideal"
 
 
-def test_a_shipped_model_is_found_by_name(bench):
-    bench.compensator(model_file="paper_machine")
+def test_a_shipped_model_is_found_by_name(rig):
+    rig.compensator(model_file="paper_machine")
     shipped = yaml.safe_load((CONFIG / "paper_machine.yaml").read_text(encoding="utf-8"))
-    bench.until(bench.status, "a status")
-    assert bench.values()["model"] == shipped["name"]
-    assert bench.logged(f"with model {shipped['name']!r}")
+    rig.until(rig.status, "a status")
+    assert rig.values()["model"] == shipped["name"]
+    assert rig.logged(f"with model {shipped['name']!r}")

@@ -1,6 +1,6 @@
 """How fast the nodes let the struts move, by which clock, and when a machine counts as standing.
 
-The bench's machine may move its struts at 250 mm/s, and by 2 mm from one command to the next. Straight up at home a
+The rig's machine may move its struts at 250 mm/s, and by 2 mm from one command to the next. Straight up at home a
 strut lengthens by less than the tool rises, so closed form lengths say how far.
 """
 
@@ -24,7 +24,7 @@ from hexapod_comp.ros.parameters import USE_SIM_TIME
 from hexapod_comp.ros.status import ERROR, OK, WARN
 
 SPEED = 0.25
-"""Largest strut speed of the bench's machine, m/s."""
+"""Largest strut speed of the rig's machine, m/s."""
 
 
 @pytest.fixture(autouse=True)
@@ -33,11 +33,11 @@ def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guards, "SHOWN_FOR", 0.3)
 
 
-def risen(bench: Bench, millimetres: float, seconds: float | None = None):
+def risen(rig: Bench, millimetres: float, seconds: float | None = None):
     """Return the command of a tool that has risen from home, stamped some seconds from now, or not at all."""
     message = pose_message(near(HOME, (0.0, 0.0, millimetres * 1e-3)), "base")
     if seconds is not None:
-        message.header.stamp = bench.stamp(seconds)
+        message.header.stamp = rig.stamp(seconds)
     return message
 
 
@@ -54,84 +54,84 @@ def way(low: float, high: float) -> float:
     return float(np.abs(next(ends) - next(ends)).max())
 
 
-def lengths(bench: Bench) -> np.ndarray:
+def lengths(rig: Bench) -> np.ndarray:
     """Return all strut commands so far, m."""
-    return np.array([message.position for message in bench.seen["strut_commands"]])
+    return np.array([message.position for message in rig.seen["strut_commands"]])
 
 
 # ---- speed ----
 
 
 @pytest.mark.parametrize("period", [0.0, 1e-6], ids=["equal", "a microsecond apart"])
-def test_commands_that_are_too_fast_by_their_stamps_are_refused(bench, period):
+def test_commands_that_are_too_fast_by_their_stamps_are_refused(rig, period):
     """By 1.5 mm at a time, each within a step; of a strut's way 5 ms at 250 mm/s pass as jitter, so one such step."""
-    bench.compensator()
-    first = risen(bench, 0.0, 0.0)
-    bench.ask(first)
+    rig.compensator()
+    first = risen(rig, 0.0, 0.0)
+    rig.ask(first)
     for n in range(1, 4):
-        message = risen(bench, 1.5 * n)
+        message = risen(rig, 1.5 * n)
         message.header.stamp.sec = first.header.stamp.sec
         message.header.stamp.nanosec = first.header.stamp.nanosec
         message.header.stamp.nanosec += round(period * n * 1e9)
-        bench.send(message)
-    bench.until(lambda: bench.values().get("refused") == "2", "two refusals")
-    values = bench.values()
+        rig.send(message)
+    rig.until(lambda: rig.values().get("refused") == "2", "two refusals")
+    values = rig.values()
     assert values["refused.speed"] == "1", "the second; the third is a step further still"
     assert values["refused.step"] == "1"
-    assert len(lengths(bench)) == 2
-    bench.ask(risen(bench, 1.6, 0.02))
+    assert len(lengths(rig)) == 2
+    rig.ask(risen(rig, 1.6, 0.02))
 
 
-def test_the_velocity_of_a_command_is_none_above_the_limit(bench):
+def test_the_velocity_of_a_command_is_none_above_the_limit(rig):
     """A microsecond after the last, as jitter allows it: 1 mm is no speed of a kilometre per second."""
-    bench.compensator()
-    stamp = bench.ask(risen(bench, 0.0, 0.0)).command.header.stamp
-    message = risen(bench, 1.0, 0.0)
+    rig.compensator()
+    stamp = rig.ask(risen(rig, 0.0, 0.0)).command.header.stamp
+    message = risen(rig, 1.0, 0.0)
     message.header.stamp.sec, message.header.stamp.nanosec = stamp.sec, stamp.nanosec + 1000
-    velocity = np.array(bench.ask(message).command.velocity)
+    velocity = np.array(rig.ask(message).command.velocity)
     assert 0.99 * SPEED < np.abs(velocity).max() <= SPEED * (1.0 + 1e-9)
 
 
-def burst(bench: Bench, count: int, stamped: bool = True, stride: float = 0.5) -> float:
+def burst(rig: Bench, count: int, stamped: bool = True, stride: float = 0.5) -> float:
     """Send commands a stride apart, mm, all at once, their stamps 4 ms apart; return the way of the struts, m."""
-    bench.ask(risen(bench, 0.0, -0.4))
+    rig.ask(risen(rig, 0.0, -0.4))
     for n in range(1, count + 1):
-        bench.send(risen(bench, stride * n, -0.4 + 4e-3 * n if stamped else None))
+        rig.send(risen(rig, stride * n, -0.4 + 4e-3 * n if stamped else None))
     return way(0.0, stride * count)
 
 
 @pytest.mark.parametrize("stamped", [True, False])
-def test_a_burst_is_followed_in_order_no_faster_than_the_struts_may_move(bench, stamped):
+def test_a_burst_is_followed_in_order_no_faster_than_the_struts_may_move(rig, stamped):
     """Twenty commands that were held up on their way for 80 ms, or have no stamps, come at once: none is lost."""
-    bench.compensator(catch_up_within=5.0, max_command_age=0.0)
+    rig.compensator(catch_up_within=5.0, max_command_age=0.0)
     began = time.monotonic()
-    told = burst(bench, 20, stamped)
-    bench.until(lambda: len(lengths(bench)) == 21, "all of them")
+    told = burst(rig, 20, stamped)
+    rig.until(lambda: len(lengths(rig)) == 21, "all of them")
     took = time.monotonic() - began
     assert told > 7.5e-3, "thirty milliseconds and more"
     assert took > told / SPEED - 1e-3, f"{told * 1e3:.2f} mm in {took * 1e3:.1f} ms"
-    heights = lengths(bench).mean(axis=1)
+    heights = lengths(rig).mean(axis=1)
     assert (np.diff(heights) > 0.0).all(), "in their order"
-    bench.until(lambda: int(bench.values().get("commands_waited", 0)) > 10, "that it is counted")
-    assert bench.values()["refused"] == "0"
+    rig.until(lambda: int(rig.values().get("commands_waited", 0)) > 10, "that it is counted")
+    assert rig.values()["refused"] == "0"
 
 
-def test_a_burst_that_would_be_followed_too_late_ends(bench):
+def test_a_burst_that_would_be_followed_too_late_ends(rig):
     """Ninety commands, 0.29 s at the largest speed; 0.02 s are allowed. What waits is refused, and the struts
     stand. A busy computer may take a quarter of a second for the ninety, and no less may be refused for that.
     """
-    bench.compensator(catch_up_within=0.02, max_command_age=0.0)
-    way_told = burst(bench, 90, stride=1.0)
+    rig.compensator(catch_up_within=0.02, max_command_age=0.0)
+    way_told = burst(rig, 90, stride=1.0)
     assert way_told / SPEED > 0.28
-    bench.until(lambda: "refused.speed" in bench.values(), "a refusal")
-    assert "commands come faster than the struts may move" in bench.values()["last_refusal"]
-    bench.until(lambda: int(bench.values()["commands"]) + int(bench.values()["refused"]) == 91, "an end")
-    answered = len(lengths(bench))
+    rig.until(lambda: "refused.speed" in rig.values(), "a refusal")
+    assert "commands come faster than the struts may move" in rig.values()["last_refusal"]
+    rig.until(lambda: int(rig.values()["commands"]) + int(rig.values()["refused"]) == 91, "an end")
+    answered = len(lengths(rig))
     assert 0 < answered < 80
     last = 1.0 * (answered - 1)
-    bench.send(risen(bench, 95.0, 0.0))
-    bench.until(lambda: "refused.step" in bench.values(), "that it is far away")
-    bench.ask(risen(bench, last + 0.5, 0.0))
+    rig.send(risen(rig, 95.0, 0.0))
+    rig.until(lambda: "refused.step" in rig.values(), "that it is far away")
+    rig.ask(risen(rig, last + 0.5, 0.0))
 
 
 def test_a_node_that_stood_still_blames_no_commands(bench):
@@ -146,44 +146,44 @@ def test_a_node_that_stood_still_blames_no_commands(bench):
     assert bench.values()["refused"] == "0"
 
 
-def test_what_a_busy_computer_hands_over_too_late_is_asked_once_more(bench, monkeypatch):
+def test_what_a_busy_computer_hands_over_too_late_is_asked_once_more(rig, monkeypatch):
     """The kit's ``ask``: a command is 1 s old when the node gets it, 0.5 s are allowed; the next is new."""
-    bench.compensator(command_timeout=0.0)
-    bench.ask(HOME)
-    stamps, now = [bench.stamp(-1.0)], bench.now
-    monkeypatch.setattr(bench, "now", lambda: stamps.pop() if stamps else now())
-    bench.ask(HOME)
-    bench.until(lambda: bench.values()["commands"] == "2", "the answer to be counted")
-    assert bench.values()["refused.stamp_past"] == "1"
+    rig.compensator(command_timeout=0.0)
+    rig.ask(HOME)
+    stamps, now = [rig.stamp(-1.0)], rig.now
+    monkeypatch.setattr(rig, "now", lambda: stamps.pop() if stamps else now())
+    rig.ask(HOME)
+    rig.until(lambda: rig.values()["commands"] == "2", "the answer to be counted")
+    assert rig.values()["refused.stamp_past"] == "1"
 
 
-def test_where_a_parameter_says_so_only_the_newest_of_a_burst_waits(bench):
+def test_where_a_parameter_says_so_only_the_newest_of_a_burst_waits(rig):
     """The first is taken, the newest is 10 mm away, further than a step: refused; the others are dropped."""
-    bench.compensator(catch_up_within=0.0, command_timeout=0.0, max_command_age=0.0)
-    burst(bench, 20)
-    bench.until_status(ERROR, "refusing commands: step")
+    rig.compensator(catch_up_within=0.0, command_timeout=0.0, max_command_age=0.0)
+    burst(rig, 20)
+    rig.until_status(ERROR, "refusing commands: step")
     counters = ("commands_dropped", "commands", "refused")
-    bench.until(lambda: sum(int(bench.values()[name]) for name in counters) == 21, "all of them in a status")
-    assert int(bench.values()["commands_dropped"]) >= 10
+    rig.until(lambda: sum(int(rig.values()[name]) for name in counters) == 21, "all of them in a status")
+    assert int(rig.values()["commands_dropped"]) >= 10
     late = "catching up with commands that came late"
-    bench.until(lambda: any(late in status.message for status in bench.statuses()), "that it is said")
+    rig.until(lambda: any(late in status.message for status in rig.statuses()), "that it is said")
 
 
-def test_commands_that_come_bunched_are_never_refused(bench):
+def test_commands_that_come_bunched_are_never_refused(rig):
     """1 kHz at 0.9 of the limit, eight at a time every 8 ms, as a network may bunch them, however busy the computer."""
-    bench.compensator(catch_up_within=5.0, max_command_age=0.0)
+    rig.compensator(catch_up_within=5.0, max_command_age=0.0)
     rise = 0.9 * SPEED * 1e-3 / way(0.0, 1.0)  # mm per command
-    stamp, begin = nanoseconds_of(bench.ask(risen(bench, 0.0, 0.0)).command.header.stamp), time.monotonic()
+    stamp, begin = nanoseconds_of(rig.ask(risen(rig, 0.0, 0.0)).command.header.stamp), time.monotonic()
     for bunch in range(10):
-        bench.until(lambda due=begin + 8e-3 * bunch: time.monotonic() >= due, "the next bunch")
+        rig.until(lambda due=begin + 8e-3 * bunch: time.monotonic() >= due, "the next bunch")
         for n in range(8 * bunch + 1, 8 * bunch + 9):
-            bench.send(risen_at(rise * n, stamp + n * 1_000_000))
-    bench.until(lambda: len(lengths(bench)) == 81, "all answers")
-    bench.until(lambda: bench.values().get("commands") == "81", "a status")
-    assert bench.values()["refused"] == "0"
+            rig.send(risen_at(rise * n, stamp + n * 1_000_000))
+    rig.until(lambda: len(lengths(rig)) == 81, "all answers")
+    rig.until(lambda: rig.values().get("commands") == "81", "a status")
+    assert rig.values()["refused"] == "0"
 
 
-def test_what_is_checked_regularly_goes_on_while_commands_wait(bench, monkeypatch):
+def test_what_is_checked_regularly_goes_on_while_commands_wait(rig, monkeypatch):
     """Ninety commands wait for each other. Checks come every 50 ms: none twice, which would put off the next ones.
 
     Where a timer took what waits, and was reset for each, a busy computer made a thousand checks, then none for
@@ -191,93 +191,93 @@ def test_what_is_checked_regularly_goes_on_while_commands_wait(bench, monkeypatc
     """
     checks, check = [], CompensatorNode._check_state
     monkeypatch.setattr(CompensatorNode, "_check_state", lambda node: (checks.append(time.monotonic()), check(node)))
-    bench.compensator(catch_up_within=5.0, max_command_age=0.0)
+    rig.compensator(catch_up_within=5.0, max_command_age=0.0)
     began, before = time.monotonic(), len(checks)
-    burst(bench, 90)
-    bench.until(lambda: len(lengths(bench)) == 91, "all answers")
+    burst(rig, 90)
+    rig.until(lambda: len(lengths(rig)) == 91, "all answers")
     took, count = time.monotonic() - began, len(checks) - before
     assert count <= took / CHECK_PERIOD + 5.0
-    bench.until(lambda: len(checks) > before + count, "the next check", 2.0)
+    rig.until(lambda: len(checks) > before + count, "the next check", 2.0)
 
 
-def test_acceleration_is_limited_where_the_geometry_says_so(bench, tmp_path):
+def test_acceleration_is_limited_where_the_geometry_says_so(rig, tmp_path):
     """1000 mm/s² are allowed; a tool that is at rest and then rises at 100 mm/s, by the stamps, is too quick for it."""
-    bench.compensator(geometry_file=geometry_file(tmp_path, {"acceleration_mm_s2": 1000.0}))
-    stamp = nanoseconds_of(bench.ask(risen(bench, 0.0, 0.0)).command.header.stamp)
-    bench.ask(risen_at(0.0, stamp + 4_000_000))
-    bench.send(risen_at(0.4, stamp + 8_000_000))
-    values = bench.until_status(ERROR, "refusing commands: acceleration")
+    rig.compensator(geometry_file=geometry_file(tmp_path, {"acceleration_mm_s2": 1000.0}))
+    stamp = nanoseconds_of(rig.ask(risen(rig, 0.0, 0.0)).command.header.stamp)
+    rig.ask(risen_at(0.0, stamp + 4_000_000))
+    rig.send(risen_at(0.4, stamp + 8_000_000))
+    values = rig.until_status(ERROR, "refusing commands: acceleration")
     assert "mm/s² by the stamps, allowed 1000 mm/s²" in values["last_refusal"]
-    bench.ask(risen_at(0.01, stamp + 12_000_000))
+    rig.ask(risen_at(0.01, stamp + 12_000_000))
 
 
 # ---- the drive ----
 
 
-def command(bench: Bench, lengths: np.ndarray) -> None:
-    bench.publish("strut_commands", JointState(name=list(STRUT_NAMES), position=[float(v) for v in lengths]))
+def command(rig: Bench, lengths: np.ndarray) -> None:
+    rig.publish("strut_commands", JointState(name=list(STRUT_NAMES), position=[float(v) for v in lengths]))
 
 
-def test_the_first_command_of_a_drive_is_held_against_where_it_stands(bench):
+def test_the_first_command_of_a_drive_is_held_against_where_it_stands(rig):
     """However long it has stood: 2 mm are a step."""
-    bench.drive(encoder_noise=0.0, command_timeout=0.0)
-    bench.until(lambda: bench.seen["strut_states"], "readings")
-    standing = np.array(bench.seen["strut_states"][-1].position)
-    bench.until(lambda: len(bench.seen["strut_states"]) > 10, "some time")
-    command(bench, standing + 2.5e-3)
-    bench.until_status(ERROR, "refusing commands: step", "strut_drive")
-    command(bench, standing + 1.9e-3)
-    bench.until_status(OK, "running", "strut_drive")
+    rig.drive(encoder_noise=0.0, command_timeout=0.0)
+    rig.until(lambda: rig.seen["strut_states"], "readings")
+    standing = np.array(rig.seen["strut_states"][-1].position)
+    rig.until(lambda: len(rig.seen["strut_states"]) > 10, "some time")
+    command(rig, standing + 2.5e-3)
+    rig.until_status(ERROR, "refusing commands: step", "strut_drive")
+    command(rig, standing + 1.9e-3)
+    rig.until_status(OK, "running", "strut_drive")
 
 
-def test_the_drive_refuses_what_is_too_fast_for_it(bench):
+def test_the_drive_refuses_what_is_too_fast_for_it(rig):
     """A bunch of 0.1 s at 250 mm/s, and a step, may come at once: 27 mm. Fifty commands of 1 mm are more."""
-    bench.drive(encoder_noise=0.0, command_timeout=0.0)
-    bench.until(lambda: bench.seen["strut_states"], "readings")
-    standing = np.array(bench.seen["strut_states"][-1].position)
+    rig.drive(encoder_noise=0.0, command_timeout=0.0)
+    rig.until(lambda: rig.seen["strut_states"], "readings")
+    standing = np.array(rig.seen["strut_states"][-1].position)
     for n in range(50):
-        command(bench, standing + 1e-3 * (n + 1))
-    bench.until(lambda: "refused.speed" in bench.values("strut_drive"), "a refusal")
-    assert int(bench.values("strut_drive")["commands"]) >= 25
-    assert bench.logged("mm ahead of 250 mm/s, allowed 27 mm")
+        command(rig, standing + 1e-3 * (n + 1))
+    rig.until(lambda: "refused.speed" in rig.values("strut_drive"), "a refusal")
+    assert int(rig.values("strut_drive")["commands"]) >= 25
+    assert rig.logged("mm ahead of 250 mm/s, allowed 27 mm")
 
 
 # ---- standing ----
 
 
-def test_a_reset_is_refused_while_the_machine_moves(bench):
+def test_a_reset_is_refused_while_the_machine_moves(rig):
     """Told to move, or measured to; nothing changes. Who may have asked is logged."""
-    bench.compensator(feedback_timeout=60.0)
-    bench.feed(closed_form_lengths(HOME))
-    bench.ask(HOME)
-    last = bench.ask(near(HOME, (0.0, 0.0, 2e-4)))
-    response = bench.trigger("reset")
+    rig.compensator(feedback_timeout=60.0)
+    rig.feed(closed_form_lengths(HOME))
+    rig.ask(HOME)
+    last = rig.ask(near(HOME, (0.0, 0.0, 2e-4)))
+    response = rig.trigger("reset")
     assert not response.success
     assert response.message.startswith("refused while the machine moves: strut_")
     assert "was told to go 0." in response.message
-    bench.until_status(WARN, "reset refused while the machine moves")
-    assert bench.logged("asked for by /witness")
-    bench.until(lambda: bench.trigger("reset").success, "the machine to stand")
-    assert bench.values()["refused_resets"] >= "1"
+    rig.until_status(WARN, "reset refused while the machine moves")
+    assert rig.logged("asked for by /witness")
+    rig.until(lambda: rig.trigger("reset").success, "the machine to stand")
+    assert rig.values()["refused_resets"] >= "1"
     for lift in (0.0, 1e-3, 2e-3):
-        bench.feed(last.lengths + lift)
-    bench.barrier()
-    assert "went 2." in bench.trigger("reset").message, "and the 0.2 mm that it has not followed"
+        rig.feed(last.lengths + lift)
+    rig.barrier()
+    assert "went 2." in rig.trigger("reset").message, "and the 0.2 mm that it has not followed"
 
 
-def test_a_following_error_outlives_deactivation(bench):
+def test_a_following_error_outlives_deactivation(rig):
     """A machine that has lost a strut does not forget it because its node was switched off and on."""
-    bench.compensator(command_timeout=0.0, feedback_timeout=60.0)
-    last = bench.ask(HOME)
-    bench.feed(last.lengths + 3e-3)
-    bench.until_status(ERROR, "refusing commands: following_error")
-    assert bench.change("deactivate")
-    assert bench.change("activate")
-    bench.feed(last.lengths)
-    bench.until_status(ERROR, "refusing commands: following_error")
-    bench.until(lambda: bench.trigger("reset").success, "the machine to stand")
-    bench.until(bench.matched, "discovery")
-    bench.ask(HOME)
+    rig.compensator(command_timeout=0.0, feedback_timeout=60.0)
+    last = rig.ask(HOME)
+    rig.feed(last.lengths + 3e-3)
+    rig.until_status(ERROR, "refusing commands: following_error")
+    assert rig.change("deactivate")
+    assert rig.change("activate")
+    rig.feed(last.lengths)
+    rig.until_status(ERROR, "refusing commands: following_error")
+    rig.until(lambda: rig.trigger("reset").success, "the machine to stand")
+    rig.until(rig.matched, "discovery")
+    rig.ask(HOME)
 
 
 SERVICES = {
@@ -303,33 +303,33 @@ def test_who_asked_is_logged(bench, service):
 
 
 @pytest.mark.parametrize("node", ["compensator", "strut_drive"])
-def test_a_node_keeps_the_clock_that_it_began_with(bench, node):
+def test_a_node_keeps_the_clock_that_it_began_with(rig, node):
     """Half of what a node does would go on by the other clock."""
-    made = bench.compensator() if node == "compensator" else bench.drive()
-    results = [bench.set_parameter(node, USE_SIM_TIME, value) for value in (True, False)]
+    made = rig.compensator() if node == "compensator" else rig.drive()
+    results = [rig.set_parameter(node, USE_SIM_TIME, value) for value in (True, False)]
     assert [result.successful for result in results] == [False, True]
     assert results[0].reason == "parameter use_sim_time: is false for as long as the node runs; set it at the start"
     assert made.get_parameter(USE_SIM_TIME).value is False
 
 
 @pytest.mark.parametrize("clock", ["none", "one that stands"])
-def test_a_change_ramps_out_without_stamps_while_simulated_time_stands(bench, clock):
+def test_a_change_ramps_out_without_stamps_while_simulated_time_stands(rig, clock):
     """Switched off, the corrections go: by the time of receipt, where neither stamps nor the clock tell a time."""
-    bench.compensator(use_sim_time=True, command_timeout=0.0, ramp_rate=5e-3)
+    rig.compensator(use_sim_time=True, command_timeout=0.0, ramp_rate=5e-3)
     if clock != "none":
-        publisher = bench.witness.create_publisher(Clock, "/clock", 10)
-        bench.until(publisher.get_subscription_count, "discovery")
-        publisher.publish(Clock(clock=bench.stamp(-1e6)))
-        bench.barrier()
-    seen = bench.seen["strut_corrections"]
-    bench.send(risen(bench, 0.0))
-    bench.until(lambda: seen, "an answer")
+        publisher = rig.witness.create_publisher(Clock, "/clock", 10)
+        rig.until(publisher.get_subscription_count, "discovery")
+        publisher.publish(Clock(clock=rig.stamp(-1e6)))
+        rig.barrier()
+    seen = rig.seen["strut_corrections"]
+    rig.send(risen(rig, 0.0))
+    rig.until(lambda: seen, "an answer")
     assert np.abs(seen[0].position).max() > 1e-4
-    assert bench.enable(False).success
+    assert rig.enable(False).success
     began = time.monotonic()
     while np.abs(seen[-1].position).max() > 0.0:
         count = len(seen)
-        bench.send(risen(bench, 0.0))
-        bench.until(lambda count=count: len(seen) > count, "an answer")
+        rig.send(risen(rig, 0.0))
+        rig.until(lambda count=count: len(seen) > count, "an answer")
         assert time.monotonic() < began + 10.0
     assert len(seen) > 2, "it has ramped"

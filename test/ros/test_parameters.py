@@ -26,32 +26,32 @@ COMPENSATOR = "compensator"
 
 
 @pytest.fixture
-def bench(ros_context, capfd):
-    with Bench(ros_context, capfd) as bench:
-        yield bench
+def rig(ros_context, capfd):
+    with Bench(ros_context, capfd) as rig:
+        yield rig
 
 
-def test_what_is_taken_at_configure_is_refused_until_a_cleanup(bench):
-    bench.compensator()
-    refused = bench.set_parameter(COMPENSATOR, "work_frame", "table")
+def test_what_is_taken_at_configure_is_refused_until_a_cleanup(rig):
+    rig.compensator()
+    refused = rig.set_parameter(COMPENSATOR, "work_frame", "table")
     assert not refused.successful
     said = "parameter work_frame: is taken at configure, and the node is active; set it after a cleanup"
     assert refused.reason == said
-    assert bench.set_parameter(COMPENSATOR, "work_frame", "work").successful, "it is so already"
-    assert bench.change("deactivate")
-    assert "the node is inactive" in bench.set_parameter(COMPENSATOR, "work_frame", "table").reason
-    assert bench.change("cleanup")
-    assert bench.set_parameter(COMPENSATOR, "work_frame", "table").successful
-    assert bench.change("configure")
-    assert bench.change("activate")
-    bench.until(bench.matched, "discovery")
-    bench.ask(HOME, "table")
+    assert rig.set_parameter(COMPENSATOR, "work_frame", "work").successful, "it is so already"
+    assert rig.change("deactivate")
+    assert "the node is inactive" in rig.set_parameter(COMPENSATOR, "work_frame", "table").reason
+    assert rig.change("cleanup")
+    assert rig.set_parameter(COMPENSATOR, "work_frame", "table").successful
+    assert rig.change("configure")
+    assert rig.change("activate")
+    rig.until(rig.matched, "discovery")
+    rig.ask(HOME, "table")
 
 
-def test_frames_are_held_against_each_other_whichever_is_set(bench):
-    bench.compensator(start=False)
+def test_frames_are_held_against_each_other_whichever_is_set(rig):
+    rig.compensator(start=False)
     for name, value in (("base_frame", "work"), ("work_frame", "base")):
-        result = bench.set_parameter(COMPENSATOR, name, value)
+        result = rig.set_parameter(COMPENSATOR, name, value)
         assert not result.successful
         assert "work_frame: must differ from base_frame" in result.reason
 
@@ -66,66 +66,66 @@ def test_frames_are_held_against_each_other_whichever_is_set(bench):
         ("autostart", False, "read-only"),
     ],
 )
-def test_a_value_that_is_not_allowed_is_refused_and_changes_nothing(bench, name, value, reason):
+def test_a_value_that_is_not_allowed_is_refused_and_changes_nothing(rig, name, value, reason):
     """None is how ``ros2 param delete`` asks."""
-    node = bench.compensator(start=False)
+    node = rig.compensator(start=False)
     before = node.get_parameter(name).value
-    result = bench.set_parameter(COMPENSATOR, name, value)
+    result = rig.set_parameter(COMPENSATOR, name, value)
     assert not result.successful
     assert reason in result.reason
     assert node.get_parameter(name).value == before
 
 
-def test_rates_and_timeouts_change_at_once(bench):
-    bench.compensator(heartbeat_rate=0.0, command_timeout=0.0)
+def test_rates_and_timeouts_change_at_once(rig):
+    rig.compensator(heartbeat_rate=0.0, command_timeout=0.0)
     beats: list[UInt64] = []
-    bench.witness.create_subscription(UInt64, "compensator/heartbeat", beats.append, 10)
-    bench.until(bench.matched, "discovery")
-    bench.ask(HOME)
-    bench.barrier()
+    rig.witness.create_subscription(UInt64, "compensator/heartbeat", beats.append, 10)
+    rig.until(rig.matched, "discovery")
+    rig.ask(HOME)
+    rig.barrier()
     assert not beats
-    assert bench.set_parameter(COMPENSATOR, "heartbeat_rate", 200.0).successful
-    bench.until(lambda: len(beats) > 5, "heartbeats")
-    assert bench.set_parameter(COMPENSATOR, "command_timeout", 0.01).successful
-    bench.until(lambda: "no new command" in bench.message(), "the command to be stale")
+    assert rig.set_parameter(COMPENSATOR, "heartbeat_rate", 200.0).successful
+    rig.until(lambda: len(beats) > 5, "heartbeats")
+    assert rig.set_parameter(COMPENSATOR, "command_timeout", 0.01).successful
+    rig.until(lambda: "no new command" in rig.message(), "the command to be stale")
 
 
-def test_a_ramp_goes_on_at_the_rate_that_is_set(bench):
+def test_a_ramp_goes_on_at_the_rate_that_is_set(rig):
     """164 µm at 1 µm/s would take minutes; stamps 20 ms apart may ramp 0.2 µm each at 10 µm/s."""
-    bench.compensator(ramp_rate=1e-6, enable_compensation=False)
-    bench.feed(closed_form_lengths(HOME))
-    bench.settle(HOME)
-    bench.enable(True)
-    slow = bench.ask(HOME).corrections
-    assert bench.set_parameter(COMPENSATOR, "ramp_rate", 1.0).successful
-    bench.settle(HOME)
-    assert np.abs(slow).max() < 1e-6 < 100e-6 < np.abs(bench.ask(HOME).corrections).max()
+    rig.compensator(ramp_rate=1e-6, enable_compensation=False)
+    rig.feed(closed_form_lengths(HOME))
+    rig.settle(HOME)
+    rig.enable(True)
+    slow = rig.ask(HOME).corrections
+    assert rig.set_parameter(COMPENSATOR, "ramp_rate", 1.0).successful
+    rig.settle(HOME)
+    assert np.abs(slow).max() < 1e-6 < 100e-6 < np.abs(rig.ask(HOME).corrections).max()
 
 
-def test_another_model_is_taken_by_reload(bench, tmp_path):
+def test_another_model_is_taken_by_reload(rig, tmp_path):
     """Within the folder that was fixed at the start: a parameter must not open the rest of the disk."""
-    node = bench.compensator(model_file=model_file(tmp_path))
+    node = rig.compensator(model_file=model_file(tmp_path))
     other = tmp_path / "other.yaml"
     other.write_text((tmp_path / "model.yaml").read_text().replace("written by a test", "the other"))
-    assert bench.set_parameter(COMPENSATOR, "model_file", str(other)).successful
+    assert rig.set_parameter(COMPENSATOR, "model_file", str(other)).successful
     assert node.compensator.model.name == "written by a test"
-    assert bench.trigger("reload_model").success
+    assert rig.trigger("reload_model").success
     assert node.compensator.model.name == "the other"
     secret = model_file(tmp_path.parent, "secret.yaml")
-    assert bench.set_parameter(COMPENSATOR, "model_file", secret).successful
-    answer = bench.trigger("reload_model")
+    assert rig.set_parameter(COMPENSATOR, "model_file", secret).successful
+    answer = rig.trigger("reload_model")
     assert not answer.success
     assert "files are only read from" in answer.message
     assert node.compensator.model.name == "the other"
 
 
-def test_descriptors_say_range_and_when(bench):
-    bench.compensator(start=False)
-    bench.drive(start=False)
+def test_descriptors_say_range_and_when(rig):
+    rig.compensator(start=False)
+    rig.drive(start=False)
     for name in KINDS:
         table = TABLES[name]
         request = DescribeParameters.Request(names=[p.name for p in table])
-        told = bench.call(DescribeParameters, f"{name}/describe_parameters", request).descriptors
+        told = rig.call(DescribeParameters, f"{name}/describe_parameters", request).descriptors
         for parameter, descriptor in zip(table, told, strict=True):
             assert descriptor.description
             assert descriptor.additional_constraints.endswith(f"taken {parameter.taken.value}")
@@ -149,10 +149,10 @@ def in_force(node: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("name", KINDS)
 def test_the_shipped_file_gives_the_defaults_in_any_namespace(ros_context, capfd, name):
-    with Bench(ros_context, capfd, "/left/cell") as bench:
-        node = bench.add(KINDS[name], False, {}, cli_args=["--ros-args", "--params-file", str(MAKER["FILE"])])
+    with Bench(ros_context, capfd, "/left/cell") as rig:
+        node = rig.add(KINDS[name], False, {}, cli_args=["--ros-args", "--params-file", str(MAKER["FILE"])])
         assert in_force(node) == {p.name: p.default for p in TABLES[name]}
-        assert not bench.logged("there is no parameter")
+        assert not rig.logged("there is no parameter")
 
 
 def other_value(parameter: Any) -> Any:
@@ -168,12 +168,12 @@ def other_value(parameter: Any) -> Any:
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_a_file_of_other_values_is_loaded_also_through_the_launch_file(bench, monkeypatch, tmp_path, name):
+def test_a_file_of_other_values_is_loaded_also_through_the_launch_file(rig, monkeypatch, tmp_path, name):
     """The launch file gives its own arguments after the file; launch_ros writes them into files, as here."""
     others = {p.name: other_value(p) for p in TABLES[name] if p.name != "model_folder"}
     path = tmp_path / "mine.yaml"
     path.write_text(yaml.safe_dump({f"/**/{name}": {"ros__parameters": others}}))
-    node = bench.add(KINDS[name], False, {}, cli_args=["--ros-args", "--params-file", str(path)])
+    node = rig.add(KINDS[name], False, {}, cli_args=["--ros-args", "--params-file", str(path)])
     assert {key: value for key, value in in_force(node).items() if key in others} == others
     given = LaunchFile(monkeypatch).start(f"params_file:={path}", "model:=table.yaml")[name]["parameters"]
     arguments = ["--ros-args"]
@@ -182,7 +182,7 @@ def test_a_file_of_other_values_is_loaded_also_through_the_launch_file(bench, mo
             (tmp_path / f"{number}.yaml").write_text(yaml.safe_dump({"/**": {"ros__parameters": part}}))
             part = str(tmp_path / f"{number}.yaml")
         arguments += ["--params-file", part]
-    values = in_force(bench.add(KINDS[name], False, {}, cli_args=arguments))
+    values = in_force(rig.add(KINDS[name], False, {}, cli_args=arguments))
     assert values == in_force(node) | {k: v for k, v in given[-1].items() if k in others}
     assert values["command_timeout"] == 3600.0
     assert values.get("model_file", "table.yaml") == "table.yaml"

@@ -35,22 +35,22 @@ STARTED = 60.0
 """The process imports for a second on a free processor, s."""
 
 
-def listen(bench: Bench, *topics: str) -> None:
+def listen(rig: Bench, *topics: str) -> None:
     for topic in topics:
-        bench.witness.create_subscription(PoseWithCovarianceStamped, topic, bench.seen[topic].append, RELIABLE)
+        rig.witness.create_subscription(PoseWithCovarianceStamped, topic, rig.seen[topic].append, RELIABLE)
 
 
-def test_the_topics_say_what_the_machine_would_do_and_how_well_that_is_known(bench, tmp_path):
+def test_the_topics_say_what_the_machine_would_do_and_how_well_that_is_known(rig, tmp_path):
     """All struts too long by d lift a level platform at home by d·L/h, and nothing turns: a closed form.
 
     Of the covariance: known struts and joints of 2 µm make the tool known to about as much; the datum takes most.
     """
-    bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
+    rig.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
     geometry = small.paper()
-    answer = bench.ask(geometry.home)
-    listen(bench, STANDING, ALIGNED)
-    bench.until(lambda: bench.seen[STANDING] and bench.seen[ALIGNED], "predicted errors", STARTED)
-    standing, aligned = bench.seen[STANDING][0], bench.seen[ALIGNED][0]
+    answer = rig.ask(geometry.home)
+    listen(rig, STANDING, ALIGNED)
+    rig.until(lambda: rig.seen[STANDING] and rig.seen[ALIGNED], "predicted errors", STARTED)
+    standing, aligned = rig.seen[STANDING][0], rig.seen[ALIGNED][0]
     for message in (standing, aligned):
         assert message.header.frame_id == "work"
         assert message.header.stamp == answer.command.header.stamp
@@ -67,14 +67,14 @@ def test_the_topics_say_what_the_machine_would_do_and_how_well_that_is_known(ben
     assert (left < 0.5 * sigma).all()
 
 
-def test_without_a_fit_the_covariance_is_nan_never_zero(bench):
+def test_without_a_fit_the_covariance_is_nan_never_zero(rig):
     """Of the shipped virtual machine nobody says how well it is known; a command in another pose, from a turn on."""
-    bench.compensator(model_file="paper_machine.yaml", ramp_rate=1.0)
+    rig.compensator(model_file="paper_machine.yaml", ramp_rate=1.0)
     pose = small.paper().home @ Pose.from_angles([0.0, 0.0, 0.0005], [0.001, 0.0, 0.0])
-    bench.ask(pose)
-    listen(bench, STANDING)
-    bench.until(lambda: bench.seen[STANDING], "predicted error", STARTED)
-    message = bench.seen[STANDING][0]
+    rig.ask(pose)
+    listen(rig, STANDING)
+    rig.until(lambda: rig.seen[STANDING], "predicted error", STARTED)
+    message = rig.seen[STANDING][0]
     assert all(math.isnan(value) for value in message.pose.covariance)
     machine = RealMachine(small.paper(), load_model("paper_machine", small.paper()))
     went, _ = machine.pose_for(strut_lengths(Structure.of(small.paper()), pose), guess=pose)
@@ -146,20 +146,20 @@ def test_a_process_that_fails_every_time_is_tried_less_and_less_often(monkeypatc
     assert status.prediction_problem == ""
 
 
-def test_a_new_model_is_predicted_with(bench, tmp_path):
+def test_a_new_model_is_predicted_with(rig, tmp_path):
     path = small.fitted_model(tmp_path)
-    bench.compensator(model_file=str(path), ramp_rate=1.0)
-    bench.ask(small.paper().home)
-    listen(bench, STANDING)
-    bench.until(lambda: bench.seen[STANDING], "predicted error", STARTED)
-    before = bench.seen[STANDING][-1].pose.pose.position.z
+    rig.compensator(model_file=str(path), ramp_rate=1.0)
+    rig.ask(small.paper().home)
+    listen(rig, STANDING)
+    rig.until(lambda: rig.seen[STANDING], "predicted error", STARTED)
+    before = rig.seen[STANDING][-1].pose.pose.position.z
     small.fitted_model(tmp_path, 60 * UM)
-    loaded = bench.begin("reload_model")
-    bench.until(loaded.done, "the new model", STARTED)
+    loaded = rig.begin("reload_model")
+    rig.until(loaded.done, "the new model", STARTED)
     assert loaded.result().success
-    bench.until(lambda: bench.seen[STANDING][-1].pose.pose.position.z > 1.5 * before, "the new error", STARTED)
-    assert bench.seen[STANDING][-1].pose.pose.position.z == pytest.approx(2.0 * before, rel=1e-3)
-    assert not math.isnan(bench.seen[STANDING][-1].pose.covariance[0])  # its own posterior, not the old model's
+    rig.until(lambda: rig.seen[STANDING][-1].pose.pose.position.z > 1.5 * before, "the new error", STARTED)
+    assert rig.seen[STANDING][-1].pose.pose.position.z == pytest.approx(2.0 * before, rel=1e-3)
+    assert not math.isnan(rig.seen[STANDING][-1].pose.covariance[0])  # its own posterior, not the old model's
 
 
 def test_a_message_holds_a_small_motion() -> None:

@@ -40,59 +40,59 @@ def field(displacement_um: float, outside: str = "hold") -> dict[str, object]:
 # ---- nothing that breaks a limit ----
 
 
-def test_a_model_that_breaks_a_limit_at_the_last_command_moves_nothing(bench, tmp_path):
+def test_a_model_that_breaks_a_limit_at_the_last_command_moves_nothing(rig, tmp_path):
     """5 mm of field need more than the 2 mm of correction allowed: said by the service, at once and in words."""
     path = model_file(tmp_path, struts={"offset_um": 100.0})
-    node = bench.compensator(model_file=path, ramp_rate=1.0, command_timeout=0.0)
-    bench.ask(HOME)
+    node = rig.compensator(model_file=path, ramp_rate=1.0, command_timeout=0.0)
+    rig.ask(HOME)
     before = dict(node._files.sources)
     model_file(tmp_path, field=field(5000.0))
-    response = bench.trigger("reload_model")
+    response = rig.trigger("reload_model")
     assert not response.success
     assert "the old model stays: strut_" in response.message
     assert "is larger than ±2000 µm" in response.message
     assert node._files.sources == before, "the journal must not name a model that is not in use"
-    bench.until_status(WARN, "the old model stays")
+    rig.until_status(WARN, "the old model stays")
     for _ in range(3):
-        np.testing.assert_allclose(bench.ask(HOME).corrections, -100e-6, rtol=0.0, atol=ROUNDING)
+        np.testing.assert_allclose(rig.ask(HOME).corrections, -100e-6, rtol=0.0, atol=ROUNDING)
     model_file(tmp_path, field=field(1000.0))
-    assert bench.trigger("reload_model").success
+    assert rig.trigger("reload_model").success
 
 
-def test_before_the_first_command_the_model_is_looked_at_at_home(bench, tmp_path):
+def test_before_the_first_command_the_model_is_looked_at_at_home(rig, tmp_path):
     path = model_file(tmp_path)
-    bench.compensator(model_file=path)
+    rig.compensator(model_file=path)
     model_file(tmp_path, field=field(5000.0))
-    assert "is larger than ±2000 µm" in bench.trigger("reload_model").message
+    assert "is larger than ±2000 µm" in rig.trigger("reload_model").message
 
 
-def test_a_field_that_refuses_extrapolation_is_refused_outside_its_box(bench, tmp_path):
+def test_a_field_that_refuses_extrapolation_is_refused_outside_its_box(rig, tmp_path):
     """Home is at z = 400 mm; where the machine stands is below the box, which begins at 350 mm."""
     path = model_file(tmp_path)
-    bench.compensator(model_file=path, command_timeout=0.0)
+    rig.compensator(model_file=path, command_timeout=0.0)
     for step in range(1, 55):
-        bench.ask(near(HOME, (0.0, 0.0, -1e-3 * step)))
+        rig.ask(near(HOME, (0.0, 0.0, -1e-3 * step)))
     model_file(tmp_path, field=field(10.0, "refuse"))
-    response = bench.trigger("reload_model")
+    response = rig.trigger("reload_model")
     assert not response.success
     assert "is outside the field's box" in response.message
 
 
-def test_compensation_is_not_switched_on_where_it_breaks_a_limit(bench, tmp_path):
+def test_compensation_is_not_switched_on_where_it_breaks_a_limit(rig, tmp_path):
     """Fine at home, not further up, where it went while compensation was off: the ramp would drag the struts there."""
     steep = field(0.0)
     for line in steep["lines"]:
         line["dz_um"] = [2000.0, 4000.0]  # −2 mm at z = 350 mm, 0 at 400 mm, 6 mm at 550 mm
-    bench.compensator(model_file=model_file(tmp_path, field=steep), command_timeout=0.0, ramp_rate=1.0)
-    bench.ask(HOME)
-    assert bench.enable(False).success
-    bench.settle(HOME)
+    rig.compensator(model_file=model_file(tmp_path, field=steep), command_timeout=0.0, ramp_rate=1.0)
+    rig.ask(HOME)
+    assert rig.enable(False).success
+    rig.settle(HOME)
     for step in range(1, 71):
-        last = bench.ask(near(HOME, (0.0, 0.0, 1e-3 * step)))
-    response = bench.enable(True)
+        last = rig.ask(near(HOME, (0.0, 0.0, 1e-3 * step)))
+    response = rig.enable(True)
     assert not response.success
     assert "is larger than ±2000 µm" in response.message
-    assert not bench.ask(near(HOME, (0.0, 0.0, 0.07))).corrections.any()
+    assert not rig.ask(near(HOME, (0.0, 0.0, 0.07))).corrections.any()
     assert not last.corrections.any()
 
 

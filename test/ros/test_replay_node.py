@@ -81,10 +81,10 @@ def test_a_run_with_everything_is_replayed_bit_for_bit(bench, tmp_path):
     assert len(recording.sources) >= 3, "geometry and both models"
 
 
-def wait_for_page(bench: Bench) -> None:
+def wait_for_page(rig: Bench) -> None:
     """Wait until a page of the journal has come that was begun from now on; it comes with the diagnostics."""
-    pages = len(bench.seen["/diagnostics"])
-    bench.until(lambda: len(bench.seen["/diagnostics"]) > pages + 1, "another page of the journal")
+    pages = len(rig.seen["/diagnostics"])
+    rig.until(lambda: len(rig.seen["/diagnostics"]) > pages + 1, "another page of the journal")
 
 
 def test_what_the_verb_records_is_replayed_and_a_folder_that_is_there_is_left_alone(bench, tmp_path):
@@ -140,15 +140,15 @@ def test_recording_may_begin_in_motion_and_two_machines_share_a_bag(ros_context,
     """A recorder that comes late replays what its first snapshot precedes; each machine has its own namespace."""
     messages = Messages()
     for namespace in ("mill", "lathe"):
-        with Bench(ros_context, capfd, namespace) as bench:
-            bench.compensator()
+        with Bench(ros_context, capfd, namespace) as rig:
+            rig.compensator()
             for n in range(140):
-                bench.ask(along(n))
+                rig.ask(along(n))
                 if n % 10 == 9:
-                    bench.until(later(0.06), "the page that the journal now writes")
-            recorder = Recorder(bench)
+                    rig.until(later(0.06), "the page that the journal now writes")
+            recorder = Recorder(rig)
             for n in range(140, 200):
-                bench.ask(along(n))
+                rig.ask(along(n))
             recorder.stop()
         messages += recorder.messages
     bag = write_bag(tmp_path / "both", messages, "sqlite3")

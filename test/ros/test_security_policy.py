@@ -129,14 +129,14 @@ def test_lifecycle_nodes_open_what_the_policy_allows(
 ) -> None:
     """Nothing more, nothing less, with every optional topic switched on."""
     namespace = "/guarded"  # of its own: the graph still knows nodes of these names from other tests
-    with Bench(ros_context, capfd, namespace) as bench:
+    with Bench(ros_context, capfd, namespace) as rig:
         if name == "compensator":
-            bench.compensator(publish_array=True)
+            rig.compensator(publish_array=True)
         elif name == "strut_drive":
-            bench.drive()
+            rig.drive()
         else:
-            assert autostart(bench.add(LinuxcncBridgeNode, False, {}, hal=StandInHal()))
-        expect_equal(bench, name, read_policy(namespace)[name])
+            assert autostart(rig.add(LinuxcncBridgeNode, False, {}, hal=StandInHal()))
+        expect_equal(rig, name, read_policy(namespace)[name])
 
 
 def test_the_client_opens_what_the_policy_allows() -> None:
@@ -207,10 +207,10 @@ def test_the_operator_may_all_that_the_ros2_tools_open(ros_context: Context, cap
     operator = read_policy()["operator"].allowed
     machines = ("compensator", "strut_drive", "linuxcnc_bridge")
     wanted: dict[str, set[str]] = {right: set() for right in RIGHTS}
-    with Bench(ros_context, capfd) as bench:
+    with Bench(ros_context, capfd) as rig:
         for node in tool_nodes(ros_context, machines):
-            bench.until(lambda node=node: "/rosout" in opened(bench.witness, node.get_name(), "")["publish"], "a tool")
-            for right, names in opened(bench.witness, node.get_name(), "").items():
+            rig.until(lambda node=node: "/rosout" in opened(rig.witness, node.get_name(), "")["publish"], "a tool")
+            for right, names in opened(rig.witness, node.get_name(), "").items():
                 wanted[right] |= {name.replace(f"/{node.get_name()}/", f"/{TOOLS}/") for name in names}
             node.destroy_node()
     own = {f"/compensator/{name}" for name in ("enable_compensation", "reload_model", "reset", "get_travel")}
@@ -244,14 +244,14 @@ def test_nothing_is_unpickled_or_executed() -> None:
     assert not found
 
 
-def expect_equal(bench: Bench, node: str, enclave: Enclave) -> None:
+def expect_equal(rig: Bench, node: str, enclave: Enclave) -> None:
     """Wait until the graph is complete, then compare."""
     assert enclave.node == node
 
     def complete() -> bool:
-        found = opened(bench.witness, node, bench.namespace)
+        found = opened(rig.witness, node, rig.namespace)
         return all(enclave.allowed[right] <= found[right] for right in RIGHTS)
 
     with contextlib.suppress(TimeoutError):  # the comparison says what is missing
-        bench.until(complete, "the rights of the policy in the graph", 5.0)
-    assert opened(bench.witness, node, bench.namespace) == enclave.allowed
+        rig.until(complete, "the rights of the policy in the graph", 5.0)
+    assert opened(rig.witness, node, rig.namespace) == enclave.allowed

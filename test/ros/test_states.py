@@ -9,7 +9,7 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -44,56 +44,54 @@ def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def stranger(bench: Bench) -> Iterator[Node]:
-    """Another node, of another name."""
-    node = rclpy.create_node("stranger", context=bench.context)
-    yield node
-    node.destroy_node()
+def over_dds(bench: Bench) -> Iterator[Callable[[str], Node]]:
+    """Give what makes a real node of a name."""
+    nodes: list[Node] = []
+
+    def make(name: str) -> Node:
+        nodes.append(rclpy.create_node(name, context=bench.context))
+        return nodes[-1]
+
+    yield make
+    for node in nodes:
+        node.destroy_node()
 
 
-@pytest.fixture
-def twin(bench: Bench) -> Iterator[Node]:
-    """Another node with the witness' name."""
-    node = rclpy.create_node("witness", context=bench.context)
-    yield node
-    node.destroy_node()
-
-
-def loop(bench: Bench, **compensator: object) -> tuple[StrutDriveNode, CompensatorNode]:
+def loop(rig: Bench, **compensator: object) -> tuple[StrutDriveNode, CompensatorNode]:
     """Start both nodes, the drive with the shipped machine's backlash and without noise, and let them meet."""
-    drive = bench.drive(step=0.0, encoder_resolution=0.0, encoder_noise=0.0)
-    node = bench.compensator(**compensator)
-    met(bench, drive, node)
+    drive = rig.drive(step=0.0, encoder_resolution=0.0, encoder_noise=0.0)
+    node = rig.compensator(**compensator)
+    met(rig, drive, node)
     return drive, node
 
 
-def met(bench: Bench, drive: LifecycleNode, compensator: LifecycleNode) -> None:
+def met(rig: Bench, drive: LifecycleNode, compensator: LifecycleNode) -> None:
     """Wait until both nodes hear each other, and readings have come."""
     ends = {end.topic_name: end for end in (*compensator.publishers, *compensator.subscriptions)}
     (heard,) = [end for end in drive.subscriptions if end.topic_name == "/strut_commands"]
-    bench.until(lambda: heard.get_publisher_count() == 1, "the drive to hear the compensator")
-    bench.until(lambda: ends["/strut_states"].get_publisher_count() == 1, "the compensator to hear the drive")
-    bench.seen["strut_states"].clear()
-    bench.until(lambda: bench.values().get("pose_estimated_from") == "strut_states", "feedback")
+    rig.until(lambda: heard.get_publisher_count() == 1, "the drive to hear the compensator")
+    rig.until(lambda: ends["/strut_states"].get_publisher_count() == 1, "the compensator to hear the drive")
+    rig.seen["strut_states"].clear()
+    rig.until(lambda: rig.values().get("pose_estimated_from") == "strut_states", "feedback")
 
 
-def end(bench: Bench, node: LifecycleNode) -> None:
+def end(rig: Bench, node: LifecycleNode) -> None:
     """End a node; nothing of it is left: its publishers live on until the executor has let go of their events."""
-    count = bench.witness.count_publishers
+    count = rig.witness.count_publishers
     before = {publisher.topic_name: count(publisher.topic_name) for publisher in node.publishers}
     node.trigger_deactivate()
-    bench.executor.remove_node(node)
-    bench.nodes.remove(node)
+    rig.executor.remove_node(node)
+    rig.nodes.remove(node)
     node.destroy_node()
-    bench.until(lambda: all(count(topic) < number for topic, number in before.items()), "its publishers to be gone")
+    rig.until(lambda: all(count(topic) < number for topic, number in before.items()), "its publishers to be gone")
 
 
-def command(bench: Bench, lengths: np.ndarray) -> None:
-    bench.publish("strut_commands", JointState(name=list(STRUT_NAMES), position=[float(v) for v in lengths]))
+def command(rig: Bench, lengths: np.ndarray) -> None:
+    rig.publish("strut_commands", JointState(name=list(STRUT_NAMES), position=[float(v) for v in lengths]))
 
 
-def measured(bench: Bench) -> np.ndarray:
-    return np.array(bench.seen["strut_states"][-1].position)
+def measured(rig: Bench) -> np.ndarray:
+    return np.array(rig.seen["strut_states"][-1].position)
 
 
 # ---- the table itself ----
@@ -121,45 +119,45 @@ def test_a_state_is_looked_at_often_enough():
 # ---- commands ----
 
 
-def test_no_command_yet(bench):
-    bench.compensator()
-    bench.until_status(OK, "waiting for the first command")
-    assert not bench.seen["strut_commands"]
+def test_no_command_yet(rig):
+    rig.compensator()
+    rig.until_status(OK, "waiting for the first command")
+    assert not rig.seen["strut_commands"]
 
 
-def test_no_command_yet_drive(bench):
-    bench.drive()
-    bench.until_status(OK, "waiting for the first command", DRIVE)
-    bench.until(lambda: len(bench.seen["strut_states"]) > 20, "readings")
-    readings = np.array([message.position for message in bench.seen["strut_states"]])
+def test_no_command_yet_drive(rig):
+    rig.drive()
+    rig.until_status(OK, "waiting for the first command", DRIVE)
+    rig.until(lambda: len(rig.seen["strut_states"]) > 20, "readings")
+    readings = np.array([message.position for message in rig.seen["strut_states"]])
     assert np.ptp(readings, axis=0).max() < 1e-6, "noise"
 
 
-def test_first_command_has_no_direction_of_motion(bench, tmp_path):
+def test_first_command_has_no_direction_of_motion(rig, tmp_path):
     """Between the two sides of a backlash of 10 µm: half of it either way is corrected once a strut moves.
 
     The first command, its way unknown, is in the middle: no correction.
     """
-    bench.compensator(model_file=model_file(tmp_path, struts={"backlash_um": 10.0}), ramp_rate=1.0)
-    assert not bench.ask(HOME).corrections.any()
-    up = bench.ask(near(HOME, (0.0, 0.0, 1e-4)))
+    rig.compensator(model_file=model_file(tmp_path, struts={"backlash_um": 10.0}), ramp_rate=1.0)
+    assert not rig.ask(HOME).corrections.any()
+    up = rig.ask(near(HOME, (0.0, 0.0, 1e-4)))
     np.testing.assert_allclose(up.corrections, 5e-6, rtol=0.0, atol=ROUNDING)
-    bench.until(lambda: bench.trigger("reset").success, "the machine to stand")
-    bench.ask(near(HOME, (0.0, 0.0, 1e-4)))
-    again = bench.ask(near(HOME, (0.0, 0.0, 1e-4)))
+    rig.until(lambda: rig.trigger("reset").success, "the machine to stand")
+    rig.ask(near(HOME, (0.0, 0.0, 1e-4)))
+    again = rig.ask(near(HOME, (0.0, 0.0, 1e-4)))
     assert not again.corrections.any(), "forgotten with the reset"
 
 
-def test_commands_end(bench):
+def test_commands_end(rig):
     """Nothing is sent any more, the drives hold; the next command goes on where the last one was."""
-    _, _ = loop(bench)
-    last = bench.settle(HOME)
-    bench.until_status(WARN, "no new command")
-    assert float(bench.until_status(WARN, "no new command", DRIVE)["command_age_s"]) >= 0.1  # said in ms
-    assert bench.seen["strut_commands"][-1].header.stamp == last.command.header.stamp
-    np.testing.assert_allclose(measured(bench), last.lengths, rtol=0.0, atol=1e-9)
-    np.testing.assert_allclose(bench.ask(HOME).lengths, last.lengths, rtol=0.0, atol=ROUNDING)
-    bench.until(lambda: bench.ask(HOME) and bench.message() == bench.message(DRIVE) == "running", "both to run again")
+    _, _ = loop(rig)
+    last = rig.settle(HOME)
+    rig.until_status(WARN, "no new command")
+    assert float(rig.until_status(WARN, "no new command", DRIVE)["command_age_s"]) >= 0.1  # said in ms
+    assert rig.seen["strut_commands"][-1].header.stamp == last.command.header.stamp
+    np.testing.assert_allclose(measured(rig), last.lengths, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(rig.ask(HOME).lengths, last.lengths, rtol=0.0, atol=ROUNDING)
+    rig.until(lambda: rig.ask(HOME) and rig.message() == rig.message(DRIVE) == "running", "both to run again")
 
 
 def test_singular_pose_near(bench, tmp_path):
@@ -178,22 +176,22 @@ def test_singular_pose_near(bench, tmp_path):
     bench.until_status(ERROR, "refusing commands")
 
 
-def test_outside_the_measured_box(bench, tmp_path):
+def test_outside_the_measured_box(rig, tmp_path):
     """Measured 5 mm around home: 6 mm beside it the node goes on, and says where it was measured."""
     x, y, z = (1e3 * HOME.position).tolist()
     box = [[x - 5.0, y - 5.0, z - 5.0], [x + 5.0, y + 5.0, z + 5.0]]
-    bench.compensator(model_file=model_file(tmp_path, region={"box_mm": box}), command_timeout=0.0)
-    bench.ask(HOME)
-    assert bench.until_status(OK, "running")["outside_box"] == "false"
-    assert bench.ask(near(HOME, (0.001, 0.0, 0.0)))
+    rig.compensator(model_file=model_file(tmp_path, region={"box_mm": box}), command_timeout=0.0)
+    rig.ask(HOME)
+    assert rig.until_status(OK, "running")["outside_box"] == "false"
+    assert rig.ask(near(HOME, (0.001, 0.0, 0.0)))
     for step in range(2, 7):
-        bench.ask(near(HOME, (0.001 * step, 0.0, 0.0)))
-    values = bench.until_status(WARN, "running, outside the box in which the model was measured")
+        rig.ask(near(HOME, (0.001 * step, 0.0, 0.0)))
+    values = rig.until_status(WARN, "running, outside the box in which the model was measured")
     assert values["outside_box"] == "true"
     assert "sides 10 × 10 × 10 mm" in values["measured_box"]
     for step in range(5, -1, -1):
-        bench.ask(near(HOME, (0.001 * step, 0.0, 0.0)))
-    bench.until_status(OK, "running")
+        rig.ask(near(HOME, (0.001 * step, 0.0, 0.0)))
+    rig.until_status(OK, "running")
 
 
 def test_overload_keeps_the_newest_and_counts_the_others(bench):
@@ -225,39 +223,39 @@ def test_overload_of_the_drive_is_counted(bench):
 
 
 @pytest.mark.parametrize("hours", [-1.0, 1.0])
-def test_clock_is_set(bench, hours):
+def test_clock_is_set(rig, hours):
     """Sender and node share the clock: commands go on at once, and a ramp under way does not step."""
-    node = bench.compensator(command_timeout=0.0, ramp_rate=1e-4)
-    before = bench.ask(HOME)
-    bench.enable(False)
+    node = rig.compensator(command_timeout=0.0, ramp_rate=1e-4)
+    before = rig.ask(HOME)
+    rig.enable(False)
     reading = node.clock.system
     node.clock.system = lambda: reading() + round(hours * 3600e9)
     message = pose_message(HOME, "base")
-    message.header.stamp = bench.stamp(hours * 3600.0)
-    step = np.abs(bench.ask(message).lengths - before.lengths).max()
+    message.header.stamp = rig.stamp(hours * 3600.0)
+    step = np.abs(rig.ask(message).lengths - before.lengths).max()
     assert step <= 1e-4 * 0.02 + ROUNDING
-    bench.seen["/diagnostics"].clear()
+    rig.seen["/diagnostics"].clear()
     way = "back" if hours < 0.0 else "forward"
-    bench.until(lambda: bench.values().get(f"clock_set_{way}") == "1", "the count")
-    assert bench.logged(f"the clock was set {way} by 3600.")
+    rig.until(lambda: rig.values().get(f"clock_set_{way}") == "1", "the count")
+    assert rig.logged(f"the clock was set {way} by 3600.")
 
 
-def test_clock_of_the_sender_is_set(bench):
+def test_clock_of_the_sender_is_set(rig):
     """0.3 s back: out of order until three in order have come over 20 ms, or half a second has passed."""
-    bench.compensator(command_timeout=0.0, max_command_age=0.0)
+    rig.compensator(command_timeout=0.0, max_command_age=0.0)
     late = pose_message(HOME, "base")
-    late.header.stamp = bench.stamp(-0.3)
-    bench.ask(HOME)
-    bench.send(late)
-    bench.until_status(ERROR, "refusing commands: stamp_order")
+    late.header.stamp = rig.stamp(-0.3)
+    rig.ask(HOME)
+    rig.send(late)
+    rig.until_status(ERROR, "refusing commands: stamp_order")
 
     def accepted() -> bool:
-        late.header.stamp = bench.stamp(-0.3)
-        bench.send(late)
-        bench.barrier()
-        return len(bench.seen["strut_commands"]) == 2
+        late.header.stamp = rig.stamp(-0.3)
+        rig.send(late)
+        rig.barrier()
+        return len(rig.seen["strut_commands"]) == 2
 
-    bench.until(accepted, "the order to begin anew")
+    rig.until(accepted, "the order to begin anew")
 
 
 def test_simulated_time_starts_again(bench):
@@ -288,11 +286,12 @@ def test_speeds_depend_on_stamps_alone():
 # ---- who commands ----
 
 
-def test_two_nodes_command(bench, stranger):
+def test_two_nodes_command(bench, over_dds):
     """Both are named, also while neither sends, and none is obeyed until one is left."""
+    other = over_dds("stranger")
     bench.compensator(command_timeout=0.0)
     bench.ask(HOME)
-    publisher = stranger.create_publisher(type(pose_message(HOME, "")), "/tool_pose_command", 1)
+    publisher = other.create_publisher(type(pose_message(HOME, "")), "/tool_pose_command", 1)
     values = bench.until_status(ERROR, "refusing commands: several_publishers: several publishers of")
     assert bench.status().message.endswith("/tool_pose_command: /stranger, /witness")
     assert values["commanded_by"] == "/stranger, /witness"
@@ -300,33 +299,34 @@ def test_two_nodes_command(bench, stranger):
         sender(MOVED)
         bench.barrier()
     assert len(bench.seen["strut_commands"]) == 1
-    stranger.destroy_publisher(publisher)
+    other.destroy_publisher(publisher)
     bench.until_status(OK, "running")
     assert bench.values()["refused.several_publishers"] in {"1", "2"}
     bench.ask(MOVED)
 
 
-def test_two_nodes_may_command_where_that_is_allowed(bench, stranger):
-    bench.compensator(command_timeout=0.0, allow_several_publishers=True)
-    bench.ask(HOME)
+def test_two_nodes_may_command_where_that_is_allowed(rig, stranger):
+    rig.compensator(command_timeout=0.0, allow_several_publishers=True)
+    rig.ask(HOME)
     publisher = stranger.create_publisher(type(pose_message(HOME, "")), "/tool_pose_command", 1)
-    bench.until(lambda: bench.values().get("commanded_by") == "/stranger, /witness", "both names")
-    bench.until(lambda: publisher.get_subscription_count() == 1, "the match")
+    rig.until(lambda: rig.values().get("commanded_by") == "/stranger, /witness", "both names")
+    rig.until(lambda: publisher.get_subscription_count() == 1, "the match")
     publisher.publish(pose_message(MOVED, "base"))
-    bench.until(lambda: len(bench.seen["strut_commands"]) == 2, "the stranger's answer")
+    rig.until(lambda: len(rig.seen["strut_commands"]) == 2, "the stranger's answer")
 
 
-def heard_from(bench: Bench, node: LifecycleNode, topic: str, count: int) -> None:
+def heard_from(rig: Bench, node: LifecycleNode, topic: str, count: int) -> None:
     """Wait until a node's subscription has so many publishers."""
     (end,) = [end for end in node.subscriptions if end.topic_name == topic]
-    bench.until(lambda: end.get_publisher_count() == count, "the publishers to be found")
+    rig.until(lambda: end.get_publisher_count() == count, "the publishers to be found")
 
 
-def test_ghost_of_a_killed_controller_does_not_stop_its_successor(bench, twin):
+def test_ghost_of_a_killed_controller_does_not_stop_its_successor(bench, over_dds):
     """DDS keeps the dead for up to 20 s: two of one name, of which one is silent."""
+    other = over_dds("witness")
     node = bench.compensator(command_timeout=0.0)
     bench.ask(HOME)
-    publisher = twin.create_publisher(type(pose_message(HOME, "")), "/tool_pose_command", 1)
+    publisher = other.create_publisher(type(pose_message(HOME, "")), "/tool_pose_command", 1)
     heard_from(bench, node, "/tool_pose_command", 2)
     for n in range(5):  # the successor counts from 1 again
         publisher.publish(pose_message(near(HOME, (0.0, 0.0, 1e-5 * n)), "base"))
@@ -334,136 +334,136 @@ def test_ghost_of_a_killed_controller_does_not_stop_its_successor(bench, twin):
     assert bench.until_status(OK, "running")["commanded_by"] == "/witness"
 
 
-def test_twins_that_both_command_are_refused(bench, twin):
-    node = bench.compensator(command_timeout=0.0)
+def test_twins_that_both_command_are_refused(rig, twin):
+    node = rig.compensator(command_timeout=0.0)
     publisher = twin.create_publisher(type(pose_message(HOME, "")), "/tool_pose_command", 1)
-    heard_from(bench, node, "/tool_pose_command", 2)
-    bench.ask(HOME)
-    bench.ask(HOME)
+    heard_from(rig, node, "/tool_pose_command", 2)
+    rig.ask(HOME)
+    rig.ask(HOME)
     publisher.publish(pose_message(MOVED, "base"))
-    bench.until(lambda: len(bench.seen["strut_commands"]) == 3, "one that may be a successor's first")
-    bench.send(HOME)
-    values = bench.until_status(ERROR, "refusing commands: several_publishers")
+    rig.until(lambda: len(rig.seen["strut_commands"]) == 3, "one that may be a successor's first")
+    rig.send(HOME)
+    values = rig.until_status(ERROR, "refusing commands: several_publishers")
     assert values["last_refusal"].startswith("two publishers of /tool_pose_command speak in turn")
-    assert len(bench.seen["strut_commands"]) == 3
+    assert len(rig.seen["strut_commands"]) == 3
     twin.destroy_publisher(publisher)
-    heard_from(bench, node, "/tool_pose_command", 1)
-    bench.until_status(OK, "running")
-    bench.ask(HOME)
+    heard_from(rig, node, "/tool_pose_command", 1)
+    rig.until_status(OK, "running")
+    rig.ask(HOME)
 
 
-def test_somebody_else_sends_strut_commands(bench, stranger):
+def test_somebody_else_sends_strut_commands(rig, stranger):
     """The compensator stops and names them, and the drive does not obey either."""
-    drive, _ = loop(bench, command_timeout=0.0)
-    bench.settle(HOME)
+    drive, _ = loop(rig, command_timeout=0.0)
+    rig.settle(HOME)
     publisher = stranger.create_publisher(JointState, "/strut_commands", 1)
-    heard_from(bench, drive, "/strut_commands", 2)
+    heard_from(rig, drive, "/strut_commands", 2)
     text = "refusing commands: several_publishers: "
-    bench.until_status(ERROR, text + "/strut_commands is also published by /stranger")
-    bench.until_status(ERROR, text + "several publishers of /strut_commands: /compensator, /stranger", DRIVE)
-    before = measured(bench)
+    rig.until_status(ERROR, text + "/strut_commands is also published by /stranger")
+    rig.until_status(ERROR, text + "several publishers of /strut_commands: /compensator, /stranger", DRIVE)
+    before = measured(rig)
     publisher.publish(JointState(name=list(STRUT_NAMES), position=closed_form_lengths(MOVED).tolist()))
-    bench.until(lambda: bench.values(DRIVE)["refused"] != "0", "the refusal")
-    np.testing.assert_allclose(measured(bench), before, rtol=0.0, atol=1e-9)
+    rig.until(lambda: rig.values(DRIVE)["refused"] != "0", "the refusal")
+    np.testing.assert_allclose(measured(rig), before, rtol=0.0, atol=1e-9)
     stranger.destroy_publisher(publisher)
-    bench.until_status(OK, "running")
-    bench.ask(MOVED)
-    bench.until(lambda: bench.status(DRIVE).level != ERROR, "the drive to recover")
-    assert bench.values(DRIVE)["commanded_by"] == "/compensator"
+    rig.until_status(OK, "running")
+    rig.ask(MOVED)
+    rig.until(lambda: rig.status(DRIVE).level != ERROR, "the drive to recover")
+    assert rig.values(DRIVE)["commanded_by"] == "/compensator"
 
 
-def test_twins_that_both_send_strut_commands_are_refused(bench, twin):
+def test_twins_that_both_send_strut_commands_are_refused(rig, twin):
     """Two compensators of one name cannot tell each other from a ghost; the drive, which listens, can."""
-    drive = bench.drive(command_timeout=0.0)
+    drive = rig.drive(command_timeout=0.0)
     publisher = twin.create_publisher(JointState, "/strut_commands", 1)
-    heard_from(bench, drive, "/strut_commands", 2)
+    heard_from(rig, drive, "/strut_commands", 2)
     home = JointState(name=list(STRUT_NAMES), position=closed_form_lengths(HOME).tolist())
     for _ in range(3):
-        for speak in (publisher.publish, lambda message: bench.publish("strut_commands", message)):
+        for speak in (publisher.publish, lambda message: rig.publish("strut_commands", message)):
             speak(home)
-            bench.barrier()
-    values = bench.until_status(ERROR, "refusing commands: several_publishers", DRIVE)
+            rig.barrier()
+    values = rig.until_status(ERROR, "refusing commands: several_publishers", DRIVE)
     assert values["last_refusal"].startswith("two publishers of /strut_commands speak in turn")
 
 
 # ---- feedback ----
 
 
-def test_no_feedback(bench):
-    bench.compensator(command_timeout=0.0)
-    bench.ask(HOME)
-    assert bench.until_status(OK, "running, pose estimated from own commands")["feedback_age_s"] == "never"
+def test_no_feedback(rig):
+    rig.compensator(command_timeout=0.0)
+    rig.ask(HOME)
+    assert rig.until_status(OK, "running, pose estimated from own commands")["feedback_age_s"] == "never"
 
 
-def test_feedback_lost(bench):
+def test_feedback_lost(rig):
     """Compensation goes on; the estimate comes from the commands; with the readings it recovers."""
-    drive, _ = loop(bench, command_timeout=0.0)
-    bench.settle(HOME)
-    bench.until_status(OK, "running")
-    assert bench.set_parameter(DRIVE, "fault_feedback_drop", 1.0).successful
-    bench.until_status(WARN, "feedback lost, pose estimated from own commands")
-    bench.ask(MOVED)
-    assert bench.set_parameter(DRIVE, "fault_feedback_drop", 0.0).successful
-    bench.until_status(OK, "running")
+    drive, _ = loop(rig, command_timeout=0.0)
+    rig.settle(HOME)
+    rig.until_status(OK, "running")
+    assert rig.set_parameter(DRIVE, "fault_feedback_drop", 1.0).successful
+    rig.until_status(WARN, "feedback lost, pose estimated from own commands")
+    rig.ask(MOVED)
+    assert rig.set_parameter(DRIVE, "fault_feedback_drop", 0.0).successful
+    rig.until_status(OK, "running")
     assert drive.drive.faults.feedback_drop == 0.0
 
 
-def test_following_error(bench):
+def test_following_error(rig):
     """Strut 3 stands 3 mm from its command, 2 mm are allowed: refused until a reset, also when it is back."""
-    bench.compensator(command_timeout=0.0, feedback_timeout=60.0)
-    last = bench.ask(HOME)
-    bench.feed(last.lengths)
-    bench.ask(HOME)
+    rig.compensator(command_timeout=0.0, feedback_timeout=60.0)
+    last = rig.ask(HOME)
+    rig.feed(last.lengths)
+    rig.ask(HOME)
     away = last.lengths + np.array([0.0, 0.0, 3e-3, 0.0, 0.0, 0.0])
-    bench.feed(away)
-    bench.until_status(ERROR, "refusing commands: following_error: strut_3 is at 512.")
-    assert " mm from its command, allowed 2 mm" in bench.status().message
-    bench.send(HOME)
-    bench.until(lambda: bench.values()["refused"] == "1", "the refusal")
-    assert len(bench.seen["strut_commands"]) == 2
+    rig.feed(away)
+    rig.until_status(ERROR, "refusing commands: following_error: strut_3 is at 512.")
+    assert " mm from its command, allowed 2 mm" in rig.status().message
+    rig.send(HOME)
+    rig.until(lambda: rig.values()["refused"] == "1", "the refusal")
+    assert len(rig.seen["strut_commands"]) == 2
     for _ in range(2):
-        bench.feed(last.lengths)
-    bench.barrier()
-    bench.send(HOME)
-    bench.until(lambda: bench.values()["refused"] == "2", "the refusal of a second command")
-    assert bench.status().message.endswith("until ~/reset")
-    bench.until(lambda: bench.trigger("reset").success, "the machine to stand")
-    bench.ask(HOME)
-    bench.until_status(OK, "running")
+        rig.feed(last.lengths)
+    rig.barrier()
+    rig.send(HOME)
+    rig.until(lambda: rig.values()["refused"] == "2", "the refusal of a second command")
+    assert rig.status().message.endswith("until ~/reset")
+    rig.until(lambda: rig.trigger("reset").success, "the machine to stand")
+    rig.ask(HOME)
+    rig.until_status(OK, "running")
 
 
-def test_following_error_ends_with_a_reset(bench):
-    bench.compensator(command_timeout=0.0, feedback_timeout=60.0)
-    bench.ask(HOME)
+def test_following_error_ends_with_a_reset(rig):
+    rig.compensator(command_timeout=0.0, feedback_timeout=60.0)
+    rig.ask(HOME)
     elsewhere = near(HOME, (0.0, 0.0, 0.05))
-    bench.feed(closed_form_lengths(elsewhere))
-    bench.until_status(ERROR, "refusing commands: following_error: strut_")
-    assert bench.trigger("reset").success
-    bench.ask(elsewhere)
-    bench.until_status(OK, "running")
+    rig.feed(closed_form_lengths(elsewhere))
+    rig.until_status(ERROR, "refusing commands: following_error: strut_")
+    assert rig.trigger("reset").success
+    rig.ask(elsewhere)
+    rig.until_status(OK, "running")
 
 
-def test_a_reading_is_held_against_the_commands_of_its_own_time(bench):
+def test_a_reading_is_held_against_the_commands_of_its_own_time(rig):
     """It comes half a second late, as when a busy computer or network holds it up: then it is old, and not wrong."""
-    bench.compensator(command_timeout=0.0, feedback_timeout=60.0, max_reading_age=10.0, max_command_age=0.0)
-    bench.ask(HOME)
+    rig.compensator(command_timeout=0.0, feedback_timeout=60.0, max_reading_age=10.0, max_command_age=0.0)
+    rig.ask(HOME)
     began = time.monotonic()
     for n in range(1, 21):
-        bench.ask(near(HOME, (0.0, 0.0, 5e-4 * n)))
+        rig.ask(near(HOME, (0.0, 0.0, 5e-4 * n)))
     half_way = closed_form_lengths(near(HOME, (0.0, 0.0, 5e-3)))
-    bench.until(lambda: time.monotonic() > began + 0.5, "half a second to pass")
-    bench.estimate(bench.feed(half_way, later=began - time.monotonic()))
-    bench.ask(near(HOME, (0.0, 0.0, 1e-2)))
-    bench.feed(half_way)
-    bench.until_status(ERROR, "refusing commands: following_error: strut_")
+    rig.until(lambda: time.monotonic() > began + 0.5, "half a second to pass")
+    rig.estimate(rig.feed(half_way, later=began - time.monotonic()))
+    rig.ask(near(HOME, (0.0, 0.0, 1e-2)))
+    rig.feed(half_way)
+    rig.until_status(ERROR, "refusing commands: following_error: strut_")
 
 
-def test_following_error_may_be_switched_off(bench):
-    bench.compensator(command_timeout=0.0, feedback_timeout=60.0, following_error_limit=0.0)
-    bench.ask(HOME)
-    bench.estimate(bench.feed(closed_form_lengths(near(HOME, (0.0, 0.0, 0.05)))))
-    bench.ask(HOME)
-    bench.until_status(OK, "running")
+def test_following_error_may_be_switched_off(rig):
+    rig.compensator(command_timeout=0.0, feedback_timeout=60.0, following_error_limit=0.0)
+    rig.ask(HOME)
+    rig.estimate(rig.feed(closed_form_lengths(near(HOME, (0.0, 0.0, 0.05)))))
+    rig.ask(HOME)
+    rig.until_status(OK, "running")
 
 
 # ---- restarts ----
@@ -485,14 +485,14 @@ def test_compensator_restarts_without_a_step(bench):
     assert (np.abs(np.diff(sent, axis=0)) <= 20e-6 + ROUNDING).all()
 
 
-def test_compensator_restarts_far_from_the_struts(bench):
+def test_compensator_restarts_far_from_the_struts(rig):
     """5 mm from the command no correction explains it: the first command may be one step from the struts."""
-    bench.compensator(feedback_timeout=60.0)
-    bench.feed(closed_form_lengths(HOME))
-    bench.barrier()
-    bench.send(near(HOME, (0.0, 0.0, 0.005)))
-    bench.until_status(ERROR, "refusing commands: step")
-    bench.ask(HOME)
+    rig.compensator(feedback_timeout=60.0)
+    rig.feed(closed_form_lengths(HOME))
+    rig.barrier()
+    rig.send(near(HOME, (0.0, 0.0, 0.005)))
+    rig.until_status(ERROR, "refusing commands: step")
+    rig.ask(HOME)
 
 
 def test_drive_restarts(bench):
@@ -519,94 +519,94 @@ def test_drive_restarts(bench):
 # ---- files ----
 
 
-def test_model_is_replaced_while_it_runs(bench, tmp_path):
+def test_model_is_replaced_while_it_runs(rig, tmp_path):
     """The service answers when the file has been read elsewhere; commands are answered all the while."""
     path = model_file(tmp_path, struts={"offset_um": 100.0})
-    bench.compensator(model_file=path, ramp_rate=1.0, command_timeout=0.0)
-    bench.ask(HOME)
+    rig.compensator(model_file=path, ramp_rate=1.0, command_timeout=0.0)
+    rig.ask(HOME)
     model_file(tmp_path, struts={"offset_um": -200.0})
-    reply = bench.begin("reload_model")
+    reply = rig.begin("reload_model")
     answered = 0
     while not reply.done():
-        bench.ask(HOME)
+        rig.ask(HOME)
         answered += 1
     assert reply.result().success
     assert answered > 10, "a second or so of imports, in another process"
-    np.testing.assert_allclose(bench.settle(HOME).corrections, 200e-6, rtol=0.0, atol=ROUNDING)
+    np.testing.assert_allclose(rig.settle(HOME).corrections, 200e-6, rtol=0.0, atol=ROUNDING)
 
 
-def test_model_half_written(bench, tmp_path):
+def test_model_half_written(rig, tmp_path):
     """The old one stays; that is said for a while, counted, and the service says why."""
     path = Path(model_file(tmp_path, struts={"offset_um": 100.0}))
-    bench.compensator(model_file=str(path), command_timeout=0.0)
-    bench.ask(HOME)
+    rig.compensator(model_file=str(path), command_timeout=0.0)
+    rig.ask(HOME)
     text = path.read_text(encoding="utf-8")
     path.write_text(text[: len(text) // 2], encoding="utf-8")
-    response = bench.trigger("reload_model")
+    response = rig.trigger("reload_model")
     assert not response.success
     assert str(path) in response.message
-    values = bench.until_status(WARN, "the old model stays")
+    values = rig.until_status(WARN, "the old model stays")
     assert values["failed_reloads"] == "1"
     assert str(path) in values["last_failed_reload"]
-    bench.until_status(OK, "running")
-    np.testing.assert_allclose(bench.ask(HOME).corrections, -100e-6, rtol=0.0, atol=ROUNDING)
+    rig.until_status(OK, "running")
+    np.testing.assert_allclose(rig.ask(HOME).corrections, -100e-6, rtol=0.0, atol=ROUNDING)
 
 
-def test_one_reload_at_a_time(bench):
-    bench.compensator()
-    first = bench.begin("reload_model")
-    second = bench.trigger("reload_model")
+def test_one_reload_at_a_time(rig):
+    rig.compensator()
+    first = rig.begin("reload_model")
+    second = rig.trigger("reload_model")
     assert not second.success
     assert "being loaded already" in second.message
-    bench.until(first.done, "the first answer")
+    rig.until(first.done, "the first answer")
     assert first.result().success
 
 
-def test_model_leads_out_of_its_folder(bench, tmp_path):
+def test_model_leads_out_of_its_folder(rig, tmp_path):
     """By a link made while the node runs, and by ``..`` at the start."""
     folder = tmp_path / "models"
     folder.mkdir()
     inside, outside = Path(model_file(folder)), Path(model_file(tmp_path, name="outside.yaml"))
-    bench.compensator(model_file=str(inside))
+    rig.compensator(model_file=str(inside))
     inside.unlink()
     inside.symlink_to(outside)
-    response = bench.trigger("reload_model")
+    response = rig.trigger("reload_model")
     assert not response.success
     assert f"leads to {outside}, but files are only read from {folder}" in response.message
-    sneaky = bench.compensator(start=False, model_folder=str(folder), model_file=f"{folder}/../outside.yaml")
+    sneaky = rig.compensator(start=False, model_folder=str(folder), model_file=f"{folder}/../outside.yaml")
     sneaky.trigger_configure()
-    (line,) = bench.logged("cannot configure")
+    (line,) = rig.logged("cannot configure")
     assert f"leads to {outside}" in line
 
 
-def test_files_by_name_in_the_model_folder(bench, tmp_path):
+def test_files_by_name_in_the_model_folder(rig, tmp_path):
     model_file(tmp_path, name="mine.yaml", struts={"offset_um": 100.0})
-    bench.compensator(model_folder=str(tmp_path), model_file="mine.yaml")
-    np.testing.assert_allclose(bench.ask(HOME).corrections, -100e-6, rtol=0.0, atol=ROUNDING)
+    rig.compensator(model_folder=str(tmp_path), model_file="mine.yaml")
+    np.testing.assert_allclose(rig.ask(HOME).corrections, -100e-6, rtol=0.0, atol=ROUNDING)
 
 
-def test_model_folder_must_be_one(bench, tmp_path):
+def test_model_folder_must_be_one(rig, tmp_path):
     with pytest.raises(ParameterError, match=r"parameter model_folder: '.*nowhere' is not a folder"):
-        bench.compensator(start=False, model_folder=str(tmp_path / "nowhere"))
+        rig.compensator(start=False, model_folder=str(tmp_path / "nowhere"))
 
 
-def test_model_is_no_regular_file(bench, tmp_path):
+def test_model_is_no_regular_file(rig, tmp_path):
     """A pipe that nobody writes into would be waited for without end."""
     path = Path(model_file(tmp_path))
-    bench.compensator(model_file=str(path))
+    rig.compensator(model_file=str(path))
     path.unlink()
     os.mkfifo(path)
-    response = bench.trigger("reload_model")
+    response = rig.trigger("reload_model")
     assert not response.success
     assert f"{path}: is not a regular file" in response.message
 
 
-def test_model_too_large(bench, tmp_path):
+def test_model_too_large(rig, tmp_path):
     path = Path(model_file(tmp_path))
-    bench.compensator(model_file=str(path))
+    rig.compensator(model_file=str(path))
     with path.open("ab") as stream:
         stream.truncate(9_000_000)
-    response = bench.trigger("reload_model")
+    response = rig.trigger("reload_model")
     assert not response.success
     assert "larger than the allowed 8 MB" in response.message
 
@@ -614,9 +614,9 @@ def test_model_too_large(bench, tmp_path):
 # ---- configuration ----
 
 
-def test_frames_of_one_name_are_refused(bench):
+def test_frames_of_one_name_are_refused(rig):
     with pytest.raises(ParameterError, match="work_frame: must differ from base_frame, 'machine'"):
-        bench.compensator(start=False, base_frame="machine", work_frame="machine")
+        rig.compensator(start=False, base_frame="machine", work_frame="machine")
 
 
 def test_shipped_models_survive_the_way_through_the_loading_process():
@@ -640,34 +640,34 @@ def test_shipped_models_survive_the_way_through_the_loading_process():
 
 
 @pytest.mark.parametrize("active", [True, False], ids=["active", "inactive"])
-def test_after_a_shutdown_nothing_is_published(bench, active):
+def test_after_a_shutdown_nothing_is_published(rig, active):
     """Before, heartbeats, journal, diagnostics and readings went on. Without a timer nothing comes by itself."""
-    nodes = bench.drive(), bench.compensator()
-    bench.ask(HOME)
+    nodes = rig.drive(), rig.compensator()
+    rig.ask(HOME)
     for node in nodes:
         name = node.get_name()
         if not active:
-            assert bench.change("deactivate", name)
+            assert rig.change("deactivate", name)
         request = ChangeState.Request()
         request.transition.label = "shutdown"
-        assert bench.call(ChangeState, f"{name}/change_state", request).success
-        assert bench.state(name) == "finalized"
+        assert rig.call(ChangeState, f"{name}/change_state", request).success
+        assert rig.state(name) == "finalized"
         assert not list(node.timers)
-        bench.until(lambda name=name: bench.message(name).startswith("not active"), "a last status")
+        rig.until(lambda name=name: rig.message(name).startswith("not active"), "a last status")
         theirs = {p.topic_name for p in node.publishers}
         assert theirs <= {"/rosout", "/parameter_events", "/diagnostics", f"/{name}/transition_event"}
-    seen = {topic: len(messages) for topic, messages in bench.seen.items()}
-    bench.send(HOME)
-    bench.barrier()
-    assert seen == {topic: len(messages) for topic, messages in bench.seen.items()}
+    seen = {topic: len(messages) for topic, messages in rig.seen.items()}
+    rig.send(HOME)
+    rig.barrier()
+    assert seen == {topic: len(messages) for topic, messages in rig.seen.items()}
 
 
 def test_two_machines_of_a_kind_have_other_hardware_ids(ros_context, capfd):
     """What monitors of a whole plant tell machines apart by."""
     with Bench(ros_context, capfd, "/left") as left, Bench(ros_context, capfd, "/hall/right") as right:
-        for bench in (left, right):
-            bench.drive()
-            bench.compensator()
-        for bench, place in ((left, "left"), (right, "hall/right")):
-            bench.until(lambda b=bench: b.values("strut_drive") and b.values(), "statuses")
-            assert {bench.status(name).hardware_id for name in ("compensator", "strut_drive")} == {f"{place}/paper"}
+        for rig in (left, right):
+            rig.drive()
+            rig.compensator()
+        for rig, place in ((left, "left"), (right, "hall/right")):
+            rig.until(lambda b=rig: b.values("strut_drive") and b.values(), "statuses")
+            assert {rig.status(name).hardware_id for name in ("compensator", "strut_drive")} == {f"{place}/paper"}

@@ -43,12 +43,12 @@ FORGED = "base\n[INFO] [1.0] [compensator]: all is well\r\x1b[2J\x1b[31m\u202e"
 HUGE = FORGED + 10_000_000 * "x"
 
 
-def bridge(bench: Bench) -> LinuxcncBridgeNode:
+def bridge(rig: Bench) -> LinuxcncBridgeNode:
     """Add a LinuxCNC bridge on a machine that is on; the witness no longer commands."""
-    bench.hush("tool_pose_command")
-    bench.hush("strut_states")
+    rig.hush("tool_pose_command")
+    rig.hush("strut_states")
     hal = StandInHal()
-    node = bench.add(LinuxcncBridgeNode, True, {"rate": 250.0, "timeout": 1.0}, hal=hal)
+    node = rig.add(LinuxcncBridgeNode, True, {"rate": 250.0, "timeout": 1.0}, hal=hal)
     for n, length in enumerate(closed_form_lengths(HOME)):
         hal[f"joint-fb.{n}"] = float(length) * 1e3
     hal["z"] = 400.0
@@ -57,8 +57,8 @@ def bridge(bench: Bench) -> LinuxcncBridgeNode:
 
 
 NODES: dict[str, Callable[[Bench], Any]] = {
-    "compensator": lambda bench: bench.compensator(),
-    "strut_drive": lambda bench: bench.drive(),
+    "compensator": lambda rig: rig.compensator(),
+    "strut_drive": lambda rig: rig.drive(),
     "linuxcnc_bridge": bridge,
 }
 
@@ -146,17 +146,17 @@ def test_several_publishers_allowed_means_also_those_without_a_readable_name(ben
 # ---- no callback ends a node ----
 
 
-def test_a_transition_that_raises_is_said(bench, monkeypatch):
+def test_a_transition_that_raises_is_said(rig, monkeypatch):
     """rclpy swallows it: the node went out of reach without a line."""
-    bench.compensator(start=False)
+    rig.compensator(start=False)
     monkeypatch.setattr(MachineFiles, "geometry", lambda files: 1 / 0)
-    assert not bench.change("configure")
-    assert bench.logged("error in a callback, the node goes on: on_configure: ZeroDivisionError")
+    assert not rig.change("configure")
+    assert rig.logged("error in a callback, the node goes on: on_configure: ZeroDivisionError")
 
 
 @pytest.mark.parametrize("name", NODES)
-def test_all_that_ros_calls_goes_through_the_guard(bench, name):
-    node = NODES[name](bench)
+def test_all_that_ros_calls_goes_through_the_guard(rig, name):
+    node = NODES[name](rig)
     callbacks = [entity.callback for kind in (node.subscriptions, node.timers, node.services) for entity in kind]
     assert len(callbacks) > 12
     assert {callback.__code__.co_filename.rpartition("/")[2] for callback in callbacks} == {
@@ -179,35 +179,35 @@ def broken(*_: object, **__: object) -> None:
         ("matching of tool_pose_command", "_status", "look"),
     ],
 )
-def test_a_callback_that_raises_is_counted_and_said_and_the_node_goes_on(bench, monkeypatch, what, owner, method):
+def test_a_callback_that_raises_is_counted_and_said_and_the_node_goes_on(rig, monkeypatch, what, owner, method):
     """A subscription, a timer, an event: whatever is wrong with us, the next message is handled."""
-    node = bench.compensator()
-    bench.ask(HOME)
+    node = rig.compensator()
+    rig.ask(HOME)
     with monkeypatch.context() as patch:
         patch.setattr(getattr(node, owner), method, broken)
-        bench.send(HOME)
-        bench.feed(closed_form_lengths(HOME))
-        bench.publish("temperatures", Temperature(temperature=20.0, header=pose_message(HOME, "base").header))
-        bench.speak("tool_pose_command") if what.startswith("matching") else None
-        bench.until(lambda: what in node.guard.values()["last_callback_error"], "the error to be caught")
-    values = bench.until_status(ERROR, "error in a callback")
+        rig.send(HOME)
+        rig.feed(closed_form_lengths(HOME))
+        rig.publish("temperatures", Temperature(temperature=20.0, header=pose_message(HOME, "base").header))
+        rig.speak("tool_pose_command") if what.startswith("matching") else None
+        rig.until(lambda: what in node.guard.values()["last_callback_error"], "the error to be caught")
+    values = rig.until_status(ERROR, "error in a callback")
     assert int(values["callback_errors"]) > 0
     assert "ZeroDivisionError: nobody has foreseen this" in values["last_callback_error"]
     assert values["last_callback_error"].isprintable()
-    assert bench.logged("error in a callback, the node goes on: ")
-    bench.until(lambda: "callback" not in bench.status().message, "the error to be past")
-    bench.ask(HOME)
+    assert rig.logged("error in a callback, the node goes on: ")
+    rig.until(lambda: "callback" not in rig.status().message, "the error to be past")
+    rig.ask(HOME)
 
 
-def test_a_service_that_raises_answers_no(bench, monkeypatch):
-    node = bench.compensator()
+def test_a_service_that_raises_answers_no(rig, monkeypatch):
+    node = rig.compensator()
     monkeypatch.setattr(node.compensator, "reset", broken)
-    answer = bench.trigger("reset")
+    answer = rig.trigger("reset")
     assert not answer.success
     assert answer.message.startswith("nobody has foreseen this")
     assert answer.message.isprintable()
     assert node.guard.values()["refused_requests"] == "1"
-    assert bench.logged("reset refused: ")
+    assert rig.logged("reset refused: ")
 
 
 def test_the_guard_of_the_spin_loop_holds_whatever_comes():
@@ -249,49 +249,49 @@ DOORS = {
 
 @pytest.mark.parametrize("text", [FORGED, HUGE], ids=["forged", "huge"])
 @pytest.mark.parametrize("door", DOORS)
-def test_text_in_a_message_neither_forges_a_line_nor_fills_anything(bench, door, text):
+def test_text_in_a_message_neither_forges_a_line_nor_fills_anything(rig, door, text):
     name, topic, message = DOORS[door]
-    NODES[name](bench)
-    publisher = bench._publishers.get(topic) or bench.witness.create_publisher(JointState, topic, RELIABLE)
+    NODES[name](rig)
+    publisher = rig._publishers.get(topic) or rig.witness.create_publisher(JointState, topic, RELIABLE)
     counter = "bad_feedback" if topic in ("strut_states", "temperatures") else "refused"
     stranger = message(text)
     for count in range(1, 4):
         if isinstance(stranger, JointState):
-            stranger.header.stamp = bench.now()
+            stranger.header.stamp = rig.now()
         publisher.publish(stranger)
-        bench.until(lambda count=count: int(bench.values(name).get(counter, "0")) >= count, "a refusal")
-    assert_harmless(bench)
+        rig.until(lambda count=count: int(rig.values(name).get(counter, "0")) >= count, "a refusal")
+    assert_harmless(rig)
     if name == "compensator":
-        assert len(bench.nodes[0]._journal._journal.page(0.0)) < 20_000
+        assert len(rig.nodes[0]._journal._journal.page(0.0)) < 20_000
 
 
-def assert_harmless(bench: Bench) -> None:
+def assert_harmless(rig: Bench) -> None:
     """All that was said, in the log and in diagnostics, is on lines of our own, short, and printable."""
-    bench.barrier()
-    bench.logged("")
-    lines = bench._log.splitlines()
+    rig.barrier()
+    rig.logged("")
+    lines = rig._log.splitlines()
     assert lines
     assert not [line for line in lines if line.startswith("[INFO] [1.0]") or not line.isprintable()]
     assert max(map(len, lines)) < LONGEST_TEXT + 200
     for name in NODES:
-        for status in bench.statuses(name):
+        for status in rig.statuses(name):
             texts = [status.message, *(entry.value for entry in status.values)]
             assert all(text.isprintable() and len(text) <= LONGEST_TEXT for text in texts)
 
 
-def test_text_in_a_request_neither_forges_a_line_nor_is_shown_whole(bench):
+def test_text_in_a_request_neither_forges_a_line_nor_is_shown_whole(rig):
     """A transition's label, a parameter's name and its value: rclpy and rcl quote them when they refuse."""
-    bench.compensator()
-    bench.drive()
+    rig.compensator()
+    rig.drive()
     request = ChangeState.Request()
     request.transition.label = FORGED
-    assert not bench.call(ChangeState, "compensator/change_state", request).success
+    assert not rig.call(ChangeState, "compensator/change_state", request).success
     for name, text in ((FORGED, "x"), ("fault_jump", FORGED), ("fault_jump", HUGE[:200_000])):
         parameter = ParameterMessage(name=name)
         parameter.value.type, parameter.value.string_value = 4, text
-        answer = bench.call(SetParameters, "strut_drive/set_parameters", SetParameters.Request(parameters=[parameter]))
+        answer = rig.call(SetParameters, "strut_drive/set_parameters", SetParameters.Request(parameters=[parameter]))
         assert not answer.results[0].successful
-    assert_harmless(bench)
+    assert_harmless(rig)
 
 
 def test_a_flood_of_refused_requests_gives_a_line_a_second(bench):
@@ -327,17 +327,17 @@ def test_a_flood_of_refused_requests_gives_a_line_a_second(bench):
 
 
 @pytest.mark.parametrize("parameter", ["geometry_file", "model_file"])
-def test_a_file_name_does_not_forge_a_line(bench, tmp_path, parameter):
-    bench.compensator(start=False, **{parameter: str(tmp_path / f"{FORGED}.yaml")})
-    assert not bench.change("configure")
-    assert bench.logged("cannot configure: ")
-    assert_harmless(bench)
+def test_a_file_name_does_not_forge_a_line(rig, tmp_path, parameter):
+    rig.compensator(start=False, **{parameter: str(tmp_path / f"{FORGED}.yaml")})
+    assert not rig.change("configure")
+    assert rig.logged("cannot configure: ")
+    assert_harmless(rig)
 
 
-def test_a_misspelt_parameter_does_not_forge_a_line(bench):
-    bench.compensator(start=False, **{f"modell_file{FORGED}": "x"})
-    assert bench.logged("there is no parameter modell_file")
-    assert_harmless(bench)
+def test_a_misspelt_parameter_does_not_forge_a_line(rig):
+    rig.compensator(start=False, **{f"modell_file{FORGED}": "x"})
+    assert rig.logged("there is no parameter modell_file")
+    assert_harmless(rig)
 
 
 @pytest.mark.parametrize("text", [FORGED, 3000 * "\x1b", 5000 * "x", "\ud800", "", "ordinary, 4 µm ± 1 °"])

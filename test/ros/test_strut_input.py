@@ -76,84 +76,83 @@ def paper() -> Compensator:
     return Compensator(geometry, find_model("ideal", geometry))
 
 
-def ask(bench: Bench, lengths: np.ndarray, **others: float) -> JointState:
+def ask(rig: Bench, lengths: np.ndarray, **others: float) -> JointState:
     """Send setpoints beside other joints and return the strut commands that answer them."""
     message = setpoints([*others.values(), *lengths], (*others, *STRUT_NAMES))
-    message.header.stamp = bench.now()
-    bench.publish("strut_setpoints", message)
+    message.header.stamp = rig.now()
+    rig.publish("strut_setpoints", message)
 
     def answers() -> list[JointState]:
-        return [m for m in bench.seen["strut_commands"][-5:] if m.header.stamp == message.header.stamp]
+        return [m for m in rig.seen["strut_commands"][-5:] if m.header.stamp == message.header.stamp]
 
-    bench.until(answers, "an answer to setpoints")
+    rig.until(answers, "an answer to setpoints")
     return answers()[0]
 
 
-def test_a_controller_of_struts_commands_the_node(bench: Bench):
-    bench.speak("strut_setpoints")
-    bench.compensator(command_input=STRUTS, enable_compensation=False, max_command_age=60.0)
+def test_a_controller_of_struts_commands_the_node(rig: Bench):
+    rig.speak("strut_setpoints")
+    rig.compensator(command_input=STRUTS, enable_compensation=False, max_command_age=60.0)
     at_home = closed_form_lengths(HOME)
     for _ in range(3):  # as ros2_control does until a controller is active
-        bench.publish("strut_setpoints", setpoints([math.nan] * 6))
-    bench.send(HOME)
-    bench.barrier()
-    values = bench.until_status(OK, "waiting for the first command")
+        rig.publish("strut_setpoints", setpoints([math.nan] * 6))
+    rig.send(HOME)
+    rig.barrier()
+    values = rig.until_status(OK, "waiting for the first command")
     assert values["commands"] == "0"
     assert not any(value != "0" for key, value in values.items() if key.startswith("refused"))
-    assert not bench.seen["strut_commands"]
-    np.testing.assert_allclose(ask(bench, at_home, spindle=12.0).position, at_home, rtol=0, atol=SAME)
+    assert not rig.seen["strut_commands"]
+    np.testing.assert_allclose(ask(rig, at_home, spindle=12.0).position, at_home, rtol=0, atol=SAME)
     further = closed_form_lengths(near(HOME, (0.0, 0.001, 0.0), 0.1))
-    np.testing.assert_allclose(ask(bench, further).position, further, rtol=0, atol=SAME)
-    bench.publish("strut_setpoints", setpoints(closed_form_lengths(near(HOME, (0.0, 0.0, 0.05)))))
-    bench.until_status(ERROR, "refusing commands: step")
-    bench.until_status(WARN, "no new command")
+    np.testing.assert_allclose(ask(rig, further).position, further, rtol=0, atol=SAME)
+    rig.publish("strut_setpoints", setpoints(closed_form_lengths(near(HOME, (0.0, 0.0, 0.05)))))
+    rig.until_status(ERROR, "refusing commands: step")
+    rig.until_status(WARN, "no new command")
 
 
-def told(bench: Bench, measured: np.ndarray) -> np.ndarray:
+def told(rig: Bench, measured: np.ndarray) -> np.ndarray:
     """Measure struts and return what a controller of nominal lengths is told of them."""
     seen: list[JointState] = []
-    listener = bench.witness.create_subscription(JointState, "nominal_strut_states", seen.append, BEST_EFFORT)
-    bench.until(lambda: listener.get_publisher_count() == 1 and bench.matched(), "the compensator's publisher")
-    sent = bench.feed(measured)
-    bench.until(lambda: [m for m in seen if m.header.stamp == sent.header.stamp], "nominal lengths of a reading")
-    bench.witness.destroy_subscription(listener)
+    listener = rig.witness.create_subscription(JointState, "nominal_strut_states", seen.append, BEST_EFFORT)
+    sent = rig.feed(measured)
+    rig.until(lambda: [m for m in seen if m.header.stamp == sent.header.stamp], "nominal lengths of a reading")
+    rig.witness.destroy_subscription(listener)
     assert tuple(seen[-1].name) == STRUT_NAMES
     return np.array(seen[-1].position)
 
 
-def test_a_controller_that_starts_again_moves_no_strut(bench: Bench):
+def test_a_controller_that_starts_again_moves_no_strut(rig: Bench):
     """It commands what it is told it stands at. Truth: closed-form lengths, and that told again nothing changes."""
-    bench.speak("strut_setpoints")
-    bench.compensator(command_input=STRUTS, ramp_rate=1.0)
+    rig.speak("strut_setpoints")
+    rig.compensator(command_input=STRUTS, ramp_rate=1.0)
     at_home = closed_form_lengths(HOME)
-    standing = told(bench, at_home)  # before any command: less what the model would correct there
+    standing = told(rig, at_home)  # before any command: less what the model would correct there
     assert np.abs(standing - at_home).max() > 5e-6
-    np.testing.assert_allclose(ask(bench, standing).position, at_home, rtol=0, atol=SAME)
+    np.testing.assert_allclose(ask(rig, standing).position, at_home, rtol=0, atol=SAME)
     for _ in range(3):
-        command = np.array(ask(bench, at_home).position)
+        command = np.array(ask(rig, at_home).position)
     assert np.abs(command - at_home).max() > 5e-6
     for _ in range(3):  # each time that it starts from the readings
-        standing = told(bench, command)
+        standing = told(rig, command)
         np.testing.assert_allclose(standing, at_home, rtol=0, atol=SAME)
-        np.testing.assert_allclose(ask(bench, standing).position, command, rtol=0, atol=SAME)
-    np.testing.assert_allclose(told(bench, command + 1e-5), at_home + 1e-5, rtol=0, atol=SAME)  # the struts lag
+        np.testing.assert_allclose(ask(rig, standing).position, command, rtol=0, atol=SAME)
+    np.testing.assert_allclose(told(rig, command + 1e-5), at_home + 1e-5, rtol=0, atol=SAME)  # the struts lag
 
 
-def test_readings_are_nominal_where_nothing_is_corrected(bench: Bench):
-    bench.compensator(command_input=STRUTS, enable_compensation=False)
+def test_readings_are_nominal_where_nothing_is_corrected(rig: Bench):
+    rig.compensator(command_input=STRUTS, enable_compensation=False)
     at_home = closed_form_lengths(HOME)
-    np.testing.assert_allclose(told(bench, at_home), at_home, rtol=0, atol=SAME)
+    np.testing.assert_allclose(told(rig, at_home), at_home, rtol=0, atol=SAME)
 
 
-def test_joints_go_by_the_machine_s_own_names(bench: Bench):
+def test_joints_go_by_the_machine_s_own_names(rig: Bench):
     names = [f"left_leg_{n}" for n in range(1, 7)]
-    bench.compensator(joint_names=names, enable_compensation=False, feedback_timeout=60.0)  # on a busy computer too
-    bench.feed(closed_form_lengths(HOME))  # under the usual names: nobody's
-    bench.until(lambda: bench.logged("left_leg_1 missing"), "a warning")
-    answer = bench.ask(HOME)
+    rig.compensator(joint_names=names, enable_compensation=False, feedback_timeout=60.0)  # on a busy computer too
+    rig.feed(closed_form_lengths(HOME))  # under the usual names: nobody's
+    rig.until(lambda: rig.logged("left_leg_1 missing"), "a warning")
+    answer = rig.ask(HOME)
     assert list(answer.command.name) == names
-    bench.feed(closed_form_lengths(HOME)[::-1], tuple(reversed(names)))
-    bench.until(lambda: bench.values().get("pose_estimated_from") == "strut_states", "feedback")
+    rig.feed(closed_form_lengths(HOME)[::-1], tuple(reversed(names)))
+    rig.until(lambda: rig.values().get("pose_estimated_from") == "strut_states", "feedback")
 
 
 @pytest.mark.parametrize(
@@ -164,19 +163,19 @@ def test_joints_go_by_the_machine_s_own_names(bench: Bench):
         ({"joint_names": ["a"] * 6}, "joint_names: must be 6 different names"),
     ],
 )
-def test_other_values_are_refused(bench: Bench, parameters: dict[str, object], problem: str):
+def test_other_values_are_refused(rig: Bench, parameters: dict[str, object], problem: str):
     with pytest.raises(ParameterError, match=problem):
-        bench.compensator(**parameters)
+        rig.compensator(**parameters)
 
 
-def test_joint_states_show_the_machine_where_its_struts_are(bench: Bench):
+def test_joint_states_show_the_machine_where_its_struts_are(rig: Bench):
     """Truth: closed-form lengths, and the pose that they belong to."""
-    bench.compensator(model_file="ideal", marker_rate=10.0)
+    rig.compensator(model_file="ideal", marker_rate=10.0)
     seen: list[JointState] = []
-    bench.witness.create_subscription(JointState, "joint_states", seen.append, 10)
+    rig.witness.create_subscription(JointState, "joint_states", seen.append, 10)
     pose = near(HOME, (0.003, -0.002, 0.01), 1.0)
-    bench.feed(closed_form_lengths(pose))
-    bench.until(lambda: seen and abs(seen[-1].position[list(seen[-1].name).index("platform_z")] - 0.41) < SAME, "pose")
+    rig.feed(closed_form_lengths(pose))
+    rig.until(lambda: seen and abs(seen[-1].position[list(seen[-1].name).index("platform_z")] - 0.41) < SAME, "pose")
     joints = dict(zip(seen[-1].name, seen[-1].position, strict=True))
     at = [joints[f"platform_{axis}"] for axis in "xyz"]
     np.testing.assert_allclose(at, pose.position, rtol=0, atol=SAME)
@@ -190,7 +189,7 @@ ASKEW = near(HOME, (0.01, 0.005, 0.0), 1.0)
 """A pose at which all struts differ."""
 
 
-def started_before(bench: Bench, folder: Path, **others: bool) -> list[Float64MultiArray]:
+def started_before(rig: Bench, folder: Path, **others: bool) -> list[Float64MultiArray]:
     """Start a compensator as doc/ros.md does before ros2_control; return what forward_command_controller is told."""
     assert main(["export", "--ros2-control", str(folder)]) == 0
     words = ["--ros-args", "--params-file", str(folder / "config" / "before.yaml")]
@@ -199,37 +198,37 @@ def started_before(bench: Bench, folder: Path, **others: bool) -> list[Float64Mu
         ("strut_states", "joint_states"),
     ):
         words += ["-r", f"{name}:={topic}"]
-    bench.add(CompensatorNode, True, {"enable_compensation": False, **others}, cli_args=words)
+    rig.add(CompensatorNode, True, {"enable_compensation": False, **others}, cli_args=words)
     told: list[Float64MultiArray] = []
-    bench.witness.create_subscription(Float64MultiArray, "forward_command_controller/commands", told.append, 10)
+    rig.witness.create_subscription(Float64MultiArray, "forward_command_controller/commands", told.append, 10)
     return told
 
 
-def broadcast(bench: Bench) -> Callable[[], bool]:
+def broadcast(rig: Bench) -> Callable[[], bool]:
     """Publish the struts as joint_state_broadcaster does: by name, in its own order, beside other joints."""
-    publisher = bench.witness.create_publisher(JointState, "joint_states", 10)
+    publisher = rig.witness.create_publisher(JointState, "joint_states", 10)
     message = setpoints([12.0, *closed_form_lengths(ASKEW)[::-1]], ("spindle", *STRUT_NAMES[::-1]))
 
     def tell(key: str, value: str) -> bool:
-        message.header.stamp = bench.now()
+        message.header.stamp = rig.now()
         publisher.publish(message)
-        return value in bench.values().get(key, "")
+        return value in rig.values().get(key, "")
 
     return tell
 
 
-def test_before_ros2_control_arrays_are_in_joint_order(bench: Bench, tmp_path: Path):
+def test_before_ros2_control_arrays_are_in_joint_order(rig: Bench, tmp_path: Path):
     """By the configuration that the export writes. Truth: closed-form lengths, all different."""
-    told, tell = started_before(bench, tmp_path), broadcast(bench)
-    bench.until(lambda: tell("pose_estimated_from", "strut_states"), "feedback through joint_states")
+    told, tell = started_before(rig, tmp_path), broadcast(rig)
+    rig.until(lambda: tell("pose_estimated_from", "strut_states"), "feedback through joint_states")
     wanted = closed_form_lengths(ASKEW)
     assert len(set(wanted.round(6))) == 6
-    bench.until(lambda: tell("pose_estimated_from", "") and (bench.send(ASKEW), told)[1], "an array")
+    rig.until(lambda: tell("pose_estimated_from", "") and (rig.send(ASKEW), told)[1], "an array")
     np.testing.assert_allclose(told[-1].data, wanted, rtol=0, atol=SAME)
 
 
-def test_before_ros2_control_its_own_joint_states_are_refused(bench: Bench, tmp_path: Path):
+def test_before_ros2_control_its_own_joint_states_are_refused(rig: Bench, tmp_path: Path):
     """What the configuration turns off: with it the node would read what it publishes itself."""
-    started_before(bench, tmp_path, publish_description=True)
-    tell = broadcast(bench)
-    bench.until(lambda: tell("last_bad_feedback", "several publishers"), "the reason")
+    started_before(rig, tmp_path, publish_description=True)
+    tell = broadcast(rig)
+    rig.until(lambda: tell("last_bad_feedback", "several publishers"), "the reason")

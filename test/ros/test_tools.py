@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from foreign_machines import Machine, with_frames
 from node_helpers import RELIABLE, Bench
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -38,14 +35,6 @@ def file(machine: Machine, tmp_path: Path) -> str:
     return str(machine.write(tmp_path / "machine.yaml"))
 
 
-@pytest.fixture
-def stranger(bench: Bench) -> Iterator[Node]:
-    """Another node, of another name."""
-    node = rclpy.create_node("stranger", context=bench.context)
-    yield node
-    node.destroy_node()
-
-
 def at_home(machine: Machine, tool: str | None = None, work: str | None = None, shift: float = 0.0) -> Pose:
     """Return the tool's pose in a frame (None: the usual ones) with the platform level and a shift above home."""
     used = machine.using(tool, work)
@@ -54,70 +43,70 @@ def at_home(machine: Machine, tool: str | None = None, work: str | None = None, 
     return Pose(tip, used.work.matrix.T @ used.tool.matrix)
 
 
-def started(bench: Bench, file: str, **parameters: object) -> None:
-    bench.compensator(geometry_file=file, model_file="ideal", **parameters)
+def started(rig: Bench, file: str, **parameters: object) -> None:
+    rig.compensator(geometry_file=file, model_file="ideal", **parameters)
 
 
-def heard(bench: Bench, kind: type, topic: str, qos: QoSProfile = RELIABLE) -> list:
+def heard(rig: Bench, kind: type, topic: str, qos: QoSProfile = RELIABLE) -> list:
     """Return a list of what is published from now on."""
     messages: list = []
-    bench.witness.create_subscription(kind, topic, messages.append, qos)
+    rig.witness.create_subscription(kind, topic, messages.append, qos)
     return messages
 
 
 # ---- frames ----
 
 
-def test_the_frame_id_picks_the_work_frame(bench: Bench, machine: Machine, file: str) -> None:
+def test_the_frame_id_picks_the_work_frame(rig: Bench, machine: Machine, file: str) -> None:
     """The same place in three frames gives the same struts: those of the zoo's own kinematics."""
-    started(bench, file)
+    started(rig, file)
     truth = machine.lengths(np.array([machine.home]), np.eye(3)[None])[0]
     for frame in ("work", "fixture"):
-        answer = bench.ask(at_home(machine, None, frame), frame)
+        answer = rig.ask(at_home(machine, None, frame), frame)
         np.testing.assert_allclose(answer.lengths, truth, rtol=0.0, atol=CLOSE)
     tip = np.array(machine.home) + np.array(machine.tool.position)
-    answer = bench.ask(Pose(tip, machine.tool.matrix), "base")
+    answer = rig.ask(Pose(tip, machine.tool.matrix), "base")
     np.testing.assert_allclose(answer.lengths, truth, rtol=0.0, atol=CLOSE)
-    bench.send(at_home(machine), "fixtures")
-    values = bench.until_status(ERROR, "refusing commands: frame_id")
+    rig.send(at_home(machine), "fixtures")
+    values = rig.until_status(ERROR, "refusing commands: frame_id")
     assert values["last_refusal"] == "frame_id must be one of base, work, fixture, not 'fixtures'"
-    bench.send(at_home(machine), "")
-    bench.until(lambda: bench.values().get("refused.frame_id") == "2")
-    bench.until(lambda: bench.values()["frame_id"] == "base")
+    rig.send(at_home(machine), "")
+    rig.until(lambda: rig.values().get("refused.frame_id") == "2")
+    rig.until(lambda: rig.values()["frame_id"] == "base")
 
 
-def test_frames_of_two_machines_have_prefixes(bench: Bench, machine: Machine, file: str) -> None:
-    started(bench, file, base_frame="left_base", work_frame="left_work", frame_prefix="left_")
-    bench.ask(at_home(machine, None, "fixture"), "left_fixture")
-    bench.send(at_home(machine, None, "fixture"), "fixture")
-    values = bench.until_status(ERROR, "refusing commands: frame_id")
+def test_frames_of_two_machines_have_prefixes(rig: Bench, machine: Machine, file: str) -> None:
+    started(rig, file, base_frame="left_base", work_frame="left_work", frame_prefix="left_")
+    rig.ask(at_home(machine, None, "fixture"), "left_fixture")
+    rig.send(at_home(machine, None, "fixture"), "fixture")
+    values = rig.until_status(ERROR, "refusing commands: frame_id")
     assert "left_base, left_work, left_fixture" in values["last_refusal"]
 
 
-def test_two_frames_of_one_name_are_refused(bench: Bench, file: str) -> None:
-    bench.compensator(start=False, geometry_file=file, model_file="ideal", work_frame="fixture")
-    assert not bench.change("configure")
-    assert bench.logged("parameter frame_prefix: with it work frame 'fixture' has the frame_id of another")
+def test_two_frames_of_one_name_are_refused(rig: Bench, file: str) -> None:
+    rig.compensator(start=False, geometry_file=file, model_file="ideal", work_frame="fixture")
+    assert not rig.change("configure")
+    assert rig.logged("parameter frame_prefix: with it work frame 'fixture' has the frame_id of another")
 
 
 # ---- tools ----
 
 
-def test_the_parameter_changes_the_tool_and_nothing_moves(bench: Bench, machine: Machine, file: str) -> None:
-    started(bench, file)
-    tools = heard(bench, String, "compensator/tool", LATCHED)
-    before = bench.ask(at_home(machine), "work")
-    assert bench.set_parameter("compensator", "tool", "probe").successful
-    bench.send(at_home(machine), "work")
-    values = bench.until_status(ERROR, "refusing commands: tool_changed")
+def test_the_parameter_changes_the_tool_and_nothing_moves(rig: Bench, machine: Machine, file: str) -> None:
+    started(rig, file)
+    tools = heard(rig, String, "compensator/tool", LATCHED)
+    before = rig.ask(at_home(machine), "work")
+    assert rig.set_parameter("compensator", "tool", "probe").successful
+    rig.send(at_home(machine), "work")
+    values = rig.until_status(ERROR, "refusing commands: tool_changed")
     assert "since the change to tool 'probe' no command was where the struts are" in values["last_refusal"]
-    after = bench.ask(at_home(machine, "probe", "fixture"), "fixture")
+    after = rig.ask(at_home(machine, "probe", "fixture"), "fixture")
     np.testing.assert_allclose(after.lengths, before.lengths, rtol=0.0, atol=CLOSE)
-    estimate = message_pose(bench.estimate(after.command))
+    estimate = message_pose(rig.estimate(after.command))
     tip = np.array(machine.home) + np.array(machine.tools["probe"].position)
     np.testing.assert_allclose(estimate.position, tip, rtol=0.0, atol=1e-10)
-    bench.until(lambda: [bench.values().get(key) for key in ("tool", "frame_id")] == ["probe", "fixture"])
-    bench.until(lambda: [message.data for message in tools][-1:] == ["probe"])
+    rig.until(lambda: [rig.values().get(key) for key in ("tool", "frame_id")] == ["probe", "fixture"])
+    rig.until(lambda: [message.data for message in tools][-1:] == ["probe"])
 
 
 def test_a_controller_selects_a_tool_by_a_topic(bench: Bench, machine: Machine, file: str) -> None:
@@ -137,85 +126,85 @@ def test_a_controller_selects_a_tool_by_a_topic(bench: Bench, machine: Machine, 
     bench.ask(at_home(machine, "stub"), "work")
 
 
-def test_a_stranger_who_selects_a_wrong_tool_stops_nothing(bench: Bench, machine: Machine, file: str, stranger) -> None:
+def test_a_stranger_who_selects_a_wrong_tool_stops_nothing(rig: Bench, machine: Machine, file: str, stranger) -> None:
     """He does not command: what he asks for in vain is said, and the controller's next step is taken as ever."""
-    started(bench, file)
+    started(rig, file)
     select = stranger.create_publisher(String, "select_tool", RELIABLE)
-    bench.until(select.get_subscription_count)
-    bench.ask(at_home(machine), "work")
+    rig.until(select.get_subscription_count)
+    rig.ask(at_home(machine), "work")
     select.publish(String(data="drill"))
-    values = bench.until_status(WARN, "tool refused: parameter tool: machine framed has no tool 'drill'")
+    values = rig.until_status(WARN, "tool refused: parameter tool: machine framed has no tool 'drill'")
     assert values["select_tool_by"] == "/stranger"
-    bench.ask(at_home(machine, shift=1e-4), "work")
+    rig.ask(at_home(machine, shift=1e-4), "work")
 
 
-def test_of_two_who_select_tools_none_is_obeyed(bench: Bench, machine: Machine, file: str, stranger) -> None:
-    started(bench, file)
-    select = bench.witness.create_publisher(String, "select_tool", RELIABLE)
+def test_of_two_who_select_tools_none_is_obeyed(rig: Bench, machine: Machine, file: str, stranger) -> None:
+    started(rig, file)
+    select = rig.witness.create_publisher(String, "select_tool", RELIABLE)
     other = stranger.create_publisher(String, "select_tool", RELIABLE)
-    bench.until(lambda: select.get_subscription_count() and other.get_subscription_count())
-    bench.ask(at_home(machine), "work")
-    values = bench.until_status(ERROR, "select_tool ignored: several_publishers: several publishers of /select_tool")
+    rig.until(lambda: select.get_subscription_count() and other.get_subscription_count())
+    rig.ask(at_home(machine), "work")
+    values = rig.until_status(ERROR, "select_tool ignored: several_publishers: several publishers of /select_tool")
     assert values["select_tool_by"] == "/stranger, /witness"
     for publisher in (select, other):
         publisher.publish(String(data="stub"))
-    bench.until(lambda: bench.values().get("refused_tools") == "2")
-    assert bench.values()["tool"] == "tool"
-    bench.ask(at_home(machine, shift=1e-4), "work")
+    rig.until(lambda: rig.values().get("refused_tools") == "2")
+    assert rig.values()["tool"] == "tool"
+    rig.ask(at_home(machine, shift=1e-4), "work")
 
 
-def test_the_tool_stays_while_the_machine_moves(bench: Bench, machine: Machine, file: str) -> None:
-    started(bench, file)
-    bench.ask(at_home(machine), "work")
-    bench.ask(at_home(machine, shift=2e-4), "work")
-    answer = bench.set_parameter("compensator", "tool", "probe")
+def test_the_tool_stays_while_the_machine_moves(rig: Bench, machine: Machine, file: str) -> None:
+    started(rig, file)
+    rig.ask(at_home(machine), "work")
+    rig.ask(at_home(machine, shift=2e-4), "work")
+    answer = rig.set_parameter("compensator", "tool", "probe")
     assert not answer.successful
     assert answer.reason.startswith("parameter tool: stays 'tool' while the machine moves: strut_")
-    assert bench.set_parameter("compensator", "tool", "tool").successful
-    bench.ask(at_home(machine, shift=3e-4), "work")
+    assert rig.set_parameter("compensator", "tool", "tool").successful
+    rig.ask(at_home(machine, shift=3e-4), "work")
 
 
 @pytest.mark.parametrize("value", ["drill", "", 3])
-def test_what_is_no_tool_is_refused(value: object, bench: Bench, file: str) -> None:
-    started(bench, file)
-    answer = bench.set_parameter("compensator", "tool", value)
+def test_what_is_no_tool_is_refused(value: object, rig: Bench, file: str) -> None:
+    started(rig, file)
+    answer = rig.set_parameter("compensator", "tool", value)
     assert not answer.successful
     assert "parameter tool: " in answer.reason
-    assert bench.nodes[0].get_parameter("tool").value == "tool"
+    assert rig.nodes[0].get_parameter("tool").value == "tool"
 
 
-def test_a_start_takes_the_tool_that_was_set(bench: Bench, machine: Machine, file: str) -> None:
-    bench.compensator(start=False, geometry_file=file, model_file="ideal", tool="probe")
-    assert bench.set_parameter("compensator", "tool", "drill").successful  # nobody knows the machine yet
-    assert not bench.change("configure")
-    assert bench.logged("cannot configure: machine framed has no tool 'drill'; it has tool, probe, stub")
-    bench.set_parameter("compensator", "tool", "stub")
-    assert bench.change("configure")
-    assert bench.change("activate")
-    bench.until(bench.matched)
+def test_a_start_takes_the_tool_that_was_set(rig: Bench, machine: Machine, file: str) -> None:
+    rig.compensator(start=False, geometry_file=file, model_file="ideal", tool="probe")
+    assert rig.set_parameter("compensator", "tool", "drill").successful  # nobody knows the machine yet
+    assert not rig.change("configure")
+    assert rig.logged("cannot configure: machine framed has no tool 'drill'; it has tool, probe, stub")
+    rig.set_parameter("compensator", "tool", "stub")
+    assert rig.change("configure")
+    assert rig.change("activate")
+    rig.until(rig.matched)
     truth = machine.lengths(np.array([machine.home]), np.eye(3)[None])[0]
-    answer = bench.ask(at_home(machine, "stub"), "work")
+    answer = rig.ask(at_home(machine, "stub"), "work")
     np.testing.assert_allclose(answer.lengths, truth, rtol=0.0, atol=CLOSE)
 
 
 # ---- travel ----
 
 
-def test_travel_is_answered_and_published_with_names_and_units(bench: Bench, machine: Machine, file: str) -> None:
-    started(bench, file)
-    early = bench.call(Trigger, "compensator/get_travel")
+def test_travel_is_answered_and_published_with_names_and_units(rig: Bench, machine: Machine, file: str) -> None:
+    started(rig, file)
+    early = rig.call(Trigger, "compensator/get_travel")
     assert not early.success
     assert "where the machine is is not known" in early.message
-    bench.ask(at_home(machine), "work")
-    bench.set_parameter("compensator", "tool", "probe")
-    bench.ask(at_home(machine, "probe", "fixture"), "fixture")
-    answer = bench.call(Trigger, "compensator/get_travel")
+    rig.ask(at_home(machine), "work")
+    rig.set_parameter("compensator", "tool", "probe")
+    rig.ask(at_home(machine, "probe", "fixture"), "fixture")
+    answer = rig.call(Trigger, "compensator/get_travel")
     assert answer.success
     assert answer.message.startswith("tool probe in fixture at x, y, z ")
     geometry = load_geometry(file).using("probe", "fixture")
     ways = travel(RealMachine(geometry, MachineModel("framed")), at_home(machine, "probe", "fixture"))
-    reports = heard(bench, DiagnosticStatus, "compensator/travel")
-    bench.until(lambda: reports, "a report")
+    reports = heard(rig, DiagnosticStatus, "compensator/travel")
+    rig.until(lambda: reports, "a report")
     values = {entry.key: entry.value for entry in reports[0].values}
     for way in ways:
         assert float(values[way.key]) == pytest.approx(way.shown, abs=2e-6)
@@ -225,10 +214,10 @@ def test_travel_is_answered_and_published_with_names_and_units(bench: Bench, mac
     assert (reports[0].hardware_id, reports[0].name) == ("framed", "compensator: travel")
 
 
-def test_nothing_is_worked_out_while_nobody_listens(bench: Bench, machine: Machine, file: str) -> None:
-    started(bench, file)
-    bench.ask(at_home(machine), "work")
-    node = bench.nodes[0]
+def test_nothing_is_worked_out_while_nobody_listens(rig: Bench, machine: Machine, file: str) -> None:
+    started(rig, file)
+    rig.ask(at_home(machine), "work")
+    node = rig.nodes[0]
     node._requests.look(1e12)
     assert node._requests._worker.process is None
 

@@ -39,22 +39,22 @@ def rviz() -> dict[str, Any]:
     return yaml.safe_load((VIEWS / "machine.rviz").read_text(encoding="utf-8"))["Visualization Manager"]
 
 
-def topics_of(bench: Bench) -> dict[str, Any]:
+def topics_of(rig: Bench) -> dict[str, Any]:
     """Return the publishers and subscriptions of the nodes by topic, publishers first."""
-    return {end.topic_name: end for node in bench.nodes for end in (*node.subscriptions, *node.publishers)}
+    return {end.topic_name: end for node in rig.nodes for end in (*node.subscriptions, *node.publishers)}
 
 
-def test_views_name_what_the_nodes_publish(bench: Bench) -> None:
+def test_views_name_what_the_nodes_publish(rig: Bench) -> None:
     """Topics, types, fields and reliability; a listener that wants more than is offered hears nothing."""
-    bench.machine(model="paper_machine.yaml")
-    ends = topics_of(bench)
+    rig.machine(model="paper_machine.yaml")
+    ends = topics_of(rig)
     for display in rviz()["Displays"]:
         topic = next((value for key, value in display.items() if key.endswith("Topic")), None)
         if topic is None or topic["Value"] == DESCRIPTION:
             continue
         end = ends["/" + topic["Value"]]
         assert end.msg_type.__name__ == SHOWS[display["Class"].rpartition("/")[2]]
-        offered = end.qos_profile.reliability if end in [p for node in bench.nodes for p in node.publishers] else None
+        offered = end.qos_profile.reliability if end in [p for node in rig.nodes for p in node.publishers] else None
         assert topic["Reliability Policy"] == "Best Effort" or offered in (None, ReliabilityPolicy.RELIABLE)
     layout = json.loads((VIEWS / "foxglove.json").read_text(encoding="utf-8"))
     scene = layout["configById"]["3D!machine"]
@@ -101,11 +101,11 @@ def test_views_name_frames_of_the_description() -> None:
     assert scene["followTf"] == scene["layers"]["grid"]["frameId"] == "base"
 
 
-def test_the_aggregator_waits_for_what_the_nodes_say(bench: Bench) -> None:
+def test_the_aggregator_waits_for_what_the_nodes_say(rig: Bench) -> None:
     """From the first status, before the node knows its machine, to the last: one name."""
-    bench.machine()
-    bench.until(lambda: bench.status() and bench.status("strut_drive"), "statuses")
-    said = {status.name for array in bench.seen["/diagnostics"] for status in array.status}
+    rig.machine()
+    rig.until(lambda: rig.status() and rig.status("strut_drive"), "statuses")
+    said = {status.name for array in rig.seen["/diagnostics"] for status in array.status}
     groups = yaml.safe_load((VIEWS / "diagnostics.yaml").read_text(encoding="utf-8"))["analyzers"]["ros__parameters"]
     waited = {
         name
@@ -212,10 +212,10 @@ def test_the_description_is_of_the_machine_that_runs(
     assert robot.find("ros2_control") is None  # nobody listens to strut_setpoints
 
 
-def test_the_description_can_be_left_to_another_node(bench: Bench) -> None:
+def test_the_description_can_be_left_to_another_node(rig: Bench) -> None:
     """As where ros2_control's joint_state_broadcaster publishes ``joint_states``."""
-    bench.compensator(publish_description=False, command_input="struts")
-    assert not {"/joint_states", f"/{DESCRIPTION}"} & set(topics_of(bench))
+    rig.compensator(publish_description=False, command_input="struts")
+    assert not {"/joint_states", f"/{DESCRIPTION}"} & set(topics_of(rig))
 
 
 @pytest.mark.usefixtures("shown")
@@ -249,24 +249,22 @@ def test_two_machines_in_one_graph_keep_to_their_frames(ros_context: Any, capfd:
     """As the launch file starts them: each takes commands in its own frames alone, and speaks in them."""
     here = (ros_context, capfd)
     with Bench(*here, "/left") as left, Bench(*here, "/right") as right:
-        for bench, side in ((left, "left"), (right, "right")):
+        for rig, side in ((left, "left"), (right, "right")):
             frames = {"base_frame": f"{side}/base", "work_frame": f"{side}/work"}
-            bench.drive(base_frame=f"{side}/base")
-            bench.compensator(**frames)
-        for bench, side, other in ((left, "left", "right"), (right, "right", "left")):
-            answer = bench.ask(HOME, f"{side}/work")
-            assert bench.estimate(answer.command).header.frame_id == f"{side}/base"
-            bench.until(lambda bench=bench: bench.seen["tool_pose_true"], "the true pose")
-            assert bench.seen["tool_pose_true"][-1].header.frame_id == f"{side}/base"
-            bench.until(lambda bench=bench: bench.seen["compensator/markers"], "markers")
-            markers = bench.seen["compensator/markers"][-1].markers
+            rig.drive(base_frame=f"{side}/base")
+            rig.compensator(**frames)
+        for rig, side, other in ((left, "left", "right"), (right, "right", "left")):
+            answer = rig.ask(HOME, f"{side}/work")
+            assert rig.estimate(answer.command).header.frame_id == f"{side}/base"
+            rig.until(lambda rig=rig: rig.seen["tool_pose_true"], "the true pose")
+            assert rig.seen["tool_pose_true"][-1].header.frame_id == f"{side}/base"
+            rig.until(lambda rig=rig: rig.seen["compensator/markers"], "markers")
+            markers = rig.seen["compensator/markers"][-1].markers
             assert {marker.header.frame_id for marker in markers} == {f"{side}/base"}
             for frame in (f"{other}/base", "base"):
-                before = len(bench.seen["strut_commands"])
-                bench.send(HOME, frame)
-                bench.until(
-                    lambda bench=bench, frame=frame: repr(frame) in bench.values().get("last_refusal", ""), frame
-                )
-                assert len(bench.seen["strut_commands"]) == before
-            assert bench.status().hardware_id == f"{side}/paper"
+                before = len(rig.seen["strut_commands"])
+                rig.send(HOME, frame)
+                rig.until(lambda rig=rig, frame=frame: repr(frame) in rig.values().get("last_refusal", ""), frame)
+                assert len(rig.seen["strut_commands"]) == before
+            assert rig.status().hardware_id == f"{side}/paper"
         np.testing.assert_allclose(left.seen["strut_commands"][-1].position, right.seen["strut_commands"][-1].position)

@@ -26,57 +26,57 @@ def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guards, "SHOWN_FOR", 0.3)
 
 
-def hear(bench: Bench, kind: type, topic: str, qos: QoSProfile = RELIABLE, **options: Any) -> list[Any]:
+def hear(rig: Bench, kind: type, topic: str, qos: QoSProfile = RELIABLE, **options: Any) -> list[Any]:
     """Return the list to which a topic's messages are appended from now on."""
     heard: list[Any] = []
-    bench.witness.create_subscription(kind, topic, heard.append, qos, **options)
+    rig.witness.create_subscription(kind, topic, heard.append, qos, **options)
     return heard
 
 
-def test_the_heartbeat_counts_every_beat_as_long_as_the_node_is_configured(bench):
-    bench.compensator(heartbeat_rate=200.0)
-    beats = hear(bench, UInt64, "compensator/heartbeat")
-    bench.until(lambda: len(beats) > 20, "heartbeats")
-    assert bench.change("deactivate")
+def test_the_heartbeat_counts_every_beat_as_long_as_the_node_is_configured(rig):
+    rig.compensator(heartbeat_rate=200.0)
+    beats = hear(rig, UInt64, "compensator/heartbeat")
+    rig.until(lambda: len(beats) > 20, "heartbeats")
+    assert rig.change("deactivate")
     inactive = len(beats)
-    bench.until(lambda: len(beats) > inactive + 20, "heartbeats of an inactive node")
-    assert bench.change("cleanup")
-    bench.barrier()
+    rig.until(lambda: len(beats) > inactive + 20, "heartbeats of an inactive node")
+    assert rig.change("cleanup")
+    rig.barrier()
     numbers = [beat.data for beat in beats]
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
     end, ended = time.monotonic() + 0.1, len(beats)
-    bench.until(lambda: time.monotonic() > end, "twenty beats' time")
+    rig.until(lambda: time.monotonic() > end, "twenty beats' time")
     assert len(beats) == ended
 
 
 @pytest.mark.parametrize("timeout", [0.1, 2.5])
-def test_a_command_is_valid_until_its_stamp_and_the_command_timeout(bench, timeout):
-    bench.compensator(command_timeout=timeout)
-    validities = hear(bench, TimeReference, "compensator/validity")
+def test_a_command_is_valid_until_its_stamp_and_the_command_timeout(rig, timeout):
+    rig.compensator(command_timeout=timeout)
+    validities = hear(rig, TimeReference, "compensator/validity")
     for pose in (HOME, near(HOME, (0.0, 0.0, 0.001))):
-        answer = bench.ask(pose)
+        answer = rig.ask(pose)
         stamp = answer.command.header.stamp
-        bench.until(lambda stamp=stamp: validities and validities[-1].header.stamp == stamp, "the command's validity")
+        rig.until(lambda stamp=stamp: validities and validities[-1].header.stamp == stamp, "the command's validity")
         lasting = Time.from_msg(validities[-1].time_ref) - Time.from_msg(stamp)
         assert lasting.nanoseconds == timeout * 1e9
         assert validities[-1].source == "/strut_commands"
-    stamp = bench.send(near(HOME, (0.0, 0.0, 0.12))).header.stamp
-    bench.until_status(ERROR, "refusing commands: step")
+    stamp = rig.send(near(HOME, (0.0, 0.0, 0.12))).header.stamp
+    rig.until_status(ERROR, "refusing commands: step")
     assert validities[-1].header.stamp != stamp  # what is refused prolongs nothing
 
 
-def test_the_stop_output_is_repeated_for_who_has_missed_what_is_latched(bench):
-    bench.compensator()
-    stops = hear(bench, Bool, "compensator/stopped", LATCHED_QOS)
-    bench.until(lambda: len(stops) >= 3, "the same once more, and again")
+def test_the_stop_output_is_repeated_for_who_has_missed_what_is_latched(rig):
+    rig.compensator()
+    stops = hear(rig, Bool, "compensator/stopped", LATCHED_QOS)
+    rig.until(lambda: len(stops) >= 3, "the same once more, and again")
     assert {stop.data for stop in stops[1:]} == {stops[-1].data}
 
 
-def test_without_a_timeout_commands_are_valid_for_ever_and_no_deadline_is_offered(bench):
-    node = bench.compensator(command_timeout=0.0)
-    validities, beats = hear(bench, TimeReference, "compensator/validity"), hear(bench, UInt64, "compensator/heartbeat")
-    bench.ask(HOME)
-    bench.until(lambda: len(beats) > 3, "heartbeats")
+def test_without_a_timeout_commands_are_valid_for_ever_and_no_deadline_is_offered(rig):
+    node = rig.compensator(command_timeout=0.0)
+    validities, beats = hear(rig, TimeReference, "compensator/validity"), hear(rig, UInt64, "compensator/heartbeat")
+    rig.ask(HOME)
+    rig.until(lambda: len(beats) > 3, "heartbeats")
     assert not validities
     assert deadline(node, "/strut_commands") == 0
 
@@ -149,15 +149,15 @@ def test_a_deadline_is_asked_for_where_a_parameter_says_so(bench):
     bench.ask(HOME)
 
 
-def test_the_drive_refuses_commands_that_are_no_longer_valid(bench):
-    bench.drive(command_validity=0.3, encoder_noise=0.0)
-    bench.until(lambda: bench.seen["strut_states"], "readings")
+def test_the_drive_refuses_commands_that_are_no_longer_valid(rig):
+    rig.drive(command_validity=0.3, encoder_noise=0.0)
+    rig.until(lambda: rig.seen["strut_states"], "readings")
     lengths = [float(v) for v in closed_form_lengths(HOME)]
-    message = JointState(name=list(bench.seen["strut_states"][-1].name), position=lengths, velocity=[0.0] * 6)
-    message.header.stamp = bench.stamp(-0.5)
-    bench.publish("strut_commands", message)
-    values = bench.until_status(ERROR, "refusing commands: stamp_past", "strut_drive")
+    message = JointState(name=list(rig.seen["strut_states"][-1].name), position=lengths, velocity=[0.0] * 6)
+    message.header.stamp = rig.stamp(-0.5)
+    rig.publish("strut_commands", message)
+    values = rig.until_status(ERROR, "refusing commands: stamp_past", "strut_drive")
     assert "s old, allowed 0.3 s" in values["last_refusal"]
-    message.header.stamp = bench.now()
-    bench.publish("strut_commands", message)
-    bench.until(lambda: bench.values("strut_drive").get("commands") == "1", "a fresh one")
+    message.header.stamp = rig.now()
+    rig.publish("strut_commands", message)
+    rig.until(lambda: rig.values("strut_drive").get("commands") == "1", "a fresh one")

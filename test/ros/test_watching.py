@@ -30,26 +30,26 @@ OFFSETS = np.array([-100.0, -50.0, 0.0, 50.0, 100.0, 200.0])
 """Of the struts, µm: actual = command + offset, so the corrections are −offset."""
 
 
-def watched(bench, geometry: str = "paper.yaml") -> Watcher:
-    """Return a watcher on the bench's executor."""
-    node = rclpy.create_node("hexapod_comp_watch", context=bench.context, namespace=bench.namespace, **QUIET)
-    return Watcher(load_geometry(geometry), bench.host(node))
+def watched(rig, geometry: str = "paper.yaml") -> Watcher:
+    """Return a watcher on the rig's executor."""
+    node = rclpy.create_node("hexapod_comp_watch", context=rig.context, namespace=rig.namespace, **QUIET)
+    return Watcher(load_geometry(geometry), rig.host(node))
 
 
-def test_what_is_heard_becomes_the_picture(bench, tmp_path):
+def test_what_is_heard_becomes_the_picture(rig, tmp_path):
     """Truth: the struts between the hexagon and the triangle of Song et al. at the commanded pose, from plane geometry;
     corrections are the offsets with the other sign. The estimate comes from the node's own commands; 1e-9 m is the
     solver's tolerance."""
-    bench.compensator(model_file=model_file(tmp_path, struts={"offset_um": OFFSETS.tolist()}), ramp_rate=1.0)
-    watcher, pose = watched(bench), near(HOME, (0.02, -0.01, 0.03), 4.0)
-    bench.settle(pose)
+    rig.compensator(model_file=model_file(tmp_path, struts={"offset_um": OFFSETS.tolist()}), ramp_rate=1.0)
+    watcher, pose = watched(rig), near(HOME, (0.02, -0.01, 0.03), 4.0)
+    rig.settle(pose)
 
     def there() -> bool:
-        bench.ask(pose)
+        rig.ask(pose)
         view = watcher.view()
         return view.latency is not None and view.corrections is not None and view.left is not None
 
-    bench.until(there, "the picture of the pose")
+    rig.until(there, "the picture of the pose")
     view = watcher.view()
     assert view.platform is not None
     assert view.commanded is not None
@@ -67,53 +67,53 @@ def test_what_is_heard_becomes_the_picture(bench, tmp_path):
 
 
 @pytest.mark.parametrize(("geometry", "close"), [("paper.yaml", 2e-9), ("example_6_6.yaml", 5e-8)])
-def test_the_error_left_is_along_the_axes_of_work(bench, geometry, close):
+def test_the_error_left_is_along_the_axes_of_work(rig, geometry, close):
     """Truth: measured struts are the distances between the joints with the platform 20 µm off along base x, by plain
     closure; seen from work that is the first row of its rotation. 2e-9 m is the solvers' tolerance; the 6-6 machine's
     screws turn with their joints, which plain closure leaves out: 0.2 % of the way."""
-    bench.hush("strut_states")
-    bench.speak("strut_states")
+    rig.hush("strut_states")
+    rig.speak("strut_states")
     machine = load_geometry(geometry)
-    watcher, home = watched(bench, geometry), machine.home
+    watcher, home = watched(rig, geometry), machine.home
 
     def measured(pose: Pose) -> np.ndarray:
         tops = pose.position + machine.platform_joints @ pose.rotation.T
         return np.linalg.norm(tops - machine.base_joints, axis=1)
 
-    bench.compensator(geometry_file=geometry, model_file="ideal")
-    bench.feed(measured(home))
-    bench.barrier()
+    rig.compensator(geometry_file=geometry, model_file="ideal")
+    rig.feed(measured(home))
+    rig.barrier()
     shift = np.array([20e-6, 0.0, 0.0])
 
     def there() -> bool:
-        bench.feed(measured(Pose(home.position + shift, home.rotation)))
-        bench.ask(home @ machine.tool)
+        rig.feed(measured(Pose(home.position + shift, home.rotation)))
+        rig.ask(home @ machine.tool)
         left = watcher.view().left
         return left is not None and np.abs(left.displacement - machine.work.rotation.T @ shift).max() < close
 
-    bench.until(there, "the error left")
+    rig.until(there, "the error left")
     view = watcher.view()
     assert view.left is not None
     assert view.left.turn < 1e-7
     np.testing.assert_allclose(view.measured, measured(Pose(home.position + shift, home.rotation)), atol=1e-12)
 
 
-def test_refusals_in_words(bench):
-    bench.compensator(model_file="ideal")
-    watcher = watched(bench)
-    bench.ask(HOME)
-    bench.send(Pose([0.0, 0.0, 3.0], np.eye(3)))
-    bench.until(lambda: "refusing commands" in words(watcher.view(), "paper"), "the refusal")
+def test_refusals_in_words(rig):
+    rig.compensator(model_file="ideal")
+    watcher = watched(rig)
+    rig.ask(HOME)
+    rig.send(Pose([0.0, 0.0, 3.0], np.eye(3)))
+    rig.until(lambda: "refusing commands" in words(watcher.view(), "paper"), "the refusal")
     text = words(watcher.view(), "paper")
     assert "<td>last refusal</td>" in text.replace(' style="padding-right: 1em"', "")
     assert "strut_drive" not in watcher.view().states
 
 
-def test_nothing_is_published(bench):
+def test_nothing_is_published(rig):
     """Only what rclpy gives every node: its parameters' events."""
-    watcher = watched(bench)
+    watcher = watched(rig)
     name, namespace = watcher.node.get_name(), watcher.node.get_namespace()
-    bench.until(lambda: watcher.node.get_publisher_names_and_types_by_node(name, namespace), "the graph")
+    rig.until(lambda: watcher.node.get_publisher_names_and_types_by_node(name, namespace), "the graph")
     assert [topic for topic, _ in watcher.node.get_publisher_names_and_types_by_node(name, namespace)] == [
         "/parameter_events"
     ]
@@ -121,19 +121,19 @@ def test_nothing_is_published(bench):
     assert not list(watcher.node.clients)
 
 
-def test_what_is_old_or_no_machine_is_not_known(bench, monkeypatch):
+def test_what_is_old_or_no_machine_is_not_known(rig, monkeypatch):
     """Struts without names, NaN before a controller is active, bytes that are no message: nothing, and no error."""
-    watcher = watched(bench)
+    watcher = watched(rig)
     names = [f"strut_{n}" for n in range(1, 7)]
     for message in (JointState(), JointState(name=names, position=[float("nan")] * 6)):
-        bench.publish("strut_states", message)
-        bench.until(lambda: "strut_states" in watcher._newest, "a message")
+        rig.publish("strut_states", message)
+        rig.until(lambda: "strut_states" in watcher._newest, "a message")
         assert watcher.view() == View()
         watcher._newest.clear()
     watcher._newest["tool_pose_estimate"] = (b"\0\1\0", np.inf)
     assert watcher.view() == View()
-    bench.feed(closed_form_lengths(HOME))
-    bench.until(lambda: watcher.view().measured is not None, "measured struts")
+    rig.feed(closed_form_lengths(HOME))
+    rig.until(lambda: watcher.view().measured is not None, "measured struts")
     monkeypatch.setattr(watching, "SILENT_AFTER", 0.0)
     assert watcher.view() == View()
 
@@ -254,7 +254,7 @@ def screenshot(browser: str, folder: Path, address: str, patience: int) -> list[
 
 
 @pytest.mark.timeout(700)
-def test_the_page_in_a_browser(bench, tmp_path):
+def test_the_page_in_a_browser(rig, tmp_path):
     """Truth: strut 1 is corrected by +100 µm and struts 5 and 6 by −100 and −200 µm, red and blue
     by the legend, and the compensator
     runs, in green. The page dims what it renders, so hues count, not brightness."""
@@ -263,27 +263,27 @@ def test_the_page_in_a_browser(bench, tmp_path):
     if browser is None:
         pytest.skip("no Chromium here")
     model = model_file(tmp_path, struts={"offset_um": OFFSETS.tolist()})
-    bench.drive(truth_file=model)
+    rig.drive(truth_file=model)
     patient = {"max_command_age": 0.0, "command_timeout": 0.0, "max_reading_age": 0.0, "feedback_timeout": 60.0}
-    bench.compensator(model_file=model, **patient)  # the browser takes all there is of the processor
-    watcher, page = watched(bench), WatchPage(load_geometry("paper.yaml"), port=free_port())
+    rig.compensator(model_file=model, **patient)  # the browser takes all there is of the processor
+    watcher, page = watched(rig), WatchPage(load_geometry("paper.yaml"), port=free_port())
     newest, due = View(), 0.0
 
     def shown() -> View:
         nonlocal newest, due
-        if time.monotonic() > due:  # no faster than the bench hears its own messages
-            bench.send(HOME)
+        if time.monotonic() > due:  # no faster than the rig hears its own messages
+            rig.send(HOME)
             newest, due = watcher.view(), time.monotonic() + 0.3
             page.show(newest)
         return newest
 
     try:
-        bench.settle(HOME)
-        bench.until(lambda: shown().platform is not None and bench.message() == "running", "the machine", 30.0)
+        rig.settle(HOME)
+        rig.until(lambda: shown().platform is not None and rig.message() == "running", "the machine", 30.0)
         for patience in (8, 40, 120):  # on a busy computer the scene comes later than the page
             command = screenshot(browser, tmp_path, page.address, patience)
             with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
-                bench.until(lambda process=process: shown() and process.poll() is not None, "the screenshot", 200.0)
+                rig.until(lambda process=process: shown() and process.poll() is not None, "the screenshot", 200.0)
             pixels = np.rint(255 * matplotlib.image.imread(tmp_path / "page.png")[..., :3]).astype(int)
             scene, panel = pixels[:, :800], pixels[:, 800:]
             others = np.stack([np.delete(scene, hue, axis=2).max(axis=2) for hue in (0, 2)], axis=2)
