@@ -14,7 +14,7 @@ from setuptools import find_packages, setup
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE / "tools"))
-from building import BuildCore  # noqa: E402 (lies beside this file, which is run from anywhere)
+from building import BuildCore, core_module  # noqa: E402 (lies beside this file, which is run from anywhere)
 
 PACKAGE_XML = ElementTree.parse(HERE / "package.xml")
 MAINTAINER = PACKAGE_XML.find("maintainer")
@@ -69,7 +69,7 @@ setup(
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     package_data={NAME: ["py.typed", "templates/*.html", "core/*.[ch]", "export/c/*", "export/ros2_control/*"]},
     cmdclass={"build_ext": BuildCore},
-    cffi_modules=["hexapod_comp/core/build.py:ffi"],
+    **core_module(),
     options={"bdist_wheel": {"py_limited_api": "cp310"}},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

@@ -17,7 +17,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from setuptools import build_meta
+from setuptools import Extension, build_meta
 from setuptools.build_meta import *  # noqa: F403 (the hooks that stay as they are)
 from setuptools.command.build_ext import build_ext
 
@@ -29,6 +29,16 @@ ZIG = [sys.executable, "-m", "ziglang", "cc", "-target", f"{platform.machine()}-
 NO_COMPILER = """no C compiler compiles and links a shared library here, and hexapod_comp builds its core with one.
   Debian, Ubuntu: apt-get install gcc libc6-dev; Fedora: dnf install gcc; without root: pip install ziglang.
   CC=... names another one."""
+
+NO_CFFI = f"""cffi is missing in {sys.executable}, and hexapod_comp builds its core with it.
+  Debian, Ubuntu: apt-get install python3-cffi; Fedora: dnf install python3-cffi; any: pip install cffi."""
+
+
+def core_module() -> dict[str, Any]:
+    """Return what setup() is told of the core; without cffi something that cannot be built, so that a build says so."""
+    if importlib.util.find_spec("cffi"):
+        return {"cffi_modules": ["hexapod_comp/core/build.py:ffi"]}
+    return {"ext_modules": [Extension("hexapod_comp.core._core", sources=[])]}
 
 
 def works(command: list[str]) -> bool:
@@ -53,6 +63,12 @@ def installed_compiler() -> list[str] | None:
 
 class BuildCore(build_ext):
     """Compile the extension with the compiler that is there, and without Python's own headers (core/stable_abi)."""
+
+    def run(self) -> None:
+        """Fail where cffi is missing, as setuptools would leave the core out without a word."""
+        if importlib.util.find_spec("cffi") is None:
+            sys.exit(f"setup.py: {NO_CFFI}")
+        super().run()
 
     def build_extensions(self) -> None:
         """Compile and link; no flag of the Python that runs this is taken over: its compiler may be another one."""
