@@ -1,10 +1,11 @@
-"""How much the tests see: mutants of the core, each changed in one place, and whether a test fails.
+"""How much the tests see: mutants of the package, each changed in one place, and whether a test fails.
 
-    python -m benchmarks.mutants [--count 200] [--seed 0] [--only N [N ...]]
+    python -m benchmarks.mutants [--count 300] [--seed 0] [--rooms ROOM ...] [--only N [N ...]]
 
 A mutant is a copy of the sources with one operator, ``not``, number, returned value or statement changed, drawn at
-random from all such places. The tests that concern its file run until one fails: it is killed, also when they run out
-of time. ``--only`` repeats mutants by their numbers, as after a new test.
+random from all such places of all rooms; in the C core, whose text is changed and compiled again, one operator, number
+or statement. The tests that concern its file run until one fails: it is killed, also when they run out of time.
+``--only`` repeats mutants by their numbers, as after a new test.
 Exits 1 when fewer than 95 % are killed. What it does is explained in doc/benchmarks.md.
 """
 
@@ -14,11 +15,14 @@ import argparse
 import ast
 import os
 import random
+import re
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterator
 from multiprocessing import get_context
 from pathlib import Path
@@ -32,17 +36,29 @@ import scipy.spatial.transform  # noqa: F401
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "hexapod_comp"
 FOLDER = ROOT / "out" / "mutants"
-CORE = ("pose.py", "calibration/estimator.py", "calibration/sensitivity.py", "calibration/selection.py")
-CORE += ("machine/*.py", "compensation/*.py")
-NOT_CORE = {"pictures.py"}
+NOT_DRAWN = {"pictures.py", "page.py", "shell_page.py", "__main__.py", "stable_abi"}
+"""Files and folders of what is judged by eye, or not ours."""
 
 TESTS = {
     "pose.py": ["test_pose.py", "ros/test_conversions.py", "machine"],
-    "machine": ["machine", "compensation", "virtual/test_simulation.py"],
-    "compensation": ["compensation", "machine/test_limits.py", "replay", "virtual/test_simulation.py"],
-    "calibration": ["calibration/test_sensitivity.py", "calibration/test_fit.py", "calibration/test_observability.py"],
+    "errors.py": ["test_errors.py", "formats"],
+    "core": ["core", "machine", "compensation", "export/test_c_core.py", "workspace"],
+    "machine": ["machine", "compensation", "calibration/test_sensitivity.py", "workspace"],
+    "compensation": ["compensation", "machine/test_limits.py", "replay", "ros"],
+    "calibration": ["calibration", "cli"],
+    "measurements": ["measurements", "cli", "calibration"],
+    "formats": ["formats", "measurements", "machine", "cli"],
+    "virtual": ["calibration/test_instruments.py", "cli/test_simulate.py", "measurements", "loop"],
+    "replay": ["replay", "ros/test_replay_node.py"],
+    "cli": ["cli", "test_doc_commands.py", "test_zoo.py"],
+    "ros": ["ros", "loop/test_processes.py"],
+    "viewer": ["ros"],
+    "testing": ["test_testing.py", "ros"],
 }
-"""Where a room's tests are, from near to far; before them run those whose file has the mutated module's name."""
+"""Where a room's tests are, from near to far, where not in the folder of its name alone."""
+
+LONGEST = 120
+"""Time of a test with a mutant that waits, s."""
 
 BAR = 0.95
 LIMIT = 20.0
@@ -61,6 +77,38 @@ SWAPS: dict[type, tuple[type, ...]] = {
 
 Mutant = tuple[ast.AST, str, object]
 """A node, the name of one of its fields, and what the field holds in the mutant."""
+
+CMutant = tuple[int, int, str]
+"""Beginning and end of what is replaced in a C file, and by what."""
+
+C_SWAPS = {
+    "<": ("<=", ">"), "<=": ("<", ">"), ">": (">=", "<"), ">=": (">", "<"), "==": ("!=",), "!=": ("==",),
+    "&&": ("||",), "||": ("&&",), "+": ("-",), "-": ("+",), "*": ("/",), "/": ("*",), "+=": ("-=",), "-=": ("+=",),
+}  # fmt: skip
+
+C_PLACES = re.compile(
+    r"(?<= )(?P<operator><=?|>=?|[=!]=|&&|\|\||[-+]=?|[*/])(?= )"
+    r"|(?<![\w.\]])(?P<number>\d+\.\d+(?:e[-+]?\d+)?|\d+)(?![\w.])"
+    r"|^ +(?P<statement>[\w.>\[\]-]+ [-+*/]?= [^;{}]+;)$",
+    re.MULTILINE,
+)
+"""What changes in C: operators between spaces, numbers, and assignments on a line of their own."""
+
+
+def c_mutants(text: str) -> Iterator[CMutant]:
+    """Yield all mutants of a C file; comments, texts, and lines of the preprocessor have none."""
+    hidden = re.compile(r"/\*.*?\*/|//[^\n]*|\"(?:\\.|[^\"\n])*\"|^#(?:[^\n]*\\\n)*[^\n]*", re.DOTALL | re.MULTILINE)
+    code = hidden.sub(lambda found: re.sub(r"[^\n]", "_", found[0]), text)
+    begin = code.find("{")  # before the first body stand declarations
+    for found in C_PLACES.finditer(code, max(begin, 0)):
+        kind = found.lastgroup or ""
+        if kind == "statement":
+            yield *found.span(kind), ";"
+        elif kind == "number":
+            number = found[kind]
+            yield *found.span(kind), repr(2.0 * float(number) or 1.0) if "." in number else str(int(number) + 1)
+        else:
+            yield from ((*found.span(kind), other) for other in C_SWAPS[found[kind]])
 
 
 def mutants(node: ast.AST) -> Iterator[Mutant]:
@@ -101,8 +149,14 @@ def changes(node: ast.AST) -> Iterator[Mutant]:
                 yield node, field, [*statements[:i], ast.copy_location(ast.Pass(), line), *statements[i + 1 :]]
 
 
-def describe(path: Path, mutant: Mutant) -> str:
+def describe(path: Path, mutant: Mutant | CMutant) -> str:
     """Return file, line, what stands there, and what changes."""
+    if isinstance(mutant[0], int):
+        text = path.read_text(encoding="utf-8")
+        begin, end, new = mutant
+        number = text.count("\n", 0, begin)
+        line = text.splitlines()[number].strip()
+        return f"{path.relative_to(PACKAGE)}:{number + 1}: {line}  [{text[begin:end]} → {new}]"
     node, field, value = mutant
     was = getattr(node, field)
     if field in ("body", "orelse", "finalbody"):
@@ -158,7 +212,7 @@ class Copy:
 
     def _run(self, tests: list[str], limit: float, *options: str) -> str:
         """Return what pytest prints in a process of its own, which has the libraries but nothing of the project."""
-        arguments = ["-q", "-p", "no:cacheprovider", "-o", "timeout=0", *options]
+        arguments = ["-q", "-p", "no:cacheprovider", "-o", f"timeout={LONGEST}", *options]
         arguments += dict.fromkeys(f"test/{test}" for test in tests)
         with tempfile.TemporaryFile("w+") as output:
             child = get_context("fork").Process(target=self._in_child, args=(arguments, limit, output.fileno()))
@@ -177,46 +231,78 @@ class Copy:
         sys.stdout.flush()
         os._exit(int(code))
 
-    def killed_by(self, path: Path, tree: ast.Module, mutant: Mutant) -> str:
+    def killed_by(self, path: Path, tree: ast.Module | str, mutant: Mutant | CMutant) -> str:
         """Put a mutant in its file's place, run the tests, and put the file back."""
-        node, field, value = mutant
-        was, place = getattr(node, field), self.folder / path.relative_to(ROOT)
+        place = self.folder / path.relative_to(ROOT)
         room = path.relative_to(PACKAGE).parts[0]
         own = [str(test.relative_to(ROOT / "test")) for test in (ROOT / "test").rglob(f"test_{path.stem}.py")]
-        parts = [[test] for test in dict.fromkeys(own + TESTS[room])]
-        setattr(node, field, value)
+        parts = [[test] for test in dict.fromkeys(own + TESTS.get(room, [room]))]
         try:
-            place.write_text(ast.unparse(ast.fix_missing_locations(tree)), encoding="utf-8")
+            place.write_text(mutated(tree, mutant), encoding="utf-8")
+            if path.suffix == ".c" and not self.compiled():
+                return "the compiler"
             return next(filter(None, map(self.failure, parts)), "")
         finally:
-            setattr(node, field, was)
             shutil.copy2(path, place)
+            if path.suffix == ".c":
+                (library,) = (PACKAGE / "core").glob("*.so")
+                (self.folder / library.relative_to(ROOT)).unlink(missing_ok=True)
+                shutil.copy2(library, self.folder / library.relative_to(ROOT))
+
+    def compiled(self) -> bool:
+        """Compile the core anew; tell whether that went."""
+        command = [sys.executable, "setup.py", "-q", "build_ext", "--inplace", "--force"]
+        return subprocess.run(command, cwd=self.folder, capture_output=True, check=False).returncode == 0
+
+
+def mutated(tree: ast.Module | str, mutant: Mutant | CMutant) -> str:
+    """Return the text of a mutant's file."""
+    if isinstance(tree, str):
+        begin, end, new = mutant
+        return f"{tree[:begin]}{new}{tree[end:]}"  # type: ignore[index,misc]
+    node, field, value = mutant
+    was = getattr(node, field)  # type: ignore[arg-type]
+    setattr(node, field, value)  # type: ignore[arg-type]
+    try:
+        return ast.unparse(ast.fix_missing_locations(tree))
+    finally:
+        setattr(node, field, was)  # type: ignore[arg-type]
 
 
 def main() -> int:
     """Draw mutants, try them and say which survive."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=200, metavar="N", help="how many mutants (default 200)")
+    parser.add_argument("--count", type=int, default=300, metavar="N", help="how many mutants (default 300)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the draw (default 0)")
+    parser.add_argument("--rooms", nargs="+", metavar="ROOM", help="of these rooms alone, as ros, cli or core")
     parser.add_argument("--only", type=int, nargs="+", metavar="N", help="only the mutants of these numbers")
     args = parser.parse_args()
-    files = [path for pattern in CORE for path in sorted(PACKAGE.glob(pattern)) if path.name not in NOT_CORE]
-    trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in files}
-    every = [(path, mutant) for path, tree in trees.items() for mutant in mutants(tree)]
+    files = [path for path in sorted(PACKAGE.rglob("*.[cp]*")) if path.suffix in (".c", ".py")]
+    files = [path for path in files if not NOT_DRAWN & set(path.relative_to(PACKAGE).parts)]
+    files = [path for path in files if not args.rooms or path.relative_to(PACKAGE).parts[0] in args.rooms]
+    texts = {path: path.read_text(encoding="utf-8") for path in files}
+    trees = {path: text if path.suffix == ".c" else ast.parse(text) for path, text in texts.items()}
+    every: list[tuple[Path, Mutant | CMutant]] = []
+    for path, tree in trees.items():
+        every += [(path, one) for one in (c_mutants(tree) if isinstance(tree, str) else mutants(tree))]
     drawn = list(enumerate(random.Random(args.seed).sample(every, args.count), 1))
     print(f"{len(every)} mutants of {len(files)} files; {len(drawn)} drawn with seed {args.seed}", flush=True)
     chosen = [one for one in drawn if not args.only or one[0] in args.only]
-    survived = 0
+    survived, rooms, start = 0, Counter[str](), time.monotonic()
     FOLDER.mkdir(parents=True, exist_ok=True)
     copy = Copy(FOLDER)
     for number, (path, mutant) in chosen:
         began, what = time.monotonic(), describe(path, mutant)
         by = copy.killed_by(path, trees[path], mutant)
         survived += not by
+        room = path.relative_to(PACKAGE).parts[0]
+        rooms.update([room] if by else [room, f"{room} survived"])
         outcome = f"killed   {what}  {by}" if by else f"SURVIVED {what}"
         print(f"{number:4} {outcome}  {time.monotonic() - began:.0f} s", flush=True)
     killed = len(chosen) - survived
-    print(f"{killed} of {len(chosen)} killed, {killed / len(chosen):.1%}")
+    for room in sorted(name for name in rooms if not name.endswith(" survived")):
+        print(f"{room}: {rooms[room] - rooms[f'{room} survived']} of {rooms[room]} killed")
+    print(f"{killed} of {len(chosen)} killed, {killed / len(chosen):.1%}; {time.monotonic() - start:.0f} s")
     return 0 if killed >= BAR * len(chosen) else 1
 
 
