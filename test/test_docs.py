@@ -48,7 +48,7 @@ def test_the_site_shows_every_page():
 
 
 def test_each_key_of_a_campaigns_noise_is_documented_with_its_default():
-    text = (ROOT / "doc" / "calibration.md").read_text(encoding="utf-8")
+    text = (ROOT / "doc" / "measuring.md").read_text(encoding="utf-8")
     for kind, sigma in DEFAULT_UNCERTAINTY.items():
         unit = "rad" if kind in ANGULAR_KINDS else "m"
         assert re.search(rf"^\| `{kind}_u{unit}` \|.+\| {sigma * 1e6:g} µ{unit} \|$", text, re.MULTILINE), kind
