@@ -90,7 +90,8 @@ def fit_lines(
     datum: Pose | None = None,
 ) -> LinesFit:
     """Fit Mou & King's polynomials to the readings on a rectangular grid of lines."""
-    _check_order(order)
+    if not (order in ("adjusted-r2", "aicc") or (isinstance(order, int) and order >= 1)):
+        raise CalibrationError("order", f"must be adjusted-r2, aicc or a whole number from 1, not {order!r}")
     readings, notes = _grid_readings(measurements)
     grid = _grid_of(readings)
     readings = readings._replace(node=_nearest_nodes(readings.point, grid))
@@ -99,32 +100,21 @@ def fit_lines(
     notes += remark
     field, fits = _fit_families(readings, GridField(grid, _no_lines(grid), probe=measurements.probe), order, zero)
     notes += _fit_notes(fits, order)
-    left = _without_means(measurements)
+    groups = np.unique(np.stack([measurements.run, measurements.channel]), axis=1, return_inverse=True)[1].ravel()
+    means = np.bincount(groups, measurements.value) / np.bincount(groups)
+    left = measurements.value - means[groups]
     if np.abs(left).max() <= LEAST_NOISE:  # one silent kind among others does this scheme no harm
         refuse_unmoved(measurements, left)
     model = MachineModel(
         machine=measurements.geometry.name,
         name=name or f"lines, {'5-D' if (readings.component >= 3).any() else '1-D'}",
         field=field,
-        region=_region_of(measurements, grid),
+        region=Region(np.array([[nodes[0] for nodes in grid], [nodes[-1] for nodes in grid]]), measurements.probe),
         origin=ModelOrigin(date or calendar.today().isoformat(), measurements.files, None, _origin_note(order)),
     )
     notes = list(dict.fromkeys((*measurements.notes, *notes)))
     model, held = hold(measurements.geometry, model, measurements.geometry.home if datum is None else datum, np.eye(6))
     return LinesFit(model, tuple(fits), tuple(notes), held, _misfit(measurements, fits))
-
-
-def _check_order(order: object) -> None:
-    """Raise on a rule that is none."""
-    if not (order in ("adjusted-r2", "aicc") or (isinstance(order, int) and order >= 1)):
-        raise CalibrationError("order", f"must be adjusted-r2, aicc or a whole number from 1, not {order!r}")
-
-
-def _without_means(measurements: MeasurementSet) -> np.ndarray:
-    """Return the readings less the mean of their channel in their run, shape (N,), m or rad."""
-    groups = np.unique(np.stack([measurements.run, measurements.channel]), axis=1, return_inverse=True)[1].ravel()
-    means = np.bincount(groups, measurements.value) / np.bincount(groups)
-    return measurements.value - means[groups]
 
 
 def _misfit(measurements: MeasurementSet, fits: Sequence[LineFit]) -> str:
@@ -315,11 +305,6 @@ def _datum_of(measurements: MeasurementSet, grid: Sequence[np.ndarray]) -> tuple
     if not beyond:
         return datum, []
     return datum, [f"home lies outside the box along {', '.join(beyond)}: lines are zero at the end next to it"]
-
-
-def _region_of(measurements: MeasurementSet, grid: Sequence[np.ndarray]) -> Region:
-    """Return the places of the measured point that the grid covers."""
-    return Region(np.array([[nodes[0] for nodes in grid], [nodes[-1] for nodes in grid]]), measurements.probe)
 
 
 # From readings to polynomials

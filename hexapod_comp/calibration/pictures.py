@@ -63,17 +63,13 @@ def strut_error_figure(
     for panels, (title, model) in zip(rows, models.items(), strict=True):
         errors = strut_length_errors(geometry, model, along, *line)
         for axes, lengths, letter, way in zip(panels, errors, "ab", ("forward →", "backward ←"), strict=True):
-            _strut_curves(axes, along, lengths)
+            for name, colour, values in zip(STRUT_NAMES, SIX_COLOURS, lengths.T, strict=True):
+                axes.plot(along * 1e3, values * 1e6, color=colour, lw=1.3, label=name)
             text = f"{picture_text(title)}, ({letter}) {way}"
             axes.set(title=text, xlabel="x in work, mm", ylabel="ΔL = actual − ideal, µm")
     figure.legend(*rows[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
     figure.suptitle(f"Strut length error along x in work, at y = {line[0] * 1e3:g} mm, z = {line[1] * 1e3:g} mm")
     return figure
-
-
-def _strut_curves(axes: Axes, along: np.ndarray, lengths: np.ndarray) -> None:
-    for name, colour, values in zip(STRUT_NAMES, SIX_COLOURS, lengths.T, strict=True):
-        axes.plot(along * 1e3, values * 1e6, color=colour, lw=1.3, label=name)
 
 
 def fitted_lines_figure(fit: LinesFit, axis: int = 0, component: int | None = None) -> Figure:
@@ -88,7 +84,11 @@ def fitted_lines_figure(fit: LinesFit, axis: int = 0, component: int | None = No
     for line in lines:
         i, j = line.nodes[0]
         _line_panel(panels[rows.index(i), columns.index(j)], line, fit.model.field.grid)
-    _label_edges(panels, axis, component)
+    for axes in panels[-1]:
+        axes.set_xlabel(f"{AXES[axis]} in work, mm")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("µm" if component < 3 else "µrad")
+    panels[0, 0].legend(fontsize=6)
     figure.suptitle(f"{COMPONENTS[component]} on lines along {AXES[axis]}: mean readings and polynomials")
     return figure
 
@@ -107,21 +107,20 @@ def _line_panel(axes: Axes, line: LineFit, grid: Sequence[np.ndarray]) -> None:
     axes.set_title(", ".join(where), fontsize=7)
 
 
-def _label_edges(panels: np.ndarray, axis: int, component: int) -> None:
-    for axes in panels[-1]:
-        axes.set_xlabel(f"{AXES[axis]} in work, mm")
-    for axes in panels[:, 0]:
-        axes.set_ylabel("µm" if component < 3 else "µrad")
-    panels[0, 0].legend(fontsize=6)
-
-
 def fit_figure(fit: ModelFit) -> Figure:
     """Show a joint fit: its residuals, the struts' errors, what the data determine, and what error to expect."""
     figure = Figure(figsize=(11, 7.6), layout="constrained")
     panels = figure.subplots(2, 2)
     _residual_panel(panels[0, 0], fit)
     _strut_panel(panels[0, 1], fit)
-    _sight_panel(panels[1, 0], fit)
+    axes = panels[1, 0]
+    blocks = fit.observability.blocks
+    names = [block.name for block in blocks]
+    axes.barh(names, [block.parameters for block in blocks], color="#d0d0d0", label="parameters")
+    axes.barh(names, [block.determined for block in blocks], height=0.5, color=WITH, label="determined by data")
+    axes.invert_yaxis()
+    axes.set(title="what the readings determine", xlabel="parameters")
+    axes.legend(fontsize=7)
     _tool_error_panel(panels[1, 1], fit)
     figure.suptitle(f"{picture_text(fit.measurements.geometry.name)}: scheme joint, {len(fit.measurements)} readings")
     return figure
@@ -154,17 +153,6 @@ def _strut_panel(axes: Axes, fit: ModelFit) -> None:
         axes.plot(at * 1e3, (errors - struts.offset[strut]) * 1e6, lw=1.2, color=SIX_COLOURS[strut], label=label)
     axes.set(title="strut errors: pitch and length map", xlabel="command, mm", ylabel="error, µm")
     axes.legend(ncols=2, fontsize=7)
-
-
-def _sight_panel(axes: Axes, fit: ModelFit) -> None:
-    """Show how many parameters of each block the data determine."""
-    blocks = fit.observability.blocks
-    names = [block.name for block in blocks]
-    axes.barh(names, [block.parameters for block in blocks], color="#d0d0d0", label="parameters")
-    axes.barh(names, [block.determined for block in blocks], height=0.5, color=WITH, label="determined by data")
-    axes.invert_yaxis()
-    axes.set(title="what the readings determine", xlabel="parameters")
-    axes.legend(fontsize=7)
 
 
 def _tool_error_panel(axes: Axes, fit: ModelFit) -> None:

@@ -159,7 +159,9 @@ class HexapodGeometry:
         put("platform_joints", frozen_array(self.platform_joints, (6, 3), "platform.joints"))
         put("kernel_joints", (self.base_joints, self.platform_joints))
         put("screw_lead", frozen_array(self.screw_lead, (6,), "screw.lead"))
-        _refuse_coincident(self.base_joints)
+        for i, j in np.argwhere(np.tril(coincident(self.base_joints), -1)):
+            problem = f"coincides with base joint {j + 1}; every strut needs a base joint of its own"
+            raise GeometryError(f"base.joints[{i}]", problem, self.base_joints[i].tolist())
         put("tools", {TOOL: self.tool, **self.tools, self.tool_name: self.tool})
         frames = {BASE: Pose.identity(), WORK: self.work, **self.work_frames, self.work_name: self.work}
         put("work_frames", frames | {BASE: Pose.identity()})
@@ -379,12 +381,6 @@ def _read_limits(section: Section) -> Limits:
         return Limits(**values)  # type: ignore[arg-type]
     except GeometryError as error:
         raise InputFileError(section.path, error.key, error.problem, error.value) from error
-
-
-def _refuse_coincident(base_joints: np.ndarray) -> None:
-    for i, j in np.argwhere(np.tril(coincident(base_joints), -1)):
-        problem = f"coincides with base joint {j + 1}; every strut needs a base joint of its own"
-        raise GeometryError(f"base.joints[{i}]", problem, base_joints[i].tolist())
 
 
 def coincident(joints: np.ndarray) -> np.ndarray:

@@ -131,7 +131,10 @@ def strut_lengths_batch(
 
     over_chunks(run, len(positions), threads)
     if not np.isfinite(lengths).all():
-        _refuse_not_finite(positions, rotations)
+        finite = np.isfinite(positions).all(axis=1) & np.isfinite(rotations).all(axis=(1, 2))
+        if not finite.all():
+            row = int(np.argmin(finite))
+            raise NotFiniteError(f"pose {row} is not finite", positions[row].tolist())
     return lengths
 
 
@@ -344,11 +347,3 @@ def batch_poses(positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarra
         problem = f"poses must have shapes (N, 3) and (N, 3, 3), not {positions.shape} and {rotations.shape}"
         raise KinematicsError(problem, positions.shape)
     return positions, np.ascontiguousarray(rotations)
-
-
-def _refuse_not_finite(positions: np.ndarray, rotations: np.ndarray) -> None:
-    """Raise for the first pose that is not finite; lengths can also overflow."""
-    finite = np.isfinite(positions).all(axis=1) & np.isfinite(rotations).all(axis=(1, 2))
-    if not finite.all():
-        row = int(np.argmin(finite))
-        raise NotFiniteError(f"pose {row} is not finite", positions[row].tolist())

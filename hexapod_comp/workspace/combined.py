@@ -138,7 +138,12 @@ def allocate(
     quantity: int = DISPLACEMENT,
 ) -> Allocation:
     """Return what each source may be so that the tool's error stays within what is allowed at every pose."""
-    _check_allocation(vectors, allowed, method)
+    if not 0.0 < allowed < np.inf:
+        raise ModelError("allowed", "must be above zero", allowed)
+    if method not in (RSS, WORST_CASE):
+        raise ModelError("method", f"must be {RSS} or {WORST_CASE}", method)
+    if not len(vectors):
+        raise ModelError("poses", "there are none: the workspace is empty", 0)
     types = len(errors.kinds)
     parts = _squares(errors, vectors, quantity) if method == RSS else _along_struts(errors, vectors)
 
@@ -163,16 +168,6 @@ def _equal_parts(only: np.ndarray, allowed: float, method: str) -> np.ndarray:
     acting = only > 0.0
     part = allowed / (np.sqrt(acting.sum()) if method == RSS else acting.sum())
     return np.where(acting, part / np.where(acting, only, 1.0), np.inf)
-
-
-def _check_allocation(vectors: np.ndarray, allowed: float, method: str) -> None:
-    """Refuse what cannot be allocated."""
-    if not 0.0 < allowed < np.inf:
-        raise ModelError("allowed", "must be above zero", allowed)
-    if method not in (RSS, WORST_CASE):
-        raise ModelError("method", f"must be {RSS} or {WORST_CASE}", method)
-    if not len(vectors):
-        raise ModelError("poses", "there are none: the workspace is empty", 0)
 
 
 def _alone(combined: Callable[[np.ndarray], np.ndarray], types: int, kind: int, allowed: float) -> float:

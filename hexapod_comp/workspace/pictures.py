@@ -85,7 +85,10 @@ def shells_figure(
     _draw(_space(figure, places[0], "the machine at home"), geometry, faces[-1], colours[-1], machine=True)
     axes = _space(figure, places[1], "cut open; the line is the platform at home" if len(layers) > 1 else "")
     _draw(axes, geometry, np.concatenate(faces), np.concatenate(colours))
-    _colour_bar(figure, axes, norm, quantity)
+    bar = figure.colorbar(ScalarMappable(norm, COLOURS), ax=axes, shrink=0.75, pad=0.12)
+    bar.set_label(quantity.label)
+    bar.ax.set_title(f"{norm.vmax:.4g}", fontsize=8)
+    bar.ax.set_xlabel(f"{norm.vmin:.4g}", fontsize=8)
     return figure
 
 
@@ -93,7 +96,8 @@ def causes_figure(geometry: HexapodGeometry, points: np.ndarray, findings: np.nd
     """Show what limits the workspace on its boundary, from above and from below."""
     faces, corners = _faces(points, 0.0)
     of_face = findings[corners]
-    area = _areas(faces)
+    diagonals = np.cross(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
+    area = 0.5 * np.linalg.norm(diagonals, axis=1)
     colours = np.array(CAUSE_COLOURS)[of_face]
     figure = Figure(figsize=(13.0, 5.2), layout=ConstrainedLayoutEngine(rect=(0.0, 0.08, 1.0, 0.92)))
     figure.suptitle(picture_text(title))
@@ -226,14 +230,6 @@ def _draw(axes: Any, geometry: HexapodGeometry, faces: np.ndarray, colours: np.n
     axes.set_box_aspect(high - low, zoom=0.88)  # room for the labels
 
 
-def _colour_bar(figure: Figure, axes: Any, norm: Normalize, quantity: Quantity) -> None:
-    """Draw a colour bar with its ends' values above and below."""
-    bar = figure.colorbar(ScalarMappable(norm, COLOURS), ax=axes, shrink=0.75, pad=0.12)
-    bar.set_label(quantity.label)
-    bar.ax.set_title(f"{norm.vmax:.4g}", fontsize=8)
-    bar.ax.set_xlabel(f"{norm.vmin:.4g}", fontsize=8)
-
-
 def _faces(points: np.ndarray, wedge: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """Return the quadrilaterals of a mesh, (F, 4, 3), less a wedge towards the eye, and their mesh indices."""
     quads = np.stack([points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]], axis=2)
@@ -248,9 +244,3 @@ def _of_faces(values: np.ndarray, corners: tuple[np.ndarray, np.ndarray]) -> np.
     """Return the mean of the four corners' values of faces given by their first corner."""
     i, j = corners
     return 0.25 * (values[i, j] + values[i, j + 1] + values[i + 1, j + 1] + values[i + 1, j])
-
-
-def _areas(faces: np.ndarray) -> np.ndarray:
-    """Return the areas of quadrilaterals, (F, 4, 3) → (F,)."""
-    diagonals = np.cross(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
-    return 0.5 * np.linalg.norm(diagonals, axis=1)

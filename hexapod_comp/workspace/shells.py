@@ -79,7 +79,9 @@ class Shell:
 
 def shell(reach: Reach, rings: int = 37, sectors: int = 72) -> Shell:
     """Find the boundary of a reach along rays from its centre."""
-    _check_mesh(rings, sectors)
+    for name, count, least in (("rings", rings, LEAST_RINGS), ("sectors", sectors, LEAST_SECTORS)):
+        if count < least:
+            raise GeometryError(name, f"must be at least {least}", count)
     ends, findings, struts, folded = _cast(reach, reach.centre, _directions(reach, rings, sectors))
     points = _closed(ends.reshape(rings, -1, 3))
     return Shell(
@@ -109,12 +111,6 @@ def _directions(reach: Reach, rings: int, sectors: int) -> np.ndarray:
     across, up = box[:2].mean() * np.cos(elevation), box[2] * np.sin(elevation) + 0.0 * azimuth
     directions = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), up], axis=-1).reshape(-1, 3)
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
-
-
-def _check_mesh(rings: int, sectors: int) -> None:
-    for name, count, least in (("rings", rings, LEAST_RINGS), ("sectors", sectors, LEAST_SECTORS)):
-        if count < least:
-            raise GeometryError(name, f"must be at least {least}", count)
 
 
 def _cast(

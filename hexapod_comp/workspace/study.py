@@ -126,7 +126,11 @@ def classify(
     return Study(
         *(geometry, budget, errors, reaches, extremes),
         rows=tuple(ranked(extremes, geometry)),
-        combined=_combined(errors, vectors, seed),
+        combined=Combined(
+            worst_case=worst_case(errors, vectors).max(axis=0),
+            root_sum_of_squares=root_sum_of_squares(vectors).max(axis=0),
+            monte_carlo=monte_carlo(vectors, DRAWS, seed=seed),
+        ),
         allocations=() if allowed is None else tuple(allocate(errors, vectors, allowed, way) for way in WAYS),
         agreement=compared(geometry, errors, reaches, compare, seed) if compare else None,
     )
@@ -135,15 +139,6 @@ def classify(
 def _finite(vectors: np.ndarray) -> np.ndarray:
     """Return the effects at the poses where all are known."""
     return vectors[np.isfinite(vectors).all(axis=(1, 2))]
-
-
-def _combined(errors: SingleErrors, vectors: np.ndarray, seed: int) -> Combined:
-    """Return the worst of all errors at once over the poses of some effects."""
-    return Combined(
-        worst_case=worst_case(errors, vectors).max(axis=0),
-        root_sum_of_squares=root_sum_of_squares(vectors).max(axis=0),
-        monte_carlo=monte_carlo(vectors, DRAWS, seed=seed),
-    )
 
 
 def random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
