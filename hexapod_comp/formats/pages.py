@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -60,30 +59,3 @@ def png(figure: Figure) -> Markup:
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=RESOLUTION, metadata={"Software": None})
     return Markup(f"data:image/png;base64,{base64.b64encode(stream.getvalue()).decode('ascii')}")
-
-
-# For pages that are put together in Python; render does the same from a template.
-
-
-def page(title: str, body: str, style: str = "") -> str:
-    """Return a page of HTML and CSS that are taken as they are."""
-    from markupsafe import Markup
-
-    return render("page.html", title=title, body=Markup(body), style=Markup(style))
-
-
-def shown(text: object, limit: int = LONGEST_CELL) -> str:
-    """Return a text from outside as HTML."""
-    from markupsafe import escape
-
-    return str(escape(printable(str(text), limit)))
-
-
-def table(header: Sequence[str], rows: Iterable[Sequence[object]], style: str = "") -> str:
-    """Return a table whose rows open with their name; all cells are texts from outside."""
-    return str(_environment().get_template("parts.html").module.table(header, rows, style))  # type: ignore[attr-defined]
-
-
-def picture(title: str, figure: Figure) -> str:
-    """Return a figure with its caption; the picture is in the page."""
-    return str(_environment().get_template("parts.html").module.picture(title, figure))  # type: ignore[attr-defined]

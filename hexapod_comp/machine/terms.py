@@ -18,7 +18,7 @@ SHOWN = {"um": ("mm", 1e3), "urad": ("mrad", 1e3), "ppm_per_percent": ("ppm per 
 
 @dataclass(frozen=True)
 class Row:
-    """What is said of one term."""
+    """The file's and the documentation's side of one term."""
 
     place: str  # section of the file, such as struts.wave
     key: str  # there, without its unit; empty: the field's name

@@ -10,18 +10,19 @@ from matplotlib.figure import Figure
 from strategies import paper_geometry
 
 from hexapod_comp.calibration.pictures import _strut_panel
-from hexapod_comp.formats.pages import page, table
+from hexapod_comp.formats.pages import _environment, render
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.machine.model_file import load_model
 
 
 def test_cells_of_a_wide_table_carry_their_columns_names():
     """The style sheet puts them in front of the cells where the screen is narrow and the head is not shown."""
+    table = _environment().get_template("parts.html").module.table
     text = table(("run", "readings", "RMS <σ>", "largest"), [("x1", 3, 0.5, 1.2)])
     assert '<table class="rows">' in text
     for cell in ('data-label="readings">3<', 'data-label="RMS &lt;σ&gt;">0.5<', 'data-label="largest">1.2<'):
         assert cell in text
-    assert "attr(data-label)" in page("", "")
+    assert "attr(data-label)" in render("page.html", title="")
     assert "class" not in table(("", "name"), [("a", "b")]).partition("<table")[2].partition(">")[0]
 
 
