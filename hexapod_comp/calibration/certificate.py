@@ -24,6 +24,7 @@ from ..measurements.iso230 import (
     DIAGONALS_STANDARD,
     CircularTest,
     Judged,
+    figure_cells,
     judge,
     largest,
     notes_of,
@@ -159,14 +160,9 @@ def _result(fit: ModelFit) -> Rows:
         between = f"{number(error.low * 1e6, 3)} … {number(error.high * 1e6, 3)}"
         sizes = number(error.before * 1e6, 2), number(error.after * 1e6, 3)
         rows.append((f"{name}: displacement", *sizes, between, number(COVERAGE * error.high * 1e6, 2), "µm"))
-        sizes, between, expanded = (
-            (number(error.rotation_before * 1e6, 1), number(error.rotation_after * 1e6, 2)),
-            "",
-            "",
-        )
-        if error.rotation_low is None or error.rotation_high is None:
-            between = "roll is not shown"
-        else:
+        sizes = number(error.rotation_before * 1e6, 1), number(error.rotation_after * 1e6, 2)
+        between, expanded = "roll is not shown", ""
+        if error.rotation_low is not None and error.rotation_high is not None:
             between = f"{number(error.rotation_low * 1e6, 2)} … {number(error.rotation_high * 1e6, 2)}"
             expanded = number(COVERAGE * error.rotation_high * 1e6, 1)
         rows.append((f"{name}: rotation", *sizes, between, expanded, "µrad"))
@@ -222,8 +218,7 @@ def _tests(before: Judged, after: Judged) -> Iterator[dict[str, object]]:
     for title, old, new in pairs:
         rows = []
         for name, test in old.items():
-            figures = test.figures(), new[name].figures()
-            cells = [" → ".join(number(part[key] * 1e6, 2) for part in figures) for key in COLUMNS]
+            cells = figure_cells(COLUMNS, 2, test.figures, new[name].figures)
             rows.append((name, f"{len(test.targets)} × {test.cycles}", *cells))
         worst = [largest(tests) for tests in (old, new)]
         ends = [f"{name[0]} {' → '.join(number(w[name] * 1e6, 2) for w in worst)} µm" for name in worst[0]]
@@ -240,11 +235,7 @@ def _circles(before: dict[str, CircularTest], after: dict[str, CircularTest]) ->
     """Return the tests of circles: each figure before → after, µm, a dash where a test cannot tell."""
     rows = []
     for name, test in before.items():
-        pairs = test.figures, after[name].figures
-        cells = [
-            " → ".join(number(figures[key] * 1e6, 2) for figures in pairs) if key in test.figures else "–"
-            for key in CIRCLE_COLUMNS
-        ]
+        cells = figure_cells(CIRCLE_COLUMNS, 2, test.figures, after[name].figures)
         rows.append((name, number(test.radius * 1e3, 1), *cells))
     header = ("run", "radius mm", *CIRCLE_COLUMNS.values())
     return {"title": f"{CIRCLES_STANDARD}, circles", "header": header, "rows": rows, "notes": notes_of(before)}

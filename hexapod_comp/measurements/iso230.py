@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,7 +15,6 @@ from ..formats.texts import aligned, number
 from .readings import BACKWARD, CHANNELS, FORWARD, LEAST_TRAVEL, LENGTH, MeasurementSet
 
 DIRECTIONS = ("up", "down")  # approach in the positive direction, and in the negative
-ARROWS = {"up": "↑", "down": "↓"}
 STANDARD_CYCLES = 5  # how often the standard has each target approached from each side
 TARGETS_PER_METRE = 5  # fewest targets per metre, and fewest at all, that the standard asks for
 LONGEST_TRAVEL = 2.0  # longest travel, m, for which the standard prescribes this test
@@ -24,149 +23,37 @@ SURE_REVERSAL = 3.0  # A mean reversal above so many of its standard errors is n
 
 
 @dataclass(frozen=True, eq=False)
-class OneDirection:
-    """Figures of the approach from one side; m targets."""
-
-    mean: np.ndarray  # (m,): mean unidirectional deviation x̄ᵢ, m
-    standard_deviation: np.ndarray  # (m,): estimator sᵢ of the repeatability, with n − 1, m
-
-    @property
-    def repeatability_at_targets(self) -> np.ndarray:
-        """Rᵢ = 4·sᵢ, shape (m,), m."""
-        return 4.0 * self.standard_deviation
-
-    @property
-    def repeatability(self) -> float:
-        """R↑ or R↓: the largest Rᵢ, m."""
-        return float(self.repeatability_at_targets.max())
-
-    @property
-    def systematic_deviation(self) -> float:
-        """E↑ or E↓: from the lowest to the highest mean, m."""
-        return float(np.ptp(self.mean))
-
-    @property
-    def interval(self) -> tuple[np.ndarray, np.ndarray]:
-        """x̄ᵢ − 2·sᵢ and x̄ᵢ + 2·sᵢ, shape (m,) each, m."""
-        return self.mean - 2.0 * self.standard_deviation, self.mean + 2.0 * self.standard_deviation
-
-    @property
-    def accuracy(self) -> float:
-        """A↑ or A↓: from the lowest x̄ᵢ − 2·sᵢ to the highest x̄ᵢ + 2·sᵢ, m."""
-        low, high = self.interval
-        return float(high.max() - low.min())
-
-
-@dataclass(frozen=True, eq=False)
-class BothDirections:
-    """Figures that take the approaches from both sides together; m targets."""
-
-    up: OneDirection  # what they are made of
-    down: OneDirection
-
-    @property
-    def mean(self) -> np.ndarray:
-        """Mean bidirectional deviation x̄ᵢ = (x̄ᵢ↑ + x̄ᵢ↓)/2, shape (m,), m."""
-        return 0.5 * (self.up.mean + self.down.mean)
-
-    @property
-    def reversal_at_targets(self) -> np.ndarray:
-        """Bᵢ = x̄ᵢ↑ − x̄ᵢ↓, shape (m,), m; negative where the motion lags, as with play."""
-        return self.up.mean - self.down.mean
-
-    @property
-    def reversal(self) -> float:
-        """B: the largest magnitude of Bᵢ, m."""
-        return float(np.abs(self.reversal_at_targets).max())
-
-    @property
-    def mean_reversal(self) -> float:
-        """B̄: the mean of Bᵢ with their signs, m."""
-        return float(self.reversal_at_targets.mean())
-
-    @property
-    def repeatability_at_targets(self) -> np.ndarray:
-        """Rᵢ = max(2·sᵢ↑ + 2·sᵢ↓ + abs(Bᵢ), Rᵢ↑, Rᵢ↓), shape (m,), m."""
-        up, down = self.up, self.down
-        across = 2.0 * up.standard_deviation + 2.0 * down.standard_deviation + np.abs(self.reversal_at_targets)
-        return np.max([across, up.repeatability_at_targets, down.repeatability_at_targets], axis=0)
-
-    @property
-    def repeatability(self) -> float:
-        """R: the largest Rᵢ, m."""
-        return float(self.repeatability_at_targets.max())
-
-    @property
-    def systematic_deviation(self) -> float:
-        """E: from the lowest to the highest of all x̄ᵢ↑ and x̄ᵢ↓, m."""
-        return float(np.ptp([self.up.mean, self.down.mean]))
-
-    @property
-    def mean_deviation(self) -> float:
-        """M: from the lowest to the highest x̄ᵢ, m."""
-        return float(np.ptp(self.mean))
-
-    @property
-    def accuracy(self) -> float:
-        """A: from the lowest x̄ᵢ − 2·sᵢ to the highest x̄ᵢ + 2·sᵢ of either direction, m."""
-        low, high = np.stack([self.up.interval, self.down.interval], axis=1)
-        return float(high.max() - low.min())
-
-
-@dataclass(frozen=True, eq=False)
 class PositioningTest:
-    """A positioning test with its figures, as :func:`evaluate` returns it."""
+    """A positioning test with its figures, as :func:`evaluate` returns it; directions are up, then down."""
 
     targets: np.ndarray  # (m,): commanded positions along the line, m
     cycles: int  # n, approaches of each target from each side
-    up: OneDirection | None  # figures by direction; None for the one that was not run
-    down: OneDirection | None
+    mean: np.ndarray  # (2, m): mean unidirectional deviations x̄ᵢ, m
+    standard_deviation: np.ndarray  # (2, m): estimators sᵢ of the repeatability, with n − 1, m
+    reversal: np.ndarray  # (m,): Bᵢ = x̄ᵢ↑ − x̄ᵢ↓, m; negative where the motion lags, as with play
+    repeatability: np.ndarray  # (3, m): Rᵢ↑, Rᵢ↓ and Rᵢ of both directions, m
+    figures: dict[str, float]  # the axis' figures by the standard's symbols, m: ``A``, ``A_up``, …, ``B_mean``, ``M``
     notes: tuple[str, ...]  # where the test departs from the standard's, and what looks wrong: one sentence each
 
-    @property
-    def both(self) -> BothDirections | None:
-        """Figures of both directions together, None after a unidirectional test."""
-        return None if self.up is None or self.down is None else BothDirections(self.up, self.down)
 
-    @property
-    def directions(self) -> dict[str, OneDirection]:
-        """The directions that were run, by name."""
-        pairs = zip(DIRECTIONS, (self.up, self.down), strict=True)
-        return {name: one for name, one in pairs if one is not None}
-
-    def figures(self) -> dict[str, float]:
-        """Return the axis' figures, m, by the standard's symbols: ``A``, ``A_up``, …, ``B_mean``, ``M``."""
-        values: dict[str, float] = {}
-        parts = {"": self.both, **{f"_{name}": one for name, one in self.directions.items()}}
-        for suffix, part in parts.items():
-            if part is not None:
-                values[f"A{suffix}"] = part.accuracy
-                values[f"E{suffix}"] = part.systematic_deviation
-                values[f"R{suffix}"] = part.repeatability
-        if self.both is not None:
-            values |= {"M": self.both.mean_deviation, "B": self.both.reversal, "B_mean": self.both.mean_reversal}
-        return values
-
-
-def evaluate(targets: np.ndarray, deviations: np.ndarray, directions: Sequence[str] = DIRECTIONS) -> PositioningTest:
-    """Return the figures of ISO 230-2:2014 for one axis, or one line."""
-    names = _checked_directions(directions)
+def evaluate(targets: np.ndarray, deviations: np.ndarray) -> PositioningTest:
+    """Return the figures of ISO 230-2:2014 for one line; deviations (up and down, cycles, targets), m."""
     positions = _checked_targets(targets)
-    readings = _checked_deviations(deviations, names, len(positions))
-    of_direction = {name: _one_direction(readings[k]) for k, name in enumerate(names)}
-    up, down = of_direction.get("up"), of_direction.get("down")
-    cycles = readings.shape[1]
-    notes = _design_notes(positions, cycles)
-    if up is not None and down is not None:
-        notes += _swap_notes(BothDirections(up, down), cycles)
-    return PositioningTest(positions, cycles, up, down, tuple(notes))
-
-
-def _checked_directions(directions: Sequence[str]) -> tuple[str, ...]:
-    names = tuple(directions)
-    if not names or len(set(names)) < len(names) or not set(names) <= set(DIRECTIONS):
-        raise ModelError("directions", "must be (up, down), or one of them", list(names))
-    return names
+    readings = _checked_deviations(deviations, len(positions))
+    mean, s = readings.mean(axis=1), readings.std(axis=1, ddof=1)
+    low, high = mean - 2.0 * s, mean + 2.0 * s
+    reversal = mean[0] - mean[1]
+    repeatability = np.stack([*(4.0 * s), 2.0 * s[0] + 2.0 * s[1] + np.abs(reversal)])
+    repeatability[2] = repeatability.max(axis=0)
+    figures = {"A": high.max() - low.min(), "E": np.ptp(mean), "R": repeatability[2].max()}
+    for d, name in enumerate(DIRECTIONS):
+        figures[f"A_{name}"] = high[d].max() - low[d].min()
+        figures[f"E_{name}"] = np.ptp(mean[d])
+        figures[f"R_{name}"] = repeatability[d].max()
+    figures |= {"M": np.ptp(mean.mean(axis=0)), "B": np.abs(reversal).max(), "B_mean": reversal.mean()}
+    notes = _design_notes(positions, readings.shape[1]) + _swap_notes(reversal, s, readings.shape[1])
+    figures = {name: float(value) for name, value in figures.items()}
+    return PositioningTest(positions, readings.shape[1], mean, s, reversal, repeatability, figures, tuple(notes))
 
 
 def _checked_targets(targets: np.ndarray) -> np.ndarray:
@@ -181,15 +68,15 @@ def _checked_targets(targets: np.ndarray) -> np.ndarray:
     return positions
 
 
-def _checked_deviations(deviations: np.ndarray, names: tuple[str, ...], count: int) -> np.ndarray:
-    """Return the deviations as an array (directions, cycles, targets) in which every reading is there."""
+def _checked_deviations(deviations: np.ndarray, count: int) -> np.ndarray:
+    """Return the deviations as an array (2 directions, cycles, targets) in which every reading is there."""
     try:
         readings = np.asarray(deviations, dtype=float)
     except ValueError as error:  # ragged lists
         problem = "every target needs the same number of readings from each direction"
         raise ModelError("deviations", problem) from error
-    if readings.ndim != 3 or readings.shape[0] != len(names) or readings.shape[2] != count:
-        problem = f"must have the shape ({len(names)} directions, cycles, {count} targets)"
+    if readings.ndim != 3 or readings.shape[0] != 2 or readings.shape[2] != count:
+        problem = f"must have the shape (2 directions, cycles, {count} targets)"
         raise ModelError("deviations", problem, readings.shape)
     if readings.shape[1] < 2:
         problem = "a standard deviation needs at least two cycles"
@@ -197,16 +84,9 @@ def _checked_deviations(deviations: np.ndarray, names: tuple[str, ...], count: i
     wrong = np.argwhere(~np.isfinite(readings))
     if len(wrong):
         direction, cycle, target = wrong[0]
-        where = f"deviations, {names[direction]}, cycle {cycle + 1}, target {target + 1}"
+        where = f"deviations, {DIRECTIONS[direction]}, cycle {cycle + 1}, target {target + 1}"
         raise ModelError(where, "must be a finite number, m", float(readings[direction, cycle, target]))
     return readings
-
-
-def _one_direction(readings: np.ndarray) -> OneDirection:
-    """Return mean and estimator of each target from readings (cycles, targets)."""
-    mean, standard_deviation = readings.mean(axis=0), readings.std(axis=0, ddof=1)
-    mean.flags.writeable = standard_deviation.flags.writeable = False
-    return OneDirection(mean, standard_deviation)
 
 
 def _design_notes(targets: np.ndarray, cycles: int) -> list[str]:
@@ -229,63 +109,46 @@ def _design_notes(targets: np.ndarray, cycles: int) -> list[str]:
     return notes
 
 
-def _swap_notes(both: BothDirections, cycles: int) -> list[str]:
+def _swap_notes(reversal: np.ndarray, deviation: np.ndarray, cycles: int) -> list[str]:
     """Return a note when the motion leads instead of lagging, at every target and beyond chance."""
-    variance = both.up.standard_deviation**2 + both.down.standard_deviation**2
-    standard_error = math.sqrt(float(variance.sum()) / cycles) / len(variance)
-    if both.reversal_at_targets.min() <= 0.0 or both.mean_reversal <= SURE_REVERSAL * standard_error:
+    standard_error = math.sqrt(float((deviation**2).sum()) / cycles) / len(reversal)
+    mean = float(reversal.mean())
+    if reversal.min() <= 0.0 or mean <= SURE_REVERSAL * standard_error:
         return []
     return [
-        f"the reversal is positive at every target (mean {both.mean_reversal * 1e6:.3f} µm), where play makes it"
+        f"the reversal is positive at every target (mean {mean * 1e6:.3f} µm), where play makes it"
         " negative: directions or sign swapped, or backlash compensated too much?"
     ]
 
 
+ROWS = {
+    "accuracy A": ("A", "A_up", "A_down"),
+    "systematic deviation E": ("E", "E_up", "E_down"),
+    "repeatability R": ("R", "R_up", "R_down"),
+    "mean bidirectional deviation M": ("M",),
+    "reversal B": ("B",),
+    "mean reversal B̄": ("B_mean",),
+}
+
+
 def report(test: PositioningTest, standard: str = "ISO 230-2:2014") -> str:
     """Return a test as text, under the name of its standard: targets in mm, everything else in µm, notes below."""
-    arrows = "".join(ARROWS[name] for name in test.directions)
+
+    def cells(values: Iterable[float]) -> str:
+        return "".join(f"{round(value * 1e6, 3) + 0.0:10.3f}" for value in values)  # never −0
+
     travel = float(np.ptp(test.targets)) * 1e3
-    title = f"{standard}: {len(test.targets)} targets over {travel:g} mm, {test.cycles} cycles {arrows}; µm"
-    lines = [title, "", *_target_lines(test), "", *_figure_lines(test)]
+    lines = [f"{standard}: {len(test.targets)} targets over {travel:g} mm, {test.cycles} cycles ↑↓; µm", ""]
+    names = ("mean ↑", "mean ↓", "s ↑", "s ↓", "R ↑", "R ↓", "B", "R")
+    lines.append("target mm".rjust(12) + "".join(name.rjust(10) for name in names))
+    columns = [*test.mean, *test.standard_deviation, *test.repeatability[:2], test.reversal, test.repeatability[2]]
+    lines += [f"{test.targets[i] * 1e3:12.4f}" + cells(v[i] for v in columns) for i in np.argsort(test.targets)]
+    lines += ["", " " * 30 + "".join(name.rjust(10) for name in ("both", "↑", "↓"))]
+    for name, keys in ROWS.items():
+        lines.append(name + " " * (30 - len(name.replace("\u0304", ""))) + cells(test.figures[key] for key in keys))
     if test.notes:
         lines += ["", *(f"note: {note}" for note in test.notes)]
     return "\n".join(lines)
-
-
-def _target_lines(test: PositioningTest) -> list[str]:
-    """Return the table of the targets, in ascending order."""
-    columns = {f"mean {ARROWS[name]}": one.mean for name, one in test.directions.items()}
-    columns |= {f"s {ARROWS[name]}": one.standard_deviation for name, one in test.directions.items()}
-    columns |= {f"R {ARROWS[name]}": one.repeatability_at_targets for name, one in test.directions.items()}
-    if test.both is not None:
-        columns |= {"B": test.both.reversal_at_targets, "R": test.both.repeatability_at_targets}
-    lines = ["target mm".rjust(12) + "".join(name.rjust(10) for name in columns)]
-    for i in np.argsort(test.targets):
-        lines.append(f"{test.targets[i] * 1e3:12.4f}" + "".join(_micrometres(v[i]) for v in columns.values()))
-    return lines
-
-
-def _figure_lines(test: PositioningTest) -> list[str]:
-    """Return the table of the axis' figures; a dash where the test cannot tell, a blank where there is none."""
-    figures = test.figures()
-    rows = {
-        "accuracy A": ("A", "A_up", "A_down"),
-        "systematic deviation E": ("E", "E_up", "E_down"),
-        "repeatability R": ("R", "R_up", "R_down"),
-        "mean bidirectional deviation M": ("M",),
-        "reversal B": ("B",),
-        "mean reversal B̄": ("B_mean",),
-    }
-    lines = [" " * 30 + "both".rjust(10) + "↑".rjust(10) + "↓".rjust(10)]
-    for name, keys in rows.items():
-        cells = [_micrometres(figures[key]) if key in figures else "–".rjust(10) for key in keys]
-        lines.append(name + " " * (30 - len(name.replace("\u0304", ""))) + "".join(cells))
-    return lines
-
-
-def _micrometres(value: float) -> str:
-    """Return a length in µm, ten characters wide, never −0."""
-    return f"{round(value * 1e6, 3) + 0.0:10.3f}"
 
 
 SENSES = {"ccw": FORWARD, "cw": BACKWARD}  # counter-clockwise and clockwise, seen against the circle's axis
@@ -586,18 +449,25 @@ def notes_of(tests: Mapping[str, PositioningTest] | Mapping[str, CircularTest]) 
     return list(dict.fromkeys(note for test in tests.values() for note in test.notes))
 
 
+def figure_cells(columns: Iterable[str], digits: int, *figures: Mapping[str, float]) -> list[str]:
+    """Return figures by their symbols, µm, of one test or before → after; a dash where a test cannot tell."""
+    return [
+        " → ".join(number(part[key] * 1e6, digits) for part in figures) if key in figures[0] else "–" for key in columns
+    ]
+
+
 def circle_table(tests: Mapping[str, CircularTest]) -> str:
     """Return the figures of several circles, one row each, µm; a dash where a test cannot tell."""
     rows = []
     for name, test in tests.items():
-        cells = [number(test.figures[key] * 1e6, 3) if key in test.figures else "–" for key in CIRCLE_COLUMNS]
+        cells = figure_cells(CIRCLE_COLUMNS, 3, test.figures)
         rows.append((name, number(test.radius * 1e3, 1), str(sum(test.readings.values())), *cells, "um"))
     return aligned(("run", "radius mm", "readings", *CIRCLE_COLUMNS.values(), ""), rows)
 
 
 def largest(tests: Mapping[str, PositioningTest]) -> dict[str, float]:
     """Return ISO 230-6's figures of diagonals of one kind together, m: ``E_d`` and ``B_d``, the largest of them."""
-    both = [test.figures() for test in tests.values()]
+    both = [test.figures for test in tests.values()]
     return {f"{name}_d": max(figures[name] for figures in both) for name in ("E", "B")}
 
 
@@ -606,9 +476,7 @@ def table(tests: Mapping[str, PositioningTest]) -> str:
     header = ("run", "targets", "cycles", *COLUMNS.values(), "")
     rows = []
     for name, test in tests.items():
-        figures = test.figures()
-        cells = [number(figures[key] * 1e6, 3) for key in COLUMNS]
-        rows.append((name, str(len(test.targets)), str(test.cycles), *cells, "um"))
+        rows.append((name, str(len(test.targets)), str(test.cycles), *figure_cells(COLUMNS, 3, test.figures), "um"))
     return aligned(header, rows)
 
 
@@ -626,10 +494,10 @@ def standards_json(judged: Judged) -> dict[str, Any]:
     """Return the figures as plain numbers by standard and run, with their unit in the keys: ``A_m``, ``E_up_m``, …"""
     result: dict[str, Any] = {}
     if judged.axes:
-        result["iso230_2"] = {name: with_units(test.figures()) for name, test in judged.axes.items()}
+        result["iso230_2"] = {name: with_units(test.figures) for name, test in judged.axes.items()}
     if judged.diagonals:
         kinds = judged.diagonals.items()
-        figures = {kind: {name: with_units(test.figures()) for name, test in tests.items()} for kind, tests in kinds}
+        figures = {kind: {name: with_units(test.figures) for name, test in tests.items()} for kind, tests in kinds}
         result["iso230_6"] = {**figures, "largest": {kind: with_units(largest(tests)) for kind, tests in kinds}}
     if judged.circles:
         result["iso230_4"] = {name: with_units(test.figures) for name, test in judged.circles.items()}

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from strategies import fixed, seeds
 
 from hexapod_comp.errors import ModelError
-from hexapod_comp.measurements.iso230 import BothDirections, PositioningTest, evaluate, report
+from hexapod_comp.measurements.iso230 import PositioningTest, evaluate, report
 
 TARGETS = np.array([0.004, 0.103, 0.196, 0.305, 0.398, 0.501])
 """Six targets, m, unevenly spaced."""
@@ -57,12 +57,6 @@ def example() -> PositioningTest:
     return evaluate(TARGETS, np.array([UP, DOWN]) * MICROMETRE)
 
 
-@pytest.fixture(scope="module")
-def both(example: PositioningTest) -> BothDirections:
-    assert example.both is not None
-    return example.both
-
-
 def um(*values: float) -> object:
     """Return what figures in m must be near to, from µm."""
     return pytest.approx([v * MICROMETRE for v in values], **EXACT)
@@ -71,65 +65,43 @@ def um(*values: float) -> object:
 # One figure at a time, each with its arithmetic.
 
 
-def test_means(both: BothDirections) -> None:
+def test_means(example: PositioningTest) -> None:
     """Target 5 ↑: (−3 + 1 − 1 − 3 + 1)/5 = −5/5 = −1."""
-    assert both.up.mean.tolist() == um(0, 2, 5, 3, -1, 1)
-    assert both.down.mean.tolist() == um(3, 4, 9, 8, 1, 4)
+    assert example.mean[0].tolist() == um(0, 2, 5, 3, -1, 1)
+    assert example.mean[1].tolist() == um(3, 4, 9, 8, 1, 4)
 
 
-def test_standard_deviations(both: BothDirections) -> None:
+def test_standard_deviations(example: PositioningTest) -> None:
     """Target 5 ↑: deviations from −1 are −2, 2, 0, −2, 2; (4 + 4 + 0 + 4 + 4)/4 = 4; root 2."""
-    assert both.up.standard_deviation.tolist() == um(0.5, 1, 1, 0.5, 2, 0.5)
-    assert both.down.standard_deviation.tolist() == um(0.5, 1, 0.5, 1.5, 0.25, 0.5)
+    assert example.standard_deviation[0].tolist() == um(0.5, 1, 1, 0.5, 2, 0.5)
+    assert example.standard_deviation[1].tolist() == um(0.5, 1, 0.5, 1.5, 0.25, 0.5)
 
 
-def test_mean_of_both_directions(both: BothDirections) -> None:
-    """(0 + 3)/2, (2 + 4)/2, (5 + 9)/2, (3 + 8)/2, (−1 + 1)/2, (1 + 4)/2; M = 7 − 0."""
-    assert both.mean.tolist() == um(1.5, 3, 7, 5.5, 0, 2.5)
-    assert [both.mean_deviation] == um(7)
+def test_reversal(example: PositioningTest) -> None:
+    """0 − 3, 2 − 4, 5 − 9, 3 − 8, −1 − 1, 1 − 4."""
+    assert example.reversal.tolist() == um(-3, -2, -4, -5, -2, -3)
 
 
-def test_reversal(both: BothDirections) -> None:
-    """0 − 3, 2 − 4, 5 − 9, 3 − 8, −1 − 1, 1 − 4; largest magnitude 5; mean −(3 + 2 + 4 + 5 + 2 + 3)/6 = −19/6."""
-    assert both.reversal_at_targets.tolist() == um(-3, -2, -4, -5, -2, -3)
-    assert [both.reversal, both.mean_reversal] == um(5, -19 / 6)
-
-
-def test_repeatability_of_one_direction(both: BothDirections) -> None:
-    """Four times s: ↑ 2, 4, 4, 2, 8, 2, largest 8; ↓ 2, 4, 2, 6, 1, 2, largest 6."""
-    assert both.up.repeatability_at_targets.tolist() == um(2, 4, 4, 2, 8, 2)
-    assert both.down.repeatability_at_targets.tolist() == um(2, 4, 2, 6, 1, 2)
-    assert [both.up.repeatability, both.down.repeatability] == um(8, 6)
-
-
-def test_repeatability_of_both_directions(both: BothDirections) -> None:
-    """The largest of 2s↑ + 2s↓ + |B|, R↑, R↓ at each target.
+def test_repeatability(example: PositioningTest) -> None:
+    """Four times s; and the largest of 2s↑ + 2s↓ + |B|, R↑, R↓ at each target.
 
     1: 1 + 1 + 3 = 5.    2: 2 + 2 + 2 = 6.      3: 2 + 1 + 4 = 7.
-    4: 1 + 3 + 5 = 9.    5: 4 + 0.5 + 2 = 6.5, less than R↑ = 8: 8.    6: 1 + 1 + 3 = 5.    R = 9.
+    4: 1 + 3 + 5 = 9.    5: 4 + 0.5 + 2 = 6.5, less than R↑ = 8: 8.    6: 1 + 1 + 3 = 5.
     """
-    assert both.repeatability_at_targets.tolist() == um(5, 6, 7, 9, 8, 5)
-    assert [both.repeatability] == um(9)
-
-
-def test_systematic_deviation(both: BothDirections) -> None:
-    """↑ from −1 to 5; ↓ from 1 to 9; together from −1 to 9."""
-    assert [both.up.systematic_deviation, both.down.systematic_deviation, both.systematic_deviation] == um(6, 8, 10)
-
-
-def test_accuracy(both: BothDirections) -> None:
-    """Mean ± 2s: ↑ −1…1, 0…4, 3…7, 2…4, −5…3, 0…2: from −5 to 7.
-
-    ↓ 2…4, 2…6, 8…10, 5…11, 0.5…1.5, 3…5: from 0.5 to 11. Together from −5 to 11.
-    """
-    assert [both.up.accuracy, both.down.accuracy, both.accuracy] == um(12, 10.5, 16)
+    assert example.repeatability[0].tolist() == um(2, 4, 4, 2, 8, 2)
+    assert example.repeatability[1].tolist() == um(2, 4, 2, 6, 1, 2)
+    assert example.repeatability[2].tolist() == um(5, 6, 7, 9, 8, 5)
 
 
 def test_figures_by_symbol(example: PositioningTest) -> None:
-    """The figures above, each under the standard's letter."""
+    """E: means ↑ from −1 to 5, ↓ from 1 to 9, together from −1 to 9. R: the largest. B̄: −(3 + 2 + 4 + 5 + 2 + 3)/6.
+
+    A, mean ± 2s: ↑ −1…1, 0…4, 3…7, 2…4, −5…3, 0…2: from −5 to 7; ↓ 2…4, 2…6, 8…10, 5…11, 0.5…1.5, 3…5: from 0.5 to 11.
+    M, of the mean of both directions, 1.5, 3, 7, 5.5, 0, 2.5: 7 − 0.
+    """
     expected = {"A": 16, "A_up": 12, "A_down": 10.5, "E": 10, "E_up": 6, "E_down": 8}
     expected |= {"R": 9, "R_up": 8, "R_down": 6, "M": 7, "B": 5, "B_mean": -19 / 6}
-    assert example.figures() == pytest.approx({k: v * MICROMETRE for k, v in expected.items()}, **EXACT)
+    assert example.figures == pytest.approx({k: v * MICROMETRE for k, v in expected.items()}, **EXACT)
 
 
 def test_the_standards_test_has_no_notes(example: PositioningTest) -> None:
@@ -158,8 +130,8 @@ def same(figures: dict[str, float], scale: float = 1.0) -> object:
 def test_a_shift_of_the_zero_moves_the_means_alone(seed: int, shift: float) -> None:
     targets, deviations = drawn(seed)
     before, after = evaluate(targets, deviations), evaluate(targets, deviations + shift)
-    assert after.figures() == same(before.figures())
-    assert after.up.mean == pytest.approx(before.up.mean + shift, abs=1e-18)
+    assert after.figures == same(before.figures)
+    assert after.mean[0] == pytest.approx(before.mean[0] + shift, abs=1e-18)
 
 
 @fixed
@@ -169,7 +141,7 @@ def test_order_of_cycles_and_targets_does_not_matter(seed: int) -> None:
     rng = np.random.default_rng(seed)
     targets_too = rng.permutation(len(targets))
     shuffled = rng.permuted(deviations, axis=1)[:, :, targets_too]
-    assert evaluate(targets[targets_too], shuffled).figures() == same(evaluate(targets, deviations).figures())
+    assert evaluate(targets[targets_too], shuffled).figures == same(evaluate(targets, deviations).figures)
 
 
 @fixed
@@ -177,31 +149,30 @@ def test_order_of_cycles_and_targets_does_not_matter(seed: int) -> None:
 def test_seen_from_the_other_end(seed: int) -> None:
     """With the axis pointing the other way, up is down and deviations change sign; the machine is the same."""
     targets, deviations = drawn(seed)
-    figures = evaluate(targets, deviations).figures()
+    figures = evaluate(targets, deviations).figures
     swapped = {"_up": "_down", "_down": "_up"}
     expected = {name[0] + swapped.get(name[1:], name[1:]): value for name, value in figures.items()}
-    assert evaluate(-targets, -deviations, ("down", "up")).figures() == same(expected)
+    assert evaluate(-targets, -deviations[::-1]).figures == same(expected)
 
 
 @fixed
 @given(seeds, st.floats(0.1, 10.0))
 def test_everything_scales(seed: int, scale: float) -> None:
     targets, deviations = drawn(seed)
-    assert evaluate(targets, scale * deviations).figures() == same(evaluate(targets, deviations).figures(), scale)
+    assert evaluate(targets, scale * deviations).figures == same(evaluate(targets, deviations).figures, scale)
 
 
 @fixed
 @given(seeds)
 def test_intervals_contain_each_other(seed: int) -> None:
     """A figure that looks at more cannot be smaller; and R at a target is what its two intervals span together."""
-    both = evaluate(*drawn(seed)).both
-    assert both is not None
-    rounding = 1e-18
-    assert both.accuracy + rounding >= max(both.up.accuracy, both.down.accuracy, both.repeatability)
-    assert both.accuracy + rounding >= both.systematic_deviation >= both.mean_deviation - rounding
-    assert both.repeatability + rounding >= both.reversal >= abs(both.mean_reversal) - rounding
-    edges = np.array([*both.up.interval, *both.down.interval])
-    assert both.repeatability_at_targets == pytest.approx(np.ptp(edges, axis=0), abs=rounding)
+    test, rounding = evaluate(*drawn(seed)), 1e-18
+    f = test.figures
+    assert f["A"] + rounding >= max(f["A_up"], f["A_down"], f["R"])
+    assert f["A"] + rounding >= f["E"] >= f["M"] - rounding
+    assert f["R"] + rounding >= f["B"] >= abs(f["B_mean"]) - rounding
+    edges = np.concatenate([test.mean + way * test.standard_deviation for way in (-2.0, 2.0)])
+    assert test.repeatability[2] == pytest.approx(np.ptp(edges, axis=0), abs=rounding)
 
 
 def test_many_cycles_find_what_the_machine_is() -> None:
@@ -209,28 +180,9 @@ def test_many_cycles_find_what_the_machine_is() -> None:
     rng = np.random.default_rng(230)
     means = np.array([[-2e-6, 0.0, 4e-6], [1e-6, 2e-6, 9e-6]])
     deviations = means[:, None] + rng.normal(0.0, 2e-6, (2, 20_000, 3))
-    figures = evaluate([0.0, 0.1, 0.25], deviations).figures()
+    figures = evaluate([0.0, 0.1, 0.25], deviations).figures
     expected = {"E": 11e-6, "M": 7e-6, "B": 5e-6, "B_mean": -10e-6 / 3, "R_up": 8e-6, "R": 13e-6, "A": 19e-6}
     assert {k: figures[k] for k in expected} == pytest.approx(expected, abs=0.15e-6)
-
-
-# One direction alone.
-
-
-@pytest.mark.parametrize(("name", "other", "readings"), [("up", "down", UP), ("down", "up", DOWN)])
-def test_unidirectional_test(name: str, other: str, readings: np.ndarray, example: PositioningTest) -> None:
-    """Truth: that direction's figures in the full test; of the rest it knows nothing."""
-    alone = evaluate(TARGETS, readings[None] * MICROMETRE, (name,))
-    expected = {key: value for key, value in example.figures().items() if key.endswith(f"_{name}")}
-    assert alone.figures() == expected
-    assert alone.both is None
-    assert getattr(alone, other) is None
-    assert "–" in report(alone)
-
-
-def test_directions_in_the_order_given(example: PositioningTest) -> None:
-    swapped = evaluate(TARGETS, np.array([DOWN, UP]) * MICROMETRE, ("down", "up"))
-    assert swapped.figures() == example.figures()
 
 
 # Notes: what departs from the standard is said, not refused.
@@ -265,23 +217,20 @@ def test_swapped_directions_are_flagged() -> None:
 
 
 @pytest.mark.parametrize(
-    ("targets", "deviations", "directions", "says"),
+    ("targets", "deviations", "says"),
     [
-        (TARGETS, np.zeros((2, 1, 6)), ("up", "down"), "at least two cycles"),
-        (TARGETS, np.zeros((2, 5, 5)), ("up", "down"), "2 directions, cycles, 6 targets"),
-        (TARGETS, np.zeros((5, 6)), ("up", "down"), "2 directions, cycles, 6 targets"),
-        (TARGETS, np.zeros((2, 5, 6)), ("up",), "1 directions, cycles, 6 targets"),
-        (TARGETS, np.zeros((2, 5, 6)), ("forward", "backward"), r"must be \(up, down\)"),
-        (TARGETS, np.zeros((2, 5, 6)), ("up", "up"), r"must be \(up, down\)"),
-        (TARGETS, [[[0.0] * 6] * 5, [[0.0] * 5] * 5], ("up", "down"), "same number of readings"),
-        ([0.0, 0.1, 0.1], np.zeros((2, 5, 3)), ("up", "down"), r"may be there once \(found 0.1\)"),
-        ([0.0, np.nan], np.zeros((2, 5, 2)), ("up", "down"), "targets: must be a list of finite"),
-        ([], np.zeros((2, 5, 0)), ("up", "down"), "targets: must be a list of finite"),
+        (TARGETS, np.zeros((2, 1, 6)), "at least two cycles"),
+        (TARGETS, np.zeros((2, 5, 5)), "2 directions, cycles, 6 targets"),
+        (TARGETS, np.zeros((5, 6)), "2 directions, cycles, 6 targets"),
+        (TARGETS, [[[0.0] * 6] * 5, [[0.0] * 5] * 5], "same number of readings"),
+        ([0.0, 0.1, 0.1], np.zeros((2, 5, 3)), r"may be there once \(found 0.1\)"),
+        ([0.0, np.nan], np.zeros((2, 5, 2)), "targets: must be a list of finite"),
+        ([], np.zeros((2, 5, 0)), "targets: must be a list of finite"),
     ],
 )
-def test_what_cannot_be_computed_is_refused(targets, deviations, directions, says: str) -> None:
+def test_what_cannot_be_computed_is_refused(targets, deviations, says: str) -> None:
     with pytest.raises(ModelError, match=says):
-        evaluate(targets, deviations, directions)
+        evaluate(targets, deviations)
 
 
 def test_a_missing_reading_is_named() -> None:

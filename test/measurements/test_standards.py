@@ -247,4 +247,4 @@ def test_figures_need_no_reach(tmp_path: Path) -> None:
     with pytest.raises(InputFileError, match="out of the machine's reach"):
         read_measurements(path, paper)
     judged = judge(read_measurements(path, paper, in_reach=False))
-    assert judged.axes["x"].figures()["E"] == pytest.approx(4e-6, abs=1e-15)
+    assert judged.axes["x"].figures["E"] == pytest.approx(4e-6, abs=1e-15)
