@@ -26,7 +26,7 @@ STATISTICS = {"strut_change": ("|dL|", "um", 1e6), "displacement": ("|dp|", "um"
 ERRORS = ("x_um", "y_um", "z_um", "rx_urad", "ry_urad", "rz_urad")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> common.Result:
     """Run the verb."""
     rows, poses = read_poses(args.poses)
     if args.machines * len(poses) > MOST_RESULTS:
@@ -46,10 +46,8 @@ def run(args: argparse.Namespace) -> int:
         result = assess(geometry, poses, bounds, args.seed, args.machines, names, bar.update)
     records = [_record(row, result, m, n) for m in range(len(result.seeds)) for n, row in enumerate(rows)]
     commanded = [pose_values(pose) for pose in poses]
-    common.write_table(args, records)
-    shown = _as_json if args.json else _report
-    common.show(shown(args, geometry, rows, commanded, records, result))
-    return 0
+    given = args, geometry, rows, commanded, records, result
+    return common.Result(lambda: _report(*given), lambda: _as_json(*given), records)
 
 
 def _record(row: Row, result: Assessment, m: int, n: int) -> dict[str, Any]:

@@ -42,7 +42,7 @@ LIMITS_SHOWN = {
 STAGES = ("nominal", "compensated")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> common.Result:
     """Run the verb; 0 when all limits are kept, 1 when one is broken."""
     with common.stage(f"reading {args.poses}"):
         rows, positions, rotations = read_pose_arrays(args.poses)
@@ -52,9 +52,12 @@ def run(args: argparse.Namespace) -> int:
         result = check(geometry, model, (positions, rotations), mode, args.rate_hz, bar.update)
     if not args.json:
         common.mention_default(args, geometry)
-    common.write_table(args, (_row_values(rows[n], n, result) for n in range(len(rows))))
-    common.show(_as_json(geometry, model, rows, result) if args.json else _report(args, geometry, model, rows, result))
-    return 0 if result.ok else 1
+    return common.Result(
+        lambda: _report(args, geometry, model, rows, result),
+        lambda: _as_json(geometry, model, rows, result),
+        (_row_values(row, n, result) for n, row in enumerate(rows)),
+        code=0 if result.ok else 1,
+    )
 
 
 def _value(result: CheckResult, name: str, n: int, stage: int) -> float:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int | common.Result:
     """Run the verb."""
     geometry = load_geometry(args.machine)
     if args.clearance_mm is not None:
@@ -55,11 +55,12 @@ def run(args: argparse.Namespace) -> int:
             progress=bar.update,
             shared_platform_joints=not args.separate_joints,
         )
-    common.show(as_json(study) if args.json else report(study, names))
-    common.write_table(args, ranking_rows(study.rows, beside(geometry, study.errors)))
+    rows = ranking_rows(study.rows, beside(geometry, study.errors))
+    common.Result(lambda: report(study, names), lambda: as_json(study), rows).finish(args)
     if args.pictures is not None or args.publish:
         bodies = shells_of(reached)
-        common.save_pictures(args, lambda: _figures(study, bodies, names))
+        if args.pictures is not None:
+            common.save_pictures(args, lambda: _figures(study, bodies, names))
         if args.pictures is not None and not args.no_page:
             _page(args, study, bodies, names)
         if args.publish:
@@ -67,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry) -> int:
+def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry) -> common.Result:
     """Show what a model's calibration leaves, and which measurement would remove most of it."""
     from ..calibration.design_report import measurement_rows, remaining_json, remaining_text
     from ..calibration.follow_up import remaining
@@ -84,10 +85,12 @@ def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry) -> i
     name = f"workspace, α and β of {', '.join(f'{math.degrees(tilt):g}' for tilt in tilts)}°"
     with common.stage_line() as say:
         result = remaining(machine, fitted, poses, name, say)
-    common.show(remaining_json(result) if args.json else remaining_text(result))
-    common.write_table(args, measurement_rows(result))
-    common.save_pictures(args, lambda: {"predicted_error.png": predicted_error_figure(machine, fitted)})
-    return 0
+    return common.Result(
+        lambda: remaining_text(result),
+        lambda: remaining_json(result),
+        measurement_rows(result),
+        lambda: {"predicted_error.png": predicted_error_figure(machine, fitted)},
+    )
 
 
 def _figures(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...]) -> dict[str, Figure]:

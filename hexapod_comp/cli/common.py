@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -86,16 +87,26 @@ def where(row: Row) -> str:
     return f"line {row.line} (row {row.label})" if row.line else "the pose"
 
 
-def show(result: Any) -> None:
-    """Print a report, which may end with a line break or not; what is no text is printed as JSON."""
-    text = result if isinstance(result, str) else json_text(result)
-    print(text, end="" if text.endswith("\n") else "\n")
+@dataclass(frozen=True)
+class Result:
+    """What a verb gives back: the same as text and as JSON, the rows of its CSV file, its pictures, its exit code."""
 
+    text: Callable[[], str]
+    content: Callable[[], Any]  # of --json
+    rows: Iterable[Mapping[str, Any]] = ()  # of the CSV file that --out names
+    pictures: Callable[[], Mapping[str, Figure]] | None = None  # by file name, for the folder of --pictures
+    code: int = 0
 
-def write_table(args: argparse.Namespace, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write rows to the CSV file that ``--out`` names, if it names one."""
-    if args.out is not None:
-        write_text(args.out, Table(list(rows)).csv())
+    def finish(self, args: argparse.Namespace) -> int:
+        """Write the CSV file and print, as the options say; draw; return the exit code."""
+        text = json_text(self.content()) if args.json else self.text()
+        if self.rows and args.out is not None:
+            write_text(args.out, Table(list(self.rows)).csv())
+        if text:
+            print(text, end="" if text.endswith("\n") else "\n")
+        if self.pictures is not None and args.pictures is not None:
+            save_pictures(args, self.pictures)
+        return self.code
 
 
 def mention(args: argparse.Namespace, text: str) -> None:
@@ -110,9 +121,7 @@ def say_notes(notes: Iterable[str]) -> None:
 
 
 def save_pictures(args: argparse.Namespace, pictures: Callable[[], Mapping[str, Figure]]) -> None:
-    """Draw pictures and write them into the folder of ``--pictures``, if there is one, and say where they are."""
-    if args.pictures is None:
-        return
+    """Draw pictures and write them into the folder of ``--pictures``, and say where they are."""
     from ..formats.figures import save
 
     with stage("drawing pictures"):

@@ -12,12 +12,12 @@ from ..loop.story import Calibration, Place, calibrate, calibration_text
 from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.model import MachineModel
 from . import common
-from .run import TRUE, chosen_model, draw, hidden_errors
+from .run import TRUE, chosen_model, drawn, hidden_errors
 
 FITTED = "fit"  # the model that is yet to be made, of readings
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> common.Result:
     """Run the verb; 0 when the loop kept what the fit promised."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as for fit: its matrices are small
 
@@ -38,16 +38,17 @@ def run(args: argparse.Namespace) -> int:
         promised = story.EXACT if calibration is None else story.promises(calibration.fit, poses, path)
         rows = story.with_promises(rows, promised, story.left_by_drives(geometry, truth, poses, path))
     complaints = report.complaints(result, rows)
-    if args.json:
-        named = [Row(0, str(n + 1)) for n in range(len(poses))]
-        measured = None if calibration is None else story.as_json(calibration)
-        known = {"machine": geometry.name, "truth": args.truth, "calibration": measured}
-        common.show({**known, **report.as_json(named, result, rows), "complaints": complaints})
-    else:
-        print(f"\n{summary(result, rows)}\n{story.REMARK}")
-        print("\n".join(f"NOT AS IT SHOULD BE: {complaint}" for complaint in complaints) or "all as it should be")
-    draw(args, result, rows, f"{geometry.name}, hidden errors {args.truth}", calibration)
-    return 1 if complaints else 0
+    named = [Row(0, str(n + 1)) for n in range(len(poses))]
+    measured = None if calibration is None else story.as_json(calibration)
+    known = {"machine": geometry.name, "truth": args.truth, "calibration": measured}
+    verdict = "\n".join(f"NOT AS IT SHOULD BE: {complaint}" for complaint in complaints) or "all as it should be"
+    title = f"{geometry.name}, hidden errors {args.truth}"
+    return common.Result(
+        lambda: f"\n{summary(result, rows)}\n{story.REMARK}\n{verdict}",
+        lambda: {**known, **report.as_json(named, result, rows), "complaints": complaints},
+        pictures=lambda: drawn(args, result, rows, title, calibration),
+        code=1 if complaints else 0,
+    )
 
 
 def _calibration(args: argparse.Namespace, geometry: HexapodGeometry, truth: MachineModel, place: Place) -> Calibration:

@@ -13,7 +13,7 @@ from . import common
 HZ_PERIOD = 1.0  # how often --hz prints a line, s
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int | common.Result:
     """Run the verb until Ctrl-C, --count or --seconds; 0 when a message has come."""
     from ..ros import heard_signals, keep_discovery_local
     from ..ros.echo import DISCOVERY_TIME, Echo, EchoedMessage, published_topics
@@ -31,8 +31,8 @@ def run(args: argparse.Namespace) -> int:
             while going_on(began + DISCOVERY_TIME):
                 session.spin_once(SPIN_PERIOD)
             topics = published_topics(session.node)
-            common.show(topics if args.json else "\n".join(f"{name}  {kind}" for name, kind in topics.items()))
-            return 0 if topics else 1
+            lines = (f"{name}  {kind}" for name, kind in topics.items())
+            return common.Result(lambda: "\n".join(lines), lambda: topics, code=0 if topics else 1)
 
         def print_message(received: EchoedMessage) -> None:
             if not args.hz and (args.count is None or echo.intervals.count <= args.count):
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
                 print(f"{echo.topic}: {echo.intervals.text()}")
     intervals = echo.intervals
     if args.hz and args.json:
-        common.show({"topic": echo.topic, **intervals.record()})
+        print(json_text({"topic": echo.topic, **intervals.record()}), end="")
     elif not args.json:
         print(f"{echo.topic}: {intervals.text()}", file=sys.stderr)
     return 0 if intervals.count else 1

@@ -23,7 +23,7 @@ from . import common
 HARMLESS = 10e-9
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> common.Result:
     """Run the verb."""
     geometry, model = common.load_machine(args)
     exact = _descriptions(args, geometry) + _c(args, geometry, model)
@@ -43,12 +43,9 @@ def run(args: argparse.Namespace) -> int:
             say("the table, and what it leaves")
             written.append(args.table)
             checks += _table(args, trial, box)
-    if args.json:
-        common.show(_as_json(args, model, box, written, checks))
-    else:
-        print(_report(args, model, box, written, checks))
-    worse = [c for _, c, _ in checks if c.level.after.rms > c.level.before.rms + HARMLESS]
-    return 1 if worse else 0
+    worse = any(c.level.after.rms > c.level.before.rms + HARMLESS for _, c, _ in checks)
+    given = args, model, box, written, checks
+    return common.Result(lambda: _report(*given), lambda: _as_json(*given), code=int(worse))
 
 
 def _descriptions(args: argparse.Namespace, geometry: HexapodGeometry) -> list[str]:
@@ -83,15 +80,12 @@ def _c(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel)
     return [str(file) for file in files]
 
 
-def _show_exact(args: argparse.Namespace, model: MachineModel, written: list[str]) -> int:
+def _show_exact(args: argparse.Namespace, model: MachineModel, written: list[str]) -> common.Result:
     """Say what was written when all of it gives the very numbers, so that nothing is to be judged."""
-    if args.json:
-        common.show({"machine": model.machine, "model": model.name, "written": written})
-    else:
-        print(f"machine {model.machine}, model {model.name}\nwritten: {', '.join(written)}")
-        if args.c_folder is not None:
-            print("build the self-test and run it on the target: see hexapod_selftest.c")
-    return 0
+    text = f"machine {model.machine}, model {model.name}\nwritten: {', '.join(written)}"
+    if args.c_folder is not None:
+        text += "\nbuild the self-test and run it on the target: see hexapod_selftest.c"
+    return common.Result(lambda: text, lambda: {"machine": model.machine, "model": model.name, "written": written})
 
 
 Result = tuple[str, "ExportCheck", list[str]]  # name of a way to use an export, what it leaves, and notes

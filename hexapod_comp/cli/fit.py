@@ -78,7 +78,7 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
     return FitSettings(shared_platform_joints=not args.separate_joints, robust=robust, **given)
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int | common.Result:
     """Run the verb; 1 when the readings do not bear the model out."""
     if args.update is not None:
         return _renew(args)
@@ -99,14 +99,15 @@ def run(args: argparse.Namespace) -> int:
     if beyond := beyond_limits(measured, result.model):
         result = replace(result, misfit="; ".join(filter(None, (result.misfit, beyond))))
     if result.misfit and not args.force:
-        content = {**result.content(), "misfit": result.misfit, "written": None} if args.json else None
-        common.show(content or f"{REFUSED}: {result.misfit}. {ADVICE}\n\n{result.text}")
         print("hexapod_comp: error: nothing was written; the report says why, --force writes it", file=sys.stderr)
-        return 1
+        return common.Result(
+            lambda: f"{REFUSED}: {result.misfit}. {ADVICE}\n\n{result.text}",
+            lambda: {**result.content(), "misfit": result.misfit, "written": None},
+            code=1,
+        )
     with common.stage("trying the model on the virtual machine"):
         tried = None if truth is None else _worth(truth, result, measured)
-    _write(args, result, measured, tried)
-    return 0
+    return _write(args, result, measured, tried)
 
 
 @dataclass(frozen=True)
@@ -197,7 +198,7 @@ def _worth(truth: RealMachine, result: Fitted, measured: MeasurementSet) -> Wort
     return replace(worth(truth, result.model, box, level=level), promised=promised)
 
 
-def _write(args: argparse.Namespace, result: Fitted, measured: MeasurementSet, tried: Worth | None) -> None:
+def _write(args: argparse.Namespace, result: Fitted, measured: MeasurementSet, tried: Worth | None) -> int:
     """Write the model and what else was asked for, and show it."""
     judged = judge(measured)
     parts = [result.text, region_text(result.model.measured, measured.geometry) + "\n"]
@@ -207,13 +208,14 @@ def _write(args: argparse.Namespace, result: Fitted, measured: MeasurementSet, t
     if result.misfit:
         text = f"{FORCED}: {result.misfit}. {ADVICE}\n\n{text}"
     beside = save_with_posterior(result.saved, result.fitted, args.out)
-    if args.json:
+
+    def content() -> dict[str, Any]:
         more = {"standards": standards_json(judged), "worth": worth_json(tried) if tried else None}
         more["measured_box"] = region_json(result.model.measured, measured.geometry)
         files = {"misfit": result.misfit, "written": args.out, "written_beside": beside}
-        common.show({**result.content(), **more, **files})
-    else:
-        print(f"{text}\nmodel: {args.out}\n{_listed(beside)}", end="")
+        return {**result.content(), **more, **files}
+
+    common.Result(lambda: f"{text}\nmodel: {args.out}\n{_listed(beside)}", content).finish(args)
     if args.report is not None:
         write_text(args.report, text)
     if args.certificate is not None and result.fit is not None:
@@ -224,14 +226,16 @@ def _write(args: argparse.Namespace, result: Fitted, measured: MeasurementSet, t
             details = None if args.details is None else load_details(args.details)
             write_text(args.certificate, certificate_text(result.fit, filed, details))
         common.mention(args, f"certificate: {args.certificate}")
-    common.save_pictures(args, result.pictures)
+    if args.pictures is not None:
+        common.save_pictures(args, result.pictures)
+    return 0
 
 
 def _listed(beside: list[Path]) -> str:
     return "".join(f"its parameters' covariance, to be kept beside it: {path}\n" for path in beside)
 
 
-def _renew(args: argparse.Namespace) -> int:
+def _renew(args: argparse.Namespace) -> common.Result:
     """Write a model renewed from few readings; 1 when they cannot renew it."""
     from ..calibration.check import refusal, update_model
     from ..calibration.check_report import update_report, verification_json, verification_report
@@ -244,9 +248,8 @@ def _renew(args: argparse.Namespace) -> int:
     text, content = verification_report(verification), verification_json(verification)
     reason = refusal(verification)
     if reason and not args.force:
-        common.show({**content, "refused": reason, "written": None} if args.json else text)
         print(f"hexapod_comp: error: nothing was written: {reason} (--force renews all the same)", file=sys.stderr)
-        return 1
+        return common.Result(lambda: text, lambda: {**content, "refused": reason, "written": None}, code=1)
     update = update_model(model, fitted, measured, verification)
     model, origin = update.model, update.model.origin
     if reason:
@@ -255,8 +258,7 @@ def _renew(args: argparse.Namespace) -> int:
         model = replace(model, name=args.name)
     beside = save_with_posterior(model, update.fitted, args.out)
     text = f"{text}\n{update_report(update, args.out)}{_listed(beside)}"
-    files = {"written": args.out, "written_beside": beside}
-    common.show({**content, "chi_square_after": update.chi_square, **files} if args.json else text)
     if args.report is not None:
         write_text(args.report, text)
-    return 0
+    files = {"written": args.out, "written_beside": beside}
+    return common.Result(lambda: text, lambda: {**content, "chi_square_after": update.chi_square, **files})

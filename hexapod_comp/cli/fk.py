@@ -18,7 +18,7 @@ from . import common
 from .table import Table
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> common.Result:
     """Run the verb."""
     if args.lengths is None:
         with common.stage(f"reading {args.lengths_file}"):
@@ -31,33 +31,27 @@ def run(args: argparse.Namespace) -> int:
         how = f"Newton sought the poses of {sets} from home and {2 * ORIENTATIONS} starts all around"
         proof = "each closes the loops, but nothing proves that there are no others"
         common.say_notes([f"machine {geometry.name} is no 6-3 machine: {how}; {proof}"])
-    if args.all_modes:
-        _all_modes(args, geometry, lengths[0])
-    else:
-        _poses(args, geometry, model, rows, lengths)
-    return 0
+    return _all_modes(args, geometry, lengths[0]) if args.all_modes else _poses(args, geometry, model, rows, lengths)
 
 
 def _poses(
     args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel, rows: list[Row], lengths: np.ndarray
-) -> None:
-    """Solve all rows; write the CSV file, print JSON or, where no file was written, CSV or a table of one pose."""
+) -> common.Result:
+    """Solve all rows; as text CSV, or a table of one pose, and nothing where a file is written."""
     poses = zip(rows, _solve(args, geometry, model, rows, lengths), strict=True)
     table = [{"sequence": row.label, **pose_values(geometry.tool_pose(pose))} for row, pose in poses]
-    common.write_table(args, table)
-    if args.json:
-        content: dict[str, Any] = {"machine": geometry.name, "model": model.name, **common.frames(geometry)}
-        content |= {"direction": args.direction or "midway"} if args.model != "ideal" else {}
-        common.show({**content, "rows": table})
-        return
-    if args.lengths is None:
-        common.mention_default(args, geometry)
-    if args.out is None and args.lengths is None:
-        common.show(Table(table).csv())
-    elif args.out is None:
+    content: dict[str, Any] = {"machine": geometry.name, "model": model.name, **common.frames(geometry)}
+    content |= {"direction": args.direction or "midway"} if args.model != "ideal" else {}
+
+    def text() -> str:
+        if args.lengths is None:
+            common.mention_default(args, geometry)
+            return "" if args.out is not None else Table(table).csv()
         title = f"{common.machine_title(geometry, model)}: pose of {common.whose(geometry)}"
         title += f", all axes and struts moved {args.direction}" if args.direction else ""
-        common.show(f"{title}\n{Table(table).text(list(table[0])[1:])}")
+        return "" if args.out is not None else f"{title}\n{Table(table).text(list(table[0])[1:])}"
+
+    return common.Result(text, lambda: {**content, "rows": table}, table)
 
 
 def _solve(
@@ -90,7 +84,7 @@ def _solve(
     return poses
 
 
-def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.ndarray) -> None:
+def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.ndarray) -> common.Result:
     """Show every assembly mode, and say for each why it is, or is not, the working one."""
     structure = Structure.of(geometry)
     modes = assembly_modes(structure, lengths)
@@ -107,15 +101,19 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
         objections = mode_objections(geometry, structure, mode)
         values = pose_values(geometry.tool_pose(mode))
         listed.append({"mode": index, **values, "working": same, "objections": objections})
-    common.write_table(
-        args, [{**m, "working": int(m["working"]), "objections": "; ".join(m["objections"])} for m in listed]
-    )
-    if args.json:
-        common.show({"machine": geometry.name, **common.frames(geometry), "modes": listed, "no_working_mode": reason})
-    elif args.out is None:
+
+    def text() -> str:
+        if args.out is not None:
+            return ""
         further = "possible, further from home"
         verdicts = ["working mode" if m["working"] else "; ".join(m["objections"]) or further for m in listed]
         shown = [{**m, "": verdict} for m, verdict in zip(listed, verdicts, strict=True)]
-        text = Table(shown).text(["mode", *(n for n in shown[0] if n.endswith(("_mm", "_deg"))), ""])
+        table = Table(shown).text(["mode", *(n for n in shown[0] if n.endswith(("_mm", "_deg"))), ""])
         title = f"machine {geometry.name}: {len(modes)} assembly modes, tool in work"
-        common.show("\n".join([title, text, *([f"no working mode: {reason}"] if reason else [])]))
+        return "\n".join([title, table, *([f"no working mode: {reason}"] if reason else [])])
+
+    return common.Result(
+        text,
+        lambda: {"machine": geometry.name, **common.frames(geometry), "modes": listed, "no_working_mode": reason},
+        [{**m, "working": int(m["working"]), "objections": "; ".join(m["objections"])} for m in listed],
+    )

@@ -58,11 +58,12 @@ def run(args: argparse.Namespace) -> int:
             lie = "the pose lies" if len(targets.rows) == 1 else f"{outside} of {len(targets.rows)} poses lie"
             text = f"{lie} outside the box in which the model was measured; the predicted error there is extrapolated"
             common.say_notes([f"{text} ({region_text(model.measured, geometry)})"])
-    _show(args, geometry, model, targets, result.lengths, predicted)
+    shown = _result(args, geometry, model, targets, result.lengths, predicted)
+    code = shown.finish(args)
     common.say_notes(f"{targets.where(breach.row)}: {breach.error}" for breach in result.breaches[:MOST_NOTES])
     if len(result.breaches) > MOST_NOTES:
         common.say_notes([f"{len(result.breaches) - MOST_NOTES} more limits are broken; see check"])
-    return 0
+    return code
 
 
 def _poses(args: argparse.Namespace) -> Targets:
@@ -158,33 +159,29 @@ def _moved(direction: str) -> str:
     return f"all axes and struts moved {direction}"
 
 
-def _show(
+def _result(
     args: argparse.Namespace,
     geometry: HexapodGeometry,
     model: MachineModel,
     targets: Targets,
     lengths: np.ndarray,
     predicted: Predicted | None,
-) -> None:
-    """Write the CSV file; print JSON or, where no file was written, CSV or a table of one pose."""
+) -> common.Result:
+    """Return the rows; as text CSV, or a table of one pose, and nothing where a file is written."""
     # Also an ideal machine's commands are not its lengths where screws turn with the joints.
     corrected = predicted is not None or bool(geometry.screw_lead.any())
     rows = [_row(targets, n, lengths[n], corrected or args.line is not None) for n in range(len(targets.rows))]
     if predicted is not None:
         rows = [{**columns, **predicted.columns(n)} for n, columns in enumerate(rows)]
-    common.write_table(args, rows)
     one = args.poses is None and args.line is None
-    if args.json:
-        content: dict[str, Any] = {"machine": geometry.name, "model": model.name, **common.frames(geometry)}
-        if predicted is not None:
-            content |= {"error_frame": geometry.work_name, "error_sd_not_known": predicted.unknown or None}
-        common.show({**content, "rows": rows})
-        return
-    if args.out is not None or not one:
-        common.mention_default(args, geometry)
-    if args.out is None and not one:
-        common.show(Table(rows).csv())
-    elif args.out is None:
+    content: dict[str, Any] = {"machine": geometry.name, "model": model.name, **common.frames(geometry)}
+    if predicted is not None:
+        content |= {"error_frame": geometry.work_name, "error_sd_not_known": predicted.unknown or None}
+
+    def text() -> str:
+        if args.out is not None or not one:
+            common.mention_default(args, geometry)
+            return "" if args.out is not None else Table(rows).csv()
         (nominal, command), direction = lengths[0] * 1e3, targets.directions[0]
         columns = {"nominal_mm": nominal}
         columns |= {"command_mm": command, "correction_um": (command - nominal) * 1e3} if corrected else {}
@@ -193,7 +190,9 @@ def _show(
         title = f"{common.machine_title(geometry, model)}: strut lengths for a pose of {common.whose(geometry)}"
         title += "" if direction == "midway" else f", {_moved(direction)}"
         errors = f"\n{predicted.text(direction)}" if predicted is not None else ""
-        common.show(f"{title}\n{Table(struts).text()}\n{errors}")
+        return f"{title}\n{Table(struts).text()}\n{errors}"
+
+    return common.Result(text, lambda: {**content, "rows": rows}, rows)
 
 
 def _row(targets: Targets, n: int, lengths: np.ndarray, with_model: bool) -> dict[str, Any]:

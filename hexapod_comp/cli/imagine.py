@@ -37,7 +37,7 @@ IN_SI = {
 }
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> common.Result:
     """Run the verb."""
     geometry = load_geometry(args.machine)
     model = imagine(geometry, args.seed, _bounds(args, geometry), args.name or "")
@@ -48,9 +48,8 @@ def run(args: argparse.Namespace) -> int:
         error_of_tool = held_out(RealMachine(geometry, model), None, box, level=attitude)
     except GeometryError as error:
         common.say_notes([f"what the tool does is not shown: {error}"])
-    drawn = _drawn(model)
-    common.show((_as_json if args.json else _report)(args, model, drawn, box, error_of_tool))
-    return 0
+    given = args, model, _drawn(model), box, error_of_tool
+    return common.Result(lambda: _report(*given), lambda: _as_json(*given))
 
 
 def _bounds(args: argparse.Namespace, geometry: HexapodGeometry) -> ImperfectionBounds:

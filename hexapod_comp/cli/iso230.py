@@ -11,7 +11,7 @@ from ..measurements.iso230 import every_target, judge, standards_json, standards
 from . import common
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> common.Result:
     """Run the verb."""
     geometry = load_geometry(args.machine)
     with common.stage("reading measurements"):
@@ -23,6 +23,5 @@ def run(args: argparse.Namespace) -> int:
             "no linear run has two cycles or more with every target read from both sides in each; no circle either"
         )
         raise CalibrationError("measurements", problem)
-    shown = standards_json if args.json else every_target if args.targets else standards_text
-    common.show(shown(judged))
-    return 0
+    text = every_target if args.targets else standards_text
+    return common.Result(lambda: text(judged), lambda: standards_json(judged))

@@ -23,7 +23,7 @@ from . import common
 from .fit import fit_settings
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> common.Result:
     """Run the verb; 1 when a goal cannot be met."""
     geometry = load_geometry(args.machine)
     campaign = common.load_campaign(args, geometry)
@@ -32,18 +32,17 @@ def run(args: argparse.Namespace) -> int:
     return _judge(args, geometry, campaign) if args.goal_um is None else _propose(args, geometry, campaign)
 
 
-def _judge(args: argparse.Namespace, geometry: HexapodGeometry, campaign: Campaign) -> int:
+def _judge(args: argparse.Namespace, geometry: HexapodGeometry, campaign: Campaign) -> common.Result:
     """Say what a campaign determines."""
     with common.stage_line() as say:
         say("laying out the readings")
         measured = template(campaign, geometry, args.seed, args.campaign)
         say(f"what {len(measured)} readings determine")
         result = plan(measured, campaign, fit_settings(args))
-    common.show(plan_json(result) if args.json else plan_report(result))
-    return 0
+    return common.Result(lambda: plan_report(result), lambda: plan_json(result))
 
 
-def _propose(args: argparse.Namespace, geometry: HexapodGeometry, base: Campaign) -> int:
+def _propose(args: argparse.Namespace, geometry: HexapodGeometry, base: Campaign) -> common.Result:
     """Propose a campaign for a goal; 1 when it is not met."""
     goal = _goal(args)
     place = MeasuringBox(geometry, base.box, base.level, goal.tilt)
@@ -52,11 +51,11 @@ def _propose(args: argparse.Namespace, geometry: HexapodGeometry, base: Campaign
     common.say_notes(_detours(geometry, result.campaign))
     if args.out is not None:
         write_text(args.out, campaign_text(result.campaign, remarks(result)))
-    if args.json:
-        common.show({**proposal_json(result), "written": args.out})
-    else:
-        common.show(proposal_report(result) + (f"\ncampaign: {args.out}\n" if args.out else ""))
-    return 0 if result.met else 1
+    return common.Result(
+        lambda: proposal_report(result) + (f"\ncampaign: {args.out}\n" if args.out else ""),
+        lambda: {**proposal_json(result), "written": args.out},
+        code=0 if result.met else 1,
+    )
 
 
 def _goal(args: argparse.Namespace) -> Goal:

@@ -20,11 +20,10 @@ def run(args: argparse.Namespace) -> int:
     with BagRecorder(args.folder, args.namespace) as recorder, common.progress_bar(0, " messages") as bar:
         print(f"hexapod_comp: recording to {args.folder} until Ctrl-C", file=sys.stderr)
         recorder.run(lambda: not heard and time.monotonic() < end, bar.update)
-    if args.json:
-        common.show({"bag": args.folder, "messages": recorder.counts})
-    else:
-        print("\n".join([f"{count:8d}  {topic}" for topic, count in sorted(recorder.counts.items())]))
-        print(f"written: {args.folder}" if not recorder.problem else "recording ended early")
+    lines = [f"{count:8d}  {topic}" for topic, count in sorted(recorder.counts.items())]
+    lines.append("recording ended early" if recorder.problem else f"written: {args.folder}")
+    shown = common.Result(lambda: "\n".join(lines), lambda: {"bag": args.folder, "messages": recorder.counts})
+    shown.finish(args)
     if recorder.problem:
         raise InputFileError(args.folder, "", recorder.problem)
     if not recorder.journal:

@@ -26,7 +26,8 @@ def run(args: argparse.Namespace) -> int:
     with common.progress_bar(0, " messages") as bar:
         recording = read_recording(args.bag, args.namespace, bar.update)
     report, geometry = _replayed(args, recording)
-    _show(args, report)
+    rows = rows_of(report) if args.out is not None else ()
+    common.Result(lambda: text(report), lambda: as_json(report), rows).finish(args)
     if args.pictures:
         from ..replay.pictures import write_pictures
 
@@ -52,12 +53,6 @@ def _replayed(args: argparse.Namespace, recording: Recording) -> tuple[Report, H
     geometry = files.geometry(recording.first.geometry) if as_it_was or other is None else other[0]
     report.work_frames = geometry.work_frames
     return report, geometry
-
-
-def _show(args: argparse.Namespace, report: Report) -> None:
-
-    common.write_table(args, rows_of(report) if args.out is not None else ())
-    common.show(as_json(report) if args.json else text(report))
 
 
 def _given(args: argparse.Namespace) -> dict[str, Source]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from contextlib import nullcontext
+from typing import TYPE_CHECKING
 
 from ..formats.csv import read_poses
 from ..loop import report, session
@@ -15,10 +16,13 @@ from ..machine.model import MachineModel
 from ..virtual.named import find_model, truth_name
 from . import common
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 TRUE = "truth"  # the model that is no file: the machine's own errors
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> common.Result:
     """Run the verb; 0 when every command was answered."""
     rate = session.checked_rate(args.rate_hz)
     geometry = load_geometry(args.machine)
@@ -31,16 +35,15 @@ def run(args: argparse.Namespace) -> int:
     with common.ended_in_order(), started as nodes:
         result = session.witnessed(geometry, nodes, poses, None, rate, compare, args.namespace)
     errors, unanswered = error_rows(result), result.lost + result.refused
-    if args.json:
-        common.show(report.as_json(rows, result, errors))
-    else:
-        for row, record in zip(rows, result.poses, strict=True):
-            print(pose_block(f"pose {row.label}", record))
-        print(summary(result, errors))
+    blocks = [pose_block(f"pose {row.label}", record) for row, record in zip(rows, result.poses, strict=True)]
     if unanswered and result.answering.busy:
         common.say_notes([busy_text(result.answering)])
-    draw(args, result, errors, f"{geometry.name}: {args.poses}")
-    return 1 if unanswered else 0
+    return common.Result(
+        lambda: "\n".join([*blocks, summary(result, errors)]),
+        lambda: report.as_json(rows, result, errors),
+        pictures=lambda: drawn(args, result, errors, f"{geometry.name}: {args.poses}"),
+        code=1 if unanswered else 0,
+    )
 
 
 def hidden_errors(args: argparse.Namespace, geometry: HexapodGeometry) -> MachineModel:
@@ -54,17 +57,14 @@ def chosen_model(args: argparse.Namespace, geometry: HexapodGeometry, truth: Mac
     return truth if args.model == TRUE else find_model(args.model, geometry)
 
 
-def draw(
+def drawn(
     args: argparse.Namespace,
     result: SessionResult,
     rows: Sequence[ErrorRow],
     title: str,
     calibration: Calibration | None = None,
-) -> None:
-    """Draw the session into the folder of ``--pictures``, under the verb's name."""
+) -> dict[str, Figure]:
+    """Return the picture of the session, under the verb's name."""
     from ..loop.pictures import session_figure
 
-    def pictures() -> dict:
-        return {f"{args.verb}.png": session_figure(result, rows, f"{title}, model {result.model}", calibration)}
-
-    common.save_pictures(args, pictures)
+    return {f"{args.verb}.png": session_figure(result, rows, f"{title}, model {result.model}", calibration)}

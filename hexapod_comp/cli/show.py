@@ -9,7 +9,7 @@ from ..workspace.overview import as_json, overview, report
 from . import common
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> common.Result:
     """Run the verb."""
     from ..workspace.pictures import overview_figure
 
@@ -17,6 +17,6 @@ def run(args: argparse.Namespace) -> int:
     with common.stage_line() as say:
         say("reach and largest box")
         seen = overview(geometry)
-    common.show(as_json(seen) if args.json else report(seen))
-    common.save_pictures(args, lambda: {"machine.png": overview_figure(seen)})
-    return 0
+    return common.Result(
+        lambda: report(seen), lambda: as_json(seen), pictures=lambda: {"machine.png": overview_figure(seen)}
+    )

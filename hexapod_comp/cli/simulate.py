@@ -22,7 +22,7 @@ from .table import Table
 RESOLUTION = 10  # digits after the point of the instruments, m and rad: a tenth of a nanometre
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> common.Result:
     """Run the verb."""
     geometry, model = common.load_machine(args)
     args.truth = truth_name(args.truth, geometry)
@@ -42,8 +42,7 @@ def run(args: argparse.Namespace) -> int:
             read = measure(plan, campaign, machine, args.seed, bar.update)
     measured = read.with_values(read.value.round(RESOLUTION))
     write_measurements(measured, args.out)
-    common.show(_as_json(measured, args) if args.json else _report(measured, args))
-    return 0
+    return common.Result(lambda: _report(measured, args), lambda: _as_json(measured, args))
 
 
 def _report(measured: MeasurementSet, args: argparse.Namespace) -> str:

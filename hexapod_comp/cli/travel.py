@@ -12,7 +12,7 @@ from ..workspace.travel import Travel, travel, travel_text
 from . import common
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> common.Result:
     """Run the verb."""
     geometry, model = common.load_machine(args)
     if args.pose is None:
@@ -21,13 +21,12 @@ def run(args: argparse.Namespace) -> int:
         _, positions, rotations = common.one_row(args.pose)
         pose = Pose(positions[0], rotations[0])
     ways = travel(RealMachine(geometry, model), pose)
-    if args.json:
-        machine = {"machine": geometry.name, "model": model.name, **common.frames(geometry)}
-        common.show({**machine, "pose": pose, "travel": [_as_json(way) for way in ways]})
-    else:
-        title = f"{common.machine_title(geometry, model)}: how far {common.whose(geometry)} may go"
-        common.show(f"{title} from {pose_text(pose)}\n{travel_text(ways)}")
-    return 0
+    title = f"{common.machine_title(geometry, model)}: how far {common.whose(geometry)} may go"
+    machine = {"machine": geometry.name, "model": model.name, **common.frames(geometry)}
+    return common.Result(
+        lambda: f"{title} from {pose_text(pose)}\n{travel_text(ways)}",
+        lambda: {**machine, "pose": pose, "travel": [_as_json(way) for way in ways]},
+    )
 
 
 def _as_json(way: Travel) -> dict[str, Any]:

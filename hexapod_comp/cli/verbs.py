@@ -299,8 +299,7 @@ example:
             MACHINE,
             NAMESPACE,
             value("--host", None, "ADDRESS", "address to serve on (default 127.0.0.1: this computer alone; 0.0.0.0: "
-                  "all that "
-                  "reach it)", default="127.0.0.1"),
+                  "all that reach it)", default="127.0.0.1"),
             value("--port", whole(1, 65535), "N", "port to serve on (default 8080)", default=8080),
         ),
         """Serves a page on this computer alone, unless --host says otherwise: the machine in 3-D, its struts coloured
@@ -390,12 +389,10 @@ example:
         "what a campaign will determine; or which one a goal needs",
         (
             reads("campaign", "campaign file, or the name of a shipped one; with --goal-um optional: whose box and "
-                  "noise count",
-                  "CAMPAIGN", "campaign", nargs="?"),
+                  "noise count", "CAMPAIGN", "campaign", nargs="?"),
             MACHINE,
             value("--repeatability-um", bound, "UM", "standard deviation of where the machine stops, along each axis "
-                  "(default: "
-                  "the campaign's)"),
+                  "(default: the campaign's)"),
             *under(
                 "proposing a campaign",
                 value("--goal-um", above_zero, "UM", "RMS tool error that may be left, the datum aligned: propose a "
@@ -404,9 +401,8 @@ example:
                 value("--instruments", None, "A,B,…", f"what there is to measure with: {', '.join(INSTRUMENTS)} "
                       "(default linear)"),
                 value("--hours", above_zero, "H", "how long measuring may take (default 4)"),
-                value("--time", times, "NAME=MIN,MIN,S", "how long an instrument takes: minutes to put it up, "
-                      "minutes a run, "
-                      "seconds a stop; may be repeated", action="append"),
+                value("--time", times, "NAME=MIN,MIN,S", "how long an instrument takes: minutes to put it up, minutes "
+                      "a run, seconds a stop; may be repeated", action="append"),
                 writes("--out", "write the proposed campaign to a file (YAML)", "CAMPAIGN"),
             ),
             *ESTIMATION,
@@ -459,12 +455,10 @@ example:
             MACHINE,
             MODEL,
             TRUTH,
-            reads("--campaign", "campaign file, or the name of a shipped one (default campaign_5d.yaml for the "
-                  "machine paper, "
-                  "else campaign)", kind="campaign"),
-            reads("--warm-up", "file of how the machine warms meanwhile, warm_up for the shipped one: then x, y and "
-                  "z lines again "
-                  "and again", kind="warm_up"),
+            reads("--campaign", "campaign file, or the name of a shipped one (default campaign_5d.yaml for the machine "
+                  "paper, else campaign)", kind="campaign"),
+            reads("--warm-up", "file of how the machine warms meanwhile, warm_up for the shipped one: then x, y and z "
+                  "lines again and again", kind="warm_up"),
             seed_of("all that is random"),
             writes("--out", "write the readings to a CSV file", type=csv_file, required=True),
             JSON,
@@ -509,12 +503,10 @@ example:
             *ESTIMATION,
             *under(
                 "scheme joint",
-                value("--scale-ppm", bound, "PPM", "scale error of the instrument, 1 σ, ppm (scheme joint; default "
-                      "by its class: "
-                      "laser 0.5, tracker 10)"),
-                value("--alignment-mrad", bound, "MRAD", "angle between a laser's beam and its line, 1 σ, mrad "
-                      "(scheme joint; "
-                      "default 0.5)"),
+                value("--scale-ppm", bound, "PPM", "scale error of the instrument, 1 σ, ppm (scheme joint; default by "
+                      "its class: laser 0.5, tracker 10)"),
+                value("--alignment-mrad", bound, "MRAD", "angle between a laser's beam and its line, 1 σ, mrad (scheme "
+                      "joint; default 0.5)"),
                 flag("--not-robust", "trust readings that disagree with the rest (scheme joint)"),
             ),
             choice("--order", ("adjusted-r2", "aicc"), "what picks the polynomials' order (scheme lines; default "
@@ -606,12 +598,10 @@ example:
             writes("--table", "CSV file for the trilinear table", "FILE.csv", type=csv_file),
             folder("--c", "folder for the compensator in C with this machine's constants", dest="c_folder"),
             folder("--ros2-control", "folder for a ROS 2 package: this machine's compensation as a controller of "
-                   "ros2_control, and "
-                   "configurations"),
+                   "ros2_control, and configurations"),
             value("--rate", whole(1, 10_000), "HZ", "of ros2_control's loop (default 250)", default=250),
             value("--joint-names", joint_names, "A,B,C,D,E,F", "the struts' joints in URDF, MJCF and ros2_control "
-                  "(default "
-                  "strut_1,…,strut_6)"),
+                  "(default strut_1,…,strut_6)"),
             writes("--urdf", "file for the machine as URDF: robot_state_publisher, RViz, ros2_control; needs no "
                    "model", "FILE.urdf"),
             writes("--mjcf", "file for the machine as MuJoCo's MJCF, loops closed; needs no model", "FILE.xml"),
@@ -642,8 +632,7 @@ example:
         "what random imperfections within bounds do to lengths and poses",
         (
             reads("poses", "CSV file of poses (mm, degrees; default: Table 1 of Song, Mou & King); - for standard "
-                  "input",
-                  "POSES.csv", "poses", nargs="?", default="table1.csv"),
+                  "input", "POSES.csv", "poses", nargs="?", default="table1.csv"),
             *(value(n, bound, "BOUND", f"bound of {what} (default {usual:g})", default=usual)
               for n, (usual, what) in DRAWN.items()),
             value("--wave-period-mm", bound, "MM", "period of that error (default 10)", default=10.0),
@@ -678,22 +667,18 @@ example:
             reads("--budget", "error budget, or the name of a shipped one (default error_budget.yaml)",
                   kind="error_budget", default="error_budget.yaml"),
             reads("--model", "in place of a budget: what the fit of this model leaves, and which measurement would "
-                  "remove most of "
-                  "it", kind="model"),
+                  "remove most of it", kind="model"),
             table_out("the ranking"),
             pictures(),
             JSON,
             SEPARATE,
             value("--cells", count, "N", "cells along the grid's longest edge (default 30)", default=30),
-            value("--clearance-mm", bound, "MM", "smallest distance between the axes of two struts, mm; 0: not "
-                  "limited (default: "
-                  "the geometry's)"),
+            value("--clearance-mm", bound, "MM", "smallest distance between the axes of two struts, mm; 0: not limited "
+                  "(default: the geometry's)"),
             value("--tilt-deg", tilts, "A,B,…", "tilts about the tool's x and y, from its attitude at home (default "
-                  "-4,0,4)",
-                  default=tilts("-4,0,4")),
+                  "-4,0,4)", default=tilts("-4,0,4")),
             choice("--method", ("exact", "linear", "iteration"), "of the ranking: exact (default), linear, or "
-                   "iteration, which is "
-                   "v. Daake et al.'s own", "exact"),
+                   "iteration, which is v. Daake et al.'s own", "exact"),
             value("--compare", count, "N", "compare exact, linear and the iteration of v. Daake et al. at N poses"),
             value("--allow-um", above_zero, "UM", "allowed error of the tool: says what the errors may be"),
             value("--workers", whole(1, 256), "N", "processes (default 1, with all threads)", default=1),

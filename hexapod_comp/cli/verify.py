@@ -23,16 +23,16 @@ from ..virtual.instruments import compensated
 from . import common
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> common.Result:
     """Run the verb; 1 when the machine has changed."""
     if args.propose is not None:
         return _propose(args)
     result = checked(args, args.model).verification
-    common.show(verification_json(result) if args.json else verification_report(result))
-    return 0 if result.verdict == VALID else 1
+    code = 0 if result.verdict == VALID else 1
+    return common.Result(lambda: verification_report(result), lambda: verification_json(result), code=code)
 
 
-def _propose(args: argparse.Namespace) -> int:
+def _propose(args: argparse.Namespace) -> common.Result:
     """Write the check readings to take."""
     _, fitted = _known(args, args.model)
     with common.stage("choosing readings"):
@@ -42,13 +42,12 @@ def _propose(args: argparse.Namespace) -> int:
         readings = propose_check(fitted, **wanted)
     write_measurements(readings, args.propose)
     runs = [(where, channels) for where, channels, _ in places(readings)]
-    if args.json:
-        listed = [{"where": where, "channels": channels} for where, channels in runs]
-        common.show({"runs": listed, "written": args.propose})
-    else:
-        print(f"{len(readings)} check readings:", *(f"  {where}: {', '.join(read)}" for where, read in runs), sep="\n")
-        print(f"to be filled in: {args.propose}")
-    return 0
+    lines = [f"{len(readings)} check readings:", *(f"  {where}: {', '.join(read)}" for where, read in runs)]
+    listed = [{"where": where, "channels": channels} for where, channels in runs]
+    return common.Result(
+        lambda: "\n".join([*lines, f"to be filled in: {args.propose}"]),
+        lambda: {"runs": listed, "written": args.propose},
+    )
 
 
 class Checked(NamedTuple):
