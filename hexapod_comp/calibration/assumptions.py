@@ -88,21 +88,37 @@ class Assumptions:
     known_late: float = assumed(60e-6, "1/K", "what of it may come late", "a part much faster than its thermometer")
     known_moisture: float = assumed(5e-4, "m/m", "swelling that surprises in no material", "polymers, dry to damp")
 
-    # Changes of a machine since its fit (changes.py, check.py)
+    # Changes of a machine since its fit (changes.py, check.py); each has some standard deviations, equally likely
     prior_odds: tuple[float, ...] = assumed(
         (1.0, 1.0, 1.0, 0.125, 0.25, 0.5),
         "",
         "of datum, strut, temperature, ageing, a wrong reading and all else",
         "ageing as likely as each of the last one's four groups: each can stand for the other",
     )
-    moved: tuple = assumed((3e-6, 3e-4), "m", "how far joints, struts or the datum may have moved", "wear to crash")
-    grown: tuple = assumed((4e-6, 120e-6), "m/m", "growth of a body", "steel by a third of a kelvin to ten kelvin")
-    aged: tuple = assumed((0.02, 0.2), "tolerances", "ageing of everything", "joints by 2 to 20 µm of 100")
-    bent: tuple = assumed((0.5, 8.0), "tolerances", "a smooth field's growth", "5 µm and 20 µrad")
-    worn_pitch: tuple = assumed((1e-5, 3e-4), "m/m", "wear of one screw's pitch", "up to several classes of ISO 3408")
-    worn_backlash: tuple = assumed((1e-6, 3e-5), "m", "wear of one screw's backlash", "preload lost")
-    wrong_reading: tuple = assumed((5.0, 1000.0), "σ", "how far off one wrong reading may be", "a slip of a digit")
-    scattered: tuple = assumed((2.0, 100.0), "σ", "additional scatter of all readings", "air, vibration")
+    moved: tuple[float, ...] = assumed(
+        (3e-6, 1e-5, 3e-5, 1e-4, 3e-4), "m", "how far joints, struts or the datum may have moved", "wear to crash"
+    )
+    grown: tuple[float, ...] = assumed(
+        (4e-6, 12e-6, 36e-6, 120e-6), "m/m", "growth of a body", "steel by a third of a kelvin to ten kelvin"
+    )
+    aged: tuple[float, ...] = assumed(
+        (0.02, 0.05, 0.1, 0.2), "tolerances", "ageing of everything", "joints by 2 to 20 µm of 100"
+    )
+    bent: tuple[float, ...] = assumed(
+        (0.5, 1.0, 2.0, 4.0, 8.0), "tolerances", "a smooth field's growth", "5 µm and 20 µrad"
+    )
+    worn_pitch: tuple[float, ...] = assumed(
+        (1e-5, 3e-5, 1e-4, 3e-4), "m/m", "wear of one screw's pitch", "up to several classes of ISO 3408"
+    )
+    worn_backlash: tuple[float, ...] = assumed(
+        (1e-6, 3e-6, 1e-5, 3e-5), "m", "wear of one screw's backlash", "preload lost"
+    )
+    wrong_reading: tuple[float, ...] = assumed(
+        (5.0, 20.0, 100.0, 1000.0), "σ", "how far off one wrong reading may be", "a slip of a digit"
+    )
+    scattered: tuple[float, ...] = assumed(
+        (2.0, 5.0, 20.0, 100.0), "σ", "additional scatter of all readings", "air, vibration"
+    )
     false_alarms: float = assumed(0.01, "", "share of unchanged machines that may be called changed", "usual level")
     sure: float = assumed(
         0.9, "", "share of the probability at which one kind of change is stated", "chosen: 10 % wrong"
@@ -160,7 +176,10 @@ class Assumptions:
         """Return name, value with unit, meaning and source of every assumption."""
 
         def shown(value: Any) -> str:
-            return "–".join(map(shown, value)) if isinstance(value, tuple) else f"{value:g}"
+            if isinstance(value, tuple):
+                named = bool(value) and isinstance(value[0], str)  # of what, and its value
+                return (" " if named else ", ").join(map(shown, value))
+            return value if isinstance(value, str) else f"{value:g}"
 
         return [
             (

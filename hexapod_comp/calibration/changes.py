@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 
 import numpy as np
 
@@ -47,12 +46,6 @@ class Change:
     group: str = ""  # changes of a kind that are alike; all groups of a kind are equally likely beforehand
 
 
-@cache
-def _scales(ends: tuple[float, float], ratio: float = 10.0**0.5) -> np.ndarray:
-    """Return scales between two ends, `ratio` apart: half a decade."""
-    return np.geomspace(*ends, round(np.log(ends[1] / ends[0]) / np.log(ratio)) + 1)
-
-
 def widened(fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS) -> FittedParameters:
     """Return what a fit knows, in a space that has more blocks; these are zero and, so far, certain."""
     old = fitted.space
@@ -75,7 +68,7 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
     base = start + np.arange(18).reshape(6, 3)
     platform = start + 18 + np.arange(3 * count).reshape(count, 3)
     offsets = np.arange(space.size)[space.offsets]
-    lengths, growths = _scales(ASSUMED.moved), _scales(ASSUMED.grown)
+    lengths, growths = np.array(ASSUMED.moved), np.array(ASSUMED.grown)
 
     def shown(names: Sequence[str], factor: float = 1e6, what: str = "µm") -> tuple[tuple[str, float, str], ...]:
         return tuple((name, factor, what) for name in names)
@@ -109,17 +102,17 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
     prior = space.physical(np.diag(space.spread(space.start_tolerances())))
     owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
     aged, bend = prior[:, np.isin(owner, modelled)], prior[:, np.isin(owner, ("field displacement", "field rotation"))]
-    changes.append(Change(AGEING, "all of it, a little", _scales(ASSUMED.aged, 2.0), aged))
+    changes.append(Change(AGEING, "all of it, a little", np.array(ASSUMED.aged), aged))
     for body, joints in (("base", base), ("platform", platform)):
         for n, places in enumerate(joints, start=1):
             changes.append(Change(OTHER, f"{body} joint {n}", lengths, unit[:, places], shown(AXES), "joints"))
     for name, ends, what in (("pitch", ASSUMED.worn_pitch, "ppm"), ("backlash", ASSUMED.worn_backlash, "µm")):
         for strut, column in zip(STRUT_NAMES, unit.T[owner == name], strict=False):  # no such block: none
             screw = Change(
-                OTHER, f"{name} of {strut}", _scales(ends), column[:, None], shown([strut], 1e6, what), "screws"
+                OTHER, f"{name} of {strut}", np.array(ends), column[:, None], shown([strut], 1e6, what), "screws"
             )
             changes.append(screw)
-    changes.append(Change(OTHER, "a smooth bend in space", _scales(ASSUMED.bent, 2.0), bend, group="bend"))
+    changes.append(Change(OTHER, "a smooth bend in space", np.array(ASSUMED.bent), bend, group="bend"))
     return changes
 
 
@@ -178,8 +171,8 @@ class CheckReadings:
 def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
     """Yield that one of some readings is wrong, or all scatter, by the effect (n, places) of a standard deviation."""
     for name, column in zip(names, single.T, strict=True):
-        yield Change(READING, name, _scales(ASSUMED.wrong_reading)), column[:, None]
-    yield Change(OTHER, "each reading by itself", _scales(ASSUMED.scattered), group="scatter"), single
+        yield Change(READING, name, np.array(ASSUMED.wrong_reading)), column[:, None]
+    yield Change(OTHER, "each reading by itself", np.array(ASSUMED.scattered), group="scatter"), single
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Parameter space and smooth field: polynomials as NumPy has them, priors as their formulas say, models as meant."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import calibration_helpers as small
 import numpy as np
@@ -13,6 +13,7 @@ from scipy.spatial.distance import cdist
 from hexapod_comp.calibration.assumptions import ASSUMED
 from hexapod_comp.calibration.blocks.field import SmoothField
 from hexapod_comp.calibration.parameters import BLOCKS, FitSettings, ParameterSpace
+from hexapod_comp.cli.app import main
 from hexapod_comp.errors import ModelError
 from hexapod_comp.measurements.campaign import template
 from hexapod_comp.measurements.readings import MeasurementSet
@@ -254,3 +255,14 @@ def test_model_says_what_the_vector_says(readings: MeasurementSet):
 def test_settings_that_cannot_be(options: dict, what: str):
     with pytest.raises(ModelError, match=what):
         FitSettings(**options)
+
+
+def test_every_assumption_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    """Numbers, lists, and lists of names with their numbers; ``fit --assumptions`` once ended at the last."""
+    with pytest.raises(SystemExit) as ended:
+        main(["fit", "--assumptions"])
+    printed = capsys.readouterr().out
+    assert ended.value.code == 0
+    assert all(f.name in printed for f in fields(ASSUMED))
+    assert "3e-06, 1e-05, 3e-05, 0.0001, 0.0003 m" in printed
+    assert "linear 5e-07, length 5e-07, position 1e-05 m/m" in printed
