@@ -113,7 +113,14 @@ def fit_figure(fit: ModelFit) -> Figure:
     panels = figure.subplots(2, 2)
     _residual_panel(panels[0, 0], fit)
     _strut_panel(panels[0, 1], fit)
-    axes = panels[1, 0]
+    _sight_panel(panels[1, 0], fit)
+    _tool_error_panel(panels[1, 1], fit)
+    figure.suptitle(f"{picture_text(fit.measurements.geometry.name)}: scheme joint, {len(fit.measurements)} readings")
+    return figure
+
+
+def _sight_panel(axes: Axes, fit: ModelFit) -> None:
+    """Show how many parameters of each block the data determine."""
     blocks = fit.observability.blocks
     names = [block.name for block in blocks]
     axes.barh(names, [block.parameters for block in blocks], color="#d0d0d0", label="parameters")
@@ -121,9 +128,6 @@ def fit_figure(fit: ModelFit) -> Figure:
     axes.invert_yaxis()
     axes.set(title="what the readings determine", xlabel="parameters")
     axes.legend(fontsize=7)
-    _tool_error_panel(panels[1, 1], fit)
-    figure.suptitle(f"{picture_text(fit.measurements.geometry.name)}: scheme joint, {len(fit.measurements)} readings")
-    return figure
 
 
 def _residual_panel(axes: Axes, fit: ModelFit) -> None:
