@@ -127,12 +127,6 @@ def test_an_old_name_works_and_says_the_new_one(hexapod, tmp_path: Path) -> None
     assert hexapod("measure", "--help")[1].startswith("usage: hexapod_comp simulate")
 
 
-def test_an_old_option_names_the_new_one(hexapod) -> None:
-    code, out, err = hexapod("demo", "--plot", "out/demo.png")
-    assert (code, out) == (2, "")
-    assert err.endswith("error: argument --plot: is now --pictures FOLDER\n")
-
-
 def test_json_is_printed_and_out_stays_csv(hexapod, tmp_path: Path) -> None:
     """Both at once: the file is the one that is written without --json."""
     one, two = str(tmp_path / "one.csv"), str(tmp_path / "two.csv")
@@ -191,47 +185,6 @@ def test_version_is_the_packages(hexapod) -> None:
     version = re.search(r"<version>(.*)</version>", (ROOT / "package.xml").read_text())
     assert version
     assert hexapod("--version") == (0, f"hexapod_comp {version.group(1)}\n", "")
-
-
-@pytest.mark.parametrize("arguments", [(), ("ik", "--pose", "1,2"), ("check",), ("fk", "--guess", "x")])
-def test_usage_errors_exit_2(hexapod, arguments: tuple[str, ...]) -> None:
-    code, out, err = hexapod(*arguments)
-    assert (code, out) == (2, "")
-    assert "usage: hexapod_comp" in err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
-        (("ik",), "give exactly one of POSES.csv, --pose, --x-mm --y-mm --z-mm, --line"),
-        (("ik", TABLE_1, "--pose", "0,0,400"), "give exactly one of"),
-        (("ik", "--line", "0,0,400,9,0,400", "--pose", "0,0,400"), "give exactly one of"),
-        (
-            ("ik", "--line", "0,0,400,9,0,400", "--step-mm", "1e-9"),
-            "--step-mm: must be 9e-05 or more on a line of 9 mm",
-        ),
-        (("ik", "--line", "0,0,400,9,0,400", "--direction", "forward"), "--direction has no meaning with --line"),
-        (("ik", "--x-mm", "1", "--z-mm", "400"), "--y-mm is missing"),
-        (("ik", "nowhere.csv"), "nowhere.csv: there is no such file"),
-        (("ik", TABLE_1, "--model", "paper"), "format: must be 'hexapod_comp/model'"),
-        (("ik", TABLE_1, "--machine", "paper_machine"), "format: must be 'hexapod_comp/geometry'"),
-        (("ik", TABLE_1, "--out", "/nowhere/lengths.csv"), "/nowhere/lengths.csv: cannot be written"),
-        (("fk",), "give exactly one of LENGTHS.csv, --lengths"),
-        (("fk", TABLE_1), "header: column L1_m or L1_mm"),
-        (("fk", "--lengths", "1,2,3,4,5,6"), "no pose has these strut lengths"),
-        (("fk", "--lengths", "500,500,500,500,500,900"), "the closest one leaves"),
-        (("fk", "--lengths", "500,500,500,500,500,900", "--cold"), "no pose"),
-        (("fk", TABLE_1, "--all-modes"), "--all-modes has no meaning without --lengths"),
-        (("export",), "at least one of --linuxcnc, --table, --c, --ros2-control, --urdf, --mjcf is needed"),
-        (("check", TABLE_1, "--rate-hz", "0"), "--rate-hz: must lie in 1…10000 Hz"),
-    ],
-)
-def test_bad_input_is_one_line_on_stderr_and_exit_2(hexapod, arguments: tuple[str, ...], complaint: str) -> None:
-    code, out, err = hexapod(*arguments)
-    assert (code, out) == (2, "")
-    assert err.startswith("hexapod_comp: error: ")
-    assert complaint in err
-    assert err.count("\n") == 1
 
 
 def test_errors_name_row_and_column(hexapod, tmp_path: Path) -> None:
@@ -339,20 +292,6 @@ def test_ik_with_a_model_prints_commands_and_corrections(hexapod) -> None:
     table = hexapod("ik", "--pose", "1,2,410,3,4,5", "--model", "paper_machine")[1]
     assert table.splitlines()[1].split() == ["strut", "nominal_mm", "command_mm", "correction_um"]
     assert code == 0
-
-
-@pytest.mark.parametrize(
-    ("given", "problem"),
-    [
-        (("--line", "0,0,400,9,0"), "argument --line: needs six or nine numbers (mm and degrees: "),
-        (("--line", "0,0,400,0,0,400"), "argument --line: must end elsewhere than it starts"),
-        ((TABLE_1, "--direction", "up"), "argument --direction: invalid choice: 'up'"),
-    ],
-)
-def test_a_line_or_direction_that_is_none_is_refused(hexapod, given: tuple[str, ...], problem: str) -> None:
-    code, out, err = hexapod("ik", *given)
-    assert (code, out) == (2, "")
-    assert problem in err
 
 
 def only_backlash(folder: Path, lost: list[float], machine: str = "paper") -> str:
@@ -814,15 +753,6 @@ def test_assess_writes_every_machine(hexapod, tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    "arguments", [("--joint-um", "-1"), ("--machines", "0"), ("--seed", "-1"), ("--strut-um", "nan")]
-)
-def test_assess_refuses_bounds_that_are_none(hexapod, arguments: tuple[str, ...]) -> None:
-    code, out, err = hexapod("assess", *arguments)
-    assert (code, out) == (2, "")
-    assert f"argument {arguments[0]}" in err
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_signals_end_a_session_in_order(number: signal.Signals) -> None:
     """What was started inside is ended, as contexts do; 128 + signal, as shells count."""
@@ -839,20 +769,3 @@ def test_signals_end_a_session_in_order(number: signal.Signals) -> None:
     assert left.value.code == 128 + number
     assert ended
     assert signal.getsignal(number) == before
-
-
-@pytest.mark.parametrize(
-    ("typed", "said"),
-    [
-        ("nonsense", "there is no verb 'nonsense'; hexapod_comp --help lists them"),
-        ("fti measured.csv", "there is no verb 'fti'; did you mean fit?"),
-        ("verfy model.yaml", "there is no verb 'verfy'; did you mean verify?"),
-        ("fit measured.csv --colums c.yaml --out m.yaml", "there is no option --colums; did you mean --columns?"),
-        ("check poses.csv --machin=mine.yaml --modle=a", "there is no option --modle; did you mean --model?"),
-        ("fk 1,2,3,4,5,6", "numbers go with an option: --lengths 1,2,3,4,5,6"),
-        ("verify m.yaml r.csv --instruments linear", "--instruments has no meaning without --propose"),
-    ],
-)
-def test_verbs_and_options_typed_wrong(typed: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(typed.split()) == 2
-    assert said in capsys.readouterr().err

@@ -96,29 +96,6 @@ def test_without_errors_the_file_is_the_ideal_machine(tmp_path: Path, capsys: py
     assert not load_model(out, load_geometry("paper")).base_deviation.any()
 
 
-@pytest.mark.parametrize(
-    ("words", "problem"),
-    [
-        ("--joints-um -1", "must not be negative"),
-        ("--wave-um 3,1", "needs one number, or the lowest and the highest"),
-        ("--wave-um 1,2,3", "needs one number, or the lowest and the highest"),
-        ("--backlash-um nan", "must be finite numbers, not 'nan'"),
-        ("--wave-period-mm 0", "must be above zero"),
-        ("--joints-um 90000", "is the unit right?"),
-        ("--pitch-ppm 900000", "strut error changes by"),
-        ("--field-um 1 --field-reversal-percent 150", "must be at most 1"),
-        ("--seed x", "must be a whole number"),
-    ],
-)
-def test_bounds_that_cannot_be_are_refused(
-    words: str, problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "truth.yaml"
-    assert cli.main(["imagine", *words.split(), "--out", str(out)]) == 2
-    assert problem in capsys.readouterr().err
-    assert not out.exists()
-
-
 CAMPAIGN = """format: hexapod_comp/campaign
 version: 1
 box_mm: [[-30, -30, 380], [30, 30, 420]]

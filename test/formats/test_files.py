@@ -87,24 +87,14 @@ def test_no_mapping(tmp_path, text):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("a: [1, 2\nb: 3", "line 4: is not valid YAML: did not find expected"),
-        ("a: 1\na: 2", "'a' is given twice"),
-        ("a: {b: 1, b: 2}", "'b' is given twice"),
-        ("1: 2", "key 1 is not text"),
-        ("[1, 2]: 3", "is not text"),
-        ("a: !!python/object/apply:os.system ['true']", r"line 3: is not valid YAML: tag .*os\.system' is not under"),
-        ("a: !!bool maybe", r"tag 'tag:yaml\.org,2002:bool' is not understood"),
-        ("a: !!float ''", "write the plain value"),
         ("a: 2026-13-45", "line 3: is not valid YAML: '2026-13-45' is no date"),
         ("a: " + "1" * 5000, r"line 3: is not valid YAML: '1+… is too long for a number"),
-        ("a: &x [1]\nb: *x", r"reference \*x is not understood"),
         ("[" * 5000, "is not valid YAML"),
-        ("a: " + "[" * 33, "nested more than 32 deep"),
-        ("a: " + "{a: " * 33, "nested more than 32 deep"),
         ("a:\n " + "- " * 100_000 + "1", "nested more than 32 deep"),
     ],
 )
 def test_yaml_that_is_refused(tmp_path, text, said):
+    """What is shorter stands in test/cli/messages.txt, as what YAML 1.1 reads otherwise than people do: 0400 is 256."""
     with pytest.raises(InputFileError, match=said):
         load(tmp_path, HEAD + text)
 
@@ -118,26 +108,12 @@ def test_a_short_file_cannot_stand_for_billions_of_values(tmp_path):
         load(tmp_path, HEAD + text)
 
 
-@pytest.mark.parametrize("number", ["0400", "-010", "0x10", "0b11", "1:30", "1:30.5", "1_000", "1_0.5"])
-def test_numbers_that_yaml_would_misread(tmp_path, number):
-    """Truth: the YAML 1.1 types: 0400 is octal (256), 1:30 is to base 60 (90), 1_000 is 1000."""
-    with pytest.raises(InputFileError, match=r"line 3.*not a plain decimal number"):
-        load(tmp_path, HEAD + f"a_mm: {number}")
-
-
 @pytest.mark.parametrize(
     ("number", "value"),
     [("0", 0), ("-0.5", -0.5), ("+400", 400), ("400.", 400), (".5", 0.5), ("1.5e-3", 0.0015), ("0.05", 0.05)],
 )
 def test_numbers_that_mean_what_they_say(tmp_path, number, value):
     assert load(tmp_path, HEAD + f"a_m: {number}").quantity("a", "length") == value
-
-
-@pytest.mark.parametrize("number", ["1e-3", "400mm", "4,5", "1" * 400])
-def test_what_yaml_does_not_take_for_a_number(tmp_path, number):
-    """YAML 1.1 reads 1e-3 (no point) as text, and 400 digits overflow: refused by name, never guessed."""
-    with pytest.raises(InputFileError, match="a_mm: must be"):
-        load(tmp_path, HEAD + f"a_mm: {number}").quantity("a", "length")
 
 
 def test_deep_nesting_does_not_end_the_process(tmp_path):
@@ -207,19 +183,6 @@ def test_a_micro_sign_of_windows(tmp_path):
     assert read_yaml(path, "test", 1).quantity("a", "length") == 3e-6
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("a:\n\tb: 1", "line 4: is not valid YAML: .*; YAML is indented by spaces, not by tabs"),
-        ("a_mm: 4,5", r"a_mm: must be a number, with a decimal point: 4\.5 \(found '4,5'\)"),
-        ("a_mm: [1; 2; 3]", r"a_mm\[0\]: must be a number, without semicolons"),
-    ],
-)
-def test_tabs_semicolons_and_decimal_commas_are_named(tmp_path, text, said):
-    with pytest.raises(InputFileError, match=said):
-        load(tmp_path, HEAD + text).quantity("a", "length")
-
-
 def test_every_unit_ends_its_key_in_one_way():
     """A key must not fit two units of one kind: a_m_min is not the length a_m in min."""
     for units in UNITS.values():
@@ -229,12 +192,6 @@ def test_every_unit_ends_its_key_in_one_way():
 def test_missing_key_suggests_its_neighbour():
     with pytest.raises(InputFileError, match=r"machine: is missing; did you mean it by 'machin'\?"):
         section(machin="x").text("machine")
-
-
-def test_quantity_without_unit_names_the_choices():
-    said = r"a: has no unit; write one of a_m, a_mm, a_um, a_in \(found 3\)"
-    with pytest.raises(InputFileError, match=said):
-        section(a=3).quantity("a", "length")
 
 
 def test_default_is_si_and_only_for_a_missing_key():

@@ -1,0 +1,63 @@
+"""The wording of what is refused, in one file: messages.txt has what is typed, or a file's text, and the answer.
+
+``RENEW_MESSAGES=1 pytest test/cli/test_messages.py`` writes the answers anew; ``git diff`` then shows every new word.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+from pathlib import Path
+
+import pytest
+
+from hexapod_comp import cli
+from hexapod_comp.errors import InputFileError
+from hexapod_comp.formats.paths import config_folder
+from hexapod_comp.formats.yaml import parse_yaml
+
+GOLDEN = Path(__file__).with_name("messages.txt")
+ASKED = ("$ ", "yaml ")
+LINES = GOLDEN.read_text(encoding="utf-8").splitlines()
+CASES = [(n, line) for n, line in enumerate(LINES) if line.startswith(ASKED)]
+
+BUDGET = "format: hexapod_comp/error_budget\nversion: 1\nmachine: positioning_unit\nerrors: "
+YAML = "format: test\nversion: 1\n"
+
+
+def read_length(text: str) -> None:
+    section = parse_yaml(text, "some.yaml", "test", 1)
+    section.quantity("a", "length")
+    section.finish()
+
+
+def answer(asked: str, capsys: pytest.CaptureFixture[str]) -> str:
+    """Return what is said of a command (in braces: the errors of its b.yaml), or of a YAML file with a length ``a``."""
+    if asked.startswith("yaml "):
+        with pytest.raises(InputFileError) as caught:
+            read_length(YAML + json.loads(asked.removeprefix("yaml ")))
+        return str(caught.value)
+    typed, brace, errors = asked.removeprefix("$ ").partition("{")
+    if brace:
+        Path("b.yaml").write_text(f"{BUDGET}{brace}{errors}\n", encoding="utf-8")
+    before = sorted(Path().rglob("*"))
+    assert cli.main(shlex.split(typed)) == 2, "refused by exit code 2"
+    out, err = capsys.readouterr()
+    assert out == "", "nothing is printed"
+    assert sorted(Path().rglob("*")) == before, "nothing is written"
+    *usage, last = err.splitlines()
+    assert usage[0].startswith("usage: hexapod_comp") if usage else last.startswith("hexapod_comp: error: "), err
+    return last.replace(f"{config_folder()}", "config").partition(" (choose from")[0]  # Python's own, by version
+
+
+@pytest.mark.parametrize(("line", "asked"), CASES, ids=[asked for _, asked in CASES])
+def test_message(
+    line: int, asked: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    said = answer(asked, capsys)
+    if "RENEW_MESSAGES" in os.environ:
+        LINES[line + 1 : line + 2] = [f"  {said}"]
+        GOLDEN.write_text("\n".join(LINES) + "\n", encoding="utf-8")
+    assert LINES[line + 1] == f"  {said}"
