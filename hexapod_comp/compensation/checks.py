@@ -25,7 +25,7 @@ LIMITS = ("stroke", "base_cone", "platform_cone", "clearance", "condition", "cor
 """Limits that have a margin, in the order in which they are shown."""
 
 OTHER_FINDINGS = ("assembly", "not_converged", "outside_field")
-"""What has no margin: it is so or it is not."""
+"""Findings without a margin."""
 
 MODES = ("poses", "moves", "stream")
 """What the rows of a list are to each other: nothing; targets joined by moves; consecutive commands."""
@@ -39,22 +39,11 @@ CHUNK = 16_384
 
 @dataclass(frozen=True)
 class Breach:
-    """One limit that one pose, or the move to it, breaks.
+    """One limit that one pose, or the move to it, breaks."""
 
-    Attributes
-    ----------
-    row : int
-        Index of the pose.
-    share : float
-        How much of the move to it is done there: 1.0 at the pose itself.
-    error : HexapodError
-        What is wrong, in words; a :class:`~hexapod_comp.errors.LimitError` for limits, with value, allowed
-        value, strut and stage.
-    """
-
-    row: int
-    share: float
-    error: HexapodError
+    row: int  # index of the pose
+    share: float  # of the move to it that is done there: 1.0 at the pose itself
+    error: HexapodError  # a LimitError for limits, with value, allowed value, strut and stage
 
     @property
     def limit(self) -> str:
@@ -62,30 +51,57 @@ class Breach:
         return self.error.reason
 
 
-@dataclass(frozen=True)
+@dataclass
 class LimitSummary:
-    """What is left of one limit, pose by pose; SI units.
+    """The margin of one limit, pose by pose, each of shape (N, 2): in the nominal and in the compensated stage; SI."""
 
-    Attributes
-    ----------
-    margin, value : ndarray, shape (N, 2)
-        Smallest distance to the limit (negative: broken) and the value there, in the nominal and in the
-        compensated stage; margin ∞ and value NaN where there was nothing to compare.
-    strut : ndarray of int, shape (N, 2)
-        Index of the strut concerned; −1 for the condition number.
-    share : ndarray, shape (N, 2)
-        As in :class:`Breach`.
-    """
+    margin: np.ndarray  # smallest distance to the limit, negative: broken; ∞ where there was nothing to compare
+    value: np.ndarray  # there; NaN where there was nothing to compare
+    strut: np.ndarray  # index of the strut; −1 for the condition number
+    share: np.ndarray  # as in Breach
+    # (row, strut) → (margin, value, stage, share) of the worst breach
+    broken: dict[tuple[int, int], tuple[float, float, int, float]] = field(default_factory=dict, repr=False)
 
-    margin: np.ndarray
-    value: np.ndarray
-    strut: np.ndarray
-    share: np.ndarray
+    @staticmethod
+    def empty(count: int) -> LimitSummary:
+        """Return the summary of rows none of which has been examined yet."""
+        shape = (count, 2)
+        return LimitSummary(np.full(shape, np.inf), np.full(shape, np.nan), np.full(shape, -1), np.ones(shape))
 
     def smallest(self) -> tuple[int, int] | None:
         """Return (row, stage) of the smallest margin, None when nothing was compared."""
         index = int(self.margin.argmin())
         return None if np.isposinf(self.margin.flat[index]) else divmod(index, 2)
+
+    def take(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
+        """Take in margins and values, (n, 2, k), of n poses that belong to the rows `owner`, ascending."""
+        margin = np.where(np.isnan(margin), -np.inf, margin)
+        starts = np.flatnonzero(np.diff(owner, prepend=-1))
+        rows = owner[starts]
+        of_pose = margin.min(axis=2)
+        for stage in range(2):
+            first = np.lexsort((of_pose[:, stage], owner))[starts]  # the worst pose of each row
+            better = of_pose[first, stage] < self.margin[rows, stage]
+            first, into = first[better], rows[better]
+            strut = margin[first, stage].argmin(axis=1)
+            self.margin[into, stage] = of_pose[first, stage]
+            self.value[into, stage] = value[first, stage, strut]
+            self.strut[into, stage] = strut if margin.shape[2] == 6 else -1
+            self.share[into, stage] = share[first]
+        self._take_broken(margin, value, owner, share)
+
+    def _take_broken(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
+        pose, stage, strut = np.nonzero(margin < 0.0)
+        # The worst of each row and strut first; of equals the nominal stage.
+        order = np.lexsort((stage, margin[pose, stage, strut], strut, owner[pose]))
+        pose, stage, strut = pose[order], stage[order], strut[order]
+        new = np.ones(len(pose), dtype=bool)
+        new[1:] = (np.diff(owner[pose]) != 0) | (np.diff(strut) != 0)
+        for p, s, k in zip(pose[new], stage[new], strut[new], strict=True):
+            key = int(owner[p]), int(k)
+            breach = float(margin[p, s, k]), float(value[p, s, k]), int(s), float(share[p])
+            if key not in self.broken or breach[0] < self.broken[key][0]:
+                self.broken[key] = breach
 
 
 @dataclass(frozen=True)
@@ -183,53 +199,6 @@ def check(
     return run.result(mode, geometry.platform_poses(positions, rotations))
 
 
-@dataclass
-class _Worst:
-    """The worst of one limit so far, per row and stage."""
-
-    margin: np.ndarray
-    value: np.ndarray
-    strut: np.ndarray
-    share: np.ndarray
-    broken: dict[tuple[int, int], tuple[float, float, int, float]] = field(default_factory=dict)
-    """(row, strut) → (margin, value, stage, share)."""
-
-    @staticmethod
-    def empty(count: int) -> _Worst:
-        shape = (count, 2)
-        return _Worst(np.full(shape, np.inf), np.full(shape, np.nan), np.full(shape, -1), np.ones(shape))
-
-    def take(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
-        """Take in margins and values, (n, 2, k), of n poses that belong to the rows `owner`, ascending."""
-        margin = np.where(np.isnan(margin), -np.inf, margin)
-        starts = np.flatnonzero(np.diff(owner, prepend=-1))
-        rows = owner[starts]
-        of_pose = margin.min(axis=2)
-        for stage in range(2):
-            first = np.lexsort((of_pose[:, stage], owner))[starts]  # the worst pose of each row
-            better = of_pose[first, stage] < self.margin[rows, stage]
-            first, into = first[better], rows[better]
-            strut = margin[first, stage].argmin(axis=1)
-            self.margin[into, stage] = of_pose[first, stage]
-            self.value[into, stage] = value[first, stage, strut]
-            self.strut[into, stage] = strut if margin.shape[2] == 6 else -1
-            self.share[into, stage] = share[first]
-        self._take_broken(margin, value, owner, share)
-
-    def _take_broken(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
-        pose, stage, strut = np.nonzero(margin < 0.0)
-        # The worst of each row and strut first; of equals the nominal stage.
-        order = np.lexsort((stage, margin[pose, stage, strut], strut, owner[pose]))
-        pose, stage, strut = pose[order], stage[order], strut[order]
-        new = np.ones(len(pose), dtype=bool)
-        new[1:] = (np.diff(owner[pose]) != 0) | (np.diff(strut) != 0)
-        for p, s, k in zip(pose[new], stage[new], strut[new], strict=True):
-            key = int(owner[p]), int(k)
-            breach = float(margin[p, s, k]), float(value[p, s, k]), int(s), float(share[p])
-            if key not in self.broken or breach[0] < self.broken[key][0]:
-                self.broken[key] = breach
-
-
 class _PathCheck:
     """One check under way: the machine, its state along the path, and the worst so far."""
 
@@ -237,7 +206,7 @@ class _PathCheck:
         self.geometry, self.rate, self.count = geometry, rate, count
         self.machine = RealMachine(geometry, model)
         self.limits = tuple(name for name in LIMITS if name != "clearance" or geometry.limits.clearance)
-        self.worst = {name: _Worst.empty(count) for name in (*self.limits, *OTHER_FINDINGS)}
+        self.worst = {name: LimitSummary.empty(count) for name in (*self.limits, *OTHER_FINDINGS)}
         self.lengths = np.full((count, 2, 6), np.nan)
         self.unchecked = np.zeros(count, dtype=bool)
         self.outside_field = np.zeros(count, dtype=bool)
@@ -373,12 +342,11 @@ class _PathCheck:
         ]
         region = self.machine.model.measured
         outside = np.zeros(self.count, dtype=bool) if region is None else ~region.contains(*platforms)
-        summaries = {name: self.worst[name] for name in self.limits}
         return CheckResult(
             mode=mode,
             rate=self.rate,
             examined=self.examined,
-            limits={n: LimitSummary(w.margin, w.value, w.strut, w.share) for n, w in summaries.items()},
+            limits={name: self.worst[name] for name in self.limits},
             breaches=sorted(breaches, key=lambda breach: breach.row),
             lengths=self.lengths,
             unchecked_moves=self.unchecked,

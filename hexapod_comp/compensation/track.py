@@ -87,7 +87,9 @@ class StrutTrack(Guard):
         longer, that it may have got there: transports delay.
         """
         struts, now = sample.values or (), sample.now
-        excess = self._jumps.excess(struts, now, self._by_stamp(sample.stamp))
+        both = sample.stamp and self._read_stamp
+        by_stamp = (sample.stamp - self._read_stamp) * 1e-9 if both else -math.inf
+        excess = self._jumps.excess(struts, now, by_stamp)
         if excess is not None:
             moved, allowed = f"{excess.moved * 1e3:.3f} mm", f"{excess.allowed * 1e3:.3f} mm"
             text = f"{STRUT_NAMES[excess.which]} has jumped by {moved}, in {excess.elapsed:.3f} s it can have moved "
@@ -188,10 +190,6 @@ class StrutTrack(Guard):
         if self._read and self._read_made >= told_at + (-FOLLOWED_WITHIN if fresh else FOLLOWED_WITHIN):
             return self.mean()
         return np.array(told) if told else None
-
-    def _by_stamp(self, stamp: int) -> float:
-        """Return the time since the last reading by the stamps of both, s; −∞ where one has none."""
-        return (stamp - self._read_stamp) * 1e-9 if stamp and self._read_stamp else -math.inf
 
 
 def _range(recent: deque[tuple[float, Struts]], since: float) -> tuple[np.ndarray, np.ndarray]:

@@ -48,7 +48,7 @@ from .interface import (
 from .messages import StrutBytes, StrutReader, period, read_message
 from .process import run
 from .rclpy_compat import Alarm
-from .requests import Requests
+from .requests import Requests, Served
 from .status import ADVICE, OTHERWISE, WARN, CompensatorStatus, seconds
 
 ESTIMATE_PERIOD = 0.02
@@ -198,12 +198,8 @@ class CompensatorNode(MachineNode):
         self._ends: list[Any] = [self._commands, self._corrections, self._array, heard, states]
         self._thermometers = Thermometers(*temperature_rules(options))
         sensing: dict[str, OneSender] = {}
-        sensors = (
-            ("temperatures", Temperature, self._take_temperature),
-            (HUMIDITY, RelativeHumidity, self._take_humidity),
-        )
-        for topic, kind, take in sensors:
-            callback = partial(self._on_sensor, topic, kind, take)
+        for topic, kind in (("temperatures", Temperature), (HUMIDITY, RelativeHumidity)):
+            callback = partial(self._on_sensor, topic, kind)
             sensor = self.obey(kind, topic, callback, self._look_at_publishers, qos=SENSOR_QOS)
             self._ends.append(sensor)
             sensing[topic] = self.sender_of(sensor, several or options["allow_several_thermometers"])
@@ -216,10 +212,11 @@ class CompensatorNode(MachineNode):
             Start(compensator, status),
             self._stamps,
         )
-        self._pacing = Pacing(self, self._take, self._refuse_waiting)
-        self._requests = Requests(
-            self, compensator, status, self._files, ids, self._forget, lambda: self._outputs.answered
+        self._pacing = Pacing(
+            self, self._take, lambda data, error, now: self._refuse(self._input.stamp(data), error, now)
         )
+        served = Served(self, compensator, status, self._files, ids, self._forget, lambda: self._outputs.answered)
+        self._requests = Requests(served)
         self._journal = JournalTopics(self, compensator, self._files.sources, ids)
         self._ends.append(self.every(CHECK_PERIOD, self._check_state))
         self._ends.append(self.every(ESTIMATE_PERIOD, self._estimate_from_commands))
@@ -270,9 +267,6 @@ class CompensatorNode(MachineNode):
         self._unestimated = when
         return 0.0
 
-    def _refuse_waiting(self, data: bytes, error: HexapodError, now: float) -> None:
-        self._refuse(self._input.stamp(data), error, now)
-
     def _refuse(self, stamp: int, error: HexapodError, now: float) -> None:
         self._journal.refused(stamp, error.reason, str(error))
         self._status.refusals.add(error.reason, str(error), now)
@@ -296,7 +290,7 @@ class CompensatorNode(MachineNode):
         self._status.reading_stamps.check(sample)
         struts = sample.values or ()
         track.check_stroke(struts)
-        # Before what cannot be is left aside: then the strut or its encoder is broken, and even one reading is said.
+        # Before the check for a jump: one reading off its command stops the machine, be it the strut or its encoder.
         if self._active and track.follow(struts, now - sample.age):
             self._status.bad_feedback.add(track.reason, track.problem, now)
         track.check_jump(sample)
@@ -316,27 +310,22 @@ class CompensatorNode(MachineNode):
             self._look_at_publishers()
         sender.check(sample)
 
-    def _on_sensor(
-        self, topic: str, kind: type, take: Callable[[Any, float], None], data: bytes, number: int | None
-    ) -> None:
+    def _on_sensor(self, topic: str, kind: type, data: bytes, number: int | None) -> None:
         # Dated by arrival: sensors need not stamp, clocks may be set, and what a transport delays a drift does not
         # notice.
         now, what = time.monotonic(), topic.removesuffix("s")
         try:
             self._hear(self._status.sensing[topic], number, Sample(now))
-            take(read_message(data, kind), now)
+            message = read_message(data, kind)
+            if kind is RelativeHumidity:
+                self.compensator.set_humidity(self._thermometers.take(HUMIDITY, message.relative_humidity, now), now)
+            else:
+                check_part(name := message.header.frame_id)
+                self.compensator.set_temperature(name, self._thermometers.take(name, message.temperature, now), now)
         except CommandError as error:
             self._ignore(topic, error.reason, f"{what} ignored: {error}", str(error), now)
         except HexapodError as error:
             self._ignore(what, what, f"{what} ignored: {error}", str(error), now)
-
-    def _take_temperature(self, message: Temperature, now: float) -> None:
-        name = message.header.frame_id
-        check_part(name)
-        self.compensator.set_temperature(name, self._thermometers.take(name, message.temperature, now), now)
-
-    def _take_humidity(self, message: RelativeHumidity, now: float) -> None:
-        self.compensator.set_humidity(self._thermometers.take(HUMIDITY, message.relative_humidity, now), now)
 
     def _ignore(self, cause: str, reason: str, warning: str, text: str, now: float) -> None:
         """Count and log what was not usable."""

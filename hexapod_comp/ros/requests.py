@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -47,32 +47,32 @@ LONGEST_REASON = 200
 """Characters of what stands in the tool's way."""
 
 
+@dataclass
+class Served:
+    """A configured compensator, as requests are about it."""
+
+    node: MachineNode
+    compensator: Compensator
+    status: CompensatorStatus
+    files: MachineFiles
+    frame_ids: dict[str, str]  # by the machine's names of its frames
+    forget: Callable[[], None]  # forgets the last command
+    newest: Callable[[], int]  # returns its stamp, ns
+
+
 class Requests:
-    """Services and topics of a configured compensator on which something is asked of it.
+    """Services and topics on which something is asked of a compensator."""
 
-    `forget` forgets the last command; `newest` returns its stamp, ns.
-    """
-
-    def __init__(
-        self,
-        node: MachineNode,
-        compensator: Compensator,
-        status: CompensatorStatus,
-        files: MachineFiles,
-        ids: dict[str, str],
-        forget: Callable[[], None],
-        newest: Callable[[], int],
-    ) -> None:
-        self._node, self._compensator, self._status, self._files = node, compensator, status, files
-        self._forget = forget
-        self._worker = Worker()
+    def __init__(self, served: Served) -> None:
+        self._served, self._worker, node = served, Worker(), served.node
+        self._node, self._compensator, self._status, self._files = node, served.compensator, served.status, served.files
         self._enable = node.create_service(SetBool, "~/enable_compensation", self._on_enable)
         self._reset = node.create_service(Trigger, "~/reset", self._on_reset)
         self._reload = LateAnswer(node.create_service(Trigger, "~/reload_model", self._on_reload))
         self._loading = False
-        self._tools = ToolChoice(node, compensator, status)
-        self._travel = TravelReports(node, compensator, status, files, ids, self._worker)
-        self._predicted = PredictedError(node, compensator, status, files, self._worker, ids[WORK], newest)
+        self._tools = ToolChoice(served)
+        self._travel = TravelReports(served, self._worker)
+        self._predicted = PredictedError(served, self._worker)
 
     def look(self, now: float) -> None:
         """Hand on what the worker has done, and ask for what is due."""
@@ -97,12 +97,13 @@ class Requests:
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Forget the last command and a following error, if the machine stands."""
         who = callers(self._node, self._reset)
-        if moving := self._status.track.moving(time.monotonic()):
+        now = time.monotonic()
+        if moving := self._status.track.moving(now):
             response.message = f"refused while the machine moves: {moving}"
-            self._status.refused_resets.add("moving", response.message, time.monotonic())
+            self._status.refused_resets.add("moving", response.message, now)
             self._node.warn_of("reset", f"reset {response.message}; asked for by {who}")
             return response
-        self._forget()
+        self._served.forget()
         self._status.track.release()
         response.success = True
         response.message = "the next command may be one allowed step from where the struts were known to be last"
@@ -121,15 +122,18 @@ class Requests:
         name, place, folder = self._files.model_place()
         late = f"{name}: could not be read within {LOADED_WITHIN:g} s; is the disk or the network behind it there?"
         arguments = {"name": name, "place": place, "folder": folder, "machine": machine}
-        job = Job("load_model", arguments, self._loaded, self._not_loaded, None, loaded_model, LOADED_WITHIN, late)
+        job = Job(
+            "load_model",
+            arguments,
+            lambda found: self._reload.answer(self._take_model(found)),
+            lambda error: self._reload.answer(self._keep_model(error)),
+            None,
+            loaded_model,
+            LOADED_WITHIN,
+            late,
+        )
         self._worker.ask(job)
         return None
-
-    def _loaded(self, found: tuple[MachineModel, Any]) -> None:
-        self._reload.answer(self._take_model(found))
-
-    def _not_loaded(self, error: HexapodError) -> None:
-        self._reload.answer(self._keep_model(error))
 
     def _take_model(self, found: tuple[MachineModel, Any]) -> Trigger.Response:
         self._loading = False
@@ -157,9 +161,11 @@ class ToolChoice:
     takes another tool.
     """
 
-    def __init__(self, node: MachineNode, compensator: Compensator, status: CompensatorStatus) -> None:
-        self._node, self._compensator, self._status = node, compensator, status
-        self._selected = node.obey(String, "select_tool", self._on_message, self._look_at_publishers)
+    def __init__(self, served: Served) -> None:
+        self._node, self._compensator, self._status = node, _, status = served.node, served.compensator, served.status
+        self._selected = node.obey(
+            String, "select_tool", self._on_message, lambda: status.sensing["select_tool"].look(time.monotonic())
+        )
         several = bool(node.get_parameter("allow_several_publishers").value)
         self._sender = status.sensing["select_tool"] = node.sender_of(self._selected, several)
         self._publisher = node.create_publisher(String, "~/tool", LATCHED_QOS)
@@ -196,9 +202,6 @@ class ToolChoice:
                 self._node.note("tool", f"tool {name!r}: the next command must be where the struts are")
                 self._publish()
 
-    def _look_at_publishers(self) -> None:
-        self._sender.look(time.monotonic())
-
     def _on_message(self, data: bytes, number: int | None) -> None:
         now = time.monotonic()
         self._sender.look(now)  # who has just come may have spoken already
@@ -233,19 +236,8 @@ class TravelReports:
     """``~/travel``, once a second while somebody subscribes, and ``~/get_travel``: how far the tool may go from where
     the machine was sent last, or before the first command was measured last."""
 
-    def __init__(
-        self,
-        node: MachineNode,
-        compensator: Compensator,
-        status: CompensatorStatus,
-        files: MachineFiles,
-        frame_ids: dict[str, str],
-        worker: Worker,
-    ) -> None:
-        self._node, self._compensator, self._status, self._worker = node, compensator, status, worker
-        self._files = files
-        self._names = {frame_id: name for name, frame_id in frame_ids.items()}
-        self._default = frame_ids[WORK]
+    def __init__(self, served: Served, worker: Worker) -> None:
+        self._served, self._worker, node = served, worker, served.node
         self._publisher = node.create_publisher(DiagnosticStatus, "~/travel", EVENT_QOS)
         self._late = LateAnswer(node.create_service(Trigger, "~/get_travel", self._on_request))
         self._busy = self._asked = False
@@ -254,7 +246,7 @@ class TravelReports:
     def close(self) -> None:
         """Stop, and leave no request without an answer."""
         self._answer(False, "the node was cleaned up")
-        self._node.close_ends(self._late.service, self._publisher)
+        self._served.node.close_ends(self._late.service, self._publisher)
 
     def look(self, now: float) -> None:
         """Begin anew when it is due."""
@@ -263,7 +255,7 @@ class TravelReports:
             try:
                 self._begin()
             except CommandError as error:
-                self._tell(ERROR, str(error), {})
+                self._publish(ERROR, str(error), {})
 
     def _on_request(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response | None:
         if self._asked and self._busy:
@@ -274,16 +266,17 @@ class TravelReports:
         return None
 
     def _begin(self) -> None:
-        compensator, frame_id = self._compensator, self._status.frame_id
-        if frame_id not in self._names:  # before the first command
-            frame_id = self._default
+        compensator, frame_id = self._served.compensator, self._served.status.frame_id
+        names = {frame_id: name for name, frame_id in self._served.frame_ids.items()}
+        if frame_id not in names:  # before the first command
+            frame_id = self._served.frame_ids[WORK]
         if np.isfinite(compensator.nominal).all():
             platform = compensator.platform
-        elif self._status.feedback.count:
+        elif self._served.status.feedback.count:
             platform = Pose(*compensator.platform_estimate)
         else:
             raise CommandError("no_feedback", "no command and no strut_states yet: where the machine is is not known")
-        geometry = compensator.geometry.using(work=self._names[frame_id])
+        geometry = compensator.geometry.using(work=names[frame_id])
         pose = geometry.tool_pose(platform)
         where = f"tool {geometry.tool_name} in {frame_id} at {pose_text(pose)}"
         arguments = {
@@ -295,22 +288,23 @@ class TravelReports:
             "enabled": compensator.enabled,
         }
         self._busy = True
-        found, failed = partial(self._found, where), partial(self._failed, where)
-        self._worker.ask(Job("travel", arguments, found, failed, self._files.made_of()))
+        self._worker.ask(
+            Job(
+                "travel",
+                arguments,
+                lambda answer: self._publish(OK, where, answer["values"], answer["text"]),
+                lambda error: self._publish(ERROR, f"{where}: {error}", {}),
+                self._served.files.made_of(),
+            )
+        )
 
-    def _found(self, where: str, answer: dict[str, Any]) -> None:
+    def _publish(self, level: bytes, text: str, values: dict[str, str], table: str = "") -> None:
         self._busy = False
-        self._tell(OK, where, answer["values"], answer["text"])
-
-    def _failed(self, where: str, error: WorkerError) -> None:
-        self._busy = False
-        self._tell(ERROR, f"{where}: {error}", {})
-
-    def _tell(self, level: bytes, text: str, values: dict[str, str], table: str = "") -> None:
         self._answer(level == OK, "\n".join(filter(None, (text, table))))
         if self._publisher.get_subscription_count():
-            name = f"{self._node.get_fully_qualified_name()[1:]}: travel"
-            self._publisher.publish(status_of(name, self._node.hardware_id, level, text, values, LONGEST_REASON))
+            node = self._served.node
+            name = f"{node.get_fully_qualified_name()[1:]}: travel"
+            self._publisher.publish(status_of(name, node.hardware_id, level, text, values, LONGEST_REASON))
 
     def _answer(self, success: bool, text: str) -> None:
         if self._asked:
@@ -322,18 +316,9 @@ class PredictedError:
     """``~/predicted_error`` and ``~/predicted_error_aligned``: what the tool's error would be at the last command
     without compensation, see :class:`..calibration.posterior.ErrorPredictor`; only while somebody listens."""
 
-    def __init__(
-        self,
-        node: MachineNode,
-        compensator: Compensator,
-        status: CompensatorStatus,
-        files: MachineFiles,
-        worker: Worker,
-        frame: str,
-        newest: Callable[[], int],
-    ) -> None:
-        self._node, self._compensator, self._status, self._files = node, compensator, status, files
-        self._worker, self._frame, self._newest = worker, frame, newest
+    def __init__(self, served: Served, worker: Worker) -> None:
+        self._served, self._worker, node = served, worker, served.node
+        self._compensator, self._status, self._files = served.compensator, served.status, served.files
         self._topics = {
             "standing": node.create_publisher(PoseWithCovarianceStamped, "~/predicted_error", EVENT_QOS),
             "aligned": node.create_publisher(PoseWithCovarianceStamped, "~/predicted_error_aligned", EVENT_QOS),
@@ -345,7 +330,7 @@ class PredictedError:
     def close(self) -> None:
         """Destroy the topics."""
         self._status.prediction_problem = ""
-        self._node.close_ends(*self._topics.values())
+        self._served.node.close_ends(*self._topics.values())
 
     def look(self, now: float) -> None:
         """Ask for the newest pose, while somebody listens."""
@@ -356,7 +341,7 @@ class PredictedError:
         if not wanted or self._busy or now < self._due or not np.isfinite(self._compensator.nominal).all():
             return
         compensator = self._compensator
-        self._busy, self._asked_for, self._due = True, self._newest(), now + PREDICTION_PERIOD
+        self._busy, self._asked_for, self._due = True, self._served.newest(), now + PREDICTION_PERIOD
         asked = {
             "position": compensator.platform.position.tolist(),
             "rotation": compensator.platform.rotation.tolist(),
@@ -372,12 +357,16 @@ class PredictedError:
         for name, publisher in self._topics.items():
             error = result[name]
             if error is not None and None not in error["values"]:
-                publisher.publish(error_message(error["values"], error["covariance"], self._frame, self._asked_for))
+                publisher.publish(
+                    error_message(error["values"], error["covariance"], self._served.frame_ids[WORK], self._asked_for)
+                )
 
     def _failed(self, error: WorkerError) -> None:
         self._busy, self._due = False, time.monotonic() + self._wait
         self._status.prediction_problem = f"no predicted error: {error}"
-        self._node.warn_of("predicted error", f"{self._status.prediction_problem}; tried again in {self._wait:g} s")
+        self._served.node.warn_of(
+            "predicted error", f"{self._status.prediction_problem}; tried again in {self._wait:g} s"
+        )
         self._wait = min(2.0 * self._wait, TRY_AGAIN_AFTER[1])
 
 

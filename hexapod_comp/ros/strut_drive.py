@@ -21,8 +21,8 @@ from sensor_msgs.msg import JointState
 from ..compensation.guards import Guard, Sample, StampGate, StrutSteps
 from ..errors import CommandError, HexapodError, KinematicsError
 from ..formats.paths import config_file
-from ..machine.geometry import STRUT_NAMES, HexapodGeometry, load_geometry
-from ..machine.model import MachineModel, RealMachine
+from ..machine.geometry import STRUT_NAMES, load_geometry
+from ..machine.model import RealMachine
 from ..virtual.machine import DriveParameters, Faults, StrutDrive
 from ..virtual.named import RANDOM, find_model, is_word
 from . import keep_discovery_local
@@ -104,8 +104,14 @@ class StrutDriveNode(MachineNode):
         self._true_out.header.frame_id = options["base_frame"]
         try:
             geometry = load_geometry(config_file(options["geometry_file"], "geometry"))
-            machine = RealMachine(geometry, self._truth(geometry))
-            self._drive = StrutDrive(machine, self._drive_parameters(), options["noise_seed"])
+            name = options["truth_file"]
+            if name == RANDOM:
+                name = f"{RANDOM}:{options['truth_seed']}"
+            machine = RealMachine(geometry, find_model(name if is_word(name) else config_file(name, "model"), geometry))
+            kept = ("step", "lag", "max_acceleration", "encoder_resolution", "encoder_noise", "tracker_noise")
+            values = {name: options[name] for name in kept}
+            parameters = DriveParameters(max_speed=options["max_speed"] or None, **values)
+            self._drive = StrutDrive(machine, parameters, options["noise_seed"])
             self.drive.faults = self._faults()
             self.drive.advance(1.0 / options["rate"])
             self._tool_in_base()
@@ -147,17 +153,6 @@ class StrutDriveNode(MachineNode):
         self._active = False
         self._check_state()
         self._diagnostics_pub.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
-
-    def _truth(self, geometry: HexapodGeometry) -> MachineModel:
-        name = self._options["truth_file"]
-        if name == RANDOM:
-            name = f"{RANDOM}:{self._options['truth_seed']}"
-        return find_model(name if is_word(name) else config_file(name, "model"), geometry)
-
-    def _drive_parameters(self) -> DriveParameters:
-        names = ("step", "lag", "max_acceleration", "encoder_resolution", "encoder_noise", "tracker_noise")
-        values = {name: self._options[name] for name in names}
-        return DriveParameters(max_speed=self._options["max_speed"] or None, **values)
 
     def _open_topics(self) -> None:
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)

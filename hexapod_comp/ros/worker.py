@@ -80,7 +80,7 @@ class Job:
 
 
 class Worker:
-    """The node's end: hands on one job at a time, and gives back what came of it when it is asked to `look`."""
+    """The node's end: sends one job at a time to the process; `look` calls back with the results that have come."""
 
     def __init__(self) -> None:
         self._waiting: deque[Job] = deque()
@@ -99,7 +99,7 @@ class Worker:
         self._next()
 
     def look(self, now: float) -> None:
-        """Hand on what has been done, give up what takes too long, and end what has nothing to do."""
+        """Call back with a result; give up a job after `within`, and end a process that is idle for IDLE_AFTER."""
         job, helper = self._running, self._helper
         if helper is None or job is None:
             if helper is not None and now - self._done_at > IDLE_AFTER:

@@ -25,12 +25,6 @@ KINDS = {"compensator": CompensatorNode, "strut_drive": StrutDriveNode}
 COMPENSATOR = "compensator"
 
 
-@pytest.fixture
-def rig(ros_context, capfd):
-    with Bench(ros_context, capfd) as rig:
-        yield rig
-
-
 def test_what_is_taken_at_configure_is_refused_until_a_cleanup(rig):
     rig.compensator()
     refused = rig.set_parameter(COMPENSATOR, "work_frame", "table")

@@ -135,7 +135,9 @@ def test_a_process_that_fails_every_time_is_tried_less_and_less_often(monkeypatc
     monkeypatch.setattr(requests.time, "monotonic", lambda: now)
     sources = {"geometry": MagicMock(), "model": MagicMock()}
     beside, files = SimpleNamespace(ask=ask), MagicMock(sources=sources)
-    topics = PredictedError(node, MagicMock(nominal=np.zeros(6)), status, files, beside, "work", lambda: 0)
+    topics = PredictedError(
+        MagicMock(node=node, compensator=MagicMock(nominal=np.zeros(6)), status=status, files=files), beside
+    )
     for tick in range(1000):
         now = 100.0 + 0.2 * tick
         topics.look(now)
