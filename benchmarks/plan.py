@@ -33,10 +33,10 @@ from hexapod_comp.calibration.posterior import box_stations, expected_error
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.machine.trial import drive, model_commands
 from hexapod_comp.measurements.campaign import Campaign, campaign_text, load_campaign, template
 from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.virtual.instruments import measure
-from hexapod_comp.virtual.trial import drive, model_commands
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
 from foreign_machines import machines

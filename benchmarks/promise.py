@@ -34,11 +34,11 @@ from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.passes import Poses, random_passes
 from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.machine.trial import Trial
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
 from hexapod_comp.virtual.imperfections import draw_model, with_length_map, with_wear
 from hexapod_comp.virtual.instruments import measure, station_errors
-from hexapod_comp.virtual.trial import Trial
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
 from foreign_machines import machines as zoo

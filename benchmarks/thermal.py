@@ -47,9 +47,9 @@ from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.passes import Passes, random_passes
 from hexapod_comp.machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
+from hexapod_comp.machine.trial import Trial
 from hexapod_comp.measurements.campaign import load_campaign
 from hexapod_comp.virtual.imperfections import draw_model
-from hexapod_comp.virtual.trial import Trial
 
 STEEL = 11.5e-6
 """Expansion of struts, base and platform, 1/K."""

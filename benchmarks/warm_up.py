@@ -33,11 +33,11 @@ from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.passes import Passes, random_passes
 from hexapod_comp.machine.temperatures import PARTS, Temperatures
+from hexapod_comp.machine.trial import Trial
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.virtual.imperfections import draw_model
 from hexapod_comp.virtual.instruments import measure
-from hexapod_comp.virtual.trial import Trial
 from hexapod_comp.virtual.warm_up import SENSED, WarmUp
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))

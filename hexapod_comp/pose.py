@@ -190,6 +190,13 @@ def rotation_angle(rotation: np.ndarray) -> float:
     return 2.0 * math.atan2(math.hypot(*vector), abs(scalar))
 
 
+def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:
+    """Return the rotation vector(s) that turn commanded into actual rotations, rad in their common frame."""
+    from scipy.spatial.transform import Rotation  # 27 MB with all that it needs, which a node does without
+
+    return Rotation.from_matrix(actual @ np.swapaxes(commanded, -1, -2)).as_rotvec()
+
+
 def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
     """Return the rigid motion that brings points as close as it can to others: the datum aligned (Kabsch).
 
@@ -204,7 +211,7 @@ def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
         T with T·points ≈ onto, least squares; None for fewer than three points or points in a line, which leave a
         turn open.
     """
-    from scipy.spatial.transform import Rotation  # 27 MB with all that it needs, which a node does without
+    from scipy.spatial.transform import Rotation  # As in attitude_error
 
     centre, mean = onto.mean(axis=0), points.mean(axis=0)
     spread = np.linalg.svd(onto - centre, compute_uv=False)

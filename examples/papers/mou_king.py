@@ -21,10 +21,10 @@ from hexapod_comp.machine.geometry import STRUT_NAMES, HexapodGeometry
 from hexapod_comp.machine.model import RealMachine, commanded_box
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.passes import Passes
+from hexapod_comp.machine.trial import Trial
 from hexapod_comp.measurements.campaign import Campaign, load_campaign, template
 from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.virtual.instruments import measure
-from hexapod_comp.virtual.trial import Trial
 
 from .comparing import OPEN, SHOWN, WRONG, Exhibit, Paper, Statement, within
 from .pictures import weights_figure

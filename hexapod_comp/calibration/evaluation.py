@@ -13,7 +13,7 @@ from ..machine.field import CROSS_AXES
 from ..machine.model import MachineModel, RealMachine
 from ..machine.passes import BOTH_WAYS, Passes, random_passes
 from ..machine.temperatures import Temperatures
-from ..virtual.trial import Trial
+from ..machine.trial import Trial
 
 INCH = 0.0254
 

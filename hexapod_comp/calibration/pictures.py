@@ -18,8 +18,8 @@ from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import MachineModel, RealMachine, commanded_box
 from ..machine.passes import Passes
+from ..machine.trial import Trial
 from ..measurements.readings import AXES, KINDS
-from ..virtual.trial import Trial
 from .fit import ModelFit
 from .lines import LineFit, LinesFit
 from .posterior import COMPONENTS as PREDICTED

@@ -23,8 +23,8 @@ from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import FOLLOWED, RealMachine
 from ..machine.passes import Passes, Poses, random_directions
 from ..machine.temperatures import HUMIDITY, REFERENCE_TEMPERATURE, Temperatures
-from ..measurements.readings import AXES, Stations, attitude_error
-from ..pose import rotation_from_angles
+from ..measurements.readings import AXES, Stations
+from ..pose import attitude_error, rotation_from_angles
 from .assumptions import ASSUMED
 from .datum import HeldDatum
 from .estimator import Estimation, LinearProblem, physical_covariance

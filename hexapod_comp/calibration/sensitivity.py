@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..machine.model import MachinesByTemperature, RealMachine
+from ..machine.trial import drive
 from ..measurements.readings import Stations
-from ..virtual.trial import drive
 from .blocks.backlash import without_negative
 from .blocks.block import Linkage
 from .parameters import ParameterSpace

@@ -27,9 +27,8 @@ from ..machine.kinematics import Structure, solve_pose
 from ..machine.model import MachineModel, RealMachine
 from ..machine.model_file import DIRECTIONS
 from ..machine.passes import Passes, at
-from ..measurements.readings import attitude_error
-from ..pose import Pose
-from ..virtual.trial import model_commands
+from ..machine.trial import model_commands
+from ..pose import Pose, attitude_error
 from .carried import AT_20_DEGC, refuse_unknown
 from .worth import DIAGONAL
 

@@ -18,7 +18,7 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel, RealMachine
 from ..machine.passes import Passes
 from ..machine.temperatures import HUMIDITY, PARTS, REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE, Temperatures
-from ..virtual.trial import ToolErrors, Trial
+from ..machine.trial import ToolErrors, Trial
 
 WARMER, DAMPER = dict.fromkeys(PARTS, REFERENCE_TEMPERATURE + 1.0), {HUMIDITY: REFERENCE_HUMIDITY + 0.1}
 """Readings of a machine that is 1 K warmer, and of one in damper air."""

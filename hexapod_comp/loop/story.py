@@ -23,12 +23,12 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel, RealMachine
 from ..machine.passes import Passes
 from ..machine.trajectory import Path, circle, commanded_in_base, join, move, pocket
+from ..machine.trial import without_datum
 from ..measurements.campaign import Campaign, template
 from ..measurements.readings import ANGULAR_KINDS
 from ..pose import Pose
 from ..virtual.instruments import measure
 from ..virtual.machine import StrutDrive
-from ..virtual.trial import without_datum
 from ..workspace.reach import machine_box
 from .report import ALIGNED, ErrorRow, PathRecord, PoseRecord, SessionResult, Track, error_rows
 from .session import MOVE_FEED

@@ -28,6 +28,7 @@ from .limits import Limits, frozen_array
 BASE, WORK, TOOL = "base", "work", "tool"
 MOST = 100  # Tools, and work frames, of one machine
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # They become ``frame_id`` in messages and links of a URDF
+USUAL_LEAD = 0.01  # m a turn, of ball screws for which the geometry file gives no lead
 TAKEN = re.compile("base|work|platform|tool|world|(platform|strut)_.*")  # What the package calls other frames
 
 

@@ -13,7 +13,7 @@ from ..errors import CalibrationError
 from ..machine.arrays import rms
 from ..machine.geometry import HexapodGeometry
 from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
-from ..pose import Pose
+from ..pose import Pose, attitude_error
 
 AXES = ("x", "y", "z")
 # What a reading is of. ``linear`` is along the run's line, ``length`` from a centre; the others are along or about an
@@ -303,8 +303,3 @@ def refuse_unmoved(measurements: MeasurementSet, left: np.ndarray) -> None:
 def spans(points: np.ndarray) -> bool:
     """Return whether points (n, 3), m, span a box."""
     return bool((np.ptp(points, axis=0) >= LEAST_SIDE).all())
-
-
-def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:
-    """Return the rotation vector(s) that turn commanded into actual rotations, rad in their common frame."""
-    return Rotation.from_matrix(actual @ np.swapaxes(commanded, -1, -2)).as_rotvec()

@@ -18,7 +18,7 @@ from ..machine.arrays import changed_rows
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths
 from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
-from ..pose import Pose, angles_from_rotation
+from ..pose import Pose, angles_from_rotation, attitude_error
 from .air import AIR_RANGES, LARGEST_INDEX, Air, correct_displacement
 from .readings import (
     ANGULAR_KINDS,
@@ -34,7 +34,6 @@ from .readings import (
     FileLine,
     MeasurementSet,
     Reading,
-    attitude_error,
 )
 from .runs import assemble
 

@@ -18,8 +18,8 @@ from ..formats.yaml import read_yaml
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, solve_poses, strut_lengths_batch
 from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
-from ..pose import Pose
-from .readings import AXES, FROM_PREVIOUS, UNKNOWN, FileLine, MeasurementSet, Reading, attitude_error
+from ..pose import Pose, attitude_error
+from .readings import AXES, FROM_PREVIOUS, UNKNOWN, FileLine, MeasurementSet, Reading
 from .runs import assemble
 from .tidy import LATEST
 

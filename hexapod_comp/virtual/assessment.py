@@ -16,10 +16,9 @@ import numpy as np
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel, RealMachine
 from ..machine.passes import Passes, Poses
-from ..measurements.readings import attitude_error
-from ..pose import Pose
+from ..machine.trial import drive, model_commands
+from ..pose import Pose, attitude_error
 from .imperfections import ImperfectionBounds, draw_model
-from .trial import drive, model_commands
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ..machine.arrays import different_rows
 from ..machine.model import MachineModel, MachinesByTemperature, RealMachine
+from ..machine.trial import drive, model_commands
 from ..measurements.campaign import Campaign
 from ..measurements.readings import (
     ABSOLUTE_KINDS,
@@ -25,7 +26,6 @@ from ..measurements.readings import (
     LENGTH,
     MeasurementSet,
 )
-from .trial import drive, model_commands
 
 VISITS, SLOPES, NOISE, CENTRES = range(4)
 """Streams of random numbers, one per cause: changing one leaves the others' draws alone."""

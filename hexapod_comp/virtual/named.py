@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError
-from ..machine.geometry import HexapodGeometry
+from ..machine.geometry import USUAL_LEAD, HexapodGeometry
 from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL, load_model
 from .imperfections import ImperfectionBounds, draw_model
@@ -36,9 +36,6 @@ USUAL: dict[str, Any] = {
     "length_map": 1e-6,
 }
 """What a machine is like that was built with care and never measured, m and m per m."""
-
-USUAL_LEAD = 0.01
-"""Period of the screws' errors where the geometry file gives no lead, m."""
 
 
 def usual_bounds(geometry: HexapodGeometry, **given: Any) -> ImperfectionBounds:

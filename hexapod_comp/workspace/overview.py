@@ -10,10 +10,9 @@ import numpy as np
 from ..core import Status
 from ..formats.texts import aligned, number
 from ..machine.doubts import doubts, twist_per_lead
-from ..machine.geometry import BASE, HexapodGeometry
+from ..machine.geometry import BASE, USUAL_LEAD, HexapodGeometry
 from ..machine.kinematics import condition_number, strut_lengths
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
-from ..virtual.named import USUAL_LEAD
 from .reach import (
     BOX_CELLS,
     Examiner,

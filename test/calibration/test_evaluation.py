@@ -16,9 +16,9 @@ from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine
 from hexapod_comp.machine.passes import Passes, random_passes
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.temperatures import Temperatures
+from hexapod_comp.machine.trial import Trial
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
-from hexapod_comp.virtual.trial import Trial
 
 BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])
 BOUNDS = ImperfectionBounds(joint=1e-4, strut_offset=1e-4, pitch=1e-4, wave=(4e-6, 4e-6), backlash=(3e-6, 5e-6))

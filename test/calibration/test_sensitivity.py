@@ -13,8 +13,8 @@ from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.sensitivity import derivatives, predict
 from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.model import RealMachine
-from hexapod_comp.measurements.readings import Stations, attitude_error
-from hexapod_comp.pose import Pose
+from hexapod_comp.measurements.readings import Stations
+from hexapod_comp.pose import Pose, attitude_error
 
 PROBE = np.array([0.02, -0.03, -0.06])
 COLD = FitSettings(lead=small.LEAD, field_degree=2)

@@ -34,10 +34,10 @@ from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
 from hexapod_comp.machine.model_file import load_model, save_model
 from hexapod_comp.machine.passes import Passes
 from hexapod_comp.machine.trajectory import move
+from hexapod_comp.machine.trial import ToolErrors, Trial
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.messages import message_pose
 from hexapod_comp.virtual.imperfections import draw_model
-from hexapod_comp.virtual.trial import ToolErrors, Trial
 
 CAMPAIGN = """format: hexapod_comp/campaign
 version: 1

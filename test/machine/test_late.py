@@ -15,8 +15,8 @@ from hexapod_comp.machine.model import MachineModel, MachinesByTemperature, Mode
 from hexapod_comp.machine.model_file import load_model, save_model
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.temperatures import PARTS, LateGrowth, Temperatures, late
+from hexapod_comp.machine.trial import drive
 from hexapod_comp.pose import Pose
-from hexapod_comp.virtual.trial import drive
 
 TIMES = np.array([5.0, 65.0, 66.0, 200.0, 900.0, 1000.0])
 VALUES = np.array([20.0, 20.4, 20.4, 21.5, 23.0, 22.1])

@@ -18,10 +18,9 @@ from hexapod_comp.measurements.readings import (
     UNKNOWN,
     FileLine,
     Reading,
-    attitude_error,
 )
 from hexapod_comp.measurements.runs import assemble
-from hexapod_comp.pose import Pose
+from hexapod_comp.pose import Pose, attitude_error
 
 
 def geometry_with(work: Pose | None = None, tool: Pose | None = None) -> HexapodGeometry:

@@ -15,12 +15,11 @@ from scipy.spatial.transform import Rotation
 from ..core import Status
 from ..core.batch import backwards_many
 from ..errors import ModelError, NotConvergedError
-from ..machine.kinematics import forward_error
-from ..machine.model import MachineModel, RealMachine
-from ..machine.passes import Passes, Poses, at
-from ..machine.temperatures import Temperatures
-from ..measurements.readings import attitude_error
-from ..pose import best_motion
+from ..pose import attitude_error, best_motion
+from .kinematics import forward_error
+from .model import MachineModel, RealMachine
+from .passes import Passes, Poses, at
+from .temperatures import Temperatures
 
 NameOf = Callable[[int], str]
 """Says in an error which row it is about."""
