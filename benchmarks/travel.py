@@ -16,10 +16,10 @@ import time
 import numpy as np
 
 from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.compensation.travel import travel
 from hexapod_comp.core.batch import quaternion_of
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import load_model
-from hexapod_comp.workspace.travel import travel
 
 COMMANDS, PAUSE, STEP = 60, 5e-4, 1e-5
 """Commands a round, seconds between two, and how far they are apart, m."""

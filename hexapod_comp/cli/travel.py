@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from ..compensation.travel import Travel, travel, travel_text
 from ..machine.geometry import pose_text
 from ..machine.model import RealMachine
 from ..pose import Pose
-from ..workspace.travel import Travel, travel, travel_text
 from . import common
 
 

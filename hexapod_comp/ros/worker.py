@@ -261,7 +261,7 @@ class Machine:
         self, position: list, rotation: list, tool: str, work: str, warmth: list[dict], enabled: bool
     ) -> dict[str, Any]:
         """Return how far a tool may go from a pose in a frame: a text, and values by their keys."""
-        from ..workspace.travel import travel, travel_text
+        from ..compensation.travel import travel, travel_text
 
         geometry = self.geometry.using(tool, work)
         machine = RealMachine(geometry, self.model, self._restored(warmth))

@@ -10,10 +10,10 @@ import pytest
 from foreign_machines import Machine, with_frames
 
 from hexapod_comp.cli import main
+from hexapod_comp.compensation.travel import travel
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.pose import Pose, angles_from_rotation
-from hexapod_comp.workspace.travel import travel
 
 SHOWN = 1e-9
 """mm; the last digit of lengths."""

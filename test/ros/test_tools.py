@@ -13,12 +13,12 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from hexapod_comp.compensation.travel import travel
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.messages import message_pose
 from hexapod_comp.ros.status import ERROR, WARN
-from hexapod_comp.workspace.travel import travel
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CLOSE = 1e-11

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..compensation.compensator import pack_pose, refusal
 from ..core import Status, Struct
 from ..core.batch import go
 from ..errors import HexapodError
 from ..formats.texts import aligned, number
 from ..machine.model import RealMachine
 from ..pose import Pose
+from .compensator import pack_pose, refusal
 
 COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")
 STEPS = 500  # Into so many steps the longest strut is divided; what is narrower than one may be stepped over

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from foreign_machines import Errors, Machine, rotation, with_frames
 
+from hexapod_comp.compensation import travel as module
 from hexapod_comp.compensation.checks import check
+from hexapod_comp.compensation.travel import travel, travel_text
 from hexapod_comp.errors import LimitError
 from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.pose import Pose
-from hexapod_comp.workspace import travel as module
-from hexapod_comp.workspace.travel import travel, travel_text
 
 CLOSE = 1e-9
 """m and rad."""
