@@ -621,6 +621,14 @@ class Estimation:
         return weights
 
 
+class NotSettled(CalibrationError):
+    """A fit whose parameters still change after the last step, with where it stood then."""
+
+    def __init__(self, problem: str, solution: Solution) -> None:
+        super().__init__("fit", problem)
+        self.solution = solution
+
+
 @dataclass(frozen=True)
 class Solution:
     """A settled fit."""
@@ -668,12 +676,34 @@ def iterate(
             break
         if robust and step > all_alike:
             weights = estimation.robust_weights(residuals)
+    solution = Solution(problem, posterior, x, residuals, weights, step, change)
     if change > 1.0:
         moving = (
             f"did not settle within {ASSUMED.steps} steps: {block} still changes by {change:.2g} standard deviations"
         )
-        raise CalibrationError("fit", f"{moving}; are all blocks allowed, and is it measured in enough places?")
-    return Solution(problem, posterior, x, residuals, weights, step, change)
+        raise NotSettled(f"{moving}; are all blocks allowed, and is it measured in enough places?", solution)
+    return solution
+
+
+def influence(run: np.ndarray, solution: Solution) -> np.ndarray:
+    """Return how far the parameters move, leaving out each run, in their standard deviations: Cook's distance, (runs,).
+
+    `run` (C,) is that of each cell. With R the run's rows, r what is left of them and C the parameters' covariance they
+    move by δ = −(C⁻¹ − Rᵀ·R)⁻¹·Rᵀ·r, which is √(δᵀ·C⁻¹·δ) standard deviations: no fit is repeated.
+    """
+    problem, p = solution.problem, solution.posterior
+    scale = 1.0 / p.noise[problem.kind]
+    rows = problem.rows.using(p.used, scale)
+    left = scale * problem.target - rows.times(p.y)
+    precision = whitened_precision(problem, p)
+
+    def moved(number: int) -> float:
+        members = np.flatnonzero(run == number)
+        own = rows.select(members).dense() * p.spread
+        change = np.linalg.solve(precision - own.T @ own, own.T @ left[members])
+        return float(np.sqrt(change @ precision @ change))
+
+    return np.array(at_once(moved, range(int(run.max()) + 1)))
 
 
 def _change(change: np.ndarray, space: ParameterSpace, posterior: Posterior) -> tuple[float, str]:

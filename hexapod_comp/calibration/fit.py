@@ -18,7 +18,16 @@ from ..pose import Pose
 from .assumptions import ASSUMED
 from .blocks import WAVES
 from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
-from .estimator import Estimation, LinearProblem, Posterior, Solution, iterate, physical_covariance
+from .estimator import (
+    Estimation,
+    LinearProblem,
+    NotSettled,
+    Posterior,
+    Solution,
+    influence,
+    iterate,
+    physical_covariance,
+)
 from .lead import ScrewLead, look_for_lead
 from .mixups import SWAPPED, mixups, swapped_directions
 from .parameters import FitSettings, ParameterSpace
@@ -160,9 +169,13 @@ def fit_model(
     """
     datum = measurements.geometry.home if datum is None else datum
     refuse_unreachable(measurements.geometry, datum)
-    begun = _begin(measurements, settings or FitSettings(), progress)
+    settings = settings or FitSettings()
+    begun = _begin(measurements, settings, progress)
     try:
-        return _fit(measurements, begun, progress, datum)
+        try:
+            return _fit(measurements, begun, progress, datum)
+        except NotSettled as error:
+            return _without_pulling(measurements, begun, error, progress, datum)
     except HexapodError as error:
         blocks = [block.name for block in begun.everything.space.blocks]
         named = mixups(begun.everything, begun.problem, blocks, progress)
@@ -171,6 +184,35 @@ def fit_model(
         if named:
             error.with_lines("\n".join(f"  {cause}" for cause in named))
         raise
+
+
+def _without_pulling(
+    measurements: MeasurementSet,
+    begun: _Begun,
+    unsettled: NotSettled,
+    progress: Callable[[str], object],
+    datum: Pose,
+) -> ModelFit:
+    """Return the fit without the runs that pull it most, one by one, until it settles; else as it stands, refused."""
+    kept, names, error = measurements, list[str](), unsettled
+    while len(names) < ASSUMED.most_left_out and len(np.unique(kept.run)) > 1:
+        of_cell = kept.run[Estimation(kept, begun.everything.space, alone=False).cells.first]
+        worst = int(influence(of_cell, error.solution).argmax())
+        names.append(kept.runs[worst].name)
+        progress(f"does not settle: without run {names[-1]}, which pulls most")
+        kept = kept.select(kept.run != worst)
+        try:
+            fit = _fit(kept, _begin(kept, begun.everything.space.settings, progress), progress, datum)
+        except NotSettled as again:
+            error = again
+            continue
+        except HexapodError:
+            break
+        doubt = f"with run {', '.join(names)} the fit does not settle: left out, for it pulls the parameters most"
+        return replace(fit, verdict=replace(fit.verdict, doubts=(doubt, *fit.verdict.doubts)))
+    problem = f"{unsettled.problem}; the runs that pull most: {', '.join(names)}"
+    fit = _fit(measurements, begun, progress, datum, settles=False)
+    return replace(fit, verdict=replace(fit.verdict, refusals=(problem, *fit.verdict.refusals)))
 
 
 def mixed_up(measurements: MeasurementSet, settings: FitSettings) -> list[str]:
@@ -189,11 +231,17 @@ class _Begun(NamedTuple):
     constants: TimeConstants
 
 
-def _fit(measurements: MeasurementSet, begun: _Begun, progress: Callable[[str], object], datum: Pose) -> ModelFit:
+def _fit(
+    measurements: MeasurementSet,
+    begun: _Begun,
+    progress: Callable[[str], object],
+    datum: Pose,
+    settles: bool = True,
+) -> ModelFit:
     """Choose blocks, fit them, and judge what comes of it."""
     everything, nominal, lead, constants = begun
     settings = everything.space.settings
-    decisions, possible, answer = _choose(everything, nominal, settings, progress)
+    decisions, possible, answer = _choose(everything, nominal, settings, progress, settles)
     space, estimation, solution = answer
     solution, drift = with_drift(estimation, solution)
     channels = tuple(_channels(estimation, solution))
@@ -255,7 +303,11 @@ def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callab
 
 
 def _choose(
-    everything: Estimation, problem: LinearProblem, settings: FitSettings, progress: Callable[[str], object]
+    everything: Estimation,
+    problem: LinearProblem,
+    settings: FitSettings,
+    progress: Callable[[str], object],
+    settles: bool = True,
 ) -> tuple[list[Decision], Posterior, tuple[ParameterSpace, Estimation, Solution]]:
     """Return what is fitted, what the readings allow with all blocks in, and the fit."""
     space, measurements = everything.space, everything.measurements
@@ -265,14 +317,14 @@ def _choose(
     start = _Start(space, space.physical(y), kept.tolerances, kept.noise)
     if not any(d.kept for d in decisions):  # too few runs to leave one out, or none that shows anything: from the start
         start = _Start(space, 0.0 * y, space.start_tolerances(), np.ones(len(KINDS)))
-    answer = _solve(measurements, decisions, settings, start, progress)
+    answer = _solve(measurements, decisions, settings, start, progress, settles)
     if answer[-1].weights.min() < ASSUMED.huber / ASSUMED.outlier:  # it was made with readings that are wrong
         start = _Start.of(answer[0], answer[-1])
         x, _, noise = _carried_over(start, space)
         problem, _ = everything.linearise(x, answer[-1].weights)
         again, possible, _ = select(space, problem, noise, progress)
         if [d.kept for d in again] != [d.kept for d in decisions]:
-            answer = _solve(measurements, again, settings, start, progress)
+            answer = _solve(measurements, again, settings, start, progress, settles)
         decisions = again
     return decisions, possible, answer
 
@@ -297,11 +349,17 @@ def _solve(
     settings: FitSettings,
     start: _Start,
     progress: Callable[[str], object],
+    settles: bool,
 ) -> tuple[ParameterSpace, Estimation, Solution]:
-    """Return a settled fit with the blocks decided on."""
+    """Return a settled fit with the blocks decided on; where none `settles`, what the last step gives."""
     space = ParameterSpace(measurements, replace(settings, blocks=tuple(d.block for d in decisions if d.kept)))
     estimation = Estimation(measurements, space)
-    return space, estimation, iterate(estimation, *_carried_over(start, space), progress)
+    try:
+        return space, estimation, iterate(estimation, *_carried_over(start, space), progress)
+    except NotSettled as error:
+        if settles:
+            raise
+        return space, estimation, error.solution
 
 
 def _carried_over(start: _Start, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -16,6 +16,7 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, permutations, product
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -27,7 +28,8 @@ from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import MachineModel
 from ..machine.passes import Passes
-from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_KINDS, MeasurementSet, Run
+from ..machine.temperatures import REFERENCE_TEMPERATURE
+from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_KINDS, UNKNOWN, MeasurementSet, Run
 from ..measurements.runs import GEOMETRIES
 from ..pose import angles_from_rotation
 from ..virtual.instruments import compensated
@@ -36,11 +38,13 @@ from .blocks import EXPECTED
 from .estimator import (
     Estimation,
     LinearProblem,
+    Posterior,
     log_evidence,
     solve,
     whitened_precision,
 )
-from .parameters import FitSettings, ParameterSpace
+from .parameters import TOLERANCES, FitSettings, ParameterSpace
+from .promise import STEEL
 from .sensitivity import Prediction, predict
 
 FAMILIES = ("x lines", "y lines", "z lines", "other lines", "other runs")
@@ -53,6 +57,11 @@ UNITS = {
 """Units in which readings may stand that are said to be µm or µrad."""
 
 SWAPPED = "forward and backward look swapped, or the sign of all readings reversed"
+UNIT = {"mm": 1e-3, "mrad": 1e-3, "ppm": 1e-6, "µm": 1e-6}
+SCALED = ("linear", "length", "position")
+"""Kinds of channel whose instrument has a scale."""
+
+FORCE = "correct it, or write the model all the same (--force) if the machine is so"
 TURNS = ((1, "by 90°"), (2, "by 180°"), (3, "by -90°"))
 
 
@@ -63,6 +72,18 @@ class Alternative:
     name: str  # "x lines, linear: sign reversed"
     gain: float  # logarithm of the likelihood ratio to the readings as they are
     better: float  # how many times smaller the noise of the kind that gains most becomes
+    text: str = ""  # what to print in place of both
+
+
+class Mode(NamedTuple):
+    """What all readings, or all parts of the machine, may have in common, by a mistake rather than by chance."""
+
+    name: str
+    causes: str  # what it looks like, and what to do
+    unit: str
+    effect: np.ndarray  # (C,): what a unit of it, SI, adds to cells' values
+    usual: float  # standard deviation of a machine and an instrument with no mistake, SI
+    block: str = ""  # whose tolerance, as fitted without the mode, is as usual; empty: none
 
 
 def family_of_run(measurements: MeasurementSet) -> np.ndarray:
@@ -100,16 +121,17 @@ def mixups(
         # What every screw has belongs to readings taken rightly, though a fit may do without where they are mixed up.
         blocks = {*blocks, *(name for name in EXPECTED if everything.space.block(name))}
         model = _Fitted(everything, problem, blocks)
-        if blocks <= set(EXPECTED) and (model.posterior.noise[model.kinds] < ASSUMED.noisy).all():
-            return []  # a machine and its screws alone describe the readings: nothing is left to explain
-        found = [*model.reversed_signs(), *model.other_units(), *model.otherwise(_relabelled(m))]
-        found += _elsewhere(m, model, blocks)
+        found = [*model.common_modes(), *model.other_directions()]
+        if not blocks <= set(EXPECTED) or (model.posterior.noise[model.kinds] >= ASSUMED.noisy).any():
+            # Otherwise a machine and its screws alone describe the readings.
+            found += [*model.reversed_signs(), *model.other_units(), *model.otherwise(_relabelled(m))]
+            found += _elsewhere(m, model, blocks)
     except (HexapodError, np.linalg.LinAlgError):
         return []
     best = max((other.gain for other in found), default=0.0)
     odds = np.log(ASSUMED.mixup_odds)
     named = [other for other in found if other.gain > max(odds, best - odds)]
-    return [f"{n.name} fits {n.better:.3g} times better" for n in sorted(named, key=lambda n: -n.gain)]
+    return [n.text or f"{n.name} fits {n.better:.3g} times better" for n in sorted(named, key=lambda n: -n.gain)]
 
 
 def swapped_directions(everything: Estimation, problem: LinearProblem, blocks: Collection[str]) -> bool:
@@ -127,13 +149,21 @@ def swapped_directions(everything: Estimation, problem: LinearProblem, blocks: C
     return bool((backlash < -ASSUMED.negative_backlash * deviation).sum() > len(backlash) // 2)
 
 
+class _Way(NamedTuple):
+    """A common mode under one prior."""
+
+    amplitude: float  # the most probable one, SI
+    deviation: float  # the prior's, SI
+    evidence: float  # logarithm
+
+
 class _Fitted:
     """The fitted model's linear problem, and how probable readings that were taken otherwise are under it."""
 
     def __init__(
         self, estimation: Estimation, problem: LinearProblem, blocks: Collection[str], start: _Fitted | None = None
     ) -> None:
-        self.estimation, self.problem = estimation, problem
+        self.estimation, self.problem, self._blocks = estimation, problem, set(blocks)
         self.space = space = estimation.space
         kept = np.array([n == 0 or block.name in blocks for n, block in enumerate(space.blocks)])
         self._first_guess = np.where(kept, space.start_tolerances(), 0.0)
@@ -160,6 +190,96 @@ class _Fitted:
         jacobian = float(problem.freedom[self.kinds] @ np.log(scale[self.kinds]))
         gain = log_evidence(problem, tried) + jacobian - self.evidence - choices
         return Alternative(name, gain, float((p.noise * scale / tried.noise)[self.kinds].max()))
+
+    def common_modes(self) -> list[Alternative]:
+        """Return what is more probably a mistake that all readings share than a machine whose parts err alike.
+
+        The amplitude a of a mode d has the prior N(0, σ²): σ is usual for a right machine, or `mistaken` times that.
+        With K the readings' covariance without it, h = dᵀK⁻¹t and I = dᵀK⁻¹d, it changes their log evidence by
+        ½h²σ²/(1 + σ²I) − ½log(1 + σ²I). Parts that shift alike blow their block's tolerance up, which hides the mode:
+        tolerances and noise are estimated anew under either prior.
+        """
+        found = []
+        for mode in common_modes(self.estimation, self.space):
+            effect = self.estimation.free_of_nuisance(mode.effect[:, None])[:, 0]
+            usual, posterior = self._with_mode(effect, mode, 1.0, self.posterior)
+            if abs(usual.amplitude) < usual.deviation:
+                continue
+            mistaken, without = self._with_mode(effect, mode, ASSUMED.mistaken, posterior)
+            # Tolerances that the mode has not blown up may suit a right machine as well.
+            usual = max(usual, self._by_mode(effect, mode, 1.0, without), key=lambda way: way.evidence)
+            amplitude = mistaken.amplitude / UNIT[mode.unit]
+            size = f"{amplitude:+.3g} {mode.unit}, {abs(mistaken.amplitude) / usual.deviation:.1f} times what is usual"
+            gain = mistaken.evidence - usual.evidence
+            found.append(Alternative(mode.name, gain, 1.0, f"{mode.name}: {size}: {mode.causes}"))
+        return found
+
+    def _with_mode(self, effect: np.ndarray, mode: Mode, times: float, posterior: Posterior) -> tuple[_Way, Posterior]:
+        """Return the evidence with a mode, by tolerances and noise that are estimated with it, and the posterior."""
+        for _ in range(ASSUMED.mode_rounds):
+            way = self._by_mode(effect, mode, times, posterior)
+            rest = self.with_target(self.problem.target - way.amplitude * effect, np.ones(len(KINDS)))
+            posterior = solve(self.space, rest, posterior.tolerances, posterior.noise, ASSUMED.mixup_first_rounds)
+        return self._by_mode(effect, mode, times, posterior), posterior
+
+    def _by_mode(self, effect: np.ndarray, mode: Mode, times: float, posterior: Posterior) -> _Way:
+        """Return amplitude, prior and evidence of a mode, by the tolerances and the noise of a posterior."""
+        plain = solve(self.space, self.problem, posterior.tolerances, posterior.noise, rounds=0)
+        tolerances = dict(zip([b.name for b in self.space.blocks], plain.tolerances, strict=True))
+        deviation = times * max(mode.usual, tolerances.get(mode.block, 0.0))
+        (_, h), (_, information) = self._gram(np.column_stack([self.problem.target, effect]), plain)
+        grown = 1.0 + deviation**2 * information
+        gain = 0.5 * h**2 * deviation**2 / grown - 0.5 * np.log(grown)
+        return _Way(deviation**2 * h / grown, deviation, log_evidence(self.problem, plain) + gain)
+
+    def other_directions(self) -> list[Alternative]:
+        """Return readings taken the other way than labelled, each by its own likelihood ratio, if any are.
+
+        A strut's backlash moves a reading by Δ or, taken the other way, by −Δ. Readings that the other way explains
+        better are relabelled and the model is fitted again, for wrong labels have hidden a part of the backlash. Which
+        they are is one choice of 2ⁿ.
+        """
+        block, m = self.space.block("backlash"), self.estimation.measurements
+        if block is None or not (m.direction != UNKNOWN).any():
+            return []
+        order = np.lexsort((m.channel, m.station, m.run))
+        key = np.column_stack([m.run, m.station, m.channel])[order]
+        start = np.flatnonzero(np.r_[True, (np.diff(key, axis=0) != 0).any(axis=1)])
+        time = np.empty(len(m), dtype=int)  # numbers the readings of a channel at a station
+        time[order] = np.arange(len(m)) - np.repeat(start, np.diff(np.r_[start, len(m)]))
+        groups, group = np.unique(np.column_stack([m.run, m.station, time]), axis=0, return_inverse=True)
+        known = m.direction != UNKNOWN
+        flipped, model = np.zeros(len(groups), dtype=bool), self
+        for _ in range(ASSUMED.mode_rounds):
+            ratio = np.bincount(group.ravel(), known * model._reversal_ratio(block.part))
+            if np.maximum(ratio, 0.0).sum() < np.log(ASSUMED.mixup_odds):
+                break
+            flipped = flipped ^ (ratio > 0.0)
+            if 2 * flipped.sum() > len(flipped):  # the majority is right: all of them swapped is another alternative
+                flipped = ~flipped
+            other = _turned_back(m, flipped[group.ravel()])
+            problem = _linearised(other, self.space, None)
+            if problem is None:
+                return []
+            estimation = Estimation(other, self.space, alone=False)
+            model = _Fitted(estimation, problem, [b.name for b in self.space.blocks if b.name in self._blocks])
+        if model is self:
+            return []
+        gain = model.evidence - self.evidence - len(groups) * np.log(2.0)
+        better = float((self.posterior.noise / model.posterior.noise)[self.kinds].max())
+        counts = f"direction of {int(flipped.sum())} of {len(flipped)} readings: forward and backward exchanged"
+        return [Alternative(counts, gain, better)]
+
+    def _reversal_ratio(self, backlash: slice) -> np.ndarray:
+        """Return the log likelihood ratio of each reading, taken in the other direction than labelled, (N,)."""
+        m, c, p = self.estimation.measurements, self.estimation.cells, self.posterior
+        scale = np.sqrt(np.bincount(c.of_reading, self.estimation.uncertainty**-2))
+        of_backlash = (p.used >= backlash.start) & (p.used < backlash.stop)
+        moved = (self._rows[:, of_backlash] @ p.y[of_backlash] / scale)[c.of_reading]
+        left = ((self.problem.target - self._rows @ p.y) / scale)[c.of_reading]
+        left = left + m.value - self._cell_values(m.value)[c.of_reading]
+        sigma = self.estimation.uncertainty * p.noise[m.kind]
+        return 0.5 * (left**2 - (left + 2.0 * moved) ** 2) / sigma**2
 
     def with_target(self, target: np.ndarray, scale: np.ndarray) -> LinearProblem:
         """Return the problem of values that were changed, but not where they were taken."""
@@ -268,13 +388,61 @@ class _Fitted:
         of_reading, weights = self.estimation.cells.of_reading, self.estimation.uncertainty**-2
         return np.bincount(of_reading, weights * values) / np.bincount(of_reading, weights)
 
-    def _gram(self, columns: np.ndarray) -> np.ndarray:
+    def _gram(self, columns: np.ndarray, posterior: Posterior | None = None) -> np.ndarray:
         """Return columnsᵀ·K⁻¹·columns, K the covariance of the cells by priors and noise."""
-        p, weights = self.posterior, self.posterior.noise[self.problem.kind] ** -1.0
+        p = posterior or self.posterior
+        weights = p.noise[self.problem.kind] ** -1.0
         columns, rows = weights[:, None] * columns, weights[:, None] * self._rows * p.spread
         factor = cho_factor(whitened_precision(self.problem, p), lower=True)
         explained = rows.T @ columns
         return columns.T @ columns - explained.T @ cho_solve(factor, explained)
+
+
+def common_modes(estimation: Estimation, space: ParameterSpace) -> Iterator[Mode]:
+    """Yield what readings may have in common: rigid motions of platform and base, scales of instruments, all screws."""
+    m, cells = estimation.measurements, estimation.cells
+    stations, directions = m.stations, cells.directions
+    points, place = m.points(), max(TOLERANCES["structure"], dict(space.settings.tolerances)["structure"])
+
+    def read(motions: np.ndarray) -> np.ndarray:
+        """Return what motions of the measured points, (M, 6), add to cells."""
+        return np.einsum("ci,ci->c", directions, motions[cells.station])
+
+    turned = stations.rotations @ m.geometry.tool.rotation
+    for axis, name in enumerate(AXES):
+        along = turned[:, :, axis]
+        causes = f"looks like a probe, or a tool, of which the file has another length or offset than was used; {FORCE}"
+        moved = np.hstack([along, np.zeros_like(along)])
+        yield Mode(f"measured point along the tool's {name}", causes, "mm", read(moved), place, "structure")
+        causes = f"looks like a target or a tool that was mounted turned, or angles with another zero; {FORCE}"
+        lever = np.cross(along, points - stations.positions)
+        size = place / m.geometry.characteristic_length
+        yield Mode(f"platform turned about the tool's {name}", causes, "mrad", read(np.hstack([lever, along])), size)
+        causes = f"looks like a work frame, or an instrument's, that is not where the file has it; {FORCE}"
+        still, unit = np.zeros_like(points), np.tile(m.geometry.work.rotation[:, axis], (len(points), 1))
+        yield Mode(f"base moved along {name}", causes, "mm", read(np.hstack([unit, still])), place, "structure")
+        about = np.hstack([np.cross(unit, points - m.geometry.work.position), unit])
+        yield Mode(f"base turned about {name}", causes, "mrad", read(about), size)
+    warmth = float(np.abs(stations.temperatures - REFERENCE_TEMPERATURE).mean())
+    usual = np.hypot(ASSUMED.usual_scale, 0.0 if space.stated_expansion.any() else STEEL * warmth)
+    centre = np.nan_to_num(m.centre[cells.first])
+    for kind in SCALED:
+        members = cells.kind == KINDS.index(kind)
+        away = points[cells.station] - (centre if kind == "length" else points.mean(axis=0))
+        causes = "looks like a laser without compensation of the air, a temperature off 20 °C, or a stated lead "
+        causes += f"that is wrong for all screws; {FORCE}"
+        scaled = np.where(members, np.einsum("ci,ci->c", directions[:, :3], away), 0.0)
+        yield Mode(f"scale of all {kind} readings", causes, "ppm", scaled, usual)
+
+
+def _turned_back(m: MeasurementSet, readings: np.ndarray) -> MeasurementSet:
+    """Return a set in which some readings, (N,), were taken in the other direction."""
+    twice = m.stations.select(np.tile(np.arange(len(m.stations)), 2))
+    sense = twice.sense.copy()
+    sense[len(m.stations) :] *= -1.0
+    direction = np.where(readings, -m.direction, m.direction)
+    stations = replace(twice, sense=sense)
+    return replace(m, stations=stations, station=m.station + len(m.stations) * readings, direction=direction)
 
 
 def _screened(gram: np.ndarray, flipped: np.ndarray) -> float:

@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 from calibration_helpers import BOX, FEW, SETTINGS, campaign, measured, virtual_machine
 from foreign_machines import machines
+from scipy.stats import multivariate_normal
 
+from hexapod_comp.calibration.estimator import Estimation, NotSettled, influence, iterate
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model, mixed_up
-from hexapod_comp.calibration.mixups import FAMILIES, SWAPPED, family_of_run, in_frame
-from hexapod_comp.calibration.parameters import FitSettings
+from hexapod_comp.calibration.mixups import FAMILIES, SWAPPED, _Fitted, common_modes, family_of_run, in_frame
+from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import expected_error
 from hexapod_comp.calibration.promise import Scatter, Unexplained
 from hexapod_comp.calibration.report import as_json, fit_report
@@ -27,6 +29,7 @@ from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.measurements.campaign import Campaign
 from hexapod_comp.measurements.readings import BACKWARD, CHANNELS, FORWARD, KINDS, MeasurementSet
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model, with_length_map
+from hexapod_comp.virtual.instruments import station_errors
 
 ROTATION_X = CHANNELS.index("rotation_x")
 LINEAR, STRAIGHTNESS, ROTATION = (KINDS.index(kind) for kind in ("linear", "straightness", "rotation"))
@@ -342,6 +345,105 @@ def test_a_unit_that_all_lengths_share_is_named_once(readings):
     lengths = readings.kind != ROTATION
     named = mixed_up(readings.with_values(np.where(lengths, readings.value / 0.0254, readings.value)), FEW)
     assert named[0].startswith("all lengths: µinch in place of µm fits")
+
+
+def tilted_set() -> MeasurementSet:
+    """Return lines, and poses that tilt by up to 10°, read by a tracker."""
+    return measured(virtual_machine(3), replace(campaign(), poses=60, tilt=np.radians(10.0)), 3)
+
+
+def longer_probe(m: MeasurementSet) -> MeasurementSet:
+    """Return what is read 1 mm further out along the tool."""
+    out = 1e-3 * (m.stations.rotations @ m.geometry.tool.rotation)[:, :, 2]
+    return m.with_values(m.value + (m.directions()[:, :3] * out[m.station]).sum(axis=1))
+
+
+def half_backward(m: MeasurementSet) -> MeasurementSet:
+    """Return a set in which every second place that was passed forward was passed backward, but is labelled forward."""
+    there = np.where(m.direction == FORWARD, m.station, -1)
+    wrong = np.unique(there[there >= 0])[::2]
+    truth = virtual_machine(3)
+    turned = m.stations.sense.copy()
+    turned[wrong] *= -1.0
+    stations = replace(m.stations, sense=turned)
+    moved = station_errors(replace(m, stations=stations), truth) - station_errors(m, truth)
+    return m.with_values(m.value + (m.directions() * moved[m.station]).sum(axis=1))
+
+
+SHARED = {
+    "": lambda m: m,
+    "measured point along the tool's z: +1": longer_probe,
+    "scale of all linear readings: +2": lambda m: m.with_values(m.value + 270e-6 * m.along() * (m.kind == LINEAR)),
+    "direction of ": half_backward,
+}
+
+
+@pytest.mark.parametrize("cause", SHARED)
+def test_what_all_readings_share_is_named(cause):
+    """A probe 1 mm longer, 270 ppm (a laser in air that counts vacuum wavelengths), half the forward labels wrong."""
+    named = mixed_up(SHARED[cause](tilted_set()), FEW)
+    assert any(text.startswith(cause) for text in named) if cause else not named
+
+
+def test_the_evidence_of_a_common_mode_is_that_of_a_normal_distribution(readings):
+    """With K + σ²·d·dᵀ as covariance of few readings, by SciPy's density."""
+    m = readings.select(np.arange(len(readings)) % 9 == 0)
+    space = ParameterSpace(m, FEW)
+    estimation = Estimation(m, space, alone=False)
+    problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(m)))
+    fitted = _Fitted(estimation, problem, [block.name for block in space.blocks])
+    mode = next(mode for mode in common_modes(estimation, space) if mode.name.startswith("scale of all linear"))
+    effect = estimation.free_of_nuisance(mode.effect[:, None])[:, 0]
+    p = fitted.posterior
+    rows = problem.rows.dense()[:, p.used] * p.spread
+    plain = rows @ rows.T + np.diag(p.noise[problem.kind] ** 2)
+    target = problem.target
+    with_mode = multivariate_normal.logpdf(target, cov=plain + np.outer(effect, effect) * (3.0 * mode.usual) ** 2)
+    gain = fitted._by_mode(effect, mode, 3.0, p).evidence - fitted.evidence
+    assert gain == pytest.approx(with_mode - multivariate_normal.logpdf(target, cov=plain), rel=1e-6, abs=1e-6)
+
+
+def pulled(readings: MeasurementSet) -> MeasurementSet:
+    """Return readings of which run 3 is of another machine state: 200 ppm longer, bent by 20 µm."""
+    along = readings.along() / np.abs(readings.along()).max()
+    return readings.with_values(readings.value + np.where(readings.run == 3, 50e-6 * along + 20e-6 * along**2, 0.0))
+
+
+@pytest.mark.parametrize("always", [False, True])
+def test_a_fit_that_does_not_settle_names_the_runs_that_pull(readings, monkeypatch, always):
+    """It does not settle with run 3, or whatever is left out: then it is refused, but can be forced."""
+
+    def unsettled(estimation, *start):
+        solution = iterate(estimation, *start)
+        if always or (estimation.measurements.run == 3).any():
+            raise NotSettled("did not settle", solution)
+        return solution
+
+    monkeypatch.setattr("hexapod_comp.calibration.fit.iterate", unsettled)
+    fit = fit_model(pulled(readings), FEW)
+    name = readings.runs[3].name
+    if always:
+        assert f"did not settle; the runs that pull most: {name}" in fit.misfit
+    else:
+        assert fit.verdict.doubts[0].startswith(f"with run {name} the fit does not settle: left out")
+        assert 3 not in fit.measurements.run
+
+
+def test_influence_is_what_leaving_a_run_out_does(readings):
+    """Against normal equations without the run's rows."""
+    space = ParameterSpace(readings, FEW)
+    estimation = Estimation(readings, space)
+    start = np.zeros(space.size), space.start_tolerances(), np.ones(len(KINDS))
+    solution = iterate(estimation, *start, lambda _: None)
+    run = readings.run[estimation.cells.first]
+    p, scale = solution.posterior, 1.0 / solution.posterior.noise[solution.problem.kind]
+    rows = scale[:, None] * solution.problem.rows.dense()[:, p.used]
+    prior, target = np.diag(p.spread**-2.0), scale * solution.problem.target
+    everything = rows.T @ rows + prior
+    others = run != 3
+    change = np.linalg.solve(rows[others].T @ rows[others] + prior, rows[others].T @ target[others])
+    change -= np.linalg.solve(everything, rows.T @ target)
+    assert influence(run, solution)[3] == pytest.approx(np.sqrt(change @ everything @ change), rel=1e-6)
 
 
 @pytest.mark.parametrize("value", [1e308, -1e150, 2.0, np.nan])
