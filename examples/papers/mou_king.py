@@ -174,12 +174,7 @@ def weights(field: GridField) -> Exhibit:
         Statement(
             "k = Mod(i + 2)", "without its modulus", "modulus 4, corners counted from 1: the corner opposite", WRONG
         ),
-        Statement(
-            "the four weights add up to 1",
-            "Σ W = 1 by their formula",
-            f"within {off:.0e}",
-            within(off < 1e-12),
-        ),
+        Statement("the four weights add up to 1", "Σ W = 1 by their formula", f"within {off:.0e}", within(off < 1e-12)),
         Statement(
             "Δx = Σ W_xi f_xi(P_x), and so for y and z",
             "formulas",

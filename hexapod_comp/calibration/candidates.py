@@ -11,15 +11,7 @@ from ..core import Status
 from ..errors import GeometryError
 from ..machine.field import CROSS_AXES
 from ..machine.geometry import HexapodGeometry
-from ..measurements.campaign import (
-    LINE_INSTRUMENTS,
-    PLANES,
-    POSE_INSTRUMENTS,
-    CampaignRun,
-    circle_run,
-    line_run,
-    tilts,
-)
+from ..measurements.campaign import LINE_INSTRUMENTS, PLANES, POSE_INSTRUMENTS, CampaignRun, circle_run, line_run, tilts
 from ..measurements.readings import AXES
 from ..pose import rotation_from_angles
 from ..workspace.reach import Examiner

@@ -18,26 +18,14 @@ from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from ..errors import CalibrationError, InputFileError
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..measurements.campaign import Campaign, CampaignRun, template
-from ..measurements.readings import (
-    DEFAULT_UNCERTAINTY,
-    KINDS,
-    MeasurementSet,
-)
+from ..measurements.readings import DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
 from .assumptions import ASSUMED
 from .candidates import MeasuringBox, candidates
 from .estimator import Estimation, physical_covariance, solve
 from .fit import unseen_errors
 from .observations import Cells
 from .parameters import Extent, FitSettings, ParameterSpace
-from .posterior import (
-    POINTS,
-    Observability,
-    ToolError,
-    UnseenError,
-    box_errors,
-    expected_error,
-    observe,
-)
+from .posterior import POINTS, Observability, ToolError, UnseenError, box_errors, expected_error, observe
 from .promise import Scatter, Unexplained
 from .trust import TILT
 

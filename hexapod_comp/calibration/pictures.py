@@ -46,10 +46,7 @@ def strut_length_errors(
 
 
 def strut_error_figure(
-    geometry: HexapodGeometry,
-    models: Mapping[str, MachineModel],
-    y: float | None = None,
-    z: float | None = None,
+    geometry: HexapodGeometry, models: Mapping[str, MachineModel], y: float | None = None, z: float | None = None
 ) -> Figure:
     """Show Mou & King's Figures 3 and 4: the six struts' length errors along x, forward (a) and backward (b)."""
     if not models or any(model.measured is None for model in models.values()):

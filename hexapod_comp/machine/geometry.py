@@ -284,11 +284,7 @@ def paper_joints(a: float, b: float, d: float) -> tuple[np.ndarray, np.ndarray]:
             raise GeometryError(key, "must be finite and positive, m", value)
     third = np.sqrt(3.0) / 6.0
     half = np.array(
-        [
-            [third * (2 * b + d), d / 2, 0.0],
-            [-third * (b - d), (b + d) / 2, 0.0],
-            [-third * (b + 2 * d), b / 2, 0.0],
-        ]
+        [[third * (2 * b + d), d / 2, 0.0], [-third * (b - d), (b + d) / 2, 0.0], [-third * (b + 2 * d), b / 2, 0.0]]
     )
     mirror = np.array([1.0, -1.0, 1.0])
     base = np.vstack([half, half[::-1] * mirror])

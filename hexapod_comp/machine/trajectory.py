@@ -44,11 +44,7 @@ def move(geometry: HexapodGeometry, start: Pose, end: Pose, rate: float, feed: f
 
 
 def moves(
-    geometry: HexapodGeometry,
-    positions: np.ndarray,
-    rotations: np.ndarray,
-    rate: float,
-    feed: float | None = None,
+    geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, rate: float, feed: float | None = None
 ) -> tuple[Path, np.ndarray]:
     """Return the moves (see :func:`move`) that join N tool poses, with a rest at each."""
     legs = np.arange(len(positions) - 1)

@@ -328,12 +328,7 @@ def _clock_times(table: Table, time: Times, used: set[str]) -> np.ndarray:
 
 
 def _lengths(
-    table: Table,
-    struts: StrutColumns,
-    measured: _Poses,
-    geometry: HexapodGeometry,
-    used: set[str],
-    notes: list[str],
+    table: Table, struts: StrutColumns, measured: _Poses, geometry: HexapodGeometry, used: set[str], notes: list[str]
 ) -> np.ndarray:
     """Return the strut lengths that the readings say, shape (rows, 6), m."""
     travel = _read_numbers(table, struts.readings, 1.0, used) * struts.length_per_unit

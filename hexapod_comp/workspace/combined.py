@@ -12,7 +12,6 @@ from scipy.stats import binom
 from ..errors import CalibrationError, ModelError
 from .budget import SingleErrors
 
-DISPLACEMENT, ROTATION = 0, 1  # Columns of every result
 RSS, WORST_CASE = "rss", "worst_case"  # How an allocation adds the errors up
 UNIFORM, NORMAL = "uniform", "normal"  # Distributions of u: uniform within ±1, or normal with a standard deviation of 1
 CHUNK = 512  # Poses handled together: bounds the memory of all combinations of signs
@@ -114,7 +113,7 @@ class Allocation:
     """What the errors may be, given what the tool's error may be."""
 
     method: str  # ``rss`` or ``worst_case``
-    allowed: float  # Allowed error of the tool at the worst pose, m or rad
+    allowed: float  # Allowed error of the tool at the worst pose, m
     combined: float  # What the budget as it is adds up to there
     pose: int  # The worst pose's number
     scale: float  # Largest factor that all sizes may be multiplied by
@@ -130,14 +129,8 @@ class Allocation:
     equal: np.ndarray
 
 
-def allocate(
-    errors: SingleErrors,
-    vectors: np.ndarray,
-    allowed: float,
-    method: str = RSS,
-    quantity: int = DISPLACEMENT,
-) -> Allocation:
-    """Return what each source may be so that the tool's error stays within what is allowed at every pose."""
+def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float, method: str = RSS) -> Allocation:
+    """Return what each source may be so that the tool's displacement stays within what is allowed, m, at every pose."""
     if not 0.0 < allowed < np.inf:
         raise ModelError("allowed", "must be above zero", allowed)
     if method not in (RSS, WORST_CASE):
@@ -145,13 +138,16 @@ def allocate(
     if not len(vectors):
         raise ModelError("poses", "there are none: the workspace is empty", 0)
     types = len(errors.kinds)
-    parts = _squares(errors, vectors, quantity) if method == RSS else _along_struts(errors, vectors)
+    if method == RSS:
+        parts = (vectors[..., :3] ** 2).sum(axis=2) @ np.eye(types)[errors.kind]  # squared, (N, K)
+    else:
+        parts = _along_struts(errors, vectors)
 
     def combined(factors: np.ndarray) -> np.ndarray:
         """Return the combined error at each pose with each type's size multiplied, shape (N,)."""
         if method == RSS:
-            return np.sqrt((parts @ factors**2).max(axis=1))
-        return _worst(parts @ factors)[:, quantity]
+            return np.sqrt(parts @ factors**2)
+        return _worst(parts @ factors)[:, 0]
 
     now = combined(np.ones(types))
     pose = int(np.argmax(now))
@@ -186,13 +182,6 @@ def _alone(combined: Callable[[np.ndarray], np.ndarray], types: int, kind: int, 
         if high > LARGEST_FACTOR:
             return np.inf
     return float(brentq(excess, 0.0, high, rtol=1e-10))
-
-
-def _squares(errors: SingleErrors, vectors: np.ndarray, quantity: int) -> np.ndarray:
-    """Return each type's part of the squared error, shape (N, 1 or 3 axes, K)."""
-    belongs = np.eye(len(errors.kinds))[errors.kind]
-    parts = np.einsum("nec,ek->nck", vectors**2, belongs)
-    return parts[:, :3].sum(axis=1, keepdims=True) if quantity == DISPLACEMENT else parts[:, 3:]
 
 
 def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:

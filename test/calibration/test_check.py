@@ -92,11 +92,7 @@ def test_other_instruments_propose_what_shows_the_struts(instruments: tuple[str,
     """Straightnesses come by threes, for their slope is unknown; poses are whole. A change is seen where stated."""
     proposed = propose_check(fitted().known, 15, instruments)
     kinds = {CHANNELS[channel].partition("_")[0] for channel in proposed.channel}
-    wanted = {
-        "straightness": {"straightness"},
-        "tracker": {"position"},
-        "tracker_6d": {"position", "attitude"},
-    }
+    wanted = {"straightness": {"straightness"}, "tracker": {"position"}, "tracker_6d": {"position", "attitude"}}
     assert kinds == wanted[instruments[0]]
     assert 12 <= len(proposed) <= 15
     of_channel = np.stack([proposed.run, proposed.channel], axis=1)[proposed.kind == KINDS.index("straightness")]

@@ -102,12 +102,7 @@ def test_every_limit_is_met() -> None:
     geometry = load_geometry("example_6_6.yaml")
     model, start = MachineModel(geometry.name), np.array([0.01, 0.02, 0.38, 1.0, 2.0, 15.0])
     met = set()
-    for tight in (
-        {},
-        {"base_cone": np.radians(np.full(6, 20.0))},
-        {"clearance": 0.128},
-        {"condition": 1.75},
-    ):
+    for tight in ({}, {"base_cone": np.radians(np.full(6, 20.0))}, {"clearance": 0.128}, {"condition": 1.75}):
         limited = replace(geometry, limits=replace(geometry.limits, **tight))
         met |= compare(limited, model, start)
     assert met >= {"stroke", "base_cone", "platform_cone", "clearance", "condition", "correction"}

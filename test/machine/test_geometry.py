@@ -166,10 +166,7 @@ FIFTH_JOINT = ", [20, -2, 0]]"
         pytest.param("step_mm: 2", "step_mm: 2\n  step_um: 2000", ["limits.step_", "given twice"], id="two units"),
         pytest.param("  step_mm: 2\n", "", ["limits.step", "missing", "step_mm"], id="limit missing"),
         pytest.param(
-            "speed_m_min: 12",
-            "speed_m_min: 12\n  warp: 9",
-            ["limits.warp", "not a known key", "9"],
-            id="unknown key",
+            "speed_m_min: 12", "speed_m_min: 12\n  warp: 9", ["limits.warp", "not a known key", "9"], id="unknown key"
         ),
         pytest.param("screw:", "screws:", ["screws", "not a known key"], id="unknown block"),
         pytest.param("  platform_cone", "  base_cone_deg: 3\n  platform_cone", ["base_cone_deg", "twice"], id="twice"),

@@ -117,10 +117,7 @@ def test_a_model_comes_back(tmp_path, seed):
     """Truth: the model saved. One rounding per number, 2.2e-16, where no decimal in the unit hits it."""
     rng = np.random.default_rng(seed)
     model = replace(
-        random_model(rng, "skewed"),
-        region=random_region(rng),
-        reversal_threshold=rng.uniform(0.0, 1e-5),
-        origin=ORIGIN,
+        random_model(rng, "skewed"), region=random_region(rng), reversal_threshold=rng.uniform(0.0, 1e-5), origin=ORIGIN
     )
     assert_equal(there_and_back(model, tmp_path, SKEWED), model, relative=2.3e-16)
 
@@ -367,22 +364,14 @@ LAST_LINE = "  - {axis: z, at: [1, 1], direction: both, dx_um: []}\n"
         ("knots_mm: [330, 880]", "knots_mm: [880, 330]", ["struts.map_knots", "increasing", "0.88"]),
         ("knots_mm: [330, 880]", "knots_mm: [330, 600, 880]", ["struts.map_values", "(6, 3)", "(6, 2)"]),
         (", [0, 6]]", "]", ["struts.map.values_um", "6×n", "5×2"]),
-        (
-            "thermal:\n",
-            "thermal:\n  tool_expansion_ppm_per_K: 5\n",
-            ["thermal.tool_expansion_ppm_per_K", "5"],
-        ),
+        ("thermal:\n", "thermal:\n  tool_expansion_ppm_per_K: 5\n", ["thermal.tool_expansion_ppm_per_K", "5"]),
         ("thermal:\n  platform_expansion_ppm_per_K: 23.1", "thermal:", ["thermal", "mapping"]),
         ("grid_x_mm: [-200, 200]", "grid_x_mm: [200, -200]", ["field.grid_x", "increasing", "0.2"]),
         ("grid_x_mm: [-200, 200]", "grid_x_mm: 200", ["field.grid_x_mm", "shape n"]),
         ("  grid_x_mm: [-200, 200]\n", "", ["field.grid_x", "missing", "grid_x_mm"]),
         ("  probe_mm", "  outside: guess\n  probe_mm", ["field.outside", "hold, refuse", "guess"]),
         ("axis: z, at: [0, 0]", "axis: w, at: [0, 0]", ["field.lines[0].axis", "x, y, z", "'w'"]),
-        (
-            "direction: forward",
-            "direction: up",
-            ["field.lines[1].direction", "forward, backward, both", "up"],
-        ),
+        ("direction: forward", "direction: up", ["field.lines[1].direction", "forward, backward, both", "up"]),
         ("at: [1, 1]", "at: [1, 2]", ["field.lines[4].at", "0…1 and 0…1", "[1, 2]"]),
         ("at: [1, 1]", "at: [-1, 1]", ["field.lines[4].at", "0…1", "[-1, 1]"]),
         ("at: [1, 1]", "at: [1.0, 1]", ["field.lines[4].at", "indices", "[1.0, 1]"]),
@@ -400,16 +389,8 @@ LAST_LINE = "  - {axis: z, at: [1, 1], direction: both, dx_um: []}\n"
         ("[10, 20, 30, 40, 50, 60]", "[10, 200000, 0, 0, 0, 0]", ["struts.offset", "±100 mm", "unit", "0.2"]),
         ("expansion_ppm_per_K: 11.7", "expansion_ppm_per_K: 11700", ["struts.expansion", "±1000 ppm per K", "0.0117"]),
         (LAST_LINE, "", ["field.lines", "the forward line along z at [1, 1] is missing"]),
-        (
-            "at: [0, 1], direction: backward",
-            "at: [0, 0], direction: backward",
-            ["lines[2].at", "given twice"],
-        ),
-        (
-            "direction: backward",
-            "direction: both",
-            ["lines[2].at", "forward line along z", "twice", "[0, 1]"],
-        ),
+        ("at: [0, 1], direction: backward", "at: [0, 0], direction: backward", ["lines[2].at", "given twice"]),
+        ("direction: backward", "direction: both", ["lines[2].at", "forward line along z", "twice", "[0, 1]"]),
         ("direction: forward", "direction: backward", ["lines[2].at", "backward line along z", "twice"]),
         (LAST_LINE, LAST_LINE + "tuning: 1\n", ["tuning", "not a known key", "1"]),
         (LAST_LINE, LAST_LINE + "name: again\n", ["'name' is given twice"]),
@@ -491,22 +472,7 @@ def test_a_file_that_cannot_be_written_says_so(tmp_path):
 def test_names_of_every_kind_come_back(tmp_path_factory, seed):
     """Text that YAML would take for something else (no, 1.5, null, a date, colons) stays text."""
     rng = np.random.default_rng(seed)
-    words = [
-        "no",
-        "1.5",
-        "null",
-        "2026-01-31",
-        "a: b",
-        "- x",
-        "#1",
-        "0400",
-        "é µ 漢",
-        "'",
-        '"',
-        "!x",
-        "&a",
-        "*b",
-    ]
+    words = ["no", "1.5", "null", "2026-01-31", "a: b", "- x", "#1", "0400", "é µ 漢", "'", '"', "!x", "&a", "*b"]
     name, note, file = (" ".join(rng.choice(words, rng.integers(1, 4))) for _ in range(3))
     model = MachineModel("paper", name, origin=ModelOrigin("2026-01-31", ((file, DIGEST),), None, note))
     assert_equal(there_and_back(model, tmp_path_factory.getbasetemp(), PAPER), model)

@@ -12,17 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from strategies import paper_geometry, random_pose
 
 from hexapod_comp.machine.geometry import HexapodGeometry
-from hexapod_comp.machine.trajectory import (
-    TRACK_WINDOW,
-    Path,
-    circle,
-    feet_on,
-    join,
-    motion_onto,
-    move,
-    moves,
-    pocket,
-)
+from hexapod_comp.machine.trajectory import TRACK_WINDOW, Path, circle, feet_on, join, motion_onto, move, moves, pocket
 from hexapod_comp.pose import Pose
 
 PAPER = paper_geometry()

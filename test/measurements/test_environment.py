@@ -12,12 +12,7 @@ from hypothesis import strategies as st
 from strategies import fixed
 
 from hexapod_comp.errors import ModelError
-from hexapod_comp.measurements.air import (
-    VACUUM_WAVELENGTH,
-    Air,
-    ciddor_index,
-    correct_displacement,
-)
+from hexapod_comp.measurements.air import VACUUM_WAVELENGTH, Air, ciddor_index, correct_displacement
 
 STANDARD_AIR = Air(20.0, 101_325.0, 0.5)
 

@@ -67,10 +67,7 @@ def test_units(tmp_path: Path, channel: str, value: str, unit: str, si: float) -
     np.testing.assert_array_equal(found.points()[0], [-0.01, 0.0, 0.4])
 
 
-@pytest.mark.parametrize(
-    ("axis", "turns"),
-    [("x", ("x", "y", "z")), ("y", ("y", "x", "z")), ("z", ("z", "x", "y"))],
-)
+@pytest.mark.parametrize(("axis", "turns"), [("x", ("x", "y", "z")), ("y", ("y", "x", "z")), ("z", ("z", "x", "y"))])
 def test_roll_pitch_and_yaw(tmp_path: Path, axis: str, turns: tuple[str, ...]) -> None:
     """Roll is about the line; on horizontal lines yaw is about z; on vertical ones pitch is about x."""
     ends = {"x": ("-1,0,400", "1,0,400"), "y": ("0,-1,400", "0,1,400"), "z": ("0,0,400", "0,0,401")}[axis]
