@@ -136,11 +136,9 @@ def test_the_report_has_all_its_parts(done: Done) -> None:
 
 
 def test_screw_pitch_comes_first_by_two(done: Done) -> None:
-    """004, Table 1: 34.4 µm to 13.68 µm, 2.5; "a factor of about two or more" on a machine of other geometry.
-
-    Its size is 2 to 2.86 times the others' sizes, so that a factor near two is to be expected of any machine
-    whose joints act about as their struts do. The others lie within the paper's order of magnitude.
-    """
+    """004, Table 1: 34.4 µm to 13.68 µm, 2.5; "a factor of about two or more" on a machine of other geometry."""
+    # Its size is 2 to 2.86 times the others' sizes, so that a factor near two is to be expected of any machine whose
+    # joints act about as their struts do. The others lie within the paper's order of magnitude.
     rows = done.rows
     assert [row["rank"] for row in rows] == ["1", "2", "3", "4"]
     assert rows[0]["error_type"] == "screw pitch"
@@ -154,10 +152,8 @@ def test_screw_pitch_comes_first_by_two(done: Done) -> None:
 
 
 def test_effects_scale_with_the_input_error(done: Done) -> None:
-    """Quantisation is a length error of 7 µm where screw pitch is one of 20 µm: the same legs, the same poses.
-
-    The effects are linear within size/length, about 1e-4.
-    """
+    """Quantisation is a length error of 7 µm where screw pitch is one of 20 µm: the same legs, the same poses."""
+    # The effects are linear within size/length, about 1e-4.
     by_type = {row["error_type"]: row for row in done.rows}
     pitch, quantum = by_type["screw pitch"], by_type["quantisation"]
     for name in ("translation_max_um", "translation_min_um", "rotation_max_mdeg", "rotation_min_mdeg"):

@@ -37,6 +37,7 @@ from hexapod_comp.measurements.files import read_measurements
 from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.pose import Pose
 
+# Six readings on the shortest lines, the fewest that scheme lines takes; two cycles, the fewest for ISO 230-2
 CAMPAIGN = """format: hexapod_comp/campaign
 version: 1
 box_mm: [[-203.2, -203.2, 350], [203.2, 203.2, 553.2]]
@@ -46,10 +47,8 @@ instrument: 1-D
 diagonals: 4
 cycles: 2
 """
-"""Six readings on the shortest lines, the fewest that scheme lines takes; two cycles, the fewest for ISO 230-2."""
 
-BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])
-"""The same box, m."""
+BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])  # the same box, m
 
 JOINT = ("--lead-mm", "10", "--blocks", "pitch,wave,backlash")
 
@@ -468,10 +467,8 @@ def test_noise_that_is_stated_is_welcome(hexapod: Program, stated: Path, tmp_pat
 
 
 def test_micrometres_called_millimetres_write_nothing(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
-    """By either scheme, whether the file states no noise, or noise that is in millimetres then, too.
-
-    Scheme lines leaves the screws' waves, a few micrometres, which now are millimetres.
-    """
+    """By either scheme, whether the file states no noise, or noise that is in millimetres then, too."""
+    # Scheme lines leaves the screws' waves, a few micrometres, which now are millimetres.
     wrong, text = tmp_path / "mm.csv", done.measured.read_text().replace(",um,", ",mm,")
     wrong.write_text("".join(line.rsplit(",", 1)[0] + "\n" for line in text.splitlines()))
     code, out, _ = hexapod("fit", wrong, "--scheme", "lines", "--out", tmp_path / "m.yaml")

@@ -15,17 +15,15 @@ from hexapod_comp import cli
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import load_model
 
+# Leaves what the tests' own reader and kinematics have: structure, offsets and pitch
 PLAIN = ("--wave-um", "0", "--map-um", "0", "--backlash-um", "0")
-"""Leaves what the tests' own reader and kinematics have: structure, offsets and pitch."""
 
 
 @pytest.mark.parametrize("name", machine_names())
 def test_any_machine(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The figures of the report are those of the file, at random places of the box that the report names.
-
-    Of 1,000 places each. Aligned errors grow towards the corners, so that squares scatter by one and a half times their
-    size: a mean square good to 4.5/√1000 = 14 %, its root to 7 %, two such 10 %.
-    """
+    """The figures of the report are those of the file, at random places of the box that the report names."""
+    # Of 1,000 places each. Aligned errors grow towards the corners, so that squares scatter by one and a half times
+    # their size: a mean square good to 4.5/√1000 = 14 %, its root to 7 %, two such 10 %.
     machine = machines()[name]
     geometry, out = machine.write(tmp_path / "machine.yaml"), tmp_path / "truth.yaml"
     bounds = ("--joints-um", "30", "--struts-um", "20", "--pitch-ppm", "100")

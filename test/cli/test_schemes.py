@@ -17,14 +17,14 @@ REACHED = [("paper", name, "lines") for name in ("campaign", "campaign_5d", "cam
 REACHED += [("paper", "campaign_1d", "lines joint")]
 REACHED += [(name, "campaign", "lines joint") for name in ("example_6_6", "jugglebot", "positioning_unit")]
 
+# By a work frame at 15° to the base; and by lines of 164 mm that are read every 41 mm
 REFUSED = {
     ("example_6_6", "lines"): ("turned against those of base by 15°", "scheme joint does not"),
     ("jugglebot", "lines"): ("has 5 points in a direction", "one every 32.8 mm or closer (step_mm of a campaign)"),
 }
-"""By a work frame at 15° to the base; and by lines of 164 mm that are read every 41 mm."""
 
+# Scheme lines leaves what lines do not show, such as squareness; a joint fit of two blocks the screws' waves
 LEAST_REMOVED = {"lines": 0.25, "joint": 0.5}
-"""Scheme lines leaves what lines do not show, such as squareness; a joint fit of two blocks the screws' waves."""
 
 
 @pytest.mark.parametrize(("machine", "campaign", "schemes"), REACHED)

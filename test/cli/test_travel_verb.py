@@ -15,8 +15,7 @@ from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.pose import Pose, angles_from_rotation
 
-SHOWN = 1e-9
-"""mm; the last digit of lengths."""
+SHOWN = 1e-9  # mm; the last digit of lengths
 
 Printed = pytest.CaptureFixture[str]
 

@@ -22,8 +22,7 @@ from hexapod_comp.measurements.tidy import write_measurements
 from hexapod_comp.virtual.instruments import compensated, measure
 
 MICRON = (1e-6,) * len(KINDS)
-STRUT = 1
-"""Which strut is moved, by 50 µm."""
+STRUT = 1  # which strut is moved, by 50 µm
 
 
 @pytest.fixture(scope="module")

@@ -37,6 +37,7 @@ from hexapod_comp.workspace.budget import load_budget
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 PAPER = load_geometry("paper")
 
+# Each kind of YAML file, and a shipped one of it
 YAML_READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "geometry": (load_geometry, "example_6_6.yaml"),
     "model": (lambda path: load_model(path, PAPER), "paper_machine.yaml"),
@@ -45,7 +46,6 @@ YAML_READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "columns": (load_columns, "jugglebot_columns.yaml"),
     "warm-up": (load_warm_up, "warm_up.yaml"),
 }
-"""Each kind of YAML file, and a shipped one of it."""
 
 READERS: dict[str, Callable[[Path], Any]] = {
     **{name: read for name, (read, _) in YAML_READERS.items()},
@@ -152,6 +152,7 @@ def put(tree: Any, at: tuple, value: Any) -> Any:
 
 VALUES = [[], {}, None, "x", 1e308, float("inf"), [None]]
 
+# A field of four lines in place of the shipped model's hundred
 NEXT_TO_NOTHING = """
 grid_x_mm: [-1, 1]
 grid_y_mm: [-1, 1]
@@ -163,7 +164,6 @@ lines:
 - {axis: z, at: [1, 0], direction: both}
 - {axis: z, at: [1, 1], direction: both}
 """
-"""A field of four lines in place of the shipped model's hundred."""
 
 
 @pytest.mark.parametrize("kind", YAML_READERS)

@@ -25,8 +25,8 @@ from hexapod_comp.formats.outputs import new_file, write_text
 from hexapod_comp.formats.texts import PlainStream
 
 ROOT = Path(__file__).resolve().parents[2]
+# Sets a terminal's title, clears it, colours it (in one C1 code), turns the direction
 SENTINEL = "\x1b]0;owned\x07\x1b[2J\x9b31m\u202e"
-"""Sets a terminal's title, clears it, colours it (in one C1 code), turns the direction."""
 
 
 # Files.

@@ -33,6 +33,7 @@ pytestmark = [pytest.mark.skipif(bool(why_not()), reason=f"LinuxCNC: {why_not()}
 DATA = Path(__file__).resolve().parents[1] / "data"
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 
+# Lasers see everything but where the machine stands as a whole; the tracker's poses see that
 CAMPAIGN = """format: hexapod_comp/campaign
 version: 1
 box_mm: [[-203.2, -203.2, 350], [203.2, 203.2, 553.2]]
@@ -45,8 +46,8 @@ tilt_deg: 10
 noise: {linear_um: 1, straightness_um: 1, rotation_urad: 1, position_um: 10, attitude_urad: 10}
 beam_slope_urad: 100
 """
-"""Lasers see everything but where the machine stands as a whole; the tracker's poses see that."""
 
+# A circle of 120 mm diameter at 25 mm/s, then two moves with a tilting tool
 PROGRAM = """G21 G90 G94
 G1 X60 Y0 Z400 A0 B0 C0 F1500
 G3 X60 Y0 I-60 J0
@@ -54,19 +55,11 @@ G1 X20 Y-30 Z420 A6 B-5 C4
 G1 X-20 Y20 Z390 A-5 B6 C-3
 M2
 """
-"""A circle of 120 mm diameter at 25 mm/s, then two moves with a tilting tool."""
 
-RAMP = 1e-3
-"""Configured ramp of the corrections, mm per servo cycle of 1 ms: 1 mm/s."""
-
-DIGITS = 1.1e-6
-"""Two readings of halsampler, mm: it prints six digits behind the point."""
-
-LATE = 500
-"""Servo cycles, ms, that a process may be kept waiting by a machine that does much else."""
-
-EVERY = 5
-"""Every so many cycles of a record are judged: neighbours are micrometres apart."""
+RAMP = 1e-3  # configured ramp of the corrections, mm per servo cycle of 1 ms: 1 mm/s
+DIGITS = 1.1e-6  # two readings of halsampler, mm: it prints six digits behind the point
+LATE = 500  # servo cycles, ms, that a process may be kept waiting by a machine that does much else
+EVERY = 5  # every so many cycles of a record are judged: neighbours are micrometres apart
 
 
 def uniform(rng: np.random.Generator, *shape: int) -> np.ndarray:
@@ -125,10 +118,8 @@ def run_program(linuxcnc: Linuxcnc, text: str = PROGRAM) -> Record:
 
 
 def tool_errors(truth: RealMachine, record: Record, tool_length: float = 0.0) -> np.ndarray:
-    """Return true minus commanded tool positions along a record, m, shape (N, 3).
-
-    The machine has neither backlash nor field: directions of motion do not matter.
-    """
+    """Return true minus commanded tool positions along a record, m, shape (N, 3)."""
+    # The machine has neither backlash nor field: directions of motion do not matter.
     up = np.array([0.0, 0.0, tool_length])
     guess, sense, errors = truth.geometry.home, MotionState().sense, []
     for axes, struts in zip(record.axes[::EVERY], record.struts[::EVERY], strict=True):
@@ -139,11 +130,9 @@ def tool_errors(truth: RealMachine, record: Record, tool_length: float = 0.0) ->
 
 
 def in_force(truth: RealMachine, record: Record, tool_length: float = 0.0) -> np.ndarray:
-    """Return the tool errors of a record while the corrections were in force, m, shape (N, 3).
-
-    On a machine under load processes stand still for longer than the bridge's timeout now and then; the
-    corrections then ramp out and in again, as they must. That is another test's matter.
-    """
+    """Return the tool errors of a record while the corrections were in force, m, shape (N, 3)."""
+    # On a machine under load processes stand still for longer than the bridge's timeout now and then; the corrections
+    # then ramp out and in again, as they must. That is another test's matter.
     errors = tool_errors(truth, record, tool_length)
     there = settled(record, 2)[::EVERY]
     print(f"\ncorrections in force for {100 * there.mean():.0f} % of the time")
@@ -152,10 +141,8 @@ def in_force(truth: RealMachine, record: Record, tool_length: float = 0.0) -> np
 
 
 def settled(record: Record, status: int) -> np.ndarray:
-    """Return in which cycles a living bridge has had a status for 0.3 s, and keeps it for 0.3 s, bool, shape (N,).
-
-    The status of a bridge that is dead, or kept waiting, is an old one.
-    """
+    """Return in which cycles a living bridge has had a status for 0.3 s, and keeps it for 0.3 s, bool, shape (N,)."""
+    # The status of a bridge that is dead, or kept waiting, is an old one.
     there = (record.status == status) & record.alive
     return np.ones(len(there), bool) if there.all() else distance_transform_edt(there) > 300.0
 
@@ -180,10 +167,8 @@ def table(name: str) -> list[list[float]]:
 
 
 def test_table_2(controller: Linuxcnc) -> None:
-    """Rows of Table 1 that turn about one axis only give Table 2's lengths, to its last digit.
-
-    LinuxCNC turns about other axes in another order; with one angle there is no order.
-    """
+    """Rows of Table 1 that turn about one axis only give Table 2's lengths, to its last digit."""
+    # LinuxCNC turns about other axes in another order; with one angle there is no order.
     controller.enable(False)
     tried = 0
     for angles_first, lengths in zip(table_1(), table("table2_strut_lengths_ideal.csv"), strict=True):
@@ -308,11 +293,9 @@ M2
 
 
 def test_the_servo_thread_beside_the_bridge(controller: Linuxcnc) -> None:
-    """Print the servo thread's longest cycle with the bridge and without it: medians of several short runs in turn.
-
-    They are not judged here: the longest cycle of a shared, virtual machine tells who else was on it. What must hold
-    is that LinuxCNC goes on, without a following error, whether the bridge runs or stands.
-    """
+    """Print the servo thread's longest cycle with the bridge and without it: medians of several short runs in turn."""
+    # They are not judged here: the longest cycle of a shared, virtual machine tells who else was on it. What must hold
+    # is that LinuxCNC goes on, without a following error, whether the bridge runs or stands.
     names = ("servo-thread.tmax", "motion-controller.tmax")
     longest: dict[bool, list[list[float]]] = {False: [], True: []}
     bridge = controller.pid_of("hexapod_comp")

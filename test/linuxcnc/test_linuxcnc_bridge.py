@@ -36,11 +36,10 @@ from hexapod_comp.ros.status import ERROR, OK, WARN
 
 NODE = "linuxcnc_bridge"
 
-RATE = 250.0
-"""Cycles per second, Hz: a test shares one Python with the compensator and the witness."""
+RATE = 250.0  # cycles per second, Hz: a test shares one Python with the compensator and the witness
 
+# A busy machine's test may pause for more than the 0.1 s after which a compensator counts as lost
 SLOW = {"rate": RATE, "timeout": 1.0}
-"""A busy machine's test may pause for more than the 0.1 s after which a compensator counts as lost."""
 
 
 class Machine:
@@ -83,10 +82,8 @@ class Machine:
 
 @pytest.fixture
 def speak(bench):
-    """Give a function that publishes corrections as a compensator would: stamped now unless told otherwise.
-
-    ``speak.steadily`` does so at 100 Hz at most, however often it is called.
-    """
+    """Give a function that publishes corrections as a compensator would: stamped now unless told otherwise."""
+    # `speak.steadily` does so at 100 Hz at most, however often it is called.
     publisher = bench.witness.create_publisher(JointState, "strut_corrections", RELIABLE)
 
     def send(values: list[float], stamp: Any = None, names: tuple[str, ...] = STRUT_NAMES) -> None:

@@ -48,13 +48,13 @@ pytestmark = [
 
 __all__ = ["calibrated"]  # the fixture
 
+# The circle at 6 m/min, 100 mm/s
 FAST = """G21 G90 G94
 G1 X60 Y0 Z400 F6000
 G3 X60 Y0 I-60 J0
 G3 X60 Y0 I-60 J0
 M2
 """
-"""The circle at 6 m/min, 100 mm/s."""
 
 
 @pytest.fixture(scope="module")

@@ -39,6 +39,7 @@ from hexapod_comp.pose import Pose
 from hexapod_comp.ros.messages import message_pose
 from hexapod_comp.virtual.imperfections import draw_model
 
+# The box and the lasers of the bars, a quarter of their lines, half their readings, the four body diagonals
 CAMPAIGN = """format: hexapod_comp/campaign
 version: 1
 box_mm: [[-203.2, -203.2, 350], [203.2, 203.2, 553.2]]
@@ -48,28 +49,21 @@ instrument: 5-D
 diagonals: 4
 cycles: 2
 """
-"""The box and the lasers of the bars, a quarter of their lines, half their readings, the four body diagonals."""
 
+# The machine has the first three; a length map it has not, and the fit has to find that out
 BLOCKS = ("pitch", "wave", "backlash", "map")
-"""The machine has the first three; a length map it has not, and the fit has to find that out."""
 
-POINTS = 15
-"""Held-out points, each approached from both sides: 30 rests."""
+POINTS = 15  # held-out points, each approached from both sides: 30 rests
+APPROACH = 2e-3  # way on which a point is approached, m: four hundred times the backlash
 
-APPROACH = 2e-3
-"""Way on which a point is approached, m: four hundred times the backlash."""
-
+# Every strut changes by this share of the approach and more: 100 µm, so that each takes up its backlash
 LEAST_SHARE = 0.05
-"""Every strut changes by this share of the approach and more: 100 µm, so that each takes up its backlash."""
 
-STEP = 0.1e-6
-"""Motor step of the drive, m; the shipped default."""
+STEP = 0.1e-6  # motor step of the drive, m; the shipped default
+REST = 1e-9  # what the motor step does not explain: as in test_loop.py, m
 
-REST = 1e-9
-"""What the motor step does not explain: as in test_loop.py, m."""
-
+# Commands per second, Hz; largest tool speed on the way and on the approach, m/s
 RATE, FEED, APPROACH_FEED = 100.0, 2.0, 0.075
-"""Commands per second, Hz; largest tool speed on the way and on the approach, m/s."""
 
 
 @dataclass(frozen=True)
@@ -204,15 +198,12 @@ def leverage(point: np.ndarray) -> np.ndarray:
 
 
 def test_the_loop_leaves_what_the_fit_promised(bench: Bench, tmp_path: Path, promise: Promise) -> None:
-    """The issue's last sentence: the error at held-out points falls by what the report predicted.
-
-    The promise is of the RMS over the whole box. The loop adds two things. Motors stand on steps of 0.1 µm: each
-    strut is off by up to half a step, evenly distributed, standard deviation step/√12, and the tool by that times
-    the struts' leverage, added as squares (some 0.05 µm, next to some 0.2 µm promised). And 30 rests are not
-    the whole box: an RMS of 15 independent error vectors of three components scatters by 1/√(2·45) = 10.5 %, so
-    the interval is widened by twice that. A wrong sign, or one block that is lost between file and
-    machine, would leave microns.
-    """
+    """The issue's last sentence: the error at held-out points falls by what the report predicted."""
+    # The promise is of the RMS over the whole box. The loop adds two things. Motors stand on steps of 0.1 µm: each
+    # strut is off by up to half a step, evenly distributed, standard deviation step/√12, and the tool by that times the
+    # struts' leverage, added as squares (some 0.05 µm, next to some 0.2 µm promised). And 30 rests are not the whole
+    # box: an RMS of 15 independent error vectors of three components scatters by 1/√(2·45) = 10.5 %, so the interval is
+    # widened by twice that. A wrong sign, or one block that is lost between file and machine, would leave microns.
     geometry = start_loop(bench, tmp_path, promise)
     points, ways = held_out_points(geometry)
     actual, wanted = visit(bench, geometry, points, ways), np.tile(points, (2, 1))
@@ -237,11 +228,10 @@ def test_the_loop_leaves_what_the_fit_promised(bench: Bench, tmp_path: Path, pro
     assert (np.abs(actual - expected) <= bound).all()
 
 
-MACHINES = 8
-"""Machines whose promises are checked without DDS."""
+MACHINES = 8  # machines whose promises are checked without DDS
 
+# So many of them must lie in their interval: fewer would happen once in a hundred honest studies
 LEAST_KEPT = int(binom.ppf(0.01, MACHINES, 0.95))
-"""So many of them must lie in their interval: fewer would happen once in a hundred honest studies."""
 
 
 def test_promises_are_kept_as_often_as_they_say() -> None:

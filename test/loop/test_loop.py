@@ -27,26 +27,17 @@ from hexapod_comp.ros.messages import message_pose
 from hexapod_comp.ros.status import ERROR, OK
 from hexapod_comp.virtual.machine import DriveParameters, StrutDrive
 
-STEP = 0.1e-6
-"""Motor step of a fine drive, m; the shipped default."""
-
-ENCODER = 0.1e-6
-"""Encoder count, m."""
-
-NOISE = 0.05e-6
-"""Standard deviation of an encoder reading, m."""
-
-REST = 1e-9
-"""What neither drive nor encoder explains, m and rad."""
-
-RATE, FEED = 250.0, 0.1
-"""Commands per second, Hz, and largest tool speed, m/s."""
+STEP = 0.1e-6  # motor step of a fine drive, m; the shipped default
+ENCODER = 0.1e-6  # encoder count, m
+NOISE = 0.05e-6  # standard deviation of an encoder reading, m
+REST = 1e-9  # what neither drive nor encoder explains, m and rad
+RATE, FEED = 250.0, 0.1  # commands per second, Hz, and largest tool speed, m/s
 
 TRUE_MODEL = "paper_machine.yaml"
 LINES_MODEL = "paper_lines_model.yaml"
 
+# Two poses of the paper's Table 1, tilted by 5° about x and about z
 TARGETS = [table_poses()[index] for index in (1, 3)]
-"""Two poses of the paper's Table 1, tilted by 5° about x and about z."""
 
 
 @pytest.fixture(scope="module")

@@ -26,8 +26,7 @@ from hexapod_comp.ros.client import LISTENER_QOS, LoopClient, Sent
 from hexapod_comp.ros.interface import PROGRAM as COMPENSATOR
 from hexapod_comp.ros.parameters import outside_ros
 
-STOP_WITHIN = 2.0
-"""From the signal to the end of the process, s."""
+STOP_WITHIN = 2.0  # from the signal to the end of the process, s
 
 
 @pytest.fixture
@@ -98,10 +97,8 @@ def run_both(*arguments: str) -> list[tuple[int, str]]:
 
 
 def test_loop_between_processes(client, pair):
-    """A command comes back as struts near the closed form, the tool goes there, the estimate says so.
-
-    In three commands, so that every strut has a direction of motion: the first alone has none to go by.
-    """
+    """A command comes back as struts near the closed form, the tool goes there, the estimate says so."""
+    # In three commands, so that every strut has a direction of motion: the first alone has none to go by.
     pose = near(HOME, (0.0005, -0.0003, 0.0008))
     for share in (0.2, 0.6, 1.0):
         entry = ask(client, near(HOME, (0.0005 * share, -0.0003 * share, 0.0008 * share)))
@@ -233,12 +230,12 @@ def test_bad_start_ends_with_1_and_a_clear_word(isolated_ros, arguments, texts):
             assert text in said
 
 
+# Executables: module, and texts of their help
 PROGRAMS = {
     "compensator": ("ros.compensator", "model_file  [ideal]", "tool_pose_command"),
     "strut_drive": ("ros.strut_drive", "truth_file  [paper_machine.yaml]", "strut_commands"),
     "linuxcnc_bridge": ("linuxcnc.bridge", "units  [mm]", "strut_corrections"),
 }
-"""Executables: module, and texts of their help."""
 
 
 def run_program(name: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -328,10 +325,8 @@ def runs(pid: int) -> bool:
 
 
 def test_nodes_receive_by_udp_only(client, pair):
-    """A process that is killed in another's shared-memory port stalls it for seconds; nobody opens one here.
-
-    Fast DDS keeps each port of its shared-memory transport in /dev/shm/fastrtps_port….
-    """
+    """A process that is killed in another's shared-memory port stalls it for seconds; nobody opens one here."""
+    # Fast DDS keeps each port of its shared-memory transport in /dev/shm/fastrtps_port….
     ask(client, HOME)
     for node in pair:
         maps = Path(f"/proc/{node.pid}/maps").read_text(encoding="ascii")
@@ -348,11 +343,9 @@ def dropped(pid: int) -> int:
 
 
 def test_a_command_for_which_a_socket_had_no_room_is_repeated_at_once(client, pair):
-    """A stopped process's socket is full of readings after a second; it goes on when the next command has been lost.
-
-    Fast DDS repeats what was lost when the writer's heartbeat tells of it: by itself every 3 s, when a command
-    would be too old to be obeyed. No later command brings one earlier here.
-    """
+    """A stopped process's socket is full of readings after a second; it goes on when the next command has been lost."""
+    # Fast DDS repeats what was lost when the writer's heartbeat tells of it: by itself every 3 s, when a command would
+    # be too old to be obeyed. No later command brings one earlier here.
     compensator, _ = pair
     ask(client, HOME)
     compensator.send(signal.SIGSTOP)

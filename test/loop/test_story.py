@@ -47,11 +47,9 @@ def small(coarse: None, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("name", machine_names())
 def test_the_promise_for_the_poses_is_kept(name: str, tmp_path: Path, coarse: None) -> None:
-    """Structure, offsets and pitch at random, in a machine that is of the tests' own kinematics.
-
-    The interval holds with 95 % for each of five machines and one noise; it was not chosen for them. The error that
-    is left is taken at the demonstration's own poses, and neither drives nor backlash are here.
-    """
+    """Structure, offsets and pitch at random, in a machine that is of the tests' own kinematics."""
+    # The interval holds with 95 % for each of five machines and one noise; it was not chosen for them. The error that
+    # is left is taken at the demonstration's own poses, and neither drives nor backlash are here.
     machine = machines()[name]
     truth = Errors.drawn(machine, 7)
     geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
@@ -71,10 +69,8 @@ def test_the_promise_for_the_poses_is_kept(name: str, tmp_path: Path, coarse: No
 
 
 def test_poses_and_path_are_about_this_machines_home(tmp_path: Path) -> None:
-    """Inside the measured box, the tool level, in the frames that are said; the next pose is the nearest one left.
-
-    The box stands about home, or as near to it as the ends of the machine's own largest box allow.
-    """
+    """Inside the measured box, the tool level, in the frames that are said; the next pose is the nearest one left."""
+    # The box stands about home, or as near to it as the ends of the machine's own largest box allow.
     for machine in machines().values():
         geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
         place = story.demo_place(geometry)
@@ -142,10 +138,9 @@ def refuse_all_but_the_path_of_a_busy_computer(code: int, complaints: list[str])
 
 @pytest.mark.timeout(300)  # a fit and half a minute of motion, on a busy computer
 def test_the_whole_story_on_a_foreign_machine(isolated_ros, tmp_path: Path, small: None) -> None:
-    """Turned tool and work frames, every kind of error that ``random`` has, both nodes over DDS.
-
-    A busy computer may leave the path, for its drives then skip commands, and says so; at rest it is where it was sent.
-    """
+    """Turned tool and work frames, every kind of error that ``random`` has, both nodes over DDS."""
+    # A busy computer may leave the path, for its drives then skip commands, and says so; at rest it is where it was
+    # sent.
     machine = machines()["framed"]
     file = machine.write(tmp_path / "machine.yaml")
     code, told = demo("--machine", file, "--truth", "random:5", "--seed", 2, "--pictures", tmp_path / "out")

@@ -65,8 +65,7 @@ from hexapod_comp.replay import storage
 from hexapod_comp.replay.bag import Recording, read_recording
 from hexapod_comp.replay.replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Replay, replay_recording
 
-FAR = Pose([0.2, 0.0, 0.4], np.eye(3))
-"""From home, struts would change by some 90 mm in one command: refused."""
+FAR = Pose([0.2, 0.0, 0.4], np.eye(3))  # from home, struts would change by some 90 mm in one command: refused
 
 JOINT_STATE, TEXT = "sensor_msgs/msg/JointState", "std_msgs/msg/String"
 
@@ -334,11 +333,9 @@ def test_recording_that_begins_at_rest_needs_no_further_snapshot(run, tmp_path):
     [([3], 2), ([5], 5), ([1], 4), ([7, 8, 9], 1), ([24, 51], 1 + 4), ([59, 60], 0)],
 )
 def test_what_the_recorder_has_lost_is_never_called_a_difference(run, tmp_path, capsys, lost, silent):
-    """What is compared is identical; what lies between a lost page and the next snapshot is counted, not judged.
-
-    Page 0 is empty, each other holds 20 answers; every fifth, and page 0, closes with a snapshot. So after the loss of
-    page 3 pages 4 and 5 are `silent`.
-    """
+    """What is compared is identical; what lies between a lost page and the next snapshot is counted, not judged."""
+    # Page 0 is empty, each other holds 20 answers; every fifth, and page 0, closes with a snapshot. So after the loss
+    # of page 3 pages 4 and 5 are `silent`.
     pages = of_topic(run.messages, "journal")
     messages = without(run.messages, *(pages[n] for n in lost))
     bag = write_bag(tmp_path / "run", messages)
@@ -437,10 +434,8 @@ def offset_model(folder: Path, offset_um: float) -> Path:
 
 
 def test_another_model_shows_what_it_would_have_corrected(tmp_path, capsys):
-    """Recorded without a model, so with corrections of zero; struts too long by 30 µm are told 30 µm less.
-
-    A difference of lengths below a metre is exact to 1e-16 m.
-    """
+    """Recorded without a model, so with corrections of zero; struts too long by 30 µm are told 30 µm less."""
+    # A difference of lengths below a metre is exact to 1e-16 m.
     machine = RecordedMachine(model=offset_model(tmp_path, 0.0))
     machine.wave(200)
     machine.page()
@@ -634,8 +629,8 @@ def test_messages_that_are_damaged_are_named(run, tmp_path):
         read_recording(write_bag(tmp_path / "cut", [*run.messages[:8], (time, topic, kind, raw[:20])]))
 
 
+# What stands in a page where something else should
 JUNK = (None, [], {}, "x", "\x1b[2J", -1, 0.5, math.inf, 1e30, 10**30, True, [None] * 6, {"x": 1})
-"""What stands in a page where something else should."""
 
 
 def places_in(content: object, path: tuple = ()) -> list[tuple]:
