@@ -47,6 +47,7 @@ from hexapod_comp.ros.messages import message_pose, pose_message
 from hexapod_comp.ros.parameters import ParameterError
 from hexapod_comp.ros.rclpy_compat import Throttle
 from hexapod_comp.ros.status import ERROR, OK, WARN, Flow, HealthReport, Refusals
+from hexapod_comp.ros.strut_drive import StrutDriveNode
 
 STEP_BACK = (0.0002, 0.0001, -0.0003)
 """A small move, m, that no limit forbids."""
@@ -916,21 +917,27 @@ def test_known_parameters_are_not_warned_of(rig):
 
 
 @pytest.mark.parametrize(
-    ("parameter", "text"),
+    ("kind", "parameter", "text"),
     [
-        ({"command_timeout": -0.1}, "command_timeout"),
-        ({"ramp_rate": 2.0}, "ramp_rate"),
-        ({"ramp_rate": math.nan}, "ramp_rate"),
-        ({"ramp_rate": 2}, "ramp_rate: must lie in 1e-06 to 1 m/s, not 2"),
-        ({"temperature_time_constant_s": -1.0}, "temperature_time_constant_s"),
-        ({"require_feedback": "yes"}, "require_feedback: must be bool, not 'yes'"),
-        ({"marker_rate": True}, "marker_rate: must be float, not True"),
-        ({"model_file": 3}, "model_file: must be str, not 3"),
+        (CompensatorNode, {"command_timeout": -0.1}, "command_timeout"),
+        (CompensatorNode, {"ramp_rate": 2.0}, "ramp_rate"),
+        (CompensatorNode, {"ramp_rate": math.nan}, "ramp_rate"),
+        (CompensatorNode, {"ramp_rate": 2}, "ramp_rate: must lie in 1e-06 to 1 m/s, not 2"),
+        (CompensatorNode, {"temperature_time_constant_s": -1.0}, "temperature_time_constant_s"),
+        (CompensatorNode, {"require_feedback": "yes"}, "require_feedback: must be bool, not 'yes'"),
+        (CompensatorNode, {"marker_rate": True}, "marker_rate: must be float, not True"),
+        (CompensatorNode, {"model_file": 3}, "model_file: must be str, not 3"),
+        (StrutDriveNode, {"rate": 0.0}, "rate"),
+        (StrutDriveNode, {"rate": 5000}, "rate: must lie in 1 to 2000 Hz, not 5000"),
+        (StrutDriveNode, {"lag": 0.0}, "lag"),
+        (StrutDriveNode, {"truth_seed": -1}, "truth_seed"),
+        (StrutDriveNode, {"truth_seed": 1.5}, "truth_seed: must be int, not 1.5"),
+        (StrutDriveNode, {"fault_stuck_strut": 9}, "fault_stuck_strut"),
     ],
 )
-def test_parameter_out_of_range_or_of_another_type_is_refused(rig, parameter, text):
+def test_parameter_out_of_range_or_of_another_type_is_refused(rig, kind, parameter, text):
     with pytest.raises(ParameterError, match=r"^parameter ") as caught:
-        rig.add(CompensatorNode, False, parameter)
+        rig.add(kind, False, parameter)
     assert text in str(caught.value)
 
 

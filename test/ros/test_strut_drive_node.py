@@ -18,9 +18,7 @@ from sensor_msgs.msg import JointState
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.messages import message_pose
-from hexapod_comp.ros.parameters import ParameterError
 from hexapod_comp.ros.status import ERROR, OK, WARN
-from hexapod_comp.ros.strut_drive import StrutDriveNode
 
 NODE = "strut_drive"
 
@@ -389,29 +387,6 @@ def test_drive_that_cannot_be_fails_and_says_why(rig, tmp_path):
     (line,) = rig.logged("cannot configure")
     assert "drive.initial_lengths of strut_1" in line
     node.say_goodbye()
-
-
-@pytest.mark.parametrize(
-    ("parameter", "text"),
-    [
-        ({"rate": 0.0}, "rate"),
-        ({"rate": 5000}, "rate: must lie in 1 to 2000 Hz, not 5000"),
-        ({"lag": 0.0}, "lag"),
-        ({"truth_seed": -1}, "truth_seed"),
-        ({"truth_seed": 1.5}, "truth_seed: must be int, not 1.5"),
-        ({"fault_stuck_strut": 9}, "fault_stuck_strut"),
-    ],
-)
-def test_parameter_out_of_range_or_of_another_type_is_refused(rig, parameter, text):
-    with pytest.raises(ParameterError, match=r"^parameter ") as caught:
-        rig.add(StrutDriveNode, False, parameter)
-    assert text in str(caught.value)
-
-
-def test_misspelt_parameter_is_warned_of(rig):
-    rig.drive(start=False, encoder_noize=0.0)
-    (line,) = rig.logged("encoder_noize")
-    assert line.endswith("did you mean encoder_noise?")
 
 
 def test_quality_of_service(rig):
