@@ -35,6 +35,7 @@ class Assumptions:
     largest_structure: float = assumed(5e-3, "m", "largest tolerance of joints", "no machine is built worse")
     least_freedom: float = assumed(10.0, "", "readings beyond parameters for a noise", "its own error is then 22 %")
     chunk: int = assumed(512, "", "cells whose derivatives are worked out together", "a processor's cache")
+    threaded: int = assumed(500, "", "rows from which on threads share the work", "their start: 0.1 ms each")
     few_cells: int = assumed(8, "", "fewer cells of a group are not condensed", "nothing is gained")
     negligible: float = assumed(1e-11, "", "variance over the noise's that does not count", "rounding")
     draws: int = assumed(160, "", "draws that show what parameters do along a line", "a line has some twenty ways")
@@ -131,7 +132,9 @@ class Assumptions:
     refused_noise: float = assumed(10.0, "", "noise found over noise stated that refuses a fit", "χ² of 100")
     doubtful_noise: float = assumed(3.0, "", "the same that puts it in doubt", "χ² of 9")
     by_chance: float = assumed(0.002, "", "how rarely runs of a right model differ more than is called clear", "3 σ")
-    jackknife_prior: float = assumed(70.0, "", "freedom with which a covariance is believed", "± 17 % of its variance")
+    jackknife_prior: float = assumed(
+        12.0, "", "freedom with which a covariance is believed", "most likely by benchmarks.promise --ablate"
+    )
     without_effect: float = assumed(
         1e-4, "", "share of the tool's squared error that is left out of the jackknife", "time"
     )

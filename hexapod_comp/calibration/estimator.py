@@ -29,8 +29,13 @@ Given = TypeVar("Given")
 Result = TypeVar("Result")
 
 
-def at_once(work: Callable[[Given], Result], items: Iterable[Given]) -> list[Result]:
-    """Return the results of independent work with matrices: NumPy lets as many threads work as there are processors."""
+def at_once(work: Callable[[Given], Result], items: Iterable[Given], rows: int) -> list[Result]:
+    """Return the results of independent work with matrices of so many rows together.
+
+    NumPy lets as many threads work as there are processors; few rows are done sooner than a thread is started.
+    """
+    if rows < ASSUMED.threaded:
+        return list(map(work, items))
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         return list(pool.map(work, items))
 
@@ -137,7 +142,7 @@ class DesignMatrix:
             return [np.concatenate(arrays) for arrays in zip(*listed, strict=True)]
 
         parts, of_rows, count = [], [], 0
-        for part, (values, *own) in zip(self.parts, at_once(few_of, self.parts), strict=True):
+        for part, (values, *own) in zip(self.parts, at_once(few_of, self.parts, self.shape[0]), strict=True):
             parts.append(Alike(np.arange(count, count + len(values)), part.columns, values))
             of_rows.append(own)
             count += len(values)
@@ -168,7 +173,7 @@ class DesignMatrix:
             for n in np.flatnonzero(owner == part).tolist():
                 unknowns[n].project_out(self.parts[part].values, in_a_row(self._place[unknowns[n].members]))
 
-        at_once(clear, range(len(self.parts)))
+        at_once(clear, range(len(self.parts)), self.shape[0])
 
 
 def _moved(values: np.ndarray, target: np.ndarray, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -405,7 +410,7 @@ def _solved_without(problem: LinearProblem, condensed: Condensed, posterior: Pos
                 changes[n] = np.linalg.solve(np.eye(b - a) - shared[a:b] @ whole[a:b].T, left[a:b]) @ shared[a:b]
         solved[np.ix_(fold[chosen[ends[:-1]]], used)] = posterior.y - changes
 
-    at_once(solve_without, _whole_folds(fold, small))
+    at_once(solve_without, _whole_folds(fold, small), len(fold))
     return solved
 
 
@@ -526,7 +531,7 @@ class Estimation:
                 moved[cells] = part @ y[columns]
             return Alike(group.cells, columns, rows)
 
-        return DesignMatrix((len(moved), space.size), at_once(rows_of, self._groups)), moved
+        return DesignMatrix((len(moved), space.size), at_once(rows_of, self._groups, len(moved))), moved
 
     def free_of_nuisance(self, rows: np.ndarray) -> np.ndarray:
         """Return what is left of cells' derivatives (C, K) beside all that instruments do not know, over their noise.
@@ -586,7 +591,7 @@ class Estimation:
         freedom = np.bincount(self.measurements.kind, minlength=kinds).astype(float)
         for part in unknowns:
             freedom -= np.bincount(kind[part.members], part.basis**2 @ part.share, kinds)
-        products = at_once(lambda part: part.values.T @ part.values, rows.parts)
+        products = at_once(lambda part: part.values.T @ part.values, rows.parts, len(target))
         for group, (_, columns, values), product in zip(self._groups, rows.parts, products, strict=True):
             normal[group.kind][np.ix_(columns, columns)] += product
             moment[group.kind][columns] += target[group.cells] @ values

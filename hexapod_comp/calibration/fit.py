@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import expit
 
 from ..errors import CalibrationError, HexapodError
 from ..machine.arrays import rms
@@ -34,7 +35,7 @@ from .parameters import FitSettings, ParameterSpace
 from .posterior import Observability, ToolError, UnseenError, box_errors, listed, observe, without_trace
 from .selection import Decision, select
 from .thermal import HeatSeen, TimeConstants, seek_time_constants, with_courses
-from .trust import Verdict, judge, with_drift
+from .trust import LeftOut, Verdict, judge, with_drift
 
 LARGEST_NOISE = 0.02  # A machine that leaves more than this of its readings, m or rad, is not the one that was measured
 # Readings taken further than this from the reference temperature, K, need an expansion: 1 µm on half a metre
@@ -255,7 +256,13 @@ def _fit(
     noise = {KINDS.index(c.kind): c.estimated for c in channels}
     mixed = mixups(everything, nominal, [d.block for d in decisions if d.kept], progress)
     verdict = judge(
-        estimation, solution, drift, settings, noise, mixed, _possible(space, solution, everything.space, possible)
+        estimation,
+        solution,
+        drift,
+        settings,
+        noise,
+        mixed,
+        _averaged(space, solution, everything.space, possible, decisions),
     )
     no_trace = unseen_errors(measurements, settings)
     if rolls := [error for error in no_trace if error.name.startswith("roll")]:
@@ -373,8 +380,18 @@ def _carried_over(start: _Start, space: ParameterSpace) -> tuple[np.ndarray, np.
     return x, tolerances, start.noise
 
 
-def _possible(space: ParameterSpace, solution: Solution, everything: ParameterSpace, possible: Posterior) -> float:
-    """Return the tool's mean squared error, m², that the readings allow with all blocks in, seen from the answer."""
+def _averaged(
+    space: ParameterSpace,
+    solution: Solution,
+    everything: ParameterSpace,
+    possible: Posterior,
+    decisions: Sequence[Decision],
+) -> LeftOut:
+    """Return how probable it is that a block was left out that is there, and the tool's error if all blocks are.
+
+    By the blocks' Bayes factors, with even odds beforehand; seen from the answer.
+    """
+    absent = np.prod([expit(-d.evidence) for d in decisions if not d.kept])
     way, x = np.zeros(everything.size), np.zeros(everything.size)
     way[possible.used] = possible.y
     own = np.zeros(space.size)
@@ -385,9 +402,10 @@ def _possible(space: ParameterSpace, solution: Solution, everything: ParameterSp
             way[block.part] -= own[kept.part]
     errors = box_errors(everything, everything.physical(x))
     if errors is None:
-        return 0.0
+        return LeftOut()
     metric, shift = errors.mean_squares()[0], everything.physical(way)
-    return float(np.vdot(metric, physical_covariance(everything, possible)) + shift @ metric @ shift)
+    square = np.vdot(metric, physical_covariance(everything, possible)) + shift @ metric @ shift
+    return LeftOut(1.0 - float(absent), float(square))
 
 
 def unseen_errors(measurements: MeasurementSet, settings: FitSettings) -> tuple[UnseenError, ...]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from ..machine.arrays import rms
 from .assumptions import ASSUMED
@@ -39,6 +40,16 @@ class Scatter(NamedTuple):
 NO_SCATTER = Scatter()
 
 
+def upper_factor(ratio: float, freedom: float, believed: float = ASSUMED.jackknife_prior) -> float:
+    """Return the factor on standard deviations that is not exceeded with 97.5 %, by variances' `ratio` as runs show it.
+
+    The variance's scale has an inverse χ² prior about 1 of so many degrees of freedom as it is `believed` with, which
+    the runs' own freedom outvotes.
+    """
+    least = 2.0 * float(gammaincinv(0.5 * (believed + freedom), 0.025))
+    return float(np.sqrt(max(1.0, (believed + freedom * ratio) / least)))
+
+
 class Promise(NamedTuple):
     """RMS error of the tool to expect, and between what it lies with 95 %: m, or rad."""
 
@@ -60,6 +71,9 @@ class Unexplained:
     drift: float = 0.0  # change of the scale from the first to the last reading, m/m; 0 where none is in the fit
     drift_error: float = 0.0  # its standard deviation
     scale: float = 0.0  # stated standard deviation of the scale of all readings, m/m
+    ratio: float = 1.0  # of the tool's squared changes to those expected, as runs are left out in turn
+    freedom: float = 0.0  # degrees of freedom of that
+    averaged: float = 1.0  # on the tool's error, by averaging over which blocks are there
 
     def promised(self, left: np.ndarray, points: np.ndarray) -> Promise:
         """Return what is promised of the tool's displacement; what is unexplained raises the upper end.
@@ -132,6 +146,9 @@ class Unexplained:
             "drift_m_per_m": self.drift,
             "drift_error_m_per_m": self.drift_error,
             "scale_m_per_m": self.scale,
+            "jackknife_variance_ratio": self.ratio,
+            "jackknife_freedom": self.freedom,
+            "factor_by_blocks_left_out": self.averaged,
         }
 
     def _outcome(self) -> str:

@@ -43,7 +43,7 @@ from .estimator import (
 from .mixups import FAMILIES, family_of_run
 from .parameters import FitSettings, ParameterSpace
 from .posterior import ToolError, box_errors, expected_error
-from .promise import Scatter, Unexplained
+from .promise import Scatter, Unexplained, upper_factor
 
 TILT = np.radians(10.0)
 """Tilt at which the report states the tool error of a tilted tool."""
@@ -101,6 +101,13 @@ class Verdict:
         return replace(self, level=level, tilted=tilted)
 
 
+class LeftOut(NamedTuple):
+    """Blocks that were left out of a fit are not proved to be absent."""
+
+    probability: float = 0.0  # that any of them is there
+    square: float = 0.0  # mean squared error of the tool to expect with all blocks in, m²
+
+
 class Residuals:
     """A settled fit's residuals, cell by cell, over the noise that was estimated, and what they say of the tool."""
 
@@ -144,13 +151,13 @@ def judge(
     drift: Drift,
     settings: FitSettings,
     noise: Mapping[int, float],
-    mixed_up: Sequence[str] = (),
-    possible: float = 0.0,
+    mixed_up: Sequence[str],
+    left_out: LeftOut,
 ) -> Verdict:
     """Return what a settled fit promises and what is wrong with it; `noise` was found for each kind, m or rad."""
     measurements, space = estimation.measurements, estimation.space
     residuals = Residuals(estimation, solution)
-    beyond = unexplained(residuals, drift, stated_scale(measurements, settings), possible)
+    beyond = unexplained(residuals, drift, stated_scale(measurements, settings), left_out)
     covariance = physical_covariance(space, solution.posterior)
     # A field that was measured with a level tool alone says nothing of a tilted one.
     level_only = space.block(FIELDS[0]) is not None and measurements.tilt() < 0.5 * TILT
@@ -175,21 +182,35 @@ def judge(
     return Verdict(level, tilted, beyond, families, runs, *listed)
 
 
-def unexplained(r: Residuals, drift: Drift, scale: float, possible: float = 0.0) -> Unexplained:
-    """Return what a settled fit leaves unexplained; `scale` is the standard deviation of that of all readings, m/m."""
+def unexplained(r: Residuals, drift: Drift, scale: float, left_out: LeftOut) -> Unexplained:
+    """Return what a settled fit leaves unexplained; `scale` is the standard deviation of that of all readings, m/m.
+
+    The upper end allows for a covariance that is wrong, as runs show, and for what averaging over the choice of blocks
+    gives (Bayesian model averaging): with the probability that one of those left out is there, the error with all in.
+    """
     ratio, freedom = jackknife(r, drift)
-    # The variance's scale has an inverse χ² prior about 1, which the runs' own freedom outvotes.
-    believed = ASSUMED.jackknife_prior
-    both = believed + freedom
-    upper = np.sqrt(max(1.0, (believed + freedom * ratio) / (2.0 * gammaincinv(0.5 * both, 0.025))))
-    if r.expected > 0.0:  # a block that was left out is not proved to be absent: `possible` has all in, m²
-        upper = max(upper, np.sqrt(possible / r.expected))
+    averaged = 1.0
+    if r.expected > 0.0:
+        averaged += left_out.probability * (left_out.square / r.expected - 1.0)
+    averaged = float(np.sqrt(max(1.0, averaged)))
+    upper = max(averaged, upper_factor(ratio, freedom))
     clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - ASSUMED.by_chance) / freedom
     factor = np.sqrt(ratio) if clear else 1.0
     prior, prior_of_rotation = (_of_priors(r, metric) for metric in r.metrics)
     displacement, rotation = discrepancy(r)
     return Unexplained(
-        float(factor), float(upper), prior, prior_of_rotation, displacement, rotation, *drift.change, scale
+        factor=float(factor),
+        upper=upper,
+        prior=prior,
+        prior_rotation=prior_of_rotation,
+        displacement=displacement,
+        rotation=rotation,
+        drift=drift.change[0],
+        drift_error=drift.change[1],
+        scale=scale,
+        ratio=ratio,
+        freedom=freedom,
+        averaged=averaged,
     )
 
 
@@ -247,7 +268,7 @@ def jackknife(r: Residuals, drift: Drift) -> tuple[float, float]:
 
     order = np.argsort(groups, kind="stable")
     members = np.split(order, np.flatnonzero(np.diff(groups[order])) + 1)
-    shown, expected, freedom = np.transpose(at_once(change, members))
+    shown, expected, freedom = np.transpose(at_once(change, members, len(groups)))
     return float(shown.sum() / expected.sum()), float(expected.sum() ** 2 / (expected**2 / freedom).sum())
 
 

@@ -20,7 +20,7 @@ from hexapod_comp.calibration.fit import fit_model, mixed_up
 from hexapod_comp.calibration.mixups import FAMILIES, SWAPPED, _Fitted, common_modes, family_of_run, in_frame
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import expected_error
-from hexapod_comp.calibration.promise import Scatter, Unexplained
+from hexapod_comp.calibration.promise import Scatter, Unexplained, upper_factor
 from hexapod_comp.calibration.report import as_json, fit_report
 from hexapod_comp.calibration.trust import stated_scale
 from hexapod_comp.errors import CalibrationError, ModelError
@@ -60,6 +60,15 @@ def test_what_is_described_is_promised_as_before(readings):
     assert "IN DOUBT" not in fit_report(fit)
     assert fit.level.rotation_high is None, "nothing reads the roll"
     assert "µrad RMS by the priors" in fit_report(fit)
+
+
+def test_the_upper_end_holds_what_a_variance_may_be():
+    """Closed forms: χ² with 2 degrees of freedom is exponential; what is believed without end is not widened."""
+    tail = -2.0 * np.log(0.975)  # exceeded with 97.5 %
+    assert upper_factor(1.0, 0.0, 2.0) == pytest.approx(np.sqrt(2.0 / tail))
+    assert upper_factor(5.0, 1.0, 1.0) == pytest.approx(np.sqrt(6.0 / tail))
+    assert upper_factor(4.0, 20.0, 1e9) == pytest.approx(1.0, abs=1e-3)
+    assert upper_factor(4.0, 1e9, 12.0) == pytest.approx(2.0, rel=1e-3)
 
 
 def test_an_interval_is_widened_by_each_cause_in_its_way():
