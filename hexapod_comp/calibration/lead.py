@@ -100,9 +100,8 @@ def _strongest(estimation: Estimation, problem: LinearProblem) -> tuple[float, L
         return 0.0, None, posterior
     spectrum = rest.spectrum()
     best = _fundamental(rest, spectrum)
-    others = at_once(
-        lambda f: rest.line(f, 1), _rivals(rest.frequencies, spectrum, best.frequency, rest.span), len(problem.target)
-    )
+    rivals = _rivals(rest.frequencies, spectrum, best.frequency, rest.span)
+    others = at_once(lambda f: rest.line(f, 1), rivals, len(problem.target))
     return min([best.odds, *(best.odds - other.odds for other in others)]), best, posterior
 
 
