@@ -708,7 +708,7 @@ def influence(run: np.ndarray, solution: Solution) -> np.ndarray:
         change = np.linalg.solve(precision - own.T @ own, own.T @ left[members])
         return float(np.sqrt(change @ precision @ change))
 
-    return np.array(at_once(moved, range(int(run.max()) + 1)))
+    return np.array(at_once(moved, range(int(run.max()) + 1), len(run)))
 
 
 def _change(change: np.ndarray, space: ParameterSpace, posterior: Posterior) -> tuple[float, str]:
