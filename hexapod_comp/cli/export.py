@@ -103,8 +103,7 @@ def _box_text(box: np.ndarray) -> str:
 
 def _linuxcnc(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray) -> tuple[list[str], Result]:
     """Write LinuxCNC's files, read them back and drive the machine through them."""
-    from ..export.linuxcnc import make_genhexkins, table_misfit
-    from ..export.linuxcnc_files import read_genhexkins, write_genhexkins
+    from ..export.linuxcnc import make_genhexkins, read_genhexkins, table_misfit, write_genhexkins
 
     machine = trial.machine
     genhexkins = make_genhexkins(machine, box)

@@ -24,7 +24,6 @@ from ..machine.model import MachineModel, members
 from ..machine.temperatures import Temperatures
 from ..machine.trajectory import moves
 from ..pose import Pose, rotation_from_angles, stacked
-from . import carried
 from .carried import refuse_unknown
 
 CORE, AROUND = Path(__file__).parents[1] / "core", Path(__file__).parent / "c"
@@ -70,7 +69,7 @@ def sources() -> list[Path]:
 
 def model_header(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str]) -> str:
     """Return ``hexapod_model.h``: geometry, limits and model as one hc_model; a term unknown to the core is refused."""
-    refuse_unknown(model, carried.C, "the C core")
+    refuse_unknown(model, "the C core")
     arrays: list[str] = []
     text = _initialiser(members(geometry, model, hashes), dtype_of("hc_model"), "hexapod", arrays)
     return f"""\

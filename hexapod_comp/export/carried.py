@@ -7,7 +7,7 @@ none of these lists, so a model that has it is refused until the exporter's auth
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -17,27 +17,23 @@ from ..machine.model import MachineModel
 
 PROVENANCE = ("machine", "name", "origin", "region")  # Fields that move no tool
 
-C = frozenset(
+CARRIED = frozenset(
     {
         *("base_deviation", "platform_deviation", "base_axes_turn", "reversal_threshold"),
         *(f"struts.{name}" for name in ("offset", "pitch", "reference_length", "cosine", "sine", "period", "backlash")),
-        *(f"struts.{name}" for name in ("map_knots", "map_values", "map_backlash", "expansion")),
-        "struts.moisture",
+        *(f"struts.{name}" for name in ("map_knots", "map_values", "map_backlash", "expansion", "moisture")),
         *(f"field.{name}" for name in ("grid", "lines", "probe", "outside", "reversal_threshold")),
         *("base_expansion", "platform_expansion"),
         *(f"late_growth.{name}" for name in ("time_constants", "expansion", "thermometer")),
     }
 )
-"""What the C core's constants hold."""
-
-AT_20_DEGC = C
-"""What LinuxCNC's files and the table hold, or report as not carried: the field or its tilt, growth, swelling."""
+"""What the C core holds. LinuxCNC's files and the table hold it or report it: field or tilt, growth, swelling."""
 
 
-def refuse_unknown(model: MachineModel, known: Collection[str], export: str) -> None:
+def refuse_unknown(model: MachineModel, export: str) -> None:
     """Refuse a model with a term that an export does not know."""
     for name, value in terms(model):
-        if name not in known:
+        if name not in CARRIED:
             problem = f"cannot be exported: {export} does not know it. Leave it out, or let the compensator run it"
             raise ModelError(name, problem, np.asarray(value).tolist())
 

@@ -29,7 +29,7 @@ from ..machine.model_file import DIRECTIONS
 from ..machine.passes import Passes, at
 from ..machine.trial import model_commands
 from ..pose import Pose, attitude_error
-from .carried import AT_20_DEGC, refuse_unknown
+from .carried import refuse_unknown
 from .worth import DIAGONAL
 
 POSITION = ("x", "y", "z")
@@ -97,7 +97,7 @@ def make_table(
     geometry: HexapodGeometry, model: MachineModel, box: np.ndarray, step: float
 ) -> tuple[GridTable, list[str]]:
     """Evaluate a model on a grid."""
-    refuse_unknown(model, AT_20_DEGC, "the table")
+    refuse_unknown(model, "the table")
     nodes = _grid_nodes(box, step)
     shape = tuple(len(n) for n in nodes)
     places = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)

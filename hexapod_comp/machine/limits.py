@@ -7,28 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..core import Status, Struct
+from ..core import Status, Struct, ffi, lib
 from ..errors import GeometryError, KinematicsError, LimitError, NotFiniteError, TooEarlyError
 
 STRUT_NAMES = tuple(f"strut_{i}" for i in range(1, 7))  # Names of the six struts, in order, as they stand in messages
 
-REASONS = (
-    "",
-    "stroke",
-    "stroke",
-    "base_cone",
-    "platform_cone",
-    "clearance",
-    "condition",
-    "assembly",
-    "not_finite",
-    "correction",
-    "step",
-    "speed",
-    "speed",
-    "acceleration",
-)
-"""Names of the findings, as counted in diagnostics."""
+REASONS = tuple(ffi.string(lib.hc_reason(status)).decode() for status in range(Status.ACCELERATION + 1))
+"""Names of the findings, by their number, as counted in diagnostics."""
 
 STAGES = ("nominal", "compensated")
 
@@ -137,29 +122,23 @@ class Limits:
             allowed = cones[strut]
             found, most = math.degrees(value), math.degrees(allowed)
             text = f"{name}: {body} joint at {found:.3f}° ({which}), allowed {most:g}° from its neutral direction"
-        elif code == Status.CLEARANCE:
-            allowed = self.clearance
-            text = f"{name}: {mm:.3f} mm from the nearest other strut ({which}), allowed {allowed * 1e3:g} mm"
-        elif code == Status.CONDITION:
-            allowed = self.condition
-            text = f"condition number {value:.4g} of the {which} pose is above {allowed:g}: near a singularity"
         elif code == Status.ASSEMBLY:
             text = f"the {which} pose belongs to another assembly mode than home"
-        elif code == Status.CORRECTION:
-            allowed = self.correction
-            text = f"{name}: correction {value * 1e6:.3f} µm is larger than ±{allowed * 1e6:g} µm"
-        elif code == Status.STEP:
-            allowed = self.step
-            text = (
-                f"{name}: the {which} length would change by {mm:.4f} mm in one command, allowed {allowed * 1e3:g} mm"
-            )
         else:
-            which, (quantity, unit) = (
-                "compensated",
-                ("speed", "mm/s") if code == Status.SPEED else ("acceleration", "mm/s²"),
-            )
-            allowed = getattr(self, quantity)
-            text = f"{name}: {quantity} {mm:.4g} {unit} by the stamps, allowed {allowed * 1e3:g} {unit}"
+            if code in (Status.SPEED, Status.ACCELERATION):
+                which = "compensated"
+            allowed = getattr(self, REASONS[code])
+            most = allowed * 1e3
+            text = {
+                Status.CLEARANCE: f"{name}: {mm:.3f} mm from the nearest other strut ({which}), allowed {most:g} mm",
+                Status.CONDITION: f"condition number {value:.4g} of the {which} pose is above {allowed:g}: "
+                "near a singularity",
+                Status.CORRECTION: f"{name}: correction {value * 1e6:.3f} µm is larger than ±{allowed * 1e6:g} µm",
+                Status.STEP: f"{name}: the {which} length would change by {mm:.4f} mm in one command, "
+                f"allowed {most:g} mm",
+                Status.SPEED: f"{name}: speed {mm:.4g} mm/s by the stamps, allowed {most:g} mm/s",
+                Status.ACCELERATION: f"{name}: acceleration {mm:.4g} mm/s² by the stamps, allowed {most:g} mm/s²",
+            }[Status(code)]
         return LimitError(REASONS[code], text, value, float(allowed), strut if strut >= 0 else None, which)
 
 

@@ -12,7 +12,7 @@ from strategies import paper_geometry, random_model
 
 from hexapod_comp.errors import ModelError
 from hexapod_comp.export.c_code import model_header
-from hexapod_comp.export.carried import AT_20_DEGC, PROVENANCE, C, terms
+from hexapod_comp.export.carried import CARRIED, PROVENANCE, terms
 from hexapod_comp.export.linuxcnc import make_genhexkins
 from hexapod_comp.export.table import make_table
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -70,7 +70,7 @@ def test_the_ideal_machine_has_no_terms_and_a_random_one_those_that_it_was_given
     assert list(terms(MachineModel("paper", name="other"))) == []
     given = {name for name, _ in terms(random_model(np.random.default_rng(1), "paper"))}
     assert {"base_deviation", "struts.offset", "struts.cosine", "field.lines", "base_expansion"} <= given
-    assert given <= C
+    assert given <= CARRIED
 
 
 def test_the_lists_hold_todays_terms_and_no_others():
@@ -88,4 +88,4 @@ def test_the_lists_hold_todays_terms_and_no_others():
             [f"{entry.name}.{one.name}" for one in fields(blocks[entry.name])] if entry.name in blocks else [entry.name]
         )
     }
-    assert today == AT_20_DEGC == C
+    assert today == CARRIED

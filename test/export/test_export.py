@@ -18,8 +18,16 @@ from strategies import PAPER_FILE, paper_geometry, random_model, skewed_geometry
 from hexapod_comp.cli import export
 from hexapod_comp.cli.app import make_parser
 from hexapod_comp.errors import GeometryError, HexapodError, InputFileError, LimitError, ModelError, OutsideFieldError
-from hexapod_comp.export.linuxcnc import Genhexkins, make_genhexkins, table_misfit
-from hexapod_comp.export.linuxcnc_files import COMP_FILES, HAL_FILE, INI_FILE, read_genhexkins, write_genhexkins
+from hexapod_comp.export.linuxcnc import (
+    COMP_FILES,
+    HAL_FILE,
+    INI_FILE,
+    Genhexkins,
+    make_genhexkins,
+    read_genhexkins,
+    table_misfit,
+    write_genhexkins,
+)
 from hexapod_comp.export.table import (
     COLUMNS,
     GridTable,
@@ -440,7 +448,7 @@ def test_verb_tells_when_an_export_makes_it_worse(tmp_path: Path, monkeypatch: p
         found = read(folder, unit)
         return replace(found, base_joints=found.base_joints + 1e-6 * np.eye(6)[:, :3])
 
-    monkeypatch.setattr("hexapod_comp.export.linuxcnc_files.read_genhexkins", wrong)
+    monkeypatch.setattr("hexapod_comp.export.linuxcnc.read_genhexkins", wrong)
     assert run_verb(*box) == 1
 
 

@@ -20,7 +20,7 @@ import yaml
 
 from hexapod_comp.calibration.certificate import load_details
 from hexapod_comp.errors import InputFileError
-from hexapod_comp.export.linuxcnc_files import read_genhexkins
+from hexapod_comp.export.linuxcnc import read_genhexkins
 from hexapod_comp.export.table import read_table
 from hexapod_comp.formats import csv, files
 from hexapod_comp.formats.csv import Layout, Table, read_lengths, read_poses

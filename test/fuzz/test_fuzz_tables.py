@@ -35,8 +35,15 @@ from strategies import paper_geometry, random_model
 from test_measurement_csv import STRUTS, WIDE, WIDE_COLUMNS
 
 from hexapod_comp.errors import HexapodError
-from hexapod_comp.export.linuxcnc import make_genhexkins, table_misfit
-from hexapod_comp.export.linuxcnc_files import COMP_FILES, HAL_FILE, INI_FILE, read_genhexkins, write_genhexkins
+from hexapod_comp.export.linuxcnc import (
+    COMP_FILES,
+    HAL_FILE,
+    INI_FILE,
+    make_genhexkins,
+    read_genhexkins,
+    table_misfit,
+    write_genhexkins,
+)
 from hexapod_comp.export.table import make_table, read_table, write_table
 from hexapod_comp.formats.csv import read_lengths, read_poses
 from hexapod_comp.machine.model import RealMachine
