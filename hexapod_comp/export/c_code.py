@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..compensation.compensator import DEFAULT_RAMP_RATE, Compensator
-from ..core import Status, dtype_of
+from ..core import Status, dtype_of, ffi, lib
 from ..errors import HexapodError, TooEarlyError
 from ..formats.outputs import write_text
 from ..machine.geometry import HexapodGeometry
@@ -43,9 +43,7 @@ class Vector:
     values: tuple[float, ...]  # as the core's function takes them
     time: float  # of a command, s
     status: int  # hc_status
-    expected: tuple[
-        float, ...
-    ]  # six strut commands, m; of an estimate, position, m, and last row of the rotation matrix
+    expected: tuple[float, ...]  # strut commands, m; of an estimate, position, m, and last row of the rotation matrix
 
 
 def write_c(folder: str | Path, geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str]) -> list[Path]:
@@ -91,9 +89,8 @@ def _initialiser(value: Any, kind: np.dtype, path: str, arrays: list[str], margi
     """Return the C initialiser of a value; what a pointer points to becomes an array of its own, named by its path."""
     inner = margin + "    "
     if isinstance(value, str):  # what is not plain ASCII is written in octal, byte by byte
-        return (
-            '"' + "".join(chr(b) if 32 <= b < 127 and b not in b'"\\?' else f"\\{b:03o}" for b in value.encode()) + '"'
-        )
+        text = "".join(chr(b) if 32 <= b < 127 and b not in b'"\\?' else f"\\{b:03o}" for b in value.encode())
+        return f'"{text}"'
     if kind.base.names and isinstance(value, np.ndarray):
         value = {name: value[name] for name in kind.base.names}
     if isinstance(value, dict):
@@ -105,9 +102,7 @@ def _initialiser(value: Any, kind: np.dtype, path: str, arrays: list[str], margi
         arrays.append(f"static const double {path}[{len(numbers)}] = {{\n    " + ",\n    ".join(rows) + "};\n")
         return path
     if kind.base == np.uintp or kind.base.names:
-        return (
-            "{" + ", ".join(_initialiser(v, kind.base, f"{path}_{n}", arrays, inner) for n, v in enumerate(value)) + "}"
-        )
+        return f"{{{', '.join(_initialiser(v, kind.base, f'{path}_{n}', arrays, inner) for n, v in enumerate(value))}}}"
     while kind.subdtype:
         kind = kind.base
     return _numbers(np.asarray(value).astype(kind).tolist())
@@ -132,10 +127,8 @@ def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> 
     stream = [path.pose(k) for k in range(len(path))]
     quarter = max(1, len(stream) // 4)
     recorder.commands(stream[:quarter])
-    recorder.take("t", (2.0, 24.5))
-    recorder.take("t", (6.0, 21.25))
-    recorder.take("t", (7.0, 1e3))
-    recorder.take("t", (6.0, 22.25))
+    for part, temperature in ((2.0, 24.5), (6.0, 21.25), (7.0, 1e3), (6.0, 22.25)):
+        recorder.take("t", (part, temperature))
     recorder.commands(stream[quarter : 2 * quarter])
     recorder.take("e", (0.0,))
     recorder.commands(stream[2 * quarter : 3 * quarter])
@@ -207,12 +200,11 @@ class Recorder:
 
 def status_of(error: HexapodError) -> int:
     """Return the hc_status of what the Python compensator raises."""
-    name = {"bad_model": "temperature", "other_assembly_mode": "other_assembly"}.get(error.reason, error.reason)
     if isinstance(error, TooEarlyError):
-        name = "early"
-    if name == "stroke":
-        name = "stroke_short" if error.value < error.limit else "stroke_long"  # type: ignore[attr-defined]
-    return int(Status[name.upper()])
+        return int(Status.EARLY)
+    if error.reason == "stroke":
+        return int(Status.STROKE_SHORT if error.value < error.limit else Status.STROKE_LONG)  # type: ignore[attr-defined]
+    return next(int(status) for status in Status if ffi.string(lib.hc_reason(status)).decode() == error.reason)
 
 
 def vectors_header(vectors: Sequence[Vector]) -> str:
