@@ -204,7 +204,7 @@ def status_of(error: HexapodError) -> int:
         return int(Status.EARLY)
     if error.reason == "stroke":
         return int(Status.STROKE_SHORT if error.value < error.limit else Status.STROKE_LONG)  # type: ignore[attr-defined]
-    return next(int(status) for status in Status if ffi.string(lib.hc_reason(status)).decode() == error.reason)
+    return min(int(status) for status in Status if ffi.string(lib.hc_reason(status)).decode() == error.reason)
 
 
 def vectors_header(vectors: Sequence[Vector]) -> str:

@@ -44,7 +44,7 @@ def test_self_test_agrees_to_the_last_digit_and_stays_inside(tmp_path, capsys, m
     made = compiled(tmp_path, *sanitizers, "hexapod_comp.c", "hexapod_selftest.c", "-o", "selftest")
     assert made.returncode == 0, made.stderr
     ran = subprocess.run([tmp_path / "selftest"], capture_output=True, text=True)
-    assert (ran.returncode, ran.stderr) == (0, "")
+    assert (ran.returncode, ran.stderr) == (0, ""), ran.stdout
     assert "as they should be" in ran.stdout
 
 
