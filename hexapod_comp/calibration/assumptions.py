@@ -42,6 +42,12 @@ class Assumptions:
     together: int = assumed(1000, "", "rows of small folds left out together", "a processor's cache")
 
     # Observations (observations.py)
+    centre: float = assumed(5e-3, "m", "where a centre of lengths is beside its place, 1 σ of each axis", "by a rule")
+    across: float = assumed(
+        0.3e-3, "m", "the same where lengths hardly show it", "it acts with the machine's error alone"
+    )
+    unmoved: float = assumed(1e-3, "", "change of lengths by a body's motion that hardly shows it", "a circle's centre")
+    far: float = assumed(5.0, "σ", "a centre further off its place is refused", "coordinates or unit are wrong")
     frame_stations: int = assumed(4, "", "tracker runs with fewer stations share a frame", "six unknowns need three")
     frame_rank: float = assumed(1e-9, "", "what moves readings less does not count as a frame's", "rounding")
 

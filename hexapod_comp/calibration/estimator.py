@@ -21,7 +21,7 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dpstrf, dtrtrs
 from ..errors import CalibrationError, KinematicsError, ModelError
 from ..measurements.readings import KINDS, LEAST_NOISE, MeasurementSet, refuse_absurd
 from .assumptions import ASSUMED
-from .observations import Cells, Nuisance, of_zero
+from .observations import Cells, Nuisance, of_square, of_zero
 from .parameters import ParameterSpace
 from .sensitivity import Prediction, Slopes, predict
 
@@ -470,6 +470,7 @@ class Estimation:
         self.cells = Cells.of(measurements)
         self.uncertainty = measurements.stated
         self._zeros, self._lengths = self.cells.groups(measurements)
+        self._squares = self.cells.squares()
         self._frames = [] if space.settings.tracker_frame == "known" else self.cells.frames(measurements)
         self._components = np.abs(self.cells.directions) > ROUNDING
         for frame in self._frames:  # turning the frame turns them
@@ -481,7 +482,7 @@ class Estimation:
         self._groups = self._group_alike()
         needed = len(space.blocks[0].labels)
         free = len(self.cells.station) - len(self._zeros) - sum(along is not None for _, along in self._zeros)
-        free -= sum(lengths.count for lengths in self._lengths) + 6 * len(self._frames)
+        free -= len(self._squares) + sum(lengths.count for lengths in self._lengths) + 6 * len(self._frames)
         if alone and free < needed:
             problem = f"{len(measurements)} readings at {len(self.cells.station)} distinct places leave {free} "
             raise CalibrationError("measurements", problem + f"numbers for the structure's {needed} parameters")
@@ -572,6 +573,7 @@ class Estimation:
         """Return what cells with errors (C, 6) should read, and what is unknown; renews `directions` that change."""
         expected = np.einsum("ci,ci->c", directions, errors)
         unknowns = [of_zero(members, scale[members], along) for members, along in self._zeros]
+        unknowns += [of_square(n, scale[n], self.cells.lever[n], self.cells.group[n]) for n in self._squares]
         for lengths in self._lengths:
             n = lengths.members
             expected[n], directions[n, :3], parts = lengths.seen(errors[n, :3], values[n], scale[n])
@@ -602,7 +604,9 @@ class Estimation:
     def _group_alike(self) -> list[_Group]:
         """Return the cells in groups of one kind whose errors have the same components."""
         c = self.cells
-        for members in [members for members, _ in self._zeros] + [lengths.members for lengths in self._lengths]:
+        for members in (
+            [members for members, _ in self._zeros] + self._squares + [lengths.members for lengths in self._lengths]
+        ):
             self._components[members] |= self._components[members].any(axis=0)
         key = c.kind * 64 + self._components @ (1 << np.arange(6))
         order = np.lexsort((c.group, self.measurements.run[c.first], key))

@@ -20,17 +20,6 @@ from ..machine.arrays import different_rows, rms
 from ..measurements.readings import ABSOLUTE_KINDS, KINDS, LEAST_TRAVEL, LENGTH, MeasurementSet
 from .assumptions import ASSUMED
 
-CENTRE = 5e-3
-"""Standard deviation of where a centre is, beside its place in the file, along each axis, m."""
-
-UNMOVED, ACROSS = 1e-3, 0.3e-3
-"""A body that moves without changing its lengths by more than this share, as the centre of a circle across its plane,
-is known so well, m: it only acts together with the machine's error in that direction, and a fit could not tell them
-apart."""
-
-FAR = 5.0
-"""A centre so many standard deviations off its place is refused: coordinates or unit are wrong."""
-
 ROUNDS, SETTLED = 20, 1e-10
 """Most Gauss–Newton steps to a body's place, and the step, m, after which it has settled."""
 
@@ -58,6 +47,15 @@ class Nuisance(NamedTuple):
         weight = 1.0 - np.sqrt(1.0 - self.share)
         along = self.basis.T @ values[where]
         values[where] -= self.basis @ (weight * along.T).T
+
+
+def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: np.ndarray) -> Nuisance:
+    """Return the slope that groups of cells share, free of their zeros."""
+    slope = scale * lever
+    for own in (group == n for n in np.unique(group)):
+        zero = scale[own] / np.linalg.norm(scale[own])
+        slope[own] -= zero * (zero @ slope[own])
+    return Nuisance(members, (slope / np.linalg.norm(slope))[:, None], np.ones(1))
 
 
 def of_zero(members: np.ndarray, scale: np.ndarray, along: np.ndarray | None = None) -> Nuisance:
@@ -138,14 +136,15 @@ class Lengths:
         if not self.known_zero:
             columns -= columns.mean(axis=0)
         squares, directions = np.linalg.eigh(columns.T @ columns / len(columns))
-        return directions * np.where(squares > UNMOVED**2, CENTRE, ACROSS)
+        return directions * np.where(squares > ASSUMED.unmoved**2, ASSUMED.centre, ASSUMED.across)
 
     def _refuse_far(self, place: np.ndarray) -> None:
         """Raise when the body is at another place, m, than the file's."""
-        if np.abs(place).max() > FAR * CENTRE:
+        if np.abs(place).max() > ASSUMED.far * ASSUMED.centre:
             shown = ", ".join(f"{v * 1e3:.1f}" for v in place)
             problem = f"the lengths of run {self.name} put their centre {shown} mm (in base) off its place in the file"
-            hint = f"it must be known to {FAR * CENTRE * 1e3:g} mm; do places, units and commanded poses fit?"
+            known = f"it must be known to {ASSUMED.far * ASSUMED.centre * 1e3:g} mm"
+            hint = f"{known}; do places, units and commanded poses fit?"
             raise CalibrationError("centre", f"{problem}; {hint}")
 
 
@@ -202,6 +201,8 @@ class Cells:
     group: np.ndarray  # (C,): Of each cell; a group is one channel of one run, whose unknowns its cells share
     directions: np.ndarray  # (C, 6): w of each cell; of a length, from its centre's place in the file
     along: np.ndarray  # (C,): Commanded coordinate along the line, m
+    lever: np.ndarray  # (C,): By how much a square that turns moves it, m per rad
+    square: np.ndarray  # (C,): Number of the square and its axis whose slope it has; -1: its group has its own, or none
     # (C,): What is left out together in cross-validation: a line's run, a ball bar's circle, or a scattered pose
     fold: np.ndarray
 
@@ -216,6 +217,10 @@ class Cells:
         whole = _left_out_whole(m)[m.run[first]]
         poses = np.hstack([m.stations.positions, m.stations.rotations.reshape(-1, 9)]).round(9)
         pose = different_rows(poses)[1][m.station[first]]
+        names = np.array([run.slope for run in m.runs])
+        levers, about = (values[first] for values in m.square_levers())
+        numbers = np.unique(names, return_inverse=True)[1].ravel()[m.run[first]]
+        square = np.where((names[m.run[first]] != "") & (levers != 0.0), 3 * numbers + about, -1)
         fold_key = np.where(whole, -1 - m.run[first], pose)
         return Cells(
             of_reading=of_reading,
@@ -226,6 +231,8 @@ class Cells:
             group=np.where(absolute, -1, groups[first]),
             directions=m.directions()[first],
             along=m.along()[first],
+            lever=levers,
+            square=square,
             fold=np.unique(fold_key, return_inverse=True)[1].ravel(),
         )
 
@@ -242,9 +249,18 @@ class Cells:
                 places = points[c.station[members]], m.centre[c.first[members]]
                 lengths.append(Lengths(run.name, members, *places, run.known_zero))
                 continue
-            sloping = KINDS[c.kind[members[0]]] == "straightness" and np.ptp(c.along[members]) > 0.0
+            sloping = (
+                (c.square[members] < 0).all()
+                and KINDS[c.kind[members[0]]] == "straightness"
+                and np.ptp(c.along[members]) > 0.0
+            )
             zeros.append((members, c.along[members] if sloping else None))
         return zeros, lengths
+
+    def squares(self) -> list[np.ndarray]:
+        """Return the cells that turn with each square about each axis: all of their groups."""
+        numbers = np.unique(self.square[self.square >= 0])
+        return [np.flatnonzero(np.isin(self.group, self.group[self.square == n])) for n in numbers]
 
     def frames(self, measurements: MeasurementSet) -> list[Frame]:
         """Return the set-ups of trackers: runs of position and attitude; those of few stations are one set-up."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import ModelError
 from ..formats.paths import input_file
-from ..formats.schema import Choice, Numbers, Section, Whole, complaints_about, in_unit, read_whole
+from ..formats.schema import Choice, Numbers, Section, Text, Whole, complaints_about, in_unit, read_whole
 from ..formats.yaml import block_text, read_yaml
 from ..machine.field import CROSS_AXES
 from ..machine.geometry import HexapodGeometry
@@ -79,6 +79,7 @@ class CampaignRun:
     centres: np.ndarray | None = None  # from where lengths are read, (n, 3), in the work frame, m
     known_zero: bool = False  # the lengths are known as a whole
     alternate: bool = False  # a line's places are read once: every second one on the way there, the others back
+    slope: str = ""  # the square whose slope its straightness shares with other runs
 
     def __post_init__(self) -> None:
         where = f"run {self.name}"
@@ -136,7 +137,8 @@ class CampaignRun:
         """Yield the readings, values of zero; a line's in so many passes forward and backward, each pose's once."""
         poses = [Pose(*pose) for pose in zip(self.positions, self.rotations, strict=True)]
         if self.is_line:
-            yield from line_readings(self.name, poses, self.channels, cycles, self.alternate)
+            for reading in line_readings(self.name, poses, self.channels, cycles, self.alternate):
+                yield reading._replace(slope=self.slope)
             return
         way_of = UNKNOWN if self.instrument in POSE_INSTRUMENTS else FROM_PREVIOUS
         of_file = [None] * len(poses) if self.centres is None else [tuple(c) for c in self.centres.tolist()]
@@ -160,6 +162,7 @@ class CampaignRun:
         if not self.is_line:
             return {**head, "poses_mm": positions, "angles_deg": angles}
         head |= {"line_mm": [positions[0], positions[-1]], "points": len(positions), "angles_deg": angles[0]}
+        head |= {"slope": self.slope} if self.slope else {}
         return head | ({"stops": "alternate"} if self.alternate else {})
 
 
@@ -236,12 +239,15 @@ class LineEntry:
     points: Annotated[int, Whole(2, MOST_POINTS)] = 2
     angles: Angles = field(default_factory=_level)
     stops: Annotated[str, Choice("all", "alternate")] = "all"
+    slope: Annotated[str, Text()] = ""
 
     def run(self, name: str, instrument: str) -> CampaignRun:
         """Return the run."""
         positions = np.linspace(self.line[0], self.line[1], self.points).round(12)
         rotations = np.tile(rotation_from_angles(self.angles), (self.points, 1, 1))
-        return CampaignRun(name, instrument, positions, rotations, alternate=self.stops == "alternate")
+        return CampaignRun(
+            name, instrument, positions, rotations, alternate=self.stops == "alternate", slope=self.slope
+        )
 
 
 @dataclass(frozen=True)

@@ -80,6 +80,7 @@ class Reading(NamedTuple):
     centre: tuple[float, ...] | None = None
     known_zero: bool = False  # a length that is known as a whole, as with a calibrated bar
     humidity: float = np.nan  # relative humidity of the air, a fraction; NaN when not known
+    slope: str = ""  # runs of this name read their straightness from one square, whose faces' slope they share
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,7 @@ class Run:
     axis: np.ndarray
     origin: np.ndarray  # (3,): first commanded point of the line, m in ``base``
     known_zero: bool = False  # its lengths are known as a whole
+    slope: str = ""  # the square or straightedge whose slope it shares with other runs; empty: one of its own
 
     @property
     def is_line(self) -> bool:
@@ -266,6 +268,20 @@ class MeasurementSet:
         origins = np.array([run.origin for run in self.runs]).reshape(-1, 3)
         axes = np.array([run.axis for run in self.runs]).reshape(-1, 3)
         return ((self.points()[self.station] - origins[self.run]) * axes[self.run]).sum(axis=1)
+
+    def square_levers(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return by how much a square that turns moves each straightness, m per rad, and its axis in the work frame.
+
+        Shape (N,) each. A face along a turns about ω to ω × a: seen along s, the third of these axes, by ω × a · s. Of
+        a line that is not parallel to an axis the lever is shorter; other readings have none.
+        """
+        in_work = np.array([run.axis for run in self.runs]).reshape(-1, 3) @ self.geometry.work.rotation
+        ways, seen = in_work[self.run], self.channel - CHANNELS.index("straightness_x")
+        seen = np.where(self.kind == KINDS.index("straightness"), seen, 0)
+        about = 3 - seen - np.where(np.abs(ways).argmax(axis=1) == seen, (seen + 1) % 3, np.abs(ways).argmax(axis=1))
+        turned = np.cross(np.eye(3)[about], ways)
+        levers = np.take_along_axis(turned, seen[:, None], axis=1)[:, 0] * self.along()
+        return np.where(self.kind == KINDS.index("straightness"), levers, 0.0), about
 
     def select(self, mask: np.ndarray) -> MeasurementSet:
         """Return the set of the readings in a boolean mask (N,); runs and stations keep their numbers."""

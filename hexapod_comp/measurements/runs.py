@@ -246,6 +246,8 @@ def _recognise(readings: list[Reading], arrays: _Arrays, points: np.ndarray, wor
     of_line = OF_LINES[arrays.channel]
     if of_line.any() and not of_line.all():
         raise InputFileError(first.source.file, f"run {name}", "mixes channels of a line with others")
+    if first.slope and not np.isin(arrays.channel, STRAIGHTNESS).any():
+        raise InputFileError(first.source.file, f"run {name}", "has a slope, but no straightness", first.slope)
     if not of_line.any():
         return Run(name, np.zeros(3), points[0], first.known_zero)
     spread = points - points[0]
@@ -260,8 +262,10 @@ def _recognise(readings: list[Reading], arrays: _Arrays, points: np.ndarray, wor
         raise InputFileError(where.source.file, _line(where), problem)
     in_work = work_axes @ far
     _check_straightness(readings, arrays, in_work / np.linalg.norm(far))
+    if len({r.slope for r in readings}) > 1:
+        raise InputFileError(first.source.file, f"run {name}", "has more than one slope; call them two runs")
     leading = in_work[np.abs(in_work) > LEAST_TRAVEL][0]
-    return Run(name, axis * np.sign(leading), points[0])
+    return Run(name, axis * np.sign(leading), points[0], slope=first.slope)
 
 
 def _check_straightness(readings: list[Reading], arrays: _Arrays, along: np.ndarray) -> None:

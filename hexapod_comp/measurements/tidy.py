@@ -74,6 +74,7 @@ class TidyRow(NamedTuple):
     line: int
     time: float
     humidity: float
+    slope: str
 
 
 def read_rows(table: Table) -> list[TidyRow]:
@@ -85,6 +86,7 @@ def read_rows(table: Table) -> list[TidyRow]:
     temperatures, (air, humidity) = _temperatures(table), _air(table)
     centres, known = _centres(table), _known_zeros(table)
     times = _optional(table, "time", "time", lambda v: abs(v) <= LATEST, f"±{LATEST:g} s", blank=True)
+    slopes = [""] * len(runs) if table.column("slope", None) is None else table.texts("slope")
     table.refuse_unknown()
     sizes: dict[tuple[str, str], float] = {}
     rows = []
@@ -100,7 +102,9 @@ def read_rows(table: Table) -> list[TidyRow]:
         uncertainty = _uncertainty(table, line, cells, uncertainty_column, sizes[key])
         place = (runs[n], cycles[n], directions[n], poses[n], channels[n])
         set_up = air[n], centres[n], known[n]
-        rows.append(TidyRow(*place, *value, uncertainty, temperatures[n], *set_up, line, times[n], humidity[n]))
+        rows.append(
+            TidyRow(*place, *value, uncertainty, temperatures[n], *set_up, line, times[n], humidity[n], slopes[n])
+        )
     return rows
 
 
@@ -339,7 +343,7 @@ def _file_readings(
             reading = (names[row.run], row.cycle, row.direction, row.pose, channel, value, row.uncertainty)
             source = FileLine(file, row.line)
             state = row.temperatures, commands.get(visits[n]) if commands else None, source, row.time
-            readings.append(Reading(*reading, *state, row.centre, row.known_zero, row.humidity))
+            readings.append(Reading(*reading, *state, row.centre, row.known_zero, row.humidity, row.slope))
     if not readings:
         raise InputFileError(file, "", "holds strut readings only: nothing that was measured")
     return readings, len(corrected)
@@ -589,12 +593,16 @@ def _centre_cells(measurements: MeasurementSet) -> tuple[list[str], np.ndarray, 
     """Return columns of centres, the centres in the work frame as the file says them, (N, 3) m, and their cells."""
     work = measurements.geometry.work
     centres = ((measurements.centre - work.position) @ work.rotation).round(13)
+    slopes = [measurements.runs[run].slope for run in measurements.run]
     if not (measurements.channel == LENGTH).any():
-        return [], centres, [[] for _ in measurements.station]
+        sloping = any(slopes)
+        return ["slope"] * sloping, centres, [[slope] * sloping for slope in slopes]
     known = [measurements.runs[run].known_zero for run in measurements.run]
-    names = [f"centre_{axis}_mm" for axis in AXES] + ["zero"] * any(known)
+    names = [f"centre_{axis}_mm" for axis in AXES] + ["zero"] * any(known) + ["slope"] * any(slopes)
     texts = [["", "", ""] if np.isnan(c[0]) else [_scaled(float(v), 3) for v in c + 0.0] for c in centres]
-    zeros = [["known" if of else ""] if any(known) else [] for of in known]
+    zeros = [
+        ["known" if of else ""] * any(known) + [slope] * any(slopes) for of, slope in zip(known, slopes, strict=True)
+    ]
     return names, centres, [text + zero for text, zero in zip(texts, zeros, strict=True)]
 
 

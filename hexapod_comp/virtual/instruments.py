@@ -55,7 +55,7 @@ def measure(
     commanded = np.linalg.norm(points - template.centre[lengths], axis=1)
     value[lengths] = np.linalg.norm(points + errors[lengths, :3] - centres, axis=1) - commanded
     value -= _zeros(template, value)
-    value += _slopes(template, campaign.beam_slope, np.random.default_rng([seed, SLOPES])) * template.along()
+    value += campaign.beam_slope * _beams(template, np.random.default_rng([seed, SLOPES]))
     sigma = np.array(campaign.noise)[template.kind]
     value += sigma * np.random.default_rng([seed, NOISE]).standard_normal(len(value))
     return replace(template, value=value, uncertainty=np.where(sigma > 0.0, np.maximum(sigma, LEAST_NOISE), np.nan))
@@ -135,10 +135,20 @@ def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
     return np.where(absolute, 0.0, value[first][group.ravel()])
 
 
-def _slopes(template: MeasurementSet, slope: float, rng: np.random.Generator) -> np.ndarray:
-    """Return the slope of the beam of each straightness reading, rad, zero for the others, shape (N,)."""
-    drawn = slope * rng.standard_normal(len(template.runs) * len(AXES))
-    straightness = template.kind == KINDS.index("straightness")
-    axis = template.channel - CHANNELS.index("straightness_x")
-    index = np.where(straightness, template.run * len(AXES) + axis, 0)
-    return np.where(straightness, drawn[index], 0.0)
+def _beams(template: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
+    """Return what beams that lie off their lines, each by a draw, add to straightness, per rad, shape (N,), m.
+
+    A square is turned by one draw about each axis of the work frame, for all runs that share its slope.
+    """
+    drawn = rng.standard_normal((len(template.runs), len(AXES)))
+    straightness = np.flatnonzero(template.kind == KINDS.index("straightness"))
+    run, axis = template.run[straightness], template.channel[straightness] - CHANNELS.index("straightness_x")
+    slopes, names = drawn[run, axis], np.array([r.slope for r in template.runs])
+    levers, about = template.square_levers()
+    shared = np.flatnonzero(names[run] != "")
+    first = np.array([int((names == name).argmax()) for name in names])
+    result = np.zeros(len(template))
+    result[straightness] = slopes * template.along()[straightness]
+    chosen = straightness[shared]
+    result[chosen] = drawn[first[run[shared]], about[chosen]] * levers[chosen]
+    return result
