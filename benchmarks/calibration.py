@@ -1,4 +1,4 @@
-"""What calibration is worth: virtual machines measured, fitted, and judged at points that nothing was fitted to.
+"""How much error calibration removes: virtual machines measured, fitted, and judged at points not used in the fit.
 
 Each machine is drawn from its own seed, measured by the virtual instruments of a campaign, and fitted as
 ``hexapod_comp fit`` does it, with every block of parameters allowed. 1,000 random points, passed there and

@@ -365,7 +365,7 @@ def _fit_notes(fits: Sequence[LineFit], order: OrderRule) -> list[str]:
 
 
 def _predicted(field: GridField, readings: Readings, component: int) -> np.ndarray:
-    """Return what a field says of some readings, shape (N,): an axis that stands still has no direction."""
+    """Return the errors that a field predicts for readings, shape (N,); an axis that stands still has no direction."""
     predicted = np.zeros(len(readings.value))
     if not any(family[:, :, :, component].any() for family in field.lines):
         return predicted

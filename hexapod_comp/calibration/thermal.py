@@ -338,10 +338,10 @@ class _Known:
     def of(estimation: Estimation, solution: Solution, constants: TimeConstants, factor: float) -> _Known:
         """Return the covariance of a fit, whose priors and time constants are themselves no more than estimates.
 
-        The size of a prior is estimated from hardly three numbers, which are themselves drawn to it: how far they may
-        be off is worked out with a prior that no material surprises. Time constants that differ by δ, in the logarithm,
-        move the readings by h·δ, and with them the parameters by −C·Rᵀ·h·δ. One thermometer for all whose late parts
-        nothing has shown may have some all the same, as far as the readings allow.
+        The size of a prior is estimated from three numbers at most, which the prior itself pulls towards zero: the
+        covariance is therefore computed with a prior wide enough for any material. Time constants that differ by δ,
+        in the logarithm, move the readings by h·δ, and with them the parameters by −C·Rᵀ·h·δ. One thermometer for all
+        whose late parts nothing has shown may have some all the same, as far as the readings allow.
         """
         space, noise, problem = estimation.space, solution.posterior.noise, solution.problem
         least = [LEAST_KNOWN.get(block.name, 0.0) for block in space.blocks]

@@ -124,7 +124,7 @@ class Fitted:
 
     @property
     def saved(self) -> MachineModel:
-        """The model, with a remark to whoever runs it where it was forced."""
+        """Return the model; one written by --force carries the reason in its note."""
         if not self.misfit:
             return self.model
         origin = self.model.origin

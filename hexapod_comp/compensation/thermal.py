@@ -107,7 +107,7 @@ class Thermometers:
         return mean
 
     def stale(self, time: float) -> tuple[str, ...]:
-        """Return the parts, and ``humidity``, that no longer tell, at a time, s."""
+        """Return the parts (and ``humidity``) whose last reading is too old at a time, s."""
         timeout, limits = self._rules.timeout, self._limits
         known = (name for name in (*Temperatures.NAMES, HUMIDITY) if name in limits)
         return tuple(name for name in known if 0.0 < timeout < time - limits[name].at)

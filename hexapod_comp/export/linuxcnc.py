@@ -356,7 +356,7 @@ def _comp_names(path: Path, text: str) -> list[str]:
         wrong = next((s for s in sections if s["COMP_FILE_TYPE"] != str(COMP_TYPE)), None)
         names = [section["COMP_FILE"] for section in sections]
     except (configparser.Error, KeyError) as error:
-        raise InputFileError(path, "", f"is not the lines that were written: {str(error).splitlines()[0]}") from error
+        raise InputFileError(path, "", f"reads back otherwise than written: {str(error).splitlines()[0]}") from error
     if wrong is not None:
         raise InputFileError(path, f"[{wrong.name}]COMP_FILE_TYPE", f"must be {COMP_TYPE}", wrong["COMP_FILE_TYPE"])
     for section, name in zip(sections, names, strict=True):

@@ -329,7 +329,7 @@ class Whole(Kind):
 
 
 class Choice(Kind):
-    """One of some words, or numbers."""
+    """A value that must be one of the listed words or numbers."""
 
     def __init__(self, *words: Any) -> None:
         self.words = words

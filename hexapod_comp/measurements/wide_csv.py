@@ -42,7 +42,7 @@ class UncertaintyColumns:
 
     @staticmethod
     def read(section: Section, name: str, dimension: str) -> float | UncertaintyColumns:
-        """Take one standard deviation for all rows, or where each row's stand; NaN where there is neither."""
+        """Read one standard deviation for all rows, or one per row from its columns; NaN without either."""
         if name not in section:
             return float(section.quantity(name, dimension, default=np.nan))
         part, (low, high) = section.section(name), COVERAGE_FACTORS

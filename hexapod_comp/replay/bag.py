@@ -397,7 +397,7 @@ def _joined(pages: list[tuple[int, Page]]) -> tuple[np.ndarray, list[tuple[int, 
 
 
 def _lengths(message: Any, joints: Sequence[str]) -> tuple[float, ...] | None:
-    """Return the six struts' positions in strut order, m; None when they are not what the message holds."""
+    """Return the six struts' positions in strut order, m; None when the message does not hold all six."""
     names, positions = list(message.name), message.position.tolist()
     if len(names) != len(positions) or any(names.count(name) != 1 for name in joints):
         return None

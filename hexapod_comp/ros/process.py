@@ -1,4 +1,4 @@
-"""A node's process: its spin loop, signals, end, and a log that cannot hold it up; and a session for other programs."""
+"""A node's process: its spin loop, signals, end, and a log that never blocks it; and a session for other programs."""
 
 from __future__ import annotations
 

@@ -299,7 +299,7 @@ class CompensatorStatus:
         return bool(self.commands.count and 0.0 < self.options["command_timeout"] < self.commands.age(now))
 
     def stale(self, now: float) -> str:
-        """Return the parts whose thermometers no longer tell."""
+        """Return the parts whose last temperature is too old."""
         return ", ".join(name for name in self.thermometers.stale(now) if name != HUMIDITY)
 
     def near_singular(self, now: float) -> bool:

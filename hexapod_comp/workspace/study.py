@@ -333,7 +333,7 @@ def _both(values: np.ndarray) -> tuple[str, str]:
 
 
 def _allocation_text(study: Study, allocation: Allocation) -> str:
-    """Return what each error may be."""
+    """Return the largest size of each error."""
     how = {"rss": "root sum of squares", "worst_case": "worst case"}[allocation.method]
     head = (
         f"allowed {allocation.allowed * 1e6:g} µm, {how}: the budget adds up to {allocation.combined * 1e6:.2f} µm; "

@@ -254,7 +254,7 @@ def test_files_are_what_linuxcnc_reads(tmp_path: Path) -> None:
         (HAL_FILE, r"setp genhexkins.base.3.y", "setp motion.base.3.y", "is not setp of a genhexkins pin"),
         (HAL_FILE, r"# set ....", "# set 0000", "files of two exports"),
         (INI_FILE, r"COMP_FILE_TYPE = 1", "COMP_FILE_TYPE = 0", "must be 1"),
-        (INI_FILE, r"\[JOINT_5\]", "[JOINT_6]", "is not the lines"),
+        (INI_FILE, r"\[JOINT_5\]", "[JOINT_6]", "reads back otherwise than written"),
         ("strut_2.comp", r"\A", "# a comment\n", "has no points"),
         ("strut_2.comp", r"\A(.*\n)", r"\1\1", "must increase"),
         ("strut_2.comp", r"\A(.*\n)", r"1 0 0\n2 0 0\n\1", "at most 256"),
@@ -404,7 +404,8 @@ def test_what_no_table_can_hold_is_refused() -> None:
 
 
 def run_verb(*arguments: str) -> int:
-    return export.run(make_parser().parse_args(["export", "--machine", str(PAPER_FILE), *arguments]))
+    args = make_parser().parse_args(["export", "--machine", str(PAPER_FILE), *arguments])
+    return int(export.run(args).finish(args))
 
 
 def test_verb_writes_reads_back_and_reports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

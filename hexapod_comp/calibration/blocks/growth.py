@@ -73,7 +73,7 @@ class Expansion(Block):
 
     @classmethod
     def of(cls, facts: Facts) -> Expansion | None:
-        """Where temperatures changed, which the settings' blocks tell."""
+        """Whether temperatures changed, as the settings' blocks report."""
         return cls(facts.settings)
 
     def causes(self, stations: Stations) -> np.ndarray:
