@@ -29,25 +29,36 @@ from hexapod_comp.ros.parameters import outside_ros
 STOP_WITHIN = 2.0  # from the signal to the end of the process, s
 
 
-@pytest.fixture
-def client(isolated_ros) -> Iterator[LoopClient]:
-    made = LoopClient()
+@pytest.fixture(scope="module")
+def running(isolated_ros) -> Iterator[list[LoopClient | NodeProcess]]:
+    """Give what `pair` has started and no test has ended yet: client, compensator, strut drive."""
+    made: list[LoopClient | NodeProcess] = []
     yield made
-    made.close()
+    end(made)
+
+
+def end(made: list[LoopClient | NodeProcess]) -> None:
+    while made:
+        one = made.pop()
+        one.close() if isinstance(one, LoopClient) else one.stop()
 
 
 @pytest.fixture
-def pair(client) -> Iterator[tuple[NodeProcess, NodeProcess]]:
-    """Compensator and strut drive, connected with each other and with the client."""
+def pair(running) -> tuple[NodeProcess, NodeProcess]:
+    """Compensator and strut drive, connected with each other and with the client; anew where a test ended one."""
     # The struts start from where they are measured; at this rate the correction is in with the second command.
-    parameters = {"model_file": "paper_machine.yaml", "ramp_rate": 1.0}
-    nodes = NodeProcess("compensator", parameters), NodeProcess("strut_drive", {})
-    try:
-        connect(client, nodes)
-        yield nodes
-    finally:
-        for node in nodes:
-            node.stop()
+    if not running or any(node.exit_code() is not None for node in running[1:]):
+        end(running)
+        running.append(LoopClient())
+        running.append(NodeProcess("compensator", {"model_file": "paper_machine.yaml", "ramp_rate": 1.0}))
+        running.append(NodeProcess("strut_drive", {}))
+        connect(running[0], running[1:])
+    return running[1], running[2]
+
+
+@pytest.fixture
+def client(running, pair) -> LoopClient:
+    return running[0]
 
 
 def ask(client: LoopClient, pose: Pose) -> Sent:
@@ -96,21 +107,7 @@ def run_both(*arguments: str) -> list[tuple[int, str]]:
             process.kill()
 
 
-def test_loop_between_processes(client, pair):
-    """A command comes back as struts near the closed form, the tool goes there, the estimate says so."""
-    # In three commands, so that every strut has a direction of motion: the first alone has none to go by.
-    pose = near(HOME, (0.0005, -0.0003, 0.0008))
-    for share in (0.2, 0.6, 1.0):
-        entry = ask(client, near(HOME, (0.0005 * share, -0.0003 * share, 0.0008 * share)))
-    np.testing.assert_allclose(entry.command - entry.correction, closed_form_lengths(pose), rtol=0.0, atol=1e-12)
-    client.spin_until(client.settled(), 5.0, "the tool to rest")
-    # 0.1 µm steps, 0.05 µm noise of the encoders, J⁻¹ below 3: a fraction of a micrometre; uncorrected 100 µm.
-    assert np.abs(client.true_pose.position - pose.position).max() < 0.5e-6
-    assert np.abs(client.estimate.position - pose.position).max() < 2e-6
-    assert client.counted() == (3, 0)
-    for node in pair:
-        assert "ready" in node.output()
-        assert_ends_well(node, signal.SIGINT)
+# The first tests leave the nodes running for the next, each of the later ones ends at least one.
 
 
 def test_a_refused_command_is_said_with_its_reason(client, pair):
@@ -119,6 +116,57 @@ def test_a_refused_command_is_said_with_its_reason(client, pair):
     entry = client.send(near(HOME, (0.0, 0.0, 0.5)))
     with pytest.raises(NoAnswerError, match=r"a command was refused: strut_\d: nominal length .* outside the stroke"):
         client.wait_for_answer(entry, timeout=60.0)
+
+
+def test_nodes_receive_by_udp_only(client, pair):
+    """A process that is killed in another's shared-memory port stalls it for seconds; nobody opens one here."""
+    # Fast DDS keeps each port of its shared-memory transport in /dev/shm/fastrtps_port….
+    ask(client, HOME)
+    for node in pair:
+        maps = Path(f"/proc/{node.pid}/maps").read_text(encoding="ascii")
+        assert "libfastrtps" in maps
+        assert "/dev/shm/fastrtps_port" not in maps
+
+
+def dropped(pid: int) -> int:
+    """Return how many datagrams found a process's UDP sockets full: the last column of /proc/net/udp."""
+    links = [os.readlink(link) for link in Path(f"/proc/{pid}/fd").iterdir() if link.is_symlink()]
+    own = {link[len("socket:[") : -1] for link in links if link.startswith("socket:[")}
+    rows = [line.split() for line in Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]]
+    return sum(int(row[12]) for row in rows if row[9] in own)
+
+
+def test_a_command_for_which_a_socket_had_no_room_is_repeated_at_once(client, pair):
+    """A stopped process's socket is full of readings after a second; it goes on when the next command has been lost."""
+    # Fast DDS repeats what was lost when the writer's heartbeat tells of it: by itself every 3 s, when a command would
+    # be too old to be obeyed. No later command brings one earlier here.
+    compensator, _ = pair
+    ask(client, HOME)
+    compensator.send(signal.SIGSTOP)
+    try:
+        client.spin_until(lambda: dropped(compensator.pid), 10.0, "the socket to be full")
+        entry = client.send(HOME)
+    finally:
+        compensator.send(signal.SIGCONT)
+    client.spin_until(lambda: answered(entry), 5.0, "the answer to a command that was lost")
+
+
+def test_loop_between_processes(client, pair):
+    """A command comes back as struts near the closed form, the tool goes there, the estimate says so."""
+    # In three commands, so that every strut has a direction of motion: the first alone has none to go by.
+    pose = near(HOME, (0.0005, -0.0003, 0.0008))
+    accepted, refused = client.counted()
+    for share in (0.2, 0.6, 1.0):
+        entry = ask(client, near(HOME, (0.0005 * share, -0.0003 * share, 0.0008 * share)))
+    np.testing.assert_allclose(entry.command - entry.correction, closed_form_lengths(pose), rtol=0.0, atol=1e-12)
+    client.spin_until(client.settled(), 5.0, "the tool to rest")
+    # 0.1 µm steps, 0.05 µm noise of the encoders, J⁻¹ below 3: a fraction of a micrometre; uncorrected 100 µm.
+    assert np.abs(client.true_pose.position - pose.position).max() < 0.5e-6
+    assert np.abs(client.estimate.position - pose.position).max() < 2e-6
+    assert client.counted() == (accepted + 3, refused)
+    for node in pair:
+        assert "ready" in node.output()
+        assert_ends_well(node, signal.SIGINT)
 
 
 @pytest.mark.parametrize(
@@ -322,39 +370,6 @@ def runs(pid: int) -> bool:
             return stat.read().rsplit(")", 1)[1].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):
         return False
-
-
-def test_nodes_receive_by_udp_only(client, pair):
-    """A process that is killed in another's shared-memory port stalls it for seconds; nobody opens one here."""
-    # Fast DDS keeps each port of its shared-memory transport in /dev/shm/fastrtps_port….
-    ask(client, HOME)
-    for node in pair:
-        maps = Path(f"/proc/{node.pid}/maps").read_text(encoding="ascii")
-        assert "libfastrtps" in maps
-        assert "/dev/shm/fastrtps_port" not in maps
-
-
-def dropped(pid: int) -> int:
-    """Return how many datagrams found a process's UDP sockets full: the last column of /proc/net/udp."""
-    links = [os.readlink(link) for link in Path(f"/proc/{pid}/fd").iterdir() if link.is_symlink()]
-    own = {link[len("socket:[") : -1] for link in links if link.startswith("socket:[")}
-    rows = [line.split() for line in Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]]
-    return sum(int(row[12]) for row in rows if row[9] in own)
-
-
-def test_a_command_for_which_a_socket_had_no_room_is_repeated_at_once(client, pair):
-    """A stopped process's socket is full of readings after a second; it goes on when the next command has been lost."""
-    # Fast DDS repeats what was lost when the writer's heartbeat tells of it: by itself every 3 s, when a command would
-    # be too old to be obeyed. No later command brings one earlier here.
-    compensator, _ = pair
-    ask(client, HOME)
-    compensator.send(signal.SIGSTOP)
-    try:
-        client.spin_until(lambda: dropped(compensator.pid), 10.0, "the socket to be full")
-        entry = client.send(HOME)
-    finally:
-        compensator.send(signal.SIGCONT)
-    client.spin_until(lambda: answered(entry), 5.0, "the answer to a command that was lost")
 
 
 @pytest.mark.parametrize("variable", PROFILE_VARIABLES)

@@ -41,7 +41,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def small(coarse: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Make running quick too: a small box, the fewest poses, a short path; its drives leave a micrometre at most."""
-    for name, value in (("LONGEST_SIDE", 0.08), ("PATH_SIDE", 0.006), ("PATH_TIME", 0.2), ("POSES", 6)):
+    for name, value in (("LONGEST_SIDE", 0.08), ("PATH_SIDE", 0.0015), ("PATH_TIME", 0.1), ("POSES", 6)):
         monkeypatch.setattr(story, name, value)
 
 
