@@ -234,7 +234,7 @@ MACHINES = 8  # machines whose promises are checked without DDS
 LEAST_KEPT = int(binom.ppf(0.01, MACHINES, 0.95))
 
 
-def test_promises_are_kept_as_often_as_they_say() -> None:
+def test_promises_are_kept_as_often_as_they_say(unsuspected: None) -> None:
     """Eight machines, eight noises: the RMS at 500 held-out points lies in the fit's 95 % interval. 40 others
     kept 39 (5-D) promises; the points' own scatter is 1 %, against an interval of ±40 %."""
     kept, left = [], []
