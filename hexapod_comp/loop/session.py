@@ -225,8 +225,8 @@ RATES = (1.0, 1000.0)  # commands per second that make sense over DDS from Pytho
 
 
 # What a simulated machine's compensator lets pass, m and s: drives and clocks are sound, but wait for a processor at
-# times, and the usual 2 mm are 20 ms of that
-PATIENCE = {"following_error_limit": 0.02, "max_command_age": 5.0}
+# times, and at 250 mm/s the usual 2 mm are 8 ms of that, 0.1 m are 0.4 s
+PATIENCE = {"following_error_limit": 0.1, "max_command_age": 5.0}
 
 
 def checked_rate(rate: float) -> float:

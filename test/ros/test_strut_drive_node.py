@@ -408,5 +408,6 @@ def test_works_in_a_namespace(ros_context, capfd):
         command(left, closed_form_lengths(TARGET))
         until_at(left, closed_form_lengths(TARGET), 1e-12)
         assert not other.seen["strut_states"]
+        left.until(lambda: left.status(NODE), "a status")
         status = left.status(NODE)
         assert (status.name, status.hardware_id) == ("left/strut_drive: state", "left/paper")
