@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import importlib
 import importlib.util
 import re
 import sys
@@ -121,3 +122,9 @@ def test_the_configuration_of_the_pages_needs_nothing_but_sphinx(tmp_path: Path,
     assert settings["html_title"] == "hexapod_comp"
     assert "myst_parser" in settings["extensions"]
     assert "**/api.md" in settings["exclude_patterns"]
+
+
+@pytest.mark.parametrize("page", sorted(ROOT.glob("doc/notebooks/*.md")), ids=lambda page: page.name)
+def test_notebooks_import_what_is_there(page: Path):
+    for line in re.findall(r"^from (?:hexapod_comp|examples)\S* import .+$", page.read_text("utf-8"), re.M):
+        exec(line, {})

@@ -8,7 +8,7 @@ from pathlib import Path
 from hexapod_comp.formats.pages import render
 from hexapod_comp.formats.texts import number
 
-from .comparing import MET, MISSED, OPEN, SHOWN, WRONG, Paper
+from .comparing import MET, MISSED, OPEN, SHOWN, WRONG, Exhibit, Paper
 
 TITLE = "The papers' tables and figures, computed"
 
@@ -28,3 +28,9 @@ def page_text(papers: Sequence[Paper], note: str) -> str:
     """Return the page; `note` says how it was made."""
     given = {"title": TITLE, "note": note, "papers": papers, "marks": MARKS, "meanings": MEANINGS, "number": number}
     return render(Path(__file__).with_name("papers.html"), **given)
+
+
+def exhibit_html(exhibit: Exhibit) -> str:
+    """Return one exhibit as it stands on the page, for a notebook."""
+    page = page_text([Paper("", "", (exhibit,))], "")
+    return page[page.index("<section") : page.index("</section>")] + "</section>"
