@@ -254,7 +254,7 @@ class _Fitted:
             ratio = np.bincount(group.ravel(), known * model._reversal_ratio(block.part))
             if np.maximum(ratio, 0.0).sum() < np.log(ASSUMED.mixup_odds):
                 break
-            flipped = flipped ^ (ratio > 0.0)
+            flipped ^= ratio > 0.0
             if 2 * flipped.sum() > len(flipped):  # the majority is right: all of them swapped is another alternative
                 flipped = ~flipped
             other = _turned_back(m, flipped[group.ravel()])
