@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -979,7 +980,7 @@ def test_stale_commands_are_said(rig):
 
 def test_log_lets_one_line_per_cause_and_second_through(monkeypatch):
     clock = iter([0.0, 0.4, 0.5, 0.9, 1.1, 1.6])
-    monkeypatch.setattr(rclpy_compat.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(rclpy_compat, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     throttle = Throttle()
     causes = ["nan", "nan", "step", "nan", "nan", "step"]
     assert [throttle.passes(cause) for cause in causes] == [0, None, 0, None, 2, 0]
@@ -1007,7 +1008,7 @@ def test_what_happened_while_a_node_stood_still_is_said_once():
 
 def test_rate_and_age_of_a_flow(monkeypatch):
     """250 events in the 2 s since it was made: 125 a second."""
-    monkeypatch.setattr(status_module.time, "monotonic", lambda: 10.0)
+    monkeypatch.setattr(status_module, "time", SimpleNamespace(monotonic=lambda: 10.0))
     flow = Flow()
     assert flow.age(11.0) == math.inf
     for n in range(250):

@@ -132,7 +132,7 @@ def test_a_process_that_fails_every_time_is_tried_less_and_less_often(monkeypatc
     node, status = MagicMock(), SimpleNamespace(prediction_problem="")
     listeners = node.create_publisher.return_value.get_subscription_count
     listeners.return_value = 1
-    monkeypatch.setattr(requests.time, "monotonic", lambda: now)
+    monkeypatch.setattr(requests, "time", SimpleNamespace(monotonic=lambda: now))
     sources = {"geometry": MagicMock(), "model": MagicMock()}
     beside, files = SimpleNamespace(ask=ask), MagicMock(sources=sources)
     topics = PredictedError(
