@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from ..compensation.journal import Source
 from ..errors import InputFileError
@@ -11,9 +12,12 @@ from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.model import MachineModel
 from ..replay.bag import Files, Recording, read_recording
 from ..replay.replay import replay_recording, what_if
-from ..replay.report import Report, as_json, rows_of, text
+from ..replay.report import Report, rows_of
 from ..virtual.named import find_model, is_random, is_word
 from . import common
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 NOTHING = (
     "nothing in it can be compared: no answer follows a snapshot of the journal without a page lost between; "
@@ -21,19 +25,20 @@ NOTHING = (
 )
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> common.Result:
     """Run the verb; 0 when the replay gives the same."""
     with common.progress_bar(0, " messages") as bar:
         recording = read_recording(args.bag, args.namespace, bar.update)
     report, geometry = _replayed(args, recording)
-    rows = rows_of(report) if args.out is not None else ()
-    common.Result(lambda: text(report), lambda: as_json(report), rows).finish(args)
-    if args.pictures:
-        from ..replay.pictures import write_pictures
+    text, content = report.shown()
 
-        for path in write_pictures(report, geometry, args.pictures):
-            common.mention(args, f"picture: {path}")
-    return 0 if report.same else 1
+    def pictures() -> dict[str, Figure]:
+        from ..replay.pictures import figures_of
+
+        return figures_of(report, geometry)
+
+    code = 0 if report.same else 1
+    return common.Result(lambda: text, lambda: content, rows_of(report), pictures, code)
 
 
 def _replayed(args: argparse.Namespace, recording: Recording) -> tuple[Report, HexapodGeometry]:

@@ -31,11 +31,7 @@ from .storage import Allowance, Message, UnpackingError, cut_off, messages, refu
 POSE, STRUTS, TEXT = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState", "std_msgs/msg/String"
 
 # A machine's topics in its namespace that are shown, and their types
-TOPICS = {
-    "strut_states": STRUTS,
-    "tool_pose_estimate": POSE,
-    "tool_pose_true": POSE,
-}
+TOPICS = {"strut_states": STRUTS, "tool_pose_estimate": POSE, "tool_pose_true": POSE}
 
 COMMANDS = "tool_pose_command"  # topic of commands: counted, not read. What the compensator took, its journal says.
 JOURNAL, FILES = "/journal", "/files"  # how the topics of a compensator's journal end, after the node's name
@@ -70,6 +66,11 @@ class Series:
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+    @property
+    def when(self) -> np.ndarray:
+        """Their stamps, ns; those of drives that do not stamp are the recorder's times."""
+        return self.stamps if self.stamps.all() else self.times
 
 
 @dataclass
@@ -152,7 +153,7 @@ def read_recording(
     size = sum(file.stat().st_size for file in inside if file.is_file())
     with TemporaryDirectory(prefix="hexapod_comp_") as folder:
         if packing == "file":
-            files = [_unpacked_file(path, file, Path(folder), Allowance(size)) for file in files]
+            files = [_unpacked(path, file, Path(folder) / file.stem, Allowance(size)) for file in files]
         counts, texts = Counter[tuple[str, str]](), list[Message]()
         for message in _messages(path, files, packing, size):
             counts[message.topic, message.kind] += 1
@@ -198,23 +199,18 @@ def _files(path: Path) -> tuple[list[Path], str, list[str]]:
         return [path], "", []
     file = path / METADATA
     if not file.exists():
-        files = sorted(one for one in path.iterdir() if one.suffix in STORAGE)
-        if not files:
+        if not (files := sorted(one for one in path.iterdir() if one.suffix in STORAGE)):
             raise InputFileError(path, "", "is no bag: it has neither metadata.yaml nor a .mcap or .db3 file")
-        return (
-            files,
-            "",
-            ["metadata.yaml is missing, as when the recorder is killed; all files of the folder were read"],
-        )
+        note = "metadata.yaml is missing, as when the recorder is killed; all files of the folder were read"
+        return files, "", [note]
     top = Section(file, "", yaml_content(read_text(file, most=MOST_METADATA), file, MOST_NODES))
     about = top.section("rosbag2_bagfile_information")
     names = about.take("relative_file_paths")
     if not isinstance(names, list) or not all(isinstance(name, str) and Path(name).name for name in names):
         raise about.error("relative_file_paths", "must be a list of names", names)
     files = [path / Path(name).name for name in names]
-    for one in files:
-        if not one.exists():
-            raise about.error("relative_file_paths", f"there is no file {one.name}")
+    if missing := next((one for one in files if not one.exists()), None):
+        raise about.error("relative_file_paths", f"there is no file {missing.name}")
     packing, by = (about.take(key) if key in about else "" for key in ("compression_mode", "compression_format"))
     packing = str(packing or "").lower()
     if packing in ("file", "message") and by != "zstd":
@@ -222,9 +218,8 @@ def _files(path: Path) -> tuple[list[Path], str, list[str]]:
     return files, packing, []
 
 
-def _unpacked_file(path: Path, file: Path, folder: Path, allowance: Allowance) -> Path:
-    """Return a file of a bag that is packed as a whole, unpacked into a folder."""
-    target = folder / file.stem
+def _unpacked(path: Path, file: Path, target: Path, allowance: Allowance) -> Path:
+    """Return where a file of a bag that is packed as a whole is unpacked to."""
     try:
         with zstd_stream(file) as stream, open(target, "wb") as unpacked:
             unpacked.writelines(allowance.blocks(stream))
@@ -310,47 +305,34 @@ def _wanted(path: Path, topics: Collection[tuple[str, str]], node: str) -> dict[
     return {topic: name for topic, (name, _) in names.items()}
 
 
-class _Columns:
-    """One topic's messages on their way into a Series: plain numbers, a fifth of the memory of tuples."""
-
-    def __init__(self) -> None:
-        self.times, self.stamps, self.values = array("q"), array("q"), array("d")
-
-    def series(self, width: int) -> Series:
-        """Return them, oldest first."""
-        times = np.array(self.times, dtype=np.int64)
-        order = np.argsort(times, kind="stable")
-        values = np.array(self.values, dtype=float).reshape((-1, width))[order]
-        return Series(stamps=np.array(self.stamps, dtype=np.int64)[order], times=times[order], values=values)
-
-
 class _Collected:
-    """Messages on their way into a Recording."""
+    """Messages on their way into a Recording; of each topic plain numbers, a fifth of the memory of tuples."""
 
     def __init__(self, path: str | Path, node: str) -> None:
         self._path, self._node = path, node
-        self._columns = {name: _Columns() for name in TOPICS}
+        self._columns = {name: (array("q"), array("q"), array("d")) for name in TOPICS}  # as in Series
         self._pages: list[tuple[int, Page]] = []
         self._sources: dict[str, Source] = {}
-        self._odd: dict[str, int] = {}
+        self._odd = Counter[str]()
         self._joints: tuple[str, ...] = STRUT_NAMES
 
     def take(self, name: str, time: int, message: Any) -> None:
-        """Take one message."""
+        """Add one message."""
         if name in (JOURNAL, FILES):
-            self._take_text(name, time, message.data)
+            self.take_text(name, time, message.data)
             return
-        columns, pose = self._columns[name], getattr(message, "pose", None)
-        place = pose and pose.position
+        place = getattr(message, "pose", None) and message.pose.position
         numbers = (place.x, place.y, place.z) if place else _lengths(message, self._joints)
         if numbers is None:
-            self._odd[name] = self._odd.get(name, 0) + 1
+            self._odd[name] += 1
             return
-        columns.times.append(time)
-        columns.stamps.append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
-        columns.values.extend(numbers)
+        stamps, times, values = self._columns[name]
+        times.append(time)
+        stamps.append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
+        values.extend(numbers)
 
-    def _take_text(self, name: str, time: int, text: str) -> None:
+    def take_text(self, name: str, time: int, text: str) -> None:
+        """Add a page of the journal, or the files in use."""
         try:
             if name == JOURNAL:
                 self._pages.append((time, page := read_page(text)))
@@ -362,14 +344,18 @@ class _Collected:
 
     def recording(self, notes: list[str], heard: int) -> Recording:
         """Return what was collected."""
-        pages = _in_order(self._pages)
+        commands, pages = self._in_order()
         if not any(page.snapshot for _, page in pages):
             problem = "holds no snapshot of the compensator's state: record for longer than half a second"
             raise InputFileError(self._path, self._node + JOURNAL, problem)
-        commands, pages = _joined(pages)
         if not len(commands):
             raise InputFileError(self._path, self._node + JOURNAL, "holds not a single answer of the compensator")
-        topics = {name: columns.series(3 if TOPICS[name] == POSE else 6) for name, columns in self._columns.items()}
+        topics = {}
+        for name, (stamps, times, values) in self._columns.items():
+            table = np.array(values, dtype=float).reshape((-1, 3 if TOPICS[name] == POSE else 6))
+            order = np.argsort(times, kind="stable")
+            of_stamps, of_times = (np.array(one, dtype=np.int64)[order] for one in (stamps, times))
+            topics[name] = Series(of_stamps, of_times, table[order])
         notes = notes + [
             f"{count} messages of {name} left out: not a position for each of {', '.join(self._joints)}"
             for name, count in self._odd.items()
@@ -379,21 +365,17 @@ class _Collected:
             raise InputFileError(self._path, self._node + JOURNAL, "has a command in a frame that no snapshot names")
         return recording
 
-
-def _in_order(pages: list[tuple[int, Page]]) -> list[tuple[int, Page]]:
-    """Return pages session by session; each once, if a recorder that joined twice has it twice."""
-    pages = sorted(pages, key=lambda entry: entry[0])
-    sessions = {session: n for n, session in enumerate(dict.fromkeys(page.session for _, page in pages))}
-    once = {(sessions[page.session], page.number): (time, page) for time, page in reversed(pages)}
-    return [once[key] for key in sorted(once)]
-
-
-def _joined(pages: list[tuple[int, Page]]) -> tuple[np.ndarray, list[tuple[int, Page]]]:
-    """Return all answers in one array, and the pages with views of it."""
-    commands = np.concatenate([page.commands for _, page in pages])
-    ends = np.cumsum([len(page.commands) for _, page in pages])
-    views = np.split(commands, ends[:-1])
-    return commands, [(time, replace(page, commands=view)) for (time, page), view in zip(pages, views, strict=True)]
+    def _in_order(self) -> tuple[np.ndarray, list[tuple[int, Page]]]:
+        """Return all answers, and the pages, with views of them, session by session; each once where it came twice."""
+        pages = sorted(self._pages, key=lambda entry: entry[0])
+        sessions = {session: n for n, session in enumerate(dict.fromkeys(page.session for _, page in pages))}
+        once = {(sessions[page.session], page.number): (time, page) for time, page in reversed(pages)}
+        pages = [once[key] for key in sorted(once)]
+        if not pages:
+            return np.zeros(0), []
+        commands = np.concatenate([page.commands for _, page in pages])
+        views = np.split(commands, np.cumsum([len(page.commands) for _, page in pages])[:-1])
+        return commands, [(time, replace(page, commands=view)) for (time, page), view in zip(pages, views, strict=True)]
 
 
 def _lengths(message: Any, joints: Sequence[str]) -> tuple[float, ...] | None:
@@ -410,7 +392,7 @@ class Files:
     def __init__(self, recording: Recording, given: Mapping[str, Source]) -> None:
         self._path = recording.path
         self._sources = {**recording.sources, **given}
-        self._loaded: dict[tuple[str, str], Any] = {}
+        self._read: dict[tuple[str, str], Any] = {}
         pages = [page for _, page in recording.pages]
         snapshots = [page.snapshot for page in pages if page.snapshot is not None]
         self.used = {one["sha256"] for snapshot in snapshots for one in (snapshot.geometry, snapshot.model)}
@@ -428,31 +410,26 @@ class Files:
 
     def geometry(self, identity: Mapping[str, str]) -> HexapodGeometry:
         """Return a geometry by its name and hash."""
-        key = identity["sha256"], ""
-        if key not in self._loaded:
-            self._loaded[key] = self._load("machine", identity, Source.geometry)
-        return self._loaded[key]
+        return self._loaded("machine", identity, "", Source.geometry)
 
     def model(self, identity: Mapping[str, str], geometry: HexapodGeometry) -> MachineModel:
         """Return a model by its name and hash."""
-        key = identity["sha256"], geometry.name
-        if key not in self._loaded:
-            if identity["sha256"] == IDEAL:
-                self._loaded[key] = IDEAL_SOURCE.model(geometry.name)
-            else:
-                self._loaded[key] = self._load("model", identity, lambda source: source.model(geometry.name))
-        return self._loaded[key]
+        return self._loaded("model", identity, geometry.name, lambda source: source.model(geometry.name))
 
-    def _load(self, what: str, identity: Mapping[str, str], load: Callable[[Source], Any]) -> Any:
-        source = self._sources.get(identity["sha256"])
-        if source is None or source.text is None:
+    def _loaded(self, what: str, identity: Mapping[str, str], machine: str, load: Callable[[Source], Any]) -> Any:
+        """Return what a file holds, which is read once."""
+        sha256 = identity["sha256"]
+        if (sha256, machine) in self._read:
+            return self._read[sha256, machine]
+        source = IDEAL_SOURCE if what == "model" and sha256 == IDEAL else self._sources.get(sha256)
+        if source is None or (source.text is None and source is not IDEAL_SOURCE):
             problem = (
                 f"does not carry the {what} {identity.get('name', '')!r} that was in use; "
-                f"give its file with --{what} (sha256 {identity['sha256']})"
+                f"give its file with --{what} (sha256 {sha256})"
             )
             raise InputFileError(self._path, "", problem)
         try:
-            return load(source)
+            return self._read.setdefault((sha256, machine), load(source))
         except InputFileError as error:
             # A file of another version of this package, most likely: name the bag, not a file of today.
             raise InputFileError(self._path, f"{source.name}: {error.key}", error.problem, error.value) from error

@@ -8,11 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..compensation.journal import Entry
-from ..formats.figures import WITH, WITHOUT, picture_text, save
+from ..formats.figures import WITH, WITHOUT, picture_text
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from .replay import BEFORE, DIFFERENT, LOST
-from .report import LONGEST_GAP, Report, following_error, since, tool_positions
+from .report import LONGEST_GAP, Report, following_error, tool_positions
 
 EVENT_COLOURS = {
     "temperature": "#8a6d3b", "humidity": "#1f78b4", "model": "#7b3294", "enable": "#2e8b57", "tool": "#b8860b",
@@ -22,8 +21,8 @@ EVENT_COLOURS = {
 MOST_LABELS = 12  # more changes than this are drawn without their names
 
 
-def write_pictures(report: Report, geometry: HexapodGeometry | None, folder: str | Path) -> list[Path]:
-    """Write every picture that there is something for; return the files."""
+def figures_of(report: Report, geometry: HexapodGeometry | None) -> dict[str, Figure]:
+    """Return every picture that there is something for, by file name."""
     figures = {"corrections": corrections_figure(report), "commands": commands_figure(report)}
     if len(report.recording.topics["strut_states"]):
         figures["following_error"] = following_figure(report)
@@ -33,11 +32,7 @@ def write_pictures(report: Report, geometry: HexapodGeometry | None, folder: str
         figures["refused"] = refused_figure(report)
     if report.other is not None or not report.same:
         figures["difference"] = difference_figure(report)
-    paths = []
-    for name, figure in figures.items():
-        paths.append(Path(folder) / f"{name}.png")
-        save(figure, paths[-1])
-    return paths
+    return {f"{name}.png": figure for name, figure in figures.items()}
 
 
 def _figure(report: Report, what: str, height: float = 4.5) -> Figure:
@@ -70,8 +65,10 @@ def _mark_events(report: Report, axes: Axes) -> None:
         at, entry = seconds[min(event.row, len(seconds) - 1)], event.entry
         axes.axvline(at, color=EVENT_COLOURS.get(entry.what, "black"), lw=0.8, ls="--")
         if len(replayed.changes) <= MOST_LABELS:
+            label = f"{entry.what} {picture_text(str(entry.values.get('name', '')), 20)}".rstrip()
+            label = label if entry.what != "enable" else "enable" if entry.values["on"] else "disable"
             axes.annotate(
-                _label(entry), (at, 1.0), (2, -3), xycoords=("data", "axes fraction"), textcoords="offset points",
+                label, (at, 1.0), (2, -3), xycoords=("data", "axes fraction"), textcoords="offset points",
                 rotation=90, va="top", fontsize=6,
             )  # fmt: skip
     lost = np.isin(replayed.outcome, (LOST, BEFORE))
@@ -79,12 +76,6 @@ def _mark_events(report: Report, axes: Axes) -> None:
         low, high = axes.get_ylim()
         axes.fill_between(seconds, low, high, where=lost.tolist(), color="grey", alpha=0.2, lw=0.0, step="mid")
         axes.set_ylim(low, high)
-
-
-def _label(entry: Entry) -> str:
-    if entry.what == "enable":
-        return "enable" if entry.values["on"] else "disable"
-    return f"{entry.what} {picture_text(str(entry.values.get('name', '')), 20)}".rstrip()
 
 
 def corrections_figure(report: Report) -> Figure:
@@ -103,9 +94,10 @@ def commands_figure(report: Report) -> Figure:
     panels = figure.subplots(2, 3, sharex=True)
     commands, states = report.strut_commands * 1e3, report.recording.topics["strut_states"]
     for n, axes in enumerate(panels.ravel()):
-        if len(states) and states.stamps.all():
-            measured = since(states.stamps, report.recording.commands["stamp"])
-            axes.plot(*_broken(measured, states.values[:, n] * 1e3), color=WITHOUT, lw=1.6, label="measured")
+        if len(states):
+            axes.plot(
+                *_broken(report.since(states.when), states.values[:, n] * 1e3), color=WITHOUT, lw=1.6, label="measured"
+            )
         axes.plot(*_broken(report.seconds, commands[:, n]), color=WITH, lw=0.8, label="command")
         axes.set(title=STRUT_NAMES[n])
     for axes in panels[1]:
@@ -142,19 +134,14 @@ def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
         axes.axis("equal")
     panels[0].legend(fontsize=7)
     if both:
-        at = since(estimates.stamps, report.recording.commands["stamp"])
-        _off(panels[2], report.seconds, positions, at, estimates.values[:, :3])
+        seconds, at = report.seconds, report.since(estimates.when)
+        inside = (at >= seconds[0]) & (at <= seconds[-1])
+        for name, wanted, point in zip("xyz", positions.T, estimates.values[inside, :3].T, strict=True):
+            off = point - np.interp(at[inside], seconds, wanted)
+            panels[2].plot(*_broken(at[inside], off * 1e6), lw=0.8, label=f"{name} in base")
+        panels[2].set(title="estimated − commanded, lag included", xlabel="time, s", ylabel="µm")
+        panels[2].legend(fontsize=7)
     return figure
-
-
-def _off(axes: Axes, seconds: np.ndarray, wanted: np.ndarray, at: np.ndarray, points: np.ndarray) -> None:
-    """Draw by how much estimated points are off the commanded ones at the same time, x, y, z."""
-    inside = (at >= seconds[0]) & (at <= seconds[-1])
-    for name, column, point in zip("xyz", wanted.T, points.T, strict=True):
-        off = point[inside] - np.interp(at[inside], seconds, column)
-        axes.plot(*_broken(at[inside], off * 1e6), lw=0.8, label=f"{name} in base")
-    axes.set(title="estimated − commanded, lag included", xlabel="time, s", ylabel="µm")
-    axes.legend(fontsize=7)
 
 
 def refused_figure(report: Report) -> Figure:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..compensation.compensator import BESIDE_NUMBERS, PLACES, Compensator, pack_pose
-from ..compensation.journal import Entry, Page, Snapshot, time_of
+from ..compensation.journal import Entry, Snapshot, time_of
 from ..errors import FrameError, HexapodError
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
@@ -113,7 +113,7 @@ def replay_recording(
     InputFileError
         Geometry or model in use are not at hand.
     """
-    return _AsItWas(recording, progress, files or Files(recording, {})).run()
+    return _Run(recording, progress, files or Files(recording, {})).run()
 
 
 def what_if(
@@ -121,30 +121,28 @@ def what_if(
 ) -> Replay:
     """Run the recorded commands through another model, or another geometry."""
     # Temperatures, humidity, switching and starts are those of the recording; its own models are not. The corrections
-    # begin at the other model's: nothing ramps. All answers are run; nothing is left out after lost pages.
-    run = _Run(recording, progress)
-    compensator = Compensator(geometry, model)
-    compensator.restore(_begin(compensator, recording.first))
+    # begin at the other model's: nothing ramps. All answers are run; nothing is left out after lost pages. Of the
+    # snapshot no more than what another machine can take over counts: directions, switches, the tool's name.
+    compensator, state = Compensator(geometry, model), recording.first.state
+    kept = ("temperatures", "tool", "motion_sense", "enabled", "resumes", "ramp_rate")
+    fresh = compensator.snapshot() | {name: value for name, value in state.items() if name in kept}
+    compensator.restore(fresh | {"motion_sense": np.nan_to_num(fresh["motion_sense"])})
+    run = _Run(recording, progress, None)
     run.take(compensator)
     return run.run()
 
 
-def _begin(compensator: Compensator, snapshot: Snapshot) -> dict[str, Any]:
-    """Return a snapshot with no more than what another machine can take over: directions, switches, the tool's name."""
-    kept = ("temperatures", "tool", "motion_sense", "enabled", "resumes", "ramp_rate")
-    fresh = compensator.snapshot() | {name: value for name, value in snapshot.state.items() if name in kept}
-    return fresh | {"motion_sense": np.nan_to_num(fresh["motion_sense"])}
-
-
 class _Run:
-    """A replay under way: all pages, step by step."""
+    """A replay under way, page by page: with what was in use, from its files, or with one compensator throughout."""
 
     compensator: Compensator
 
-    def __init__(self, recording: Recording, progress: Progress) -> None:
-        self._recording, self._progress = recording, progress
+    def __init__(self, recording: Recording, progress: Progress, files: Files | None) -> None:
+        self._recording, self._progress, self._files = recording, progress, files
         self._commands, count = recording.commands, len(recording.commands)
         self.result = Replay(self._commands, np.full(count, BEFORE), np.full((count, 2, 6), np.nan))
+        self._known = files is None  # whether the compensator is in the recorded state
+        self._in_use = "", ""  # hashes of its geometry and model
 
     def take(self, compensator: Compensator) -> None:
         """Give the commands from now on to a compensator."""
@@ -153,33 +151,37 @@ class _Run:
 
     def run(self) -> Replay:
         """Return what comes of it."""
-        row, result = 0, self.result
+        row, result, otherwise, expected = 0, self.result, BEFORE, ("", 0, 0)
         for time, page in self._recording.pages:
-            self.begin(page)
+            if self._files is not None:  # after a lost page nothing is known until the next snapshot
+                session, _, begins = expected
+                self._known &= expected == (page.session, page.number, page.begins)
+                if session == page.session:
+                    result.lost += max(0, page.begins - begins)
+                expected = page.session, page.number + 1, page.begins + len(page.commands)
             for entry in page.steps():
                 if entry is None:
-                    result.outcome[row] = self.step(row)
+                    result.outcome[row] = self._step(row) if self._known else otherwise
                     row += 1
                     self._progress(1)
                 elif entry.what == "refused":
                     result.refused.append(Event(row, time, entry))
                 else:
                     result.changes.append(Event(row, time, entry))
-                    self.change(entry)
-            if page.snapshot is not None:
-                self.check(page.snapshot, row)
+                    if self._known:
+                        self._change(entry)
+            if self._files is not None and page.snapshot is not None:
+                self._resume(self._files, page.snapshot, row)
+                self._known, otherwise = True, LOST
         return result
 
-    def begin(self, page: Page) -> None:
-        """Begin a page."""
-
-    def check(self, snapshot: Snapshot, row: int) -> None:
-        """Compare states before answer `row`."""
-
-    def change(self, entry: Entry) -> None:
-        """Make a change that the journal tells of."""
+    def _change(self, entry: Entry) -> None:
+        """Make a change that the journal holds."""
         values = entry.values
-        if entry.what == "temperature":
+        if entry.what == "model" and self._files is not None:
+            self.compensator.set_model(self._files.model(values, self.compensator.geometry))
+            self._in_use = self._in_use[0], values["sha256"]
+        elif entry.what == "temperature":
             self.compensator.set_temperature(values["name"], float(values["value"]), float(values["time"]))
         elif entry.what == "humidity":
             self.compensator.set_humidity(float(values["value"]), float(values["time"]))
@@ -193,7 +195,7 @@ class _Run:
             measured = values["measured"]
             self.compensator.reset(None if measured is None else np.array(measured, dtype=float))
 
-    def step(self, row: int) -> int:
+    def _step(self, row: int) -> int:
         """Give the command that was answered, as the node did; return what comes of it."""
         asked, given = self._commands[row], self.result.lengths[row]
         try:
@@ -209,50 +211,18 @@ class _Run:
         given[0], given[1] = self.compensator.command, self.compensator.correction
         return IDENTICAL if given.tobytes() == asked["lengths"].tobytes() else DIFFERENT
 
-
-class _AsItWas(_Run):
-    """A replay with what was in use."""
-
-    def __init__(self, recording: Recording, progress: Progress, files: Files) -> None:
-        super().__init__(recording, progress)
-        self._files = files
-        self._known, self._otherwise = False, BEFORE
-        self._in_use = "", ""
-        self._next = "", 0, 0
-
-    def begin(self, page: Page) -> None:
-        """Notice lost pages: from there on nothing is known until the next snapshot."""
-        session, _, begins = self._next
-        self._known &= self._next == (page.session, page.number, page.begins)
-        if session == page.session:
-            self.result.lost += max(0, page.begins - begins)
-        self._next = page.session, page.number + 1, page.begins + len(page.commands)
-
-    def change(self, entry: Entry) -> None:
-        """Make a change that the journal tells of."""
-        if not self._known:
-            return
-        if entry.what == "model":
-            self.compensator.set_model(self._files.model(entry.values, self.compensator.geometry))
-            self._in_use = self._in_use[0], entry.values["sha256"]
-        super().change(entry)
-
-    def step(self, row: int) -> int:
-        """Compare an answer, if the state before it is known."""
-        return super().step(row) if self._known else self._otherwise
-
-    def check(self, snapshot: Snapshot, row: int) -> None:
-        """Compare states, and go on from the recorded one."""
+    def _resume(self, files: Files, snapshot: Snapshot, row: int) -> None:
+        """Compare states before answer `row`, and go on from the recorded one."""
         in_use = snapshot.geometry["sha256"], snapshot.model["sha256"]
         same = in_use == self._in_use
         if not same:
-            geometry = self._files.geometry(snapshot.geometry)
-            self.take(Compensator(geometry, self._files.model(snapshot.model, geometry)))
+            geometry = files.geometry(snapshot.geometry)
+            self.take(Compensator(geometry, files.model(snapshot.model, geometry)))
         if not same or not _same_state(self.compensator.snapshot(), snapshot.state):
             self.compensator.restore(snapshot.state)
             if self._known:
                 self.result.states_differ.append(row)
-        self._in_use, self._known, self._otherwise = in_use, True, LOST
+        self._in_use = in_use
 
 
 def _same_state(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:

@@ -1,4 +1,4 @@
-"""What a replay prints: is it the same, where does it part, what was refused, and the figures of the run."""
+"""What a replay shows: is it the same, where does it part, what was refused, and the figures of the run."""
 
 from __future__ import annotations
 
@@ -19,24 +19,21 @@ from .bag import Recording
 from .replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Event, Replay
 
 # Names of outcomes in CSV and JSON
-OUTCOMES = {
-    IDENTICAL: "identical",
-    DIFFERENT: "different",
-    LOST: "not replayed",
-    BEFORE: "before the journal",
-}
+OUTCOMES = {IDENTICAL: "identical", DIFFERENT: "different", LOST: "not replayed", BEFORE: "before the journal"}
 
 # Differences below this, m, are those of another processor's or library's rounding, not of another model
 ROUNDING = 1e-12
 
 LONGEST_GAP = 0.1  # between commands further apart, s, nobody can tell what the struts should have done
 
+Part = tuple[list[str], dict[str, Any]]  # of a report: its lines, and the same under their keys in JSON
+
 
 @dataclass
 class Report:
-    """Everything that one replay has to tell."""
+    """A recording, and what came of its replays."""
 
-    recording: Recording  # what was read
+    recording: Recording
     replayed: Replay | None  # with what was in use; None when geometry or model were not at hand
     other: Replay | None = None  # with another model or geometry
     other_name: str = ""  # what that was
@@ -47,8 +44,11 @@ class Report:
     @property
     def seconds(self) -> np.ndarray:
         """Time of each answer since the first, s, by their stamps."""
-        stamps = self.recording.commands["stamp"]
-        return since(stamps, stamps)
+        return self.since(self.recording.commands["stamp"])
+
+    def since(self, stamps: np.ndarray) -> np.ndarray:
+        """Return stamps, ns, as seconds since the first answer's."""
+        return (stamps - self.recording.commands["stamp"][0]) * 1e-9
 
     @property
     def strut_commands(self) -> np.ndarray:
@@ -84,55 +84,102 @@ class Report:
         worst = np.abs(replayed.difference[replayed.different]).max(initial=0.0)  # NaN where one is refused now
         return bool(self.tolerance > 0.0 and worst <= self.tolerance)
 
+    def shown(self) -> tuple[str, dict[str, Any]]:
+        """Return the report as text, and as plain data with lengths in m."""
+        lines, content = list[str](), dict[str, Any]()
+        for text, data in (_run(self), _compared(self), _with_other(self), _figures(self), _refused(self)):
+            lines += text
+            content |= data
+        notes = self.recording.notes
+        return "\n".join([*lines, *(f"note: {note}" for note in notes)]), content | {"notes": notes}
 
-def since(stamps: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """Return stamps, ns, as seconds since the first of `origin`."""
-    return (stamps - origin[0]) * 1e-9
+    def place(self, row: int) -> str:
+        """Say which answer one is."""
+        if row >= len(self.recording.commands):
+            return "the end"
+        stamp = int(self.recording.commands["stamp"][row])
+        return f"answer {row + 1} (stamp {stamp // 10**9}.{stamp % 10**9:09d}, {self.seconds[row]:.3f} s)"
 
 
-def text(report: Report) -> str:
-    """Return the report."""
-    lines = [*_run_text(report), *_replay_text(report), *_other_text(report), *_figures(report), *_refused_text(report)]
-    return "\n".join([*lines, *(f"note: {note}" for note in report.recording.notes)])
-
-
-def _run_text(report: Report) -> Iterator[str]:
-    recording, stamps = report.recording, report.recording.commands["stamp"]
-    machine, model = (printable(one["name"]) for one in (recording.first.geometry, recording.first.model))
-    yield f"{recording.path}: {printable(recording.node)}, machine {machine}, model {model}"
-    began = datetime.fromtimestamp(stamps[0] * 1e-9, timezone.utc)
+def _run(report: Report) -> Part:
+    """Say which run it is, and how many commands were answered."""
+    recording, answers = report.recording, len(report.recording.commands)
+    first = recording.first
+    machine, model = (printable(one["name"]) for one in (first.geometry, first.model))
+    began = datetime.fromtimestamp(recording.commands["stamp"][0] * 1e-9, timezone.utc)
     heard = f"; the recorder heard {recording.heard}" if recording.heard else ""
-    yield (
-        f"from {began:%Y-%m-%d %H:%M:%S} UTC, {report.seconds[-1]:.1f} s: {len(stamps) + report.refusals} commands "
-        f"taken, {len(stamps)} answered, {report.refusals} refused{heard}"
-    )
+    lines = [
+        f"{recording.path}: {printable(recording.node)}, machine {machine}, model {model}",
+        f"from {began:%Y-%m-%d %H:%M:%S} UTC, {report.seconds[-1]:.1f} s: {answers + report.refusals} commands "
+        f"taken, {answers} answered, {report.refusals} refused{heard}",
+    ]
+    return lines, {
+        "bag": recording.path,
+        "node": recording.node,
+        "geometry": first.geometry,
+        "model": first.model,
+        "commands": answers + report.refusals,
+        "commands_heard_by_recorder": recording.heard,
+        "answers": answers,
+        "answers_lost": None if report.replayed is None else report.replayed.lost,
+        "same": None if report.replayed is None else report.same,
+        "made_with": first.made_with,
+        "refused": report.refusals,
+    }
 
 
-def _replay_text(report: Report) -> Iterator[str]:
-    """Yield what came of the replay, and where and how it first differs."""
+def _compared(report: Report) -> Part:
+    """Say what came of the replay with what was in use, and where and how it first differs."""
     replayed = report.replayed
     if replayed is None:
-        yield "not replayed as it was: geometry and model that were in use are not at hand"
-        return
-    counts, count = Counter(replayed.outcome.tolist()), len(replayed.commands)
+        return ["not replayed as it was: geometry and model that were in use are not at hand"], {}
+    counts, stamps = Counter(replayed.outcome.tolist()), [*replayed.commands["stamp"].tolist(), None]
     same, different = counts[IDENTICAL], counts[DIFFERENT]
     found = f"{same} identical bit for bit, {different} different" if different else "identical bit for bit"
-    yield f"replayed {same + different} of {count} answers: {found}"
+    lines = [f"replayed {same + different} of {len(replayed.commands)} answers: {found}"]
     if replayed.lost:
-        yield f"the recorder has lost answers that the journal counts: {replayed.lost}"
+        lines.append(f"the recorder has lost answers that the journal counts: {replayed.lost}")
     if counts[LOST]:
-        yield f"left out: {counts[LOST]} answers after lost pages of the journal, up to its next snapshot"
+        lines.append(f"left out: {counts[LOST]} answers after lost pages of the journal, up to its next snapshot")
     if counts[BEFORE]:
-        yield f"left out: {counts[BEFORE]} answers before the journal's first snapshot"
+        lines.append(f"left out: {counts[BEFORE]} answers before the journal's first snapshot")
     changes = Counter(event.entry.what for event in replayed.changes)
     listed = ", ".join(f"{count} × {what}" for what, count in sorted(changes.items())) or "none"
-    yield f"changes between commands: {listed}; {len(report.recording.pages)} pages of the journal"
-    if replayed.states_differ and not different:
-        place = _place(report, replayed.states_differ[0])
-        yield f"answers agree, but the compensator's state is another first before {place}"
-    if not different:
-        return
-    row, worst = int(replayed.different[0]), replayed.largest_difference
+    lines.append(f"changes between commands: {listed}; {len(report.recording.pages)} pages of the journal")
+    first = None
+    if different:
+        row = int(replayed.different[0])
+        recorded, now, refusal = replayed.commands["lengths"][row], replayed.lengths[row], replayed.refused_now.get(row)
+        lines += _difference(report, replayed, row)
+        first = {
+            "stamp_ns": stamps[row],
+            "recorded_correction_m": recorded[1],
+            "replayed_correction_m": now[1],
+            "refused_now": refusal,
+        }
+    elif replayed.states_differ:
+        place = report.place(replayed.states_differ[0])
+        lines.append(f"answers agree, but the compensator's state is another first before {place}")
+    return lines, {
+        "outcomes": {name: counts[outcome] for outcome, name in OUTCOMES.items()},
+        "first_difference": first,
+        "largest_difference_m": replayed.largest_difference,
+        "states_differ": len(replayed.states_differ),
+        "changes": [
+            {"before_stamp_ns": stamps[e.row], "what": e.entry.what, **e.entry.values} for e in replayed.changes
+        ],
+        "refusals": [
+            {"before_stamp_ns": stamps[event.row], "stamp_ns": values["stamp"]}
+            | {k: values[k] for k in ("reason", "text")}
+            for event in replayed.refused
+            for values in (event.entry.values,)
+        ],
+    }
+
+
+def _difference(report: Report, replayed: Replay, row: int) -> Iterator[str]:
+    """Yield how the first answer that differs does, how large the largest difference is, and what it may come from."""
+    worst = replayed.largest_difference
     if row in replayed.refused_now:
         how = f"the replay refuses the command ({replayed.refused_now[row]})"
     else:
@@ -141,38 +188,34 @@ def _replay_text(report: Report) -> Iterator[str]:
         kind, n = next(place for place in places if recorded[place].tobytes() != now[place].tobytes())
         was, is_now = (float(one[kind, n]) * 1e6 for one in (recorded, now))
         how = f"strut_{n + 1}, {('command', 'correction')[kind]} recorded {was!r} µm, replayed {is_now!r} µm"
-    yield f"first difference: {_place(report, row)}: {how}"
+    yield f"first difference: {report.place(row)}: {how}"
     accepted = f", accepted up to {report.tolerance * 1e6:g} µm" if report.same else ""
     yield f"largest difference {worst * 1e6:.9g} µm{accepted}"
     then, here = report.recording.first.made_with, made_with()
-    unlike = [
-        f"{key} {printable(then[key])}, here {here[key]}" for key in here if then.get(key, here[key]) != here[key]
-    ]
+    unlike = [f"{key} {printable(then[key])}, here {here[key]}"
+              for key in here if then.get(key, here[key]) != here[key]]  # fmt: skip
     if unlike:
         yield f"{'it is of the size of rounding; ' if worst < ROUNDING else ''}recorded with {'; '.join(unlike)}"
 
 
-def _place(report: Report, row: int) -> str:
-    if row >= len(report.recording.commands):
-        return "the end"
-    stamp = int(report.recording.commands["stamp"][row])
-    return f"answer {row + 1} (stamp {stamp // 10**9}.{stamp % 10**9:09d}, {report.seconds[row]:.3f} s)"
-
-
-def _other_text(report: Report) -> Iterator[str]:
+def _with_other(report: Report) -> Part:
+    """Say what another model or geometry would have corrected."""
     other = report.other
     if other is None:
-        return
+        return [], {}
     difference = np.abs(other.difference)
-    seen = int(np.isfinite(difference).all(axis=1).sum())
-    yield f"with {report.other_name}: {seen} answers; corrections differ from the recorded ones by"
-    if seen:
+    answered = difference[np.isfinite(difference).all(axis=1)]
+    lines = [f"with {report.other_name}: {len(answered)} answers; corrections differ from the recorded ones by"]
+    if len(answered):
         # The recorded ones may ramp at their ends; what follows is what a machinist would see on the struts.
-        sizes = [(f"{_rms(column):.3f}", f"{np.nanmax(column) * 1e6:.3f}") for column in difference.T]
-        yield aligned(["", "RMS_um", "max_um"], [[f"strut_{n + 1}", *size] for n, size in enumerate(sizes)])
+        sizes = ((f"{_rms(column):.3f}", f"{np.nanmax(column) * 1e6:.3f}") for column in difference.T)
+        lines.append(aligned(["", "RMS_um", "max_um"], [[f"strut_{n}", *size] for n, size in enumerate(sizes, 1)]))
     if other.refused_now:
         row, why = next(iter(other.refused_now.items()))
-        yield f"  it refuses {len(other.refused_now)} commands, first {_place(report, row)}: {why}"
+        lines.append(f"  it refuses {len(other.refused_now)} commands, first {report.place(row)}: {why}")
+    largest = np.nanmax(difference, axis=0, initial=0.0)
+    refused = len(other.refused_now)
+    return lines, {"other": {"name": report.other_name, "largest_difference_m": largest, "refused": refused}}
 
 
 def _rms(values: np.ndarray) -> float:
@@ -180,24 +223,32 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.nanmean(np.square(values)))) * 1e6
 
 
-def _figures(report: Report) -> Iterator[str]:
+def _figures(report: Report) -> Part:
+    """Say how large corrections, following errors and distances of the tool to its path are."""
+
     def size(distances: np.ndarray) -> str:
         return f"{_rms(distances):.2f}/{np.abs(distances).max() * 1e6:.2f}"
 
-    corrections = report.strut_corrections
+    def data(distances: np.ndarray | None) -> dict[str, float] | None:
+        return None if distances is None else {"rms_m": _rms(distances) * 1e-6, "max_m": float(distances.max())}
+
+    lines, tools, corrections = list[str](), dict[str, Any](), report.strut_corrections
     if np.isfinite(corrections).any():
         row, strut = divmod(int(np.nanargmax(np.abs(corrections))), 6)
-        yield f"largest correction {corrections[row, strut] * 1e6:.3f} µm, strut_{strut + 1}, {_place(report, row)}"
+        largest = f"{corrections[row, strut] * 1e6:.3f} µm, strut_{strut + 1}, {report.place(row)}"
+        lines.append(f"largest correction {largest}")
     _, error = following_error(report)
     if len(error):
         shown = " ".join(map(size, error.T))
-        yield f"following error (measured − commanded, drives' lag included), RMS/largest µm per strut: {shown}"
-    for name, raw, left in tool_distances(report):
+        lines.append(f"following error (measured − commanded, drives' lag included), RMS/largest µm per strut: {shown}")
+    for name, raw, left in _tool_distances(report):
         shown = f"as it is {size(raw)}" + ("" if left is None else f", datum aligned {size(left)}")
-        yield f"distance of {name} to the commanded path, RMS/largest µm: {shown}"
+        lines.append(f"distance of {name} to the commanded path, RMS/largest µm: {shown}")
+        tools[name] = {"as_it_is": data(raw), "datum_aligned": data(left)}
+    return lines, {"distance_to_path": tools}
 
 
-def tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
+def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
     """Yield by how much the tool was off its path: a topic, distances as they are, and with the datum aligned, m."""
     # A late tool is not off. The second is None where the tool moved in a line or not at all.
     when = report.seconds
@@ -206,8 +257,7 @@ def tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray
     corners = tool_positions(report.recording, report.work_frames)
     for name in ("tool_pose_estimate", "tool_pose_true"):
         poses = report.recording.topics[name]
-        stamps = poses.stamps if poses.stamps.all() else poses.times
-        at = since(stamps, report.recording.commands["stamp"])
+        at = report.since(poses.when)
         inside = (at >= when[0]) & (at <= when[-1])
         if not inside.any():
             continue
@@ -220,26 +270,26 @@ def tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray
         yield name, raw, left
 
 
-def _refused_text(report: Report) -> Iterator[str]:
+def _refused(report: Report) -> Part:
+    """Say which commands were refused, by reason."""
     if not report.refusals:
-        return
+        return [], {}
     unnamed = report.refusals - len(report.refused)
-    yield f"refused commands: {report.refusals}" + (f", {unnamed} of them not named in the journal" if unnamed else "")
-    rows = []
-    for reason, count in Counter(event.entry.values["reason"] for event in report.refused).most_common():
+    counts, rows = Counter(event.entry.values["reason"] for event in report.refused), []
+    for reason, count in counts.most_common():
         first = next(event for event in report.refused if event.entry.values["reason"] == reason)
-        when = report.since_first_page(first.time)
-        rows.append([printable(reason), str(count), f"{when:.2f}", printable(first.entry.values["text"])])
-    yield aligned(["reason", "count", "first_s", ""], rows)
+        when = f"{report.since_first_page(first.time):.2f}"
+        rows.append([printable(reason), str(count), when, printable(first.entry.values["text"])])
+    title = f"refused commands: {report.refusals}" + (f", {unnamed} of them not named in the journal" * bool(unnamed))
+    return [title, aligned(["reason", "count", "first_s", ""], rows)], {}
 
 
 def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
-    """Return by how much the measured struts were off their commands."""
+    """Return by how much the measured struts were off their commands: times, s, (n,), and errors, m, (n, 6)."""
     states, when = report.recording.topics["strut_states"], report.seconds
     if len(when) < 2 or not len(states):
         return np.zeros(0), np.zeros((0, 6))
-    # Drives that do not stamp are taken by the recorder's clock.
-    at = since(states.stamps if states.stamps.all() else states.times, report.recording.commands["stamp"])
+    at = report.since(states.when)
     after = np.clip(np.searchsorted(when, at), 1, len(when) - 1)
     inside = (at >= when[0]) & (at <= when[-1]) & (when[after] - when[after - 1] <= LONGEST_GAP)
     wanted = np.stack([np.interp(at[inside], when, column) for column in report.strut_commands.T], axis=1)
@@ -255,15 +305,15 @@ def tool_positions(recording: Recording, work_frames: Mapping[str, Pose]) -> np.
     return positions
 
 
-def rows_of(report: Report) -> list[dict[str, Any]]:
-    """Return one CSV row per answer: stamps, commands (mm), corrections (µm) recorded, replayed and with the other."""
+def rows_of(report: Report) -> Iterator[dict[str, Any]]:
+    """Yield one CSV row per answer: stamps, commands (mm), corrections (µm) recorded, replayed and with the other."""
     replayed, other = report.replayed, report.other
     corrections = {"recorded": report.strut_corrections}
     if replayed is not None:
         corrections["replayed"] = replayed.lengths[:, 1]
     if other is not None:
         corrections["other"] = other.lengths[:, 1]
-    rows, stamps = [], report.recording.commands["stamp"].tolist()
+    stamps = report.recording.commands["stamp"].tolist()
     for n, (stamp, time) in enumerate(zip(stamps, report.seconds.tolist(), strict=True)):
         row: dict[str, Any] = {"stamp_ns": stamp, "time_s": time}
         row |= {f"L{i + 1}_mm": v * 1e3 for i, v in enumerate(report.strut_commands[n].tolist())}
@@ -271,69 +321,4 @@ def rows_of(report: Report) -> list[dict[str, Any]]:
             row |= {f"{name}_L{i + 1}_um": v * 1e6 for i, v in enumerate(values[n].tolist())}
             if replayed is not None and name == "replayed":
                 row["outcome"] = OUTCOMES[int(replayed.outcome[n])]
-        rows.append(row)
-    return rows
-
-
-def as_json(report: Report) -> dict[str, Any]:
-    """Return the report as plain data; lengths in m."""
-
-    def size(distances: np.ndarray | None) -> dict[str, float] | None:
-        return None if distances is None else {"rms_m": _rms(distances) * 1e-6, "max_m": float(distances.max())}
-
-    recording, replayed, other = report.recording, report.replayed, report.other
-    distances = {name: (size(raw), size(left)) for name, raw, left in tool_distances(report)}
-    content: dict[str, Any] = {
-        "bag": recording.path,
-        "node": recording.node,
-        "geometry": recording.first.geometry,
-        "model": recording.first.model,
-        "commands": len(recording.commands) + report.refusals,
-        "commands_heard_by_recorder": recording.heard,
-        "answers": len(recording.commands),
-        "answers_lost": replayed.lost if replayed is not None else None,
-        "same": report.same if replayed is not None else None,
-        "made_with": recording.first.made_with,
-        "refused": report.refusals,
-        "notes": recording.notes,
-        "distance_to_path": {n: {"as_it_is": raw, "datum_aligned": left} for n, (raw, left) in distances.items()},
-    }
-    if replayed is not None:
-        content |= _replay_json(replayed)
-    if other is not None:
-        content["other"] = {
-            "name": report.other_name,
-            "largest_difference_m": np.nanmax(np.abs(other.difference), axis=0, initial=0.0),
-            "refused": len(other.refused_now),
-        }
-    return content
-
-
-def _replay_json(replayed: Replay) -> dict[str, Any]:
-    def before(row: int) -> int | None:
-        """Return the stamp of the answer that an event precedes; None after the last."""
-        return int(replayed.commands["stamp"][row]) if row < len(replayed.commands) else None
-
-    counts, first = Counter(replayed.outcome.tolist()), None
-    if len(replayed.different):
-        row = int(replayed.different[0])
-        first = {
-            "stamp_ns": before(row),
-            "recorded_correction_m": replayed.commands["lengths"][row, 1],
-            "replayed_correction_m": replayed.lengths[row, 1],
-            "refused_now": replayed.refused_now.get(row),
-        }
-    changes = [{"before_stamp_ns": before(e.row), "what": e.entry.what, **e.entry.values} for e in replayed.changes]
-    refusals = [
-        {"before_stamp_ns": before(event.row), "stamp_ns": values["stamp"]} | {k: values[k] for k in ("reason", "text")}
-        for event in replayed.refused
-        for values in (event.entry.values,)
-    ]
-    return {
-        "outcomes": {name: counts[outcome] for outcome, name in OUTCOMES.items()},
-        "first_difference": first,
-        "largest_difference_m": replayed.largest_difference,
-        "states_differ": len(replayed.states_differ),
-        "changes": changes,
-        "refusals": refusals,
-    }
+        yield row

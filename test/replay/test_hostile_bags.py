@@ -26,7 +26,7 @@ from hexapod_comp.errors import HexapodError, InputFileError
 from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.replay.bag import FILES, JOURNAL, Files, _Collected, read_recording
 from hexapod_comp.replay.replay import replay_recording, what_if
-from hexapod_comp.replay.report import Report, as_json, rows_of, text
+from hexapod_comp.replay.report import Report, rows_of
 
 VALUES = [[], {}, None, "x", 1e308, {"a": [1.0]}]
 
@@ -137,10 +137,10 @@ def test_any_value_in_any_place_of_the_journal(machine: RecordedMachine, monkeyp
     def replayed(now: list[tuple[str, int, str]]) -> None:
         collected = _Collected("bag", "/compensator")
         for name, time, content in now:
-            collected._take_text(name, time, content)
+            collected.take_text(name, time, content)
         recording = collected.recording([], 0)
         report = Report(recording, replay_recording(recording, Files(recording, {})), tolerance=1e-6)
-        text(report), as_json(report), list(rows_of(report))
+        report.shown(), list(rows_of(report))
         what_if(recording, machine.geometry, MachineModel(machine.geometry.name))
 
     monkeypatch.setattr(Source, "geometry", lambda source: machine.geometry)  # both take most of the time

@@ -130,7 +130,8 @@ def without(messages: Messages, *numbers: int) -> Messages:
 
 def call(*arguments: object) -> int:
     """Run the verb as the command line does, errors apart."""
-    return verb.run(make_parser().parse_args(["replay", *map(str, arguments)]))
+    args = make_parser().parse_args(["replay", *map(str, arguments)])
+    return verb.run(args).finish(args)
 
 
 # ---- the same bits ----
