@@ -130,7 +130,13 @@ def _figures(axes: Axes, rows: Sequence[ErrorRow], calibration: Calibration | No
         ]
     axes.set_xlabel("µm, RMS" + (";  * Mou & King (1998), mean |error|" if calibration else ""))
     for height, (_, before, after, promised) in enumerate(entries):
-        _from_to(axes, height, before, after, promised)
+        if promised is not None:
+            low, high = (max(v * 1e6, FLOOR) for v in promised)
+            axes.fill_betweenx([height - 0.25, height + 0.25], low, high, color=WITH, alpha=0.2, lw=0.0)
+        if before is not None:
+            axes.plot([before * 1e6, after * 1e6], [height, height], color="0.6", lw=1.5, zorder=1)
+            axes.plot(before * 1e6, height, SIDES[0][2], color=WITHOUT)
+        axes.plot(after * 1e6, height, SIDES[1][2], color=WITH)
     axes.set(
         title="Tool error, without → with compensation",
         xscale="log",
@@ -144,14 +150,3 @@ def _figures(axes: Axes, rows: Sequence[ErrorRow], calibration: Calibration | No
         if before is not None:
             text = f"{100.0 * (1.0 - after / before):.1f} % less" if after <= before else "more"
             axes.annotate(text, (before * 1e6, height), (8, 0), textcoords="offset points", va="center")
-
-
-def _from_to(axes: Axes, height: int, before: float | None, after: float, promised: tuple[float, float] | None) -> None:
-    """Draw one line from an error without compensation to that with it, m."""
-    if promised is not None:
-        low, high = (max(v * 1e6, FLOOR) for v in promised)
-        axes.fill_betweenx([height - 0.25, height + 0.25], low, high, color=WITH, alpha=0.2, lw=0.0)
-    if before is not None:
-        axes.plot([before * 1e6, after * 1e6], [height, height], color="0.6", lw=1.5, zorder=1)
-        axes.plot(before * 1e6, height, SIDES[0][2], color=WITHOUT)
-    axes.plot(after * 1e6, height, SIDES[1][2], color=WITH)

@@ -1,10 +1,9 @@
-"""What a witnessed run prints: one block per pose, a table of errors, how the loop answered, and what was wrong."""
+"""What a witnessed run saw, and what is printed of it: poses, a table of errors, the loop's answers, what was wrong."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,14 +13,13 @@ from ..machine.arrays import rms
 from ..machine.trajectory import Path, feet_on
 from ..pose import Pose, best_motion, rotation_angle
 
-if TYPE_CHECKING:
-    pass
-
-
 FEWEST_ALIGNED = 6  # a datum takes six numbers away, two poses' worth: from fewer poses hardly anything would be left
 
 # A computer is called busy when more of its answers are late, or when its processes wait for more of the time
 LATE_SHARE, WAITED_SHARE = 0.02, 0.2
+
+# Rigid motions of what was commanded, and of what the tool did without and with compensation; None: nobody knows it
+Motions = tuple[Pose, "Pose | None", "Pose | None"]
 
 
 @dataclass
@@ -29,26 +27,35 @@ class PoseRecord:
     """What happened at one commanded pose; m, rotation matrices; all poses in one frame, ``base`` at first."""
 
     target: Pose  # commanded pose of the tool
-    # (6,): compensated strut commands and their correction, m
-    command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))
-    # (6,): compensated strut commands and their correction, m
-    correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))
+    command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # (6,): compensated strut commands, m
+    correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # (6,): how they were corrected, m
     estimate: Pose | None = None  # estimated pose of the tool with compensation
-    true_without: Pose | None = None  # where the tool really was, when anybody can tell
-    true_with: Pose | None = None  # where the tool really was, when anybody can tell
+    true_without: Pose | None = None  # where the tool really was without compensation, when anybody knows
+    true_with: Pose | None = None  # and with it
 
-    def seen_from(self, frame: Pose) -> PoseRecord:
-        """Return the same with its poses in another frame, whose own pose is given in the present one."""
-        inverse = frame.inverse()
-        estimate, without, compensated = (
-            None if pose is None else inverse @ pose for pose in (self.estimate, self.true_without, self.true_with)
+    def moved(self, motions: Motions) -> PoseRecord:
+        """Return the same with its poses moved."""
+        target, estimate, without, compensated = (
+            None if motion is None or pose is None else motion @ pose
+            for motion, pose in zip(
+                (motions[0], *motions), (self.target, self.estimate, self.true_without, self.true_with), strict=True
+            )
         )
-        target = inverse @ self.target
+        target = target or self.target
         return replace(self, target=target, estimate=estimate, true_without=without, true_with=compensated)
 
     def errors(self) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
-        """Return (position error m, rotation error rad) without and with compensation."""
-        return pose_error(self.target, self.true_without), pose_error(self.target, self.true_with)
+        """Return (position error m, rotation error rad) without and with compensation; None where it is unknown."""
+        without, compensated = (
+            None
+            if actual is None
+            else (
+                float(np.linalg.norm(actual.position - self.target.position)),
+                rotation_angle(self.target.rotation.T @ actual.rotation),
+            )
+            for actual in (self.true_without, self.true_with)
+        )
+        return without, compensated
 
 
 @dataclass
@@ -75,24 +82,21 @@ class PathRecord:
     """What happened along a path."""
 
     path: Path  # commanded poses, in ``base`` at first
-    without: Track | None  # the two passes; None where there was none, or nobody to tell where the tool was
-    compensated: Track | None  # the two passes; None where there was none, or nobody to tell where the tool was
+    without: Track | None  # the pass without compensation; None where there was none, or nobody saw the tool
+    compensated: Track | None  # the pass with it
     corrections: np.ndarray  # (N, 6): corrections sent, m
 
-    def seen_from(self, frame: Pose) -> PathRecord:
-        """Return the same in another frame, whose own pose is given in the present one."""
-        inverse = frame.inverse()
-        path = Path(_moved(inverse, self.path.positions), inverse.rotation @ self.path.rotations, self.path.rate)
-        return self._with(path, (inverse, inverse))
+    def moved(self, motions: Motions) -> PathRecord:
+        """Return the same moved."""
 
-    def aligned(self, datums: tuple[Pose | None, Pose | None]) -> PathRecord:
-        """Return the same with each pass's true positions moved by its datum; a pass without a datum is left out."""
-        return self._with(self.path, datums)
+        def points(motion: Pose, positions: np.ndarray) -> np.ndarray:
+            return motion.position + positions @ motion.rotation.T
 
-    def _with(self, path: Path, motions: tuple[Pose | None, Pose | None]) -> PathRecord:
+        commanded = motions[0]
+        path = Path(points(commanded, self.path.positions), commanded.rotation @ self.path.rotations, self.path.rate)
         without, compensated = (
-            None if track is None or motion is None else Track.along(path, _moved(motion, track.positions), track.sent)
-            for track, motion in zip((self.without, self.compensated), motions, strict=True)
+            None if track is None or motion is None else Track.along(path, points(motion, track.positions), track.sent)
+            for track, motion in zip((self.without, self.compensated), motions[1:], strict=True)
         )
         return replace(self, path=path, without=without, compensated=compensated)
 
@@ -102,10 +106,8 @@ class Answering:
     """How fast the loop answered, and what kept it waiting."""
 
     latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))  # command to answer of the compensated pass, s
-    # commands of the whole session that were answered, and those of which the answer came after the next was due
-    answered: int = 0
-    # commands of the whole session that were answered, and those of which the answer came after the next was due
-    late: int = 0
+    answered: int = 0  # commands of the whole session that were answered
+    late: int = 0  # those of which the answer came after the next command was due
     longest: float = 0.0  # longest time to an answer in the whole session, s
     elapsed: float = 0.0  # length of the session, s
     waited: float = 0.0  # how long its processes waited for a processor, added up, s
@@ -121,57 +123,36 @@ class SessionResult:
     """Everything that a session has seen."""
 
     poses: list[PoseRecord] = field(default_factory=list)  # the single poses
-    path: PathRecord | None = None  # the path
-    answering: Answering = field(default_factory=Answering)  # how fast the loop answered
+    path: PathRecord | None = None
+    answering: Answering = field(default_factory=Answering)
     sent: int = 0  # commands of the whole session
-    lost: int = 0  # commands of the whole session
-    refused: int = 0  # commands of the whole session
+    lost: int = 0  # of these neither answered nor refused
+    refused: int = 0
     refusals: dict[str, int] = field(default_factory=dict)  # refused commands by reason
     model: str = ""  # model that the compensator ran
 
+    def _moved(self, motions: Motions) -> SessionResult:
+        path = None if self.path is None else self.path.moved(motions)
+        return replace(self, poses=[record.moved(motions) for record in self.poses], path=path)
+
     def seen_from(self, frame: Pose) -> SessionResult:
         """Return the same in another frame, whose own pose is given in the present one."""
-        path = None if self.path is None else self.path.seen_from(frame)
-        return replace(self, poses=[record.seen_from(frame) for record in self.poses], path=path)
+        inverse = frame.inverse()
+        return self._moved((inverse, inverse, inverse))
 
     def aligned(self) -> SessionResult | None:
         """Return the same once the datum is aligned: each pass by the rigid motion that fits its poses best."""
         # A path is moved by its pass's poses, as a workpiece whose zero was set by them. None with fewer than
-        # FEWEST_ALIGNED poses, with poses in a line, or when nobody told where the tool was.
-        before = _datum(self.poses, [record.true_without for record in self.poses])
-        after = _datum(self.poses, [record.true_with for record in self.poses])
-        if after is None:
-            return None
-        poses = []
-        for record in self.poses:
-            moved = _after(before, record.true_without), _after(after, record.true_with)
-            poses.append(replace(record, true_without=moved[0], true_with=moved[1]))
-        path = None if self.path is None else self.path.aligned((before, after))
-        return replace(self, poses=poses, path=path)
+        # FEWEST_ALIGNED poses, with poses in a line, or when nobody saw where the tool was.
+        targets = np.array([record.target.position for record in self.poses])
 
+        def datum(actual: list[Pose | None]) -> Pose | None:
+            seen = [pose.position for pose in actual if pose is not None]
+            return None if len(seen) < max(len(targets), FEWEST_ALIGNED) else best_motion(np.array(seen), targets)
 
-def _datum(records: Sequence[PoseRecord], actual: Sequence[Pose | None]) -> Pose | None:
-    """Return the rigid motion that brings true tool positions onto commanded ones; None where there is no telling."""
-    seen = [pose.position for pose in actual if pose is not None]
-    if len(seen) < len(records) or len(seen) < FEWEST_ALIGNED:
-        return None
-    return best_motion(np.array(seen), np.array([record.target.position for record in records]))
-
-
-def _after(motion: Pose | None, pose: Pose | None) -> Pose | None:
-    return None if motion is None or pose is None else motion @ pose
-
-
-def _moved(motion: Pose, points: np.ndarray) -> np.ndarray:
-    return motion.position + points @ motion.rotation.T
-
-
-def pose_error(target: Pose, actual: Pose | None) -> tuple[float, float] | None:
-    """Return distance (m) and angle (rad) between two poses, None when one is unknown."""
-    if actual is None:
-        return None
-    distance = float(np.linalg.norm(actual.position - target.position))
-    return distance, rotation_angle(target.rotation.T @ actual.rotation)
+        after = datum([record.true_with for record in self.poses])
+        before = datum([record.true_without for record in self.poses])
+        return None if after is None else self._moved((Pose.identity(), before, after))
 
 
 # How a tool error is taken: where the machine stands, or less the one rigid motion that a new zero takes up
@@ -182,99 +163,113 @@ AS_IT_IS, ALIGNED = "as it is", "datum aligned"
 class ErrorRow:
     """The tool's error at rest or along a path, in one way of taking it."""
 
-    what: str  # ``at rest`` or ``path``; :data:`AS_IT_IS` or :data:`ALIGNED`
-    datum: str  # ``at rest`` or ``path``; :data:`AS_IT_IS` or :data:`ALIGNED`
+    what: str  # ``at rest`` or ``path``
+    datum: str  # :data:`AS_IT_IS` or :data:`ALIGNED`
     count: int  # poses
-    # errors of the two passes, m: distances to the pose at rest, to the nearest place of the path along it
-    without: np.ndarray | None
-    # errors of the two passes, m: distances to the pose at rest, to the nearest place of the path along it
-    compensated: np.ndarray
+    without: np.ndarray | None  # errors of the pass without compensation, m: distances to the pose, or to the path
+    compensated: np.ndarray  # errors of the pass with it, m
     promised: tuple[float, float] | None = None  # between these the RMS is expected, m, with 95 %
 
     @property
-    def removed(self) -> float | None:
-        """Share of the RMS error that compensation removes."""
-        return None if self.without is None else 1.0 - rms(self.compensated) / rms(self.without)
+    def name(self) -> str:
+        """What it is called in tables."""
+        return f"{self.what}, {self.datum}"
 
+    @property
+    def complaint(self) -> str:
+        """What is wrong with the error that is left; empty when nothing is."""
+        left = rms(self.compensated)
+        if self.without is not None and left >= rms(self.without):
+            return f"{self.name}: compensation does not reduce the error"
+        if self.promised is None or left <= self.promised[1]:
+            return ""
+        return f"{self.name}: {left * 1e6:.3f} µm RMS are left; at most {self.promised[1] * 1e6:.3f} were promised"
 
-def pose_block(title: str, record: PoseRecord) -> str:
-    """Return the lines about one pose of the tool in the work frame: mm, degrees, µm, µrad."""
-    lines = [
-        f"{title}: tool in work",
-        f"  commanded   {_pose_text(record.target)}",
-        f"  struts      {_row(record.command * 1e3, '11.4f')} mm",
-        f"  correction  {_row(record.correction * 1e6, '+11.2f')} µm",
-    ]
-    if record.estimate is not None:
-        lines.append(f"  estimated   {_pose_text(record.estimate)}")
-    if record.true_with is not None:
-        lines.append(f"  true        {_pose_text(record.true_with)}")
-    without, compensated = record.errors()
-    if compensated is not None:
-        before = "" if without is None else f"without {_error_text(without)}   "
-        lines.append(f"  error       {before}with {_error_text(compensated)}")
-    return "\n".join(lines)
+    def cells(self) -> list[str]:
+        """Return the row of a table for people: name, RMS without and with, largest, share removed, promise."""
+        before, left = None if self.without is None else rms(self.without), rms(self.compensated)
+        of = "RMS of" if self.what == "at rest" else "RMS distance to a path of"
+        return [
+            self.name,
+            "–" if before is None else number(before * 1e6, 2),
+            number(left * 1e6, 3),
+            number(float(self.compensated.max()) * 1e6, 3),
+            "–" if before is None else f"{100.0 * (1.0 - left / before):.2f} %",
+            "–" if self.promised is None else "…".join(number(v * 1e6, 3) for v in self.promised),
+            f"{of} {self.count} poses",
+        ]
+
+    def record(self) -> dict[str, object]:
+        """Return the row for programs."""
+        without, compensated = (
+            None if errors is None else {"rms_um": rms(errors) * 1e6, "max_um": float(errors.max()) * 1e6}
+            for errors in (self.without, self.compensated)
+        )
+        promised = None if self.promised is None else [v * 1e6 for v in self.promised]
+        about = {"what": self.what, "datum": self.datum}
+        return {**about, "without": without, "with": compensated, "promised_rms_um": promised}
 
 
 def error_rows(result: SessionResult) -> list[ErrorRow]:
     """Return the tool's errors at rest and along the path, first with the datum aligned where that can be."""
-    taken = ((ALIGNED, result.aligned()), (AS_IT_IS, result))
-    rows = [_rest_row(datum, one.poses) for datum, one in taken if one is not None]
-    rows += [_path_row(datum, one.path) for datum, one in taken if one is not None and one.path is not None]
-    return [row for row in rows if row is not None]
-
-
-def _rest_row(datum: str, records: Sequence[PoseRecord]) -> ErrorRow | None:
-    pairs = [record.errors() for record in records]
-    before, after = ([error[0] for pair in pairs if (error := pair[side]) is not None] for side in (0, 1))
-    if not after:
-        return None
-    return ErrorRow("at rest", datum, len(records), np.array(before) if before else None, np.array(after))
-
-
-def _path_row(datum: str, path: PathRecord) -> ErrorRow | None:
-    def deviation(track: Track | None) -> np.ndarray | None:
-        return None if track is None else track.deviation
-
-    after = deviation(path.compensated)
-    return None if after is None else ErrorRow("path", datum, len(path.path), deviation(path.without), after)
+    taken = [(datum, one) for datum, one in ((ALIGNED, result.aligned()), (AS_IT_IS, result)) if one is not None]
+    rows = []
+    for datum, one in taken:
+        pairs = [record.errors() for record in one.poses]
+        before, after = (np.array([error[0] for pair in pairs if (error := pair[n]) is not None]) for n in (0, 1))
+        if len(after):
+            rows.append(ErrorRow("at rest", datum, len(pairs), before if len(before) else None, after))
+    for datum, one in taken:
+        if one.path is not None and one.path.compensated is not None:
+            without = None if one.path.without is None else one.path.without.deviation
+            rows.append(ErrorRow("path", datum, len(one.path.path), without, one.path.compensated.deviation))
+    return rows
 
 
 def error_table(rows: Sequence[ErrorRow]) -> str:
     """Return the table of errors: RMS without and with compensation, what that removes, the largest left; µm."""
-    promises = any(row.promised for row in rows)
-    header = ["tool error, µm", "without", "with", "largest", "removed", *(["promised"] if promises else [])]
-    return aligned([*header, ""], [[*_cells(row, promises), _about(row)] for row in rows])
+    table = [
+        ["tool error, µm", "without", "with", "largest", "removed", "promised", ""],
+        *(row.cells() for row in rows),
+    ]
+    if not any(row.promised for row in rows):
+        table = [[*cells[:5], cells[6]] for cells in table]
+    return aligned(table[0], table[1:])
 
 
-def _cells(row: ErrorRow, promises: bool) -> Iterator[str]:
-    yield f"{row.what}, {row.datum}"
-    yield "–" if row.without is None else number(rms(row.without) * 1e6, 2)
-    yield number(rms(row.compensated) * 1e6, 3)
-    yield number(float(row.compensated.max()) * 1e6, 3)
-    yield "–" if row.removed is None else f"{100.0 * row.removed:.2f} %"
-    if promises:
-        yield "–" if row.promised is None else "…".join(number(v * 1e6, 3) for v in row.promised)
+def pose_block(title: str, record: PoseRecord) -> str:
+    """Return the lines about one pose of the tool in the work frame: mm, degrees, µm, µrad."""
 
+    def pose(pose: Pose) -> str:
+        x, y, z = np.round(pose.position * 1e3, 4) + 0.0  # no minus before a zero
+        alpha, beta, gamma = np.round(np.degrees(pose.angles()), 5) + 0.0
+        return f"x {x:10.4f}  y {y:10.4f}  z {z:10.4f} mm   α {alpha:9.5f}  β {beta:9.5f}  γ {gamma:9.5f} °"
 
-def _about(row: ErrorRow) -> str:
-    return f"RMS of {row.count} poses" if row.what == "at rest" else f"RMS distance to a path of {row.count} poses"
+    lines = [
+        f"{title}: tool in work",
+        f"  commanded   {pose(record.target)}",
+        f"  struts      {' '.join(f'{v:11.4f}' for v in record.command * 1e3)} mm",
+        f"  correction  {' '.join(f'{v:+11.2f}' for v in record.correction * 1e6)} µm",
+    ]
+    if record.estimate is not None:
+        lines.append(f"  estimated   {pose(record.estimate)}")
+    if record.true_with is not None:
+        lines.append(f"  true        {pose(record.true_with)}")
+        sides = zip(("without", "with"), record.errors(), strict=True)
+        errors = (f"{name} {e[0] * 1e6:8.3f} µm {e[1] * 1e6:8.3f} µrad" for name, e in sides if e is not None)
+        lines.append(f"  error       {'   '.join(errors)}")
+    return "\n".join(lines)
 
 
 def summary(result: SessionResult, rows: Sequence[ErrorRow]) -> str:
     """Return the closing lines: model, errors without and with it, latency, commands."""
-    table = [error_table(rows)] if rows else []
-    return "\n".join([f"model {result.model}", *table, *_commands(result)])
-
-
-def _commands(result: SessionResult) -> Iterator[str]:
-    """Yield how fast the loop answered and what became of the commands."""
-    answering = result.answering
-    if len(answering.latencies):
-        p50, p95, worst = np.percentile(answering.latencies, [50, 95, 100]) * 1e3
-        yield f"latency, command to answer: median {p50:.2f} ms, 95 % {p95:.2f} ms, longest {worst:.2f} ms"
+    lines = [f"model {result.model}", *([error_table(rows)] if rows else [])]
+    if len(result.answering.latencies):
+        p50, p95, worst = np.percentile(result.answering.latencies, [50, 95, 100]) * 1e3
+        lines.append(f"latency, command to answer: median {p50:.2f} ms, 95 % {p95:.2f} ms, longest {worst:.2f} ms")
     refused = "".join(f", {count} {reason}" for reason, count in sorted(result.refusals.items()))
-    yield f"commands: {result.sent} sent, {result.lost} lost, {result.refused} refused{refused}"
+    lines.append(f"commands: {result.sent} sent, {result.lost} lost, {result.refused} refused{refused}")
+    return "\n".join(lines)
 
 
 def busy_text(answering: Answering) -> str:
@@ -288,48 +283,37 @@ def busy_text(answering: Answering) -> str:
     )
 
 
-def _pose_text(pose: Pose) -> str:
-    x, y, z = np.round(pose.position * 1e3, 4) + 0.0  # no minus before a zero
-    alpha, beta, gamma = np.round(np.degrees(pose.angles()), 5) + 0.0
-    return f"x {x:10.4f}  y {y:10.4f}  z {z:10.4f} mm   α {alpha:9.5f}  β {beta:9.5f}  γ {gamma:9.5f} °"
-
-
-def _error_text(error: tuple[float, float]) -> str:
-    return f"{error[0] * 1e6:8.3f} µm {error[1] * 1e6:8.3f} µrad"
-
-
-def _row(values: np.ndarray, form: str) -> str:
-    return " ".join(format(value, form) for value in values)
-
-
 def complaints(result: SessionResult, rows: Sequence[ErrorRow]) -> list[str]:
     """Return what was not as it should be, and whether a busy computer may be the cause; empty when all was well."""
-    listed = []
-    if result.lost:
-        listed.append(f"{result.lost} commands were lost")
-    if result.refused:
-        listed.append(f"{result.refused} commands were refused: {result.refusals}")
-    if not rows:
-        listed.append("the true tool pose was not seen")
     judged = [row for row in rows if row.datum == ALIGNED] or rows
-    listed += [problem for row in judged if (problem := _too_much(row))]
-    busy = busy_text(result.answering)
-    return [*listed, busy] if listed and busy else listed
-
-
-def _too_much(row: ErrorRow) -> str:
-    """Return what is wrong with an error that is left, m; empty when nothing is."""
-    left, name = rms(row.compensated), f"{row.what}, {row.datum}"
-    if row.without is not None and left >= rms(row.without):
-        return f"{name}: compensation does not reduce the error"
-    if row.promised is None or left <= row.promised[1]:
-        return ""
-    return f"{name}: {left * 1e6:.3f} µm RMS are left; at most {row.promised[1] * 1e6:.3f} were promised"
+    listed = [
+        f"{result.lost} commands were lost" if result.lost else "",
+        f"{result.refused} commands were refused: {result.refusals}" if result.refused else "",
+        "" if rows else "the true tool pose was not seen",
+        *(row.complaint for row in judged),
+    ]
+    listed = [text for text in listed if text]
+    return [*listed, busy] if listed and (busy := busy_text(result.answering)) else listed
 
 
 def as_json(rows: list[Row], result: SessionResult, errors: Sequence[ErrorRow]) -> dict[str, object]:
-    """Return what is told of a session: tool poses in ``work``, and its :func:`~.report.error_rows`."""
-    answering = result.answering
+    """Return a session for programs: tool poses in ``work``, and its :func:`~.report.error_rows`."""
+    answering, poses = result.answering, list[dict[str, object]]()
+    for row, record in zip(rows, result.poses, strict=True):
+        without, compensated = (
+            None if error is None else {"position_um": error[0] * 1e6, "rotation_urad": error[1] * 1e6}
+            for error in record.errors()
+        )
+        poses.append({
+            "pose": row.label,
+            "commanded": record.target,
+            "struts": length_values(record.command),
+            "correction_um": record.correction * 1e6,
+            "estimated": record.estimate,
+            "true": record.true_with,
+            "error_without": without,
+            "error_with": compensated,
+        })  # fmt: skip
     return {
         "frame": "work",
         "model": result.model,
@@ -340,37 +324,7 @@ def as_json(rows: list[Row], result: SessionResult, errors: Sequence[ErrorRow]) 
         "late_answers": answering.late,
         "longest_latency_ms": answering.longest * 1e3,
         "waited_for_processor_s": answering.waited,
-        "errors": [_row_json(row) for row in errors],
-        "poses": [_pose_json(row, record) for row, record in zip(rows, result.poses, strict=True)],
+        "errors": [row.record() for row in errors],
+        "poses": poses,
         "path": None if result.path is None else {"poses": len(result.path.path), "rate_hz": result.path.path.rate},
-    }
-
-
-def _row_json(row: ErrorRow) -> dict[str, object]:
-    def size(errors: np.ndarray | None) -> dict[str, float] | None:
-        return None if errors is None else {"rms_um": rms(errors) * 1e6, "max_um": float(errors.max()) * 1e6}
-
-    return {
-        "what": row.what,
-        "datum": row.datum,
-        "without": size(row.without),
-        "with": size(row.compensated),
-        "promised_rms_um": None if row.promised is None else [v * 1e6 for v in row.promised],
-    }
-
-
-def _pose_json(row: Row, record: PoseRecord) -> dict[str, object]:
-    def error(pair: tuple[float, float] | None) -> dict[str, float] | None:
-        return None if pair is None else {"position_um": pair[0] * 1e6, "rotation_urad": pair[1] * 1e6}
-
-    without, compensated = record.errors()
-    return {
-        "pose": row.label,
-        "commanded": record.target,
-        "struts": length_values(record.command),
-        "correction_um": record.correction * 1e6,
-        "estimated": record.estimate,
-        "true": record.true_with,
-        "error_without": error(without),
-        "error_with": error(compensated),
     }

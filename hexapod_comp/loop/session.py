@@ -30,7 +30,6 @@ from .report import Answering, PathRecord, PoseRecord, SessionResult, Track, bus
 if TYPE_CHECKING:
     from ..ros.client import LoopClient, Sent
 
-
 # Longest wait for both nodes, s: they start in under three seconds, on a busy computer in twenty
 CONNECT_TIMEOUT = 60.0
 
@@ -39,62 +38,33 @@ SETTLE_TIMEOUT = 5.0
 MOVE_FEED = 0.25  # largest tool speed between poses, m/s; on most machines the struts' speed limits it first
 
 
-@contextmanager
-def simulated_machine(
-    compensator: dict[str, object], drive: dict[str, object]
-) -> Iterator[tuple[NodeProcess, NodeProcess]]:
-    """Run compensator and strut drive as processes in a ROS domain of their own."""
-    with PrivateDomain():
-        nodes = NodeProcess("compensator", compensator), NodeProcess("strut_drive", drive)
-        try:
-            yield nodes
-        except BaseException as error:
-            output = "\n".join(f"{node.name}:\n{node.stop()[1]}" for node in nodes)
-            if isinstance(error, NoAnswerError):
-                raise NoAnswerError(f"{error}; the nodes said:").with_lines(output) from error
-            raise
-        for node in nodes:
-            code, output = node.stop()
-            if code != 0:
-                raise HexapodError(f"{node.name} ended with code {code}:").with_lines(output)
-
-
 class Session:
     """Drives a machine through poses and a path while watching it."""
 
     def __init__(
-        self,
-        client: LoopClient,
-        geometry: HexapodGeometry,
-        rate: float,
-        progress: Callable[[int], None] | None = None,
+        self, client: LoopClient, geometry: HexapodGeometry, rate: float, progress: Callable[[int], None] | None = None
     ) -> None:
-        self._client, self._geometry, self._rate = client, geometry, rate
-        self._progress = progress
+        self._client, self._rate, self._progress = client, rate, progress
         self._base = commanded_in_base(geometry)
         self._at = client.estimate
-        self._sent: list[Sent] = []
+        self.sent: list[Sent] = []  # commands streamed so far
 
-    def go(self, target: Pose) -> None:
-        """Move smoothly to a tool pose in ``base``."""
+    def go(self, target: Pose) -> Sent:
+        """Move smoothly to a tool pose in ``base`` and hold it until the true tool rests; return the last command."""
+        client = self._client
         self._stream(move(self._base, self._at, target, self._rate, MOVE_FEED))
         self._at = target
-
-    def rest(self) -> Sent:
-        """Hold the pose until the true tool rests; return the last command."""
-        client = self._client
         quiet = client.settled() if client.has_true_pose else (lambda: True)
-        return client.hold(self._at, self._rate, quiet, SETTLE_TIMEOUT, "the machine to come to rest")
+        return client.hold(target, self._rate, quiet, SETTLE_TIMEOUT, "the machine to come to rest")
 
     def enable(self, enabled: bool) -> None:
         """Switch compensation and wait until the change has ramped through."""
-        self._client.enable(enabled)
-        client = self._client
+        client, wanted = self._client, "on" if enabled else "off"
+        client.enable(enabled)
         before = dict(client.diagnostics)
 
         def through() -> bool:
             seen = client.diagnostics
-            wanted = "on" if enabled else "off"
             return seen != before and seen["compensation"] == wanted and seen["ramping"] == "false"
 
         client.hold(self._at, self._rate, through, 10.0, "compensation to ramp")
@@ -102,8 +72,7 @@ class Session:
     def visit(self, records: list[PoseRecord], compensated: bool) -> None:
         """Go to every pose, rest, and write down what is seen there."""
         for record in records:
-            self.go(record.target)
-            last = self.rest()
+            last = self.go(record.target)
             true = self._client.true_pose if self._client.has_true_pose else None
             if compensated:
                 record.command, record.correction = last.command, last.correction
@@ -114,26 +83,16 @@ class Session:
     def mill(self, path: Path) -> tuple[Track | None, np.ndarray]:
         """Run a path; return the true track and the corrections sent, shape (N, 6)."""
         self.go(path.pose(0))
-        self.rest()
         streamed = self._stream(path)
         self._at = path.pose(len(path) - 1)
-        positions = np.array([position for position, _ in self._client.track])
-        sent = np.array([count for _, count in self._client.track])
+        positions, sent = (np.array([entry[n] for entry in self._client.track]) for n in (0, 1))
         return Track.along(path, positions, sent), np.array([entry.correction for entry in streamed])
 
     def _stream(self, path: Path) -> list[Sent]:
         progress = self._progress
         sent = self._client.stream(path, None if progress is None else (lambda _: progress(1)))
-        self._sent += sent
+        self.sent += sent
         return sent
-
-    def forget(self) -> None:
-        """Forget the streamed commands so far."""
-        self._sent = []
-
-    def latencies(self) -> np.ndarray:
-        """Return the latencies of the streamed commands, s."""
-        return _latencies(self._sent)
 
 
 def _latencies(sent: Iterable[Sent]) -> np.ndarray:
@@ -147,21 +106,18 @@ class Watch:
 
     def __init__(self, nodes: Sequence[NodeProcess]) -> None:
         self._pids = [os.getpid(), *(node.pid for node in nodes)]
-        self._began, self._waited = time.monotonic(), self._waiting()
-
-    def _waiting(self) -> float:
-        return sum(map(waited_for_processor, self._pids))
+        self._began, self._waited = time.monotonic(), sum(map(waited_for_processor, self._pids))
 
     def answering(self, client: LoopClient, rate: float, latencies: np.ndarray | None = None) -> Answering:
         """Return how fast a client's commands at some rate, Hz, were answered since then."""
-        every = _latencies(client.sent.values())
+        every, waited = _latencies(client.sent.values()), sum(map(waited_for_processor, self._pids))
         return Answering(
             latencies=np.zeros(0) if latencies is None else latencies,
             answered=len(every),
             late=int((every > 1.0 / rate).sum()),
             longest=float(every.max(initial=0.0)),
             elapsed=time.monotonic() - self._began,
-            waited=max(0.0, self._waiting() - self._waited),  # an ended thread takes its share along
+            waited=max(0.0, waited - self._waited),  # an ended thread takes its share along
         )
 
 
@@ -189,36 +145,29 @@ def run_session(
     announce: Callable[[str], None] = lambda _: None,
 ) -> SessionResult:
     """Visit poses, then mill a path; first without compensation when `compare`, then with it."""
-    session = Session(client, geometry, rate, progress)
-    records = [PoseRecord(target) for target in targets]
-    track_without = None
+    session, result, without = Session(client, geometry, rate, progress), SessionResult(), None
+    result.poses = [PoseRecord(target) for target in targets]
     if compare:
         announce("pass without compensation …")
         session.enable(False)
-        session.visit(records, compensated=False)
+        session.visit(result.poses, compensated=False)
         if path is not None:
-            track_without, _ = session.mill(path)
+            without, _ = session.mill(path)
         session.enable(True)
-        session.forget()
+        session.sent = []
     announce("pass with compensation …")
-    session.visit(records, compensated=True)
-    result = SessionResult(records)
+    session.visit(result.poses, compensated=True)
     if path is not None:
-        track_with, corrections = session.mill(path)
-        result.path = PathRecord(path, track_without, track_with, corrections)
-    result.answering.latencies = session.latencies()
-    _count(client, result)
-    return result
-
-
-def _count(client: LoopClient, result: SessionResult) -> None:
+        result.path = PathRecord(path, without, *session.mill(path))
+    result.answering.latencies = _latencies(session.sent)
     accepted, result.refused = client.counted()
     result.sent = len(client.sent)
     result.lost = max(0, result.sent - accepted - result.refused)
-    result.model = client.diagnostics["model"]
-    for key, value in client.diagnostics.items():
-        if key.startswith("refused."):
-            result.refusals[key.removeprefix("refused.")] = int(value)
+    result.model, refused = client.diagnostics["model"], "refused."
+    result.refusals = {
+        key.removeprefix(refused): int(value) for key, value in client.diagnostics.items() if key.startswith(refused)
+    }
+    return result
 
 
 RATES = (1.0, 1000.0)  # commands per second that make sense over DDS from Python, Hz
@@ -249,23 +198,29 @@ def refuse_broken_limits(
 
 @contextmanager
 def simulated(machine: str, model: MachineModel, truth: MachineModel) -> Iterator[Sequence[NodeProcess]]:
-    """Start compensator and strut drive as two processes in a ROS domain of their own."""
-    geometry_file = str(config_file(machine, "geometry", beside=True).resolve())
-    with tempfile.TemporaryDirectory(prefix="hexapod_comp_") as folder:
-        model_file, truth_file = (f"{folder}/{name}.yaml" for name in ("model", "truth"))
-        save_model(_portable(model), model_file)
-        save_model(_portable(truth), truth_file)
-        with simulated_machine(
-            {"geometry_file": geometry_file, "model_file": model_file, **PATIENCE},
-            {"geometry_file": geometry_file, "truth_file": truth_file},
-        ) as nodes:
+    """Run compensator and strut drive as two processes in a ROS domain of their own."""
+    geometry = {"geometry_file": str(config_file(machine, "geometry", beside=True).resolve())}
+    with tempfile.TemporaryDirectory(prefix="hexapod_comp_") as folder, PrivateDomain():
+        files = {"model": f"{folder}/model.yaml", "truth": f"{folder}/truth.yaml"}
+        for one, file in zip((model, truth), files.values(), strict=True):
+            # With a date, and without what lies beside its own file
+            origin = replace(one.origin, date=one.origin.date or date.today().isoformat(), posterior=None)
+            save_model(replace(one, origin=origin), file)
+        nodes = (
+            NodeProcess("compensator", {**geometry, "model_file": files["model"], **PATIENCE}),
+            NodeProcess("strut_drive", {**geometry, "truth_file": files["truth"]}),
+        )
+        try:
             yield nodes
-
-
-def _portable(model: MachineModel) -> MachineModel:
-    """Return a model that can be written elsewhere: with a date, and without what lies beside its own file."""
-    origin = replace(model.origin, date=model.origin.date or date.today().isoformat(), posterior=None)
-    return replace(model, origin=origin)
+        except BaseException as error:
+            output = "\n".join(f"{node.name}:\n{node.stop()[1]}" for node in nodes)
+            if isinstance(error, NoAnswerError):
+                raise NoAnswerError(f"{error}; the nodes said:").with_lines(output) from error
+            raise
+        for node in nodes:
+            code, output = node.stop()
+            if code != 0:
+                raise HexapodError(f"{node.name} ended with code {code}:").with_lines(output)
 
 
 def witnessed(
@@ -277,16 +232,19 @@ def witnessed(
     compare: bool,
     namespace: str = "",
 ) -> SessionResult:
-    """Run poses of the work frame and a path in ``base`` through the loop, with a progress bar."""
+    """Run poses of the work frame and a path in ``base`` through the loop, with a progress bar on a terminal."""
     # The result is in the work frame, as the user's file has it; the nodes are told, and tell, `base`.
-    client = _client(namespace)
+
+    def announce(text: str) -> None:  # without tearing the progress bar
+        tqdm.write(CODES.sub("", text), file=own_terminal())
+
+    client = loop_client(namespace)
     try:
         connect(client, nodes)
-        watch = Watch(nodes)
-        with _progress() as bar:
-            targets = [geometry.work @ pose for pose in poses]
+        watch, targets = Watch(nodes), [geometry.work @ pose for pose in poses]
+        with tqdm(unit=" commands", disable=None, leave=False, mininterval=0.5) as bar:
             try:
-                result = run_session(client, geometry, targets, path, rate, compare, bar.update, _announce)
+                result = run_session(client, geometry, targets, path, rate, compare, bar.update, announce)
             except NoAnswerError as error:
                 busy = busy_text(watch.answering(client, rate))
                 raise NoAnswerError(f"{error}; {busy}" if busy else str(error)) from error
@@ -296,19 +254,7 @@ def witnessed(
         client.close()
 
 
-def _announce(text: str) -> None:
-    """Say on stderr what happens now, without tearing the progress bar."""
-    tqdm.write(CODES.sub("", text), file=own_terminal())
-
-
-@contextmanager
-def _progress():
-    """A bar on a terminal, nothing elsewhere."""
-    with tqdm(unit=" commands", disable=None, leave=False, mininterval=0.5) as bar:
-        yield bar
-
-
-def _client(namespace: str) -> LoopClient:
+def loop_client(namespace: str) -> LoopClient:
     """Return a client of the nodes, with a clear word where there is no ROS."""
     try:
         from ..ros.client import LoopClient

@@ -63,8 +63,8 @@ class Calibration:
     """A machine measured and fitted."""
 
     fit: ModelFit  # scheme joint on 5-D lines and diagonals
-    lines: PaperMetric  # mou & King's own measure of their 1-D scheme, and of `fit`
-    joint: PaperMetric  # mou & King's own measure of their 1-D scheme, and of `fit`
+    lines: PaperMetric  # Mou & King's own measure of their 1-D scheme
+    joint: PaperMetric  # and of `fit`
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,9 @@ def calibrate(
     say("measuring with 5-D lasers")
     measured = measure(template(campaign, geometry, seed), campaign, real, seed)
     measured = replace(measured, uncertainty=np.array(campaign.noise)[measured.kind])
-    fit = fit_model(measured, FitSettings(lead=_lead(geometry, truth)), say)
+    struts = truth.struts  # the data sheet says the screws' lead: it counts where they err and the geometry is silent
+    waves = (struts.cosine.any() or struts.sine.any()) and not geometry.screw_lead.any()
+    fit = fit_model(measured, FitSettings(lead=float(struts.period[0]) if waves else None), say)
     say("the 1-D scheme of Mou & King")
     # Their lines run along the base's axes, and the platform is as level as above, whatever the work frame is.
     level = geometry.work.rotation @ place.attitude @ geometry.tool.rotation.T
@@ -154,13 +156,6 @@ def as_json(calibration: Calibration) -> dict[str, object]:
         "notes": fit.notes,
         "misfit": fit.misfit,
     }
-
-
-def _lead(geometry: HexapodGeometry, truth: MachineModel) -> float | None:
-    """Return the screws' lead as their data sheet has it, m, where they have an error and the geometry is silent."""
-    struts = truth.struts
-    waves = struts.cosine.any() or struts.sine.any()
-    return float(struts.period[0]) if waves and not geometry.screw_lead.any() else None
 
 
 def demo_poses(place: Place, seed: int) -> list[Pose]:

@@ -6,7 +6,6 @@ differ in every number.
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -62,15 +61,10 @@ def result(monkeypatch: pytest.MonkeyPatch) -> SessionResult:
         true = TURNED_WORK @ Pose(GIVEN.position + OFF, GIVEN.rotation)
         return SessionResult([PoseRecord(target, np.zeros(6), np.zeros(6), target, None, true) for target in targets])
 
-    @contextmanager
-    def no_bar():
-        yield SimpleNamespace(update=None)
-
     client = SimpleNamespace(close=lambda: None)
     for name, stand_in in (("connect", lambda *_: None), ("run_session", run_session), ("Watch", NoWatch)):
         monkeypatch.setattr(session, name, stand_in)
-    monkeypatch.setattr(session, "_client", lambda _: client)
-    monkeypatch.setattr(session, "_progress", no_bar)
+    monkeypatch.setattr(session, "loop_client", lambda _: client)
     geometry = replace(paper_geometry(), work=TURNED_WORK, tool=TURNED_TOOL)
     found = session.witnessed(geometry, (), [GIVEN], None, 100.0, False)
     in_base = TURNED_WORK.position + TURNED_WORK.rotation @ GIVEN.position
@@ -206,6 +200,6 @@ def test_a_busy_computer_is_named_when_an_answer_does_not_come(monkeypatch: pyte
 
     for name, stand_in in (("connect", lambda *_: None), ("run_session", run_session), ("Watch", Busy)):
         monkeypatch.setattr(session, name, stand_in)
-    monkeypatch.setattr(session, "_client", lambda _: SimpleNamespace(close=lambda: None))
+    monkeypatch.setattr(session, "loop_client", lambda _: SimpleNamespace(close=lambda: None))
     with pytest.raises(NoAnswerError, match="within 5 s; the computer was busy: 50 of 100"):
         session.witnessed(paper_geometry(), (), [GIVEN], None, 100.0, False)
