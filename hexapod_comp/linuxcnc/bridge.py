@@ -136,47 +136,41 @@ class CorrectionGuard:
 
     def offer(self, correction: Sequence[float], now: float) -> None:
         """Take a correction as what the output shall become."""
-        values = [float(value) for value in correction]
-        try:
-            self._check(values)
-        except CommandError:
+        values, problem = [float(value) for value in correction], None
+        if len(values) != 6:
+            problem = CommandError("strut_count", f"six corrections are needed, not {len(values)}")
+        for number, value in enumerate(values, start=1):
+            if problem is None and not math.isfinite(value):
+                problem = CommandError("not_finite", f"strut {number}: a correction must be finite, not {value}")
+            elif problem is None and abs(value) > self._limit:
+                text = f"correction {value * 1e6:.3f} µm is larger than ±{self._limit * 1e6:g} µm"
+                problem = CommandError("correction", f"strut {number}: {text}")
+        if problem is not None:
             self.rejected += 1
-            raise
+            raise problem
         self._newest, self._accepted_at = values, now
         self.accepted += 1
 
-    def _check(self, values: list[float]) -> None:
-        if len(values) != 6:
-            raise CommandError("strut_count", f"six corrections are needed, not {len(values)}")
-        for number, value in enumerate(values, start=1):
-            if not math.isfinite(value):
-                raise CommandError("not_finite", f"strut {number}: a correction must be finite, not {value}")
-            if abs(value) > self._limit:
-                raise CommandError(
-                    "correction",
-                    f"strut {number}: correction {value * 1e6:.3f} µm is larger than ±{self._limit * 1e6:g} µm",
-                )
-
     def update(self, now: float, enabled: bool) -> list[float]:
         """Move the output on and return it."""
-        reach = self._ramp_rate * self._elapsed(now)
+        elapsed, self._updated_at = (
+            now - self._updated_at,
+            now,
+        )  # the first update, and a clock that went back, move nothing
+        reach = self._ramp_rate * (min(elapsed, LONGEST_STEP) if 0.0 < elapsed < math.inf else 0.0)
         target, arrived = self._aim(now, enabled)
         ways = [there - here for there, here in zip(target, self.output, strict=True)]
         longest = max(abs(way) for way in ways)
         if longest <= reach:
             self.output, self.status = list(target), arrived
             return self.output
-        share = reach / longest
+        share, left = reach / longest, longest - reach
         self.output = [here + share * way for here, way in zip(self.output, ways, strict=True)]
-        self._name_motion(arrived, longest - reach)
+        if arrived is not GuardStatus.COMPENSATING:
+            self.status = GuardStatus.RETURNING
+        elif self.status is not GuardStatus.COMPENSATING or left > self._ramp_rate * LONGEST_STEP:
+            self.status = GuardStatus.RAMPING  # a target that moves on a little is still followed
         return self.output
-
-    def _elapsed(self, now: float) -> float:
-        """Return the time that this update stands for, s: none for the first or when the clock went back."""
-        elapsed, self._updated_at = now - self._updated_at, now
-        if not 0.0 < elapsed < math.inf:
-            return 0.0
-        return min(elapsed, LONGEST_STEP)
 
     def _aim(self, now: float, enabled: bool) -> tuple[Sequence[float], GuardStatus]:
         """Return where the output shall go, and what it does once it is there."""
@@ -187,13 +181,6 @@ class CorrectionGuard:
         if self.age(now) <= self._timeout:
             return self._newest, GuardStatus.COMPENSATING
         return (self.output, GuardStatus.HOLDING) if self._holds else (ZERO, GuardStatus.WAITING)
-
-    def _name_motion(self, arrived: GuardStatus, left: float) -> None:
-        """Set the status of an output that has not arrived; a target that moves on a little is not left by that."""
-        if arrived is not GuardStatus.COMPENSATING:
-            self.status = GuardStatus.RETURNING
-        elif self.status is not GuardStatus.COMPENSATING or left > self._ramp_rate * LONGEST_STEP:
-            self.status = GuardStatus.RAMPING
 
 
 TEXTS = {
@@ -211,18 +198,14 @@ class BridgeStatus:
     """Counters of a bridge, and the status made of them."""
 
     guard: CorrectionGuard  # between the compensator and the controller
-    # cycles of the loop, commands and measured struts published, corrections that came
-    cycles: Flow = field(default_factory=Flow)
-    # cycles of the loop, commands and measured struts published, corrections that came
-    sent: Flow = field(default_factory=Flow)
-    # cycles of the loop, commands and measured struts published, corrections that came
-    states: Flow = field(default_factory=Flow)
-    # cycles of the loop, commands and measured struts published, corrections that came
-    heard: Flow = field(default_factory=Flow)
-    refusals: Refusals = field(default_factory=Refusals)  # corrections and pins that were not used
-    bad_pins: Refusals = field(default_factory=Refusals)  # corrections and pins that were not used
+    cycles: Flow = field(default_factory=Flow)  # of the loop
+    sent: Flow = field(default_factory=Flow)  # commands published
+    states: Flow = field(default_factory=Flow)  # measured struts published
+    heard: Flow = field(default_factory=Flow)  # corrections that came
+    refusals: Refusals = field(default_factory=Refusals)  # corrections that were not used
+    bad_pins: Refusals = field(default_factory=Refusals)  # pins that were not used
     machine_on: bool = False  # the controller's switches
-    enabled: bool = False  # the controller's switches
+    enabled: bool = False
     resets: int = 0  # how often the compensator was asked to start anew
     latency: float = 0.0  # age of the last correction's command when it came, s
 
@@ -360,9 +343,7 @@ class LinuxcncBridgeNode(MachineNode):
         super().__init__("linuxcnc_bridge", PARAMETERS, **options)
         self._metres = METRES[self._options["units"]]
         self._guard = CorrectionGuard(*(self._options[name] for name in GUARDED))
-        self._status = status = BridgeStatus(self._guard)
-        self._sent, self._states, self._heard = status.sent, status.states, status.heard
-        self._refusals = status.refusals
+        self._status = BridgeStatus(self._guard)
         self._reader = StrutReader()
         self.clock = StampClock()  # the system's: what the bridge stamps with
         self._stamps = StampGate("correction", self.clock)
@@ -397,7 +378,7 @@ class LinuxcncBridgeNode(MachineNode):
         self._pose_pub = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS, self._options["timeout"])
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
         self.speak_for(self._options["component"])
-        self._subscription = self.obey(JointState, "strut_corrections", self._on_correction, self._look_at_publishers)
+        self._subscription = self.obey(JointState, "strut_corrections", self._on_correction, self._look)
         self._source = self.sender_of(self._subscription, self._options["allow_several_publishers"])
         self._check = self.every(CHECK_PERIOD, self._check_state)
         self._reset = CompensatorReset(self, self._status, self._options)
@@ -454,70 +435,61 @@ class LinuxcncBridgeNode(MachineNode):
         if self._active and status.machine_on:
             self._send(now)
             if self._reset is not None:
-                self._reset.ask(self._streaming_since, self._heard.last, now)
+                self._reset.ask(self._streaming_since, self._status.heard.last, now)
         output = self._guard.update(now, self._active and status.machine_on and status.enabled)
         status.cycles.tick(now)
         self._write_corrections([value / self._metres for value in output])
-        self._write_state(self._state_numbers(now, output))
-
-    def _state_numbers(self, now: float, output: list[float]) -> tuple[float, ...]:
-        guard = self._guard
         self._beat = not self._beat
-        rejected = sum(self._refusals.counts.values())
-        return (
-            guard.status,
-            min(guard.age(now), NEVER),
-            max(map(abs, output)) / self._metres,
-            guard.status is GuardStatus.COMPENSATING,
-            self._beat,
-            self._stop.stopped(now),
-            guard.accepted % COUNTS,
-            rejected % COUNTS,
-            self._status.resets % COUNTS,
+        self._write_state(
+            (
+                self._guard.status,
+                min(self._guard.age(now), NEVER),
+                max(map(abs, output)) / self._metres,
+                self._guard.status is GuardStatus.COMPENSATING,
+                self._beat,
+                self._stop.stopped(now),
+                self._guard.accepted % COUNTS,
+                sum(status.refusals.counts.values()) % COUNTS,
+                status.resets % COUNTS,
+            )
         )
 
     def _send(self, now: float) -> None:
         """Publish measured struts and commanded pose, each only if all its pins are usable."""
-        stamp = stamp_of(time.time_ns())
+        stamp, status = stamp_of(time.time_ns()), self._status
+        p, q = self._pose_out.pose.position, self._pose_out.pose.orientation
         # Half a cycle less, since cycles come a little early or late.
-        if self._states.age(now) >= 1.0 / self._options["states_rate"] - 0.5 / self._options["rate"]:
+        if self._status.states.age(now) >= 1.0 / self._options["states_rate"] - 0.5 / self._options["rate"]:
             feedback = self._read_feedback()
             if self._usable(FEEDBACK, feedback, now):
                 self._send_states(feedback, stamp, now)
         axes = self._read_axes()
         if self._usable(AXES, axes, now):
-            if self._sent.age(now) > self._options["timeout"]:
+            if status.sent.age(now) > self._options["timeout"]:
                 self._streaming_since = now
-            self._write_pose(axes)
+            x, y, z, q.x, q.y, q.z, q.w = pose_from_axes(*axes)
+            p.x, p.y, p.z = x * self._metres, y * self._metres, z * self._metres
             self._pose_out.header.stamp = stamp
             self._pose_pub.publish(self._pose_out)
-            self._sent.tick(now)
+            status.sent.tick(now)
 
     def _send_states(self, feedback: Sequence[float], stamp: Time, now: float) -> None:
         """Publish measured struts; while no corrections come, only when they stand."""
         # A compensator starts from the measured struts, and takes their way to its commands for a correction to be
         # ramped out. Moving struts lag: one that starts while they move is better left without them, unless it cannot
         # start where it was told to be last.
-        out, since = self._states_out, self._states.age(now)
-        self._states.tick(now)
+        out, since = self._states_out, self._status.states.age(now)
+        self._status.states.tick(now)
         followed = since < self._options["timeout"]
         out.write(np.array(feedback) * self._metres, since if followed else 0.0)
         if not followed or max(map(abs, out.velocity.tolist())) > STANDING:
             self._moved_at = now
         in_vain = self._reset is not None and self._reset.in_vain
-        if self._silent(now) and now - self._moved_at < self._options["timeout"] and not in_vain:
+        silent = self._status.heard.age(now) > self._options["timeout"]
+        if silent and now - self._moved_at < self._options["timeout"] and not in_vain:
             return
         out.message.header.stamp = stamp
         self._states_pub.publish(out.message)
-
-    def _silent(self, now: float) -> bool:
-        """Return whether the compensator has not been heard of late."""
-        return self._heard.age(now) > self._options["timeout"]
-
-    def _write_pose(self, axes: Sequence[float]) -> None:
-        p, q = self._pose_out.pose.position, self._pose_out.pose.orientation
-        x, y, z, q.x, q.y, q.z, q.w = pose_from_axes(*axes)
-        p.x, p.y, p.z = x * self._metres, y * self._metres, z * self._metres
 
     def _usable(self, names: Sequence[str], values: Sequence[float], now: float) -> bool:
         bad = {name: value for name, value in zip(names, values, strict=True) if not abs(value) <= LARGEST_PIN}
@@ -529,12 +501,12 @@ class LinuxcncBridgeNode(MachineNode):
         self.warn_of(which, text)
         return False
 
-    def _look_at_publishers(self) -> None:
+    def _look(self) -> None:
         self._source.look(time.monotonic())
 
     def _on_correction(self, data: bytes, number: int | None) -> None:
         sample = Sample(time.monotonic())
-        self._heard.tick(sample.now)
+        self._status.heard.tick(sample.now)
         self._source.hear(number, sample.now)
         try:
             self._source.check(sample)
@@ -547,7 +519,7 @@ class LinuxcncBridgeNode(MachineNode):
             self._guard.offer(sample.values or (), sample.now)
             self._stamps.accept(sample)
         except CommandError as error:
-            self._refusals.add(error.reason, str(error), sample.now)
+            self._status.refusals.add(error.reason, str(error), sample.now)
             self.warn_of(error.reason, f"correction refused ({error.reason}): {error}")
 
     # ---- state ----
@@ -560,14 +532,11 @@ class LinuxcncBridgeNode(MachineNode):
         level, text = self._status.judged(self._active, now)
         if text != self._last_text:
             self._last_text = text
-            self._say(level, text)
+            if level != OK:
+                self.warn_of(text, text)
+            elif self._throttle.passes(text) is not None:
+                self.get_logger().info(text)
         self.tell(level, text, lambda: self._status.values(", ".join(self._source.names), now))
-
-    def _say(self, level: bytes, text: str) -> None:
-        if level != OK:
-            self.warn_of(text, text)
-        elif self._throttle.passes(text) is not None:
-            self.get_logger().info(text)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

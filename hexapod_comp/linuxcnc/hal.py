@@ -59,32 +59,24 @@ def _own_signals() -> Iterator[None]:
 def _import(name: str) -> ModuleType:
     with suppress(ImportError):
         return importlib.import_module(name)
-    folder = str(DEBIAN_PACKAGES)
     # At the end, and only for now: in front of the environment's own folders it would replace NumPy.
-    sys.path.append(folder)
+    sys.path.append(folder := str(DEBIAN_PACKAGES))
     importlib.invalidate_caches()
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise HalError(_absence(name)) from error
+        files = [file for form in (f"_{name}.*.so", f"{name}.*.so") for file in DEBIAN_PACKAGES.glob(form)]
+        if built := sorted(file.name.split(".")[1] for file in files):
+            here = f"CPython {sys.version_info.major}.{sys.version_info.minor}"
+            problem = f"in {DEBIAN_PACKAGES} is built for {', '.join(built)}, this is {here}"
+        else:
+            problem = (
+                f"is neither on this Python's path nor in {DEBIAN_PACKAGES}: install LinuxCNC "
+                "(Debian: apt install linuxcnc-uspace), or set PYTHONPATH to its lib/python"
+            )
+        raise HalError(f"LinuxCNC's Python module {name!r} {problem}") from error
     finally:
         sys.path.remove(folder)
-
-
-def _absence(name: str) -> str:
-    """Return why a module cannot be imported, and what helps."""
-    here = f"CPython {sys.version_info.major}.{sys.version_info.minor}"
-    built = sorted(
-        file.name.split(".")[1]
-        for pattern in (f"_{name}.*.so", f"{name}.*.so")
-        for file in DEBIAN_PACKAGES.glob(pattern)
-    )
-    if not built:
-        return (
-            f"LinuxCNC's Python module {name!r} is neither on this Python's path nor in {DEBIAN_PACKAGES}: "
-            "install LinuxCNC (Debian: apt install linuxcnc-uspace), or set PYTHONPATH to its lib/python"
-        )
-    return f"LinuxCNC's Python module {name!r} in {DEBIAN_PACKAGES} is built for {', '.join(built)}, this is {here}"
 
 
 @dataclass(frozen=True)
@@ -110,14 +102,14 @@ class HalComponent:
         self._error = hal.error
         try:
             self._component = hal.component(name)
-            self._pins = {pin.name: self._add(hal, pin) for pin in wanted}
+            self._pins = {
+                pin.name: self._component.newpin(
+                    pin.name, getattr(hal, f"HAL_{pin.kind.upper()}"), getattr(hal, f"HAL_{pin.direction.upper()}")
+                )
+                for pin in wanted
+            }
         except (hal.error, ValueError, RuntimeError) as error:
             raise HalError(f"HAL refuses the component {name!r}: {error}") from error
-
-    def _add(self, hal: Any, pin: Pin) -> Any:
-        return self._component.newpin(
-            pin.name, getattr(hal, f"HAL_{pin.kind.upper()}"), getattr(hal, f"HAL_{pin.direction.upper()}")
-        )
 
     def reader(self, *names: str) -> Callable[[], list[Any]]:
         """Return a fast function that reads some pins."""
@@ -145,9 +137,9 @@ class HalComponent:
 
 def quaternion_from_axes(a: float, b: float, c: float) -> tuple[float, float, float, float]:
     """Return the unit quaternion (x, y, z, w) of LinuxCNC's rotary axes: R = Rz(C)·Ry(B)·Rx(A) (genhexkins)."""
-    cr, sr = _half(a)
-    cp, sp = _half(b)
-    cy, sy = _half(c)
+    (cr, sr), (cp, sp), (cy, sy) = (
+        (math.cos(half), math.sin(half)) for half in (math.radians(0.5 * angle) for angle in (a, b, c))
+    )
     return (
         sr * cp * cy - cr * sp * sy,
         cr * sp * cy + sr * cp * sy,
@@ -172,11 +164,6 @@ def pose_from_axes(
     )
 
 
-def _half(degrees: float) -> tuple[float, float]:
-    half = math.radians(0.5 * degrees)
-    return math.cos(half), math.sin(half)
-
-
 LIBRARY = "liblinuxcnchal.so.0"
 
 ROW = re.compile(r"^\s*(\d+)\s+User\s+(\S+)\s+(\d+)\s", re.MULTILINE)  # `halcmd show comp`: number, type, name, process
@@ -189,22 +176,18 @@ def dead_components(listing: str, name: str) -> list[int]:
 
 
 def _is_alive(pid: int) -> bool:
+    """Return whether a process runs; one that has ended, and whose parent has not asked for its exit code, does not."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
     except PermissionError:
         pass
-    return not _is_zombie(pid)
-
-
-def _is_zombie(pid: int) -> bool:
-    """Return whether a process has ended, and its parent has not asked for its exit code."""
     try:
         with open(f"/proc/{pid}/stat", encoding="utf-8") as file:
-            return file.read().rpartition(")")[2].split()[0] in "ZX"
+            return file.read().rpartition(")")[2].split()[0] not in "ZX"
     except OSError:
-        return False
+        return True
 
 
 def remove(number: int) -> None:

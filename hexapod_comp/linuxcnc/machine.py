@@ -55,25 +55,21 @@ class WatchedMachine:
         geometry = machine.geometry
         self._motion = MotionState()
         self._guess = geometry.home
-        self._tool_in_platform, self._base_in_work = geometry.tool, geometry.work.inverse()
-        self._work, self._platform_in_tool = geometry.work, geometry.tool.inverse()
+        self._base_in_work, self._platform_in_tool = geometry.work.inverse(), geometry.tool.inverse()
 
     def look(self, struts: np.ndarray, command: Pose, tool_length: float = 0.0) -> tuple[Pose, np.ndarray]:
         """Return where the tool is, as LinuxCNC's axes would put it, and its tip's error."""
-        up = np.array([0.0, 0.0, tool_length])
+        geometry, model, up = self.machine.geometry, self.machine.model, np.array([0.0, 0.0, tool_length])
         commanded = Pose(command.position - up + command.rotation @ up, command.rotation)
-        self._follow(struts, self._work @ commanded @ self._platform_in_tool)
-        platform, self._guess = self.machine.pose_for(struts, self._motion.sense, self._guess)
-        tool = self._base_in_work @ platform @ self._tool_in_platform
-        true = Pose(tool.position - tool.rotation @ up + up, tool.rotation)
-        return true, true.position - command.position
-
-    def _follow(self, struts: np.ndarray, platform: Pose) -> None:
-        """Update the directions of motion that the truth's backlash and field depend on."""
-        model = self.machine.model
-        point = platform.position + platform.rotation @ model.field.probe
+        wanted = geometry.work @ commanded @ self._platform_in_tool
+        # Directions of motion, which the truth's backlash and field depend on
+        point = wanted.position + wanted.rotation @ model.field.probe
         thresholds = model.field.reversal_threshold, model.reversal_threshold
         follow_nine(np.concatenate([point, struts]), *thresholds, self._motion.low, self._motion.sense)
+        platform, self._guess = self.machine.pose_for(struts, self._motion.sense, self._guess)
+        tool = self._base_in_work @ platform @ geometry.tool
+        true = Pose(tool.position - tool.rotation @ up + up, tool.rotation)
+        return true, true.position - command.position
 
 
 class MachineComponent:

@@ -84,11 +84,10 @@ LOG_LINE = re.compile(r"\[\w+\] \[[\d.]+\] \[[\w.]+\]: (.*)")  # how ROS logs: [
 class Answer:
     """What came back for one command."""
 
-    command: JointState  # the two messages with the command's stamp
-    correction: JointState  # the two messages with the command's stamp
-    sent_at: float  # monotonic times just before sending and just after both had come, s: the node handled it between
-    # monotonic times just before sending and just after both had come, s: the node handled it between
-    answered_at: float
+    command: JointState  # with the command's stamp, as the correction
+    correction: JointState
+    sent_at: float  # monotonic time just before sending, s
+    answered_at: float  # and just after both had come: the node handled it between
 
     @property
     def lengths(self) -> np.ndarray:
