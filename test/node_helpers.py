@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import pickle
 import sys
 import time
 from collections import defaultdict, deque
+from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -152,15 +154,22 @@ class Rig(Bench):
                 rig._alarms.append(self)
                 super().__init__(*arguments)
 
-        class Helper:  # instead of a process
-            process, ended = None, False
+        class AtOnce:  # instead of a thread
+            def __init__(self, *_: object) -> None:
+                self.shutdown = lambda **_: None
 
-            def __init__(self) -> None:
-                done, answers = worker.Jobs(), deque()
-                self.jobs = SimpleNamespace(
-                    put=lambda job: answers.append(job.result(done.answer(job.line(job.machine))))
-                )
-                self.answers = SimpleNamespace(get_nowait=answers.popleft)
+            def submit(self, call: Any, *arguments: Any) -> Future[Any]:
+                future: Future[Any] = Future()
+                try:
+                    future.set_result(call(*arguments))
+                except worker.WorkerError as error:
+                    future.set_exception(error)
+                return future
+
+        class Process(worker._Process):  # none, but what it is asked and answers is pickled as ever
+            def talk(self, request: Any, within: float | None) -> Any:
+                self.jobs = getattr(self, "jobs", None) or worker.Jobs()
+                return pickle.loads(pickle.dumps(self.jobs.do(*pickle.loads(pickle.dumps(request)))))
 
         for name, module in list(sys.modules.items()):
             if name.startswith("hexapod_comp.ros.") or name == "hexapod_comp.testing.bench":
@@ -169,7 +178,8 @@ class Rig(Bench):
                         patch.setattr(module, what, stand_in)
         patch.setattr(rclpy_compat, "time", self.clock)
         patch.setattr(rclpy_compat, "Thread", lambda **_: SimpleNamespace(start=lambda: None, join=lambda: None))
-        patch.setattr(worker, "_Helper", Helper)
+        patch.setattr(worker, "_Process", Process)
+        patch.setattr(worker, "ThreadPoolExecutor", AtOnce)
         base, clock = "hexapod_comp.ros.base", self.clock
         patch.setattr(f"{base}.StampClock", lambda simulated: StampClock(simulated, clock.time_ns, clock.monotonic_ns))
         patch.setattr(f"{base}.publishers", lambda node, topic: (tuple(sorted(set(self.speakers(topic)))), ""))

@@ -48,7 +48,7 @@ from .interface import (
 from .messages import StrutBytes, StrutReader, period, read_message
 from .process import run
 from .rclpy_compat import Alarm
-from .requests import Requests, Served
+from .requests import Requests
 from .status import ADVICE, OTHERWISE, WARN, CompensatorStatus, seconds
 
 ESTIMATE_PERIOD = 0.02
@@ -206,7 +206,7 @@ class CompensatorNode(MachineNode):
         self._source, self._measuring = self.sender_of(heard, several), self.sender_of(states, several)
         own = self.sender_of(self._commands, several)
         status = self._status
-        status.configure(compensator, self._thermometers, self._source, own, self._measuring, sensing)
+        status.configure(compensator, self._thermometers, ids, self._source, own, self._measuring, sensing)
         self._command_guards: tuple[Guard, ...] = (
             Standing(self._frames, status),
             Start(compensator, status),
@@ -215,8 +215,7 @@ class CompensatorNode(MachineNode):
         self._pacing = Pacing(
             self, self._take, lambda data, error, now: self._refuse(self._input.stamp(data), error, now)
         )
-        served = Served(self, compensator, status, self._files, ids, self._forget, lambda: self._outputs.answered)
-        self._requests = Requests(served)
+        self._requests = Requests(self, status, self._files, self._forget)
         self._journal = JournalTopics(self, compensator, self._files.sources, ids)
         self._ends.append(self.every(CHECK_PERIOD, self._check_state))
         self._ends.append(self.every(ESTIMATE_PERIOD, self._estimate_from_commands))

@@ -185,12 +185,9 @@ class MachineFiles:
         return bool(self._options["model_file"] == IDEAL)
 
     def made_of(self) -> dict[str, Any]:
-        """Return what another process needs to make geometry and model of the same texts, for JSON."""
+        """Return what the worker's process needs to make geometry and model of the same texts."""
         folder = self._folders["model"]
-        return {
-            **{name: vars(source) for name, source in self.sources.items()},
-            "folder": None if folder is None else str(folder),
-        }
+        return {**self.sources, "folder": None if folder is None else str(folder)}
 
     def model_place(self) -> tuple[str, str, str | None]:
         """Return name, the folder that relative paths start from (where it was deleted, only absolute ones are found),

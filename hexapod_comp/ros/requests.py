@@ -1,12 +1,12 @@
 """What is asked of a compensator beside commands: a reset, the switch, another model or tool, how far the tool may go,
-what its error would be. Who may have called is logged."""
+what its error would be. Who may have called is logged: after an accident, who reset the machine is the first question.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,6 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from ..compensation.compensator import Compensator
 from ..compensation.guards import Sample
 from ..compensation.journal import IDEAL_SOURCE
 from ..errors import CommandError, HexapodError
@@ -29,7 +28,7 @@ from .interface import MachineFiles
 from .messages import read_message, stamp_of
 from .rclpy_compat import LateAnswer, callers
 from .status import ERROR, OK, CompensatorStatus, status_of
-from .worker import Job, Worker, WorkerError, loaded_model
+from .worker import Job, Worker, WorkerError
 
 LOADED_WITHIN = 30.0
 """A model file that takes longer to read is given up, s; the shipped ones take one second, nearly all of it imports."""
@@ -47,48 +46,36 @@ LONGEST_REASON = 200
 """Characters of what stands in the tool's way."""
 
 
-@dataclass
-class Served:
-    """A configured compensator, as requests are about it."""
-
-    node: MachineNode
-    compensator: Compensator
-    status: CompensatorStatus
-    files: MachineFiles
-    frame_ids: dict[str, str]  # by the machine's names of its frames
-    forget: Callable[[], None]  # forgets the last command
-    newest: Callable[[], int]  # returns its stamp, ns
-
-
 class Requests:
-    """Services and topics on which something is asked of a compensator."""
+    """Services and topics on which something is asked of a configured compensator."""
 
-    def __init__(self, served: Served) -> None:
-        self._served, self._worker, node = served, Worker(), served.node
-        self._node, self._compensator, self._status, self._files = node, served.compensator, served.status, served.files
+    def __init__(
+        self, node: MachineNode, status: CompensatorStatus, files: MachineFiles, forget: Callable[[], None]
+    ) -> None:
+        self._node, self._status, self._files, self._forget = node, status, files, forget
+        self._worker = Worker()
         self._enable = node.create_service(SetBool, "~/enable_compensation", self._on_enable)
         self._reset = node.create_service(Trigger, "~/reset", self._on_reset)
         self._reload = LateAnswer(node.create_service(Trigger, "~/reload_model", self._on_reload))
         self._loading = False
-        self._tools = ToolChoice(served)
-        self._travel = TravelReports(served, self._worker)
-        self._predicted = PredictedError(served, self._worker)
+        self._tools = ToolChoice(node, status)
+        self._travel = TravelReports(node, status, files, self._worker)
+        self._predicted = PredictedError(node, status, files, self._worker)
 
     def look(self, now: float) -> None:
         """Hand on what the worker has done, and ask for what is due."""
-        self._worker.look(now)
-        self._travel.look(now)
-        self._predicted.look(now)
+        for part in (self._worker, self._travel, self._predicted):
+            part.look(now)
 
     def close(self) -> None:
         """Destroy services and topics, leave no request without an answer, and end the worker."""
-        self._reload.answer(Trigger.Response(success=False, message="the old model stays: the node was cleaned up"))
+        self._reload.answer(Trigger.Response(message="the old model stays: the node was cleaned up"))
         for part in (self._tools, self._travel, self._predicted, self._worker):
             part.close()
         self._node.close_ends(self._enable, self._reset, self._reload.service)
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self._compensator.enable(request.data)
+        self._status.compensator.enable(request.data)
         response.success = True
         response.message = f"compensation ramps {'in' if request.data else 'out'}"
         self._node.note("enable", f"{response.message}: asked for by {callers(self._node, self._enable)}")
@@ -96,14 +83,13 @@ class Requests:
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Forget the last command and a following error, if the machine stands."""
-        who = callers(self._node, self._reset)
-        now = time.monotonic()
+        who, now = callers(self._node, self._reset), time.monotonic()
         if moving := self._status.track.moving(now):
             response.message = f"refused while the machine moves: {moving}"
             self._status.refused_resets.add("moving", response.message, now)
             self._node.warn_of("reset", f"reset {response.message}; asked for by {who}")
             return response
-        self._served.forget()
+        self._forget()
         self._status.track.release()
         response.success = True
         response.message = "the next command may be one allowed step from where the struts were known to be last"
@@ -115,33 +101,30 @@ class Requests:
     def _on_reload(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response | None:
         self._node.note("reload", f"reload: asked for by {callers(self._node, self._reload.service)}")
         if self._loading:
-            return Trigger.Response(success=False, message="the model is being loaded already")
-        self._loading, machine = True, self._compensator.geometry.name
+            return Trigger.Response(message="the model is being loaded already")
+        self._loading, machine = True, self._status.compensator.geometry.name
         if self._files.ideal:
-            return self._take_model((MachineModel(machine), IDEAL_SOURCE))
+            return self._use_model((MachineModel(machine), IDEAL_SOURCE))
         name, place, folder = self._files.model_place()
         late = f"{name}: could not be read within {LOADED_WITHIN:g} s; is the disk or the network behind it there?"
-        arguments = {"name": name, "place": place, "folder": folder, "machine": machine}
-        job = Job(
-            "load_model",
-            arguments,
-            lambda found: self._reload.answer(self._take_model(found)),
-            lambda error: self._reload.answer(self._keep_model(error)),
-            None,
-            loaded_model,
-            LOADED_WITHIN,
-            late,
+        self._worker.ask(
+            Job(
+                "load_model",
+                {"name": name, "place": place, "folder": folder, "machine": machine},
+                lambda found: self._reload.answer(self._use_model(found)),
+                lambda error: self._reload.answer(self._keep_model(error)),
+                within=LOADED_WITHIN,
+                late=late,
+            )
         )
-        self._worker.ask(job)
         return None
 
-    def _take_model(self, found: tuple[MachineModel, Any]) -> Trigger.Response:
-        self._loading = False
-        sources = self._files.sources
+    def _use_model(self, found: tuple[MachineModel, Any]) -> Trigger.Response:
+        self._loading, sources = False, self._files.sources
         before = sources["model"]
         model, sources["model"] = found  # the source first: the journal notes it with the change
         try:
-            self._compensator.set_model(model)
+            self._status.compensator.set_model(model)
         except HexapodError as error:
             sources["model"] = before
             return self._keep_model(error)
@@ -151,40 +134,39 @@ class Requests:
         self._loading = False
         self._status.failed_reloads.add(error.reason, str(error), time.monotonic())
         self._node.get_logger().warning(f"the old model stays: {error}")
-        return Trigger.Response(success=False, message=f"the old model stays: {error}")
+        return Trigger.Response(message=f"the old model stays: {error}")
 
 
 class ToolChoice:
     """The tool in use: the parameter ``tool`` and the topic ``select_tool`` choose it, ``~/tool`` says which it is.
 
     The topic is for controllers: it sets the parameter. Only one node may publish on it, and only a machine that stands
-    takes another tool.
+    changes its tool.
     """
 
-    def __init__(self, served: Served) -> None:
-        self._node, self._compensator, self._status = node, _, status = served.node, served.compensator, served.status
-        self._selected = node.obey(
-            String, "select_tool", self._on_message, lambda: status.sensing["select_tool"].look(time.monotonic())
-        )
-        several = bool(node.get_parameter("allow_several_publishers").value)
+    def __init__(self, node: MachineNode, status: CompensatorStatus) -> None:
+        self._node, self._compensator, self._status = node, status.compensator, status
+        look = lambda: status.look(time.monotonic())  # noqa: E731
+        self._selected = node.obey(String, "select_tool", self._on_message, look)
+        several = bool(status.options["allow_several_publishers"])
         self._sender = status.sensing["select_tool"] = node.sender_of(self._selected, several)
         self._publisher = node.create_publisher(String, "~/tool", LATCHED_QOS)
         node.add_on_set_parameters_callback(self._judge)
-        node.add_post_set_parameters_callback(self._take)
+        node.add_post_set_parameters_callback(self._use)
         self._publish()
 
     def close(self) -> None:
-        """Take no more tools."""
+        """Choose no more tools."""
         self._node.remove_on_set_parameters_callback(self._judge)
-        self._node.remove_post_set_parameters_callback(self._take)
+        self._node.remove_post_set_parameters_callback(self._use)
         self._status.sensing.pop("select_tool", None)
         self._node.close_ends(self._selected, self._publisher)
 
-    def _judge(self, parameters: list[Parameter]) -> SetParametersResult:
+    def _judge(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         """Refuse a tool that there is not, and any while the machine moves."""
         geometry = self._compensator.geometry
         try:
-            for name in _tools(parameters):
+            for name in (parameter.value for parameter in parameters if parameter.name == "tool"):
                 if not isinstance(name, str):
                     raise CommandError("tool", f"must be str, not {name!r}")
                 geometry.using(tool=name)
@@ -195,49 +177,41 @@ class ToolChoice:
             return SetParametersResult(successful=False, reason=f"parameter tool: {error}")
         return SetParametersResult(successful=True)
 
-    def _take(self, parameters: list[Parameter]) -> None:
-        for name in _tools(parameters):
+    def _use(self, parameters: Sequence[Parameter]) -> None:
+        for name in (parameter.value for parameter in parameters if parameter.name == "tool"):
             if name != self._compensator.geometry.tool_name:
                 self._compensator.set_tool(name)
                 self._node.note("tool", f"tool {name!r}: the next command must be where the struts are")
                 self._publish()
 
     def _on_message(self, data: bytes, number: int | None) -> None:
-        now = time.monotonic()
-        self._sender.look(now)  # who has just come may have spoken already
+        """Set the parameter. Where the commander's choice is refused, its next command must be where the struts are:
+        commands for the tool that it did not get may follow. Whoever else asks in vain stops nothing."""
+        now, status = time.monotonic(), self._status
+        status.look(now)  # who has just come may have sent already, and who commands may not have been looked up yet
         self._sender.hear(number, now)
         try:
             self._sender.check(Sample(now))
-            self._select(read_message(data, String).data)
+            name = read_message(data, String).data
+            result = self._node.set_parameters([Parameter("tool", value=name)])[0]
+            if not result.successful:
+                if set(self._sender.names) <= set(status.source.names) and not status.track.moving(now):
+                    self._compensator.set_tool(self._compensator.geometry.tool_name)
+                raise CommandError("tool", result.reason)
         except CommandError as error:
-            self._status.refused_tools.add(error.reason, str(error), now)
+            status.refused_tools.add(error.reason, str(error), now)
             self._node.warn_of("tool", f"select_tool refused: {error}")
-
-    def _select(self, name: str) -> None:
-        """Take a tool as the parameter would; where the commander's is refused, its next command must be where the
-        struts are: commands for the tool that it did not get may follow. Whoever else asks in vain stops nothing."""
-        result = self._node.set_parameters([Parameter("tool", value=name)])[0]
-        if result.successful:
-            return
-        commands = set(self._sender.names) <= set(self._status.source.names)
-        if commands and not self._status.track.moving(time.monotonic()):
-            self._compensator.set_tool(self._compensator.geometry.tool_name)
-        raise CommandError("tool", result.reason)
 
     def _publish(self) -> None:
         self._publisher.publish(String(data=self._compensator.geometry.tool_name))
-
-
-def _tools(parameters: list[Parameter]) -> list:
-    return [parameter.value for parameter in parameters if parameter.name == "tool"]
 
 
 class TravelReports:
     """``~/travel``, once a second while somebody subscribes, and ``~/get_travel``: how far the tool may go from where
     the machine was sent last, or before the first command was measured last."""
 
-    def __init__(self, served: Served, worker: Worker) -> None:
-        self._served, self._worker, node = served, worker, served.node
+    def __init__(self, node: MachineNode, status: CompensatorStatus, files: MachineFiles, worker: Worker) -> None:
+        self._node, self._status, self._files, self._worker = node, status, files, worker
         self._publisher = node.create_publisher(DiagnosticStatus, "~/travel", EVENT_QOS)
         self._late = LateAnswer(node.create_service(Trigger, "~/get_travel", self._on_request))
         self._busy = self._asked = False
@@ -245,8 +219,8 @@ class TravelReports:
 
     def close(self) -> None:
         """Stop, and leave no request without an answer."""
-        self._answer(False, "the node was cleaned up")
-        self._served.node.close_ends(self._late.service, self._publisher)
+        self._late.answer(Trigger.Response(message="the node was cleaned up"))
+        self._node.close_ends(self._late.service, self._publisher)
 
     def look(self, now: float) -> None:
         """Begin anew when it is due."""
@@ -255,7 +229,7 @@ class TravelReports:
             try:
                 self._begin()
             except CommandError as error:
-                self._publish(ERROR, str(error), {})
+                self._report(ERROR, str(error))
 
     def _on_request(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response | None:
         if self._asked and self._busy:
@@ -266,59 +240,51 @@ class TravelReports:
         return None
 
     def _begin(self) -> None:
-        compensator, frame_id = self._served.compensator, self._served.status.frame_id
-        names = {frame_id: name for name, frame_id in self._served.frame_ids.items()}
-        if frame_id not in names:  # before the first command
-            frame_id = self._served.frame_ids[WORK]
+        compensator, status = self._status.compensator, self._status
+        names = {frame_id: name for name, frame_id in status.frame_ids.items()}
+        work = names.get(status.frame_id, WORK)  # before the first command the usual one
         if np.isfinite(compensator.nominal).all():
             platform = compensator.platform
-        elif self._served.status.feedback.count:
+        elif status.feedback.count:
             platform = Pose(*compensator.platform_estimate)
         else:
             raise CommandError("no_feedback", "no command and no strut_states yet: where the machine is is not known")
-        geometry = compensator.geometry.using(work=names[frame_id])
+        geometry = compensator.geometry.using(work=work)
         pose = geometry.tool_pose(platform)
-        where = f"tool {geometry.tool_name} in {frame_id} at {pose_text(pose)}"
-        arguments = {
-            "position": pose.position.tolist(),
-            "rotation": pose.rotation.tolist(),
+        where = f"tool {geometry.tool_name} in {status.frame_ids[work]} at {pose_text(pose)}"
+        asked = {
+            "pose": pose,
             "tool": geometry.tool_name,
-            "work": geometry.work_name,
-            "warmth": list(compensator.temperatures.snapshot().values()),
+            "work": work,
+            "warmth": compensator.temperatures,
             "enabled": compensator.enabled,
         }
         self._busy = True
         self._worker.ask(
             Job(
                 "travel",
-                arguments,
-                lambda answer: self._publish(OK, where, answer["values"], answer["text"]),
-                lambda error: self._publish(ERROR, f"{where}: {error}", {}),
-                self._served.files.made_of(),
+                asked,
+                lambda found: self._report(OK, where, *found),
+                lambda error: self._report(ERROR, f"{where}: {error}"),
+                self._files.made_of(),
             )
         )
 
-    def _publish(self, level: bytes, text: str, values: dict[str, str], table: str = "") -> None:
-        self._busy = False
-        self._answer(level == OK, "\n".join(filter(None, (text, table))))
+    def _report(self, level: bytes, text: str, table: str = "", values: dict[str, str] | None = None) -> None:
+        self._busy = self._asked = False
+        self._late.answer(Trigger.Response(success=level == OK, message="\n".join(filter(None, (text, table)))))
         if self._publisher.get_subscription_count():
-            node = self._served.node
-            name = f"{node.get_fully_qualified_name()[1:]}: travel"
-            self._publisher.publish(status_of(name, node.hardware_id, level, text, values, LONGEST_REASON))
-
-    def _answer(self, success: bool, text: str) -> None:
-        if self._asked:
-            self._asked = False
-            self._late.answer(Trigger.Response(success=success, message=text))
+            name = f"{self._node.get_fully_qualified_name()[1:]}: travel"
+            self._publisher.publish(status_of(name, self._node.hardware_id, level, text, values or {}, LONGEST_REASON))
 
 
 class PredictedError:
-    """``~/predicted_error`` and ``~/predicted_error_aligned``: what the tool's error would be at the last command
-    without compensation, see :class:`..calibration.posterior.ErrorPredictor`; only while somebody listens."""
+    """``~/predicted_error`` and ``~/predicted_error_aligned``: the error that the tool would have without compensation
+    at the newest command, as the model predicts it, and how well that is known. Worked out while somebody subscribes.
+    """
 
-    def __init__(self, served: Served, worker: Worker) -> None:
-        self._served, self._worker, node = served, worker, served.node
-        self._compensator, self._status, self._files = served.compensator, served.status, served.files
+    def __init__(self, node: MachineNode, status: CompensatorStatus, files: MachineFiles, worker: Worker) -> None:
+        self._node, self._status, self._files, self._worker = node, status, files, worker
         self._topics = {
             "standing": node.create_publisher(PoseWithCovarianceStamped, "~/predicted_error", EVENT_QOS),
             "aligned": node.create_publisher(PoseWithCovarianceStamped, "~/predicted_error_aligned", EVENT_QOS),
@@ -330,61 +296,52 @@ class PredictedError:
     def close(self) -> None:
         """Destroy the topics."""
         self._status.prediction_problem = ""
-        self._served.node.close_ends(*self._topics.values())
+        self._node.close_ends(*self._topics.values())
 
     def look(self, now: float) -> None:
         """Ask for the newest pose, while somebody listens."""
+        compensator, source = self._status.compensator, self._files.sources["model"]
         wanted = any(publisher.get_subscription_count() for publisher in self._topics.values())
-        if not wanted or self._source is not self._files.sources["model"]:
-            self._source, self._status.prediction_problem = self._files.sources["model"], ""
+        if not wanted or self._source is not source:
+            self._source, self._status.prediction_problem = source, ""
             self._wait, self._due = TRY_AGAIN_AFTER[0], min(self._due, now)
-        if not wanted or self._busy or now < self._due or not np.isfinite(self._compensator.nominal).all():
+        if not wanted or self._busy or now < self._due or not np.isfinite(compensator.nominal).all():
             return
-        compensator = self._compensator
-        self._busy, self._asked_for, self._due = True, self._served.newest(), now + PREDICTION_PERIOD
+        self._busy, self._asked_for, self._due = True, self._status.last_answered, now + PREDICTION_PERIOD
         asked = {
-            "position": compensator.platform.position.tolist(),
-            "rotation": compensator.platform.rotation.tolist(),
-            "sense": compensator.motion.sense.tolist(),
+            "platform": compensator.platform,
+            "sense": compensator.motion.sense.copy(),
             "tool": compensator.geometry.tool_name,
-            "warmth": list(compensator.temperatures.snapshot().values()),
+            "warmth": compensator.temperatures,
         }
         self._worker.ask(Job("predict", asked, self._publish, self._failed, self._files.made_of()))
 
     def _publish(self, result: dict[str, Any]) -> None:
-        """Publish both errors; of a pose that the machine with its errors cannot take there is none."""
+        """Publish both errors; of a pose that the machine with its errors cannot reach there is none."""
         self._busy, self._wait, self._status.prediction_problem = False, TRY_AGAIN_AFTER[0], ""
         for name, publisher in self._topics.items():
-            error = result[name]
-            if error is not None and None not in error["values"]:
-                publisher.publish(
-                    error_message(error["values"], error["covariance"], self._served.frame_ids[WORK], self._asked_for)
-                )
+            if (error := result[name]) is not None and np.isfinite(error[0]).all():
+                publisher.publish(error_message(error[0], error[1], self._status.frame_ids[WORK], self._asked_for))
 
     def _failed(self, error: WorkerError) -> None:
         self._busy, self._due = False, time.monotonic() + self._wait
         self._status.prediction_problem = f"no predicted error: {error}"
-        self._served.node.warn_of(
-            "predicted error", f"{self._status.prediction_problem}; tried again in {self._wait:g} s"
-        )
+        self._node.warn_of("predicted error", f"{self._status.prediction_problem}; tried again in {self._wait:g} s")
         self._wait = min(2.0 * self._wait, TRY_AGAIN_AFTER[1])
 
 
 def error_message(
-    values: list[float], covariance: list[float] | None, frame: str, stamp: int
+    values: Sequence[float] | np.ndarray, covariance: np.ndarray | None, frame: str, stamp: int
 ) -> PoseWithCovarianceStamped:
-    """Return an error as a message: where the tool would be and how it would stand, seen from where it should.
-
-    `values`: displacement, m, and rotation vector, rad; `covariance`: its 36 numbers, row by row; None: not known,
-    which is NaN in the message, never zero; `stamp`: the command's, ns.
-    """
+    """Return an error, displacement, m, and rotation vector, rad, as a message: where the tool would be and how it
+    would stand, seen from where it should. A covariance that is not known is NaN, never zero."""
     message = PoseWithCovarianceStamped()
     message.header.frame_id, message.header.stamp = frame, stamp_of(stamp)
     position, orientation = message.pose.pose.position, message.pose.pose.orientation
-    position.x, position.y, position.z = values[:3]
+    position.x, position.y, position.z = map(float, values[:3])
     half = 0.5 * math.hypot(*values[3:])
     share = 0.5 * math.sin(half) / half if half > 0.0 else 0.5
-    orientation.x, orientation.y, orientation.z = (share * turn for turn in values[3:])
+    orientation.x, orientation.y, orientation.z = (share * float(turn) for turn in values[3:])
     orientation.w = math.cos(half)
-    message.pose.covariance = [math.nan] * 36 if covariance is None else covariance
+    message.pose.covariance = [math.nan] * 36 if covariance is None else np.ravel(covariance).tolist()
     return message

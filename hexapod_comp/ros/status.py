@@ -206,6 +206,7 @@ class CompensatorStatus:
         self,
         compensator: Compensator,
         thermometers: Thermometers,
+        frame_ids: dict[str, str],
         source: OneSender,
         own_topic: OneSender,
         measuring: OneSender,
@@ -214,6 +215,7 @@ class CompensatorStatus:
         """Take what a configuration has made: who commands, who else publishes strut commands, who measures; who
         publishes temperatures, humidity, the choice of tool, of whom a second one is not obeyed and stops nothing."""
         self.compensator, self.thermometers = compensator, thermometers
+        self.frame_ids = frame_ids  # by the machine's names of its frames
         self.source, self.own_topic, self.measuring, self.sensing = source, own_topic, measuring, sensing
         self.standing: tuple[Guard, ...] = (source, own_topic, measuring, self.track)
         self.track.watch(compensator.geometry)

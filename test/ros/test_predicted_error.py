@@ -129,15 +129,13 @@ def test_a_process_that_fails_every_time_is_tried_less_and_less_often(monkeypatc
         began.append(now)
         job.failed(worker.WorkerError("it cannot"))
 
-    node, status = MagicMock(), SimpleNamespace(prediction_problem="")
+    node = MagicMock()
+    status = SimpleNamespace(prediction_problem="", last_answered=1, compensator=MagicMock(nominal=np.zeros(6)))
     listeners = node.create_publisher.return_value.get_subscription_count
     listeners.return_value = 1
     monkeypatch.setattr(requests, "time", SimpleNamespace(monotonic=lambda: now))
-    sources = {"geometry": MagicMock(), "model": MagicMock()}
-    beside, files = SimpleNamespace(ask=ask), MagicMock(sources=sources)
-    topics = PredictedError(
-        MagicMock(node=node, compensator=MagicMock(nominal=np.zeros(6)), status=status, files=files), beside
-    )
+    files = MagicMock(sources={"geometry": MagicMock(), "model": MagicMock()})
+    topics = PredictedError(node, status, files, SimpleNamespace(ask=ask))
     for tick in range(1000):
         now = 100.0 + 0.2 * tick
         topics.look(now)

@@ -23,7 +23,7 @@ from hexapod_comp.errors import InputFileError
 from hexapod_comp.formats.files import read_text
 from hexapod_comp.formats.paths import confined_opener
 from hexapod_comp.ros.status import WARN
-from hexapod_comp.ros.worker import Job, Worker, loaded_model
+from hexapod_comp.ros.worker import Job, Worker
 
 ROUNDING = 1e-12
 
@@ -122,18 +122,8 @@ def wanted(place: Path, folder: Path) -> dict:
 def outcome(name: str, arguments: dict, within: float = 60.0) -> list:
     """Have a worker do a job, and return its result or its error."""
     beside, found = Worker(), []
-    beside.ask(
-        Job(
-            name,
-            arguments,
-            found.append,
-            found.append,
-            None,
-            loaded_model,
-            within,
-            f"could not be read in {within:g} s",
-        )
-    )
+    late = f"could not be read in {within:g} s"
+    beside.ask(Job(name, arguments, found.append, found.append, within=within, late=late))
     end = time.monotonic() + 60.0
     while not found and time.monotonic() < end:
         beside.look(time.monotonic())

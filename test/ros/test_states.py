@@ -5,8 +5,8 @@ Cases that another file tests are named there with that file. Levels and texts a
 
 from __future__ import annotations
 
-import json
 import os
+import pickle
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -621,15 +621,15 @@ def test_frames_of_one_name_are_refused(rig):
 
 def test_shipped_models_survive_the_way_through_the_loading_process():
     """Every number bit for bit, by the saved text of both."""
+    from hexapod_comp.formats.json import json_text
     from hexapod_comp.machine.geometry import load_geometry
     from hexapod_comp.machine.model_file import load_model
-    from hexapod_comp.ros.worker import model_json, model_of
 
     geometry = load_geometry(CONFIG / "paper.yaml")
     for name in ("paper_machine.yaml", "paper_lines_model.yaml"):
         model = load_model(CONFIG / name, geometry)
-        again = model_of(json.loads(model_json(model)))
-        assert model_json(again) == model_json(model)
+        again = pickle.loads(pickle.dumps(model))
+        assert json_text(again) == json_text(model)
         assert {name: type(value) for name, value in vars(again).items()} == {
             name: type(value) for name, value in vars(model).items()
         }

@@ -109,21 +109,21 @@ def test_the_parameter_changes_the_tool_and_nothing_moves(rig: Bench, machine: M
     rig.until(lambda: [message.data for message in tools][-1:] == ["probe"])
 
 
-def test_a_controller_selects_a_tool_by_a_topic(bench: Bench, machine: Machine, file: str) -> None:
-    started(bench, file)
-    select = bench.witness.create_publisher(String, "select_tool", RELIABLE)
-    bench.until(select.get_subscription_count)
-    bench.ask(at_home(machine), "work")
+def test_a_controller_selects_a_tool_by_a_topic(rig: Bench, machine: Machine, file: str) -> None:
+    started(rig, file)
+    select = rig.witness.create_publisher(String, "select_tool", RELIABLE)
+    rig.until(select.get_subscription_count)
+    rig.ask(at_home(machine), "work")
     select.publish(String(data="stub"))
-    bench.until(lambda: bench.nodes[0].get_parameter("tool").value == "stub", "the tool")
-    bench.ask(at_home(machine, "stub"), "work")
+    rig.until(lambda: rig.nodes[0].get_parameter("tool").value == "stub", "the tool")
+    rig.ask(at_home(machine, "stub"), "work")
     select.publish(String(data="drill"))
-    values = bench.until_status(WARN, "tool refused: parameter tool: machine framed has no tool 'drill'")
+    values = rig.until_status(WARN, "tool refused: parameter tool: machine framed has no tool 'drill'")
     assert (values["tool"], values["refused_tools"]) == ("stub", "1")
     # Commands for the tool that it did not get are refused, however near.
-    bench.send(at_home(machine, "stub", shift=1e-4), "work")
-    bench.until_status(ERROR, "refusing commands: tool_changed")
-    bench.ask(at_home(machine, "stub"), "work")
+    rig.send(at_home(machine, "stub", shift=1e-4), "work")
+    rig.until_status(ERROR, "refusing commands: tool_changed")
+    rig.ask(at_home(machine, "stub"), "work")
 
 
 def test_a_stranger_who_selects_a_wrong_tool_stops_nothing(rig: Bench, machine: Machine, file: str, stranger) -> None:
