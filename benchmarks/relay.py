@@ -16,8 +16,8 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
+from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.ros.base import COMMAND_QOS, STATE_QOS, MachineNode
-from hexapod_comp.ros.messages import StrutMessage
 from hexapod_comp.ros.parameters import Program, read_table
 from hexapod_comp.ros.process import run
 
@@ -42,7 +42,10 @@ class RelayNode(MachineNode):
         self._command_pub = self.publish_on(JointState, "strut_commands", COMMAND_QOS)
         self._correction_pub = self.publish_on(JointState, "strut_corrections", COMMAND_QOS)
         self._estimate_pub = self.publish_on(PoseStamped, "tool_pose_estimate", STATE_QOS)
-        self._command, self._correction = StrutMessage().message, StrutMessage().message
+        zeros = [0.0] * 6
+        self._command, self._correction = (
+            JointState(name=list(STRUT_NAMES), position=zeros, velocity=zeros) for _ in range(2)
+        )
         self._bytes, self._estimate, self._answered = serialize_message(self._command), PoseStamped(), False
         callback = self._on_bytes if self._serialized else self._on_command
         topic = "tool_pose_command"

@@ -19,8 +19,6 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
-import numpy as np
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
@@ -33,7 +31,7 @@ from ..compensation.guards import Sample, StampClock, StampGate
 from ..errors import CommandError, HexapodError
 from ..ros import keep_discovery_local
 from ..ros.base import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, LATCHED_QOS, STATE_QOS, MachineNode
-from ..ros.messages import StrutMessage, StrutReader, stamp_of
+from ..ros.messages import StrutBytes, StrutReader, stamp_of
 from ..ros.parameters import Program, read_table
 from ..ros.process import run
 from ..ros.status import ERROR, OK, WARN, Flow, Refusals, seconds, status_prefix
@@ -352,7 +350,7 @@ class LinuxcncBridgeNode(MachineNode):
         self._reset: CompensatorReset | None = None  # while topics are open
         self._hal: HalComponent | None = HalComponent(self._options["component"], PINS, hal)
         self._open_pins(self._hal)
-        self._pose_out, self._states_out = PoseStamped(), StrutMessage()
+        self._pose_out, self._states_out = PoseStamped(), StrutBytes()
         self._stop = StopInput(self, self._options)
         self._hal.ready()
         self._loop = self.every(1.0 / self._options["rate"], self._cycle)
@@ -456,7 +454,7 @@ class LinuxcncBridgeNode(MachineNode):
 
     def _send(self, now: float) -> None:
         """Publish measured struts and commanded pose, each only if all its pins are usable."""
-        stamp, status = stamp_of(time.time_ns()), self._status
+        stamp, status = time.time_ns(), self._status
         p, q = self._pose_out.pose.position, self._pose_out.pose.orientation
         # Half a cycle less, since cycles come a little early or late.
         if self._status.states.age(now) >= 1.0 / self._options["states_rate"] - 0.5 / self._options["rate"]:
@@ -469,11 +467,11 @@ class LinuxcncBridgeNode(MachineNode):
                 self._streaming_since = now
             x, y, z, q.x, q.y, q.z, q.w = pose_from_axes(*axes)
             p.x, p.y, p.z = x * self._metres, y * self._metres, z * self._metres
-            self._pose_out.header.stamp = stamp
+            self._pose_out.header.stamp = stamp_of(stamp)
             self._pose_pub.publish(self._pose_out)
             status.sent.tick(now)
 
-    def _send_states(self, feedback: Sequence[float], stamp: Time, now: float) -> None:
+    def _send_states(self, feedback: Sequence[float], stamp: int, now: float) -> None:
         """Publish measured struts; while no corrections come, only when they stand."""
         # A compensator starts from the measured struts, and takes their way to its commands for a correction to be
         # ramped out. Moving struts lag: one that starts while they move is better left without them, unless it cannot
@@ -481,15 +479,14 @@ class LinuxcncBridgeNode(MachineNode):
         out, since = self._states_out, self._status.states.age(now)
         self._status.states.tick(now)
         followed = since < self._options["timeout"]
-        out.write(np.array(feedback) * self._metres, since if followed else 0.0)
+        message = out.made([value * self._metres for value in feedback], stamp, since if followed else 0.0)
         if not followed or max(map(abs, out.velocity.tolist())) > STANDING:
             self._moved_at = now
         in_vain = self._reset is not None and self._reset.in_vain
         silent = self._status.heard.age(now) > self._options["timeout"]
         if silent and now - self._moved_at < self._options["timeout"] and not in_vain:
             return
-        out.message.header.stamp = stamp
-        self._states_pub.publish(out.message)
+        self._states_pub.publish(message)
 
     def _usable(self, names: Sequence[str], values: Sequence[float], now: float) -> bool:
         bad = {name: value for name, value in zip(names, values, strict=True) if not abs(value) <= LARGEST_PIN}

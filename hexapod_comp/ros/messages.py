@@ -3,7 +3,7 @@
 rclpy builds a Python object for every part of a message that comes, and looks at every element of one that goes; that
 takes longer than a compensation. So commands, struts and pose estimates are read and written as the bytes that go over
 the wire: CDR (OMG DDS-RTPS 9.4.2, 10.2), four bytes that tell the encoding, then the fields in order, each at a
-multiple of its size. Where the layout is not the usual one, rclpy's own conversion is used.
+multiple of its size, counted from behind those four. What is not laid out so is read by rclpy.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
 from ..compensation.guards import Sample
 from ..core import ffi, lib
-from ..core.batch import quaternion_of, write_lengths
+from ..core.batch import quaternion_of
 from ..errors import CommandError
 from ..machine.geometry import STRUT_NAMES
 from ..pose import Pose
@@ -38,12 +38,26 @@ no speed between them."""
 LITTLE_ENDIAN = b"\x00\x01"
 """How plain CDR with the lowest byte first begins."""
 
+_ENCODING = LITTLE_ENDIAN + b"\0\0"
 _START, _STAMP, _COUNT = struct.Struct("<iII"), struct.Struct("<iI"), struct.Struct("<I")
 _SIX, _SEVEN = struct.Struct("<6d"), struct.Struct("<7d")
 _START_AT, _FRAME_AT = 4, 16
 _SECOND = 1_000_000_000
-_NONE = _COUNT.pack(0)
-_MARK = _STAMP.pack(0x01020304, 0x05060708)
+_HEAD = _ENCODING + bytes(_STAMP.size)
+_NONE, _SIX_ALIGNED = _COUNT.pack(0), _COUNT.pack(6) + bytes(4)
+
+
+def _aligned(data: bytes, size: int) -> bytes:
+    return data + bytes((_START_AT - len(data)) % size)
+
+
+def _with_count(data: bytes, count: int) -> bytes:
+    return _aligned(data, 4) + _COUNT.pack(count)
+
+
+def _with_text(data: bytes, text: str) -> bytes:
+    encoded = text.encode() + b"\0"
+    return _with_count(data, len(encoded)) + encoded
 
 
 def nanoseconds_of(stamp: Time) -> int:
@@ -121,7 +135,7 @@ def read_pose(data: bytes, sample: Sample) -> None:
     if data[:2] == LITTLE_ENDIAN and _FRAME_AT + _SEVEN.size <= len(data) <= LARGEST_MESSAGE:
         seconds, nanoseconds, length = _START.unpack_from(data, _START_AT)
         end = _FRAME_AT + length
-        numbers_at = end + (_START_AT - end) % 8  # alignment counts from behind the four bytes
+        numbers_at = end + (_START_AT - end) % 8
         fits = numbers_at + _SEVEN.size == len(data) and nanoseconds < _SECOND
         if fits and (not length or data[end - 1] == 0):
             sample.frame_id = data[_FRAME_AT : end - 1].decode(errors="replace")
@@ -133,94 +147,55 @@ def read_pose(data: bytes, sample: Sample) -> None:
 
 
 class PoseBytes:
-    """A PoseStamped as bytes, written in place, to be published again and again."""
+    """A PoseStamped as bytes, to be published again and again."""
 
     def __init__(self, frame_id: str) -> None:
-        self._message = PoseStamped()
-        self._message.header.frame_id = frame_id
-        self._message.header.stamp.sec, self._message.header.stamp.nanosec = _STAMP.unpack(_MARK)
-        marks = tuple(float(n) for n in range(1, 8))
-        p, q = self._message.pose.position, self._message.pose.orientation
-        p.x, p.y, p.z, q.x, q.y, q.z, q.w = marks
-        data, wanted = serialize_message(self._message), (_MARK, _SEVEN.pack(*marks))
-        self._known = data[:2] == LITTLE_ENDIAN and all(data.count(part) == 1 for part in wanted)
-        self._bytes = bytearray(data)
-        self._stamp_at, self._numbers_at = (data.find(part) for part in wanted)
+        self._bytes = bytearray(_aligned(_with_text(_HEAD, frame_id), 8) + bytes(_SEVEN.size))
         self._quaternion = ffi.new("double[4]")
 
-    def made(self, pose: np.ndarray, stamp: int) -> bytes | PoseStamped:
+    def made(self, pose: np.ndarray, stamp: int) -> bytes:
         """Return what to publish: position, m, and rotation matrix by rows, shape (12,), with a stamp in ns."""
-        if not self._known:
-            write_pose(self._message, pose[:3], pose[3:].reshape((3, 3)))
-            self._message.header.stamp = stamp_of(stamp)
-            return self._message
         lib.hc_quaternion(ffi.from_buffer("double[9]", pose[3:]), self._quaternion)
-        _STAMP.pack_into(self._bytes, self._stamp_at, *divmod(stamp, _SECOND))
-        _SEVEN.pack_into(self._bytes, self._numbers_at, *pose[:3].tolist(), *self._quaternion)
+        _STAMP.pack_into(self._bytes, _START_AT, *divmod(stamp, _SECOND))
+        _SEVEN.pack_into(self._bytes, len(self._bytes) - _SEVEN.size, *pose[:3].tolist(), *self._quaternion)
         return bytes(self._bytes)
 
 
 # ---- struts ----
 
 
-class StrutMessage:
-    """A JointState of the six struts whose numbers, m and m/s, are written in place, to be published again and again.
+def _before_positions(frame_id: str, names: Sequence[str]) -> bytes:
+    """Return a JointState of six positions as bytes, up to these, with a stamp of zero."""
+    data = _with_count(_with_text(_HEAD, frame_id), len(names))
+    for name in names:
+        data = _with_text(data, name)
+    return _aligned(_with_count(data, 6), 8)
+
+
+class StrutBytes:
+    """A JointState of the six struts as bytes, to be published again and again.
 
     The velocity field is filled too: an empty one makes bags that some readers refuse.
     """
 
     def __init__(self, frame_id: str = "", names: Sequence[str] = STRUT_NAMES) -> None:
-        self.message = JointState(name=list(names), position=[0.0] * 6, velocity=[0.0] * 6)
-        self.message.header.frame_id = frame_id
-        self.position = np.frombuffer(self.message.position, dtype=float)
-        self.velocity = np.frombuffer(self.message.velocity, dtype=float)
-
-    def write(self, lengths: np.ndarray, period: float = 0.0) -> None:
-        """Write lengths, m, and as velocities their change since the last ones over `period` s; 0: at rest."""
-        write_lengths(lengths, period, np.inf, self.position, self.velocity)
-
-
-class StrutBytes:
-    """The same as bytes. Where each number stands is learnt from what the middleware's own serialiser has written."""
-
-    def __init__(self, frame_id: str = "", names: Sequence[str] = STRUT_NAMES) -> None:
         self.stamp = 0  # of the message last made, ns; 0 before
-        self._plain: StrutMessage | None = None
-        marks = np.arange(1.0, 13.0)
-        sample = JointState(name=list(names), position=marks[:6].tolist(), velocity=marks[6:].tolist())
-        sample.header.frame_id = frame_id
-        sample.header.stamp.sec, sample.header.stamp.nanosec = _STAMP.unpack(_MARK)
-        data = serialize_message(sample)
-        wanted = (_MARK, marks[:6].tobytes(), marks[6:].tobytes())
-        if data[:2] != LITTLE_ENDIAN or any(data.count(part) != 1 for part in wanted):
-            self._plain = StrutMessage(frame_id, names)
-            self.position, self.velocity = self._plain.position, self._plain.velocity
-        else:
-            self._stamp_at, position, velocity = (data.index(part) for part in wanted)
-            data = data[: velocity + 48 + 4]  # behind the efforts, none, the serialiser leaves bytes that mean nothing
-            spare = -position % 8  # in front, so that numpy finds the numbers at multiples of eight
-            whole = np.empty(spare + len(data), np.uint8)
-            self._bytes = whole[spare:]
-            self._bytes[:] = np.frombuffer(data, np.uint8)
-            self.position = self._bytes[position : position + 48].view(float)
-            self.velocity = self._bytes[velocity : velocity + 48].view(float)
-            self.position[:], self.velocity[:] = 0.0, 0.0
+        self.position, self.velocity = np.zeros(6), np.zeros(6)  # m and m/s
+        self._names = _before_positions(frame_id, names)[_START_AT + _STAMP.size :]
         self._at = ffi.from_buffer("double[6]", self.position), ffi.from_buffer("double[6]", self.velocity)
 
-    def made(self, lengths: Any, stamp: int, period: float = 0.0, fastest: float = np.inf) -> bytes | JointState:
-        """Return what to publish, with a stamp in ns; bytes, or a message where the layout is not known.
+    def made(self, lengths: Any, stamp: int, period: float = 0.0, fastest: float = np.inf) -> bytes:
+        """Return what to publish, with a stamp in ns.
 
-        `lengths`: six, m, as the core takes them (``double[6]``); velocities are their change since the last ones over
-        `period` s; 0: at rest. Stamps jitter, and velocities that are larger than `fastest`, m/s, are none: then all
-        are smaller in proportion.
+        `lengths`: six, m, a tuple, a list or the core's ``double[6]``; None: position and velocity as they are.
+        Velocities are their change since the last ones over `period` s; 0: at rest. Stamps jitter, and no strut is
+        faster than `fastest`, m/s: where one would be, all velocities are smaller in proportion.
         """
-        lib.hc_write_lengths(lengths, period, fastest, *self._at)
-        self.stamp = stamp
-        if self._plain is not None:
-            self._plain.message.header.stamp = stamp_of(stamp)
-            return self._plain.message
-        _STAMP.pack_into(self._bytes.data, self._stamp_at, *divmod(stamp, _SECOND))
-        return self._bytes.tobytes()
+        if lengths is not None:
+            lib.hc_write_lengths(lengths, period, fastest, *self._at)
+        self.stamp, when = stamp, _STAMP.pack(*divmod(stamp, _SECOND))
+        numbers = self.position.tobytes(), _SIX_ALIGNED, self.velocity.tobytes()
+        return b"".join((_ENCODING, when, self._names, *numbers, _NONE))
 
 
 class StrutReader:
@@ -230,7 +205,9 @@ class StrutReader:
         self.lengths = np.zeros(6)  # last read, in strut order, m
         self._struts, self._names = names, list[str]()
         self._order: Sequence[int] = range(6)
-        self._shape: tuple[int, bytes, int, bytes, int] = (0, b"", 0, b"", 0)  # of the last message: see _learn
+        # Of the last message: size, what stands before the positions but for the stamp, where these stand, the count of
+        # velocities behind them, and where that of efforts, none, stands.
+        self._shape: tuple[int, bytes, int, bytes, int] = (0, b"", 0, b"", 0)
 
     def sample(self, data: bytes, sample: Sample) -> None:
         """Read a message that came as bytes into a sample: stamp and lengths, a tuple in strut order.
@@ -249,7 +226,12 @@ class StrutReader:
             return
         message = self.take(data)
         sample.stamp, sample.values = nanoseconds_of(message.header.stamp), tuple(self.lengths.tolist())
-        self._learn(data, message)
+        head, fast = _before_positions(message.header.frame_id, message.name), len(message.velocity)
+        at, efforts, six = len(head), len(head) + (104 if fast else 52), len(message.position) == 6 and fast in (0, 6)
+        usual = data[12:at] == head[12:] and data[:2] == LITTLE_ENDIAN and len(data) >= efforts + 4
+        self._shape = (0, b"", 0, b"", 0)
+        if usual and six and not len(message.effort):
+            self._shape = (len(data), data[:4] + data[12:at], at, _COUNT.pack(fast), efforts)
 
     def take(self, data: bytes) -> JointState:
         """Read a message that came as bytes, and return it; errors as :func:`read_message` and :meth:`read`."""
@@ -282,33 +264,12 @@ class StrutReader:
             allowed = f"finite and below {LARGEST_LENGTH:g} m"
             raise CommandError("not_finite", f"strut lengths must be {allowed}, not {list(lengths)}")
 
-    def _learn(self, data: bytes, message: JointState) -> None:
-        """Remember how a message that was read is laid out: its size, what stands before the positions, where these
-        stand, the count of velocities behind them, and that of efforts, none, at the end."""
-        self._shape = (0, b"", 0, b"", 0)
-        if len(message.position) != 6 or len(message.velocity) not in (0, 6) or len(message.effort):
-            return
-        rest = data[12:]
-        positions, velocities = message.position.tobytes(), message.velocity.tobytes()
-        at = 12 + rest.find(positions)
-        # Behind the positions: count of velocities, at the next multiple of eight these, count of efforts.
-        behind = at + 52 + (4 + 48 if velocities else 0)
-        counts = data[at + 48 : at + 52]
-        usual = data[:2] == LITTLE_ENDIAN and rest.count(positions) == 1 and data[behind : behind + 4] == _NONE
-        usual = usual and counts == _COUNT.pack(len(message.velocity))
-        usual = usual and (at - 4) % 8 == 0 and data[at - 8 : at].find(_COUNT.pack(6)) >= 0
-        if usual and (not velocities or data[at + 56 : at + 104] == velocities):
-            self._shape = (len(data), data[:4] + data[12:at], at, counts, behind)
-
 
 def strut_order(names: Sequence[str], struts: Sequence[str] = STRUT_NAMES) -> np.ndarray:
     """Return where each of the six struts stands in a list of names; a CommandError, ``strut_names``, where one is
     missing, or there twice."""
-    places_of: dict[str, list[int]] = {name: [] for name in struts}
-    for place, name in enumerate(names):
-        if name in places_of:
-            places_of[name].append(place)
-    wrong = [f"{name} {'twice' if places else 'missing'}" for name, places in places_of.items() if len(places) != 1]
+    counts = [(name, list(names).count(name)) for name in struts]
+    wrong = [f"{name} {'twice' if count else 'missing'}" for name, count in counts if count != 1]
     if wrong:
         raise CommandError("strut_names", f"each strut must be named once: {', '.join(wrong)}")
-    return np.array([places[0] for places in places_of.values()])
+    return np.array([list(names).index(name) for name in struts])

@@ -27,7 +27,7 @@ from ..virtual.machine import DriveParameters, Faults, StrutDrive
 from ..virtual.named import RANDOM, find_model, is_word
 from . import keep_discovery_local
 from .base import ACKNOWLEDGED_WITHIN, CHECK_PERIOD, STATE_QOS, MachineNode
-from .messages import StrutMessage, StrutReader, write_pose
+from .messages import StrutBytes, StrutReader, stamp_of, write_pose
 from .parameters import Program, read_table
 from .process import run
 from .status import ERROR, OK, WARN, Flow, LogSpace, Refusals, joined, seconds
@@ -100,7 +100,7 @@ class StrutDriveNode(MachineNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Build the machine and open topics."""
         options, names = self._options, self._options["joint_names"]
-        self._reader, self._states_out, self._true_out = StrutReader(names), StrutMessage(names=names), PoseStamped()
+        self._reader, self._states_out, self._true_out = StrutReader(names), StrutBytes(names=names), PoseStamped()
         self._true_out.header.frame_id = options["base_frame"]
         try:
             geometry = load_geometry(config_file(options["geometry_file"], "geometry"))
@@ -216,19 +216,18 @@ class StrutDriveNode(MachineNode):
         now = time.monotonic()
         self.drive.advance(min(now - self._last_run, LONGEST_PAUSE))
         self._last_run = now
-        stamp = self.get_clock().now().to_msg()
+        stamp = self.get_clock().now().nanoseconds
         if self.drive.feedback_arrived:
             out = self._states_out
             out.position[:] = self.drive.encoder_lengths()
             out.velocity[:] = self.drive.encoder_speeds()
-            out.message.header.stamp = stamp
-            self._states_pub.publish(out.message)
+            self._states_pub.publish(out.made(None, stamp))
         try:
             self._tool_in_base()
         except KinematicsError as error:
             self.warn_of("true pose", f"the machine cannot stand where its struts are: {error}")
             return
-        self._true_out.header.stamp = stamp
+        self._true_out.header.stamp = stamp_of(stamp)
         self._true_pub.publish(self._true_out)
 
     def _tool_in_base(self) -> None:
