@@ -226,11 +226,10 @@ class StrutReader:
             return
         message = self.take(data)
         sample.stamp, sample.values = nanoseconds_of(message.header.stamp), tuple(self.lengths.tolist())
-        head, fast = _before_positions(message.header.frame_id, message.name), len(message.velocity)
-        at, efforts, six = len(head), len(head) + (104 if fast else 52), len(message.position) == 6 and fast in (0, 6)
-        usual = data[12:at] == head[12:] and data[:2] == LITTLE_ENDIAN and len(data) >= efforts + 4
-        self._shape = (0, b"", 0, b"", 0)
-        if usual and six and not len(message.effort):
+        at, fast = len(_before_positions(message.header.frame_id, message.name)), len(message.velocity)
+        efforts, self._shape = at + (104 if fast else 52), (0, b"", 0, b"", 0)
+        six = len(message.position) == 6 and fast in (0, 6) and not len(message.effort)
+        if six and data[:2] == LITTLE_ENDIAN and data[at : at + 48] == message.position.tobytes():
             self._shape = (len(data), data[:4] + data[12:at], at, _COUNT.pack(fast), efforts)
 
     def take(self, data: bytes) -> JointState:
