@@ -21,20 +21,16 @@ from ..machine.passes import Poses
 from ..machine.trajectory import moves
 from ..pose import Pose, stacked
 
+# Limits that have a margin, in the order in which they are shown
 LIMITS = ("stroke", "base_cone", "platform_cone", "clearance", "condition", "correction", "step", "speed")
-"""Limits that have a margin, in the order in which they are shown."""
 
-OTHER_FINDINGS = ("assembly", "not_converged", "outside_field")
-"""Findings without a margin."""
+OTHER_FINDINGS = ("assembly", "not_converged", "outside_field")  # Findings without a margin
 
+# What the rows of a list are to each other: nothing; targets joined by moves; consecutive commands
 MODES = ("poses", "moves", "stream")
-"""What the rows of a list are to each other: nothing; targets joined by moves; consecutive commands."""
 
-RATES = (1.0, 10_000.0)
-"""Command rates that make sense, Hz."""
-
-CHUNK = 16_384
-"""Poses examined at a time: bounds the memory of long paths."""
+RATES = (1.0, 10_000.0)  # Command rates that make sense, Hz
+CHUNK = 16_384  # Poses examined at a time: bounds the memory of long paths
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,6 @@ from ..errors import (
     OutsideFieldError,
     PoseError,
 )
-from ..machine.field import GridField
 from ..machine.geometry import STRUT_NAMES, TOOL, HexapodGeometry, pose_text
 from ..machine.kinematics import forward_error, jacobian
 from ..machine.model import MachineModel, MotionState, RealMachine, core_model, write_temperatures
@@ -35,42 +34,23 @@ from ..machine.temperatures import HUMIDITY, Lag, Temperatures, check_part
 from ..machine.temperatures import PARTS as MEASURED_PARTS
 from ..pose import Pose
 
-DEFAULT_RAMP_RATE = 1e-3
-"""How fast a change of model, temperature or enabling moves a strut, m/s."""
+DEFAULT_RAMP_RATE = 1e-3  # How fast a change of model, temperature or enabling moves a strut, m/s
 
+# Nominal lengths that differ by no more, m, are the same place: what a controller's decimals round; the core's
 SAME_PLACE = 1e-5
-"""Nominal lengths that differ by no more, m, are the same place: what a controller's decimals round; the core's."""
 
+# Parts of a snapshot, and how many numbers each is: the members of ``hc_last``, and the ramp's rate. A recording
+# holds them under these names, so a new meaning needs a new name.
 PARTS = {
-    "motion_low": 9,
-    "motion_sense": 9,
-    "nominal": 6,
-    "correction": 6,
-    "command": 6,
-    "ramp": 6,
-    "time": 1,
-    "platform_position": 3,
-    "platform_rotation": 9,
-    "model_position": 3,
-    "model_rotation": 9,
-    "enabled": 1,
-    "changed": 1,
-    "resumes": 1,
-    "ramp_rate": 1,
-    "received": 1,
-    "published": 1,
-    "ahead_by_stamp": 6,
-    "ahead_by_receipt": 6,
-    "smooth_speed": 6,
+    **dict.fromkeys(("motion_low", "motion_sense", "platform_rotation", "model_rotation"), 9),
+    **dict.fromkeys(("nominal", "correction", "command", "ramp"), 6),
+    **dict.fromkeys(("ahead_by_stamp", "ahead_by_receipt", "smooth_speed"), 6),
+    **dict.fromkeys(("platform_position", "model_position"), 3),
+    **dict.fromkeys(("time", "enabled", "changed", "resumes", "ramp_rate", "received", "published"), 1),
 }
-"""Parts of a snapshot, and how many numbers each is: the members of ``hc_last``, and the ramp's rate. A recording holds
-them under these names, so a new meaning needs a new name."""
 
-PLACES = ("platform_", "model_")
-"""Beginnings of the names of parts that are poses."""
-
-BESIDE_NUMBERS = ("temperatures", "lags", "tool")
-"""What a compensator's snapshot holds beside the numbers of its state."""
+PLACES = ("platform_", "model_")  # Beginnings of the names of parts that are poses
+BESIDE_NUMBERS = ("temperatures", "lags", "tool")  # What a compensator's snapshot holds beside the numbers of its state
 
 
 @dataclass(frozen=True)
@@ -139,21 +119,22 @@ class Phase(Enum):
     RUNNING = "at the last command"
 
 
+_ALWAYS = {
+    "reset": Phase.FIRST,
+    "reset to struts": Phase.RESUMED,
+    "command": Phase.RUNNING,
+    "ramped": Phase.RAMPING,
+}
+# What each event makes of each phase. ``change``: of model, temperature, humidity, or the switch; ``command``: an
+# accepted one with which all is taken up; ``ramped``: one after which something is still to be taken up. A refused
+# command changes nothing. doc/states.md shows this table, and tests hold the core to it.
 TRANSITIONS = {
-    Phase.FIRST: {"reset": Phase.FIRST, "reset to struts": Phase.RESUMED, "tool": Phase.FIRST, "change": Phase.FIRST,
-                  "command": Phase.RUNNING, "ramped": Phase.RAMPING},
-    Phase.RESUMED: {"reset": Phase.FIRST, "reset to struts": Phase.RESUMED, "tool": Phase.RESUMED,
-                    "change": Phase.RESUMED, "command": Phase.RUNNING, "ramped": Phase.RAMPING},
-    Phase.NEW_TOOL: {"reset": Phase.FIRST, "reset to struts": Phase.RESUMED, "tool": Phase.NEW_TOOL,
-                     "change": Phase.NEW_TOOL, "command": Phase.RUNNING, "ramped": Phase.RAMPING},
-    Phase.RAMPING: {"reset": Phase.FIRST, "reset to struts": Phase.RESUMED, "tool": Phase.NEW_TOOL,
-                    "change": Phase.RAMPING, "command": Phase.RUNNING, "ramped": Phase.RAMPING},
-    Phase.RUNNING: {"reset": Phase.FIRST, "reset to struts": Phase.RESUMED, "tool": Phase.NEW_TOOL,
-                    "change": Phase.RAMPING, "command": Phase.RUNNING, "ramped": Phase.RAMPING},
-}  # fmt: skip
-"""What each event makes of each phase. ``change``: of model, temperature, humidity, or the switch; ``command``: an
-accepted one with which all is taken up; ``ramped``: one after which something is still to be taken up. A refused
-command changes nothing. doc/states.md shows this table, and tests hold the core to it."""
+    Phase.FIRST: {**_ALWAYS, "tool": Phase.FIRST, "change": Phase.FIRST},
+    Phase.RESUMED: {**_ALWAYS, "tool": Phase.RESUMED, "change": Phase.RESUMED},
+    Phase.NEW_TOOL: {**_ALWAYS, "tool": Phase.NEW_TOOL, "change": Phase.NEW_TOOL},
+    Phase.RAMPING: {**_ALWAYS, "tool": Phase.NEW_TOOL, "change": Phase.RAMPING},
+    Phase.RUNNING: {**_ALWAYS, "tool": Phase.NEW_TOOL, "change": Phase.RAMPING},
+}
 
 
 def pack_pose(pose: Pose) -> Struct:
@@ -161,8 +142,7 @@ def pack_pose(pose: Pose) -> Struct:
     return Struct("hc_pose", {"position": pose.position, "rotation": pose.rotation})
 
 
-NO_SHIFT = pack_pose(Pose.identity())
-"""Frame of poses that are in ``base`` already."""
+NO_SHIFT = pack_pose(Pose.identity())  # Frame of poses that are in ``base`` already
 
 
 class Compensator:
@@ -281,24 +261,16 @@ class Compensator:
             drag the struts there and be refused on its way. The old model stays.
         """
         constants = core_model(self.geometry, model)
-        self._check(constants, model)
+        if lib.hc_check(self._at, constants.at, self._answer):
+            raise refusal(self._answer, self.geometry, model)
         lib.hc_set_model(self._at, constants.at)
         self._constants, self.model, self._machine = constants, model, None
         self.on_change("model", model)
 
     def check(self) -> None:
-        """Raise what is wrong with all that the model would correct at the last command, before the first one at home.
-
-        Raises
-        ------
-        LimitError, KinematicsError, OutsideFieldError
-            As for :meth:`set_model`.
-        """
-        self._check(self._constants, self.model)
-
-    def _check(self, constants: Struct, model: MachineModel) -> None:
-        if lib.hc_check(self._at, constants.at, self._answer):
-            raise refusal(self._answer, self.geometry, model)
+        """Raise what is wrong with all that the model would correct, as :meth:`set_model` does."""
+        if lib.hc_check(self._at, self._constants.at, self._answer):
+            raise refusal(self._answer, self.geometry, self.model)
 
     def set_temperature(self, name: str, value: float, time: float = math.nan) -> None:
         """Take a temperature, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
@@ -566,43 +538,29 @@ class Compensator:
 
     def predicted_error(self) -> np.ndarray:
         """Return the tool error that nominal lengths would leave at the last command (see `Correction`)."""
-        platform, twist = self.platform, self._model_correction() * -1.0
-        solve_linear(jacobian(self.geometry, platform), twist)
-        lever = platform.rotation @ self.geometry.tool.position
-        twist[:3] += np.cross(twist[3:], lever)
-        return twist
-
-    def _model_correction(self) -> np.ndarray:
-        """Return what the model would correct at the last command, ramp and switch left aside."""
         platform, commands = self.platform, np.empty(6)
         low, sense = self.motion.low.copy(), self.motion.sense.copy()
         given_pose, unused = (platform.position, platform.rotation), (np.empty(3), np.empty((3, 3)))
         if backwards(self._state, *given_pose, low, sense, *unused, commands) == Status.NOT_CONVERGED:
             raise NotConvergedError("the error field is too steep to be undone at this pose")
-        return commands - self.nominal
+        twist = self.nominal - commands  # what the model would correct, ramp and switch left aside, and its sign turned
+        solve_linear(jacobian(self.geometry, platform), twist)
+        twist[:3] += np.cross(twist[3:], platform.rotation @ self.geometry.tool.position)
+        return twist
 
 
 def named_parts(state: Struct) -> dict[str, np.ndarray]:
     """Return the parts of a compensator's state by their names in a snapshot, each in the state's memory."""
-    last = state.view["last"]
-    parts = {}
-    for name in PARTS:
+    last, parts = state.view["last"], {"ramp_rate": state.view["ramp_rate"]}
+    for name in PARTS.keys() - parts.keys():
         body, _, part = name.partition("_")
-        if name == "ramp_rate":
-            parts[name] = state.view[name]
-        else:
-            parts[name] = last[body][part] if body in ("platform", "model") else last[name]
-    return parts
+        parts[name] = last[body][part] if body in ("platform", "model") else last[name]
+    return {name: parts[name] for name in PARTS}
 
 
 def read_parts(snapshot: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the numbers of a compensator's snapshot by name.
-
-    Raises
-    ------
-    ModelError
-        A name is missing or unknown, or has not as many numbers as it should.
-    """
+    """Return the numbers of a compensator's snapshot by name, or a ModelError: a name is missing or unknown, or has not
+    as many numbers as it should."""
     for name in sorted({*PARTS} ^ ({*snapshot} - {*BESIDE_NUMBERS})):
         raise ModelError(f"snapshot.{name}", "is missing" if name in PARTS else "is unknown to this release")
     parts = {name: np.asarray(snapshot[name], dtype=float) for name in PARTS}
@@ -622,14 +580,27 @@ def refusal(
     """Return what the core found wrong with a command, its numbers if it was given so, as an error in words; `stands`:
     ``pose_platform_in_base`` of the last command."""
     status = answer.status
-    if status == Status.QUATERNION or (status == Status.NOT_FINITE and answer.strut < 0):
-        return _pose_error(status, numbers)
+    if status == Status.QUATERNION:
+        norm = math.hypot(*numbers[3:])
+        problem = f"quaternion must have norm 1 within {QUATERNION_NORM_TOLERANCE:g}, not {norm:.6g}"
+        return PoseError(problem, list(numbers[3:]), "quaternion")
+    if status == Status.NOT_FINITE and answer.strut < 0:
+        return PoseError("pose must be finite", list(numbers), "not_finite")
     if status == Status.NOT_CONVERGED:
         return NotConvergedError("the error field is too steep to be undone at this pose")
     if status == Status.OUTSIDE_FIELD:
-        return _outside_error(pose_of(answer.platform), model.field)
+        platform, box = pose_of(answer.platform), model.field.box * 1e3
+        point = (platform.position + platform.rotation @ model.field.probe) * 1e3
+        low, high = (", ".join(f"{v:g}" for v in corner) for corner in box)
+        problem = f"the measured point ({point[0]:.3f}, {point[1]:.3f}, {point[2]:.3f}) mm is outside the field's box"
+        return OutsideFieldError(f"{problem} ({low})…({high}) mm, in base", point, box)
     if status == Status.TOOL_CHANGED:
-        return _tool_error(answer.strut, answer.value, geometry, stands or geometry.home)
+        problem = (
+            f"since the change to tool {geometry.tool_name!r} no command was where the struts are: "
+            f"{STRUT_NAMES[answer.strut]} would move by {answer.value * 1e3:.4f} mm, allowed {SAME_PLACE * 1e3:g} mm; "
+            f"in {geometry.work_name} the tool is at {pose_text(geometry.tool_pose(stands or geometry.home))}"
+        )
+        return LimitError("tool_changed", problem, answer.value, SAME_PLACE, answer.strut, "nominal")
     return geometry.limits.error(status, answer.strut, answer.compensated, answer.value)
 
 
@@ -637,28 +608,3 @@ def pose_of(pose: Any) -> Pose:
     """Return an ``hc_pose`` as a pose."""
     numbers = np.frombuffer(ffi.buffer(ffi.addressof(pose)), dtype=float)
     return Pose(numbers[:3], numbers[3:].reshape(3, 3))
-
-
-def _tool_error(strut: int, way: float, geometry: HexapodGeometry, stands: Pose) -> LimitError:
-    problem = (
-        f"since the change to tool {geometry.tool_name!r} no command was where the struts are: "
-        f"{STRUT_NAMES[strut]} would move by {way * 1e3:.4f} mm, allowed {SAME_PLACE * 1e3:g} mm; in "
-        f"{geometry.work_name} the tool is at {pose_text(geometry.tool_pose(stands))}"
-    )
-    return LimitError("tool_changed", problem, way, SAME_PLACE, strut, "nominal")
-
-
-def _pose_error(status: int, numbers: Sequence[float]) -> PoseError:
-    if status == Status.NOT_FINITE:
-        return PoseError("pose must be finite", list(numbers), "not_finite")
-    norm = math.hypot(*numbers[3:])
-    problem = f"quaternion must have norm 1 within {QUATERNION_NORM_TOLERANCE:g}, not {norm:.6g}"
-    return PoseError(problem, list(numbers[3:]), "quaternion")
-
-
-def _outside_error(platform: Pose, field: GridField) -> OutsideFieldError:
-    box = field.box * 1e3
-    point = (platform.position + platform.rotation @ field.probe) * 1e3
-    low, high = (", ".join(f"{v:g}" for v in corner) for corner in box)
-    problem = f"the measured point ({point[0]:.3f}, {point[1]:.3f}, {point[2]:.3f}) mm is outside the field's box"
-    return OutsideFieldError(f"{problem} ({low})…({high}) mm, in base", point, box)

@@ -15,45 +15,38 @@ from typing import NamedTuple
 from ..errors import CommandError, LimitError
 from ..machine.limits import STRUT_NAMES
 
-SHOWN_FOR = 1.0
-"""What has happened colours a node's status for this long, s."""
+SHOWN_FOR = 1.0  # What has happened colours a node's status for this long, s
 
+# After a pause this long, s, stamps may start again earlier: the sender or its clock was restarted
 FORGET_ORDER_AFTER = 0.5
-"""After a pause this long, s, stamps may start again earlier: the sender or its clock was restarted."""
 
-STEP_TOLERANCE = 2_000_000
-"""A change between system and monotonic clock up to this, ns, is no step."""
+STEP_TOLERANCE = 2_000_000  # A change between system and monotonic clock up to this, ns, is no step
+SLEW = 1e-3  # A clock may be corrected at this rate without being set (NTP's own limit is half of it)
 
-SLEW = 1e-3
-"""A clock may be corrected at this rate without being set (NTP's own limit is half of it)."""
-
+# Two clocks read further apart than this, ns, are read again: the processor was elsewhere in between
 READ_WITHIN = 200_000
-"""Two clocks read further apart than this, ns, are read again: the processor was elsewhere in between."""
 
-IN_FLIGHT = 0.5
-"""For this long after a step of the clock, s, messages that were stamped before it may still arrive."""
+IN_FLIGHT = 0.5  # For this long after a step of the clock, s, messages that were stamped before it may still arrive
 
+# No message is from the future by more than this, ns, or than its sender's messages are, where it stamps ahead
 EARLY = 2_000_000
-"""No message is from the future by more than this, ns, or than its sender's messages are, where it stamps ahead."""
 
+# How fast it is forgotten how far a sender stamps ahead, ns/s: clocks drift apart by a tenth of that
 LEAD_SHRINKS = 1e6
-"""How fast it is forgotten how far a sender stamps ahead, ns/s: clocks drift apart by a tenth of that."""
 
+# This many messages that are in order among themselves and arrive over this time, s, were not overtaken: their
+# sender's clock was set back. What was held up on its way arrives at once.
 RUN, RUN_LASTS = 3, 0.02
-"""This many messages that are in order among themselves and arrive over this time, s, were not overtaken: their
-sender's clock was set back. What was held up on its way arrives at once."""
 
-BUNCHED_WITHIN = 0.1
-"""Commands that were held up on their way for up to this time, s, may come all at once."""
+BUNCHED_WITHIN = 0.1  # Commands that were held up on their way for up to this time, s, may come all at once
 
+# A sender that returns this long after another has taken over is not a predecessor that was stopped, s
 SPEAKERS_WITHIN = 1.0
-"""A sender that returns this long after another has taken over is not a predecessor that was stopped, s."""
 
-SPEAKERS_HELD = 2.0
-"""Two that sent in turn count as two for this long after the last turn, s."""
+SPEAKERS_HELD = 2.0  # Two that sent in turn count as two for this long after the last turn, s
 
+# What rmw calls a publisher whose node it has not heard of: found a moment ago, or not a ROS node
 UNKNOWN_NAME = "_NODE_NAME_UNKNOWN_"
-"""What rmw calls a publisher whose node it has not heard of: found a moment ago, or not a ROS node."""
 
 
 class Sample:

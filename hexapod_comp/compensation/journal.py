@@ -37,34 +37,30 @@ from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL, parse_model
 from .compensator import BESIDE_NUMBERS, Compensator
 
-FORMAT = 5
-"""Version of pages."""
+FORMAT = 5  # Version of pages
+READABLE = (4, FORMAT)  # Versions that are read. In 4 there was one tool, and two frames.
 
-READABLE = (4, FORMAT)
-"""Versions that are read. In 4 there was one tool, and two frames."""
-
+# Why older versions cannot be replayed
 OLDER = {
     1: "does not hold what the compensator consumed, in its order",
     2: "holds the compensator's state as numbers without names, which another release may order differently",
     3: "does not hold when each command was received, by which the struts' speed is limited",
 }
-"""Why older versions cannot be replayed."""
 
+# Longest time between two snapshots, s: what a lost message costs a replay. A late subscriber is given the ten newest
+# pages; at one every 50 ms a snapshot is among them.
 SNAPSHOT_PERIOD = 0.4
-"""Longest time between two snapshots, s: what a lost message costs a replay. A late subscriber is given the ten
-newest pages; at one every 50 ms a snapshot is among them."""
 
+# Frames of commanded poses that every machine has; an answer names its frame by its place in the snapshots' frames
 ROLES = (BASE, WORK)
-"""Frames of commanded poses that every machine has; an answer names its frame by its place in the snapshots' frames."""
 
 _TIMES = [("stamp", "<i8"), ("stamped", "u1"), ("received", "<f8"), ("published", "<f8")]
+# One answered command: its answer's stamp, ns; whether that was the command's own, or else its time is not known;
+# when it was received and its answer had gone out, s, as the compensator was told; frame; position, m, and quaternion
+# x, y, z, w; strut commands and corrections that it answered, m
 COMMAND = np.dtype([*_TIMES, ("frame", "u1"), ("pose", "<f8", 7), ("lengths", "<f8", (2, 6))])
-"""One answered command: its answer's stamp, ns; whether that was the command's own, or else its time is not known; when
-it was received and its answer had gone out, s, as the compensator was told; frame; position, m, and quaternion x, y, z,
-w; strut commands and corrections that it answered, m."""
 
-_HEAD = struct.Struct("<qBddB7d")
-"""The first six fields of a COMMAND: packed so in a fifth of the time."""
+_HEAD = struct.Struct("<qBddB7d")  # The first six fields of a COMMAND: packed so in a fifth of the time
 
 
 def time_of(stamp: int, stamped: bool) -> float:
@@ -72,14 +68,11 @@ def time_of(stamp: int, stamped: bool) -> float:
     return stamp * 1e-9 if stamped else math.nan
 
 
-REFUSALS_PER_PAGE = 20
-"""A page names no more refused commands than this; it counts the others."""
+REFUSALS_PER_PAGE = 20  # A page names no more refused commands than this; it counts the others
+LARGEST_SOURCE = 250_000  # Longer files are named, not copied, characters: the message is made while commands wait
 
-LARGEST_SOURCE = 250_000
-"""Longer files are named, not copied, characters: the message is made while commands wait."""
-
+# Longer messages are refused: a page of 50 ms has some 10 kB at 1 kHz, the files in use no more than 1.5 MB
 MOST_CHARACTERS = 8_000_000
-"""Longer messages are refused: a page of 50 ms has some 10 kB at 1 kHz, the files in use no more than 1.5 MB."""
 
 CPU_INFO = Path("/proc/cpuinfo")
 
@@ -127,8 +120,7 @@ class Source:
         return self.text
 
 
-IDEAL_SOURCE = Source.of(IDEAL, "")
-"""Stands for the file of the ideal model, which has none."""
+IDEAL_SOURCE = Source.of(IDEAL, "")  # Stands for the file of the ideal model, which has none
 
 
 @dataclass(frozen=True)
@@ -211,12 +203,25 @@ class Journal:
 
     def note(self, what: str, value: Any) -> None:
         """Write down a change that has just been made."""
-        entry = {"after": self._count, "what": what, **_values(what, value, self._sources)}
-        if self._entries and what == "reset":
-            last = self._entries[-1]
+        entry = {"after": self._count, "what": what}
+        if what in ("temperature", "humidity"):
+            *name, number, time = value
+            entry |= {
+                "value": number,
+                "time": None if math.isnan(time) else time,
+                **({"name": name[0]} if name else {}),
+            }
+        elif what == "model":
+            entry |= {"name": value.name, "sha256": self._sources["model"].sha256}
+        elif what == "reset":
+            entry["measured"] = None if value is None else value.tolist()
             # Every refused first command resets anew; only the last reset counts, and a page stays short.
-            if (last["what"], last["after"]) == (what, entry["after"]):
+            if self._entries and (self._entries[-1]["what"], self._entries[-1]["after"]) == (what, self._count):
                 self._entries.pop()
+        elif what in ("enable", "ramp_rate", "tool"):
+            entry |= {key: read(value) for key, read in ENTRIES[what].items()}
+        else:
+            raise JournalError(f"the journal knows no change called {what!r}")
         self._entries.append(entry)
 
     def refused(self, stamp: int, reason: str, text: str) -> None:
@@ -228,13 +233,22 @@ class Journal:
 
     def due(self, now: float) -> bool:
         """Return whether a page should be written at the monotonic time `now`, s."""
-        return bool(self._commands or self._entries) or self._snapshot_due(now)
-
-    def _snapshot_due(self, now: float) -> bool:
-        return now - self._last >= SNAPSHOT_PERIOD
+        return bool(self._commands or self._entries) or now - self._last >= SNAPSHOT_PERIOD
 
     def page(self, now: float) -> str:
         """Return the next page and begin a new one."""
+        snapshot = None
+        if now - self._last >= SNAPSHOT_PERIOD:
+            self._last, compensator = now, self._compensator
+            state = compensator.snapshot()
+            for key, value in state.items():  # null for NaN
+                state[key] = [None if v != v else v for v in value] if isinstance(value, list) else value
+            snapshot = {
+                "state": state,
+                "model": {"name": compensator.model.name, "sha256": self._sources["model"].sha256},
+                "geometry": {"name": compensator.geometry.name, "sha256": self._sources["geometry"].sha256},
+                **self._always,
+            }
         self._number += 1
         content = {
             "journal": FORMAT,
@@ -243,7 +257,7 @@ class Journal:
             "begins": self._begins,
             "entries": self._entries,
             "refused_more": max(0, self._refused - REFUSALS_PER_PAGE),
-            "snapshot": self._snapshot(now) if self._snapshot_due(now) else None,
+            "snapshot": snapshot,
         }
         commands = base64.b64encode(self._commands).decode()
         self._commands, self._begins = bytearray(), self._count
@@ -251,61 +265,21 @@ class Journal:
         # Put in by hand: looking for what must be escaped in so long a string takes longer than all the rest.
         return f'{json.dumps(content, ensure_ascii=False)[:-1]}, "answers": "{commands}"}}'
 
-    def _snapshot(self, now: float) -> dict[str, Any]:
-        self._last = now
-        return {
-            "state": _nullified(self._compensator.snapshot()),
-            "model": _identity(self._compensator.model, self._sources["model"]),
-            "geometry": {"name": self._compensator.geometry.name, "sha256": self._sources["geometry"].sha256},
-            **self._always,
-        }
-
-
-def _values(what: str, value: Any, sources: Mapping[str, Source]) -> dict[str, Any]:
-    if what == "temperature":
-        return {"name": value[0], **_values("humidity", value[1:], sources)}
-    if what == "humidity":
-        return {"value": value[0], "time": None if math.isnan(value[1]) else value[1]}
-    if what == "model":
-        return _identity(value, sources["model"])
-    if what in ("enable", "ramp_rate", "tool"):
-        return {key: read(value) for key, read in ENTRIES[what].items()}
-    if what == "reset":
-        return {"measured": None if value is None else value.tolist()}
-    raise JournalError(f"the journal knows no change called {what!r}")
-
-
-def _identity(model: MachineModel, source: Source) -> dict[str, str]:
-    return {"name": model.name, "sha256": source.sha256}
-
-
-def _nullified(snapshot: dict[str, Any]) -> dict[str, Any]:
-    """Return a snapshot with null for NaN."""
-    return {
-        key: [None if v != v else v for v in value] if isinstance(value, list) else value
-        for key, value in snapshot.items()
-    }
-
 
 def made_with() -> dict[str, str]:
-    """Return the versions and the processor that a result's last bit may depend on."""
+    """Return the versions and the processor, as Linux calls it, that a result's last bit may depend on."""
+    try:
+        lines = CPU_INFO.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return {
         "core": core.VERSION,
         "core_sources": core.SOURCES_HASH,
         "python": platform.python_version(),
         "numpy": np.__version__,
-        "processor": _processor(),
+        "processor": names[0] if names else platform.machine(),
     }
-
-
-def _processor() -> str:
-    """Return what Linux calls the processor, else its family."""
-    try:
-        text = CPU_INFO.read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        text = ""
-    names = [line.partition(":")[2].strip() for line in text.splitlines() if line.startswith("model name")]
-    return names[0] if names else platform.machine()
 
 
 def sources_text(sources: Mapping[str, Source]) -> str:
@@ -380,60 +354,51 @@ def _object(content: Any, where: str) -> dict[str, Any]:
     return content
 
 
-def _measured(content: Any) -> list[float] | None:
-    return None if content is None else [float(value) for value in content]
-
-
-def _time(content: Any) -> float:
-    return math.nan if content is None else float(content)
-
-
+# What each kind of entry says, and how it is read
 ENTRIES: dict[str, dict[str, Callable[[Any], Any]]] = {
-    "temperature": {"name": str, "value": float, "time": _time},
-    "humidity": {"value": float, "time": _time},
+    "temperature": {"name": str, "value": float, "time": lambda found: math.nan if found is None else float(found)},
+    "humidity": {"value": float, "time": lambda found: math.nan if found is None else float(found)},
     "model": {"name": str, "sha256": str},
     "enable": {"on": bool},
     "ramp_rate": {"value": float},
     "tool": {"name": str},
-    "reset": {"measured": _measured},
+    "reset": {"measured": lambda found: None if found is None else [float(value) for value in found]},
     "refused": {"stamp": int, "reason": str, "text": str},
 }
-"""What each kind of entry says, and how it is read."""
 
 
 def _read_entry(content: Any) -> Entry:
     what = str(_object(content, "an entry")["what"])
-    return Entry(
-        int(content["after"]),
-        what,
-        {key: read(content[key] if key != "time" else content.get(key)) for key, read in ENTRIES[what].items()},
-    )
+    found = {key: read(content[key] if key != "time" else content.get(key)) for key, read in ENTRIES[what].items()}
+    return Entry(int(content["after"]), what, found)
 
 
 def _read_snapshot(content: Any) -> Snapshot:
     state = _object(_object(content, "snapshot")["state"], "snapshot.state")
-    temperatures = {
-        key: float(value) for key, value in _object(state["temperatures"], "snapshot.state.temperatures").items()
-    }
+    temperatures = _object(state["temperatures"], "snapshot.state.temperatures").items()
+    lags = _object(state.get("lags", {}), "snapshot.state.lags").items()
     arrays = {
         name: np.array([math.nan if v is None else float(v) for v in numbers])
         for name, numbers in state.items()
         if name not in BESIDE_NUMBERS
     }
-    given = _object(state.get("lags", {}), "snapshot.state.lags")
-    lags = {name: [float(v) for v in numbers] for name, numbers in given.items()}
+    beside = {
+        "temperatures": {key: float(value) for key, value in temperatures},
+        "lags": {name: [float(v) for v in numbers] for name, numbers in lags},
+        "tool": str(state.get("tool", TOOL)),
+    }
+
+    def words(key: str, *required: str) -> dict[str, str]:
+        found = {name: str(value) for name, value in _object(content[key], f"snapshot.{key}").items()}
+        if missing := [name for name in required if name not in found]:
+            raise KeyError(f"snapshot.{key}.{missing[0]}")
+        return found
+
     return Snapshot(
-        state={**arrays, "temperatures": temperatures, "lags": lags, "tool": str(state.get("tool", TOOL))},
-        model=_words(content, "model", "name", "sha256"),
-        geometry=_words(content, "geometry", "name", "sha256"),
-        frames=_words(content, "frames", *ROLES),
-        made_with=_words(content, "made_with"),
+        state={**arrays, **beside},
+        model=words("model", "name", "sha256"),
+        geometry=words("geometry", "name", "sha256"),
+        frames=words("frames", *ROLES),
+        made_with=words("made_with"),
         joints=tuple(str(name) for name in content.get("joints", STRUT_NAMES)),
     )
-
-
-def _words(content: dict[str, Any], key: str, *required: str) -> dict[str, str]:
-    words = {name: str(value) for name, value in _object(content[key], f"snapshot.{key}").items()}
-    if missing := [name for name in required if name not in words]:
-        raise KeyError(f"snapshot.{key}.{missing[0]}")
-    return words

@@ -14,15 +14,14 @@ from ..errors import ModelError
 from ..machine.temperatures import HUMIDITY, REFERENCE_TEMPERATURE, Temperatures, quantity_of
 from .guards import RateLimit
 
+# Time constant of the filter, s: of a reading a second an eighth of the noise is left, and the drift is followed 30 s
+# late, by 1/60 K when it is 1 K in half an hour
 DEFAULT_TIME_CONSTANT = 30.0
-"""Time constant of the filter, s: of a reading a second an eighth of the noise is left, and the drift is
-followed 30 s late, by 1/60 K when it is 1 K in half an hour."""
 
+# Two readings of a sensor may differ by this at once, K or a fraction: noise, and the last digit of a coarse one
 JITTER, HUMIDITY_JITTER = 1.0, 0.05
-"""Two readings of a sensor may differ by this at once, K or a fraction: noise, and the last digit of a coarse one."""
 
-HUMIDITY_RATE = 0.02
-"""Fastest change of a shop's humidity, 1/s: a gate that opens."""
+HUMIDITY_RATE = 0.02  # Fastest change of a shop's humidity, 1/s: a gate that opens
 
 
 @dataclass
@@ -90,17 +89,21 @@ class Thermometers:
     def take(self, name: str, value: float, time: float) -> float:
         """Take a reading and return what counts from now on; a ModelError, also where it has jumped or does not fit
         the other parts, changes nothing."""
-        reading = Temperatures({name: value}).values[name]
+        reading, rules = Temperatures({name: value}).values[name], self._rules
         limit = self._limits.get(name) or RateLimit(HUMIDITY_JITTER if name == HUMIDITY else JITTER, 0.0)
-        limit.rate = self._rules.humidity_rate if name == HUMIDITY else self._rules.rate
-        excess = limit.excess((reading,), time) if limit.rate else None
-        quantity = quantity_of(name)
+        limit.rate = rules.humidity_rate if name == HUMIDITY else rules.rate
+        excess, quantity = limit.excess((reading,), time) if limit.rate else None, quantity_of(name)
         if excess is not None and limit.last is not None:
             way = f"from {limit.last[0]:.2f} to {reading:.2f}{quantity.unit} in {time - limit.at:.1f} s"
             problem = f"has jumped {way}, allowed {excess.allowed:.3g}{quantity.difference}"
             raise ModelError(quantity.title.format(name), problem)
-        if name != HUMIDITY:
-            self._check_spread(name, reading, time)
+        left_out = {name, HUMIDITY, *self.stale(time)}
+        others = [one.last[0] for part, one in self._limits.items() if part not in left_out and one.last]
+        middle = statistics.median(others or [REFERENCE_TEMPERATURE])
+        if name != HUMIDITY and 0.0 < rules.spread < (off := abs(reading - middle)):
+            whose = f"the other parts' {middle:.2f} °C" if others else f"{middle:g} °C, and no other part is known"
+            problem = f"reads {reading:.2f} °C, {off:.1f} K from {whose}; allowed {rules.spread:g} K"
+            raise ModelError(f"temperature of {name}", problem)
         mean = self._filter.take(name, reading, time)
         limit.accept((reading,), time)
         self._limits[name] = limit
@@ -111,14 +114,3 @@ class Thermometers:
         timeout, limits = self._rules.timeout, self._limits
         known = (name for name in (*Temperatures.NAMES, HUMIDITY) if name in limits)
         return tuple(name for name in known if 0.0 < timeout < time - limits[name].at)
-
-    def _check_spread(self, name: str, reading: float, time: float) -> None:
-        left_out = {name, HUMIDITY, *self.stale(time)}
-        others = [limit.last[0] for part, limit in self._limits.items() if part not in left_out and limit.last]
-        middle = statistics.median(others or [REFERENCE_TEMPERATURE])
-        if 0.0 < self._rules.spread < abs(reading - middle):
-            whose = f"the other parts' {middle:.2f} °C" if others else f"{middle:g} °C, and no other part is known"
-            problem = (
-                f"reads {reading:.2f} °C, {abs(reading - middle):.1f} K from {whose}; allowed {self._rules.spread:g} K"
-            )
-            raise ModelError(f"temperature of {name}", problem)

@@ -13,23 +13,21 @@ from ..errors import CommandError, LimitError
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from .guards import Guard, RateLimit, Sample
 
-KEPT = 512
-"""Commands and readings remembered: half a second at 1 kHz."""
+KEPT = 512  # Commands and readings remembered: half a second at 1 kHz
 
+# A drive follows and tells within this time, s: a strut is right where any command of that time wants it
 FOLLOWED_WITHIN = 0.1
-"""A drive follows and tells within this time, s: a strut is right where any command of that time wants it."""
 
+# A strut that moves by no more than this in that time stands, m: encoders and servos are never quite still
 STANDS_WITHIN = 50e-6
-"""A strut that moves by no more than this in that time stands, m: encoders and servos are never quite still."""
 
+# Readings of a machine at rest are averaged over this time, s: ten at least of a slow drive, at 20 Hz
 AVERAGED_OVER = 0.5
-"""Readings of a machine at rest are averaged over this time, s: ten at least of a slow drive, at 20 Hz."""
 
+# Readings that differ by no more than this, m, are of one place: encoders read to 0.1 µm, servos hold to 1 µm
 NOISE = 2e-6
-"""Readings that differ by no more than this, m, are of one place: encoders read to 0.1 µm, servos hold to 1 µm."""
 
-FASTER = 2.0
-"""Struts may have moved so many times faster than they may be commanded: jogged by hand, or pulled back."""
+FASTER = 2.0  # Struts may have moved so many times faster than they may be commanded: jogged by hand, or pulled back
 
 Struts = Sequence[float]
 

@@ -10,8 +10,8 @@ import sys
 from collections.abc import Callable
 from types import FrameType
 
+# Where Fast DDS looks for a user's profile: up to version 2 (ROS 2 Jazzy), and from version 3
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
-"""Where Fast DDS looks for a user's profile: up to version 2 (ROS 2 Jazzy), and from version 3."""
 
 _LIBC = ctypes.CDLL(None)  # at once: end_with_parent runs between fork and exec
 

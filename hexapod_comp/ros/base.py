@@ -44,24 +44,25 @@ from .status import ERROR, HealthReport, Refusals, joined
 
 _LAST, _RELIABLE, _BEST_EFFORT = HistoryPolicy.KEEP_LAST, ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
 
+# Commands: each must arrive. A hundred wait while a busy processor pauses for 0.1 s at 1 kHz, or a cable repeats.
 COMMAND_QOS = QoSProfile(depth=100, history=_LAST, reliability=_RELIABLE)
-"""Commands: each must arrive. A hundred wait while a busy processor pauses for 0.1 s at 1 kHz, or a cable repeats."""
 
+# Publishers of states: the newest only, to reliable listeners too. Who subscribes without a thought is one.
 STATE_QOS = QoSProfile(depth=1, history=_LAST, reliability=_RELIABLE)
-"""Publishers of states: the newest only, to reliable listeners too. Who subscribes without a thought is one."""
 
+# Subscriptions of states, however published: only the newest counts, and an old one is not worth repeating
 NEWEST_QOS = QoSProfile(depth=1, history=_LAST, reliability=_BEST_EFFORT)
-"""Subscriptions of states, however published: only the newest counts, and an old one is not worth repeating."""
 
+# Subscriptions of sensors, however they publish
 SENSOR_QOS = QoSProfile(depth=10, history=_LAST, reliability=_BEST_EFFORT)
-"""Subscriptions of sensors, however they publish."""
 
+# Rare messages, each of which counts: diagnostics, markers
 EVENT_QOS = QoSProfile(depth=10, history=_LAST, reliability=_RELIABLE)
-"""Rare messages, each of which counts: diagnostics, markers."""
 
+# A state that who comes late must know too
 LATCHED_QOS = QoSProfile(depth=1, history=_LAST, reliability=_RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""A state that who comes late must know too."""
 
+# What of a topic's QoS a user may override by parameters; subscriptions have no lifespan
 OVERRIDES = QoSOverridingOptions(
     (
         QoSPolicyKind.HISTORY,
@@ -71,15 +72,13 @@ OVERRIDES = QoSOverridingOptions(
         QoSPolicyKind.LIFESPAN,
     )
 )
-"""What of a topic's QoS a user may override by parameters; subscriptions have no lifespan."""
 
 TRANSITIONS = ("on_configure", "on_activate", "on_deactivate", "on_cleanup", "on_shutdown")
 
-CHECK_PERIOD = 0.05
-"""How often a node looks whether its state has changed, s."""
+CHECK_PERIOD = 0.05  # How often a node looks whether its state has changed, s
 
+# How long the last message waits to be acknowledged: that may take DDS 3 s, and the dead never do it
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.4)
-"""How long the last message waits to be acknowledged: that may take DDS 3 s, and the dead never do it."""
 
 
 class CallbackGuard:

@@ -21,13 +21,13 @@ from .messages import StrutReader, message_pose, nanoseconds_of, pose_message
 from .process import RosSession
 from .status import status_prefix
 
+# Answers are all kept until they are read: a witness must not lose any
 LISTENER_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
-"""Answers are all kept until they are read: a witness must not lose any."""
 
 TRACK_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 
+# A command without an answer after this long is lost, s: a busy computer may hold it up for seconds
 ANSWER_TIMEOUT = 5.0
-"""A command without an answer after this long is lost, s: a busy computer may hold it up for seconds."""
 
 
 @dataclass

@@ -51,11 +51,8 @@ from .rclpy_compat import Alarm
 from .requests import Requests
 from .status import ADVICE, OTHERWISE, WARN, CompensatorStatus, seconds
 
-ESTIMATE_PERIOD = 0.02
-"""How often the pose is estimated from the node's own commands while there is no feedback, s."""
-
-JITTER = 0.02
-"""A wait of a command up to this, s, is nothing to speak of, nor is an alarm that rings so late."""
+ESTIMATE_PERIOD = 0.02  # How often the pose is estimated from the node's own commands while there is no feedback, s
+JITTER = 0.02  # A wait of a command up to this, s, is nothing to speak of, nor is an alarm that rings so late
 
 
 class Standing(Guard):

@@ -23,12 +23,10 @@ from .base import LATCHED_QOS
 
 TOPIC = "robot_description"
 
-WARN_AFTER = 5.0
-"""Without a URDF for this long the log says what is missing, s."""
+WARN_AFTER = 5.0  # Without a URDF for this long the log says what is missing, s
 
 
-SIGNALS_SEEN_WITHIN = 0.2
-"""rclpy waits in C: Python handles a signal when the wait ends, s."""
+SIGNALS_SEEN_WITHIN = 0.2  # rclpy waits in C: Python handles a signal when the wait ends, s
 
 
 def wait_for_description(arguments: Sequence[str]) -> str:

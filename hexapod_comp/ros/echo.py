@@ -24,14 +24,9 @@ from ..machine.geometry import STRUT_NAMES
 from ..pose import Pose
 from .messages import nanoseconds_of, read_message
 
-DISCOVERY_TIME = 3.0
-"""How long a topic may take to be discovered, s; Fast DDS needs 0.1 to 1 s."""
-
-RATE_WINDOW = 2.0
-"""The rate is that of the messages of this last time, s."""
-
-QUEUE = 1000
-"""Messages that may wait while the terminal is slow: a second of commands."""
+DISCOVERY_TIME = 3.0  # How long a topic may take to be discovered, s; Fast DDS needs 0.1 to 1 s
+RATE_WINDOW = 2.0  # The rate is that of the messages of this last time, s
+QUEUE = 1000  # Messages that may wait while the terminal is slow: a second of commands
 
 ANGLES = ("alpha", "beta", "gamma")
 
@@ -49,11 +44,11 @@ class MessageField(NamedTuple):
         return f"{self.name}_{self.unit}" if self.unit else self.name
 
 
+# Units as people read them, where that is not how keys spell them
 UNITS = {"um": "µm", "urad": "µrad", "deg": "°", "mm_s": "mm/s", "degC": "°C", "percent": "%"}
-"""Units as people read them, where that is not how keys spell them."""
 
+# Digits after the point: a nanometre; SI numbers of topics that are not ours get nine
 DIGITS = {"mm": 6, "um": 3, "deg": 6, "urad": 3, "mm_s": 3, "degC": 2, "percent": 1, "s": 6, "m": 9, "rad": 9}
-"""Digits after the point: a nanometre; SI numbers of topics that are not ours get nine."""
 
 
 def message_fields(topic: str, message: Any) -> list[MessageField]:

@@ -38,23 +38,22 @@ from .base import ACKNOWLEDGED_WITHIN, EVENT_QOS, LATCHED_QOS, STATE_QOS, Machin
 from .messages import PoseBytes, StrutBytes, StrutReader, command_stamp, period, read_message, read_pose, stamp_of
 from .parameters import ParameterError, Program, read_table
 
-POSES, STRUTS = "poses", "struts"
-"""Values of the parameter ``command_input``."""
+POSES, STRUTS = "poses", "struts"  # Values of the parameter ``command_input``
 
+# Whether the node stops the machine is said again after this long, s: who comes late is given what is latched, but on
+# a busy computer the middleware loses that now and then
 REPEATED_AFTER = 1.0
-"""Whether the node stops the machine is said again after this long, s: who comes late is given what is latched, but on
-a busy computer the middleware loses that now and then."""
 
+# The largest time that a message can hold, ns: what is valid until later is valid until then
 LAST_STAMP = 2**31 * 10**9 - 1
-"""The largest time that a message can hold, ns: what is valid until later is valid until then."""
 
+# Pages: each counts, and who comes late needs the last snapshot
 JOURNAL_QOS = QoSProfile(
     depth=10,  # a recorder's own queue is no longer than this
     history=HistoryPolicy.KEEP_LAST,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
-"""Pages: each counts, and who comes late needs the last snapshot."""
 
 PARAMETERS = read_table(f"""
 autostart | true |  | start | configure and activate at the start
@@ -439,8 +438,7 @@ class JournalTopics:
 
 STRUT_DIAMETER = 0.02
 JOINT_DIAMETER = 0.035
-LIFETIME = Duration(sec=1)
-"""A machine that nobody updates disappears instead of standing there as if it were alive."""
+LIFETIME = Duration(sec=1)  # A machine that nobody updates disappears instead of standing there as if it were alive
 
 GREY = ColorRGBA(r=0.5, g=0.5, b=0.55, a=1.0)
 STEEL = ColorRGBA(r=0.3, g=0.35, b=0.45, a=0.9)

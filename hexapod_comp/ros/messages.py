@@ -25,18 +25,17 @@ from ..errors import CommandError
 from ..machine.geometry import STRUT_NAMES
 from ..pose import Pose
 
+# Longer messages are refused unread, byte: a thousand times ours. Read, they would fill many times their size.
 LARGEST_MESSAGE = 1 << 18
-"""Longer messages are refused unread, byte: a thousand times ours. Read, they would fill many times their size."""
 
+# The squares of larger numbers, m, overflow; whether a strut can be so long is a question for limits
 LARGEST_LENGTH = 1e150
-"""The squares of larger numbers, m, overflow; whether a strut can be so long is a question for limits."""
 
+# Two commands count as no closer than the one when a speed is made of them, s; further apart than the other there is
+# no speed between them
 SHORTEST_PERIOD, LONGEST_PERIOD = 1e-4, 1.0
-"""Two commands count as no closer than the one when a speed is made of them, s; further apart than the other there is
-no speed between them."""
 
-LITTLE_ENDIAN = b"\x00\x01"
-"""How plain CDR with the lowest byte first begins."""
+LITTLE_ENDIAN = b"\x00\x01"  # How plain CDR with the lowest byte first begins
 
 _ENCODING = LITTLE_ENDIAN + b"\0\0"
 _START, _STAMP, _COUNT = struct.Struct("<iII"), struct.Struct("<iI"), struct.Struct("<I")

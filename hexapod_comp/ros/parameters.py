@@ -220,8 +220,7 @@ ROS_ARGUMENTS, END_OF_ROS_ARGUMENTS = "--ros-args", "--"
 
 USAGE_ERROR = 2
 
-WIDTH = 118
-"""Of the help, characters."""
+WIDTH = 118  # Of the help, characters
 
 
 @dataclass(frozen=True)

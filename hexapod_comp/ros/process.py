@@ -29,27 +29,20 @@ from . import avoid_shared_memory, heard_signals, open_streams
 from .base import MachineNode
 from .parameters import Program
 
+# Longest wait of one spin, s: how soon a signal is noticed (EventsExecutor.spin itself never returns)
 SPIN_PERIOD = 0.1
-"""Longest wait of one spin, s: how soon a signal is noticed (EventsExecutor.spin itself never returns)."""
 
-ENDED_WITHIN = 4.0
-"""What the end of a process may take from its signal on, s; usually it is a fraction of a second."""
+ENDED_WITHIN = 4.0  # What the end of a process may take from its signal on, s; usually it is a fraction of a second
+STREAMS = (1, 2)  # stdout and stderr: RCUTILS_LOGGING_USE_STDOUT decides where ROS writes
+BUFFER_SIZE = 1 << 20  # Of the log's pipe, byte: some thousands of lines. Linux allows everybody this much.
+LEAVING_WITHIN = 0.5  # How long the end of a process waits for its last lines to be taken, s
 
-STREAMS = (1, 2)
-"""stdout and stderr: RCUTILS_LOGGING_USE_STDOUT decides where ROS writes."""
-
-BUFFER_SIZE = 1 << 20
-"""Of the log's pipe, byte: some thousands of lines. Linux allows everybody this much."""
-
-LEAVING_WITHIN = 0.5
-"""How long the end of a process waits for its last lines to be taken, s."""
-
+# Options of a node that publishes nothing and offers nothing
 QUIET: dict[str, Any] = {
     "start_parameter_services": False,
     "enable_rosout": False,
     "parameter_overrides": [RosParameter("start_type_description_service", value=False)],
 }
-"""Options of a node that publishes nothing and offers nothing."""
 
 
 def autostart(node: LifecycleNode, heard: Sequence[int] = ()) -> bool:

@@ -18,6 +18,7 @@ from std_msgs.msg import String
 from ..errors import HexapodError, InputFileError
 from .process import QUIET, SPIN_PERIOD, RosSession
 
+# What is recorded, its type, and whether it is offered reliably
 TOPICS = {
     "tool_pose_command": (PoseStamped, True),
     "strut_setpoints": (JointState, True),
@@ -30,21 +31,17 @@ TOPICS = {
     "humidity": (RelativeHumidity, False),
     "/diagnostics": (DiagnosticArray, True),
 }
-"""What is recorded, its type, and whether it is offered reliably."""
 
 JOURNAL = "compensator/journal"
-KEPT = (JOURNAL, "compensator/files")
-"""Topics that who comes late is given too."""
+KEPT = (JOURNAL, "compensator/files")  # Topics that who comes late is given too
+DEPTH = 1000  # Messages that may wait while the disk is slow: a second of commands
 
-DEPTH = 1000
-"""Messages that may wait while the disk is slow: a second of commands."""
-
+# With less room than this on its disk, byte, a recording ends: closing it takes chunks of 1 MB that are on their way,
+# an index of 300 bytes for each chunk, and others may write to the disk between two looks
 RESERVE = 64_000_000
-"""With less room than this on its disk, byte, a recording ends: closing it takes chunks of 1 MB that are on their way,
-an index of 300 bytes for each chunk, and others may write to the disk between two looks."""
 
+# The disk, and whether the bag is still where it was made, are looked at this often, s, and after this much, byte
 LOOK_PERIOD, LOOK_AFTER = 1.0, 16_000_000
-"""The disk, and whether the bag is still where it was made, are looked at this often, s, and after this much, byte."""
 
 
 class BagWriter:
@@ -162,6 +159,8 @@ class BagRecorder:
     def _hear(self, topic: str, kind: Any, qos: QoSProfile) -> None:
         name = self._session.node.resolve_topic_name(topic)
         text = f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
-        self._session.node.create_subscription(
-            kind, topic, lambda data: self._bag.write(name, text, bytes(data)), qos, raw=True
-        )
+
+        def keep(data: bytes) -> None:
+            self._bag.write(name, text, bytes(data))
+
+        self._session.node.create_subscription(kind, topic, keep, qos, raw=True)

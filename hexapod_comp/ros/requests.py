@@ -30,20 +30,16 @@ from .rclpy_compat import LateAnswer, callers
 from .status import ERROR, OK, CompensatorStatus, status_of
 from .worker import Job, Worker, WorkerError
 
+# A model file that takes longer to read is given up, s; the shipped ones take one second, nearly all of it imports
 LOADED_WITHIN = 30.0
-"""A model file that takes longer to read is given up, s; the shipped ones take one second, nearly all of it imports."""
 
-PREDICTION_PERIOD = 0.2
-"""How often a predicted error is asked for and published, s."""
+PREDICTION_PERIOD = 0.2  # How often a predicted error is asked for and published, s
 
+# A prediction that failed is tried again after this long, s: the first time, and at most, as the wait doubles
 TRY_AGAIN_AFTER = (2.0, 60.0)
-"""A prediction that failed is tried again after this long, s: the first time, and at most, as the wait doubles."""
 
-TRAVEL_PERIOD = 1.0
-"""Between two messages of ``~/travel``, s."""
-
-LONGEST_REASON = 200
-"""Characters of what stands in the tool's way."""
+TRAVEL_PERIOD = 1.0  # Between two messages of ``~/travel``, s
+LONGEST_REASON = 200  # Characters of what stands in the tool's way
 
 
 class Requests:

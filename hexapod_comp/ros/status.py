@@ -27,11 +27,8 @@ from ..machine.temperatures import HUMIDITY, REFERENCE_HUMIDITY
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
-LEAST_ROOM = 65_536
-"""A file system with less than this, byte, is full: a few hundred lines of log."""
-
-NEAR_SINGULAR = 0.9
-"""From this share of the largest allowed condition number on, diagnostics warn."""
+LEAST_ROOM = 65_536  # A file system with less than this, byte, is full: a few hundred lines of log
+NEAR_SINGULAR = 0.9  # From this share of the largest allowed condition number on, diagnostics warn
 
 
 def status_prefix(namespace: str, node: str) -> str:
@@ -166,6 +163,7 @@ class HealthReport:
 # ---- the compensator's ----
 
 
+# What the sender of a refused command is to do, by reason
 ADVICE = {
     "stamp_past": "send the pose again with a new stamp; never skip one that was not answered",
     "stamp_future": "set the clocks, or send a zero stamp, which means now",
@@ -179,10 +177,9 @@ ADVICE = {
     "several_publishers": "leave one publisher on the topic",
     "unknown_publisher": "leave one publisher on the topic, whose node's name can be read",
 }
-"""What the sender of a refused command is to do, by reason."""
 
+# The same for all other reasons: a limit, a frame, a message that cannot be read
 OTHERWISE = "mend what the refusal names, and go on from the last answered command (last_answered)"
-"""The same for all other reasons: a limit, a frame, a message that cannot be read."""
 
 
 class CompensatorStatus:
@@ -322,6 +319,7 @@ def _if(holds: Any, text: str) -> str:
     return text if holds else ""
 
 
+# What there is to say of an active compensator, worst first: level, and the text, empty where there is nothing
 FINDINGS: tuple[tuple[bytes, Callable[[CompensatorStatus, float], str]], ...] = (
     (ERROR, CompensatorStatus.refusing),
     (ERROR, CompensatorStatus.refused),
@@ -351,8 +349,8 @@ FINDINGS: tuple[tuple[bytes, Callable[[CompensatorStatus, float], str]], ...] = 
     (OK, lambda s, now: _if(s.compensator.ramping, "running, a change is ramping in")),
     (OK, lambda s, now: "running" if s.fed(now) else "running, pose estimated from own commands"),
 )
-"""What there is to say of an active compensator, worst first: level, and the text, empty where there is nothing."""
 
+# What else it says: key and value
 VALUES: dict[str, Callable[[CompensatorStatus, float], str]] = {
     "model": lambda s, now: s.compensator.model.name,
     "tool": lambda s, now: s.compensator.geometry.tool_name,
@@ -390,4 +388,3 @@ VALUES: dict[str, Callable[[CompensatorStatus, float], str]] = {
     "refused_resets": lambda s, now: str(s.refused_resets.total),
     "refused_tools": lambda s, now: str(s.refused_tools.total),
 }
-"""What else it says: key and value."""

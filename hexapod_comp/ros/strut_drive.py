@@ -32,8 +32,7 @@ from .parameters import Program, read_table
 from .process import run
 from .status import ERROR, OK, WARN, Flow, LogSpace, Refusals, joined, seconds
 
-LONGEST_PAUSE = 0.25
-"""After a longer pause (a stopped process), the machine has moved on by no more than this, s."""
+LONGEST_PAUSE = 0.25  # After a longer pause (a stopped process), the machine has moved on by no more than this, s
 
 PARAMETERS = read_table("""
 autostart | true |  | start | configure and activate at the start

@@ -30,14 +30,13 @@ from ..machine.model import MachineModel, RealMachine
 from ..machine.temperatures import Temperatures
 from ..pose import Pose
 
-NICENESS = 10
-"""Commands come first."""
+NICENESS = 10  # Commands come first
 
+# Without a job for this long the process is ended, s: it holds a hundred megabytes; a new one takes a second
 IDLE_AFTER = 10.0
-"""Without a job for this long the process is ended, s: it holds a hundred megabytes; a new one takes a second."""
 
+# Where the process runs: Python also imports from the folder it runs in, which must not be just any
 PACKAGE_ROOT = Path(__file__).resolve().parents[2]
-"""Where the process runs: Python also imports from the folder it runs in, which must not be just any."""
 
 
 class WorkerError(HexapodError):

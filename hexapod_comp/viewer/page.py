@@ -34,17 +34,12 @@ from ..ros.messages import StrutReader, message_pose, nanoseconds_of, read_messa
 from ..ros.process import QUIET, SPIN_PERIOD, RosSession
 from ..ros.status import ERROR, OK, WARN, status_prefix
 
+# Best effort, so that nobody waits for a slow witness; deep enough that the latencies are those of all commands
 STREAM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Best effort, so that nobody waits for a slow witness; deep enough that the latencies are those of all commands."""
 
-SILENT_AFTER = 2.0
-"""What nobody has said for this long is not known any more, s: diagnostics come once a second."""
-
-WINDOW = 5.0
-"""Latencies are those of the last so many seconds."""
-
-UPDATE_PERIOD = 0.1
-"""How often what is seen is shown anew, s."""
+SILENT_AFTER = 2.0  # What nobody has said for this long is not known any more, s: diagnostics come once a second
+WINDOW = 5.0  # Latencies are those of the last so many seconds
+UPDATE_PERIOD = 0.1  # How often what is seen is shown anew, s
 
 NODES = ("compensator", "strut_drive")
 
@@ -228,8 +223,8 @@ def _predicted(data: bytes) -> WatchedError:
 # ---- the page ----
 
 GREY = (128, 128, 140)
+# Struts of a machine that is not heard; viser shows the ends' own colours lighter than a line's one colour
 UNKNOWN = (50, 50, 55)
-"""Struts of a machine that is not heard; viser shows the ends' own colours lighter than a line's one colour."""
 
 STEEL = (110, 150, 210)
 GOLD = (240, 190, 60)
@@ -238,6 +233,7 @@ SILENT = "#8b949e"
 
 TITLES = dict(zip(NODES, ("Compensator", "Drive"), strict=True))
 
+# What of the diagnostics' values is shown, and its name
 KEYS = {
     "commanded_by": "commanded by",
     "command_rate_hz": "commands per second",
@@ -246,7 +242,6 @@ KEYS = {
     "model": "model",
     "compensation": "compensation",
 }
-"""What of the diagnostics' values is shown, and its name."""
 
 
 class WatchPage:

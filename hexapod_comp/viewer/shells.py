@@ -20,21 +20,18 @@ from ..ros import keep_discovery_local
 from ..workspace.pictures import shades
 from ..workspace.shells import Layer, Quantity
 
+# Latched: the last message is kept for those who subscribe later
 SHELL_QOS = QoSProfile(
     depth=1,
     history=HistoryPolicy.KEEP_LAST,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
-"""Latched: the last message is kept for those who subscribe later."""
 
 TOPIC = "workspace/shells"
 NAMESPACE = "workspace_shells"
-TEXT_SHARE = 0.06
-"""Height of the text, of the width of the outermost shell."""
-
-OPACITY = (1.0, 0.35)
-"""Of the innermost and of the outermost shell."""
+TEXT_SHARE = 0.06  # Height of the text, of the width of the outermost shell
+OPACITY = (1.0, 0.35)  # Of the innermost and of the outermost shell
 
 
 def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, frame_id: str, stamp: Time) -> MarkerArray:
