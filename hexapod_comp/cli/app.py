@@ -63,7 +63,8 @@ def _run(arguments: Sequence[str]) -> int:
         with protected(*named.values()):
             if args.verb in ONE_THREAD:  # NumPy reads this when it is loaded, and nothing has loaded it yet
                 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-            result = importlib.import_module(f".{args.verb}", __package__).run(args)
+            run = getattr(importlib.import_module(f".{verb.module}", __package__), args.verb)
+            result = run(args)
             return result if isinstance(result, int) else int(result.finish(args))
     except (HexapodError, ImportError) as error:
         if isinstance(error, ImportError) and error.name != "hexapod_comp.core._core":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,98 +17,106 @@ from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.model import MachineModel, commanded_box
 from ..machine.model_file import IDEAL, model_text
 from ..virtual.named import is_random
-from . import common
+from . import results
+from .results import Result
 
 # An error that grows by less than this, m, has not grown: the files' digits and LinuxCNC's floats count for more
 HARMLESS = 10e-9
 
 
-def run(args: argparse.Namespace) -> common.Result:
-    """Run the verb."""
-    geometry, model = common.load_machine(args)
-    exact = _descriptions(args, geometry) + _c(args, geometry, model)
-    if args.linuxcnc is None and args.table is None:
-        return _show_exact(args, model, exact)
+class Tried(NamedTuple):
+    """One way to use an export, driven through the machine that the model describes."""
+
+    name: str
+    check: ExportCheck  # what it leaves
+    notes: list[str]  # what it does not carry
+
+
+def export(args: argparse.Namespace) -> Result:
+    """Write a model in other forms, and show what they leave; 1 when one would make the error larger."""
+    geometry, model = results.load_machine(args)
+    written, tried = _exact(args, geometry, model), list[Tried]()
+    title, known = f"machine {model.machine}, model {model.name}", {"machine": model.machine, "model": model.name}
+    if args.linuxcnc is None and args.table is None:  # what was written has the very numbers: nothing is to be judged
+        text = f"{title}\nwritten: {', '.join(written)}"
+        if args.c_folder is not None:
+            text += "\nbuild the self-test and run it on the target: see hexapod_selftest.c"
+        return Result(lambda: text, lambda: {**known, "written": written})
     box = commanded_box(geometry, model) if args.box is None else np.array(args.box)
-    written, checks = exact, []
-    with common.stage_line() as say:
+    low, high = (", ".join(f"{v:g}" for v in corner.round(9) * 1e3) for corner in box)
+    box_text = f"box of tool positions in work ({low})…({high}) mm, 20 °C"
+    dated = f" of {model.origin.date}" if model.origin.date else ""
+    titles = [f"{title}{dated}, written by hexapod_comp export", box_text]
+    with results.stage_line() as say:
         say("the tool's error as the machine is")
         trial = ExportTrial(geometry, model, box, args.poses, args.seed, math.radians(args.tilt_deg))
         if args.linuxcnc is not None:
             say("LinuxCNC's files, and what they leave")
-            files, result = _linuxcnc(args, trial, box)
+            files, one = _linuxcnc(args, trial, box, titles)
             written += files
-            checks.append(result)
+            tried.append(one)
         if args.table is not None:
             say("the table, and what it leaves")
             written.append(args.table)
-            checks += _table(args, trial, box)
-    worse = any(c.level.after.rms > c.level.before.rms + HARMLESS for _, c, _ in checks)
-    given = args, model, box, written, checks
-    return common.Result(lambda: _report(*given), lambda: _as_json(*given), code=int(worse))
+            tried += _table(args, trial, box, titles)
+    lines = [
+        title,
+        box_text,
+        f"written: {', '.join(written)}",
+        "",
+        f"tool error of that machine at {args.poses} random poses, forward and backward, before → after "
+        "(files read back, the model taken for the truth):",
+    ]
+    checks = []
+    for one in tried:
+        shown, numbers = _shown(one, args.tilt_deg)
+        lines += shown
+        checks.append(numbers)
+    worse = any(c.level.after.rms > c.level.before.rms + HARMLESS for _, c, _ in tried)
+    drawn = {"frame": "work", "box_mm": box * 1e3, "poses": args.poses, "seed": args.seed, "tilt_deg": args.tilt_deg}
+    content = {**known, **drawn, "written": written, "checks": checks}
+    return Result(lambda: "\n".join(lines), lambda: content, code=int(worse))
 
 
-def _descriptions(args: argparse.Namespace, geometry: HexapodGeometry) -> list[str]:
-    """Write what robot programs want to know of the machine; return the files."""
+def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
+    """Write what robot programs want to know, and the C core with this machine's constants; return the files."""
     from ..export.robot_description import mjcf, urdf
 
+    joints = args.joint_names or STRUT_NAMES
     written = [(file, form) for file, form in ((args.urdf, urdf), (args.mjcf, mjcf)) if file is not None]
     for file, form in written:
-        write_text(file, form(geometry, args.joint_names or STRUT_NAMES))
-    return [file for file, _ in written]
-
-
-def _c(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
-    """Write the C core with this machine's constants, alone and as a controller of ros2_control; return the files."""
+        write_text(file, form(geometry, joints))
+    files = [file for file, _ in written]
     if args.c_folder is None and args.ros2_control is None:
-        return []
+        return files
     from ..compensation.journal import IDEAL_SOURCE, Source
     from ..export.c_code import write_c
     from ..export.control_package import write_ros2_control
 
-    machine = Source.read(input_file(args.machine))
     if args.model == IDEAL:
         source = IDEAL_SOURCE
     elif is_random(args.model):
         source = Source.of(args.model, model_text(model))
     else:
         source = Source.read(input_file(args.model))
-    of = (geometry, model, (machine.sha256, source.sha256))
-    files = [] if args.c_folder is None else write_c(args.c_folder, *of)
-    if args.ros2_control is not None:
-        files += write_ros2_control(args.ros2_control, *of, args.rate, args.joint_names or STRUT_NAMES)
-    return [str(file) for file in files]
-
-
-def _show_exact(args: argparse.Namespace, model: MachineModel, written: list[str]) -> common.Result:
-    """Say what was written when all of it gives the very numbers, so that nothing is to be judged."""
-    text = f"machine {model.machine}, model {model.name}\nwritten: {', '.join(written)}"
+    of = (geometry, model, (Source.read(input_file(args.machine)).sha256, source.sha256))
     if args.c_folder is not None:
-        text += "\nbuild the self-test and run it on the target: see hexapod_selftest.c"
-    return common.Result(lambda: text, lambda: {"machine": model.machine, "model": model.name, "written": written})
+        files += map(str, write_c(args.c_folder, *of))
+    if args.ros2_control is not None:
+        files += map(str, write_ros2_control(args.ros2_control, *of, args.rate, joints))
+    return files
 
 
-Result = tuple[str, "ExportCheck", list[str]]  # name of a way to use an export, what it leaves, and notes
-
-
-def _titles(model: MachineModel, box: np.ndarray) -> list[str]:
-    dated = f" of {model.origin.date}" if model.origin.date else ""
-    return [f"machine {model.machine}, model {model.name}{dated}, written by hexapod_comp export", _box_text(box)]
-
-
-def _box_text(box: np.ndarray) -> str:
-    low, high = (", ".join(f"{v:g}" for v in corner.round(9) * 1e3) for corner in box)
-    return f"box of tool positions in work ({low})…({high}) mm, 20 °C"
-
-
-def _linuxcnc(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray) -> tuple[list[str], Result]:
+def _linuxcnc(
+    args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles: list[str]
+) -> tuple[list[str], Tried]:
     """Write LinuxCNC's files, read them back and drive the machine through them."""
     from ..export.linuxcnc import make_genhexkins, read_genhexkins, table_misfit, write_genhexkins
 
     machine = trial.machine
     genhexkins = make_genhexkins(machine, box)
     misfit = table_misfit(machine, genhexkins, box)
-    files = write_genhexkins(genhexkins, args.linuxcnc, args.units, _titles(machine.model, box), misfit)
+    files = write_genhexkins(genhexkins, args.linuxcnc, args.units, titles, misfit)
     back = read_genhexkins(args.linuxcnc, args.units)
     check = trial.check(back.commands)
     rms, largest = table_misfit(machine, back, box).max(axis=0) * 1e6
@@ -117,52 +125,55 @@ def _linuxcnc(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray) -> 
         f"what bends between the {points} points of a strut's .comp file: {rms:.3f} µm RMS, {largest:.3f} at most",
         f"the error field: moves the tool by {_size(check.field)}",
     ]
-    return [str(file) for file in files], ("LinuxCNC", check, notes)
+    return [str(file) for file in files], Tried("LinuxCNC", check, notes)
 
 
-def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray) -> list[Result]:
+def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles: list[str]) -> list[Tried]:
     """Write the table, read it back, and drive the machine through its strut and through its pose corrections."""
     from ..export.table import commands_by_poses, commands_by_struts, make_table, read_table, write_table
 
     geometry, model = trial.machine.geometry, trial.machine.model
     table, left_out = make_table(geometry, model, box, args.step_mm * 1e-3)
     left_out.append("tilt: the table holds for a level tool; above stands what a tilted one keeps")
-    write_table(table, args.table, _titles(model, box))
+    write_table(table, args.table, titles)
     back = read_table(args.table)
-    by_struts = trial.check(partial(commands_by_struts, back))
-    by_poses = trial.check(partial(commands_by_poses, back))
     lost = model.struts.largest_backlash.max() * 1e6
     backlash = [f"backlash of struts, up to {lost:.3f} µm: no pose correction fits six directions"] if lost else []
-    return [("table, struts", by_struts, left_out), ("table, poses", by_poses, [*left_out, *backlash])]
+    return [
+        Tried("table, struts", trial.check(partial(commands_by_struts, back)), left_out),
+        Tried("table, poses", trial.check(partial(commands_by_poses, back)), [*left_out, *backlash]),
+    ]
+
+
+def _shown(tried: Tried, tilt_deg: float) -> tuple[list[str], dict[str, Any]]:
+    """Return lines about one way to use an export, and the same for programs."""
+    name, check, notes = tried
+    heat, damp = check.per_kelvin, check.per_humidity
+    tilted = "no such pose is within the machine's limits" if check.tilted is None else _change(check.tilted)
+    if heat is None:
+        carried = "thermal growth (the model has none)"
+    else:
+        carried = f"thermal growth: 1 K on struts, base and platform moves the tool by {_size(heat)}"
+    left_out = [*notes, carried]
+    left_out += [] if damp is None else [f"growth of the struts by humidity: 10 % moves the tool by {_size(damp)}"]
+    lines = [
+        f"  {name}, level tool: {_change(check.level)}",
+        f"  {name}, tool tilted by {tilt_deg:g}°: {tilted}",
+        *(f"    not carried: {note}" for note in left_out),
+    ]
+    return lines, {
+        "export": name,
+        "level": _numbers(check.level),
+        "tilted": None if check.tilted is None else _numbers(check.tilted),
+        **_sizes("field", check.field),
+        **_sizes("per_kelvin", heat),
+        **_sizes("per_10_percent_humidity", damp),
+        "not_carried": notes,
+    }
 
 
 def _size(size: Size) -> str:
     return f"{size.rms * 1e6:.3f} µm RMS, {size.largest * 1e6:.3f} at most"
-
-
-def _report(
-    args: argparse.Namespace, model: MachineModel, box: np.ndarray, written: list[str], checks: list[Result]
-) -> str:
-    """Return the report for people."""
-    lines = [f"machine {model.machine}, model {model.name}", _box_text(box), f"written: {', '.join(written)}", ""]
-    lines.append(
-        f"tool error of that machine at {args.poses} random poses, forward and backward, before → after "
-        "(files read back, the model taken for the truth):"
-    )
-    for name, check, notes in checks:
-        lines.append(f"  {name}, level tool: {_change(check.level)}")
-        tilted = "no such pose is within the machine's limits" if check.tilted is None else _change(check.tilted)
-        lines.append(f"  {name}, tool tilted by {args.tilt_deg:g}°: {tilted}")
-        heat, damp = check.per_kelvin, check.per_humidity
-        moved = (
-            "(the model has none)"
-            if heat is None
-            else f": 1 K on struts, base and platform moves the tool by {_size(heat)}"
-        )
-        left_out = [*notes, f"thermal growth{' ' * (heat is None)}{moved}"]
-        left_out += [] if damp is None else [f"growth of the struts by humidity: 10 % moves the tool by {_size(damp)}"]
-        lines += [f"    not carried: {note}" for note in left_out]
-    return "\n".join(lines)
 
 
 def _change(comparison: Comparison) -> str:
@@ -173,33 +184,6 @@ def _change(comparison: Comparison) -> str:
         text += f" ({texts.number(100.0 * abs(1.0 - c / a), 1)} % {'more' if c > a + HARMLESS * 1e6 else 'less'})"
     turned = f"{comparison.before_rotation.rms * 1e6:.2f} → {comparison.after_rotation.rms * 1e6:.2f} µrad RMS"
     return f"{text}, {b:.3f} → {d:.3f} µm at most, {turned}"
-
-
-def _as_json(
-    args: argparse.Namespace, model: MachineModel, box: np.ndarray, written: list[str], checks: list[Result]
-) -> dict[str, Any]:
-    return {
-        "machine": model.machine,
-        "model": model.name,
-        "frame": "work",
-        "box_mm": box * 1e3,
-        "poses": args.poses,
-        "seed": args.seed,
-        "tilt_deg": args.tilt_deg,
-        "written": written,
-        "checks": [
-            {
-                "export": name,
-                "level": _numbers(check.level),
-                "tilted": None if check.tilted is None else _numbers(check.tilted),
-                **_sizes("field", check.field),
-                **_sizes("per_kelvin", check.per_kelvin),
-                **_sizes("per_10_percent_humidity", check.per_humidity),
-                "not_carried": notes,
-            }
-            for name, check, notes in checks
-        ],
-    }
 
 
 def _sizes(name: str, size: Size | None, unit: str = "um") -> dict[str, float | None]:

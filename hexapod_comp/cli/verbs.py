@@ -15,8 +15,9 @@ from .options import (
 
 
 class Verb(NamedTuple):
-    """A verb; its module of the same name has ``run(args)``."""
+    """A verb: a function of its name, of the parsed options, that returns an exit code or a Result."""
 
+    module: str  # in which it is
     group: str  # under which heading it is listed
     summary: str  # one line
     options: tuple[Option, ...]
@@ -89,7 +90,7 @@ BOUNDS = (
 # fmt: off
 VERBS = {
     "show": Verb(
-        "kinematics",
+        "poses", "kinematics",
         "a machine at a glance: frames, joints, reach, largest box",
         (
             reads("machine", "geometry file, or the name of a shipped one", "MACHINE", "geometry"),
@@ -111,7 +112,7 @@ example:
   picture: out/machine.png""",
     ),
     "ik": Verb(
-        "kinematics",
+        "poses", "kinematics",
         "strut lengths (mm) for a tool pose (mm, degrees) or a CSV file",
         (
             reads("poses", "CSV file of poses; - for standard input", "POSES.csv", "poses", nargs="?"),
@@ -154,7 +155,7 @@ example:
         ),
     ),
     "fk": Verb(
-        "kinematics",
+        "poses", "kinematics",
         "tool pose (mm, degrees) for six strut lengths (mm) or a CSV file",
         (
             reads("lengths_file", "CSV file; - for standard input", "LENGTHS.csv", "lengths", nargs="?"),
@@ -189,7 +190,7 @@ example:
         ),
     ),
     "check": Verb(
-        "kinematics",
+        "poses", "kinematics",
         "which pose of a CSV file breaks which limit, with all margins",
         (
             reads("poses", "CSV file of poses (mm, degrees); - for standard input", "POSES.csv", "poses"),
@@ -223,7 +224,7 @@ example:
   all within limits""",
     ),
     "travel": Verb(
-        "kinematics",
+        "poses", "kinematics",
         "how far the tool may go from a pose, each way, and what stops it",
         (
             value("--pose", pose, SHAPE, f"where the tool is, {POSE_HELP} (default: home)"),
@@ -239,7 +240,7 @@ example:
   $ hexapod_comp travel --pose 0,0,400,0,0,5 --model paper_machine.yaml""",
     ),
     "run": Verb(
-        "loop",
+        "running", "loop",
         "send poses through the loop: two simulated nodes, or your own",
         (
             reads("poses", "CSV file of poses (mm, degrees)", "POSES.csv", "poses"),
@@ -265,7 +266,7 @@ example:
   $ hexapod_comp run poses.csv --attach --rate-hz 100     (nodes already running in this ROS domain)""",
     ),
     "demo": Verb(
-        "loop",
+        "running", "loop",
         "measure, fit and compensate a machine: what is left of its errors",
         (
             *LOOP,
@@ -293,7 +294,7 @@ example:
   $ hexapod_comp demo --model paper_lines_model     (the scheme of Mou & King 1998 on 1-D lines)""",
     ),
     "watch": Verb(
-        "loop",
+        "running", "loop",
         "show a running machine in the browser: 3-D, errors, refusals",
         (
             MACHINE,
@@ -312,7 +313,7 @@ example:
   hexapod_comp: mine is shown on http://127.0.0.1:8080 until Ctrl-C""",
     ),
     "echo": Verb(
-        "loop",
+        "running", "loop",
         "print a topic of a running machine with units, rate and age",
         (
             value("topic", None, "TOPIC", "name of a topic (default: list those that are published)", nargs="?"),
@@ -336,7 +337,7 @@ example:
   $ hexapod_comp echo strut_commands --hz --seconds 10""",
     ),
     "record": Verb(
-        "loop",
+        "running", "loop",
         "record a running machine's topics, for replay",
         (
             folder("--out", "folder for the bag (MCAP); must not be there yet", dest="folder", required=True),
@@ -353,7 +354,7 @@ example:
   $ hexapod_comp replay run""",
     ),
     "replay": Verb(
-        "loop",
+        "running", "loop",
         "run a recorded bag through the compensator again: the same bits?",
         (
             reads("bag", "folder of a bag, .mcap or .db3 file", "BAG"),
@@ -385,7 +386,7 @@ example:
   …""",
     ),
     "plan": Verb(
-        "calibration",
+        "fitting", "calibration",
         "what a campaign will determine; or which one a goal needs",
         (
             reads("campaign", "campaign file, or the name of a shipped one; with --goal-um optional: whose box and "
@@ -427,7 +428,7 @@ example:
         ),
     ),
     "imagine": Verb(
-        "calibration",
+        "measuring", "calibration",
         "draw a virtual machine with hidden errors, for any geometry",
         (
             MACHINE,
@@ -449,7 +450,7 @@ example:
   $ hexapod_comp simulate --machine mine.yaml --truth truth.yaml --campaign mine_5d.yaml --out measured.csv""",
     ),
     "simulate": Verb(
-        "calibration",
+        "measuring", "calibration",
         "measure the virtual machine: a campaign's readings as a CSV file",
         (
             MACHINE,
@@ -478,7 +479,7 @@ example:
         alias="measure",
     ),
     "fit": Verb(
-        "calibration",
+        "fitting", "calibration",
         "fit a model of the machine's errors to measurements",
         (
             *readings(),
@@ -539,7 +540,7 @@ example:
         ),
     ),
     "verify": Verb(
-        "calibration",
+        "fitting", "calibration",
         "does a model still hold, by a few readings; what has changed",
         (
             reads("model", "model file that fit has written, MODEL.posterior.npz beside it", "MODEL"),
@@ -572,7 +573,7 @@ example:
         ),
     ),
     "iso230": Verb(
-        "calibration",
+        "measuring", "calibration",
         "the figures of ISO 230-2, 230-4 and 230-6 of readings",
         (
             *readings(),
@@ -589,7 +590,7 @@ example:
   $ hexapod_comp iso230 measured.csv""",
     ),
     "export": Verb(
-        "calibration",
+        "export", "calibration",
         "write a model for LinuxCNC or as a table; check what it leaves",
         (
             MACHINE,
@@ -628,7 +629,7 @@ example:
         (some_of("--linuxcnc", "--table", "--c", "--ros2-control", "--urdf", "--mjcf"),),
     ),
     "assess": Verb(
-        "analysis",
+        "poses", "analysis",
         "what random imperfections within bounds do to lengths and poses",
         (
             reads("poses", "CSV file of poses (mm, degrees; default: Table 1 of Song, Mou & King); - for standard "
@@ -660,7 +661,7 @@ example:
   largest strut change 34.198 µm (two joints in a corner of their cubes and a strut allow 44.641 µm)""",
     ),
     "classify": Verb(
-        "analysis",
+        "classify", "analysis",
         "rank a machine's errors by what they do to the tool",
         (
             machine("positioning_unit.yaml"),

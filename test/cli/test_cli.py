@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from strategies import paper_geometry, random_field, random_model
 
 from hexapod_comp import cli
-from hexapod_comp.cli import common, ik
+from hexapod_comp.cli import poses, results
 from hexapod_comp.cli.verbs import VERBS
 from hexapod_comp.compensation.checks import LIMITS, check
 from hexapod_comp.compensation.compensator import Compensator
@@ -94,7 +94,8 @@ def test_no_help_loads_what_is_heavy() -> None:
     code = (
         "import sys, hexapod_comp.cli as cli\n"
         f"for verb in {list(VERBS)}: assert cli.main([verb, '--help']) == 0\n"
-        "heavy = {'numpy', 'scipy', 'matplotlib', *(f'hexapod_comp.cli.{verb}' for verb in cli.app.VERBS)}\n"
+        "modules = (f'hexapod_comp.cli.{verb.module}' for verb in cli.app.VERBS.values())\n"
+        "heavy = {'numpy', 'scipy', 'matplotlib', *modules}\n"
         "assert not heavy & set(sys.modules), heavy & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.DEVNULL, timeout=20, check=True)
@@ -201,7 +202,7 @@ def test_control_c_and_a_closed_pipe(hexapod, monkeypatch: pytest.MonkeyPatch) -
     def interrupted(args: object) -> int:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(ik, "run", interrupted)
+    monkeypatch.setattr(poses, "ik", interrupted)
     assert hexapod("ik", "--pose", "0,0,400") == (130, "", "")
 
 
@@ -760,7 +761,7 @@ def test_signals_end_a_session_in_order(number: signal.Signals) -> None:
     before = signal.getsignal(number)
 
     def session() -> None:
-        with common.ended_in_order(), contextlib.ExitStack() as started:
+        with results.ended_in_order(), contextlib.ExitStack() as started:
             started.callback(ended.append, True)
             os.kill(os.getpid(), number)
 

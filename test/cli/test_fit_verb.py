@@ -26,8 +26,8 @@ from hexapod_comp.calibration.fit import ModelFit
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.posterior import expected_error
 from hexapod_comp.calibration.posterior_file import load_posterior
-from hexapod_comp.cli import fit as fit_module
-from hexapod_comp.cli.fit import beyond_limits
+from hexapod_comp.cli import fitting as fit_module
+from hexapod_comp.cli.fitting import beyond_limits
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import MachineModel

@@ -405,7 +405,7 @@ def test_what_no_table_can_hold_is_refused() -> None:
 
 def run_verb(*arguments: str) -> int:
     args = make_parser().parse_args(["export", "--machine", str(PAPER_FILE), *arguments])
-    return int(export.run(args).finish(args))
+    return int(export.export(args).finish(args))
 
 
 def test_verb_writes_reads_back_and_reports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -42,8 +42,7 @@ from replay_helpers import (
 )
 from rosbags.rosbag2 import CompressionMode
 
-from hexapod_comp.cli import main
-from hexapod_comp.cli import replay as verb
+from hexapod_comp.cli import main, running
 from hexapod_comp.cli.app import make_parser
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.compensation.journal import (
@@ -131,7 +130,7 @@ def without(messages: Messages, *numbers: int) -> Messages:
 def call(*arguments: object) -> int:
     """Run the verb as the command line does, errors apart."""
     args = make_parser().parse_args(["replay", *map(str, arguments)])
-    return verb.run(args).finish(args)
+    return running.replay(args).finish(args)
 
 
 # ---- the same bits ----

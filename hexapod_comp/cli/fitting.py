@@ -1,38 +1,45 @@
-"""``hexapod_comp fit``: from measurements to a model of the machine; with ``--update``, a model renewed from few."""
+"""From measurements to a model: ``plan``, ``fit``, also ``--update`` of a model from few readings, and ``verify``."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ..calibration.blocks import HARMONICS
+from ..calibration.check import VALID, Verification, refusal, update_model, verify_model
+from ..calibration.check_report import update_report, verification_json, verification_report
 from ..calibration.evaluation import Worth, worth, worth_json, worth_text
 from ..calibration.fit import ModelFit, fit_model
 from ..calibration.lines import fit_lines
 from ..calibration.parameters import TOLERANCES, FitSettings
 from ..calibration.posterior import FittedParameters
-from ..calibration.posterior_file import SUFFIX, save_with_posterior
-from ..calibration.report import as_json, fit_report, lines_json, lines_report
+from ..calibration.posterior_file import SUFFIX, load_posterior, save_with_posterior
+from ..calibration.report import as_json, fit_report, lines_json, lines_report, plan_json, plan_report
 from ..compensation.checks import check
 from ..errors import CalibrationError, CommandError
 from ..formats.outputs import write_text
 from ..formats.paths import input_file
 from ..formats.texts import number
-from ..machine.geometry import load_geometry
+from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.model import MachineModel, RealMachine
+from ..machine.model_file import load_model
 from ..machine.region import region_json, region_text
+from ..measurements.campaign import Campaign, campaign_text, template
 from ..measurements.files import read_measurements
 from ..measurements.iso230 import judge, standards_json, standards_text
 from ..measurements.readings import MeasurementSet, spans
+from ..measurements.tidy import write_measurements
 from ..pose import Pose
+from ..virtual.instruments import compensated
 from ..virtual.named import find_model
-from . import common
+from . import results
+from .results import Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,8 +74,7 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
         several = {"field": ("field displacement", "field rotation", "field reversal"), "harmonics": HARMONICS}
         given["blocks"] = tuple(block for name in named for block in several.get(name, (name,)))
     for option, (name, unit) in IN_SI.items():
-        if getattr(args, option, None) is not None:
-            value = getattr(args, option)
+        if (value := getattr(args, option, None)) is not None:
             given[name] = value * unit if isinstance(value, float) else value
     if args.expansion_ppm is not None:
         given |= dict(zip(("strut_expansion", "base_expansion", "platform_expansion"), args.expansion_ppm, strict=True))
@@ -78,8 +84,68 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
     return FitSettings(shared_platform_joints=not args.separate_joints, robust=robust, **given)
 
 
-def run(args: argparse.Namespace) -> int | common.Result:
-    """Run the verb; 1 when the readings do not bear the model out."""
+# ---- plan ----
+
+
+def plan(args: argparse.Namespace) -> Result:
+    """Say what a campaign determines, or propose one for a goal; 1 when the goal cannot be met."""
+    from ..calibration.candidates import MeasuringBox
+    from ..calibration.design import TIMES, Goal, Times, plan, propose
+    from ..calibration.design_report import proposal_json, proposal_report, remarks
+
+    geometry = load_geometry(args.machine)
+    campaign = results.load_campaign(args, geometry)
+    if args.repeatability_um is not None:
+        campaign = replace(campaign, repeatability=args.repeatability_um * 1e-6)
+    if args.goal_um is None:
+        with results.stage_line() as say:
+            say("laying out the readings")
+            measured = template(campaign, geometry, args.seed, args.campaign)
+            say(f"what {len(measured)} readings determine")
+            result = plan(measured, campaign, fit_settings(args))
+        return Result(lambda: plan_report(result), lambda: plan_json(result))
+    times = dict(TIMES)
+    for name, numbers in args.time or ():
+        if name not in times:
+            raise CalibrationError("--time", f"is of one of {', '.join(times)}, not {name}")
+        times[name] = Times(*numbers)
+    given: dict[str, Any] = {"instruments": tuple(args.instruments.split(","))} if args.instruments is not None else {}
+    given |= {"seconds": args.hours * 3600.0} if args.hours is not None else {}
+    goal = Goal(args.goal_um * 1e-6, float(np.radians(args.tilt_deg or 0.0)), times=times, **given)
+    place = MeasuringBox(geometry, campaign.box, campaign.level, goal.tilt)
+    with results.stage_line() as say:
+        proposal = propose(place, goal, fit_settings(args), campaign, say)
+    results.say_notes(_detours(geometry, proposal.campaign))
+    if args.out is not None:
+        write_text(args.out, campaign_text(proposal.campaign, remarks(proposal)))
+    return Result(
+        lambda: proposal_report(proposal) + (f"\ncampaign: {args.out}\n" if args.out else ""),
+        lambda: {**proposal_json(proposal), "written": args.out},
+        code=0 if proposal.met else 1,
+    )
+
+
+def _detours(geometry: HexapodGeometry, campaign: Campaign) -> Iterator[str]:
+    """Yield between which runs the machine cannot move straight, as ``check`` sees it."""
+    ends = [
+        (run, slice(None, None, max(1, len(run.positions) - 1)) if run.is_line else slice(None))
+        for run in campaign.runs
+    ]
+    names = [run.name for run, part in ends for _ in run.positions[part]]
+    positions, rotations = (
+        np.concatenate([getattr(run, what)[part] for run, part in ends]) for what in ("positions", "rotations")
+    )
+    result = check(geometry, MachineModel(geometry.name), (positions, rotations))
+    for row in sorted({breach.row for breach in result.breaches}):
+        error = next(breach.error for breach in result.breaches if breach.row == row)
+        yield f"no straight way from {names[max(row - 1, 0)]} to {names[row]}: go by home ({error})"
+
+
+# ---- fit ----
+
+
+def fit(args: argparse.Namespace) -> int | Result:
+    """Fit a model to measurements and write it; 1 when the readings do not bear it out."""
     if args.update is not None:
         return _renew(args)
     if args.details is not None:
@@ -89,23 +155,24 @@ def run(args: argparse.Namespace) -> int | common.Result:
     geometry = load_geometry(args.machine)
     truth = None if args.truth is None else RealMachine(geometry, find_model(args.truth, geometry))
     settings = fit_settings(args)
-    with common.stage("reading measurements"):
+    with results.stage("reading measurements"):
         measured = read_measurements(args.files, geometry, args.columns, args.probe_mm)
+    datum = None if args.datum is None else geometry.platform_pose(Pose.from_angles(*args.datum))
     try:
-        result = _joint(args, measured, settings) if args.scheme == "joint" else _lines(args, measured)
+        result = _joint(args, measured, settings, datum) if args.scheme == "joint" else _lines(args, measured, datum)
     except CalibrationError:
-        common.say_notes(measured.notes)  # they may say why
+        results.say_notes(measured.notes)  # they may say why
         raise
     if beyond := beyond_limits(measured, result.model):
         result = replace(result, misfit="; ".join(filter(None, (result.misfit, beyond))))
     if result.misfit and not args.force:
         print("hexapod_comp: error: nothing was written; the report says why, --force writes it", file=sys.stderr)
-        return common.Result(
+        return Result(
             lambda: f"{REFUSED}: {result.misfit}. {ADVICE}\n\n{result.text}",
             lambda: {**result.content(), "misfit": result.misfit, "written": None},
             code=1,
         )
-    with common.stage("trying the model on the virtual machine"):
+    with results.stage("trying the model on the virtual machine"):
         tried = None if truth is None else _worth(truth, result, measured)
     return _write(args, result, measured, tried)
 
@@ -122,24 +189,11 @@ class Fitted:
     fitted: FittedParameters | None = None  # how well parameters are known, and the fit, of scheme joint
     fit: ModelFit | None = None
 
-    @property
-    def saved(self) -> MachineModel:
-        """Return the model; one written by --force carries the reason in its note."""
-        if not self.misfit:
-            return self.model
-        origin = self.model.origin
-        return replace(self.model, origin=replace(origin, note=f"FORCED: {self.misfit}. {origin.note}"))
 
-
-def _datum(args: argparse.Namespace, measured: MeasurementSet) -> Pose | None:
-    """Return the platform's pose in base at the datum, None for home."""
-    return None if args.datum is None else measured.geometry.platform_pose(Pose.from_angles(*args.datum))
-
-
-def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSettings) -> Fitted:
+def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSettings, datum: Pose | None) -> Fitted:
     """Fit with scheme joint."""
-    with common.stage_line() as say:
-        fit = fit_model(measured, settings, say, _datum(args, measured))
+    with results.stage_line() as say:
+        fit = fit_model(measured, settings, say, datum)
     fitted = FittedParameters.of(fit)
 
     def pictures() -> dict[str, Figure]:
@@ -157,9 +211,9 @@ def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSett
     return Fitted(model, fit_report(fit), lambda: as_json(fit), pictures, fit.misfit, fitted, fit)
 
 
-def _lines(args: argparse.Namespace, measured: MeasurementSet) -> Fitted:
+def _lines(args: argparse.Namespace, measured: MeasurementSet, datum: Pose | None) -> Fitted:
     """Fit with scheme lines."""
-    fit = fit_lines(measured, args.order or "adjusted-r2", name=args.name or "", datum=_datum(args, measured))
+    fit = fit_lines(measured, args.order or "adjusted-r2", name=args.name or "", datum=datum)
 
     def pictures() -> dict[str, Figure]:
         from ..calibration.pictures import fitted_lines_figure, predicted_error_figure, strut_error_figure
@@ -207,7 +261,7 @@ def _write(args: argparse.Namespace, result: Fitted, measured: MeasurementSet, t
     text = "\n".join(parts)
     if result.misfit:
         text = f"{FORCED}: {result.misfit}. {ADVICE}\n\n{text}"
-    beside = save_with_posterior(result.saved, result.fitted, args.out)
+    beside = save_with_posterior(_forced(result.model, result.misfit), result.fitted, args.out)
 
     def content() -> dict[str, Any]:
         more = {"standards": standards_json(judged), "worth": worth_json(tried) if tried else None}
@@ -215,32 +269,35 @@ def _write(args: argparse.Namespace, result: Fitted, measured: MeasurementSet, t
         files = {"misfit": result.misfit, "written": args.out, "written_beside": beside}
         return {**result.content(), **more, **files}
 
-    common.Result(lambda: f"{text}\nmodel: {args.out}\n{_listed(beside)}", content).finish(args)
+    # The model is there: what follows may fail, and pictures come last.
+    Result(lambda: f"{text}\nmodel: {args.out}\n{_listed(beside)}", content).finish(args)
     if args.report is not None:
         write_text(args.report, text)
     if args.certificate is not None and result.fit is not None:
         from ..calibration.certificate import Filed, certificate_text, load_details
 
-        with common.stage("writing the certificate"):
+        with results.stage("writing the certificate"):
             filed = Filed(result.model.name, (Path(args.out), *beside), text)
             details = None if args.details is None else load_details(args.details)
             write_text(args.certificate, certificate_text(result.fit, filed, details))
-        common.mention(args, f"certificate: {args.certificate}")
+        results.mention(args, f"certificate: {args.certificate}")
     if args.pictures is not None:
-        common.save_pictures(args, result.pictures)
+        results.save_pictures(args, result.pictures)
     return 0
+
+
+def _forced(model: MachineModel, reason: str) -> MachineModel:
+    """Return the model; one written by --force carries the reason in its note."""
+    origin = model.origin
+    return replace(model, origin=replace(origin, note=f"FORCED: {reason}. {origin.note}")) if reason else model
 
 
 def _listed(beside: list[Path]) -> str:
     return "".join(f"its parameters' covariance, to be kept beside it: {path}\n" for path in beside)
 
 
-def _renew(args: argparse.Namespace) -> common.Result:
+def _renew(args: argparse.Namespace) -> Result:
     """Write a model renewed from few readings; 1 when they cannot renew it."""
-    from ..calibration.check import refusal, update_model
-    from ..calibration.check_report import update_report, verification_json, verification_report
-    from .verify import checked
-
     old, new = input_file(args.update), Path(args.out)
     if new.resolve().with_name(new.stem + SUFFIX) == old.resolve().with_name(old.stem + SUFFIX):
         raise CommandError("--out", f"{new} would replace what the fit of {old} knows; write to another name")
@@ -249,11 +306,9 @@ def _renew(args: argparse.Namespace) -> common.Result:
     reason = refusal(verification)
     if reason and not args.force:
         print(f"hexapod_comp: error: nothing was written: {reason} (--force renews all the same)", file=sys.stderr)
-        return common.Result(lambda: text, lambda: {**content, "refused": reason, "written": None}, code=1)
+        return Result(lambda: text, lambda: {**content, "refused": reason, "written": None}, code=1)
     update = update_model(model, fitted, measured, verification)
-    model, origin = update.model, update.model.origin
-    if reason:
-        model = replace(model, origin=replace(origin, note=f"FORCED: {reason}. {origin.note}"))
+    model = _forced(update.model, reason)
     if args.name is not None:
         model = replace(model, name=args.name)
     beside = save_with_posterior(model, update.fitted, args.out)
@@ -261,4 +316,64 @@ def _renew(args: argparse.Namespace) -> common.Result:
     if args.report is not None:
         write_text(args.report, text)
     files = {"written": args.out, "written_beside": beside}
-    return common.Result(lambda: text, lambda: {**content, "chi_square_after": update.chi_square, **files})
+    return Result(lambda: text, lambda: {**content, "chi_square_after": update.chi_square, **files})
+
+
+# ---- verify ----
+
+
+def verify(args: argparse.Namespace) -> Result:
+    """Say whether a model still holds, 1 when the machine has changed; or write the check readings to take."""
+    if args.propose is None:
+        result = checked(args, args.model).verification
+        code = 0 if result.verdict == VALID else 1
+        return Result(lambda: verification_report(result), lambda: verification_json(result), code=code)
+    from ..calibration.follow_up import places, propose_check
+
+    _, fitted = _known(args, args.model)
+    with results.stage("choosing readings"):
+        wanted: dict[str, Any] = {} if args.readings is None else {"readings": args.readings}
+        if args.instruments is not None:
+            wanted["instruments"] = args.instruments.split(",")
+        readings = propose_check(fitted, **wanted)
+    write_measurements(readings, args.propose)
+    runs = [{"where": where, "channels": channels} for where, channels, _ in places(readings)]
+    lines = [f"{len(readings)} check readings:", *(f"  {run['where']}: {', '.join(run['channels'])}" for run in runs)]
+    return Result(
+        lambda: "\n".join([*lines, f"to be filled in: {args.propose}"]),
+        lambda: {"runs": runs, "written": args.propose},
+    )
+
+
+class Checked(NamedTuple):
+    """A model with what its fit knows, and readings that check it."""
+
+    model: MachineModel
+    fitted: FittedParameters
+    measured: MeasurementSet
+    verification: Verification
+
+
+def checked(args: argparse.Namespace, path: str) -> Checked:
+    """Return a model beside the check readings that the options name."""
+    model, fitted = _known(args, path)
+    geometry, probe = fitted.space.geometry, args.probe_mm
+    if probe is None and not np.allclose(fitted.space.probe, geometry.tool.position, rtol=0.0, atol=1e-12):
+        probe = fitted.space.probe  # as the fit was told
+    with results.stage("reading measurements"):
+        measured = read_measurements(args.files, geometry, args.columns, probe)
+    if args.compensated:
+        measured = compensated(measured, model)
+    with results.stage("weighing what may have happened"):
+        return Checked(model, fitted, measured, verify_model(model, fitted, measured))
+
+
+def _known(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedParameters]:
+    """Return a model and what its fit knows."""
+    geometry = load_geometry(args.machine)
+    model = load_model(path, geometry)
+    fitted, unknown = load_posterior(model, geometry, path)
+    if fitted is None:
+        advice = "A fit of scheme joint writes MODEL.posterior.npz beside its model"
+        raise CommandError("model", f"{path} cannot be checked: {unknown}. {advice}")
+    return model, fitted

@@ -1,33 +1,91 @@
-"""What the verbs share: how files are found, how results are shown and written."""
+"""What the verbs share: the one table and the one result that all print, and how machines are found."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..formats.csv import Row
+from ..formats.csv import Row, csv_text
 from ..formats.json import json_text
 from ..formats.outputs import write_text
-from ..formats.texts import CODES, own_terminal
+from ..formats.texts import CODES, aligned, number, own_terminal
 from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.model import MachineModel
-from ..pose import rotation_from_angles
-from .table import Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ..measurements.campaign import Campaign
+
+# Digits after the point in CSV files, by unit: a picometre, and less than that at the platform's edge
+DECIMALS = {"mm": 9, "deg": 9, "um": 6, "urad": 6}
+SHOWN = {"mm": 6, "deg": 6}  # the same for people, who otherwise get three
+
+
+class Table:
+    """Rows with the same columns, named with their units; a value is text, a whole number, a number, or missing."""
+
+    def __init__(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        self.rows = rows
+
+    def csv(self) -> str:
+        """Return the rows as CSV; what is missing or not finite stays empty."""
+        return csv_text([list(self.rows[0]), *self._cells(list(self.rows[0]), DECIMALS, 6, "", lambda value: value)])
+
+    def text(self, names: Sequence[str] = (), digits: Mapping[str, int] | None = None) -> str:
+        """Return some columns, or all, aligned; with other digits after the point where they are given by name."""
+        names, digits = names or list(self.rows[0]), {**SHOWN, **(digits or {})}
+        return aligned(names, self._cells(names, digits, 3, "–", lambda v: "–" if v is None else str(v)))
+
+    def _cells(
+        self, names: Sequence[str], digits: Mapping[str, int], usual: int, missing: str, other: Callable[[Any], Any]
+    ) -> Iterator[list[Any]]:
+        """Yield the rows' cells: numbers with the digits of their column, or else of its unit."""
+        places = {name: digits.get(name, digits.get(name.rpartition("_")[2], usual)) for name in names}
+        for row in self.rows:
+            yield [
+                other(row[n])
+                if not isinstance(row[n], float)
+                else number(row[n], places[n])
+                if math.isfinite(row[n])
+                else missing
+                for n in names
+            ]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a verb gives back: the same as text and as JSON, the rows of its CSV file, its pictures, its exit code."""
+
+    text: Callable[[], str]
+    content: Callable[[], Any]  # of --json
+    rows: Iterable[Mapping[str, Any]] = ()  # of the CSV file that --out names
+    pictures: Callable[[], Mapping[str, Figure]] | None = None  # by file name, for the folder of --pictures
+    code: int = 0
+    notes: Iterable[str] = ()  # for stderr, below the result
+
+    def finish(self, args: argparse.Namespace) -> int:
+        """Write the CSV file and print, as the options say; draw; return the exit code."""
+        text = json_text(self.content()) if args.json else self.text()
+        if self.rows and args.out is not None:
+            write_text(args.out, Table(list(self.rows)).csv())
+        if text:
+            print(text, end="" if text.endswith("\n") else "\n")
+        say_notes(self.notes)
+        if self.pictures is not None and args.pictures is not None:
+            save_pictures(args, self.pictures)
+        return self.code
 
 
 def load_machine(args: argparse.Namespace) -> tuple[HexapodGeometry, MachineModel]:
@@ -61,13 +119,14 @@ def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campai
     return load_campaign(args.campaign, own_box)
 
 
-def frames(geometry: HexapodGeometry) -> dict[str, str]:
-    """Return what JSON says of poses: whose they are, and in which frame."""
-    return {"tool": geometry.tool_name, "frame": geometry.work_name}
+def about(geometry: HexapodGeometry, model: MachineModel | None = None) -> dict[str, str]:
+    """Return what JSON begins with: machine, model, and whose poses it has in which frame."""
+    named = {"machine": geometry.name} | ({} if model is None else {"model": model.name})
+    return named | {"tool": geometry.tool_name, "frame": geometry.work_name}
 
 
 def whose(geometry: HexapodGeometry) -> str:
-    """Return the same in words: ``the tool in work``."""
+    """Return whose poses a report has: ``the tool in work``."""
     return f"the {geometry.tool_name} in {geometry.work_name}"
 
 
@@ -76,37 +135,9 @@ def machine_title(geometry: HexapodGeometry, model: MachineModel) -> str:
     return f"machine {geometry.name}" + (f", model {model.name}" if model.name != "ideal" else "")
 
 
-def one_row(argument: tuple[tuple[float, ...], tuple[float, ...]]) -> tuple[list[Row], np.ndarray, np.ndarray]:
-    """Return a pose given on the command line as a list of one: rows, positions, rotations."""
-    position, angles = argument
-    return [Row(0, "1")], np.array([position]), rotation_from_angles(np.array([angles]))
-
-
 def where(row: Row) -> str:
     """Say where a row stands, for messages."""
     return f"line {row.line} (row {row.label})" if row.line else "the pose"
-
-
-@dataclass(frozen=True)
-class Result:
-    """What a verb gives back: the same as text and as JSON, the rows of its CSV file, its pictures, its exit code."""
-
-    text: Callable[[], str]
-    content: Callable[[], Any]  # of --json
-    rows: Iterable[Mapping[str, Any]] = ()  # of the CSV file that --out names
-    pictures: Callable[[], Mapping[str, Figure]] | None = None  # by file name, for the folder of --pictures
-    code: int = 0
-
-    def finish(self, args: argparse.Namespace) -> int:
-        """Write the CSV file and print, as the options say; draw; return the exit code."""
-        text = json_text(self.content()) if args.json else self.text()
-        if self.rows and args.out is not None:
-            write_text(args.out, Table(list(self.rows)).csv())
-        if text:
-            print(text, end="" if text.endswith("\n") else "\n")
-        if self.pictures is not None and args.pictures is not None:
-            save_pictures(args, self.pictures)
-        return self.code
 
 
 def mention(args: argparse.Namespace, text: str) -> None:

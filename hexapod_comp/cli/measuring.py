@@ -1,0 +1,178 @@
+"""Measuring: ``imagine`` draws a virtual machine, ``simulate`` measures it, ``iso230`` judges readings."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import numpy as np
+
+from ..errors import CalibrationError, GeometryError
+from ..formats.texts import aligned, number
+from ..machine.arrays import rms
+from ..machine.geometry import load_geometry
+from ..machine.model import MachineModel, RealMachine
+from ..machine.temperatures import PARTS
+from ..measurements.campaign import template
+from ..measurements.readings import ANGULAR_KINDS, KINDS
+from ..virtual import named
+from . import results
+from .results import Result, Table
+
+# What each option of imagine is called among the bounds, and its unit in SI
+IN_SI = {
+    "joints_um": ("joint", 1e-6),
+    "struts_um": ("strut_offset", 1e-6),
+    "pitch_ppm": ("pitch", 1e-6),
+    "wave_um": ("wave", 1e-6),
+    "harmonics_um": ("harmonics", 1e-6),
+    "wave_period_mm": ("wave_period", 1e-3),
+    "map_um": ("length_map", 1e-6),
+    "backlash_um": ("backlash", 1e-6),
+    "wear_um": ("wear", 1e-6),
+    "strut_expansion_ppm_per_k": ("strut_expansion", 1e-6),
+    "body_expansion_ppm_per_k": ("body_expansion", 1e-6),
+    "field_um": ("field_displacement", 1e-6),
+    "field_urad": ("field_rotation", 1e-6),
+    "field_reversal_percent": ("field_reversal", 1e-2),
+}
+UNITS = {"um": "µm", "urad": "µrad", "ppm_per_k": "ppm/K"}  # as people read them
+RESOLUTION = 10  # digits after the point of the instruments, m and rad: a tenth of a nanometre
+
+
+def imagine(args: argparse.Namespace) -> Result:
+    """Draw the hidden errors of a virtual machine, for any geometry."""
+    from ..calibration.evaluation import held_out
+    from ..machine.model_file import save_model
+    from ..workspace.reach import machine_box
+
+    geometry = load_geometry(args.machine)
+    bounds: dict[str, Any] = {"shared_platform_joints": not args.separate_joints}
+    for option, (name, unit) in IN_SI.items():
+        if (value := getattr(args, option)) is not None:
+            bounds[name] = tuple(unit * v for v in value) if isinstance(value, tuple) else unit * value
+    if args.field_um or args.field_urad:
+        box, attitude, _ = machine_box(geometry)
+        box = box if args.box is None else np.array(args.box)
+        corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)  # of the tool in work
+        positions, _ = geometry.platform_poses(corners, np.tile(attitude, (len(corners), 1, 1)))
+        bounds["field_box"] = np.array([positions.min(axis=0), positions.max(axis=0)])
+    model = named.imagine(geometry, args.seed, named.usual_bounds(geometry, **bounds), args.name or "")
+    save_model(model, args.out)
+    lines = [f"machine {model.machine}, seed {args.seed}: model {model.name}"]
+    drawn = _drawn(model)
+    rows = [[name, number(value, 3), UNITS.get(unit, unit)] for name, value, unit in drawn]
+    lines.append(aligned(["error", "largest", ""], rows) if rows else "no errors at all")
+    tool: dict[str, Any] | None = None
+    try:
+        box, attitude, _ = machine_box(geometry)
+        error = held_out(RealMachine(geometry, model), None, box, level=attitude)
+        low, high = (", ".join(number(v * 1e3, 1) for v in corner) for corner in box)
+        lines.append(
+            f"tool error, tool positions in ({low})…({high}) mm of work: {error.raw.rms * 1e6:.2f} µm RMS as it is, "
+            f"{error.aligned.rms * 1e6:.2f} µm with the datum aligned"
+        )
+        tool = {"frame": "work", "box_m": box, "rms_m": error.raw.rms, "aligned_rms_m": error.aligned.rms}
+    except GeometryError as problem:
+        results.say_notes([f"what the tool does is not shown: {problem}"])
+    content = {
+        "machine": model.machine,
+        "name": model.name,
+        "seed": args.seed,
+        "largest": {f"{name.replace(', ', ' ').replace(' ', '_')}_{unit}": value for name, value, unit in drawn},
+        "tool_error": tool,
+        "written": args.out,
+    }
+    return Result(lambda: "\n".join([*lines, f"truth: {args.out}"]), lambda: content)
+
+
+def _drawn(model: MachineModel) -> list[tuple[str, float, str]]:
+    """Return name, largest value and unit of each error that the machine has."""
+    from ..virtual.imperfections import largest_errors
+
+    struts, size = model.struts, np.abs
+    bodies = np.array([model.base_expansion, model.platform_expansion])
+    of_field = largest_errors(model.field) if any(family.size for family in model.field.lines) else np.zeros(6)
+    sizes = (
+        ("base joints", size(model.base_deviation).max(), "um"),
+        ("platform joints", size(model.platform_deviation).max(), "um"),
+        ("strut lengths", size(struts.offset).max(), "um"),
+        ("pitch", size(struts.pitch).max(), "ppm"),
+        ("wave", np.hypot(struts.cosine, struts.sine)[:, 0].max(), "um"),
+        ("its harmonics", np.hypot(struts.cosine, struts.sine)[:, 1:].max(initial=0.0), "um"),
+        ("smooth length error", size(struts.map_values).max(initial=0.0), "um"),
+        ("backlash", struts.backlash.max(), "um"),
+        ("wear", struts.map_backlash.max(initial=0.0), "um"),
+        ("expansion of struts", size(struts.expansion).max(), "ppm_per_k"),
+        ("expansion of bodies", size(bodies).max(), "ppm_per_k"),
+        ("field, displacement", of_field[:3].max(), "um"),
+        ("field, rotation", of_field[3:].max(), "urad"),
+    )
+    return [(name, float(value) * 1e6, unit) for name, value, unit in sizes if value > 0.0]
+
+
+def simulate(args: argparse.Namespace) -> Result:
+    """Measure the virtual machine: a campaign's readings."""
+    from ..measurements.tidy import write_measurements
+    from ..virtual.instruments import compensated, measure
+    from ..virtual.warm_up import growing, load_warm_up
+
+    geometry, model = results.load_machine(args)
+    args.truth = named.truth_name(args.truth, geometry)
+    truth = named.find_model(args.truth, geometry)
+    campaign = results.load_campaign(args, geometry)
+    warm_up = None
+    if args.warm_up is not None:
+        warm_up, expansion = load_warm_up(args.warm_up, args.seed)
+        campaign, truth = warm_up.campaign(campaign), growing(truth, expansion)
+    plan = template(campaign, geometry, args.seed, args.campaign)
+    running, machine = None if args.model == "ideal" else model, RealMachine(geometry, truth)
+    with results.progress_bar(len(plan.stations), " stations") as bar:
+        if warm_up is not None:
+            read = warm_up.measured(plan, campaign, machine, args.seed, running, bar.update)
+        else:
+            plan = plan if running is None else compensated(plan, running)
+            read = measure(plan, campaign, machine, args.seed, bar.update)
+    measured = read.with_values(read.value.round(RESOLUTION))
+    write_measurements(measured, args.out)
+
+    lengths = "nominal strut lengths" if running is None else f"the strut lengths of {args.model}"
+    lines = [f"machine {geometry.name} with the errors of {args.truth}, moved by {lengths}; seed {args.seed}"]
+    content = {"machine": geometry.name, "truth": args.truth, "model": args.model, "seed": args.seed}
+    stations = measured.stations
+    if args.warm_up is not None:
+        went = (stations.temperatures.max(axis=0) - stations.temperatures.min(axis=0)).tolist()
+        rises = dict(zip(PARTS, went, strict=True))
+        damp = stations.humidity.max() - stations.humidity.min()  # NaN where nobody measures it
+        listed = ", ".join(f"{name} {number(rise, 2)} K" for name, rise in rises.items() if rise)
+        air = f", humidity {number(100.0 * damp, 1)} %" if damp > 0.0 else ""
+        lines.append(f"warms while it is measured: {listed}{air}, as {args.warm_up} has it")
+        content |= {"warm_up": args.warm_up, "warmed_K": rises}
+    counts = {"readings": len(measured), "runs": len(measured.runs), "stations": len(stations)}
+    channels = []
+    for n, kind in enumerate(KINDS):
+        if len(values := measured.value[measured.kind == n] * 1e6):
+            unit, largest = "urad" if kind in ANGULAR_KINDS else "um", float(abs(values).max())
+            channels.append({"channel": kind, "readings": len(values), "rms": rms(values), "max": largest, "": unit})
+    lines.append(Table(channels).text())
+    lines.append(f"{len(measured)} readings of {counts['runs']} runs at {counts['stations']} stations: {args.out}")
+    in_json = [{f"{key}_{c['']}" if key in ("rms", "max") else key: c[key] for key in c if key} for c in channels]
+    content |= {**counts, "channels": in_json, "written": args.out}
+    return Result(lambda: "\n".join(lines), lambda: content)
+
+
+def iso230(args: argparse.Namespace) -> Result:
+    """Show the figures of ISO 230 of measured lines and circles."""
+    from ..measurements.files import read_measurements
+    from ..measurements.iso230 import every_target, judge, standards_json, standards_text
+
+    geometry = load_geometry(args.machine)
+    with results.stage("reading measurements"):
+        measured = read_measurements(args.files, geometry, args.columns, args.probe_mm, in_reach=False)
+    results.say_notes(measured.notes)
+    judged = judge(measured)
+    if not judged:
+        text = "no linear run has two cycles or more with every target read from both sides in each; no circle either"
+        raise CalibrationError("measurements", text)
+    shown = every_target if args.targets else standards_text
+    return Result(lambda: shown(judged), lambda: standards_json(judged))

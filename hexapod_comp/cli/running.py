@@ -1,0 +1,244 @@
+"""Running machines, simulated or your own: ``run``, ``demo``, ``watch``, ``echo``, ``record``, ``replay``."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import nullcontext
+from typing import TYPE_CHECKING
+
+from ..errors import InputFileError
+from ..formats.csv import Row, read_poses
+from ..formats.json import json_text
+from ..formats.paths import input_file
+from ..machine.geometry import HexapodGeometry, load_geometry
+from ..machine.model import MachineModel
+from ..virtual.named import find_model, is_random, is_word, truth_name
+from . import results
+from .results import Result
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ..loop.report import ErrorRow, SessionResult
+    from ..loop.story import Calibration
+    from ..ros.echo import EchoedMessage
+
+TRUE = "truth"  # the model that is no file: the machine's own errors
+FITTED = "fit"  # the model of demo that is yet to be made, of readings
+HZ_PERIOD = 1.0  # how often echo --hz prints a line, s
+
+
+def run(args: argparse.Namespace) -> Result:
+    """Send the poses of a file through the loop; 0 when every command was answered."""
+    from ..loop import report, session
+
+    rate = session.checked_rate(args.rate_hz)
+    geometry = load_geometry(args.machine)
+    truth = _hidden_errors(args, geometry)
+    model = MachineModel(geometry.name) if args.attach else _chosen_model(args, geometry, truth)
+    rows, poses = read_poses(args.poses)
+    session.refuse_broken_limits(args.poses, geometry, model, rows, poses)
+    started = nullcontext(()) if args.attach else session.simulated(args.machine, model, truth)
+    compare = not (args.attach or args.no_compare)  # nobody switches a real machine's compensation off in passing
+    with results.ended_in_order(), started as nodes:
+        result = session.witnessed(geometry, nodes, poses, None, rate, compare, args.namespace)
+    errors, unanswered = report.error_rows(result), result.lost + result.refused
+    blocks = [report.pose_block(f"pose {row.label}", record) for row, record in zip(rows, result.poses, strict=True)]
+    return Result(
+        lambda: "\n".join([*blocks, report.summary(result, errors)]),
+        lambda: report.as_json(rows, result, errors),
+        pictures=lambda: _drawn(args, result, errors, f"{geometry.name}: {args.poses}"),
+        code=1 if unanswered else 0,
+        notes=filter(None, [report.busy_text(result.answering)]) if unanswered else (),
+    )
+
+
+def _hidden_errors(args: argparse.Namespace, geometry: HexapodGeometry) -> MachineModel:
+    """Return the machine's hidden errors, and leave the name that they go by in the options."""
+    args.truth = truth_name(args.truth, geometry)
+    return find_model(args.truth, geometry)
+
+
+def _chosen_model(args: argparse.Namespace, geometry: HexapodGeometry, truth: MachineModel) -> MachineModel:
+    """Return the model that the compensator runs."""
+    return truth if args.model == TRUE else find_model(args.model, geometry)
+
+
+def _drawn(
+    args: argparse.Namespace,
+    result: SessionResult,
+    rows: Sequence[ErrorRow],
+    title: str,
+    calibration: Calibration | None = None,
+) -> dict[str, Figure]:
+    """Return the picture of the session, under the verb's name."""
+    from ..loop.pictures import session_figure
+
+    return {f"{args.verb}.png": session_figure(result, rows, f"{title}, model {result.model}", calibration)}
+
+
+def demo(args: argparse.Namespace) -> Result:
+    """Measure, fit and run a machine with hidden errors; 0 when the loop kept what the fit promised."""
+    from ..loop import report, session, story
+
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as for fit: its matrices are small
+    rate = session.checked_rate(args.rate_hz)
+    geometry = load_geometry(args.machine)
+    truth, calibration = _hidden_errors(args, geometry), None
+    place = story.demo_place(geometry)
+    poses, path = story.demo_poses(place, args.seed), story.demo_path(geometry, place, rate)
+    if args.model == FITTED:
+        with results.stage_line() as say:
+            calibration = story.calibrate(geometry, truth, place, args.seed, say)
+        if not args.json:
+            begun = f"machine {geometry.name}, hidden errors: {args.truth}"
+            print(f"{begun}\n{story.calibration_text(calibration)}", flush=True)
+    model = _chosen_model(args, geometry, truth) if calibration is None else calibration.fit.model
+    with results.ended_in_order(), session.simulated(args.machine, model, truth) as nodes:
+        result = session.witnessed(geometry, nodes, poses, path, rate, compare=True)
+    rows = report.error_rows(result)
+    if args.model in (TRUE, FITTED):
+        promised = story.EXACT if calibration is None else story.promises(calibration.fit, poses, path)
+        rows = story.with_promises(rows, promised, story.left_by_drives(geometry, truth, poses, path))
+    complaints = report.complaints(result, rows)
+    named = [Row(0, str(n + 1)) for n in range(len(poses))]
+    measured = None if calibration is None else story.as_json(calibration)
+    known = {"machine": geometry.name, "truth": args.truth, "calibration": measured}
+    verdict = "\n".join(f"NOT AS IT SHOULD BE: {complaint}" for complaint in complaints) or "all as it should be"
+    title = f"{geometry.name}, hidden errors {args.truth}"
+    return Result(
+        lambda: f"\n{report.summary(result, rows)}\n{story.REMARK}\n{verdict}",
+        lambda: {**known, **report.as_json(named, result, rows), "complaints": complaints},
+        pictures=lambda: _drawn(args, result, rows, title, calibration),
+        code=1 if complaints else 0,
+    )
+
+
+def watch(args: argparse.Namespace) -> int:
+    """Serve a page that shows a running machine until Ctrl-C."""
+    from ..ros import heard_signals
+    from ..viewer.page import WatchPage, watch
+
+    geometry = load_geometry(args.machine)
+    page = WatchPage(geometry, args.host, args.port)
+    heard = heard_signals()
+    print(f"hexapod_comp: {geometry.name} is shown on {page.address} until Ctrl-C", file=sys.stderr)
+    try:
+        watch(geometry, page.show, lambda: not heard, args.namespace)
+    finally:
+        page.close()
+    return 0
+
+
+def echo(args: argparse.Namespace) -> int | Result:
+    """Print a topic's messages until Ctrl-C, --count or --seconds; 0 when one has come."""
+    from ..ros import heard_signals, keep_discovery_local
+    from ..ros.echo import DISCOVERY_TIME, Echo, published_topics
+    from ..ros.process import QUIET, SPIN_PERIOD, RosSession
+
+    keep_discovery_local()
+    signals = heard_signals()
+    began = time.monotonic()
+
+    def going_on(until: float) -> bool:
+        return not signals and time.monotonic() < until
+
+    with RosSession("hexapod_comp_echo", args.namespace, **QUIET) as session:
+        if args.topic is None:
+            while going_on(began + DISCOVERY_TIME):
+                session.spin_once(SPIN_PERIOD)
+            topics = published_topics(session.node)
+            lines = (f"{name}  {kind}" for name, kind in topics.items())
+            return Result(lambda: "\n".join(lines), lambda: topics, code=0 if topics else 1)
+
+        def print_message(received: EchoedMessage) -> None:
+            if not args.hz and (args.count is None or heard.intervals.count <= args.count):
+                print(json_text(received.record(), indent=None) if args.json else received.text() + "\n")
+
+        heard = Echo(session.node, session.spin_once, args.topic, print_message)
+        end, next_line = began + (args.seconds or math.inf), began + HZ_PERIOD
+        while going_on(end) and (args.count is None or heard.intervals.count < args.count):
+            session.spin_once(SPIN_PERIOD)
+            sys.stdout.flush()
+            if args.hz and not args.json and time.monotonic() > next_line:
+                next_line += HZ_PERIOD
+                print(f"{heard.topic}: {heard.intervals.text()}")
+    intervals = heard.intervals
+    if args.hz and args.json:
+        print(json_text({"topic": heard.topic, **intervals.record()}), end="")
+    elif not args.json:
+        print(f"{heard.topic}: {intervals.text()}", file=sys.stderr)
+    return 0 if intervals.count else 1
+
+
+def record(args: argparse.Namespace) -> int:
+    """Write a machine's topics into a bag; 0 when there is something to be replayed."""
+    from ..ros import heard_signals
+    from ..ros.recorder import BagRecorder
+
+    heard, end = heard_signals(), time.monotonic() + (args.seconds or math.inf)
+    with BagRecorder(args.folder, args.namespace) as recorder, results.progress_bar(0, " messages") as bar:
+        print(f"hexapod_comp: recording to {args.folder} until Ctrl-C", file=sys.stderr)
+        recorder.run(lambda: not heard and time.monotonic() < end, bar.update)
+    lines = [f"{count:8d}  {topic}" for topic, count in sorted(recorder.counts.items())]
+    lines.append("recording ended early" if recorder.problem else f"written: {args.folder}")
+    nothing = not (recorder.problem or recorder.journal)
+    shown = Result(
+        lambda: "\n".join(lines),
+        lambda: {"bag": args.folder, "messages": recorder.counts},
+        code=0 if recorder.journal else 1,
+        notes=["no compensator was heard: there is nothing to replay"] if nothing else (),
+    )
+    code = shown.finish(args)
+    if recorder.problem:
+        raise InputFileError(args.folder, "", recorder.problem)
+    return code
+
+
+def replay(args: argparse.Namespace) -> Result:
+    """Run a recording again with what was in use, and with what the options name, where that is another."""
+    from ..compensation.journal import Source
+    from ..replay.bag import Files, read_recording
+    from ..replay.replay import replay_recording, what_if
+    from ..replay.report import Report, rows_of
+
+    with results.progress_bar(0, " messages") as bar:
+        recording = read_recording(args.bag, args.namespace, bar.update)
+    model_name, first = args.model or "", recording.first
+    named = {"geometry": args.machine, "model": None if is_word(model_name) else args.model}
+    given = [Source.read(input_file(name, kind)) for kind, name in named.items() if name is not None]
+    files = Files(recording, {source.sha256: source for source in given})
+    other = None
+    if (
+        {source.sha256 for source in given} - files.used
+        or is_random(model_name)
+        or (model_name == "ideal" and not files.used_ideal)
+    ):
+        machine = load_geometry(args.machine) if args.machine else files.geometry(first.geometry)
+        other = machine, find_model(args.model, machine) if args.model else files.model(first.model, machine)
+    as_it_was = other is None or files.missing() is None
+    report = Report(recording, None, tolerance=args.tolerance_um * 1e-6)
+    with results.progress_bar(len(recording.commands) * (as_it_was + bool(other)), " answers") as bar:
+        if as_it_was:
+            report.replayed = replay_recording(recording, files, bar.update)
+            if other is None and not report.replayed.compared:
+                problem = "nothing in it can be compared: no answer follows a snapshot of the journal without a page "
+                raise InputFileError(args.bag, "", problem + "lost between; record for longer than a second")
+        if other is not None:
+            report.other = what_if(recording, *other, bar.update)
+            report.other_name = f"machine {other[0].name}, model {other[1].name}"
+    geometry = files.geometry(first.geometry) if as_it_was or other is None else other[0]
+    report.work_frames = geometry.work_frames
+    text, content = report.shown()
+
+    def pictures() -> dict[str, Figure]:
+        from ..replay.pictures import figures_of
+
+        return figures_of(report, geometry)
+
+    return Result(lambda: text, lambda: content, rows_of(report), pictures, 0 if report.same else 1)
