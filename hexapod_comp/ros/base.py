@@ -14,6 +14,7 @@ from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters
+from rclpy.client import Client
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
@@ -114,17 +115,22 @@ class CallbackGuard:
         return guarded
 
     def answering(self, name: str, kind: Any, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """Return a service's callback that refuses a request where the one it has would raise."""
+        """Return a service's callback that refuses a request where the one it has would raise: what the response does
+        not fill in is false or empty."""
 
         def answer(request: Any, response: Any) -> Any:
             self.request = name
             try:
                 return callback(request, response)
             except Exception as error:  # rclpy's own errors, Python's where it does not check: of many kinds
-                text = printable(str(error), LONGEST_TEXT)
+                text, refusal = printable(str(error), LONGEST_TEXT), kind.Response()
                 self._requests.add(name, text, time.monotonic())
                 self._warn(name, f"{name} refused: {text}")
-                return _refusal(kind, request, text)
+                if isinstance(refusal, SetParameters.Response):
+                    refusal.results = [SetParametersResult(reason=text) for _ in request.parameters]
+                elif hasattr(refusal, "message"):
+                    refusal.message = text
+                return refusal
             finally:
                 self.request = ""
 
@@ -142,16 +148,6 @@ class CallbackGuard:
             "last_callback_error": self._caught.last_text,
             "refused_requests": str(self._requests.total),
         }
-
-
-def _refusal(kind: Any, request: Any, reason: str) -> Any:
-    """Return the response of a service type that says no: what is not filled in is false or empty."""
-    response = kind.Response()
-    if isinstance(response, SetParameters.Response):
-        response.results = [SetParametersResult(reason=reason) for _ in request.parameters]
-    elif hasattr(response, "message"):
-        response.message = reason
-    return response
 
 
 class MachineNode(LifecycleNode):
@@ -219,29 +215,25 @@ class MachineNode(LifecycleNode):
     @contextmanager
     def all_or_nothing(self) -> Iterator[None]:
         """Close what is opened in this block where it raises, so that the node is as it was before."""
-        kinds: tuple[tuple[str, Callable[[Any], Any]], ...] = (
-            ("timers", self.destroy_timer),
-            ("subscriptions", self.destroy_subscription),
-            ("services", self.destroy_service),
-            ("clients", self.destroy_client),
-            ("publishers", self.destroy_publisher),
-        )
-        before = {kind: list(getattr(self, kind)) for kind, _ in kinds}
+
+        def ends() -> list[Any]:
+            return [*self.timers, *self.subscriptions, *self.services, *self.clients, *self.publishers]
+
+        before = ends()
         try:
             yield
         except BaseException:
-            for kind, destroy in kinds:
-                for entity in [entity for entity in getattr(self, kind) if entity not in before[kind]]:
-                    destroy(entity)
+            self.close_ends(*(end for end in ends() if end not in before))
             raise
 
-    def close_ends(self, *ends: Publisher | Subscription | Service | Timer | None) -> None:
-        """Destroy publishers, subscriptions, services and timers of this node."""
+    def close_ends(self, *ends: Publisher | Subscription | Service | Timer | Client | None) -> None:
+        """Destroy publishers, subscriptions, services, timers and clients of this node."""
         kinds: tuple[tuple[type, Callable[[Any], Any]], ...] = (
             (Publisher, self.destroy_publisher),
             (Subscription, self.destroy_subscription),
             (Service, self.destroy_service),
             (Timer, self.destroy_timer),
+            (Client, self.destroy_client),
         )
         for end in ends:
             for kind, destroy in kinds:

@@ -93,9 +93,13 @@ class Parameter:
 
     def checked(self, value: Any) -> Any:
         """Return `value` as the parameter's type, or refuse it."""
+        if isinstance(self.default, list):
+            names, count = list(value) if isinstance(value, list | tuple) else [], len(self.default)
+            named = all(isinstance(name, str) and name for name in names)
+            if len(names) != count or not named or len(set(names)) != count:
+                raise self.refusal(f"must be {count} different names, not {shorten(value)}")
+            return names
         wanted: Any = type(self.default)
-        if wanted is list:
-            return self._checked_names(value)
         if wanted is float and type(value) is int:
             value = float(value)
         if type(value) is not wanted:
@@ -106,14 +110,6 @@ class Parameter:
         if not low <= value <= high:
             raise self.refusal(f"must lie in {self.allowed}, not {value!r}")
         return value
-
-    def _checked_names(self, value: Any) -> list[str]:
-        """Return a list of names, or refuse it."""
-        names = list(value) if isinstance(value, list | tuple) else []
-        count = len(self.default) if isinstance(self.default, list) else 0
-        if len(set(names)) != count or len(names) != count or not all(isinstance(name, str) and name for name in names):
-            raise self.refusal(f"must be {count} different names, not {shorten(value)}")
-        return names
 
     def refusal(self, problem: str) -> ParameterError:
         """Return the error that says what is wrong with a value."""
@@ -147,27 +143,21 @@ class Parameters(dict[str, Any]):
     ) -> None:
         self._node, self._changed = node, changed
         self._table = {parameter.name: parameter for parameter in table}
-        super().__init__({parameter.name: self._declared(parameter) for parameter in table})
+        for name, parameter in self._table.items():
+            try:
+                value = node.declare_parameter(name, parameter.default, parameter.descriptor()).value
+            except rclpy.exceptions.InvalidParameterValueException as error:
+                raise parameter.refusal(str(error)) from error
+            self[name] = parameter.checked(value)
         self._check_differences(self)
-        self._warn_of_strangers()
-        node.add_on_set_parameters_callback(self._judge)  # asked before rclpy's own, which switches the clock at once
-        node.add_post_set_parameters_callback(self._take)
-
-    def _declared(self, parameter: Parameter) -> Any:
-        try:
-            value = self._node.declare_parameter(parameter.name, parameter.default, parameter.descriptor()).value
-        except rclpy.exceptions.InvalidParameterValueException as error:
-            raise parameter.refusal(str(error)) from error
-        return parameter.checked(value)
-
-    def _warn_of_strangers(self) -> None:
-        """Warn of overrides that no declared parameter takes: most likely misspelt."""
-        declared = set(self._node.get_parameters_by_prefix(""))
-        for name in overrides(self._node):
+        declared = set(node.get_parameters_by_prefix(""))
+        for name in overrides(node):  # those that no declared parameter has the name of are most likely misspelt
             if name not in declared and not name.startswith("qos_overrides."):
                 near = difflib.get_close_matches(name, declared, 1)
                 hint = f"; did you mean {near[0]}?" if near else ""
-                self._node.get_logger().warning(f"there is no parameter {name}, it is ignored{hint}")
+                node.get_logger().warning(f"there is no parameter {name}, it is ignored{hint}")
+        node.add_on_set_parameters_callback(self._judge)  # asked before rclpy's own, which switches the clock at once
+        node.add_post_set_parameters_callback(self._use)
 
     def _check_differences(self, values: dict[str, Any]) -> None:
         for parameter in self._table.values():
@@ -180,37 +170,30 @@ class Parameters(dict[str, Any]):
         return {p.name: self._table[p.name].checked(p.value) for p in parameters if p.name in self._table}
 
     def _judge(self, parameters: list[RosParameter]) -> SetParametersResult:
-        """Refuse what is not allowed, or not now."""
+        """Refuse what is not allowed, or has no effect before the node is configured or started again.
+
+        Another clock is refused: stamps, ramps and the order of commands hang on the one that the node began with.
+        """
         try:
-            wanted = self._known(parameters)
+            wanted, state = self._known(parameters), lifecycle_state(self._node)[1]
             for name, value in wanted.items():
-                if value != self[name]:
-                    self._check_now(self._table[name])
+                at_configure = self._table[name].taken is Taken.CONFIGURE and state != "unconfigured"
+                if at_configure and value != self[name]:
+                    problem = f"is taken at configure, and the node is {state}; set it after a cleanup"
+                    raise self._table[name].refusal(problem)
             self._check_differences({**self, **wanted})
-            for parameter in parameters:
-                self._check_clock(parameter)
+            clock = self._node.get_parameter(USE_SIM_TIME).value
+            if any(parameter.name == USE_SIM_TIME and parameter.value is not clock for parameter in parameters):
+                problem = f"is {str(clock).lower()} for as long as the node runs; set it at the start"
+                raise ParameterError(f"parameter {USE_SIM_TIME}: {problem}")
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def _check_now(self, parameter: Parameter) -> None:
-        """Refuse a change that would have no effect before the node is configured again."""
-        state = lifecycle_state(self._node)[1]
-        if parameter.taken is Taken.CONFIGURE and state != "unconfigured":
-            problem = f"is taken at configure, and the node is {state}; set it after a cleanup"
-            raise parameter.refusal(problem)
-
-    def _check_clock(self, parameter: RosParameter) -> None:
-        """Refuse another clock: stamps, ramps and the order of commands hang on the one that the node began with."""
-        now = self._node.get_parameter(USE_SIM_TIME).value
-        if parameter.name == USE_SIM_TIME and parameter.value is not now:
-            problem = f"is {str(now).lower()} for as long as the node runs; set it at the start"
-            raise ParameterError(f"parameter {USE_SIM_TIME}: {problem}")
-
-    def _take(self, parameters: list[RosParameter]) -> None:
-        if taken := self._known(parameters):  # ROS also declares parameters of its own
-            self.update(taken)
-            self._changed(set(taken))
+    def _use(self, parameters: list[RosParameter]) -> None:
+        if known := self._known(parameters):  # ROS also declares parameters of its own
+            self.update(known)
+            self._changed(set(known))
 
 
 # ---- the program ----
@@ -242,22 +225,26 @@ class Program:
         return run_with_plain_streams(lambda: self._refusal(arguments))
 
     def _refusal(self, arguments: Sequence[str]) -> int | None:
+        lines = ["parameters (-p NAME:=VALUE behind --ros-args; default in brackets):"]
+        for parameter in self.parameters:
+            text = f"{parameter.name}  [{shown(parameter.default)}]  {parameter.described()}"
+            lines += textwrap.wrap(text, WIDTH, initial_indent="  ", subsequent_indent="      ")
+        if self.topics:
+            lines += ["", "topics and services:", *textwrap.indent(self.topics.strip(), "  ").splitlines()]
+        example = f"{self.name} {ROS_ARGUMENTS} {self.example}"
         parser = argparse.ArgumentParser(
             self.name,
             usage=f"{self.name} [-h] [--ros-args -p NAME:=VALUE … -r TOPIC:=OTHER … --params-file FILE …]",
             description=self.summary,
-            epilog=self._epilog(),
+            epilog="\n".join([*lines, "", f"example: {example}"]),
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
         try:
             _, strange = parser.parse_known_args(outside_ros(arguments))
             if strange:
-                shown = printable(" ".join(strange), LONGEST_TEXT)
-                parser.error(
-                    f"arguments not understood: {shown}. Parameters follow --ros-args: "
-                    f"{self.name} {ROS_ARGUMENTS} {self.example}"
-                )
+                listed = printable(" ".join(strange), LONGEST_TEXT)
+                parser.error(f"arguments not understood: {listed}. Parameters follow --ros-args: {example}")
             remove_ros_args(list(arguments))
         except RuntimeError as error:
             parser.print_usage(sys.stderr)
@@ -267,15 +254,6 @@ class Program:
         except SystemExit as leaving:
             return leaving.code if isinstance(leaving.code, int) else USAGE_ERROR
         return None
-
-    def _epilog(self) -> str:
-        lines = ["parameters (-p NAME:=VALUE behind --ros-args; default in brackets):"]
-        for parameter in self.parameters:
-            text = f"{parameter.name}  [{shown(parameter.default)}]  {parameter.described()}"
-            lines += textwrap.wrap(text, WIDTH, initial_indent="  ", subsequent_indent="      ")
-        topics = ["", "topics and services:", *textwrap.indent(self.topics.strip(), "  ").splitlines()]
-        example = ["", f"example: {self.name} {ROS_ARGUMENTS} {self.example}"]
-        return "\n".join([*lines, *(topics if self.topics else ()), *example])
 
 
 def outside_ros(arguments: Sequence[str]) -> list[str]:

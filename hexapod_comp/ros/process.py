@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import faulthandler
 import fcntl
 import functools
@@ -80,7 +79,11 @@ def run(
         return refusal
     open_streams()
     heard = heard_signals()
-    with _own_stderr() as stderr:
+    try:  # as it is now, whatever will stand in its place
+        stderr = os.fdopen(os.dup(sys.stderr.fileno()), "w")
+    except (AttributeError, OSError):  # closed, or a test's
+        stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
+    with stderr:
         with LogRelay():
             code = _run_until(heard, make_node, arguments, stderr)
         if argv is None:
@@ -92,14 +95,6 @@ def run(
         faulthandler.cancel_dump_traceback_later()
         signal.setitimer(signal.ITIMER_REAL, 0.0)
     return code
-
-
-def _own_stderr() -> TextIO:
-    """Return stderr as it is now, whatever will stand in its place."""
-    try:
-        return open(os.dup(sys.stderr.fileno()), "w")
-    except (AttributeError, OSError):  # closed, or a test's
-        return open(os.devnull, "w")
 
 
 def _run_until(
@@ -154,7 +149,7 @@ def _end_within(seconds: float, stderr: TextIO) -> None:
 
 
 class LogRelay:
-    """Context manager: writing to stdout and stderr never waits, and what nobody takes in time is lost.
+    """Context manager: writing to stdout and stderr never waits, and what nobody reads in time is lost.
 
     ROS writes its log to stderr from within the call, with Python's lock held. A terminal stopped with Ctrl-S, or a
     pipe that nobody reads, would then stop the machine's loop for as long as it likes. Here a thread stands between:
@@ -162,49 +157,38 @@ class LogRelay:
     """
 
     def __enter__(self) -> LogRelay:
-        self._relays = [_Relay(stream) for stream in STREAMS if _may_block(stream)]
+        self._relays: list[tuple[int, int, threading.Thread]] = []
+        for stream in STREAMS:
+            try:
+                if stat.S_ISREG(os.fstat(stream).st_mode):
+                    continue  # a file: nobody is waited for
+            except OSError:  # closed
+                continue
+            real, (source, sink) = os.dup(stream), os.pipe()
+            with suppress(OSError):  # a system with a lower limit keeps its own size
+                fcntl.fcntl(sink, fcntl.F_SETPIPE_SZ, BUFFER_SIZE)
+            os.set_blocking(sink, False)
+            os.dup2(sink, stream)
+            os.close(sink)
+            thread = threading.Thread(target=_carry, args=(source, real), name=f"log of stream {stream}", daemon=True)
+            thread.start()
+            self._relays.append((stream, real, thread))
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for relay in self._relays:
-            relay.close()
+        for stream, real, thread in self._relays:
+            os.dup2(real, stream)
+            thread.join(LEAVING_WITHIN)  # for what is on its way
 
 
-def _may_block(stream: int) -> bool:
-    """Return whether writing can wait for somebody: a terminal, a pipe or a socket, but not a file."""
-    try:
-        return not stat.S_ISREG(os.fstat(stream).st_mode)
-    except OSError:  # closed
-        return False
-
-
-class _Relay:
-    """One stream and the thread that empties the pipe put in its place."""
-
-    def __init__(self, stream: int) -> None:
-        self._stream, self._real = stream, os.dup(stream)
-        self._source, sink = os.pipe()
-        with contextlib.suppress(OSError):  # a system with a lower limit keeps its own size
-            fcntl.fcntl(sink, fcntl.F_SETPIPE_SZ, BUFFER_SIZE)
-        os.set_blocking(sink, False)
-        os.dup2(sink, stream)
-        os.close(sink)
-        self._thread = threading.Thread(target=self._carry, name=f"log of stream {stream}", daemon=True)
-        self._thread.start()
-
-    def _carry(self) -> None:
-        """Hand on what was written, until the last writer has gone; go on emptying when the reader has gone."""
-        while data := os.read(self._source, 1 << 16):
-            with contextlib.suppress(OSError):
-                while data:
-                    data = data[os.write(self._real, data) :]
-
-    def close(self) -> None:
-        """Put the stream back and wait a little for what is on its way."""
-        os.dup2(self._real, self._stream)
-        self._thread.join(LEAVING_WITHIN)
+def _carry(source: int, real: int) -> None:
+    """Hand on what was written, until the last writer has gone; go on emptying when the reader has gone."""
+    while data := os.read(source, 1 << 16):
+        with suppress(OSError):
+            while data:
+                data = data[os.write(real, data) :]
 
 
 # ---- other programs ----

@@ -9,7 +9,7 @@ import math
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -193,7 +193,7 @@ class CompensatorStatus:
         self.refusals, self.bad_feedback = Refusals(), Refusals()
         self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
         self.waited = self.dropped = 0  # commands that have waited, and that a newer one has replaced
-        self.behind = Lately()  # commands were taken late: jitter is nothing to speak of
+        self.behind = Lately()  # commands were handled late, by more than jitter
         self.frame_id = self.prediction_problem = ""  # of the last command; why no error is predicted
         self.last_answered = 0  # stamp, ns; 0 before the first
         self.fresh_start = True  # no command is in force
@@ -209,16 +209,16 @@ class CompensatorStatus:
         measuring: OneSender,
         sensing: dict[str, OneSender],
     ) -> None:
-        """Take what a configuration has made: who commands, who else publishes strut commands, who measures; who
-        publishes temperatures, humidity, the choice of tool, of whom a second one is not obeyed and stops nothing."""
-        self.compensator, self.thermometers = compensator, thermometers
-        self.frame_ids = frame_ids  # by the machine's names of its frames
+        """Go by a configuration: the machine, its frames by the machine's names, and who commands, who else publishes
+        strut commands, who measures; of those who publish temperatures, humidity, the choice of tool, a second one is
+        not obeyed and stops nothing."""
+        self.compensator, self.thermometers, self.frame_ids = compensator, thermometers, frame_ids
         self.source, self.own_topic, self.measuring, self.sensing = source, own_topic, measuring, sensing
         self.standing: tuple[Guard, ...] = (source, own_topic, measuring, self.track)
         self.track.watch(compensator.geometry)
 
     def take_parameters(self) -> None:
-        """Take the parameters as they are now; others are looked up where they are needed."""
+        """Go by the parameters as they are now; others are looked up where they are needed."""
         self.command_stamps.max_age = self.options["max_command_age"]
         self.reading_stamps.max_age = self.options["max_reading_age"]
         self.track.limit = self.options["following_error_limit"]
@@ -231,10 +231,7 @@ class CompensatorStatus:
 
     def problem(self) -> Guard | None:
         """Return the guard that stops the machine at present, if any."""
-        for guard in self.standing:
-            if guard.problem:
-                return guard
-        return None
+        return next((guard for guard in self.standing if guard.problem), None)
 
     def stops(self, now: float) -> bool:
         """Return whether an active node refuses commands: by a guard, for want of readings, or as of late."""
@@ -244,147 +241,112 @@ class CompensatorStatus:
         """Return whether measured struts are fresh."""
         return self.feedback.age(now) <= float(self.options["feedback_timeout"])
 
-    def advice(self) -> str:
-        """Return what the sender of commands is to do: about what stops the machine, or else about the last refusal."""
-        guard = self.problem()
-        reason = guard.reason if guard is not None else self.refusals.last_reason
-        return ADVICE.get(reason, OTHERWISE) if reason else ""
-
     def judged(self, now: float) -> tuple[bytes, str]:
         """Return level and message of an active node."""
-        return joined((level, text) for level, shown in FINDINGS if (text := shown(self, now)))
+        return joined(self.findings(now))
+
+    def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
+        """Yield level and text of what there is to say of an active node, worst first."""
+        compensator, guard, fed = self.compensator, self.problem(), self.fed(now)
+        if guard is not None:
+            yield ERROR, f"refusing commands: {guard.reason}: {guard.problem}"
+        if reasons := self.refusals.reasons(now, guard.reason if guard is not None else ""):
+            yield ERROR, f"refusing commands: {reasons}"
+        disputed = [(topic, sender) for topic, sender in self.sensing.items() if sender.problem]
+        senders = (self.measuring, *(sender for _, sender in disputed))
+        said = next((sender.reason for sender in senders if sender.problem), "")
+        if reasons := self.bad_feedback.reasons(now, said):
+            yield ERROR, f"bad feedback: {reasons}"
+        for topic, sender in disputed:
+            yield ERROR, f"{topic} ignored: {sender.reason}: {sender.problem}"
+        if self.failed_reloads.recent(now):
+            yield WARN, "the old model stays"
+        if self.refused_resets.recent(now):
+            yield WARN, "reset refused while the machine moves"
+        if self.refused_tools.recent(now):
+            yield WARN, f"tool refused: {self.refused_tools.last_text}"
+        silent = bool(self.commands.count) and 0.0 < self.options["command_timeout"] < self.commands.age(now)
+        if silent:
+            yield WARN, "no new command"
+        if self.feedback.count and not fed:
+            yield WARN, "feedback lost, pose estimated from own commands"
+        if stale := self.stale(now):
+            yield WARN, f"temperatures stale: {stale}"
+        if HUMIDITY in self.thermometers.stale(now):
+            yield WARN, "humidity stale"
+        if self.source.missing(now) and not silent:
+            yield WARN, "running, commands are being missed"
+        if self.behind.holds(now):
+            yield WARN, "running, catching up with commands that came late"
+        for problem in filter(None, (self.prediction_problem, self.log_space.problem)):
+            yield WARN, problem
+        if self.track.waits(now):
+            yield WARN, "waiting for strut_states: where the struts stand is not known"
+        if not self.commands.count:
+            yield OK, "waiting for the first command"
+        if compensator.condition > NEAR_SINGULAR * compensator.geometry.limits.condition:
+            yield WARN, "running, near a singularity"
+        if compensator.outside_box:
+            yield WARN, "running, outside the box in which the model was measured"
+        if compensator.ramping:
+            yield OK, "running, a change is ramping in"
+        yield OK, "running" if fed else "running, pose estimated from own commands"
 
     def values(self, now: float) -> dict[str, str]:
         """Return everything else as key and value."""
-        values = {key: value(self, now) for key, value in VALUES.items()}
+        compensator, guard, fed = self.compensator, self.problem(), self.fed(now)
+        model, temperatures, region = compensator.model, compensator.temperatures, compensator.model.measured
+        reason = guard.reason if guard is not None else self.refusals.last_reason
+        set_back = self.command_stamps.sender_set_back + self.reading_stamps.sender_set_back
+        largest = 0.0 if self.fresh_start else float(np.abs(compensator.correction).max())
+        values = {
+            "model": model.name,
+            "tool": compensator.geometry.tool_name,
+            "frame_id": self.frame_id,
+            "datum": str(model.origin.datum or "not known"),
+            "compensation": "on" if compensator.enabled else "off",
+            "ramping": str(compensator.ramping).lower(),
+            "pose_estimated_from": "strut_states" if fed else "own commands",
+            "commanded_by": ", ".join(self.source.names),
+            "measured_by": ", ".join(self.measuring.names),
+            "stale_temperatures": self.stale(now),
+            "commands": str(self.commands.count),
+            "commands_missed": str(self.source.missed),
+            "commands_waited": str(self.waited),
+            "commands_dropped": str(self.dropped),
+            "command_rate_hz": f"{self.commands.rate(now):.1f}",
+            "command_age_s": seconds(self.commands.age(now)),
+            "feedback_rate_hz": f"{self.feedback.rate(now):.1f}",
+            "feedback_age_s": seconds(self.feedback.age(now)),
+            "clock_set_back": str(self.clock.set_back),
+            "clock_set_forward": str(self.clock.set_forward),
+            "senders_clock_set_back": str(set_back),
+            "largest_correction_m": f"{largest:.9f}",
+            "condition_number": f"{compensator.condition:.3f}",
+            "outside_field": str(compensator.outside_field).lower(),
+            "outside_box": str(compensator.outside_box).lower(),
+            "measured_box": "not known" if region is None else region.text(compensator.geometry),
+            "last_refusal": self.refusals.last_text,
+            "what_to_do": ADVICE.get(reason, OTHERWISE) if reason else "",
+            "last_answered": f"{self.last_answered // 10**9}.{self.last_answered % 10**9:09d}",
+            "last_bad_feedback": self.bad_feedback.last_text,
+            "bad_feedback": str(self.bad_feedback.total),
+            "failed_reloads": str(self.failed_reloads.total),
+            "last_failed_reload": self.failed_reloads.last_text,
+            "refused_resets": str(self.refused_resets.total),
+            "refused_tools": str(self.refused_tools.total),
+        }
         values |= {f"{topic}_by": ", ".join(sender.names) for topic, sender in self.sensing.items()}
-        temperatures, model = self.compensator.temperatures, self.compensator.model
         heard = dict(temperatures.values)
         if (humidity := heard.pop(HUMIDITY, None)) is not None:
             values["humidity_percent"] = f"{100.0 * humidity:.1f}"
         elif model.struts.moisture.any():
             values["humidity_percent"] = f"not known, taken as {100.0 * REFERENCE_HUMIDITY:g}"
-        values.update({f"temperature.{name}_degC": f"{value:.2f}" for name, value in heard.items()})
+        values |= {f"temperature.{name}_degC": f"{value:.2f}" for name, value in heard.items()}
         if (unknown := temperatures.unknown_for(model.late_growth, now)) > 0.0:
             values["late_parts"] = f"not known for another {unknown:.0f} s: the readings began too short ago"
         return {**values, **self.refusals.values()}
 
-    # ---- what the tables below ask ----
-
-    def refusing(self, now: float) -> str:
-        """Return what stops the machine."""
-        guard = self.problem()
-        return f"refusing commands: {guard.reason}: {guard.problem}" if guard is not None else ""
-
-    def refused(self, now: float) -> str:
-        """Return why commands were refused of late, beside what stops the machine."""
-        guard = self.problem()
-        reasons = self.refusals.reasons(now, guard.reason if guard is not None else "")
-        return f"refusing commands: {reasons}" if reasons else ""
-
-    def disturbed(self, now: float) -> str:
-        """Return why readings were not used of late."""
-        senders = (self.measuring, *self.sensing.values())
-        reasons = self.bad_feedback.reasons(now, next((sender.reason for sender in senders if sender.problem), ""))
-        return f"bad feedback: {reasons}" if reasons else ""
-
-    def disputed(self, now: float) -> str:
-        """Return whose readings are not used because several send them."""
-        several = ((topic, sender) for topic, sender in self.sensing.items() if sender.problem)
-        return "; ".join(f"{topic} ignored: {sender.reason}: {sender.problem}" for topic, sender in several)
-
-    def silent(self, now: float) -> bool:
-        """Return whether commands have ended."""
-        return bool(self.commands.count and 0.0 < self.options["command_timeout"] < self.commands.age(now))
-
     def stale(self, now: float) -> str:
         """Return the parts whose last temperature is too old."""
         return ", ".join(name for name in self.thermometers.stale(now) if name != HUMIDITY)
-
-    def near_singular(self, now: float) -> bool:
-        """Return whether the last pose was."""
-        return bool(self.compensator.condition > NEAR_SINGULAR * self.compensator.geometry.limits.condition)
-
-    def largest_correction(self) -> float:
-        """Return it in m; before the first command nothing is corrected."""
-        return 0.0 if self.fresh_start else float(np.abs(self.compensator.correction).max())
-
-    def measured_box(self) -> str:
-        """Return the region in which the model was measured."""
-        region = self.compensator.model.measured
-        return "not known" if region is None else region.text(self.compensator.geometry)
-
-
-def _if(holds: Any, text: str) -> str:
-    return text if holds else ""
-
-
-# What there is to say of an active compensator, worst first: level, and the text, empty where there is nothing
-FINDINGS: tuple[tuple[bytes, Callable[[CompensatorStatus, float], str]], ...] = (
-    (ERROR, CompensatorStatus.refusing),
-    (ERROR, CompensatorStatus.refused),
-    (ERROR, CompensatorStatus.disturbed),
-    (ERROR, CompensatorStatus.disputed),
-    (WARN, lambda s, now: _if(s.failed_reloads.recent(now), "the old model stays")),
-    (WARN, lambda s, now: _if(s.refused_resets.recent(now), "reset refused while the machine moves")),
-    (WARN, lambda s, now: _if(s.refused_tools.recent(now), f"tool refused: {s.refused_tools.last_text}")),
-    (WARN, lambda s, now: _if(s.silent(now), "no new command")),
-    (
-        WARN,
-        lambda s, now: _if(s.feedback.count and not s.fed(now), "feedback lost, pose estimated from own commands"),
-    ),
-    (WARN, lambda s, now: _if(stale := s.stale(now), f"temperatures stale: {stale}")),
-    (WARN, lambda s, now: _if(HUMIDITY in s.thermometers.stale(now), "humidity stale")),
-    (WARN, lambda s, now: _if(s.source.missing(now) and not s.silent(now), "running, commands are being missed")),
-    (WARN, lambda s, now: _if(s.behind.holds(now), "running, catching up with commands that came late")),
-    (WARN, lambda s, now: s.prediction_problem),
-    (WARN, lambda s, now: s.log_space.problem),
-    (WARN, lambda s, now: _if(s.track.waits(now), "waiting for strut_states: where the struts stand is not known")),
-    (OK, lambda s, now: _if(not s.commands.count, "waiting for the first command")),
-    (WARN, lambda s, now: _if(s.near_singular(now), "running, near a singularity")),
-    (
-        WARN,
-        lambda s, now: _if(s.compensator.outside_box, "running, outside the box in which the model was measured"),
-    ),
-    (OK, lambda s, now: _if(s.compensator.ramping, "running, a change is ramping in")),
-    (OK, lambda s, now: "running" if s.fed(now) else "running, pose estimated from own commands"),
-)
-
-# What else it says: key and value
-VALUES: dict[str, Callable[[CompensatorStatus, float], str]] = {
-    "model": lambda s, now: s.compensator.model.name,
-    "tool": lambda s, now: s.compensator.geometry.tool_name,
-    "frame_id": lambda s, now: s.frame_id,
-    "datum": lambda s, now: str(s.compensator.model.origin.datum or "not known"),
-    "compensation": lambda s, now: "on" if s.compensator.enabled else "off",
-    "ramping": lambda s, now: str(s.compensator.ramping).lower(),
-    "pose_estimated_from": lambda s, now: "strut_states" if s.fed(now) else "own commands",
-    "commanded_by": lambda s, now: ", ".join(s.source.names),
-    "measured_by": lambda s, now: ", ".join(s.measuring.names),
-    "stale_temperatures": lambda s, now: s.stale(now),
-    "commands": lambda s, now: str(s.commands.count),
-    "commands_missed": lambda s, now: str(s.source.missed),
-    "commands_waited": lambda s, now: str(s.waited),
-    "commands_dropped": lambda s, now: str(s.dropped),
-    "command_rate_hz": lambda s, now: f"{s.commands.rate(now):.1f}",
-    "command_age_s": lambda s, now: seconds(s.commands.age(now)),
-    "feedback_rate_hz": lambda s, now: f"{s.feedback.rate(now):.1f}",
-    "feedback_age_s": lambda s, now: seconds(s.feedback.age(now)),
-    "clock_set_back": lambda s, now: str(s.clock.set_back),
-    "clock_set_forward": lambda s, now: str(s.clock.set_forward),
-    "senders_clock_set_back": lambda s, now: str(s.command_stamps.sender_set_back + s.reading_stamps.sender_set_back),
-    "largest_correction_m": lambda s, now: f"{s.largest_correction():.9f}",
-    "condition_number": lambda s, now: f"{s.compensator.condition:.3f}",
-    "outside_field": lambda s, now: str(s.compensator.outside_field).lower(),
-    "outside_box": lambda s, now: str(s.compensator.outside_box).lower(),
-    "measured_box": lambda s, now: s.measured_box(),
-    "last_refusal": lambda s, now: s.refusals.last_text,
-    "what_to_do": lambda s, now: s.advice(),
-    "last_answered": lambda s, now: f"{s.last_answered // 10**9}.{s.last_answered % 10**9:09d}",
-    "last_bad_feedback": lambda s, now: s.bad_feedback.last_text,
-    "bad_feedback": lambda s, now: str(s.bad_feedback.total),
-    "failed_reloads": lambda s, now: str(s.failed_reloads.total),
-    "last_failed_reload": lambda s, now: s.failed_reloads.last_text,
-    "refused_resets": lambda s, now: str(s.refused_resets.total),
-    "refused_tools": lambda s, now: str(s.refused_tools.total),
-}
