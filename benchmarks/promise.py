@@ -5,7 +5,8 @@ points, the datum aligned. Kept: the error that is left is not above the upper e
 the fit says that nothing may be written without force. Kinds of the model's own class (±10 and ±100 µm, length maps,
 fields, worn screws) show that neither is bought by widening everything; the others carry what no block of the model
 describes: higher harmonics of the screws, joints whose error of 20 µm depends on their angle, beams 1.5 mrad off, a
-drift of 0.5 K that nobody wrote down, gross errors with an instrument that slips, and all of these together.
+drift of 0.5 K that nobody wrote down, gross errors with an instrument that slips, a lost motion by friction that is
+different along the struts, and all of these together but the last.
 
 With ``--ablate``: what the promise would be with the covariance believed more or less than ``jackknife_prior`` degrees
 of freedom, with and without averaging over the blocks that were left out; and with how much it is most likely believed.
@@ -53,7 +54,7 @@ from foreign_machines import machines as zoo
 
 GEOMETRIES = ("paper", "offset", "framed", "hanging", "inches", "mirror")
 OWN = ("A", "B", "D", "G", "worn")
-FOREIGN = ("harmonics", "joints", "beams", "drift", "outliers", "all")
+FOREIGN = ("harmonics", "joints", "beams", "drift", "outliers", "friction", "all")
 PLANS = (("5-D", 4), ("5-D", 16), ("1-D", 16))
 """Instrument on lines, and diagonals."""
 
@@ -70,6 +71,9 @@ HARMONICS = {2: (0.5e-6, 2e-6), 3: (0.3e-6, 1e-6)}
 
 JOINTS, JOINT_WAVE = 20e-6, 0.7
 """Amplitude, m, and wave, in direction cosines, of the error of a joint with its angle."""
+
+FRICTION, FRICTION_WAVE = 3e-6, 80e-3
+"""Amplitude of a lost motion by friction, by the sign of a strut's speed, and its wave along the strut, m."""
 
 BEAM = 1.5e-3
 """Standard deviation of a beam's direction across its line, rad."""
@@ -88,19 +92,23 @@ POINTS = 500
 
 @dataclass(frozen=True)
 class Hidden:
-    """What a machine of a foreign kind has beside its model: `joints` directions and phases, (2, 6, 4), or None."""
+    """What a machine of a foreign kind has beside its model."""
 
     geometry: HexapodGeometry
-    joints: np.ndarray | None
+    joints: np.ndarray | None = None  # (2, 6, 4): directions and phases
+    friction: np.ndarray | None = None  # (6,): phases
 
-    def lengths(self, poses: Poses) -> np.ndarray:
-        """Return what each strut is longer at poses, (N, 6), m."""
+    def lengths(self, poses: Poses, senses: np.ndarray) -> np.ndarray:
+        """Return what each strut is longer at poses, (N, 6), m; `senses` (N, 9) are directions of motion."""
         positions, rotations = poses
-        if self.joints is None:
-            return np.zeros((len(positions), 6))
         struts = positions[:, None] + self.geometry.platform_joints @ np.swapaxes(rotations, 1, 2)
         struts = struts - self.geometry.base_joints
-        u = struts / np.linalg.norm(struts, axis=2, keepdims=True)
+        length = np.linalg.norm(struts, axis=2)
+        if self.friction is not None:
+            return FRICTION * senses[:, 3:] * np.cos(2.0 * np.pi * length / FRICTION_WAVE + self.friction)
+        if self.joints is None:
+            return np.zeros((len(positions), 6))
+        u = struts / length[:, :, None]
         there = u, np.einsum("nji,nkj->nki", rotations, u)
         parts = [np.einsum("nki,ki->nk", v, j[:, :3]) / JOINT_WAVE for v, j in zip(there, self.joints, strict=True)]
         waves = [np.cos(2.0 * np.pi * part + j[:, 3]) for part, j in zip(parts, self.joints, strict=True)]
@@ -112,6 +120,8 @@ def hidden_of(geometry: HexapodGeometry, kind: str, rng: np.random.Generator) ->
     directions = rng.standard_normal((2, 6, 3))
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)
     phases = rng.uniform(0.0, 2.0 * np.pi, (2, 6, 1))
+    if kind == "friction":
+        return Hidden(geometry, friction=phases[0, :, 0])
     return Hidden(geometry, np.concatenate([directions, phases], axis=2) if kind in ("joints", "all") else None)
 
 
@@ -147,12 +157,8 @@ def readings_of(plan: Campaign, truth: RealMachine, hidden: Hidden, kind: str, s
     """Return what the instruments read."""
     empty = template(plan, truth.geometry)
     stations = empty.stations
-    real = replace(
-        empty,
-        stations=replace(
-            stations, commands=stations.commands + hidden.lengths((stations.positions, stations.rotations))
-        ),
-    )
+    lengths = hidden.lengths((stations.positions, stations.rotations), stations.sense)
+    real = replace(empty, stations=replace(stations, commands=stations.commands + lengths))
     return empty.with_values(measure(real, plan, truth, seed).value + carelessness(empty, real, truth, kind, seed))
 
 
@@ -205,7 +211,7 @@ def left(truth: RealMachine, hidden: Hidden, model: MachineModel, plan: Campaign
     """Return the RMS error of the tool at random points, both ways, the datum aligned, m."""
     passes = random_passes(truth.geometry, plan.box, POINTS, 0.0, np.random.default_rng([seed, 4]))
     trial = Trial(truth, passes)
-    errors = trial.errors(trial.commands(model) + hidden.lengths(passes.poses))
+    errors = trial.errors(trial.commands(model) + hidden.lengths(passes.poses, passes.senses()))
     return float(np.sqrt((errors.aligned().displacement ** 2).sum(axis=1).mean()))
 
 

@@ -36,10 +36,6 @@ class Assumptions:
     least_freedom: float = assumed(10.0, "", "readings beyond parameters for a noise", "its own error is then 22 %")
     chunk: int = assumed(512, "", "cells whose derivatives are worked out together", "a processor's cache")
     threaded: int = assumed(500, "", "rows from which on threads share the work", "their start: 0.1 ms each")
-    few_cells: int = assumed(8, "", "fewer cells of a group are not condensed", "nothing is gained")
-    negligible: float = assumed(1e-11, "", "variance over the noise's that does not count", "rounding")
-    draws: int = assumed(160, "", "draws that show what parameters do along a line", "a line has some twenty ways")
-    together: int = assumed(1000, "", "rows of small folds left out together", "a processor's cache")
 
     # Observations (observations.py)
     centre: float = assumed(5e-3, "m", "where a centre of lengths is beside its place, 1 σ of each axis", "by a rule")
@@ -131,7 +127,7 @@ class Assumptions:
     sure: float = assumed(
         0.9, "", "share of the probability at which one kind of change is stated", "chosen: 10 % wrong"
     )
-    clear: float = assumed(4.0, "σ", "changes of this size are surely seen", "1 in 16,000 missed by chance")
+    surely: float = assumed(4.0, "σ", "changes of this size are surely seen", "1 in 16,000 missed by chance")
     unchanged_draws: int = assumed(4000, "", "unchanged machines drawn to find the false alarms", "1 % to ± 0.16 %")
     most_check_readings: int = assumed(500, "", "readings of a check; more are a calibration", "chosen")
     # Trust (trust.py, promise.py)
@@ -141,17 +137,8 @@ class Assumptions:
     jackknife_prior: float = assumed(
         12.0, "", "freedom with which a covariance is believed", "most likely by benchmarks.promise --ablate"
     )
-    without_effect: float = assumed(
-        1e-4, "", "share of the tool's squared error that is left out of the jackknife", "time"
-    )
     drift: float = assumed(11.5e-6, "m/m", "prior of the scale's change over a campaign", "steel by 1 K")
-    drift_terms: int = assumed(2, "", "degree of a drift in time", "exponential settling has no more")
-    drift_runs: int = assumed(6, "", "runs that read lengths from which on a drift is looked for", "two each way")
-    clear_drift: float = assumed(3.0, "σ", "a drift that is remarked on", "1 in 370 by chance")
-    clear_misfit: float = assumed(3.0, "σ", "a discrepancy that is no chance", "1 in 370")
-    least_pairs: int = assumed(30, "", "pairs there and back, or repeats, that tell noise from discrepancy", "± 26 %")
-    least_left: float = assumed(0.25, "", "least share of a discrepancy that the parameters leave", "known no better")
-    least_free: float = assumed(3.0, "", "degrees of freedom from which on a χ² is given", "below it tells nothing")
+    clear: float = assumed(3.0, "σ", "a drift or a discrepancy that is no chance", "1 in 370")
     held: float = assumed(0.5, "", "share of a promise that may come from the priors", "half")
     fine_terms: float = assumed(0.3, "", "how well coarse terms of a field tell the fine ones, log", "factor of 1.35")
     scales: tuple = assumed(

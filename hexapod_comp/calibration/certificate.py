@@ -247,7 +247,7 @@ def left_out(fit: ModelFit) -> np.ndarray:
     cell = Cells.of(m).of_reading
     weights = solution.weights / m.stated**2
     total = np.bincount(cell, weights)
-    errors = solution.held_out * solution.posterior.noise[solution.problem.kind] / np.sqrt(total)
+    errors = fit.held_out / np.sqrt(total)
     return m.value - (np.bincount(cell, weights * m.value) / total)[cell] + errors[cell]
 
 

@@ -199,7 +199,7 @@ def _visible(evidence: Evidence) -> dict[str, float]:
     for hypothesis in evidence.hypotheses:
         family = hypothesis.change.family
         if family == DATUM or (family in (STRUT, TEMPERATURE) and len(hypothesis.change.shown) == 1):
-            size = ASSUMED.clear / hypothesis.least_gain if hypothesis.least_gain > 0.0 else np.inf
+            size = ASSUMED.surely / hypothesis.least_gain if hypothesis.least_gain > 0.0 else np.inf
             sizes[family] = max(size, sizes.get(family, 0.0))
     return sizes
 

@@ -11,12 +11,10 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from itertools import pairwise
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dpstrf, dtrtrs
+from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs
 
 from ..errors import CalibrationError, KinematicsError, ModelError
 from ..measurements.readings import KINDS, LEAST_NOISE, MeasurementSet, refuse_absurd
@@ -83,13 +81,6 @@ class DesignMatrix:
             result[part.columns] += part.values.T @ v[part.cells]
         return result
 
-    def normal(self) -> np.ndarray:
-        """Return rowsᵀ·rows, shape (size, size)."""
-        result = np.zeros((self.shape[1], self.shape[1]))
-        for part in self.parts:
-            result[np.ix_(part.columns, part.columns)] += part.values.T @ part.values
-        return result
-
     def between(self, matrix: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """Return aᵀ·M·b for the rows a and b of pairs of cells, shape (pairs,)."""
         result = np.empty(len(first))
@@ -108,46 +99,28 @@ class DesignMatrix:
             parts.append(Alike(at, part.columns, part.values[in_a_row(self._place[cells[at]])]))
         return DesignMatrix((len(cells), self.shape[1]), parts)
 
-    def using(self, used: np.ndarray, factors: np.ndarray) -> DesignMatrix:
-        """Return the rows times a factor each, (C,), with the columns of some parameters only."""
+    def using(self, used: np.ndarray, factors: np.ndarray, spread: np.ndarray | None = None) -> DesignMatrix:
+        """Return the rows times a factor each, (C,), with some parameters' columns only, times their spread."""
         place = np.full(self.shape[1], -1)
         place[used] = np.arange(len(used))
         parts = []
         for part in self.parts:
             kept = np.flatnonzero(place[part.columns] >= 0)
+            columns = place[part.columns[kept]]
             values = factors[part.cells, None] * part.values[:, in_a_row(kept)]
-            parts.append(Alike(part.cells, place[part.columns[kept]], values))
+            if spread is not None:
+                values *= spread[columns]
+            parts.append(Alike(part.cells, columns, values))
         return DesignMatrix((self.shape[0], len(used)), parts)
 
-    def condensed(
-        self, target: np.ndarray, group: np.ndarray, draws: np.ndarray
-    ) -> tuple[DesignMatrix, np.ndarray, np.ndarray]:
-        """Return fewer rows that say the same, with their targets and groups.
-
-        Cells of a group that the same parameters move are turned, orthogonally, so that a few of them have all that
-        parameters do: some twenty along a line, however densely it was read. The others are left out.
-        """
-
-        def few_of(part: Alike) -> list[np.ndarray]:
-            order = np.argsort(group[part.cells], kind="stable")
-            pieces = np.split(order, np.flatnonzero(np.diff(group[part.cells[order]])) + 1)
-            few = np.concatenate(
-                [np.zeros(0, dtype=int), *(piece for piece in pieces if len(piece) < ASSUMED.few_cells)]
-            )
-            listed = [(part.values[few], target[part.cells[few]], group[part.cells[few]])]
-            for piece in (piece for piece in pieces if len(piece) >= ASSUMED.few_cells):
-                cells = part.cells[piece]
-                rows, along = _moved(part.values[in_a_row(piece)], target[cells], draws[part.columns])
-                listed.append((rows, along, np.full(len(along), group[cells[0]])))
-            return [np.concatenate(arrays) for arrays in zip(*listed, strict=True)]
-
-        parts, of_rows, count = [], [], 0
-        for part, (values, *own) in zip(self.parts, at_once(few_of, self.parts, self.shape[0]), strict=True):
-            parts.append(Alike(np.arange(count, count + len(values)), part.columns, values))
-            of_rows.append(own)
-            count += len(values)
-        targets, groups = (np.concatenate(arrays) for arrays in zip(*of_rows, strict=True))
-        return DesignMatrix((count, self.shape[1]), parts), targets, groups
+    def beside(self, columns: np.ndarray) -> DesignMatrix:
+        """Return the matrix with further columns (C, k)."""
+        size, further = self.shape[1], np.arange(columns.shape[1])
+        parts = [
+            Alike(p.cells, np.append(p.columns, size + further), np.hstack([p.values, columns[p.cells]]))
+            for p in self.parts
+        ]
+        return DesignMatrix((self.shape[0], size + len(further)), parts)
 
     def project_out(self, unknowns: Sequence[Nuisance]) -> None:
         """Take off, in place, what unknowns of instruments may explain.
@@ -176,19 +149,6 @@ class DesignMatrix:
         at_once(clear, range(len(self.parts)), self.shape[0])
 
 
-def _moved(values: np.ndarray, target: np.ndarray, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return Qᵀ·values and Qᵀ·target, with the columns of Q an orthonormal basis of what draws of parameters do.
-
-    A pivoted Cholesky factor tells which draws are enough; all cells are kept where none are.
-    """
-    shown = values @ draws
-    _, pivots, rank, _ = dpstrf((shown.T @ shown).T, tol=ASSUMED.negligible, overwrite_a=1)
-    if rank >= min(shown.shape):
-        return values, target
-    basis = np.linalg.qr(shown[:, pivots[:rank] - 1])[0].T
-    return basis @ values, basis @ target
-
-
 def in_a_row(indices: np.ndarray) -> np.ndarray | slice:
     """Return indices as a slice where they follow each other: then indexing copies nothing."""
     if len(indices) and indices[-1] - indices[0] == len(indices) - 1 and (np.diff(indices) == 1).all():
@@ -202,15 +162,6 @@ def _alike(first: np.ndarray, second: np.ndarray) -> Iterator[tuple[tuple[int, i
     pairs, group = np.unique(first * many + second, return_inverse=True)
     for n, pair in enumerate(pairs.tolist()):
         yield divmod(pair, many), np.flatnonzero(group == n)
-
-
-class Condensed(NamedTuple):
-    """The cells of a linear problem, each fold's and kind's in as few rows as its parameters can be told by."""
-
-    target: np.ndarray  # (K,): In place of the cells' targets
-    rows: DesignMatrix  # (K, size): In place of theirs
-    cell: np.ndarray  # (K,) and (C,): The first cell of the fold and kind that a row, or a cell, belongs to
-    first: np.ndarray  # (K,) and (C,): The first cell of the fold and kind that a row, or a cell, belongs to
 
 
 @dataclass(frozen=True)
@@ -350,80 +301,6 @@ def log_evidence(problem: LinearProblem, posterior: Posterior) -> float:
     weights, moment = posterior.noise[kinds] ** -2, problem.moment[np.ix_(kinds, posterior.used)]
     unmet = weights @ (problem.square[kinds] - moment @ posterior.y)
     return float(-0.5 * (unmet + posterior.log_determinant - problem.freedom[kinds] @ np.log(weights)))
-
-
-def condense(problem: LinearProblem, posterior: Posterior) -> Condensed:
-    """Return what leaving out folds looks at, for fits with the parameters of a posterior, or some of them."""
-    group = problem.fold * len(problem.freedom) + problem.kind
-    _, cells, member = np.unique(group, return_index=True, return_inverse=True)
-    first = cells[member.ravel()]
-    draws = np.zeros((problem.rows.shape[1], ASSUMED.draws))
-    z = np.random.default_rng(5).standard_normal((len(posterior.used), ASSUMED.draws)) / np.sqrt(ASSUMED.draws)
-    root = np.linalg.cholesky(whitened_precision(problem, posterior))
-    draws[posterior.used] = posterior.spread[:, None] * dtrtrs(root, z, lower=1, trans=1)[0]
-    rows, target, cell = problem.rows.condensed(problem.target, first, draws / posterior.noise[problem.kind].min())
-    return Condensed(target, rows, cell, first)
-
-
-def held_out(problem: LinearProblem, condensed: Condensed, posterior: Posterior) -> np.ndarray:
-    """Return the errors, in standard deviations, at cells whose fold the fit did not see, shape (C,)."""
-    solved = _solved_without(problem, condensed, posterior)
-    return _errors(problem.rows, problem.target, problem.fold, solved) / posterior.noise[problem.kind]
-
-
-def _errors(rows: DesignMatrix, target: np.ndarray, fold: np.ndarray, solved: np.ndarray) -> np.ndarray:
-    """Return what is left of targets at each fold's own answer (folds, size)."""
-    result = target.copy()
-    for part in rows.parts:
-        for first in range(0, len(part.cells), ASSUMED.together):
-            cells, values = part.cells[first : first + ASSUMED.together], part.values[first : first + ASSUMED.together]
-            result[cells] -= np.einsum("ci,ci->c", values, solved[np.ix_(fold[cells], part.columns)])
-    return result
-
-
-def _solved_without(problem: LinearProblem, condensed: Condensed, posterior: Posterior) -> np.ndarray:
-    """Return the most probable y of fits that did not see one fold, shape (folds, size): exact, and no fit is repeated.
-
-    Without a fold with rows R and residuals r, y changes by −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r, with C the parameters' covariance,
-    or by −(C⁻¹ − Rᵀ·R)⁻¹·Rᵀ·r: a matrix of the rows' size, where they are few, or of the parameters'.
-    """
-    used, spread, fold = posterior.used, posterior.spread, problem.fold[condensed.cell]
-    solved, small = np.zeros((int(problem.fold.max()) + 1, problem.rows.shape[1])), len(used) // 2
-    # It is not needed where no fold is large.
-    precision = whitened_precision(problem, posterior) if np.bincount(fold).max() > small else np.zeros((0, 0))
-
-    def solve_without(some: tuple[np.ndarray, list[int]]) -> None:
-        chosen, ends = some
-        scale = 1.0 / posterior.noise[problem.kind[condensed.cell[chosen]]]
-        rows = condensed.rows.select(chosen).using(used, scale)
-        left = scale * condensed.target[chosen] - rows.times(posterior.y)
-        if ends[1] > small:
-            seen = rows.normal()
-            seen *= spread[:, None]
-            seen *= spread
-            factor = np.linalg.cholesky(np.subtract(precision, seen, out=seen))
-            changes = spread * dpotrs(factor, spread * rows.transposed_times(left), lower=1)[0]
-        else:
-            shared, whole = rows.times(posterior.covariance), rows.dense()
-            changes = np.empty((len(ends) - 1, len(used)))
-            for n, (a, b) in enumerate(pairwise(ends)):
-                changes[n] = np.linalg.solve(np.eye(b - a) - shared[a:b] @ whole[a:b].T, left[a:b]) @ shared[a:b]
-        solved[np.ix_(fold[chosen[ends[:-1]]], used)] = posterior.y - changes
-
-    at_once(solve_without, _whole_folds(fold, small), len(fold))
-    return solved
-
-
-def _whole_folds(fold: np.ndarray, small: int) -> Iterator[tuple[np.ndarray, list[int]]]:
-    """Yield rows in the order of their folds, and where each ends: some thousand of small folds, or a large one."""
-    order = np.argsort(fold, kind="stable")
-    ends = [0, *(np.flatnonzero(np.diff(fold[order])) + 1).tolist(), len(order)]
-    first = 0
-    for n, (start, end) in enumerate(pairwise(ends), 1):
-        last = n == len(ends) - 1
-        if last or end - ends[first] >= ASSUMED.together or max(end - start, ends[n + 1] - end) > small:
-            yield order[ends[first] : end], [e - ends[first] for e in ends[first : n + 1]]
-            first = n
 
 
 def whitened_precision(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
@@ -650,16 +527,6 @@ class Solution:
     steps: int  # Gauss–Newton steps
     change: float  # Largest change of a parameter in the last one, in its standard deviation
 
-    @cached_property
-    def condensed(self) -> Condensed:
-        """The cells in as few rows as the parameters in use can be told by."""
-        return condense(self.problem, self.posterior)
-
-    @cached_property
-    def held_out(self) -> np.ndarray:
-        """Errors, in standard deviations, at cells whose fold a fit does not see, shape (C,)."""
-        return held_out(self.problem, self.condensed, self.posterior)
-
 
 def iterate(
     estimation: Estimation,
@@ -694,25 +561,57 @@ def iterate(
     return solution
 
 
+class Omitted(NamedTuple):
+    """What leaving one group of cells out of a fit does."""
+
+    cells: np.ndarray  # (n,): the group
+    errors: np.ndarray  # (n,): leave-one-out residuals, in standard deviations: of fits that did not see the group
+    moved: np.ndarray  # (k,): by how much effects of the parameters change
+    covariance: np.ndarray  # (k, k): of that change, if the model is right
+
+
+def jackknife(
+    rows: DesignMatrix, residual: np.ndarray, precision: np.ndarray, groups: np.ndarray, effects: np.ndarray
+) -> list[Omitted]:
+    """Return what leaving out each group of cells does, by the linear problem: exact, and no fit is repeated.
+
+    Without a group's rows R and residuals r, parameters z whose precision is P = C⁻¹ change by
+    (P − Rᵀ·R)⁻¹·Rᵀ·r = C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r, a matrix of the parameters' size or of the group's; the covariance of
+    that is (P − Rᵀ·R)⁻¹ − C if the model is right. `effects`, (n, k), are those of the parameters to look at.
+    """
+    covariance = np.linalg.inv(precision)
+    reached = covariance @ effects
+    before = effects.T @ reached
+
+    def without(cells: np.ndarray) -> Omitted:
+        own, left = rows.select(cells).dense(), residual[cells]
+        few = 2 * len(left) < len(precision)
+        matrix = np.eye(len(left)) - own @ covariance @ own.T if few else precision - own.T @ own
+        factor = np.linalg.cholesky(matrix)
+        half, moment = (
+            dtrtrs(factor, side, lower=1)[0] for side in ((own @ reached, left) if few else (effects, own.T @ left))
+        )
+        solved = dtrtrs(factor, moment, lower=1, trans=1)[0]
+        errors, grown = (solved, half.T @ half) if few else (left + own @ solved, half.T @ half - before)
+        return Omitted(cells, errors, half.T @ moment, grown)
+
+    order = np.argsort(groups, kind="stable")
+    members = np.split(order, np.flatnonzero(np.diff(groups[order])) + 1)
+    return at_once(without, members, len(groups))
+
+
 def influence(run: np.ndarray, solution: Solution) -> np.ndarray:
     """Return how far the parameters move, leaving out each run, in their standard deviations: Cook's distance, (runs,).
 
-    `run` (C,) is that of each cell. With R the run's rows, r what is left of them and C the parameters' covariance they
-    move by δ = −(C⁻¹ − Rᵀ·R)⁻¹·Rᵀ·r, which is √(δᵀ·C⁻¹·δ) standard deviations: no fit is repeated.
+    `run` (C,) is that of each cell.
     """
     problem, p = solution.problem, solution.posterior
     scale = 1.0 / p.noise[problem.kind]
-    rows = problem.rows.using(p.used, scale)
-    left = scale * problem.target - rows.times(p.y)
+    rows = problem.rows.using(p.used, scale, p.spread)
     precision = whitened_precision(problem, p)
-
-    def moved(number: int) -> float:
-        members = np.flatnonzero(run == number)
-        own = rows.select(members).dense() * p.spread
-        change = np.linalg.solve(precision - own.T @ own, own.T @ left[members])
-        return float(np.sqrt(change @ precision @ change))
-
-    return np.array(at_once(moved, range(int(run.max()) + 1), len(run)))
+    left = scale * problem.target - rows.times(p.y / p.spread)
+    omitted = jackknife(rows, left, precision, run, np.linalg.cholesky(precision))
+    return np.array([np.linalg.norm(one.moved) for one in omitted])
 
 
 def _change(change: np.ndarray, space: ParameterSpace, posterior: Posterior) -> tuple[float, str]:

@@ -35,7 +35,7 @@ from .parameters import FitSettings, ParameterSpace
 from .posterior import Observability, ToolError, UnseenError, box_errors, listed, observe, without_trace
 from .selection import Decision, select
 from .thermal import HeatSeen, TimeConstants, seek_time_constants, with_courses
-from .trust import LeftOut, Verdict, judge, with_drift
+from .trust import LeftOut, Residuals, Verdict, judge, with_drift
 
 LARGEST_NOISE = 0.02  # A machine that leaves more than this of its readings, m or rad, is not the one that was measured
 # Readings taken further than this from the reference temperature, K, need an expansion: 1 µm on half a metre
@@ -99,6 +99,8 @@ class ModelFit:
         What they tell of heat.
     lead : ScrewLead or None
         What is known of the screws' lead; None where it was not looked for.
+    held_out : ndarray, shape (C,)
+        Leave-one-out errors of the cells, whose line or pose a fit did not see, over their stated standard deviation.
     """
 
     model: MachineModel
@@ -115,6 +117,7 @@ class ModelFit:
     held: HeldDatum
     warming: HeatSeen
     lead: ScrewLead | None
+    held_out: np.ndarray
 
     @property
     def misfit(self) -> str:
@@ -245,7 +248,9 @@ def _fit(
     decisions, possible, answer = _choose(everything, nominal, settings, progress, settles)
     space, estimation, solution = answer
     solution, drift = with_drift(estimation, solution)
-    channels = tuple(_channels(estimation, solution))
+    residuals = Residuals(estimation, solution, drift)
+    held_out = residuals.held_out
+    channels = tuple(_channels(estimation, solution, held_out))
     notes = [
         *_about_lead(lead),
         *_ignored(measurements, space),
@@ -256,9 +261,7 @@ def _fit(
     noise = {KINDS.index(c.kind): c.estimated for c in channels}
     mixed = mixups(everything, nominal, [d.block for d in decisions if d.kept], progress)
     verdict = judge(
-        estimation,
-        solution,
-        drift,
+        residuals,
         settings,
         noise,
         mixed,
@@ -285,6 +288,7 @@ def _fit(
         held=held,
         warming=HeatSeen.of(measurements, estimation, solution, constants, verdict.unexplained.factor),
         lead=lead,
+        held_out=held_out,
     )
 
 
@@ -469,10 +473,9 @@ def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:
     return [f"{problem} ({', '.join(noisy)}); the expected tool error allows for it"]
 
 
-def _channels(estimation: Estimation, solution: Solution) -> list[ChannelFit]:
-    """Return how each kind of channel was met."""
+def _channels(estimation: Estimation, solution: Solution, errors: np.ndarray) -> list[ChannelFit]:
+    """Return how each kind of channel was met; `errors` (C,) are those of cells that were held out."""
     problem, posterior, kinds = solution.problem, solution.posterior, estimation.measurements.kind
-    errors = solution.held_out * posterior.noise[problem.kind]
     readings_of_cell = np.bincount(estimation.cells.of_reading, minlength=len(problem.kind))
     result = []
     for k in np.unique(kinds):

@@ -27,9 +27,10 @@ class Scatter(NamedTuple):
     Attributes
     ----------
     lack : float
-        Of an error that repeats there and back.
+        Of an error that no parameter describes: the discrepancy.
     stops, most_stops : float
-        Of where the machine stops from visit to visit, if the instruments scatter as stated; and what it is at most.
+        Of where the machine stops from visit to visit, by repeated readings, if the instruments scatter as stated; and
+        what it is at most.
     """
 
     lack: float = 0.0
@@ -113,7 +114,7 @@ class Unexplained:
         listed = []
         if self.factor > DOUBTFUL_FACTOR:
             listed.append(f"{self._outcome()}: lines, or what they were read with, disagree with each other")
-        if self.drift > ASSUMED.clear_drift * self.drift_error:
+        if self.drift > ASSUMED.clear * self.drift_error:
             size = f"{self.drift * 1e6:.2g} ppm, as steel's does in {self.drift / STEEL:.2g} K"
             problem = f"the scale of the linear readings changes by {size}, from the first to the last"
             listed.append(f"{problem}: the model is that of the middle of the campaign")
@@ -128,10 +129,10 @@ class Unexplained:
             _sizes(getattr(self.displacement, name), getattr(self.rotation, name)) for name in ("lack", "stops")
         )
         if lack:
-            listed.append(f"{lack}, there and back alike, is in no parameter; the expected tool error allows for it")
+            listed.append(f"{lack} is in no parameter (discrepancy); the expected tool error allows for it")
         if stops:
-            problem = "readings scatter more than stated, and not alike there and back: taken for the machine's own"
-            listed.append(f"{problem} repeatability, {stops}; the expected tool error has it, the lower end has not")
+            problem = "repeated readings scatter more than stated: taken for the machine's own repeatability"
+            listed.append(f"{problem}, {stops}; the expected tool error has it, the lower end has not")
         return listed
 
     def as_json(self) -> dict[str, float | str]:

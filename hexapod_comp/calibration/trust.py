@@ -16,7 +16,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dtrtrs
 from scipy.special import gammaincinv
 
 from ..machine.arrays import different_rows
@@ -35,8 +34,9 @@ from .estimator import (
     MEDIAN_TO_SIGMA,
     DesignMatrix,
     Estimation,
+    Omitted,
     Solution,
-    at_once,
+    jackknife,
     physical_covariance,
     whitened_precision,
 )
@@ -49,6 +49,16 @@ TILT = np.radians(10.0)
 """Tilt at which the report states the tool error of a tilted tool."""
 
 NOT_TILTED = "a field was needed, and measured with a level tool alone: nothing is promised for a tilted one"
+WITHOUT_EFFECT = 1e-4
+"""Share of the tool's squared error that the jackknife does not look at."""
+
+DRIFT_RUNS, DRIFT_TERMS = 6, 2
+"""Fewest runs that read lengths for a drift, two each way; its degree in time, as much as settling needs."""
+
+LEAST_PAIRS, LEAST_LEFT, LEAST_FREE = 30, 0.25, 3.0
+"""Fewest pairs, or repeats, that tell a variance (to 26 %); least share of a discrepancy that parameters leave; fewest
+degrees of freedom of a χ² that is listed."""
+
 FIELDS = ("field displacement", "field rotation")
 
 
@@ -111,12 +121,13 @@ class LeftOut(NamedTuple):
 class Residuals:
     """A settled fit's residuals, cell by cell, over the noise that was estimated, and what they say of the tool."""
 
-    def __init__(self, estimation: Estimation, solution: Solution) -> None:
-        self.estimation, self.solution = estimation, solution
+    def __init__(self, estimation: Estimation, solution: Solution, drift: Drift) -> None:
+        self.estimation, self.solution, self.drift = estimation, solution, drift
         problem, posterior, cells, m = solution.problem, solution.posterior, estimation.cells, estimation.measurements
         scale = 1.0 / posterior.noise[problem.kind]
-        self.rows: DesignMatrix = problem.rows.using(posterior.used, scale)  # derivatives by the parameters in use
-        self.residual = scale * problem.target - self.rows.times(posterior.y)
+        # Derivatives by the parameters in use, in their priors' standard deviations
+        self.rows: DesignMatrix = problem.rows.using(posterior.used, scale, posterior.spread)
+        self.residual = scale * problem.target - self.rows.times(posterior.y / posterior.spread)
         self.run, self.direction = m.run[cells.first], m.direction[cells.first]
 
     @cached_property
@@ -140,24 +151,45 @@ class Residuals:
         """Mean squared error of the tool to expect by the covariance, m²."""
         return float(np.vdot(self.metrics[0], self.solution.posterior.covariance))
 
+    @cached_property
+    def omitted(self) -> list[Omitted]:
+        """What leaving out each fold does to the tool, by the eigenvectors of its squared error."""
+        spread, terms = self.solution.posterior.spread, self.drift.columns.shape[1]
+        values, vectors = np.linalg.eigh(spread[:, None] * self.metrics[0] * spread)
+        kept = np.cumsum(values) > WITHOUT_EFFECT * self.expected  # ascending: what no prior lets happen is left out
+        kept[-1] = True
+        effects = np.pad(vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0)), ((0, terms), (0, 0)))
+        precision = whitened_precision(self.solution.problem, self.solution.posterior)
+        cross, own = self.rows.transposed_times(self.drift.columns), np.eye(terms)
+        precision = np.block([[precision, cross], [cross.T, own + self.drift.columns.T @ self.drift.columns]])
+        rows = self.rows.beside(self.drift.columns)
+        return jackknife(rows, self.residual, precision, self.estimation.cells.fold, effects)
+
+    @property
+    def held_out(self) -> np.ndarray:
+        """Errors at cells whose fold a fit did not see, over the stated standard deviations, shape (C,)."""
+        problem, posterior = self.solution.problem, self.solution.posterior
+        errors = np.empty(len(self.residual))
+        for fold in self.omitted:
+            errors[fold.cells] = fold.errors
+        return errors * posterior.noise[problem.kind]
+
     def shared(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """Return by how much fitting makes cells unlike each other, pair by pair: what both give to the parameters."""
-        return self.rows.between(self.solution.posterior.covariance, first, second)
+        posterior = self.solution.posterior
+        return self.rows.between(posterior.covariance / np.outer(posterior.spread, posterior.spread), first, second)
 
 
 def judge(
-    estimation: Estimation,
-    solution: Solution,
-    drift: Drift,
+    residuals: Residuals,
     settings: FitSettings,
     noise: Mapping[int, float],
     mixed_up: Sequence[str],
     left_out: LeftOut,
 ) -> Verdict:
     """Return what a settled fit promises and what is wrong with it; `noise` was found for each kind, m or rad."""
-    measurements, space = estimation.measurements, estimation.space
-    residuals = Residuals(estimation, solution)
-    beyond = unexplained(residuals, drift, stated_scale(measurements, settings), left_out)
+    solution, measurements, space = residuals.solution, residuals.estimation.measurements, residuals.estimation.space
+    beyond = unexplained(residuals, stated_scale(measurements, settings), left_out)
     covariance = physical_covariance(space, solution.posterior)
     # A field that was measured with a level tool alone says nothing of a tilted one.
     level_only = space.block(FIELDS[0]) is not None and measurements.tilt() < 0.5 * TILT
@@ -182,13 +214,13 @@ def judge(
     return Verdict(level, tilted, beyond, families, runs, *listed)
 
 
-def unexplained(r: Residuals, drift: Drift, scale: float, left_out: LeftOut) -> Unexplained:
+def unexplained(r: Residuals, scale: float, left_out: LeftOut) -> Unexplained:
     """Return what a settled fit leaves unexplained; `scale` is the standard deviation of that of all readings, m/m.
 
     The upper end allows for a covariance that is wrong, as runs show, and for what averaging over the choice of blocks
     gives (Bayesian model averaging): with the probability that one of those left out is there, the error with all in.
     """
-    ratio, freedom = jackknife(r, drift)
+    ratio, freedom = variance_ratio(r)
     averaged = 1.0
     if r.expected > 0.0:
         averaged += left_out.probability * (left_out.square / r.expected - 1.0)
@@ -205,8 +237,8 @@ def unexplained(r: Residuals, drift: Drift, scale: float, left_out: LeftOut) -> 
         prior_rotation=prior_of_rotation,
         displacement=displacement,
         rotation=rotation,
-        drift=drift.change[0],
-        drift_error=drift.change[1],
+        drift=r.drift.change[0],
+        drift_error=r.drift.change[1],
         scale=scale,
         ratio=ratio,
         freedom=freedom,
@@ -229,47 +261,16 @@ def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
 # The jackknife, and drift
 
 
-def jackknife(r: Residuals, drift: Drift) -> tuple[float, float]:
+def variance_ratio(r: Residuals) -> tuple[float, float]:
     """Return by how much more than expected leaving out each run changes the tool's squared error, and the freedom.
 
-    With rows R and residuals r of a run left out, the parameters change by −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r, whose covariance is
-    C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·R·C if the model is right: no fit is repeated. M turns both into the tool's error. By
-    Satterthwaite the sum over runs is about a χ² of as many degrees of freedom as its variance says.
+    By Satterthwaite the sum over runs is about a χ² of as many degrees of freedom as its variance says.
     """
-    posterior, groups, spread = r.solution.posterior, r.estimation.cells.fold, r.solution.posterior.spread
-    if not r.expected > 0.0 or len(np.unique(groups)) < 2:
+    if not r.expected > 0.0 or len(r.omitted) < 2:
         return 1.0, 0.0
-    values, vectors = np.linalg.eigh(spread[:, None] * r.metrics[0] * spread)
-    kept = np.cumsum(values) > ASSUMED.without_effect * r.expected  # ascending: what no prior lets happen is left out
-    terms, cross = len(drift.values), r.rows.transposed_times(drift.columns)
-    effects = np.pad(vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0)), ((0, terms), (0, 0)))
-    precision = np.block(
-        [
-            [whitened_precision(r.solution.problem, posterior), spread[:, None] * cross],
-            [cross.T * spread, np.eye(terms) + drift.columns.T @ drift.columns],
-        ]
-    )
-    covariance = np.linalg.inv(precision)
-    reached = covariance @ effects
-    before = effects.T @ reached
-
-    def change(members: np.ndarray) -> tuple[float, float, float]:
-        rows = np.hstack([r.rows.select(members).dense() * spread, drift.columns[members]])
-        left = r.residual[members]
-        if 2 * len(left) < len(precision):
-            matrix, sides, own = np.eye(len(left)) - rows @ covariance @ rows.T, (rows @ reached, left), 0.0
-        else:
-            matrix, sides, own = precision - rows.T @ rows, (effects, rows.T @ left), before
-        factor = np.linalg.cholesky(matrix)
-        half, moment = (dtrtrs(factor, side, lower=1)[0] for side in sides)
-        grown, moved = half.T @ half - own, half.T @ moment
-        expected = float(np.trace(grown))
-        return float(moved @ moved), expected, expected**2 / float(np.vdot(grown, grown))
-
-    order = np.argsort(groups, kind="stable")
-    members = np.split(order, np.flatnonzero(np.diff(groups[order])) + 1)
-    shown, expected, freedom = np.transpose(at_once(change, members, len(groups)))
-    return float(shown.sum() / expected.sum()), float(expected.sum() ** 2 / (expected**2 / freedom).sum())
+    sums = [(o.moved @ o.moved, np.trace(o.covariance), np.vdot(o.covariance, o.covariance)) for o in r.omitted]
+    shown, expected, squares = np.transpose(sums).sum(axis=1)
+    return float(shown / expected), float(expected**2 / squares)
 
 
 def with_drift(estimation: Estimation, solution: Solution) -> tuple[Solution, Drift]:
@@ -278,23 +279,23 @@ def with_drift(estimation: Estimation, solution: Solution) -> tuple[Solution, Dr
     A machine that warms, or a laser's air that changes: over the campaign all lengths from the middle of the box grow
     by a polynomial in time. Exact for the linear problem, with the blocks' priors and the noise as they are.
     """
-    r, m, cells = Residuals(estimation, solution), estimation.measurements, estimation.cells
+    m, cells = estimation.measurements, estimation.cells
     posterior, problem = solution.posterior, solution.problem
-    at_rest = np.zeros((len(r.residual), 0))
-    none = Drift(at_rest, np.zeros(0), np.zeros((0, 0)))
+    none = Drift(np.zeros((len(cells.kind), 0)), np.zeros(0), np.zeros((0, 0)))
+    r = Residuals(estimation, solution, none)
     lengths = ~np.isin(cells.kind, [KINDS.index(kind) for kind in (*ANGULAR_KINDS, "straightness")])
-    if len(np.unique(r.run[lengths])) < ASSUMED.drift_runs:
+    if len(np.unique(r.run[lengths])) < DRIFT_RUNS:
         return solution, none
     count = np.bincount(cells.of_reading)
     place = np.bincount(cells.of_reading, np.arange(len(m))) / count
     time = 2.0 * place / max(len(m) - 1, 1) - 1.0
     points = m.points()[cells.station]
     growth = np.where(lengths, np.einsum("ci,ci->c", cells.directions[:, :3], points - points.mean(axis=0)), 0.0)
-    legendre = np.polynomial.legendre.legvander(time, ASSUMED.drift_terms)[:, 1:]
+    legendre = np.polynomial.legendre.legvander(time, DRIFT_TERMS)[:, 1:]
     trust = np.bincount(cells.of_reading, solution.weights * estimation.uncertainty**-2)
     trust = np.sqrt(trust / np.bincount(cells.of_reading, estimation.uncertainty**-2)) / posterior.noise[cells.kind]
     columns = trust[:, None] * estimation.free_of_nuisance(ASSUMED.drift * growth[:, None] * legendre)
-    cross = r.rows.transposed_times(columns)
+    cross = r.rows.transposed_times(columns) / posterior.spread[:, None]
     gain = posterior.covariance @ cross
     precision = np.eye(columns.shape[1]) + columns.T @ columns - cross.T @ gain
     covariance = np.linalg.inv(precision)
@@ -303,7 +304,7 @@ def with_drift(estimation: Estimation, solution: Solution) -> tuple[Solution, Dr
     if shown @ values < np.linalg.slogdet(precision)[1]:
         return solution, none
     moved = -gain @ values
-    change = r.rows.times(moved) + columns @ values
+    change = r.rows.times(moved / posterior.spread) + columns @ values
     y, x = posterior.y + moved, np.zeros(estimation.space.size)
     x[posterior.used] = y
     scale = np.sqrt(np.bincount(cells.of_reading, solution.weights * estimation.uncertainty**-2))
@@ -324,72 +325,74 @@ def with_drift(estimation: Estimation, solution: Solution) -> tuple[Solution, Dr
 # The discrepancy
 
 
-class _OfKind(NamedTuple):
+class LackOfFit(NamedTuple):
     """Variances that one kind of readings shows beyond its stated noise, m² or rad²; 0 where it may be chance."""
 
-    alike: float  # shared by readings there and back, with the part that the parameters have swallowed
-    most_alike: float  # what would have shown
-    stops: float  # of what never repeats
-    most_stops: float
-    cells: int
+    alike: float = 0.0  # shared by readings there and back, with the part that the parameters have swallowed
+    most_alike: float = 0.0  # what would have shown
+    unlike: float = 0.0  # of neither that nor of repeats
+    stops: float = 0.0  # pure error: of readings repeated at one place
+    most_stops: float = 0.0
 
 
 def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
     """Return what residuals show of the tool's displacement, and of its rotation, that no parameter describes.
 
+    Pure error is what repeats show; the rest of what is beyond the stated noise is lack of fit (Draper & Smith 1998):
+    an error of the machine, as a lost motion that friction makes, however unlike itself it is there and back.
+
     A field that is not as smooth as its terms shows that first where it is large beside the readings' noise, in its
     rotations as a rule; in displacements there is as much, in proportion to the sizes that were fitted, unless so much
     would have shown there as well.
     """
-    parts = [_of_kind(r, k) for k in np.unique(r.estimation.cells.kind)]
-    angular = [KINDS[k] in ANGULAR_KINDS for k in np.unique(r.estimation.cells.kind)]
+    kinds = np.unique(r.estimation.cells.kind)
     found = []
-    for way in (False, True):
-        some = [part for part, turns in zip(parts, angular, strict=True) if turns == way]
+    for angular in (False, True):
+        some = [k for k in kinds if (KINDS[k] in ANGULAR_KINDS) == angular]
+        cells = [int((r.estimation.cells.kind == k).sum()) for k in some]
         # The mean variance of an axis, three times.
-        mean = np.average([p[:-1] for p in some], 0, [p.cells for p in some]) if some else np.zeros(4)
-        alike, most_alike, stops, most_stops = np.sqrt(3.0 * mean).tolist()
-        found.append((Scatter(alike, stops, most_stops), most_alike))
-    (displacement, hidden), (rotation, hidden_rotation) = found
+        mean = np.average([lack_of_fit(r, k) for k in some], 0, cells) if some else np.zeros(len(LackOfFit._fields))
+        found.append(LackOfFit(*np.sqrt(3.0 * mean).tolist()))
+    displacement, rotation = found
     space, sizes = r.estimation.space, r.solution.posterior.tolerances
     fields = {b.name: size for b, size in zip(space.blocks, sizes, strict=True) if b.name in FIELDS and size > 0.0}
+    shifted, turned = displacement.alike, rotation.alike
     if len(fields) == len(FIELDS):
         ratio = float(fields[FIELDS[0]] / fields[FIELDS[1]])
-        shifted = max(displacement.lack, min(rotation.lack * ratio, hidden))
-        turned = max(rotation.lack, min(displacement.lack / ratio, hidden_rotation))
-        displacement, rotation = displacement._replace(lack=shifted), rotation._replace(lack=turned)
-    hysteresis = _unread_backlash(r)
-    return displacement._replace(lack=float(np.hypot(displacement.lack, hysteresis))), rotation
+        shifted = max(shifted, min(rotation.alike * ratio, displacement.most_alike))
+        turned = max(turned, min(displacement.alike / ratio, rotation.most_alike))
+    lacks = np.linalg.norm([shifted, displacement.unlike, _unread_backlash(r)]), np.hypot(turned, rotation.unlike)
+    return tuple(  # type: ignore[return-value]
+        Scatter(float(lack), part.stops, part.most_stops) for lack, part in zip(lacks, found, strict=True)
+    )
 
 
-def _of_kind(r: Residuals, kind: int) -> _OfKind:
-    """Return what one kind of readings shows."""
+def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
+    """Return what one kind of readings shows: all variances in the stated noise's, but for the result."""
     m, estimated = r.estimation.measurements, float(r.solution.posterior.noise[kind] ** 2)
     readings, cells = int((m.kind == kind).sum()), int((r.estimation.cells.kind == kind).sum())
-    there, back = _pairs(r, kind)
     repeated, freedom = _repeated(r, kind)
-    own = error = 0.0
-    paired = len(there) >= ASSUMED.least_pairs
-    if paired:
-        shared, kept = _likeness(r, there, back)
+    pure, error = (repeated, repeated * np.sqrt(2.0 / freedom)) if freedom >= LEAST_PAIRS else (1.0, 0.0)
+    stops = pure - 1.0 if pure - 1.0 > ASSUMED.clear * error else 0.0
+    there, back = _pairs(r, kind)
+    unlike, of_readings = estimated - 1.0 - stops, estimated * np.sqrt(2.0 / readings)
+    if len(there) >= LEAST_PAIRS:
         # Residuals of cells count in their means' noise, which is smaller than a reading's.
-        alike, clear = (
-            v * estimated / kept * cells / readings for v in (shared, ASSUMED.clear_misfit / np.sqrt(len(there)))
-        )
-        own, error = (1.0 - shared) * estimated - 1.0, estimated * np.sqrt(2.0 / readings + 1.0 / len(there))
-    if freedom >= ASSUMED.least_pairs:  # repeats tell better what does not repeat
-        own, error = repeated - 1.0, repeated * np.sqrt(2.0 / freedom)
-    own = own if own > ASSUMED.clear_misfit * error else 0.0
-    if not paired:  # what is beyond noise, and may repeat, is taken for the machine's
-        alike, clear = estimated - 1.0 - own, ASSUMED.clear_misfit * estimated * np.sqrt(2.0 / readings)
-    variance = m.stated_of(kind) ** 2
-    return _OfKind(
-        alike=variance * alike if alike > clear else 0.0,
-        most_alike=variance * max(alike, clear),
-        stops=variance * own,
-        most_stops=variance * (own + 2.0 * error) if own else 0.0,
-        cells=cells,
+        shared, kept = _likeness(r, there, back)
+        share, of_pairs = cells / readings, estimated / np.sqrt(len(there))
+        alike, clear = shared * estimated * share / kept, ASSUMED.clear * of_pairs * share / kept
+        unlike -= shared * estimated * share
+        of_readings = np.hypot(of_readings, of_pairs)
+    else:  # whether it is alike there and back is not known
+        alike, clear, unlike = unlike, ASSUMED.clear * of_readings, 0.0
+    found = LackOfFit(
+        alike=alike if alike > clear else 0.0,
+        most_alike=max(alike, clear),
+        unlike=unlike if unlike > ASSUMED.clear * np.hypot(of_readings, error) else 0.0,
+        stops=stops,
+        most_stops=stops + 2.0 * error if stops else 0.0,
     )
+    return LackOfFit(*(m.stated_of(kind) ** 2 * np.array(found)).tolist())
 
 
 def _repeated(r: Residuals, kind: int) -> tuple[float, float]:
@@ -429,7 +432,7 @@ def _likeness(r: Residuals, there: np.ndarray, back: np.ndarray) -> tuple[float,
     sizes = np.bincount(groups + 1)[groups[there] + 1]
     unlike = r.shared(there, back) + np.where(groups[there] < 0, 0.0, 1.0 / sizes)
     shared = (cut[there] * cut[back] / 0.911 + unlike).mean()
-    return float(shared), float(max(1.0 - (r.taken[there] + unlike).mean(), ASSUMED.least_left))
+    return float(shared), float(max(1.0 - (r.taken[there] + unlike).mean(), LEAST_LEFT))
 
 
 def _unread_backlash(r: Residuals) -> float:
@@ -508,7 +511,7 @@ def chi_squares(r: Residuals) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare, .
         for k in np.unique(m.kind):
             for number, name in names.items():
                 members = (m.kind == k) & (numbers == number)
-                if freedom[members].sum() > ASSUMED.least_free:
+                if freedom[members].sum() > LEAST_FREE:
                     value = float(squares[members].sum() / freedom[members].sum())
                     part.append(ChiSquare(KINDS[k], name, int(members.sum()), value))
     return (*parts[0], *parts[1]), tuple(sorted(parts[2], key=lambda part: -part.value))

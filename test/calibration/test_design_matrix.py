@@ -31,7 +31,6 @@ def test_products(rows: DesignMatrix):
     close(rows.times(y), whole @ y)
     close(rows.times(y[:, 0]), whole @ y[:, 0])
     close(rows.transposed_times(v), whole.T @ v)
-    close(rows.normal(), whole.T @ whole)
     close(DesignMatrix.of(whole).times(y), whole @ y)
 
 
@@ -46,7 +45,13 @@ def test_some_cells_and_some_parameters(rows: DesignMatrix):
     close(rows.select(cells).dense(), whole[cells])
     factors = np.linspace(0.5, 2.0, 40)
     close(rows.using(used, factors).dense(), factors[:, None] * whole[:, used])
+    close(rows.using(used, factors, factors[:5]).dense(), factors[:, None] * whole[:, used] * factors[:5])
     close(rows.select(cells).using(used, factors[cells]).dense(), (factors[:, None] * whole)[np.ix_(cells, used)])
+
+
+def test_further_columns(rows: DesignMatrix):
+    columns = np.random.default_rng(6).standard_normal((40, 2))
+    close(rows.beside(columns).dense(), np.hstack([rows.dense(), columns]))
 
 
 def test_a_zero_is_taken_off_the_cells_of_its_part_alone(rows: DesignMatrix):
@@ -55,31 +60,3 @@ def test_a_zero_is_taken_off_the_cells_of_its_part_alone(rows: DesignMatrix):
     rows.project_out([of_zero(members, np.ones(6))])
     wanted[members] -= wanted[members].mean(axis=0)
     close(rows.dense(), wanted)
-
-
-def test_condensed_cells_say_the_same_in_fewer_rows():
-    """Rows of rank three, and of full rank, in two groups: the same products, and the target's projection on them.
-
-    NumPy's least squares projects. A part of three cells is kept as it is.
-    """
-    rng, shape = np.random.default_rng(5), (63, 12)
-    cells = np.split(rng.permutation(63), [3, 23])
-    values = rng.standard_normal((3, 4)), rng.standard_normal((20, 5)), rng.standard_normal((40, 3)) @ np.eye(3, 9, 2)
-    columns = np.arange(4), np.arange(5), np.arange(2, 11)
-    rows = DesignMatrix(shape, [Alike(*part) for part in zip(cells, columns, values, strict=True)])
-    target, group, whole = rng.standard_normal(63), np.zeros(63, dtype=int), rows.dense()
-    group[np.concatenate([part[::2] for part in cells])] = 1
-    few, along, owner = rows.condensed(target, group, rng.standard_normal((12, 15)))
-    assert few.shape == (3 + 10 + 6, 12)
-    assert len(along) == len(owner) == 19
-    for number in (0, 1):
-        ours, all_of_it = owner == number, group == number
-        close(few.dense()[ours].T @ few.dense()[ours], whole[all_of_it].T @ whole[all_of_it])
-        close(few.dense()[ours].T @ along[ours], whole[all_of_it].T @ target[all_of_it])
-        projected = 0.0
-        for n, part in enumerate(rows.parts):
-            members = group[part.cells] == number
-            own, left = part.values[members], target[part.cells[members]]
-            explained = own @ np.linalg.lstsq(own, left, rcond=None)[0] if n else left
-            projected += explained @ explained
-        close(along[ours] @ along[ours], projected)

@@ -19,15 +19,18 @@ from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model, mixed_up
 from hexapod_comp.calibration.mixups import FAMILIES, SWAPPED, _Fitted, common_modes, family_of_run, in_frame
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
-from hexapod_comp.calibration.posterior import expected_error
+from hexapod_comp.calibration.posterior import expected_error, stations_of
 from hexapod_comp.calibration.promise import Scatter, Unexplained, upper_factor
 from hexapod_comp.calibration.report import as_json, fit_report
 from hexapod_comp.calibration.trust import stated_scale
 from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
 from hexapod_comp.machine.model import RealMachine
+from hexapod_comp.machine.passes import random_passes
+from hexapod_comp.machine.trial import Trial
 from hexapod_comp.measurements.campaign import Campaign
-from hexapod_comp.measurements.readings import BACKWARD, CHANNELS, FORWARD, KINDS, MeasurementSet
+from hexapod_comp.measurements.readings import BACKWARD, CHANNELS, FORWARD, KINDS, MeasurementSet, Stations
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model, with_length_map
 from hexapod_comp.virtual.instruments import station_errors
 
@@ -116,20 +119,20 @@ def test_an_error_that_repeats_there_and_back_is_the_machine_s(readings):
     fit = fit_model(with_own_errors(readings), FEW)
     assert fit.verdict.unexplained.displacement.lack == pytest.approx(3e-6 * np.sqrt(3.0), rel=0.2)
     assert fit.level.high > 3e-6 * np.sqrt(3.0)
-    assert any("there and back alike" in note for note in fit.notes)
+    assert any("(discrepancy)" in note for note in fit.notes)
 
 
-def test_noise_that_does_not_repeat_is_no_error_that_stays(readings):
+def test_noise_beyond_the_stated_is_promised(readings):
     """Four times the stated noise: in doubt, above three times, but written, below ten.
 
-    Whether instrument or machine scatters so nobody can tell: the upper end has it, the lower end has not.
+    Whether instrument or machine scatters so nobody can tell without repeats: it is a discrepancy, which the upper end
+    has and the lower end has not.
     """
     noise = 4e-6 * np.random.default_rng(2).standard_normal(len(readings))
     fit = fit_model(readings.with_values(readings.value + noise), FEW)
     beyond = fit.verdict.unexplained
-    assert beyond.displacement.lack == beyond.rotation.lack == 0.0
     for part in (beyond.displacement, beyond.rotation):
-        assert part.stops == pytest.approx(4e-6 * np.sqrt(3.0), rel=0.1)
+        assert part == Scatter(lack=pytest.approx(4e-6 * np.sqrt(3.0), rel=0.1))
     assert fit.level.low < 1e-6
     assert fit.level.high > 4e-6 * np.sqrt(3.0)
     assert fit.misfit == ""
@@ -144,16 +147,56 @@ def with_stops(cycles: int, seed: int) -> MeasurementSet:
     return measured(virtual_machine(seed), campaign(cycles=cycles, repeatability=1e-6), seed)
 
 
-def test_the_machine_s_repeatability_stays_in_use():
-    """The tool stops √3 µm off, RMS, whatever the model says; some 600 readings tell that to 10 %."""
-    fit = fit_model(with_stops(1, 3), FEW)
-    scatter = fit.verdict.unexplained.displacement
-    assert scatter.stops == pytest.approx(1e-6 * np.sqrt(3.0), rel=0.1)
-    assert scatter.lack == 0.0
+@pytest.mark.parametrize(("cycles", "widest"), [(1, 1.6), (2, 1.3)])
+def test_the_machine_s_repeatability_stays_in_use(cycles: int, widest: float):
+    """The tool stops √3 µm off, RMS, whatever the model says; 600 readings, or as many repeats, tell that to 10 %.
+
+    It is called repeatability where repeats show it; without repeats it may be an error that is not in the model.
+    """
+    fit = fit_model(with_stops(cycles, 3), FEW)
+    scatter, found = fit.verdict.unexplained.displacement, pytest.approx(1e-6 * np.sqrt(3.0), rel=0.1)
+    assert (scatter.lack, scatter.stops) == ((found, 0.0) if cycles == 1 else (0.0, found))
     left = held_out(virtual_machine(3), fit.model, BOX, repeatability=1e-6).aligned.rms
-    assert fit.level.low < left < fit.level.high < 1.3 * left
+    assert fit.level.low < left < fit.level.high < widest * left
     assert fit.level.after == pytest.approx(left, rel=0.1)
-    assert any("the machine's own repeatability, 1." in note for note in fit.notes)
+    said = "(discrepancy)" if cycles == 1 else "the machine's own repeatability, 1."
+    assert any(said in note for note in fit.notes)
+
+
+def lost_motion(stations: Stations, structure: Structure) -> np.ndarray:
+    """Return what friction adds to each strut's length, (N, 6), m: by the sign of its speed, and unlike along it."""
+    lengths = strut_lengths_batch(structure, stations.positions, stations.rotations)
+    return 4e-6 * stations.sense[:, 3:] * np.cos(2.0 * np.pi * lengths / 0.06 + np.arange(6))
+
+
+@pytest.mark.parametrize("cycles", [1, 3])
+def test_friction_in_the_struts_is_no_repeatability(cycles: int):
+    """A lost motion that is different all along the struts is in no block; passes repeat it, but for 1 µm of stops.
+
+    The truth is the machine itself, moved through random points both ways.
+    """
+    truth, plan = virtual_machine(3), campaign(cycles=cycles, repeatability=1e-6)
+    structure, ours = Structure.of(truth.geometry), measured(truth, plan, 3)
+
+    def lost(stations: Stations, commands: np.ndarray) -> Stations:
+        return replace(stations, commands=commands + lost_motion(stations, structure))
+
+    rubbing = replace(ours, stations=lost(ours.stations, ours.stations.commands))
+    added = (station_errors(rubbing, truth) - station_errors(ours, truth))[ours.station]
+    added = (ours.directions() * added).sum(axis=1)
+    group = ours.run * len(CHANNELS) + ours.channel
+    first = np.unique(group, return_index=True)
+    added -= added[first[1]][np.searchsorted(first[0], group)]
+    fit = fit_model(ours.with_values(ours.value + added), FEW)
+
+    passes = random_passes(truth.geometry, BOX, 300, 0.0, np.random.default_rng(5))
+    trial, stations = Trial(truth, passes), stations_of(passes)
+    errors = trial.errors(lost(stations, trial.commands(fit.model)).commands).aligned().displacement
+    errors = errors + 1e-6 * np.random.default_rng(6).standard_normal(errors.shape)
+    left, scatter = float(np.sqrt((errors**2).sum(axis=1).mean())), fit.verdict.unexplained.displacement
+    assert fit.level.low < left < fit.level.high < 2.2 * left
+    assert scatter.stops == (0.0 if cycles == 1 else pytest.approx(1e-6 * np.sqrt(3.0), rel=0.15))
+    assert scatter.lack > 2.0 * scatter.stops
 
 
 def test_repeated_readings_tell_repeatability_from_errors_that_stay():
