@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from .compensation.compensator import Compensator as Compensator
     from .compensation.compensator import Correction as Correction
     from .errors import HexapodError as HexapodError
-    from .formats.csv import read_poses as read_poses
     from .formats.json import json_text as json_text
     from .machine.geometry import HexapodGeometry as HexapodGeometry
     from .machine.geometry import load_geometry as load_geometry
@@ -44,6 +43,7 @@ if TYPE_CHECKING:
     from .machine.model import Temperatures as Temperatures
     from .machine.model_file import load_model as load_model
     from .machine.model_file import save_model as save_model
+    from .machine.pose_files import read_poses as read_poses
     from .measurements.files import read_measurements as read_measurements
     from .measurements.readings import MeasurementSet as MeasurementSet
     from .pose import Pose as Pose
@@ -67,13 +67,13 @@ _HOMES = {
     "compensation.checks": ("CheckResult", "check"),
     "compensation.compensator": ("Compensator", "Correction"),
     "errors": ("HexapodError",),
-    "formats.csv": ("read_poses",),
     "formats.json": ("json_text",),
     "machine.geometry": ("HexapodGeometry", "load_geometry"),
     "machine.kinematics": ("jacobian", "solve_pose", "strut_lengths"),
     "machine.limits": ("Limits",),
     "machine.model": ("MachineModel", "RealMachine", "Temperatures"),
     "machine.model_file": ("load_model", "save_model"),
+    "machine.pose_files": ("read_poses",),
     "measurements.files": ("read_measurements",),
     "measurements.readings": ("MeasurementSet",),
     "pose": ("Pose",),

@@ -101,6 +101,12 @@ class Pose:
         quaternion = np.array(quaternion_of(self.rotation))
         return quaternion if quaternion[3] >= 0.0 else -quaternion
 
+    def as_columns(self) -> dict[str, float]:
+        """Return it as files and JSON have it, mm and degrees: ``x_mm``, ``y_mm``, ``z_mm``, ``alpha_deg``, …"""
+        names = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
+        values = [*(self.position * 1e3).tolist(), *np.degrees(self.angles()).tolist()]
+        return dict(zip(names, values, strict=True))
+
     def inverse(self) -> Pose:
         """Return the pose of the outer frame seen from this one."""
         return Pose(-self.rotation.T @ self.position, self.rotation.T)

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from itertools import groupby
 from typing import Any
 
-from ..errors import CommandError, HexapodError
+from ..errors import CommandError, HexapodError, InputFileError
 from ..formats.outputs import protected
 from ..formats.texts import run_with_plain_streams
 from .verbs import DESCRIPTION, EPILOG, GONE, VERBS, Verb
@@ -21,6 +21,9 @@ PROGRAM = "hexapod_comp"
 
 ALIASES = {verb.alias: name for name, verb in VERBS.items() if verb.alias}  # old names of verbs, which still work
 NEGATIVE = re.compile(r"-[.\d]")  # what follows an option and looks like this is its value, not another option
+
+NUMBERS = re.compile(r"[-+.\d]+(,[-+.\d]+)+")  # what was meant to be read as it stands, not a file's name
+TYPED = {"poses": "--pose", "lengths": "--lengths"}  # options that take what files of a kind hold
 
 # Verbs whose matrices are too small for the threads of NumPy's BLAS, which on busy cores wait for each other
 ONE_THREAD = ("fit", "verify", "demo")
@@ -57,9 +60,10 @@ def _run(arguments: Sequence[str]) -> int:
     if args.called != args.verb:
         print(f"{PROGRAM}: note: {args.called} is now called {args.verb}", file=sys.stderr)
     verb = VERBS[args.verb]
-    named = {role: {o.dest: getattr(args, o.dest) for o in verb.options if o.role == role} for role in ROLES}
+    named = {role: {o.label: getattr(args, o.dest) for o in verb.options if o.role == role} for role in ROLES}
     try:
         _refuse_what_does_not_go_together(verb, args)
+        _refuse_numbers_as_files(verb, args)
         with protected(*named.values()):
             if args.verb in ONE_THREAD:  # NumPy reads this when it is loaded, and nothing has loaded it yet
                 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -117,6 +121,15 @@ def _refuse_what_does_not_go_together(verb: Verb, args: argparse.Namespace) -> N
     for rule in verb.rules:
         if problem := rule.problem(given, label):
             raise CommandError("usage", problem)
+
+
+def _refuse_numbers_as_files(verb: Verb, args: argparse.Namespace) -> None:
+    """Raise where numbers stand in the place of a file that holds such, and say which option takes them."""
+    names = {option.name for option in verb.options}
+    for option in verb.options:
+        typed, name = TYPED.get(option.kind), getattr(args, option.dest)
+        if typed in names and name and NUMBERS.fullmatch(name) and not os.path.exists(name):
+            raise InputFileError(name, "", f"there is no such file; numbers go with an option: {typed} {name}")
 
 
 class _Parser(argparse.ArgumentParser):

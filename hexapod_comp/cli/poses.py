@@ -13,20 +13,13 @@ from ..compensation.checks import CheckResult
 from ..compensation.checks import check as check_limits
 from ..errors import CommandError, KinematicsError, NotConvergedError, NotFiniteError, UnreachableError
 from ..formats import texts
-from ..formats.csv import (
-    LENGTH_COLUMNS,
-    PREDICTED_ERRORS,
-    Row,
-    length_values,
-    pose_values,
-    read_lengths,
-    read_pose_arrays,
-)
+from ..formats.csv import Row
 from ..machine.assembly import ORIENTATIONS, assembly_modes, is_six_three, mode_objections, working_mode
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry, Limits, load_geometry, pose_text
 from ..machine.kinematics import Structure, solve_pose, solve_poses
 from ..machine.model import DIRECTIONS, FOLLOWED, MachineModel, RealMachine
 from ..machine.passes import Passes
+from ..machine.pose_files import LENGTH_COLUMNS, PREDICTED_ERRORS, length_values, read_lengths, read_pose_arrays
 from ..machine.region import region_json, region_text
 from ..pose import Pose, rotation_from_angles, stacked
 from . import results
@@ -130,7 +123,7 @@ class Targets:
         columns |= {"direction": self.directions[n]} if with_model else {}
         if self.along is not None:
             columns["along_mm"] = float(self.along[n]) * 1e3
-            columns |= pose_values(Pose(self.positions[n], self.rotations[n]))
+            columns |= Pose(self.positions[n], self.rotations[n]).as_columns()
         columns |= length_values(command if with_model else nominal)
         if with_model:
             columns |= {f"nominal_{name}": value for name, value in length_values(nominal).items()}
@@ -251,7 +244,7 @@ def fk(args: argparse.Namespace) -> Result:
     if args.all_modes:
         return _all_modes(args, geometry, lengths[0])
     poses = zip(rows, _solved(args, geometry, model, rows, lengths), strict=True)
-    table = [{"sequence": row.label, **pose_values(geometry.tool_pose(pose))} for row, pose in poses]
+    table = [{"sequence": row.label, **geometry.tool_pose(pose).as_columns()} for row, pose in poses]
     content = results.about(geometry, model)
     content |= {"direction": args.direction or "midway"} if args.model != "ideal" else {}
 
@@ -311,7 +304,7 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
     for index, mode in enumerate(modes, start=1):
         same = working is not None and all(map(np.array_equal, stacked([mode]), stacked([working])))
         objections = mode_objections(geometry, structure, mode)
-        values = pose_values(geometry.tool_pose(mode))
+        values = geometry.tool_pose(mode).as_columns()
         listed.append({"mode": index, **values, "working": same, "objections": objections})
 
     def text() -> str:
@@ -549,13 +542,13 @@ def assess(args: argparse.Namespace) -> Result:
                     **{f"ideal_{k}": v for k, v in length_values(result.ideal_lengths[n]).items()},
                     **{f"real_{k}": v for k, v in length_values(result.real_lengths[m, n]).items()},
                     **{f"change_L{i + 1}_um": float(v) * 1e6 for i, v in enumerate(result.strut_changes[m, n])},
-                    **{f"taken_{k}": v for k, v in pose_values(taken).items()},
+                    **{f"taken_{k}": v for k, v in taken.as_columns().items()},
                     **{f"error_{k}": float(v) * 1e6 for k, v in errors},
                     "round_trip_um": trip[0],
                     "round_trip_urad": trip[1],
                 }
             )
-    commanded = [{"sequence": row.label, **pose_values(pose)} for row, pose in zip(rows, poses, strict=True)]
+    commanded = [{"sequence": row.label, **pose.as_columns()} for row, pose in zip(rows, poses, strict=True)]
     statistics = result.statistics(tuple(PERCENTILES.values()))
     distance, angle = float(result.round_trip[..., 0].max()), float(result.round_trip[..., 1].max())
 

@@ -12,11 +12,12 @@ from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 from ..errors import InputFileError
-from ..formats.csv import Row, read_poses
+from ..formats.csv import Row
 from ..formats.json import json_text
 from ..formats.paths import input_file
 from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.model import MachineModel
+from ..machine.pose_files import read_poses
 from ..virtual.named import find_model, is_random, is_word, truth_name
 from . import results
 from .results import Result

@@ -1,4 +1,4 @@
-"""CSV files of poses and of strut lengths: units in the column names, errors that name row and column.
+"""CSV files: units in the column names, errors that name row and column.
 
 What separates the columns shows in the header: commas or else semicolons or else tabs. Where it is not commas, numbers
 may have decimal commas, as spreadsheets of many countries write them.
@@ -22,25 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from ..core import QUATERNION_NORM_TOLERANCE
-from ..errors import InputFileError, PoseError
-from ..pose import Pose, angles_from_rotation, rotation_from_angles
+from ..errors import InputFileError
 from .files import MAX_CSV_BYTES, open_input, too_large
-from .paths import input_file
 from .schema import LARGEST, UNITS, spellings
 from .texts import DECIMAL_COMMA, MICRO_ERRORS, THOUSANDS, number_hint, plain_number
 
 LABEL_COLUMNS = ("sequence", "name")
-POSITION_COLUMNS = ("x", "y", "z")
-ANGLE_COLUMNS = ("alpha", "beta", "gamma")
-QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
-LENGTH_COLUMNS = tuple(f"L{i}" for i in range(1, 7))
-NOMINAL_COLUMNS = tuple(f"nominal_L{i}" for i in range(1, 7))
-CORRECTION_COLUMNS = tuple(f"correction_L{i}" for i in range(1, 7))
-ALONG_COLUMNS = ("along", *POSITION_COLUMNS)  # what `ik --line` says of where a pose is, besides its angles
-
-# What `ik --model` says of the tool's error, each for x, y, z and rx, ry, rz
-PREDICTED_ERRORS = tuple(f"{error}_{{}}{known}" for error in ("error", "error_aligned") for known in ("", "_sd"))
 
 MAX_ROWS = 2_000_000  # longer files are refused: an hour's path at 500 Hz fits, a device that never ends does not
 MAX_COLUMNS = 1000  # wider files are refused: other laboratories' have some dozen columns
@@ -101,18 +88,109 @@ AS_USUAL = Layout()
 
 
 class Table:
-    """A CSV file with its header understood."""
+    """A CSV file with its header understood: less empty rows and comments."""
 
     def __init__(self, path: str | Path, layout: Layout = AS_USUAL) -> None:
         self.path = path
-        content = _read_content(path, layout)
-        self.header, self.rows, self.sha256, self.notes = content.header, content.rows, content.sha256, content.notes
-        separator = content.separator
+        self.header: list[str] = []
+        self.rows: list[tuple[int, list[str]]] = []  # line in the file, and cells
+        self.sha256, self._separator = "", ","
+        self.notes: list[str] = []
+        self._read(layout)
         if not self.rows:
             raise InputFileError(path, "", "has a header but no rows" if self.header else "has no header")
-        if separator != ",":
+        if self._separator != ",":
             self._point_decimals()
         self._known: set[str] = {name for name in LABEL_COLUMNS if name in self.header}
+
+    # ---- reading ----
+
+    def _read(self, layout: Layout) -> None:
+        """Read the file; again as Windows-1252 where it is not UTF-8 and nothing else was said."""
+        with open_input(self.path, MAX_CSV_BYTES) as file:
+            again = not layout.encoding and file.seekable()
+            start = file.read(2) if again else b""
+            encoding = layout.encoding or ("utf-16" if start in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8")
+            for attempt in (encoding, "windows-1252"):
+                if again:
+                    file.seek(0)
+                try:
+                    self._decode(file, layout, attempt)
+                    return
+                except UnicodeDecodeError as error:
+                    if attempt != "utf-8" or not again:
+                        problem = f"is not {attempt.upper()} text"
+                        if not layout.encoding:
+                            problem += "; spreadsheets have 'CSV UTF-8' among the formats in which they save"
+                        raise InputFileError(self.path, "", problem) from error
+
+    def _decode(self, file: io.FileIO, layout: Layout, encoding: str) -> None:
+        """Take header and rows of a file of a given encoding."""
+        source, self.rows = _Hashed(file, self.path, MAX_CSV_BYTES), []
+        options = {"utf-8": ("utf-8-sig", MICRO_ERRORS), "windows-1252": ("cp1252", "replace")}
+        codec, errors = options.get(encoding, (encoding, "strict"))
+        stream = io.TextIOWrapper(io.BufferedReader(source), newline="", encoding=codec, errors=errors)
+        text, lines = self._bounded_lines(stream), None
+        before = sum(1 for _ in itertools.islice(text, layout.above))
+        try:
+            header = ""  # the first line, below the skipped ones, that is neither empty nor a comment
+            for line in text:
+                if line.strip() and not line.lstrip().startswith(("#", '"#')):
+                    header = line
+                    break
+                before += 1
+            self._separator = next((mark for mark in SEPARATORS if mark in QUOTED.sub("", header)), ",")
+            lines = csv.reader(itertools.chain([header], text), delimiter=self._separator, skipinitialspace=True)
+            self._take_header(next(lines, []))
+            for _ in itertools.islice(lines, layout.below):
+                pass
+            for row in lines:
+                if row and not row[0].startswith("#"):
+                    self._take_row(before + lines.line_num, row)
+        except csv.Error as error:
+            line_number = before + (lines.line_num if lines else 0)
+            raise InputFileError(self.path, f"line {line_number}", f"is not CSV: {error}") from error
+        except OSError as error:
+            raise InputFileError(self.path, "", f"cannot be read: {error.strerror}") from error
+        if encoding == "windows-1252" and not layout.encoding:
+            self.notes = [f"{self.path}: is not UTF-8; its names were read as Windows-1252"]
+        self.sha256 = source.sha256.hexdigest()
+
+    def _bounded_lines(self, stream: io.TextIOWrapper) -> Iterator[str]:
+        """Yield the lines of a stream; refuse one too long, and the zero bytes that spreadsheets never write."""
+        for number, line in enumerate(iter(partial(stream.readline, MAX_LINE + 1), ""), start=1):
+            if len(line) > MAX_LINE:
+                problem = f"is longer than the allowed {MAX_LINE} characters"
+                raise InputFileError(self.path, f"line {number}", problem)
+            if "\0" in line:
+                raise InputFileError(self.path, f"line {number}", "is not text: it holds a zero byte")
+            yield line
+
+    def _take_header(self, cells: list[str]) -> None:
+        if len(cells) > MAX_COLUMNS:
+            raise InputFileError(self.path, "header", f"has {len(cells)} columns, at most {MAX_COLUMNS} are allowed")
+        self.header = [name.strip() for name in cells]
+        twice = next((name for name in self.header if name and self.header.count(name) > 1), None)
+        if twice is not None:
+            raise InputFileError(self.path, "header", "column is given twice", twice)
+
+    def _take_row(self, line: int, cells: list[str]) -> None:
+        if len(cells) != len(self.header):
+            hint, own = "", SEPARATORS[self._separator]
+            others = [name for mark, name in SEPARATORS.items() if name != own and any(mark in cell for cell in cells)]
+            if len(self.header) == 1:
+                hint = "; is that the header? A columns file skips titles above it: table: rows_above_header"
+            elif others:
+                hint = f"; {own} separate columns here, as in the header, and this line has {others[0]} too"
+            elif own == "commas":
+                hint = "; are its decimal points commas? Then separate columns by semicolons"
+            problem = f"has {len(cells)} columns, the header has {len(self.header)}{hint}"
+            raise InputFileError(self.path, f"line {line}", problem)
+        if len(self.rows) >= MAX_ROWS:
+            raise InputFileError(self.path, "", f"has more than the allowed {MAX_ROWS} rows")
+        if len(self.rows) * len(cells) >= MAX_CELLS:
+            raise InputFileError(self.path, "", f"has more than the allowed {MAX_CELLS} cells")
+        self.rows.append((line, cells))
 
     def _point_decimals(self) -> None:
         """Give numbers with decimal commas points; refuse a file in which a comma may mean two things."""
@@ -135,6 +213,8 @@ class Table:
             raise InputFileError(self.path, where, problem, cell)
         for _, row, k in commas:
             row[k] = row[k].replace(",", ".")
+
+    # ---- columns ----
 
     def column(self, name: str, dimension: str | None) -> tuple[int, float] | None:
         """Return index and unit of a column, or None when there is none of that name."""
@@ -166,7 +246,8 @@ class Table:
 
     def _missing(self, name: str, dimension: str | None) -> InputFileError:
         """Return (not raise) the complaint about a column that is not there."""
-        problem = f"column {_column_names(name, dimension)} is missing"
+        named = name if dimension is None else " or ".join(f"{name}_{unit}" for unit in UNITS[dimension])
+        problem = f"column {named} is missing"
         if len(self.header) > 1:
             return InputFileError(self.path, "header", problem)
         problem += f"; columns are separated by {', '.join(SEPARATORS.values())}, and this is one column"
@@ -196,28 +277,6 @@ class Table:
         cells = [row[index] for _, row in self.rows]
         known = {cell: unmarked(cell.strip()) for cell in set(cells)}
         return [known[cell] for cell in cells]
-
-    def poses(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the poses of the columns that :func:`read_poses` describes, shapes (N, 3), (N, 3, 3)."""
-        columns = self.required(POSITION_COLUMNS, "length")
-        angle_columns = self.columns(ANGLE_COLUMNS, "angle")
-        quaternion_columns = self.columns(QUATERNION_COLUMNS, None)
-        if angle_columns and quaternion_columns:
-            raise InputFileError(self.path, "header", "give either angles or a quaternion, not both")
-        positions = self.numbers(columns)
-        if quaternion_columns:
-            quaternions = self.numbers(quaternion_columns)
-            return positions, _rotations_from_quaternions(self.path, self.labels(), quaternions)
-        angles = self.numbers(angle_columns) if angle_columns else np.zeros((len(self.rows), 3))
-        return positions, self.rotations(angles)
-
-    def rotations(self, angles: np.ndarray) -> np.ndarray:
-        """Return the rotation matrices (N, 3, 3) of the rows' angles (N, 3), rad."""
-        try:
-            return rotation_from_angles(angles)
-        except PoseError as error:
-            row = int(np.abs(angles).max(axis=1).argmax())
-            raise InputFileError(self.path, f"line {self.rows[row][0]}", str(error)) from error
 
     def number(self, line: int, index: int, text: str) -> float:
         """Return the finite number in a cell."""
@@ -261,118 +320,6 @@ class _Hashed(io.RawIOBase):
         return count
 
 
-class _Content:
-    """The header and rows of a CSV file, less empty ones and comments; its separator and SHA-256."""
-
-    def __init__(self) -> None:
-        self.header: list[str] = []
-        self.rows: list[tuple[int, list[str]]] = []
-        self.separator, self.sha256 = ",", ""
-        self.notes: list[str] = []
-
-    def take_header(self, path: str | Path, cells: list[str]) -> None:
-        """Take the header's cells."""
-        if len(cells) > MAX_COLUMNS:
-            raise InputFileError(path, "header", f"has {len(cells)} columns, at most {MAX_COLUMNS} are allowed")
-        self.header = [name.strip() for name in cells]
-        twice = next((name for name in self.header if name and self.header.count(name) > 1), None)
-        if twice is not None:
-            raise InputFileError(path, "header", "column is given twice", twice)
-
-    def take_row(self, path: str | Path, line: int, cells: list[str]) -> None:
-        """Take a row's cells."""
-        if len(cells) != len(self.header):
-            problem = f"has {len(cells)} columns, the header has {len(self.header)}"
-            if len(self.header) == 1:
-                hint = "; is that the header? A columns file skips titles above it: table: rows_above_header"
-            else:
-                hint = _other_separator(cells, self.separator)
-            raise InputFileError(path, f"line {line}", problem + hint)
-        if len(self.rows) >= MAX_ROWS:
-            raise InputFileError(path, "", f"has more than the allowed {MAX_ROWS} rows")
-        if len(self.rows) * len(cells) >= MAX_CELLS:
-            raise InputFileError(path, "", f"has more than the allowed {MAX_CELLS} cells")
-        self.rows.append((line, cells))
-
-
-def _read_content(path: str | Path, layout: Layout) -> _Content:
-    """Return what a CSV file holds; read again as Windows-1252 where it is not UTF-8 and nothing else was said."""
-    with open_input(path, MAX_CSV_BYTES) as file:
-        again = not layout.encoding and file.seekable()
-        start = file.read(2) if again else b""
-        encoding = layout.encoding or ("utf-16" if start in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8")
-        for attempt in (encoding, "windows-1252"):
-            if again:
-                file.seek(0)
-            try:
-                return _decoded(path, file, layout, attempt)
-            except UnicodeDecodeError as error:
-                if attempt != "utf-8" or not again:
-                    problem = f"is not {attempt.upper()} text"
-                    if not layout.encoding:
-                        problem += "; spreadsheets have 'CSV UTF-8' among the formats in which they save"
-                    raise InputFileError(path, "", problem) from error
-    raise AssertionError("Windows-1252 decodes all bytes, or raises")
-
-
-def _decoded(path: str | Path, file: io.FileIO, layout: Layout, encoding: str) -> _Content:
-    """Return what a file of a given encoding holds."""
-    content, source = _Content(), _Hashed(file, path, MAX_CSV_BYTES)
-    options = {"utf-8": ("utf-8-sig", MICRO_ERRORS), "windows-1252": ("cp1252", "replace")}
-    codec, errors = options.get(encoding, (encoding, "strict"))
-    stream = io.TextIOWrapper(io.BufferedReader(source), newline="", encoding=codec, errors=errors)
-    before, lines = 0, None
-    try:
-        before, header, rest = _up_to_header(_bounded_lines(path, stream), layout.above)
-        content.separator = next((mark for mark in SEPARATORS if mark in QUOTED.sub("", header)), ",")
-        lines = csv.reader(itertools.chain([header], rest), delimiter=content.separator, skipinitialspace=True)
-        content.take_header(path, next(lines, []))
-        skipped = 0
-        for row in lines:
-            if skipped < layout.below:
-                skipped += 1
-            elif row and not row[0].startswith("#"):
-                content.take_row(path, before + lines.line_num, row)
-    except csv.Error as error:
-        line = before + (lines.line_num if lines else 0)
-        raise InputFileError(path, f"line {line}", f"is not CSV: {error}") from error
-    except OSError as error:
-        raise InputFileError(path, "", f"cannot be read: {error.strerror}") from error
-    if encoding == "windows-1252" and not layout.encoding:
-        content.notes = [f"{path}: is not UTF-8; its names were read as Windows-1252"]
-    content.sha256 = source.sha256.hexdigest()
-    return content
-
-
-def _up_to_header(lines: Iterator[str], skipped: int) -> tuple[int, str, Iterator[str]]:
-    """Return how many lines stand before the first, below the skipped ones, that is neither empty nor a comment, that
-    line, and the rest."""
-    before = sum(1 for _ in itertools.islice(lines, skipped))
-    for line in lines:
-        if line.strip() and not line.lstrip().startswith(("#", '"#')):
-            return before, line, lines
-        before += 1
-    return before, "", lines
-
-
-def _other_separator(row: list[str], separator: str) -> str:
-    """Return what may have gone wrong with a row that has not as many columns as the header, to follow a complaint."""
-    others = [name for mark, name in SEPARATORS.items() if mark != separator and any(mark in cell for cell in row)]
-    if others:
-        return f"; {SEPARATORS[separator]} separate columns here, as in the header, and this line has {others[0]} too"
-    return "; are its decimal points commas? Then separate columns by semicolons" if separator == "," else ""
-
-
-def _bounded_lines(path: str | Path, stream: io.TextIOWrapper) -> Iterator[str]:
-    """Yield the lines of a stream; refuse one too long, and the zero bytes that spreadsheets never write."""
-    for number, line in enumerate(iter(partial(stream.readline, MAX_LINE + 1), ""), start=1):
-        if len(line) > MAX_LINE:
-            raise InputFileError(path, f"line {number}", f"is longer than the allowed {MAX_LINE} characters")
-        if "\0" in line:
-            raise InputFileError(path, f"line {number}", "is not text: it holds a zero byte")
-        yield line
-
-
 # Digits by which a unit of such a size moves the decimal point
 SHIFTS = {10.0**digits: digits for digits in range(-9, 10)}
 
@@ -391,85 +338,3 @@ def si_from_text(text: str, number: float, unit: float) -> float:
 def exact(text: str, number: float) -> Decimal:
     """Return a number that stands in a file as a decimal, without rounding it first."""
     return Decimal(repr(number)) if "e" in text.lower() else Decimal(text)
-
-
-def _column_names(name: str, dimension: str | None) -> str:
-    if dimension is None:
-        return name
-    return " or ".join(f"{name}_{unit}" for unit in UNITS[dimension])
-
-
-def read_poses(path: str | Path) -> tuple[list[Row], list[Pose]]:
-    """Read poses from a CSV file; the name of a shipped one, as ``table1.csv``, or ``-`` for standard input will do.
-
-    Columns: ``x_mm``, ``y_mm``, ``z_mm`` (or ``_m``, ``_um``, ``_in``); optionally ``alpha_deg``,
-    ``beta_deg``, ``gamma_deg`` (the paper's angles; or ``_rad``, …) or ``qx``, ``qy``, ``qz``, ``qw``;
-    optionally ``sequence`` or ``name``. Lines that start with ``#`` are skipped.
-
-    Returns
-    -------
-    rows : list of Row
-        Where each pose stands.
-    poses : list of Pose
-        m and rotation matrices.
-
-    Raises
-    ------
-    InputFileError
-        Naming file, line and column.
-    """
-    rows, positions, rotations = read_pose_arrays(path)
-    return rows, [Pose(p, r) for p, r in zip(positions, rotations, strict=True)]
-
-
-def read_pose_arrays(path: str | Path) -> tuple[list[Row], np.ndarray, np.ndarray]:
-    """Read poses as :func:`read_poses` does, for files of many thousand rows."""
-    table = Table(input_file(path, "poses"))
-    positions, rotations = table.poses()
-    table.refuse_unknown()
-    return table.labels(), positions, rotations
-
-
-def _rotations_from_quaternions(path: str | Path, rows: list[Row], quaternions: np.ndarray) -> np.ndarray:
-    """Return rotation matrices, (N, 3, 3); refuse the first row that is no unit quaternion."""
-    wrong = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > QUATERNION_NORM_TOLERANCE
-    if wrong.any():
-        row = int(wrong.argmax())
-        try:
-            Pose.from_quaternion(np.zeros(3), quaternions[row])
-        except PoseError as error:
-            raise InputFileError(path, f"line {rows[row].line}, columns qx…qw", str(error)) from error
-    from scipy.spatial.transform import Rotation  # 27 MB that a node, which reads other tables, does without
-
-    return Rotation.from_quat(quaternions).as_matrix()
-
-
-def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
-    """Read strut lengths from a CSV file (or ``-``) with the columns ``L1_mm`` … ``L6_mm`` (or ``_m``, …)."""
-    # The columns that `ik --model` and `ik --line` add are known and passed over: `nominal_L…`, `correction_L…`,
-    # `error_…`, `direction`, `along` and the pose.
-    table = Table(input_file(path, "lengths"))
-    lengths = table.numbers(table.required(LENGTH_COLUMNS, "length"))
-    shifts, turns = (
-        tuple(n.format(axis) for n in PREDICTED_ERRORS for axis in axes) for axes in ("xyz", ("rx", "ry", "rz"))
-    )
-    for group in (NOMINAL_COLUMNS, CORRECTION_COLUMNS, shifts, ALONG_COLUMNS):
-        table.columns(group, "length")
-    for group in (turns, ANGLE_COLUMNS):
-        table.columns(group, "angle")
-    table.columns(("direction",), None)
-    table.refuse_unknown()
-    return table.labels(), lengths
-
-
-def pose_values(pose: Pose) -> dict[str, float]:
-    """Return a pose as the columns that :func:`read_poses` reads: mm and degrees."""
-    x, y, z = pose.position * 1e3
-    alpha, beta, gamma = np.degrees(angles_from_rotation(pose.rotation))
-    names = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
-    return {name: float(value) for name, value in zip(names, (x, y, z, alpha, beta, gamma), strict=True)}
-
-
-def length_values(lengths: np.ndarray) -> dict[str, float]:
-    """Return six lengths as the columns that :func:`read_lengths` reads, mm."""
-    return {f"{name}_mm": float(value) * 1e3 for name, value in zip(LENGTH_COLUMNS, lengths, strict=True)}

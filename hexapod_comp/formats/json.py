@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 
 from ..errors import HexapodError
-from ..pose import Pose
-from .csv import pose_values
 from .files import MAX_FILE_BYTES
 from .texts import CODES
 
@@ -58,8 +56,8 @@ def plain(value: Any) -> Any:
 
 def _parts(value: Any) -> Any:
     """Return what an object is made of."""
-    if isinstance(value, Pose):
-        return pose_values(value)
+    if hasattr(value, "as_columns"):  # a pose
+        return value.as_columns()
     if isinstance(value, tuple):
         return value._asdict()  # type: ignore[attr-defined]
     if is_dataclass(value) and not isinstance(value, type):

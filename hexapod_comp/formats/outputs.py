@@ -54,7 +54,7 @@ def _refuse_unwritable(files: Mapping[str, str]) -> None:
             continue
         other = taken.setdefault(os.path.realpath(path), name)
         if other != name:
-            raise InputFileError(path, "", f"cannot hold both what --{other} and what --{name} write")
+            raise InputFileError(path, "", f"cannot hold both what {other} and what {name} write")
 
 
 def refuse_replacing_input(path: str | Path) -> None:

@@ -23,8 +23,6 @@ SUFFIXES = {"poses": (".csv",), "lengths": (".csv",), "readings": (".csv",)}
 # What stands in the header of CSV files of a kind
 COLUMNS = {"poses": re.compile(r'(?:^|[",;\t])\s*x_'), "lengths": re.compile(r'(?:^|[",;\t])\s*L1_')}
 
-NUMBERS = re.compile(r"[-+.\d]+(,[-+.\d]+)+")  # what was meant to be read as it stands, not a file's name
-TYPED = {"poses": "--pose", "lengths": "--lengths"}  # options that take what files of a kind hold
 MOST_LISTED = 12  # names in a message about a file that is missing
 MOST_LOOKED_AT = 500  # files of a folder that are looked into for those of a kind
 
@@ -151,8 +149,6 @@ def version() -> str:
 def _no_such_file(name: str, kind: str, beside: bool) -> str:
     """Say that `name` is neither a file nor shipped, and which of its kind there are: beside it, and shipped."""
     own = os.path.expanduser(name)
-    if NUMBERS.fullmatch(name) and kind in TYPED:
-        return f"there is no such file; numbers go with an option: {TYPED[kind]} {name}"
     folder = os.path.dirname(own)
     if folder and not os.path.isdir(folder):
         return "there is no such file, nor its folder"

@@ -1,4 +1,4 @@
-"""What the files of people hold: keys that end in their unit, read strictly into SI, and written back to the same bits.
+"""What the files of people hold: keys that end in their unit, read strictly into SI, and back to the same numbers.
 
 A file's schema is a dataclass. The annotation of a field says what its key holds; a field with a default is optional::
 
@@ -8,10 +8,8 @@ A file's schema is a dataclass. The annotation of a field says what its key hold
         offset: Annotated[np.ndarray, Numbers("um", PER_STRUT)] = field(default_factory=lambda: np.zeros(6))
         outside: Annotated[str, Choice("hold", "refuse")] = "hold"
         wave: Wave | None = None               # a section with a schema of its own
-        lines: tuple[Line, ...] = ()           # a list of such sections
 
     struts = read(Struts, section)             # whatever is unknown, missing, not finite or of another shape is refused
-    content = write(struts)                    # with the units of the annotations, without what equals its default
 
 Fields without an annotation of this module are no keys: ``read(Campaign, top, level=...)`` gives them, and may give
 others in place of the file. :class:`Section` is what is read: values are taken out, and what stays behind is an error.
@@ -23,7 +21,7 @@ import difflib
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from decimal import Decimal
 from functools import cache
 from itertools import islice
@@ -182,23 +180,7 @@ class Section:
     def array(self, key: str, shape: Shape = ()) -> np.ndarray:
         """Take finite numbers of a given shape."""
         value = self.take(key)
-        self._refuse_non_numbers(key, value)
-        try:
-            array = np.array(value, dtype=float)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise self.error(key, f"must be numbers of shape {_shape_text(shape)}", value) from error
-        if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
-            raise self.error(key, f"must be numbers of shape {_shape_text(shape)}, not {_shape_text(array.shape)}")
-        if not np.isfinite(array).all():
-            bad = np.argwhere(~np.isfinite(array))[0]
-            raise self.error(key + "".join(f"[{i}]" for i in bad), "must be finite", float(array[tuple(bad)]))
-        if (np.abs(array) > LARGEST).any():
-            raise self.error(key, f"must be numbers within ±{LARGEST:g}", float(array.flat[np.abs(array).argmax()]))
-        return array
-
-    def _refuse_non_numbers(self, key: str, value: Any) -> None:
-        """Raise on text, booleans or mappings anywhere inside nested lists."""
-        stack = [(key, value)]
+        stack = [(key, value)]  # text, booleans or mappings anywhere inside nested lists are refused
         while stack:
             where, item = stack.pop()
             if isinstance(item, list):
@@ -206,6 +188,19 @@ class Section:
             elif isinstance(item, bool) or not isinstance(item, int | float):
                 hint = number_hint(item) if isinstance(item, str) else ""
                 raise self.error(where, f"must be a number{hint}", item)
+        wanted = f"must be numbers of shape {_shape_text(shape)}"
+        try:
+            array = np.array(value, dtype=float)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise self.error(key, wanted, value) from error
+        if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
+            raise self.error(key, f"{wanted}, not {_shape_text(array.shape)}")
+        if not np.isfinite(array).all():
+            bad = np.argwhere(~np.isfinite(array))[0]
+            raise self.error(key + "".join(f"[{i}]" for i in bad), "must be finite", float(array[tuple(bad)]))
+        if (np.abs(array) > LARGEST).any():
+            raise self.error(key, f"must be numbers within ±{LARGEST:g}", float(array.flat[np.abs(array).argmax()]))
+        return array
 
     def quantity_key(self, name: str, dimension: str) -> str | None:
         """Return the key that carries `name` with a unit of `dimension`, or None when there is none."""
@@ -273,7 +268,7 @@ def complaints_about(path: str | Path) -> Iterator[None]:
 
 
 class Kind:
-    """How a key's value is taken from a section, and written."""
+    """How a key's value is taken from a section."""
 
     def read(self, section: Section, name: str, default: Any) -> Any:
         """Return the value of a key; the default where there is no such key, unless it is MISSING."""
@@ -282,10 +277,6 @@ class Kind:
     def take(self, section: Section, name: str) -> Any:
         """Return the value of a key that must be there."""
         raise NotImplementedError
-
-    def write(self, name: str, value: Any) -> tuple[str, Any]:
-        """Return key and value of a file."""
-        return name, value
 
 
 @dataclass(frozen=True)
@@ -309,6 +300,7 @@ class Numbers(Kind):
         return values if np.ndim(values) else float(values)
 
     def write(self, name: str, value: Any) -> tuple[str, Any]:
+        """Return key and value of a file."""
         if self.shape == PER_STRUT and (value == value[0]).all():
             value = value[0]
         return (f"{name}_{self.unit}", in_unit(value, self.unit)) if self.unit else (name, np.asarray(value).tolist())
@@ -359,9 +351,6 @@ class Names(Kind):
             raise section.error(name, f"must be a list of {count}{self.what}", given)
         return tuple(given)
 
-    def write(self, name: str, value: Any) -> tuple[str, Any]:
-        return name, list(value)
-
 
 @dataclass(frozen=True)
 class Unit(Kind):
@@ -375,41 +364,30 @@ class Unit(Kind):
 
 @dataclass(frozen=True)
 class Nested(Kind):
-    """A section with a schema of its own, or a list of such sections."""
+    """A section with a schema of its own."""
 
     schema: Any
-    listed: bool = False
 
     def take(self, section: Section, name: str) -> Any:
-        if self.listed:
-            return tuple(read_whole(self.schema, one) for one in section.sections(name))
         return read_whole(self.schema, section.section(name))
-
-    def write(self, name: str, value: Any) -> tuple[str, Any]:
-        return name, [write(one) for one in value] if self.listed else write(value)
 
 
 @cache
 def keys_of(schema: type) -> dict[str, tuple[Any, Any]]:
     """Return what each field of a schema holds, by its annotation, and its default (MISSING: the key is required)."""
-    hints = get_type_hints(schema, include_extras=True)
-    result = {one.name: (_kind(hints[one.name]), _default(one)) for one in fields(schema)}
-    return {name: pair for name, pair in result.items() if pair[0] is not None}
-
-
-def _default(one: Field[Any]) -> Any:
-    return one.default if one.default_factory is MISSING else one.default_factory()
+    hints, keys = get_type_hints(schema, include_extras=True), {}
+    for one in fields(schema):
+        if (kind := _kind(hints[one.name])) is not None:
+            keys[one.name] = kind, one.default if one.default_factory is MISSING else one.default_factory()
+    return keys
 
 
 def _kind(hint: Any) -> Any:
-    """Return what an annotation says of a key: a kind, a schema, a schema or None, a tuple of schemas; else None."""
+    """Return what an annotation says of a key: a kind, a schema, or None or one of these; else None."""
     if get_origin(hint) is Annotated:
         return next((kind for kind in get_args(hint)[1:] if isinstance(kind, Kind)), None)
-    parts = get_args(hint)
     if get_origin(hint) in (Union, UnionType):
-        return next((kind for part in parts if (kind := _kind(part)) is not None), None)
-    if get_origin(hint) is tuple and len(parts) == 2 and parts[1] is Ellipsis:
-        return Nested(parts[0], listed=True) if is_dataclass(parts[0]) and keys_of(parts[0]) else None  # type: ignore[arg-type]
+        return next((kind for part in get_args(hint) if (kind := _kind(part)) is not None), None)
     return Nested(hint) if is_dataclass(hint) and keys_of(hint) else None  # type: ignore[arg-type]
 
 
@@ -429,14 +407,3 @@ def read_whole(schema: Callable[..., T], section: Section, **given: Any) -> T:
     result = read(schema, section, **given)
     section.finish()
     return result
-
-
-def write(value: Any) -> dict[str, Any]:
-    """Return the content of a file that :func:`read` makes the same of, without what equals its default."""
-    content = {}
-    for name, (kind, default) in keys_of(type(value)).items():  # type: ignore[arg-type]
-        own = getattr(value, name)
-        if default is MISSING or not (own is default or np.array_equal(own, default)):
-            key, written = kind.write(name, own)
-            content[key] = written
-    return content

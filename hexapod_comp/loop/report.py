@@ -7,9 +7,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..formats.csv import Row, length_values
+from ..formats.csv import Row
 from ..formats.texts import aligned, number
 from ..machine.arrays import rms
+from ..machine.pose_files import length_values
 from ..machine.trajectory import Path, feet_on
 from ..pose import Pose, best_motion, rotation_angle
 

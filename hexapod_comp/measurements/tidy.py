@@ -11,12 +11,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import InputFileError, PoseError
-from ..formats.csv import ANGLE_COLUMNS, POSITION_COLUMNS, Table, csv_text, exact, si_from_text
+from ..formats.csv import Table, csv_text, exact, si_from_text
 from ..formats.outputs import write_text
 from ..formats.schema import UNITS, spellings
 from ..machine.arrays import changed_rows
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths
+from ..machine.pose_files import ANGLE_COLUMNS, POSITION_COLUMNS, poses_of
 from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
 from ..pose import Pose, angles_from_rotation, attitude_error
 from .air import AIR_RANGES, LARGEST_INDEX, Air, correct_displacement
@@ -131,7 +132,7 @@ def _directions(table: Table) -> list[int]:
 
 def _poses(table: Table) -> list[Pose]:
     """Return the commanded poses; rows with the same one share the object."""
-    positions, rotations = table.poses()
+    positions, rotations = poses_of(table)
     first, number = changed_rows(np.hstack([positions, rotations.reshape(-1, 9)]))
     known: dict[bytes, Pose] = {}
     poses = []

@@ -12,11 +12,12 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from ..errors import InputFileError, ModelError, PoseError
-from ..formats.csv import AS_USUAL, ENCODINGS, MOST_SKIPPED, Layout, Table, read_pose_arrays
+from ..formats.csv import AS_USUAL, ENCODINGS, MOST_SKIPPED, Layout, Table
 from ..formats.schema import MOST_NEIGHBOURS, PER_STRUT, Choice, Names, Numbers, Section, Text, Unit, Whole, read_whole
 from ..formats.yaml import read_yaml
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, solve_poses, strut_lengths_batch
+from ..machine.pose_files import read_pose_arrays, rotations_of
 from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
 from ..pose import Pose, attitude_error
 from .readings import AXES, FROM_PREVIOUS, UNKNOWN, FileLine, MeasurementSet, Reading
@@ -226,7 +227,7 @@ def _read_poses(table: Table, columns: PoseColumns, used: set[str]) -> _Poses:
         return _Poses(positions, np.tile(np.eye(3), (len(positions), 1, 1)))
     turns = _read_numbers(table, columns.turn, columns.angle_unit or 1.0, used)
     if len(columns.turn) == 3:
-        return _Poses(positions, table.rotations(turns))
+        return _Poses(positions, rotations_of(table, turns))
     rotations = np.empty((len(turns), 3, 3))
     for n, ((line, _), quaternion) in enumerate(zip(table.rows, turns, strict=True)):
         try:

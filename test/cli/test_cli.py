@@ -28,11 +28,11 @@ from hexapod_comp.cli.verbs import VERBS
 from hexapod_comp.compensation.checks import LIMITS, check
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.errors import GeometryError, HexapodError
-from hexapod_comp.formats.csv import read_lengths, read_poses
 from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import MachineModel, ModelOrigin, MotionState, RealMachine
 from hexapod_comp.machine.model_file import load_model, model_text
+from hexapod_comp.machine.pose_files import read_lengths, read_poses
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.pose import Pose
 

@@ -23,11 +23,12 @@ from hexapod_comp.errors import InputFileError
 from hexapod_comp.export.linuxcnc import read_genhexkins
 from hexapod_comp.export.table import read_table
 from hexapod_comp.formats import csv, files
-from hexapod_comp.formats.csv import Layout, Table, read_lengths, read_poses
+from hexapod_comp.formats.csv import Layout, Table
 from hexapod_comp.formats.json import json_content
 from hexapod_comp.formats.yaml import yaml_content
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.machine.pose_files import poses_of, read_lengths, read_poses
 from hexapod_comp.measurements.campaign import load_campaign
 from hexapod_comp.measurements.files import read_measurements
 from hexapod_comp.measurements.wide_csv import load_columns
@@ -264,7 +265,7 @@ def test_tables_in_any_usual_encoding(tmp_path: Path, encoding: str) -> None:
         path.write_bytes(b"\xff\xfe" + path.read_bytes())
     table = Table(path, Layout(encoding=named))
     assert table.labels()[0].label == "Meßpunkt Ö"
-    assert table.poses()[0].tolist() == [[1.5e-6, 0.002, 0.4]]
+    assert poses_of(table)[0].tolist() == [[1.5e-6, 0.002, 0.4]]
     assert [note.endswith("read as Windows-1252") for note in table.notes] == [True] * (encoding[0] in "wl")
 
 
@@ -306,12 +307,6 @@ def test_a_drawing_in_inches_under_joints_mm(tmp_path: Path) -> None:
     path.write_text(yaml.safe_dump(tree))
     with pytest.raises(InputFileError, match=r"do the units fit\? With the joints in inches"):
         load_geometry(path)
-
-
-def test_poses_and_lengths_given_as_files() -> None:
-    for read, option in ((read_lengths, "--lengths"), (read_poses, "--pose")):
-        with pytest.raises(InputFileError, match=f"numbers go with an option: {option} 1100,-2,3"):
-            read("1100,-2,3")
 
 
 def test_a_campaign_of_scattered_poses_needs_no_grid(tmp_path: Path) -> None:

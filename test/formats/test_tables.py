@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.formats import csv as tables
-from hexapod_comp.formats.csv import length_values, pose_values, read_lengths, read_pose_arrays, read_poses
+from hexapod_comp.machine.pose_files import length_values, read_lengths, read_pose_arrays, read_poses
 from hexapod_comp.pose import Pose
 
 HEADER = "name,x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg\n"
@@ -219,7 +219,7 @@ def test_what_is_written_reads_back(tmp_path: Path) -> None:
         Pose(p, Rotation.from_rotvec(w).as_matrix())
         for p, w in zip(rng.uniform(-1, 1, (50, 3)), rng.uniform(-1, 1, (50, 3)), strict=True)
     ]
-    lines = [",".join(pose_values(poses[0])), *(",".join(map(repr, pose_values(p).values())) for p in poses)]
+    lines = [",".join(poses[0].as_columns()), *(",".join(map(repr, p.as_columns().values())) for p in poses)]
     rows, positions, rotations = read_pose_arrays(written(tmp_path, "\n".join(lines)))
     assert [row.line for row in rows] == list(range(2, 52))
     np.testing.assert_allclose(positions, [p.position for p in poses], atol=1e-15)

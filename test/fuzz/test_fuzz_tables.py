@@ -45,8 +45,8 @@ from hexapod_comp.export.linuxcnc import (
     write_genhexkins,
 )
 from hexapod_comp.export.table import make_table, read_table, write_table
-from hexapod_comp.formats.csv import read_lengths, read_poses
 from hexapod_comp.machine.model import RealMachine
+from hexapod_comp.machine.pose_files import read_lengths, read_poses
 from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.measurements.tidy import read_tidy
 from hexapod_comp.measurements.wide_csv import read_wide

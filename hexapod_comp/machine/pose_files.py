@@ -1,0 +1,111 @@
+"""CSV files of poses and of strut lengths, units in the column names: what ``ik`` and ``fk`` read and write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..core import QUATERNION_NORM_TOLERANCE
+from ..errors import InputFileError, PoseError
+from ..formats.csv import Row, Table
+from ..formats.paths import input_file
+from ..pose import Pose, rotation_from_angles
+
+POSITION_COLUMNS = ("x", "y", "z")
+ANGLE_COLUMNS = ("alpha", "beta", "gamma")
+QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
+LENGTH_COLUMNS = tuple(f"L{i}" for i in range(1, 7))
+
+# What `ik --model` says of the tool's error, each for x, y, z and rx, ry, rz
+PREDICTED_ERRORS = tuple(f"{error}_{{}}{known}" for error in ("error", "error_aligned") for known in ("", "_sd"))
+
+# What `ik --model` and `ik --line` add to lengths, and :func:`read_lengths` passes over: columns and their dimension
+BESIDE_LENGTHS = {
+    tuple(f"nominal_{name}" for name in LENGTH_COLUMNS): "length",
+    tuple(f"correction_{name}" for name in LENGTH_COLUMNS): "length",
+    tuple(name.format(axis) for name in PREDICTED_ERRORS for axis in "xyz"): "length",
+    tuple(name.format(axis) for name in PREDICTED_ERRORS for axis in ("rx", "ry", "rz")): "angle",
+    ("along", *POSITION_COLUMNS): "length",
+    ANGLE_COLUMNS: "angle",
+    ("direction",): None,
+}
+
+
+def read_poses(path: str | Path) -> tuple[list[Row], list[Pose]]:
+    """Read poses from a CSV file; the name of a shipped one, as ``table1.csv``, or ``-`` for standard input will do.
+
+    Columns: ``x_mm``, ``y_mm``, ``z_mm`` (or ``_m``, ``_um``, ``_in``); optionally ``alpha_deg``,
+    ``beta_deg``, ``gamma_deg`` (the paper's angles; or ``_rad``, …) or ``qx``, ``qy``, ``qz``, ``qw``;
+    optionally ``sequence`` or ``name``. Lines that start with ``#`` are skipped.
+
+    Returns
+    -------
+    rows : list of Row
+        Where each pose stands.
+    poses : list of Pose
+        m and rotation matrices.
+
+    Raises
+    ------
+    InputFileError
+        Naming file, line and column.
+    """
+    rows, positions, rotations = read_pose_arrays(path)
+    return rows, [Pose(p, r) for p, r in zip(positions, rotations, strict=True)]
+
+
+def read_pose_arrays(path: str | Path) -> tuple[list[Row], np.ndarray, np.ndarray]:
+    """Read poses as :func:`read_poses` does, for files of many thousand rows."""
+    table = Table(input_file(path, "poses"))
+    positions, rotations = poses_of(table)
+    table.refuse_unknown()
+    return table.labels(), positions, rotations
+
+
+def poses_of(table: Table) -> tuple[np.ndarray, np.ndarray]:
+    """Return the poses of the columns that :func:`read_poses` describes, shapes (N, 3), (N, 3, 3)."""
+    columns = table.required(POSITION_COLUMNS, "length")
+    angle_columns = table.columns(ANGLE_COLUMNS, "angle")
+    quaternion_columns = table.columns(QUATERNION_COLUMNS, None)
+    if angle_columns and quaternion_columns:
+        raise InputFileError(table.path, "header", "give either angles or a quaternion, not both")
+    positions = table.numbers(columns)
+    if not quaternion_columns:
+        angles = table.numbers(angle_columns) if angle_columns else np.zeros((len(table.rows), 3))
+        return positions, rotations_of(table, angles)
+    quaternions = table.numbers(quaternion_columns)
+    wrong = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > QUATERNION_NORM_TOLERANCE
+    if wrong.any():
+        row = int(wrong.argmax())
+        try:
+            Pose.from_quaternion(np.zeros(3), quaternions[row])
+        except PoseError as error:
+            raise InputFileError(table.path, f"line {table.rows[row][0]}, columns qx…qw", str(error)) from error
+    from scipy.spatial.transform import Rotation  # 27 MB that a node, which reads other tables, does without
+
+    return positions, Rotation.from_quat(quaternions).as_matrix()
+
+
+def rotations_of(table: Table, angles: np.ndarray) -> np.ndarray:
+    """Return the rotation matrices (N, 3, 3) of the rows' angles (N, 3), rad."""
+    try:
+        return rotation_from_angles(angles)
+    except PoseError as error:
+        row = int(np.abs(angles).max(axis=1).argmax())
+        raise InputFileError(table.path, f"line {table.rows[row][0]}", str(error)) from error
+
+
+def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
+    """Read strut lengths from a CSV file (or ``-``) with the columns ``L1_mm`` … ``L6_mm`` (or ``_m``, …)."""
+    table = Table(input_file(path, "lengths"))
+    lengths = table.numbers(table.required(LENGTH_COLUMNS, "length"))
+    for names, dimension in BESIDE_LENGTHS.items():
+        table.columns(names, dimension)
+    table.refuse_unknown()
+    return table.labels(), lengths
+
+
+def length_values(lengths: np.ndarray) -> dict[str, float]:
+    """Return six lengths as the columns that :func:`read_lengths` reads, mm."""
+    return {f"{name}_mm": float(value) * 1e3 for name, value in zip(LENGTH_COLUMNS, lengths, strict=True)}
