@@ -27,6 +27,8 @@ from hexapod_comp.measurements.runs import assemble
 from hexapod_comp.measurements.tidy import read_tidy, write_measurements
 from hexapod_comp.pose import Pose
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 UM, MM = 1e-6, 1e-3
 ZOO = ("paper", "framed", "hanging", "inches", "mirror")
 

@@ -17,6 +17,8 @@ from hexapod_comp.errors import ModelError
 from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.virtual.imperfections import ImperfectionBounds
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 MM = 1e-3
 FEW = replace(small.SETTINGS, lead=None, blocks=("pitch", "wave", "wave 2", "wave 3", "wave 4", "backlash"))
 """What machine B has, and its waves' harmonics."""

@@ -18,6 +18,8 @@ from hexapod_comp.measurements.campaign import Campaign, CampaignRun, template
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
 from hexapod_comp.virtual.instruments import measure
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 TAU = 1500.0
 SETTINGS = FitSettings(blocks=("expansion", "late"))
 
@@ -70,7 +72,7 @@ def test_expansions_and_time_constant_come_back():
     assert abs(np.log(constant / TAU)) < 3.0 * deviation < 0.6
 
 
-def test_the_noise_of_sensors_is_not_taken_for_growth(unsuspected: None):
+def test_the_noise_of_sensors_is_not_taken_for_growth():
     """Struts with sensors of their own that read 0.02 K beside, one kelvin in 150: within three of the deviations that
     the same readings have without that noise. Fitted to what is read, 19.7 ± 0.3 ppm/K would be 1.4 ± 0.2."""
     quiet = measured(parts=tuple(range(8)))

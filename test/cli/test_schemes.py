@@ -27,6 +27,7 @@ REFUSED = {
 LEAST_REMOVED = {"lines": 0.25, "joint": 0.5}
 
 
+@pytest.mark.usefixtures("unsuspected")
 @pytest.mark.parametrize(("machine", "campaign", "schemes"), REACHED)
 def test_each_scheme_models_a_shipped_machine_or_says_why_not(
     machine: str, campaign: str, schemes: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

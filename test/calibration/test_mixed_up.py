@@ -1,0 +1,214 @@
+"""What readings might be but what they are called, and how it is named.
+
+Each mistake is made by the test in the readings of a machine that the model describes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from calibration_helpers import FEW, campaign, measured, virtual_machine
+from foreign_machines import machines
+from scipy.stats import multivariate_normal
+
+from hexapod_comp.calibration.estimator import Estimation
+from hexapod_comp.calibration.fit import fit_model, mixed_up
+from hexapod_comp.calibration.mixups import FAMILIES, SWAPPED, _Fitted, common_modes, family_of_run, in_frame
+from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
+from hexapod_comp.errors import CalibrationError
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.model import RealMachine
+from hexapod_comp.measurements.campaign import Campaign
+from hexapod_comp.measurements.readings import BACKWARD, CHANNELS, FORWARD, KINDS, MeasurementSet
+from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model, with_length_map
+from hexapod_comp.virtual.instruments import station_errors
+
+ROTATION_X = CHANNELS.index("rotation_x")
+LINEAR, ROTATION = KINDS.index("linear"), KINDS.index("rotation")
+
+
+@pytest.fixture(scope="module")
+def readings() -> MeasurementSet:
+    """Return the readings of a machine that the model describes."""
+    return measured(virtual_machine(3), campaign(), 3)
+
+
+def family(readings: MeasurementSet) -> np.ndarray:
+    """Return the family of each reading."""
+    return family_of_run(readings)[readings.run]
+
+
+def reversed_where(readings: MeasurementSet, members: np.ndarray) -> MeasurementSet:
+    return readings.with_values(np.where(members, -readings.value, readings.value))
+
+
+CAUSES = {
+    "x lines: sign reversed": lambda m: reversed_where(m, family(m) == 0),
+    "rotation: arcsec in place of µrad": lambda m: m.with_values(
+        np.where(m.kind == ROTATION, m.value / np.radians(1e6 / 3600.0), m.value)
+    ),
+    "rotation_x of 8 of 15 runs": lambda m: reversed_where(m, (m.channel == ROTATION_X) & (m.run % 2 == 0)),
+    "13 of 25 runs": lambda m: m.with_values(m.value * np.where(np.arange(len(m.runs)) % 2, 1.0, -1.0)[m.run]),
+}
+
+
+def test_every_second_run_that_reads_a_rotation_about_x(readings):
+    """What the name of a cause below counts."""
+    runs = np.unique(readings.run[readings.channel == ROTATION_X])
+    assert (len(runs), int((runs % 2 == 0).sum())) == (15, 8)
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+def test_the_cause_is_named(readings, cause):
+    """The first that is named is what was done; of half the runs, which half is reversed is anybody's guess."""
+    named = mixed_up(CAUSES[cause](readings), FEW)
+    assert named
+    assert named[0].startswith(cause) or ("of 25 runs" in cause and "12 of 25 runs" in named[0])
+
+
+def test_runs_with_a_reversed_channel_are_named_where_screws_turn(tmp_path):
+    """Nominal lengths then leave errors of their own, whose sign nobody has reversed: they must not hide the runs'."""
+    machine, settings = machines()["left-hand"], FitSettings(blocks=("pitch",))
+    geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
+    side = float(np.ptp(machine.box, axis=0).min())
+    truth = RealMachine(geometry, draw_model(geometry, ImperfectionBounds(joint=500e-6), 3))
+    m = measured(truth, Campaign(machine.box, side, 0.5 * side, "5-D", 4), 3)
+    assert mixed_up(m, settings) == []
+    named = mixed_up(reversed_where(m, (m.channel == ROTATION_X) & (m.run % 2 == 0)), settings)
+    assert named[0].startswith("rotation_x of ")
+    assert " runs (" in named[0]
+
+
+def test_exchanged_channels_are_named_where_the_plain_model_lacks_much(tmp_path):
+    """Length maps leave rotations off by 54 times their noise: an exchange adds a quarter of that."""
+    machine = machines()["framed"]
+    geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
+    truth = RealMachine(
+        geometry, with_length_map(draw_model(geometry, ImperfectionBounds(joint=800e-6), 3), geometry, 3)
+    )
+    m = measured(truth, Campaign(machine.box, float(np.ptp(machine.box, axis=0).min()), 0.02, "5-D", 4), 3)
+    assert mixed_up(m, FitSettings()) == []
+    x, y = ROTATION_X, CHANNELS.index("rotation_y")
+    both = np.isin(m.channel, (x, y))
+    named = mixed_up(replace(m, channel=np.where(both, x + y - m.channel, m.channel)), FitSettings())
+    assert named[0].startswith("rotation_x and rotation_y: exchanged")
+
+
+@pytest.mark.parametrize(
+    ("frame", "name"),
+    [
+        (np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), "the work frame: turned about z by -90°"),
+        (np.diag([1.0, -1.0, 1.0]), "y: mirrored"),
+    ],
+)
+def test_another_frame_is_named(readings, frame, name):
+    """What undoes a turn is the turn back, and a mirror undoes itself; none is taken for a reversed sign."""
+    named = mixed_up(in_frame(readings, frame), FEW)
+    assert [text.rpartition(" fits")[0] for text in named] == [name]
+
+
+def test_nothing_is_suspected_without_a_cause(readings):
+    assert mixed_up(readings, FEW) == []
+
+
+def test_a_fit_that_fails_names_the_cause(readings, monkeypatch):
+    """Large errors and a reversed sign end in no machine at all: whoever reads that must learn why."""
+
+    def fail(*_):
+        raise CalibrationError("fit", "did not settle")
+
+    monkeypatch.setattr("hexapod_comp.calibration.fit._fit", fail)
+    with pytest.raises(CalibrationError, match=r"did not settle\n  x lines: sign reversed fits \d+\.\d times better$"):
+        fit_model(CAUSES["x lines: sign reversed"](readings), FEW)
+    with pytest.raises(CalibrationError, match=r"did not settle$"):
+        fit_model(readings, FEW)
+
+
+def test_the_sign_of_everything_shows_in_the_backlash_alone(readings):
+    """To first order the machine with all errors reversed reads so, but its screws would lead their nuts."""
+    with pytest.raises(CalibrationError, match=SWAPPED):
+        fit_model(readings.with_values(-readings.value), FEW)
+
+
+def test_what_fits_better_otherwise_is_not_written(readings):
+    """Straightness of the x lines is small here: exchanged, it scatters by 2.5 µm, and nothing else makes that 1 µm."""
+    exchanged = np.arange(len(CHANNELS))
+    y, z = (CHANNELS.index(f"straightness_{axis}") for axis in "yz")
+    exchanged[[y, z]] = z, y
+    of_x_lines = family(readings) == 0
+    fit = fit_model(replace(readings, channel=np.where(of_x_lines, exchanged[readings.channel], readings.channel)), FEW)
+    assert fit.misfit.startswith("x lines, straightness_y and straightness_z: exchanged fits")
+
+
+def test_a_unit_that_all_lengths_share_is_named_once(readings):
+    """Straightness and distances in µinch; the angles are as they should be."""
+    lengths = readings.kind != ROTATION
+    named = mixed_up(readings.with_values(np.where(lengths, readings.value / 0.0254, readings.value)), FEW)
+    assert named[0].startswith("all lengths: µinch in place of µm fits")
+
+
+@cache
+def tilted_set() -> MeasurementSet:
+    """Return lines, and poses that tilt by up to 10°, read by a tracker."""
+    return measured(virtual_machine(3), replace(campaign(), poses=60, tilt=np.radians(10.0)), 3)
+
+
+def longer_probe(m: MeasurementSet) -> MeasurementSet:
+    """Return what is read 1 mm further out along the tool."""
+    out = 1e-3 * (m.stations.rotations @ m.geometry.tool.rotation)[:, :, 2]
+    return m.with_values(m.value + (m.directions()[:, :3] * out[m.station]).sum(axis=1))
+
+
+def half_backward(m: MeasurementSet) -> MeasurementSet:
+    """Return a set in which every second place that was passed forward was passed backward, but is labelled forward."""
+    there = np.where(m.direction == FORWARD, m.station, -1)
+    wrong = np.unique(there[there >= 0])[::2]
+    truth = virtual_machine(3)
+    turned = m.stations.sense.copy()
+    turned[wrong] *= -1.0
+    stations = replace(m.stations, sense=turned)
+    moved = station_errors(replace(m, stations=stations), truth) - station_errors(m, truth)
+    return m.with_values(m.value + (m.directions() * moved[m.station]).sum(axis=1))
+
+
+SHARED = {
+    "": lambda m: m,
+    "measured point along the tool's z: +1": longer_probe,
+    "scale of all linear readings: +2": lambda m: m.with_values(m.value + 270e-6 * m.along() * (m.kind == LINEAR)),
+    "direction of ": half_backward,
+}
+
+
+@pytest.mark.parametrize("cause", SHARED)
+def test_what_all_readings_share_is_named(cause):
+    """A probe 1 mm longer, 270 ppm (a laser in air that counts vacuum wavelengths), half the forward labels wrong."""
+    named = mixed_up(SHARED[cause](tilted_set()), FEW)
+    assert any(text.startswith(cause) for text in named) if cause else not named
+
+
+def test_the_evidence_of_a_common_mode_is_that_of_a_normal_distribution(readings):
+    """With K + σ²·d·dᵀ as covariance of few readings, by SciPy's density."""
+    m = readings.select(np.arange(len(readings)) % 9 == 0)
+    space = ParameterSpace(m, FEW)
+    estimation = Estimation(m, space, alone=False)
+    problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(m)))
+    fitted = _Fitted(estimation, problem, [block.name for block in space.blocks])
+    mode = next(mode for mode in common_modes(estimation, space) if mode.name.startswith("scale of all linear"))
+    effect = estimation.free_of_nuisance(mode.effect[:, None])[:, 0]
+    p = fitted.posterior
+    rows = problem.rows.dense()[:, p.used] * p.spread
+    plain = rows @ rows.T + np.diag(p.noise[problem.kind] ** 2)
+    target = problem.target
+    with_mode = multivariate_normal.logpdf(target, cov=plain + np.outer(effect, effect) * (3.0 * mode.usual) ** 2)
+    gain = fitted._by_mode(effect, mode, 3.0, p).evidence - fitted.evidence
+    assert gain == pytest.approx(with_mode - multivariate_normal.logpdf(target, cov=plain), rel=1e-6, abs=1e-6)
+
+
+def test_families_follow_the_lines(readings):
+    names = [FAMILIES[n] for n in family_of_run(readings)]
+    given = [run.name for run in readings.runs]
+    assert all(name == f"{run[0]} lines" or run.startswith("diagonal") for name, run in zip(names, given, strict=True))
+    assert {FORWARD, BACKWARD} == set(readings.direction.tolist())
