@@ -309,27 +309,6 @@ def test_certificate(hexapod: Program, fitted: Calibration) -> None:
     assert "class=warning" not in text
 
 
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
-        ("--certificate out.pdf", "writes HTML, which any browser prints to PDF"),
-        ("--certificate nowhere/out.html", "nowhere/out.html: cannot be written: its folder does not exist"),
-        ("--certificate out.html --details gone.yaml", "there is no such file"),
-        ("--details {campaign}", "--details has no meaning without --certificate"),
-        ("--certificate out.html --details {campaign}", "format: must be 'hexapod_comp/certificate'"),
-        ("--certificate out.html --scheme lines", "--certificate has no meaning with --scheme lines"),
-    ],
-)
-def test_a_certificate_that_cannot_be_is_refused_before_the_fit(
-    hexapod: Program, fitted: Calibration, arguments: str, complaint: str
-) -> None:
-    words = arguments.replace("{campaign}", str(fitted.campaign)).split()
-    code, out, err = hexapod("fit", fitted.measured, "--out", "model.yaml", *words)
-    assert (code, out) == (2, "")
-    assert complaint in err
-    assert not list(Path.cwd().iterdir())
-
-
 # Scheme lines.
 
 
@@ -498,140 +477,11 @@ def test_a_dead_instrument_is_refused(hexapod: Program, done: Calibration, tmp_p
     assert list(tmp_path.iterdir()) == [dead]
 
 
-# What is refused: nothing is written, one line says what and where.
-
-
-@dataclass(frozen=True)
-class Wrong:
-    """A usage that is wrong, with the file that it needs, if any."""
-
-    arguments: str
-    complaint: str
-    name: str = ""
-    content: str = ""
-
-
-LINE = "x line,forward,{x},0,400,linear,0,um\n"
-TIDY = "run,direction,x_mm,y_mm,z_mm,channel,value,unit\n"
-WIDE = "cx,cy,cz,mx,my,mz\n0,0,400,0.1,0,400\n"
-
-WRONG = {
-    "no such file": Wrong("gone.csv", r"gone\.csv: there is no such file"),
-    "a folder": Wrong(".", r"\.: is a folder"),
-    "empty": Wrong("e.csv", r"e\.csv: has no header", "e.csv"),
-    "header only": Wrong("h.csv", r"h\.csv: has a header but no rows", "h.csv", TIDY),
-    "not text": Wrong("b.csv", r"b\.csv: has a header but no rows", "b.csv", "\xff\xfe,\n1,2\n"),
-    "nan": Wrong("n.csv", r"n\.csv: line 2, column value: .*'nan'", "n.csv",
-                 TIDY + "l,forward,0,0,400,linear,nan,um\n"),
-    "unit": Wrong("u.csv", r"u\.csv: line 2, column unit: .*'furlong'", "u.csv",
-                  TIDY + "l,forward,0,0,400,linear,1,furlong\n"),
-    "out of reach": Wrong("r.csv", r"r\.csv: line 3: the commanded pose is out of .*outside the stroke", "r.csv",
-                          TIDY + LINE.format(x=0) + LINE.format(x=900)),
-    "too few": Wrong("f.csv", r"11 readings .* leave 10 numbers for the structure's 33", "f.csv",
-                     TIDY + "".join(LINE.format(x=10 * n) for n in range(11))),
-    "endless": Wrong("v.csv", r"v\.csv: line 2, column value: must be a number within .*'1e308'", "v.csv",
-                     TIDY + "l,forward,0,0,400,linear,1e308,um\n" + LINE.format(x=9)),
-    "turns": Wrong("v.csv", r"v\.csv: line 2: value must be within ±10 rad", "v.csv",
-                   TIDY + "l,forward,0,0,400,rotation_x,11,rad\n" + LINE.format(x=9)),
-    "below any instrument": Wrong("v.csv", r"v\.csv: line 2: uncertainty must be 1e-12…10 m", "v.csv",
-                                  TIDY.replace("unit", "unit,uncertainty") + "l,forward,0,0,400,linear,1,um,1e-300\n"),
-    "no certainty": Wrong("v.csv", r"v\.csv: line 2, column uncertainty: must be a number within", "v.csv",
-                          TIDY.replace("unit", "unit,uncertainty") + "l,forward,0,0,400,linear,1,um,1e300\n"),
-    "the same file twice": Wrong("{measured} {measured}", "is the same file as"),
-    "unknown block": Wrong("{measured} --blocks pitch,colour", r"blocks: must be of structure, .*'colour'"),
-    "no lead": Wrong("{measured} --lead-mm 0", r"lead: must be 0\.1 mm to 1000 mm \(found 0\.0\)"),
-    "endless lead": Wrong("{measured} --lead-mm 5000", r"lead: .*\(found 5000\.0\)"),
-    "lead of a clockwork": Wrong("{measured} --lead-mm 1e-300", r"lead: must be 0\.1 mm to"),
-    "degree": Wrong("{measured} --field-degree 9", r"field_degree: must be 1…8 \(found 9\)"),
-    "wide without columns": Wrong("w.csv", r"w\.csv: header: column run is missing", "w.csv", WIDE),
-    "tidy with columns": Wrong("{measured} --columns jugglebot_columns", r"measured\.csv: header: column position_x"),
-    "no columns file": Wrong("w.csv --columns gone.yaml", r"gone\.yaml: there is no such file", "w.csv", WIDE),
-    "columns of another kind": Wrong("w.csv --columns paper", r"format: must be 'hexapod_comp/columns'", "w.csv", WIDE),
-    "probe of a wide file": Wrong("w.csv --columns jugglebot_columns --probe-mm 0,0,1", "leave the probe out",
-                                  "w.csv", WIDE),
-    "another machine": Wrong("{measured} --machine jugglebot", r"measured\.csv: line 2: the commanded pose is out of"),
-    "no machine": Wrong("{measured} --machine gone", r"gone: there is no such file"),
-    "a model for a machine": Wrong("{measured} --machine paper_machine", "format: must be 'hexapod_comp/geometry'"),
-    "no truth": Wrong("{measured} --truth gone.yaml", r"gone\.yaml: there is no such file"),
-    "a machine for a truth": Wrong("{measured} --truth paper", "format: must be 'hexapod_comp/model'"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_a_wrong_fit_is_one_line_and_writes_nothing(
-    hexapod: Program, done: Calibration, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, case: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    wrong = WRONG[case]
-    if wrong.name:
-        Path(wrong.name).write_bytes(wrong.content.encode("latin-1"))
-    arguments = wrong.arguments.format(measured=done.measured).split()
-    written = ("--out", "m.yaml", "--report", "r.txt", "--pictures", "p")
-    assert_refused(hexapod("fit", *arguments, *written), wrong.complaint)
-    assert [path.name for path in tmp_path.iterdir()] == [wrong.name] * bool(wrong.name)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
-        ("", "arguments are required: FILE, --out"),
-        ("x.csv", "arguments are required: --out"),
-        ("--out m.yaml", "arguments are required: FILE"),
-        ("x.csv --out m.yaml --lead-mm -1", "argument --lead-mm: must not be negative"),
-        ("x.csv --out m.yaml --lead-mm nan", "argument --lead-mm: must be finite"),
-        ("x.csv --out m.yaml --lead-mm ten", "argument --lead-mm: must be finite numbers, not 'ten'"),
-        ("x.csv --out m.yaml --tolerance-um -3", "argument --tolerance-um: must not be negative"),
-        ("x.csv --out m.yaml --field-degree 0", "argument --field-degree: must be a whole number from 1 to 10000000"),
-        ("x.csv --out m.yaml --field-degree 2.5", "argument --field-degree: must be a whole number from 1 to 10000000"),
-        ("x.csv --out m.yaml --expansion-ppm 1,2", "argument --expansion-ppm: needs one or three numbers"),
-        ("x.csv --out m.yaml --probe-mm 1,2", "argument --probe-mm: needs three"),
-        ("x.csv --out m.yaml --probe-mm 1,2,3,4,5,6", "argument --probe-mm: needs three numbers, mm"),
-        ("x.csv --out m.yaml --scheme cubic", "argument --scheme: invalid choice: 'cubic'"),
-        ("x.csv --out m.yaml --order bic", "argument --order: invalid choice: 'bic'"),
-    ],
-)
-def test_a_wrong_option_shows_the_usage(hexapod: Program, arguments: str, complaint: str) -> None:
-    code, out, err = hexapod("fit", *arguments.split())
-    assert (code, out) == (2, "")
-    assert err.startswith("usage: hexapod_comp fit")
-    assert complaint in err
-
-
-@pytest.mark.parametrize(
-    ("option", "path"),
-    [
-        ("--out", "nowhere/m.yaml"),
-        ("--report", "nowhere/r.txt"),
-        ("--out", "."),
-    ],
-)
-def test_what_cannot_be_written_is_named(hexapod: Program, fitted: Calibration, option: str, path: str) -> None:
-    options = {"--out": "m.yaml", option: path}
-    words = [word for pair in options.items() for word in pair]
-    assert_refused(hexapod("fit", fitted.measured, *words), rf"{re.escape(path)}: cannot be written")
-
-
 def test_a_file_where_the_pictures_should_go_is_named(hexapod: Program, fitted: Calibration) -> None:
     Path("p").write_text("here already")
     code, _, err = hexapod("fit", fitted.measured, "--out", "m.yaml", "--pictures", "p")
     assert code == 2
     assert re.fullmatch(r"hexapod_comp: error: p: cannot be made a folder: it is a file\n", err)
-
-
-def test_no_output_without_its_model(hexapod: Program, fitted: Calibration) -> None:
-    words = ("--out", "nowhere/m.yaml", "--report", "r.txt")
-    assert_refused(hexapod("fit", fitted.measured, *words), "nowhere/m.yaml: cannot be written")
-    assert not list(Path.cwd().iterdir())
-
-
-def test_a_tolerance_of_zero_is_refused(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
-    options = ("--tolerance-um", 0, "--blocks", "pitch", "--out", tmp_path / "m.yaml")
-    assert_refused(hexapod("fit", done.measured, *options), "tolerance")
-
-
-def test_scheme_lines_refuses_what_it_would_ignore(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
-    options = ("--scheme", "lines", "--blocks", "pitch", "--out", tmp_path / "m.yaml")
-    assert_refused(hexapod("fit", done.measured, *options), "--blocks")
 
 
 def test_fit_of_too_short_lines_says_which_and_what_is_needed(hexapod: Program, tmp_path: Path) -> None:
@@ -641,42 +491,6 @@ def test_fit_of_too_short_lines_says_which_and_what_is_needed(hexapod: Program, 
     assert hexapod("simulate", "--campaign", tmp_path / "c.yaml", "--out", measured)[0] == 0
     outcome = hexapod("fit", measured, "--scheme", "lines", "--out", tmp_path / "m.yaml")
     assert_refused(outcome, r"z line at x -203\.2, y -203\.2 .*has 5 points.*, over 203\.2 mm; 6 are needed")
-
-
-# measure, wrongly.
-
-
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
-        ("--campaign gone.yaml", r"gone\.yaml: there is no such file"),
-        ("--campaign high.yaml", r"run x line at .*: the commanded pose is out of the machine's reach: strut_1"),
-        ("--campaign laser.yaml", r"laser\.yaml: instrument: must be one of 1-D, 5-D, 6-D, none \(found '7-D'\)"),
-        ("--campaign key.yaml", r"key\.yaml: colour: is not a known key here \(found 'blue'\)"),
-        ("--campaign paper", "format: must be 'hexapod_comp/campaign'"),
-        ("--campaign small.yaml --truth gone.yaml", r"gone\.yaml: there is no such file"),
-        (
-            "--campaign small.yaml --machine jugglebot --truth paper_machine",
-            r"machine: the model is for another machine",
-        ),
-        ("--campaign small.yaml --out nowhere/m.csv", r"nowhere/m\.csv: cannot be written"),
-    ],
-)
-def test_wrong_campaigns(
-    hexapod: Program, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, arguments: str, complaint: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    files = {
-        "small.yaml": CAMPAIGN,
-        "high.yaml": CAMPAIGN.replace("553.2", "1553.2"),
-        "laser.yaml": CAMPAIGN.replace("1-D", "7-D"),
-        "key.yaml": CAMPAIGN + "colour: blue\n",
-    }
-    for name, content in files.items():
-        Path(name).write_text(content)
-    out = () if "--out" in arguments else ("--out", "m.csv")
-    assert_refused(hexapod("simulate", *arguments.split(), *out), complaint)
-    assert {path.name for path in tmp_path.iterdir()} == set(files)
 
 
 # plan.
@@ -738,40 +552,6 @@ def test_plan_and_fit_agree(done: Calibration, hexapod: Program) -> None:
     assert fit.level.after > explained.after
 
 
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
-        ("gone.yaml", r"gone\.yaml: there is no such file"),
-        ("paper", "format: must be 'hexapod_comp/campaign'"),
-        ("{measured}", r"measured\.csv: must hold keys and values"),
-        ("{campaign} --lead-mm 0", r"lead: must be 0\.1 mm to"),
-        ("{campaign} --blocks colour", r"blocks: must be of .*'colour'"),
-        ("{campaign} --machine jugglebot", "the commanded pose is out of the machine's reach"),
-        ("laser.yaml", r"laser\.yaml: instrument: must be one of .*'7-D'"),
-    ],
-)
-def test_wrong_plans(
-    hexapod: Program,
-    done: Calibration,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    arguments: str,
-    complaint: str,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("laser.yaml").write_text(CAMPAIGN.replace("1-D", "7-D"))
-    words = arguments.format(measured=done.measured, campaign=done.campaign).split()
-    assert_refused(hexapod("plan", *words), complaint)
-
-
-@pytest.mark.parametrize("verb", ["plan", "simulate"])
-def test_a_campaign_out_of_reach_names_its_file(hexapod: Program, tmp_path: Path, verb: str) -> None:
-    high = tmp_path / "high.yaml"
-    high.write_text(CAMPAIGN.replace("553.2", "1553.2"))
-    words = ("plan", high) if verb == "plan" else ("simulate", "--campaign", high, "--out", tmp_path / "m.csv")
-    assert_refused(hexapod(*words), "high.yaml")
-
-
 def test_plan_proposes_a_campaign(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
     """The proposed file is one that plan judges; what it says beforehand is what plan says of it, draws aside."""
     path = tmp_path / "mine.yaml"
@@ -805,21 +585,6 @@ def test_no_plan_brings_a_machine_below_its_repeatability(hexapod: Program, done
     planned = json.loads(hexapod("plan", done.campaign, *JOINT, "--repeatability-um", "1", "--json")[1])
     assert planned["expected_tool_error"]["after_m"] > planned["repeatability_m"] == pytest.approx(3.0**0.5 * 1e-6)
     assert "not counted: the machine's repeatability" in hexapod("plan", done.campaign, *JOINT)[1]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
-        ("", "at least one of CAMPAIGN, --goal-um is needed"),
-        ("{campaign} --hours 2", "--hours has no meaning without --goal-um"),
-        ("{campaign} --goal-um 1 --instruments laser", "instruments: must be one or more of linear"),
-        ("{campaign} --goal-um 1 --hours 0.1", "hours: are too few"),
-        ("{campaign} --goal-um 1 --time laser=1,1,1", "--time: is of one of linear"),
-        ("{campaign} --goal-um 1 --tilt-deg 80", "tilt: must be 0"),
-    ],
-)
-def test_wrong_goals(hexapod: Program, done: Calibration, arguments: str, complaint: str) -> None:
-    assert_refused(hexapod("plan", *arguments.format(campaign=done.campaign).split(), *JOINT), complaint)
 
 
 # iso230.
@@ -865,14 +630,6 @@ def test_iso230_target_by_target(hexapod: Program, done: Calibration) -> None:
     assert out.count("accuracy A") == 25
     assert (out.count("ISO 230-2:2014: "), out.count("ISO 230-6:2002: ")) == (21, 4)
     assert "x line at y 0.0, z 350.0" in out
-
-
-def test_iso230_of_single_passes_says_what_is_missing(hexapod: Program, tmp_path: Path) -> None:
-    rows = [f"l,{way},{x},0,400,linear,{x},um\n" for way in ("forward", "backward") for x in (0, 10, 20)]
-    (tmp_path / "once.csv").write_text(TIDY + "".join(rows))
-    assert_refused(hexapod("iso230", tmp_path / "once.csv"), "no linear run has two cycles or more")
-    complaint = r"gone\.csv: there is no such file; \.csv files beside it: once\.csv"
-    assert_refused(hexapod("iso230", tmp_path / "gone.csv"), complaint)
 
 
 def test_a_trackers_export_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,7 @@
 """The wording of what is refused, in one file: messages.txt has what is typed, or a file's text, and the answer.
 
+A line ``file NAME "its text"`` gives every command below it that names the file this file to read.
+
 ``RENEW_MESSAGES=1 pytest test/cli/test_messages.py`` writes the answers anew; ``git diff`` then shows every new word.
 """
 
@@ -21,6 +23,7 @@ GOLDEN = Path(__file__).with_name("messages.txt")
 ASKED = ("$ ", "yaml ")
 LINES = GOLDEN.read_text(encoding="utf-8").splitlines()
 CASES = [(n, line) for n, line in enumerate(LINES) if line.startswith(ASKED)]
+FILES = dict(line.split(" ", 2)[1:] for line in LINES if line.startswith("file "))
 
 BUDGET = "format: hexapod_comp/error_budget\nversion: 1\nmachine: positioning_unit\nerrors: "
 YAML = "format: test\nversion: 1\n"
@@ -41,6 +44,8 @@ def answer(asked: str, capsys: pytest.CaptureFixture[str]) -> str:
     typed, brace, errors = asked.removeprefix("$ ").partition("{")
     if brace:
         Path("b.yaml").write_text(f"{BUDGET}{brace}{errors}\n", encoding="utf-8")
+    for name in FILES.keys() & set(shlex.split(typed)):
+        Path(name).write_bytes(json.loads(FILES[name]).encode("latin-1"))
     before = sorted(Path().rglob("*"))
     assert cli.main(shlex.split(typed)) == 2, "refused by exit code 2"
     out, err = capsys.readouterr()

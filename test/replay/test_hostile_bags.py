@@ -28,7 +28,7 @@ from hexapod_comp.replay.bag import FILES, JOURNAL, Files, _Collected, read_reco
 from hexapod_comp.replay.replay import replay_recording, what_if
 from hexapod_comp.replay.report import Report, rows_of
 
-VALUES = [[], {}, None, "x", 1e308, {"a": [1.0]}]
+VALUES = [[], {}, None, "\x1b[2J", 1e308, {"a": [1.0]}]
 
 
 @pytest.fixture(scope="module")

@@ -629,53 +629,11 @@ def test_messages_that_are_damaged_are_named(run, tmp_path):
         read_recording(write_bag(tmp_path / "cut", [*run.messages[:8], (time, topic, kind, raw[:20])]))
 
 
-# What stands in a page where something else should
-JUNK = (None, [], {}, "x", "\x1b[2J", -1, 0.5, math.inf, 1e30, 10**30, True, [None] * 6, {"x": 1})
-
-
-def places_in(content: object, path: tuple = ()) -> list[tuple]:
-    """Return the way to every value inside nested lists and mappings."""
-    items = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
-    inner = [place for key, value in items for place in places_in(value, (*path, key))]
-    return [path, *inner] if path else inner
-
-
-@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
-def test_pages_that_are_wrong_somewhere_never_end_in_a_traceback(tmp_path, capsys):
-    """One value of the journal is junk, 40 times: an error of the package, or a report."""
-    machine, draw = RecordedMachine(model=offset_model(tmp_path, 10.0)), np.random.default_rng(11)
-    machine.wave(20)
-    machine.compensator.set_temperature("strut_1", 21.0)
-    machine.compensator.enable(False)
-    machine.compensator.set_model(machine.load(offset_model(tmp_path, 20.0)))
-    machine.compensator.reset(machine.compensator.command)
-    machine.send(FAR)
-    machine.page()
-    machine.wave(20, 20)
-    machine.page()
-    numbers = of_topic(machine.messages, "journal")
-    for case in range(40):
-        messages = list(machine.messages)
-        place = numbers[case % len(numbers)]
-        time, topic, kind, raw = messages[place]
-        page = json.loads(STORE.deserialize_cdr(raw, kind).data)
-        ways = [way for way in places_in(page) if way[:2] != ("snapshot", "state") or way[-1] == 0 or len(way) < 4]
-        *way, last = ways[int(draw.integers(len(ways)))]
-        target = page
-        for key in way:
-            target = target[key]
-        target[last] = JUNK[int(draw.integers(len(JUNK)))]
-        messages[place] = time, topic, kind, serialized(kind, TYPES[TEXT](json.dumps(page)))
-        with contextlib.suppress(HexapodError):
-            call(write_bag(tmp_path / str(case), messages))
-    assert "\x1b" not in capsys.readouterr().out
-
-
 @pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value", "ignore:Mean of empty slice")
 def test_answers_that_are_wrong_somewhere_never_end_in_a_traceback(run, tmp_path, capsys):
-    """Bytes of commands and answers are junk, 12 times: an error of the package, or a report that sees it."""
+    """Bytes of commands and answers are junk, six times: an error of the package, or a report that sees it."""
     draw = np.random.default_rng(12)
-    for case in range(12):
+    for case in range(6):
 
         def spoil(page: dict) -> None:
             answers = bytearray(base64.b64decode(page["answers"]))
