@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -53,29 +53,15 @@ ADVICE = "Do units, lead, geometry and the instrument's uncertainty fit?"
 # Limits that a model breaks by itself; others, such as the stroke's end, a measured pose may be next to
 OF_THE_MODEL = ("correction", "assembly", "not_converged")
 
-# What options are called among the settings of a fit, and their units
-IN_SI = {
-    "lead_mm": ("lead", 1e-3),
-    "field_degree": ("field_degree", 1),
-    "moisture_ppm": ("strut_moisture", 1e-4),
-    "scale_ppm": ("scale", 1e-6),
-    "alignment_mrad": ("alignment", 1e-3),
-    "thermometer": ("thermometer", 1),
-    "time_constants_s": ("time_constants", 1),
-    "tracker_frame": ("tracker_frame", 1),
-}
-
 
 def fit_settings(args: argparse.Namespace) -> FitSettings:
     """Return what the options say about a fit of scheme joint; raises ModelError on an unknown block."""
-    given: dict[str, Any] = {}
+    known = {one.name for one in fields(FitSettings)} & vars(args).keys()
+    given: dict[str, Any] = {name: value for name in known if (value := getattr(args, name)) is not None}
     if args.blocks is not None:
         named = [name.strip() for name in args.blocks.split(",") if name.strip()]
         several = {"field": ("field displacement", "field rotation", "field reversal"), "harmonics": HARMONICS}
         given["blocks"] = tuple(block for name in named for block in several.get(name, (name,)))
-    for option, (name, unit) in IN_SI.items():
-        if (value := getattr(args, option, None)) is not None:
-            given[name] = value * unit if isinstance(value, float) else value
     if args.expansion_ppm is not None:
         given |= dict(zip(("strut_expansion", "base_expansion", "platform_expansion"), args.expansion_ppm, strict=True))
     if args.tolerance_um is not None:

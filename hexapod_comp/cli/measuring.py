@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -16,26 +17,10 @@ from ..machine.temperatures import PARTS
 from ..measurements.campaign import template
 from ..measurements.readings import ANGULAR_KINDS, KINDS
 from ..virtual import named
+from ..virtual.imperfections import ImperfectionBounds, largest_errors
 from . import results
 from .results import Result, Table
 
-# What each option of imagine is called among the bounds, and its unit in SI
-IN_SI = {
-    "joints_um": ("joint", 1e-6),
-    "struts_um": ("strut_offset", 1e-6),
-    "pitch_ppm": ("pitch", 1e-6),
-    "wave_um": ("wave", 1e-6),
-    "harmonics_um": ("harmonics", 1e-6),
-    "wave_period_mm": ("wave_period", 1e-3),
-    "map_um": ("length_map", 1e-6),
-    "backlash_um": ("backlash", 1e-6),
-    "wear_um": ("wear", 1e-6),
-    "strut_expansion_ppm_per_k": ("strut_expansion", 1e-6),
-    "body_expansion_ppm_per_k": ("body_expansion", 1e-6),
-    "field_um": ("field_displacement", 1e-6),
-    "field_urad": ("field_rotation", 1e-6),
-    "field_reversal_percent": ("field_reversal", 1e-2),
-}
 UNITS = {"um": "µm", "urad": "µrad", "ppm_per_k": "ppm/K"}  # as people read them
 RESOLUTION = 10  # digits after the point of the instruments, m and rad: a tenth of a nanometre
 
@@ -48,10 +33,9 @@ def imagine(args: argparse.Namespace) -> Result:
 
     geometry = load_geometry(args.machine)
     bounds: dict[str, Any] = {"shared_platform_joints": not args.separate_joints}
-    for option, (name, unit) in IN_SI.items():
-        if (value := getattr(args, option)) is not None:
-            bounds[name] = tuple(unit * v for v in value) if isinstance(value, tuple) else unit * value
-    if args.field_um or args.field_urad:
+    known = {one.name for one in fields(ImperfectionBounds)} & vars(args).keys()
+    bounds |= {name: value for name in known if (value := getattr(args, name)) is not None}
+    if args.field_displacement or args.field_rotation:
         box, attitude, _ = machine_box(geometry)
         box = box if args.box is None else np.array(args.box)
         corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)  # of the tool in work
@@ -88,8 +72,6 @@ def imagine(args: argparse.Namespace) -> Result:
 
 def _drawn(model: MachineModel) -> list[tuple[str, float, str]]:
     """Return name, largest value and unit of each error that the machine has."""
-    from ..virtual.imperfections import largest_errors
-
     struts, size = model.struts, np.abs
     bodies = np.array([model.base_expansion, model.platform_expansion])
     of_field = largest_errors(model.field) if any(family.size for family in model.field.lines) else np.zeros(6)

@@ -10,7 +10,8 @@ import argparse
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 from ..formats.texts import number_hint
@@ -85,7 +86,7 @@ def gone(name: str, now: str) -> Option:
 
 def under(heading: str, *options: Option) -> tuple[Option, ...]:
     """Return options that help lists under a heading."""
-    return tuple(Option(o.name, o.help, o.keywords, o.role, o.kind, heading) for o in options)
+    return tuple(replace(option, heading=heading) for option in options)
 
 
 class Assumptions(argparse.Action):
@@ -122,53 +123,40 @@ class Given(argparse.Action):
 class Rule(NamedTuple):
     """What must hold for the options of a verb that are given."""
 
-    kind: str  # one of EXACTLY_ONE, SOME, NEEDS, EXCLUDES, TOGETHER
+    kind: str
     options: tuple[str, ...]  # of EXACTLY_ONE also several with spaces between them, which stand for one way
-    by: str = ""  # of NEEDS and EXCLUDES: the option that they need, or that excludes them
 
     def problem(self, given: Callable[[str], bool], label: Callable[[str], str]) -> str:
         """Return what is wrong, empty if nothing is."""
+        by, others = self.options[0], self.options[1:]
         here = [name for name in self.options if any(given(part) for part in re.split(" (?=--)", name))]
+        first = next((label(name) for name in others if given(name)), "") if self.kind in (NEEDS, EXCLUDES) else ""
         if self.kind == EXACTLY_ONE and len(here) != 1:
             return f"give exactly one of {', '.join(map(label, self.options))}"
         if self.kind == SOME and not here:
             return f"at least one of {', '.join(map(label, self.options))} is needed"
-        if self.kind == NEEDS and here and not given(self.by):
-            return f"{label(here[0])} has no meaning without {label(self.by)}"
-        if self.kind == EXCLUDES and here and given(self.by):
-            return f"{label(here[0])} has no meaning with {label(self.by)}"
-        if self.kind == TOGETHER and here and len(here) < len(self.options):
+        if self.kind == TOGETHER and 0 < len(here) < len(self.options):
             missing = next(name for name in self.options if name not in here)
             return f"{missing} is missing: {', '.join(self.options)} go together"
+        if self.kind == NEEDS and first and not given(by):
+            return f"{first} has no meaning without {label(by)}"
+        if self.kind == EXCLUDES and first and given(by):
+            return f"{first} has no meaning with {label(by)}"
         return ""
 
 
-EXACTLY_ONE, SOME, NEEDS, EXCLUDES, TOGETHER = "exactly one", "some", "needs", "excludes", "together"
+EXACTLY_ONE, SOME, TOGETHER, NEEDS, EXCLUDES = "exactly one", "some", "together", "needs", "excludes"
 
 
-def exactly_one(*options: str) -> Rule:
-    """Return the rule that one of some options is given, and one alone."""
-    return Rule(EXACTLY_ONE, options)
+def _rule(kind: str, *options: str) -> Rule:
+    return Rule(kind, options)
 
 
-def some_of(*options: str) -> Rule:
-    """Return the rule that one or more of some options are given."""
-    return Rule(SOME, options)
-
-
-def together(*options: str) -> Rule:
-    """Return the rule that all of some options are given, or none."""
-    return Rule(TOGETHER, options)
-
-
-def needed_by(by: str, *options: str) -> Rule:
-    """Return the rule that some options mean nothing without another."""
-    return Rule(NEEDS, options, by)
-
-
-def excluded_by(by: str, *options: str) -> Rule:
-    """Return the rule that some options mean nothing with another."""
-    return Rule(EXCLUDES, options, by)
+exactly_one = partial(_rule, EXACTLY_ONE)  # of the options, and one alone
+some_of = partial(_rule, SOME)  # one or more of them
+together = partial(_rule, TOGETHER)  # all of them, or none
+needed_by = partial(_rule, NEEDS)  # those that follow mean nothing without the first
+excluded_by = partial(_rule, EXCLUDES)  # those that follow mean nothing with the first
 
 
 # What is typed becomes numbers in SI; argparse says which option was wrong.
@@ -211,6 +199,16 @@ def above_zero(text: str) -> float:
     if (number := finite(text)) <= 0.0:
         raise wrong(f"must be above zero, not {text}")
     return number
+
+
+def scaled(read: Callable[[str], Any], size: float) -> Callable[[str], Any]:
+    """Return what reads as another does, and multiplies by the size of the option's unit in SI."""
+
+    def in_si(text: str) -> Any:
+        value = read(text)
+        return tuple(size * v for v in value) if isinstance(value, tuple) else size * value
+
+    return in_si
 
 
 def span(text: str) -> tuple[float, float]:
@@ -389,11 +387,11 @@ def readings(required: bool = True) -> tuple[Option, ...]:
     )
 
 
-# What a fit of scheme joint, or a plan for one, can be given
+# What a fit of scheme joint, or a plan for one, can be given; most by the name that FitSettings has for it, in SI
 ESTIMATION = under(
     "scheme joint",
-    value("--lead-mm", bound, "MM", "period of the screws' errors (default: the geometry's; else what the readings "
-          "show)"),
+    value("--lead-mm", scaled(bound, 1e-3), "MM", "period of the screws' errors (default: the geometry's; else what "
+          "the readings show)", dest="lead"),
     value("--blocks", None, "A,B,…", "what may be fitted: pitch, wave, harmonics, backlash, map, field, expansion, "
           "moisture, late (default all)"),
     SEPARATE,
@@ -403,7 +401,8 @@ ESTIMATION = under(
     value("--field-degree", count, "N", "degree of the field (default 6)"),
     value("--expansion-ppm", expansions, "S[,B,P]", "thermal expansion of struts, or of struts, base and platform, "
           "ppm/K; a warm-up starts there (default 0)"),
-    value("--moisture-ppm", bound, "PPM", "growth of struts by humidity, ppm per %% (1 to 5)"),
+    value("--moisture-ppm", scaled(bound, 1e-4), "PPM", "growth of struts by humidity, ppm per %% (1 to 5)",
+          dest="strut_moisture"),
     value("--thermometer", None, "PART", "part whose sensor stands for all (default: the one that alone was read)"),
     value("--time-constants-s", time_constants, "S[,S]", "how late parts follow their sensors (default: sought from "
           "the readings)"),

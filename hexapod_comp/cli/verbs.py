@@ -10,7 +10,7 @@ from .options import (
     SEPARATE, SHAPE, TRUTH, WORDS, Assumptions, Option, Rule,
     above_zero, bound, box, choice, count, csv_file, excluded_by,
     exactly_one, finite, flag, folder, gone, html_file, joint_names, lengths, line, machine, needed_by, pictures, pose,
-    readings, reads, seed_of, some_of, span, table_out, tilts, times, together, under, value, whole, writes,
+    readings, reads, scaled, seed_of, some_of, span, table_out, tilts, times, together, under, value, whole, writes,
 )  # fmt: skip
 
 
@@ -66,22 +66,26 @@ DRAWN = {
     "--wave-um": (0.0, "every screw's periodic error (its amplitude, drawn from 0 up), µm"),
 }
 
-# How imperfect an imagined machine may be; defaults are those of `random`
+# How imperfect an imagined machine may be, by the names that ImperfectionBounds has; defaults are those of `random`
+BOUNDED = (
+    ("--joints-um", bound, 1e-6, "joint", "every coordinate of every joint, ± µm (default 50)"),
+    ("--struts-um", bound, 1e-6, "strut_offset", "every strut's length, ± µm (default 50)"),
+    ("--pitch-ppm", bound, 1e-6, "pitch", "every screw's pitch, ± ppm (default 50)"),
+    ("--wave-um", span, 1e-6, "wave", "amplitude of the screws' periodic error, µm (default 1,3)"),
+    ("--harmonics-um", span, 1e-6, "harmonics", "the same of those two, three and four times a turn (default 0)"),
+    ("--wave-period-mm", above_zero, 1e-3, "wave_period", "its period, mm (default: the geometry's lead, else 10)"),
+    ("--map-um", bound, 1e-6, "length_map", "smooth length error of every strut, RMS µm (default 1)"),
+    ("--backlash-um", span, 1e-6, "backlash", "backlash of every strut, µm (default 2,4)"),
+    ("--wear-um", bound, 1e-6, "wear", "how much more of it a screw has where it is worn most, µm (default 0)"),
+    ("--strut-expansion-ppm-per-k", span, 1e-6, "strut_expansion", "thermal expansion of the struts (default 0)"),
+    ("--body-expansion-ppm-per-k", span, 1e-6, "body_expansion", "the same of base and platform (default 0)"),
+    ("--field-um", bound, 1e-6, "field_displacement", "largest displacement by a field in space, µm (default 0)"),
+    ("--field-urad", bound, 1e-6, "field_rotation", "its largest rotation, µrad (default 0)"),
+    ("--field-reversal-percent", bound, 1e-2, "field_reversal", "share of it that changes with direction (default 10)"),
+)
 BOUNDS = (
-    value("--joints-um", bound, "NUMBER", "every coordinate of every joint, ± µm (default 50)"),
-    value("--struts-um", bound, "NUMBER", "every strut's length, ± µm (default 50)"),
-    value("--pitch-ppm", bound, "NUMBER", "every screw's pitch, ± ppm (default 50)"),
-    value("--wave-um", span, "LOW,HIGH", "amplitude of the screws' periodic error, µm (default 1,3)"),
-    value("--harmonics-um", span, "LOW,HIGH", "the same of those two, three and four times a turn (default 0)"),
-    value("--wave-period-mm", above_zero, "NUMBER", "its period, mm (default: the geometry's lead, else 10)"),
-    value("--map-um", bound, "NUMBER", "smooth length error of every strut, RMS µm (default 1)"),
-    value("--backlash-um", span, "LOW,HIGH", "backlash of every strut, µm (default 2,4)"),
-    value("--wear-um", bound, "NUMBER", "how much more of it a screw has where it is worn most, µm (default 0)"),
-    value("--strut-expansion-ppm-per-k", span, "LOW,HIGH", "thermal expansion of the struts (default 0)"),
-    value("--body-expansion-ppm-per-k", span, "LOW,HIGH", "the same of base and platform (default 0)"),
-    value("--field-um", bound, "NUMBER", "largest displacement by a field in space, µm (default 0)"),
-    value("--field-urad", bound, "NUMBER", "its largest rotation, µrad (default 0)"),
-    value("--field-reversal-percent", bound, "NUMBER", "share of it that changes with direction (default 10)"),
+    *(value(name, scaled(read, size), "LOW,HIGH" if read is span else "NUMBER", text, dest=bound)
+      for name, read, size, bound, text in BOUNDED),
     value("--box", box, CORNERS, "where the field is: lowest and highest tool position, mm (default: what a level tool "
           "reaches about home)"),
     flag("--separate-joints", "struts that share a platform joint each get one of their own"),
@@ -504,10 +508,10 @@ example:
             *ESTIMATION,
             *under(
                 "scheme joint",
-                value("--scale-ppm", bound, "PPM", "scale error of the instrument, 1 σ, ppm (scheme joint; default by "
-                      "its class: laser 0.5, tracker 10)"),
-                value("--alignment-mrad", bound, "MRAD", "angle between a laser's beam and its line, 1 σ, mrad (scheme "
-                      "joint; default 0.5)"),
+                value("--scale-ppm", scaled(bound, 1e-6), "PPM", "scale error of the instrument, 1 σ, ppm (scheme "
+                      "joint; default by its class: laser 0.5, tracker 10)", dest="scale"),
+                value("--alignment-mrad", scaled(bound, 1e-3), "MRAD", "angle between a laser's beam and its line, "
+                      "1 σ, mrad (scheme joint; default 0.5)", dest="alignment"),
                 flag("--not-robust", "trust readings that disagree with the rest (scheme joint)"),
             ),
             choice("--order", ("adjusted-r2", "aicc"), "what picks the polynomials' order (scheme lines; default "
