@@ -330,14 +330,14 @@ class Chosen:
 def test_a_few_episodes(isolated_ros):
     """With two faults each, or under a stream that goes on; a report in time wants a processor: without one, again.
 
-    Three of the nine, all with ALL_TESTS=1.
+    Two of the nine, all with ALL_TESTS=1.
     """
     disk = () if refusal_to_mount() else ("log_disk_full",)
     kinds = [("corrupt_pose", *disk), ("encoder_nan", "drop_pose"), ("kill_compensator", "drop_feedback")]
     kinds += [("restart_under_stream",), ("reset_under_stream",), ("stop_under_stream",), ("stamps_stand",)]
     kinds += [("latched_following_error",), ("reset_in_motion", "use_sim_time_set")]
     with Rig(domain=False) as rig:
-        for names in kinds if os.environ.get("ALL_TESTS") else kinds[::3]:
+        for names in kinds if os.environ.get("ALL_TESTS") else kinds[::5]:
             for last in (False, False, True):
                 outcome = run_episode(rig, Chosen(*names))
                 assert outcome.verdict.breaches == []

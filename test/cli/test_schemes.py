@@ -10,10 +10,12 @@ import json
 from pathlib import Path
 
 import pytest
+from helpers import long_test
 
 from hexapod_comp import cli
 
-REACHED = [("paper", name, "lines") for name in ("campaign", "campaign_5d", "campaign_full")]
+REACHED: list = [("paper", "campaign", "lines")]
+REACHED += [pytest.param("paper", name, "lines", marks=long_test) for name in ("campaign_5d", "campaign_full")]
 REACHED += [("paper", "campaign_1d", "lines joint")]
 REACHED += [(name, "campaign", "lines joint") for name in ("example_6_6", "jugglebot", "positioning_unit")]
 

@@ -1,4 +1,4 @@
-"""The package's metadata, and its dependencies as the source really has them; what is installed: test/packaging."""
+"""The package's metadata, and its dependencies as the source really has them; what is installed: test_installation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from packaging.utils import canonicalize_name
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.formats.paths import config_file, shipped_names
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "hexapod_comp"
 
 # Import name → key in rosdep's python.yaml and name on PyPI, where the three differ. ROS packages are
