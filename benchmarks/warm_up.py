@@ -237,7 +237,7 @@ def zoo_readings(kind: str, thermometer: str, seed: int) -> tuple[MachineModel, 
     campaign = warm.campaign(plan)
     empty = template(campaign, geometry)
     is_so, is_read = warm.stations(empty, seed)
-    commands = is_so.commands + hidden.lengths((is_so.positions, is_so.rotations))
+    commands = is_so.commands + hidden.lengths((is_so.positions, is_so.rotations), is_so.sense)
     empty, real = replace(empty, stations=is_read), replace(empty, stations=replace(is_so, commands=commands))
     read = measure(real, campaign, truth, seed).value + carelessness(empty, real, truth, kind, seed)
     return truth.model, warm, empty.with_values(read)
