@@ -63,7 +63,7 @@ KNOWN = tuple(block for block in BLOCKS if block not in WAVES or WAVES[block] ==
 
 BAR, WIDTH_BAR = 0.95, 2.0
 
-BELIEVED = (3.0, 6.0, 12.0, 24.0, 70.0, np.inf)
+BELIEVED = (3.0, 6.0, 8.0, 12.0, 24.0, 70.0, np.inf)
 """Degrees of freedom with which the covariance is believed, for ``--ablate``."""
 
 HARMONICS = {2: (0.5e-6, 2e-6), 3: (0.3e-6, 1e-6)}

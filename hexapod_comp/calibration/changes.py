@@ -20,6 +20,9 @@ from .estimator import Estimation
 from .parameters import BLOCKS, ParameterSpace
 from .posterior import FittedParameters
 
+MOST_READINGS = 500  # of a check; more are a calibration
+UNCHANGED_DRAWS = 4000  # machines drawn to find the false alarms: 1 % to ± 0.16 %
+
 DATUM, STRUT, TEMPERATURE, AGEING, READING, OTHER = "datum", "strut", "temperature", "ageing", "reading", "other"
 # Kinds of change, and what each is called. All but the last two are parameters that few readings can repair.
 FAMILIES = {
@@ -137,9 +140,9 @@ class CheckReadings:
             raise CalibrationError("measurements", problem)
         estimation = Estimation(measurements, space, alone=False)
         cells = estimation.cells
-        if len(cells.kind) > ASSUMED.most_check_readings:
+        if len(cells.kind) > MOST_READINGS:
             problem = f"{len(cells.kind)} readings at distinct places are no check"
-            raise CalibrationError("measurements", f"{problem} (at most {ASSUMED.most_check_readings}); fit them")
+            raise CalibrationError("measurements", f"{problem} (at most {MOST_READINGS}); fit them")
         linear, _ = estimation.linearise(fitted.x if x is None else x, np.ones(len(measurements)))
         free, sizes, _ = np.linalg.svd(estimation.free_of_nuisance(np.eye(len(cells.kind))))
         seen = free[:, sizes > ROUNDING * sizes.max(initial=0.0)].T
@@ -227,7 +230,7 @@ class Evidence:
 
     def probability_unchanged(self, readings: np.ndarray) -> float:
         """Return in which share of checks a machine that has not changed reads as strangely as this, or more so."""
-        z = np.random.default_rng(11).standard_normal((ASSUMED.unchanged_draws, len(readings)))
+        z = np.random.default_rng(11).standard_normal((UNCHANGED_DRAWS, len(readings)))
         z = np.vstack([self._whitening @ readings, z])
         changed = np.logaddexp.reduce(np.concatenate(self._of_whitened(z), axis=1), axis=1)
         return float((changed >= changed[0]).mean())

@@ -12,6 +12,7 @@ from ..machine.arrays import rms
 from ..machine.model import MachineModel, RealMachine
 from ..measurements.readings import MeasurementSet
 from .assumptions import ASSUMED
+from .blocks.block import DIGITS
 from .changes import (
     DATUM,
     FAMILIES,
@@ -290,7 +291,7 @@ def update_model(
         posterior=None,
     )
     new = replace(
-        known.space.model(x.round(ASSUMED.digits), model.name),
+        known.space.model(x.round(DIGITS), model.name),
         reversal_threshold=model.reversal_threshold,
         origin=origin,
     )

@@ -18,6 +18,7 @@ from ..machine.kinematics import Structure, strut_lengths
 from ..machine.model import Datum, MachineModel, tool_move, with_datum_held
 from ..pose import Pose
 from .assumptions import ASSUMED
+from .blocks.block import DIGITS
 from .estimator import Estimation
 from .sensitivity import carried
 
@@ -88,7 +89,7 @@ def hold(
     refuse_unreachable(geometry, pose)
     given_up = tool_move(geometry, model, pose)
     model = with_datum_held(geometry, model, pose, part)
-    rounded = {name: getattr(model, name).round(ASSUMED.digits) for name in ("base_deviation", "base_axes_turn")}
+    rounded = {name: getattr(model, name).round(DIGITS) for name in ("base_deviation", "base_axes_turn")}
     held = HeldDatum(pose, part, given_up)
     return replace(model, **rounded, origin=replace(model.origin, datum=held.datum)), held
 

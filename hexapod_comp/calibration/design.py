@@ -19,7 +19,6 @@ from ..errors import CalibrationError, InputFileError
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..measurements.campaign import Campaign, CampaignRun, template
 from ..measurements.readings import DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
-from .assumptions import ASSUMED
 from .candidates import MeasuringBox, candidates
 from .estimator import Estimation, physical_covariance, solve
 from .fit import unseen_errors
@@ -28,6 +27,9 @@ from .parameters import Extent, FitSettings, ParameterSpace
 from .posterior import POINTS, Observability, ToolError, UnseenError, box_errors, expected_error, observe
 from .promise import Scatter, Unexplained
 from .trust import TILT
+
+FAINT = 0.05  # directions that readings see by less are left out, σ
+LEAST_REACHED = 0.3  # share of the box in which the tool must tilt as wanted
 
 
 def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) -> tuple[np.ndarray, Cells]:
@@ -103,7 +105,7 @@ class ErrorLeft:
         self.parts = [slice(*pair) for pair in pairwise(np.cumsum([0, *(len(rows) for rows in seen)]))]
         rows = np.concatenate(seen)
         values, vectors = np.linalg.eigh(rows.T @ rows)
-        self.basis = vectors[:, values > ASSUMED.faint**2]
+        self.basis = vectors[:, values > FAINT**2]
         self.root = self.basis.T @ root
         self.rows = rows @ self.basis
         self.inner = np.eye(self.basis.shape[1])
@@ -321,9 +323,9 @@ class Aim:
         """Return M, shape (size, size), m²: the mean square tool error with the datum aligned is tr(M·C)."""
         errors = box_errors(space, np.zeros(space.size), tilt)
         reached = 0.0 if errors is None else len(errors.places) / (2.0 * POINTS)
-        if errors is None or reached < ASSUMED.least_reached:
+        if errors is None or reached < LEAST_REACHED:
             problem = f"{np.degrees(tilt):g}° is within the limits at {100.0 * reached:.0f} % of the box only"
-            raise CalibrationError("tilt", f"{problem}, {100.0 * ASSUMED.least_reached:g} % are needed")
+            raise CalibrationError("tilt", f"{problem}, {100.0 * LEAST_REACHED:g} % are needed")
         spread = space.spread(space.start_tolerances())
         return np.asarray(spread[:, None] * space.whitened(space.whitened(errors.mean_squares()[0]).T) * spread)
 
@@ -342,7 +344,7 @@ def seen_by(space: ParameterSpace, campaign: Campaign, measured: MeasurementSet)
     run, result = run_of_station[cells.station], []
     for n in range(len(measured.runs)):
         values, vectors = np.linalg.eigh(rows[run == n] @ rows[run == n].T)
-        result.append(np.asarray(vectors[:, values > ASSUMED.faint**2].T @ rows[run == n]))
+        result.append(np.asarray(vectors[:, values > FAINT**2].T @ rows[run == n]))
     return result
 
 

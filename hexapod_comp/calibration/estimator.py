@@ -26,13 +26,21 @@ from .sensitivity import Prediction, Slopes, predict
 Given = TypeVar("Given")
 Result = TypeVar("Result")
 
+STEPS, SETTLED = 20, 1e-2  # most Gauss-Newton steps; largest change of a parameter in the last one, σ
+ROUNDS, FEW_ROUNDS = 12, 2  # of hyperparameters at one step, and where they start at an answer
+ROUNDS_SETTLED = 1e-3  # relative change after which rounds stop: hyperparameters are known to 1/√(2n)
+LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # longest extrapolation, in rounds, and largest change by it, logarithm
+LEAST_FREEDOM = 10.0  # fewest readings beyond the parameters for a noise: its own error is then 22 %
+LARGEST_STRUCTURE = 5e-3  # tolerance of joints, m: no machine is built worse
+CHUNK, THREADED = 512, 500  # cells of a processor's cache; rows from which on threads share the work
+
 
 def at_once(work: Callable[[Given], Result], items: Iterable[Given], rows: int) -> list[Result]:
     """Return the results of independent work with matrices of so many rows together.
 
     NumPy lets as many threads work as there are processors; few rows are done sooner than a thread is started.
     """
-    if rows < ASSUMED.threaded:
+    if rows < THREADED:
         return list(map(work, items))
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         return list(pool.map(work, items))
@@ -202,7 +210,7 @@ def solve(
     problem: LinearProblem,
     tolerances: np.ndarray,
     noise: np.ndarray,
-    rounds: int = ASSUMED.rounds,
+    rounds: int = ROUNDS,
     silent: np.ndarray | None = None,
 ) -> Posterior:
     """Return the posterior of a linear problem; tolerances and noise factors are estimated with it."""
@@ -222,7 +230,7 @@ def solve(
             noise, tolerances = _noise(problem, kinds, normal, moment, posterior), _tolerances(space, posterior, z)
             scales.append(np.concatenate([tolerances, noise]))
             ratio = scales[-1][scales[-1] > 0.0] / scales[-2][scales[-1] > 0.0]
-            if np.abs(np.log(ratio)).max() < ASSUMED.rounds_settled:
+            if np.abs(np.log(ratio)).max() < ROUNDS_SETTLED:
                 break
             if len(scales) == 3:
                 scales = [_extrapolated(*scales)]
@@ -238,10 +246,10 @@ def _extrapolated(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> n
     live = third > 0.0
     logs = np.log(np.stack([first[live], second[live], third[live]]))
     step, bend = logs[1] - logs[0], logs[2] - 2.0 * logs[1] + logs[0]
-    stride = float(np.clip(np.linalg.norm(step) / max(float(np.linalg.norm(bend)), 1e-12), 1.0, ASSUMED.longest_stride))
+    stride = float(np.clip(np.linalg.norm(step) / max(float(np.linalg.norm(bend)), 1e-12), 1.0, LONGEST_STRIDE))
     result = third.copy()
     led = logs[0] + 2.0 * stride * step + stride**2 * bend
-    result[live] = np.exp(np.clip(led, logs[2] - ASSUMED.leap, logs[2] + ASSUMED.leap))
+    result[live] = np.exp(np.clip(led, logs[2] - LEAP, logs[2] + LEAP))
     return result
 
 
@@ -266,7 +274,7 @@ def _noise(
     for k, information, sums in zip(kinds, normal, moment, strict=True):
         rest = problem.square[k] - 2.0 * y @ sums + y @ information @ y
         freedom = problem.freedom[k] - np.vdot(posterior.covariance, information) / result[k] ** 2
-        if freedom > ASSUMED.least_freedom and rest > 0.0:
+        if freedom > LEAST_FREEDOM and rest > 0.0:
             result[k] = np.sqrt(rest / freedom)
     return np.maximum(result, problem.least_noise)
 
@@ -286,7 +294,7 @@ def _tolerances(space: ParameterSpace, posterior: Posterior, z: np.ndarray) -> n
             )
             result[n] = min(
                 result[n] * np.clip(factor, 0.1, 10.0),
-                ASSUMED.largest_structure if block.name == "structure" else np.inf,
+                LARGEST_STRUCTURE if block.name == "structure" else np.inf,
             )
     return result
 
@@ -403,8 +411,8 @@ class Estimation:
         def rows_of(group: _Group) -> Alike:
             columns = slopes.columns(group.components)
             rows = np.empty((len(group.cells), len(columns)))
-            for first in range(0, len(rows), ASSUMED.chunk):
-                part, cells = rows[first : first + ASSUMED.chunk], group.cells[first : first + ASSUMED.chunk]
+            for first in range(0, len(rows), CHUNK):
+                part, cells = rows[first : first + CHUNK], group.cells[first : first + CHUNK]
                 slopes.write(part, c.station[cells], directions[cells], group.components)
                 moved[cells] = part @ y[columns]
             return Alike(group.cells, columns, rows)
@@ -537,26 +545,21 @@ def iterate(
 ) -> Solution:
     """Run Gauss–Newton steps until the parameters settle, from the nominal machine or from an answer."""
     weights, robust = np.ones(len(estimation.measurements)), estimation.space.settings.robust
-    share, last = 1.0, np.inf
     all_alike = 0 if x.any() else 1  # steps whose residuals are the machine's errors: they weigh no reading
-    for step in range(1, ASSUMED.steps + 1):
+    for step in range(1, STEPS + 1):
         problem, residuals = estimation.linearise(x, weights)
         posterior = solve(estimation.space, problem, tolerances, noise)
         tolerances, noise = posterior.tolerances, posterior.noise
-        change, block = _change(estimation.space.physical(posterior.y) - x, estimation.space, posterior)
+        moved, x = estimation.space.physical(posterior.y) - x, estimation.space.physical(posterior.y)
+        change, block = _change(moved, estimation.space, posterior)
         progress(f"step {step}: largest change {change:.2g} standard deviations")
-        if step > all_alike + (2 if robust else 1) and change > ASSUMED.slow * last:
-            share = max(ASSUMED.least_share, 0.5 * share)
-        x, last = x + share * (estimation.space.physical(posterior.y) - x), change
-        if (change < ASSUMED.settled and (step > all_alike + 1 or not robust)) or step == ASSUMED.steps:
+        if (change < SETTLED and (step > all_alike + 1 or not robust)) or step == STEPS:
             break
         if robust and step > all_alike:
             weights = estimation.robust_weights(residuals)
     solution = Solution(problem, posterior, x, residuals, weights, step, change)
     if change > 1.0:
-        moving = (
-            f"did not settle within {ASSUMED.steps} steps: {block} still changes by {change:.2g} standard deviations"
-        )
+        moving = f"did not settle within {STEPS} steps: {block} still changes by {change:.2g} standard deviations"
         raise NotSettled(f"{moving}; are all blocks allowed, and is it measured in enough places?", solution)
     return solution
 

@@ -18,6 +18,7 @@ from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementS
 from ..pose import Pose
 from .assumptions import ASSUMED
 from .blocks import WAVES
+from .blocks.block import DIGITS
 from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
 from .estimator import (
     Estimation,
@@ -40,6 +41,7 @@ from .trust import LeftOut, Residuals, Verdict, judge, with_drift
 LARGEST_NOISE = 0.02  # A machine that leaves more than this of its readings, m or rad, is not the one that was measured
 # Readings taken further than this from the reference temperature, K, need an expansion: 1 µm on half a metre
 WARM = 0.2
+MOST_LEFT_OUT = 3  # runs left out of a fit that does not settle; more are a bad campaign
 
 
 @dataclass(frozen=True)
@@ -199,7 +201,7 @@ def _without_pulling(
 ) -> ModelFit:
     """Return the fit without the runs that pull it most, one by one, until it settles; else as it stands, refused."""
     kept, names, error = measurements, list[str](), unsettled
-    while len(names) < ASSUMED.most_left_out and len(np.unique(kept.run)) > 1:
+    while len(names) < MOST_LEFT_OUT and len(np.unique(kept.run)) > 1:
         of_cell = kept.run[Estimation(kept, begun.everything.space, alone=False).cells.first]
         worst = int(influence(of_cell, error.solution).argmax())
         names.append(kept.runs[worst].name)
@@ -425,7 +427,7 @@ def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
         return []
     values = solution.x[block.part]
     sigmas = values / np.sqrt(np.diag(physical_covariance(space, solution.posterior))[block.part])
-    negative = np.flatnonzero(sigmas < -ASSUMED.negative_backlash)
+    negative = np.flatnonzero(sigmas < -ASSUMED.surely)
     if len(negative) > 3:
         listed = ", ".join(f"{v * 1e6:.2f}" for v in values)
         problem = f"{SWAPPED}: the struts would have a backlash of {listed} µm"
@@ -466,7 +468,9 @@ def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:
                 f"{c.kind} readings are off by {c.estimated:.3g} {unit} (allowed {LARGEST_NOISE:g}); do units fit?"
             )
             raise CalibrationError("measurements", problem)
-    noisy = [f"{c.kind} {c.estimated / c.stated:.1f} times" for c in channels if c.estimated > ASSUMED.noisy * c.stated]
+    noisy = [
+        f"{c.kind} {c.estimated / c.stated:.1f} times" for c in channels if c.estimated > ASSUMED.misfit[0] * c.stated
+    ]
     if not noisy:
         return []
     problem = "readings scatter more than stated: something of the machine, or of an instrument, is not in the model"
@@ -524,4 +528,4 @@ def _named(
         note += f", expected tool error {level.after * 1e6:.3f} µm RMS, up to {level.high * 1e6:.3f} (95 %)"
     residual = rms(lengths) if lengths else None
     origin = ModelOrigin(date.today().isoformat(), measurements.files, residual, note)
-    return replace(space.model(solution.x.round(ASSUMED.digits)), origin=origin)
+    return replace(space.model(solution.x.round(DIGITS)), origin=origin)

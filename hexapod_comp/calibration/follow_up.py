@@ -13,10 +13,14 @@ from ..machine.model import RealMachine, measured_region
 from ..machine.passes import Poses
 from ..measurements.readings import ABSOLUTE_KINDS, BACKWARD, CHANNELS, KINDS, MeasurementSet
 from ..workspace.combined import NORMAL, covariance_factor, monte_carlo, root_sum_of_squares
-from .assumptions import ASSUMED
 from .changes import STRUT, TEMPERATURE, CheckReadings, Evidence, Explanation, possible_changes, widened, wrong_readings
 from .design import ErrorLeft, Greedy, information, laid_out
 from .posterior import POINTS, ErrorPredictor, FittedParameters
+
+TILTS = (10.0, 5.0, 2.0)  # of scattered poses, °: the first within reach
+CRASH, WARMTH = 20e-6, 12e-6  # what a proposed check is to name: a light collision, m; a kelvin of steel, m/m
+CHECK_READINGS = 12  # of a proposed check: 20 µm are named in 95 % (benchmarks.upkeep)
+MACHINES_DRAWN = 2000  # for the percentile of the worst pose: 95 % to ± 0.5 %
 
 
 def places(readings: MeasurementSet) -> Iterator[tuple[str, tuple[str, ...], np.ndarray]]:
@@ -49,7 +53,7 @@ def settle(
     space, kinds = fitted.space, np.unique(measured.kind)
     by_pose = np.isin(np.array(KINDS)[kinds], ABSOLUTE_KINDS)
     sets = [laid_out(space, lines=2)] if not by_pose.all() else []
-    sets += [laid_out(space, poses=8, tilts=(*ASSUMED.tilts, 0.0))] if by_pose.any() else []
+    sets += [laid_out(space, poses=8, tilts=(*TILTS, 0.0))] if by_pose.any() else []
     proposals = []
     for readings, _ in sets:
         readings = readings.select(np.isin(readings.kind, kinds) & (readings.direction != BACKWARD))
@@ -96,7 +100,7 @@ class Detectability:
         self.single, self.read = numbers @ check.single, every != 0.0
         self.covariance = numbers @ check.covariance(wide.covariance) @ numbers.T
         self.effects = [(c, numbers @ (check.rows @ c.columns)) for c in changes]
-        sizes = {(STRUT, name): ASSUMED.crash for name in STRUT_NAMES} | {(TEMPERATURE, "struts"): ASSUMED.warmth}
+        sizes = {(STRUT, name): CRASH for name in STRUT_NAMES} | {(TEMPERATURE, "struts"): WARMTH}
         self.wanted = [(c.family, c.name) for c in changes if (c.family, c.name) in sizes]
         self.moved = [sizes[c.family, c.name] * e[:, 0] for c, e in self.effects if (c.family, c.name) in sizes]
         self.taken = np.zeros(0, dtype=int)
@@ -133,7 +137,7 @@ class Detectability:
 
 def propose_check(
     fitted: FittedParameters,
-    readings: int = ASSUMED.check_readings,
+    readings: int = CHECK_READINGS,
     instruments: Sequence[str] = ("linear", "rotation"),
 ) -> MeasurementSet:
     """Return the check readings to take with some instruments of :data:`READ_BY`; values are not a number."""
@@ -147,7 +151,7 @@ def propose_check(
     with_lines, with_poses = (
         any(name.startswith("tracker") == poses for name in instruments) for poses in (False, True)
     )
-    tilts = (*ASSUMED.tilts, 0.0) if with_poses else (0.0,)
+    tilts = (*TILTS, 0.0) if with_poses else (0.0,)
     every, _ = laid_out(fitted.space, 2 * with_lines, 3, 12 * with_poses, tilts, "5-D")
     every = every.select(np.isin(every.channel, channels) & (every.direction != BACKWARD))
     candidates = _contrasts(every)
@@ -263,7 +267,7 @@ def _left(predictor: ErrorPredictor, poses: Poses, factor: np.ndarray, where: st
     tips, effects = tips[reached], np.swapaxes(slopes[reached] @ factor, 1, 2)
     sizes = root_sum_of_squares(effects)
     as_it_stands = np.concatenate([standing[reached] @ factor, given_up[reached, :, None]], axis=2)[:, :3]
-    drawn = monte_carlo(effects, ASSUMED.machines_drawn, percentiles=(95.0,), distribution=NORMAL)
+    drawn = monte_carlo(effects, MACHINES_DRAWN, percentiles=(95.0,), distribution=NORMAL)
     worst = int(sizes[:, 0].argmax())
     left = Left(
         where=where,
@@ -294,7 +298,7 @@ def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]
         where = "body diagonals" if axis == "diagonal" else f"lines along {axis}"
         yield f"{read}, {where}", int(members.sum()), rows[np.unique(cells.of_reading[members])]
     poses = 20
-    for tilts in ((0.0,), ASSUMED.tilts):
+    for tilts in ((0.0,), TILTS):
         try:
             readings, tilt = laid_out(space, poses=poses, tilts=tilts)
         except InputFileError:  # out of reach

@@ -17,7 +17,12 @@ from .assumptions import ASSUMED
 from .blocks import WAVES
 from .estimator import MEDIAN_TO_SIGMA, Estimation, LinearProblem, Posterior, at_once, solve
 
-SHORTEST, LONGEST = ASSUMED.shortest_period, ASSUMED.longest_period
+LEAST_FREEDOM = 200.0  # fewest readings beyond the parameters that show a period
+MOST_READINGS = 5000  # in which a period is looked for first
+WAVE_AMPLITUDE = 10e-6  # prior of amplitudes while periods are compared, m: loose
+AGREES, CLOSE = 6.0, 5e-3  # a given or a round lead agrees within, σ, and as a share
+
+SHORTEST, LONGEST = 1e-3, 30e-3  # periods that are looked for, m: beyond, a wave is as smooth as a length map
 
 GRID_STEP = SHORTEST / 32.0
 """Of the transforms, m: 0.3 % of a wave of the shortest period is lost."""
@@ -40,7 +45,7 @@ class ScrewLead:
         """The period to be fitted, m: the given one; else the one shown, or the round number that it stands for."""
         if self.given is not None or self.shown is None:
             return self.given
-        within = ASSUMED.lead_agrees * self.error
+        within = AGREES * self.error
         round_ones = [step * round(self.shown / step) for step in ROUND if within < 0.1 * step]
         near = [lead for lead in round_ones if abs(lead - self.shown) < within]
         return near[0] if near else self.shown
@@ -51,7 +56,7 @@ class ScrewLead:
         if self.given is None or self.shown is None:
             return True
         misses = [abs(self.given / n - self.shown) for n in range(1, MOST_HARMONICS + 1)]
-        return min(misses) < max(ASSUMED.lead_agrees * self.error, ASSUMED.lead_close * self.shown)
+        return min(misses) < max(AGREES * self.error, CLOSE * self.shown)
 
     def __str__(self) -> str:
         given = "" if self.given is None else f"{self.given * 1e3:.6g} mm given"
@@ -71,11 +76,11 @@ def look_for_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
     space, measurements = estimation.space, estimation.measurements
     given = float(space.periods[0]) if np.isfinite(space.periods).all() else None
     odds = 0.0
-    if len(measurements) > ASSUMED.lead_readings:
+    if len(measurements) > MOST_READINGS:
         some = np.zeros(len(measurements), dtype=bool)
-        some[np.random.default_rng(0).choice(len(measurements), ASSUMED.lead_readings, replace=False)] = True
+        some[np.random.default_rng(0).choice(len(measurements), MOST_READINGS, replace=False)] = True
         few = Estimation(measurements.select(some), space, alone=False)
-        odds, best, posterior = _strongest(few, few.linearise(np.zeros(space.size), np.ones(ASSUMED.lead_readings))[0])
+        odds, best, posterior = _strongest(few, few.linearise(np.zeros(space.size), np.ones(MOST_READINGS))[0])
     if odds < ASSUMED.lead_odds:
         odds, best, posterior = _strongest(estimation, problem)
     if best is None or odds < ASSUMED.lead_odds:
@@ -83,7 +88,7 @@ def look_for_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
     # So far the waves counted as noise, which let the priors weigh too much.
     quiet = solve(space, problem, posterior.tolerances, posterior.noise * best.noise, rounds=0)
     rest = _Rest(estimation, problem, quiet)
-    if rest.freedom >= ASSUMED.lead_freedom:  # few readings leave a quiet fit nothing to tell its noise by
+    if rest.freedom >= LEAST_FREEDOM:  # few readings leave a quiet fit nothing to tell its noise by
         best = rest.line(best.frequency)
     if not np.isfinite(best.error):
         return ScrewLead(given, None, np.inf, odds)
@@ -96,7 +101,7 @@ def _strongest(estimation: Estimation, problem: LinearProblem) -> tuple[float, L
     tolerances = np.where([b.name in WAVES for b in space.blocks], 0.0, space.start_tolerances())
     posterior = solve(space, problem, tolerances, np.ones(problem.normal.shape[0]), 5)
     rest = _Rest(estimation, problem, posterior)
-    if rest.freedom < ASSUMED.lead_freedom:
+    if rest.freedom < LEAST_FREEDOM:
         return 0.0, None, posterior
     spectrum = rest.spectrum()
     best = _fundamental(rest, spectrum)
@@ -206,7 +211,7 @@ class _Rest:
         """
         precision = columns.T @ columns - shared.T @ self._posterior.covariance @ shared
         tight = len(precision) - loose
-        precision[np.diag_indices(tight)] += ASSUMED.wave_amplitude**-2
+        precision[np.diag_indices(tight)] += WAVE_AMPLITUDE**-2
         covariance = np.linalg.pinv(precision, hermitian=True)
         moment = columns.T @ self.left
         factors = covariance @ moment

@@ -36,6 +36,8 @@ from ..virtual.instruments import compensated
 from .assumptions import ASSUMED
 from .blocks import EXPECTED
 from .estimator import (
+    FEW_ROUNDS,
+    ROUNDS,
     Estimation,
     LinearProblem,
     Posterior,
@@ -46,6 +48,12 @@ from .estimator import (
 from .parameters import TOLERANCES, FitSettings, ParameterSpace
 from .promise import STEEL
 from .sensitivity import Prediction, predict
+
+PARALLEL = 0.999  # cosine from which a line is parallel to an axis
+MOST_READINGS, FEW_READINGS = 2500, 400  # drawn at random to weigh mix-ups, and to try frames first
+FINALISTS = 3  # alternatives of a sort for which sizes of priors are estimated
+MODE_ROUNDS = 3  # in which priors are estimated with a mistake that all readings share
+STRANGE, PLAUSIBLE, AS_GOOD = 100.0, 10.0, 3.0  # χ² per number of misread checks, of right ones, over the best
 
 FAMILIES = ("x lines", "y lines", "z lines", "other lines", "other runs")
 """Families of runs, by direction in the work frame."""
@@ -89,7 +97,7 @@ class Mode(NamedTuple):
 def family_of_run(measurements: MeasurementSet) -> np.ndarray:
     """Return the index into :data:`FAMILIES` of each run."""
     axes = np.array([run.axis for run in measurements.runs]).reshape(-1, 3) @ measurements.geometry.work.rotation
-    parallel = np.abs(axes) > ASSUMED.parallel
+    parallel = np.abs(axes) > PARALLEL
     family = np.where(parallel.any(axis=1), parallel.argmax(axis=1), 3)
     return np.where(axes.any(axis=1), family, 4)
 
@@ -112,8 +120,8 @@ def mixups(
         Called with what is tried.
     """
     m = everything.measurements
-    if len(m) > ASSUMED.mixup_readings:
-        m = _thinned(m, ASSUMED.mixup_readings)
+    if len(m) > MOST_READINGS:
+        m = _thinned(m, MOST_READINGS)
         everything = Estimation(m, everything.space, alone=False)
         problem, _ = everything.linearise(np.zeros(everything.space.size), np.ones(len(m)))
     progress("are the readings more probable, taken another way?")
@@ -122,7 +130,7 @@ def mixups(
         blocks = {*blocks, *(name for name in EXPECTED if everything.space.block(name))}
         model = _Fitted(everything, problem, blocks)
         found = [*model.common_modes(), *model.other_directions()]
-        if not blocks <= set(EXPECTED) or (model.posterior.noise[model.kinds] >= ASSUMED.noisy).any():
+        if not blocks <= set(EXPECTED) or (model.posterior.noise[model.kinds] >= ASSUMED.misfit[0]).any():
             # Otherwise a machine and its screws alone describe the readings.
             found += [*model.reversed_signs(), *model.other_units(), *model.otherwise(_relabelled(m))]
             found += _elsewhere(m, model, blocks)
@@ -146,7 +154,7 @@ def swapped_directions(everything: Estimation, problem: LinearProblem, blocks: C
     deviation = np.sqrt(np.diag(posterior.covariance))[
         np.searchsorted(posterior.used, np.arange(space.size)[block.part])
     ]
-    return bool((backlash < -ASSUMED.negative_backlash * deviation).sum() > len(backlash) // 2)
+    return bool((backlash < -ASSUMED.surely * deviation).sum() > len(backlash) // 2)
 
 
 class _Way(NamedTuple):
@@ -168,11 +176,11 @@ class _Fitted:
         kept = np.array([n == 0 or block.name in blocks for n, block in enumerate(space.blocks)])
         self._first_guess = np.where(kept, space.start_tolerances(), 0.0)
         if start is None:
-            self.posterior = solve(space, problem, self._first_guess, np.ones(len(KINDS)), ASSUMED.mixup_rounds)
+            self.posterior = solve(space, problem, self._first_guess, np.ones(len(KINDS)), ROUNDS)
         else:
             known = dict(zip([b.name for b in start.space.blocks], start.posterior.tolerances, strict=True))
             tolerances = np.array([known[block.name] for block in space.blocks])
-            self.posterior = solve(space, problem, tolerances, start.posterior.noise, ASSUMED.mixup_first_rounds)
+            self.posterior = solve(space, problem, tolerances, start.posterior.noise, FEW_ROUNDS)
         self.kinds = np.unique(problem.kind)
         self.evidence = log_evidence(problem, self.posterior)
         self._rows = problem.rows.dense()[:, self.posterior.used]
@@ -216,10 +224,10 @@ class _Fitted:
 
     def _with_mode(self, effect: np.ndarray, mode: Mode, times: float, posterior: Posterior) -> tuple[_Way, Posterior]:
         """Return the evidence with a mode, by tolerances and noise that are estimated with it, and the posterior."""
-        for _ in range(ASSUMED.mode_rounds):
+        for _ in range(MODE_ROUNDS):
             way = self._by_mode(effect, mode, times, posterior)
             rest = self.with_target(self.problem.target - way.amplitude * effect, np.ones(len(KINDS)))
-            posterior = solve(self.space, rest, posterior.tolerances, posterior.noise, ASSUMED.mixup_first_rounds)
+            posterior = solve(self.space, rest, posterior.tolerances, posterior.noise, FEW_ROUNDS)
         return self._by_mode(effect, mode, times, posterior), posterior
 
     def _by_mode(self, effect: np.ndarray, mode: Mode, times: float, posterior: Posterior) -> _Way:
@@ -250,7 +258,7 @@ class _Fitted:
         groups, group = np.unique(np.column_stack([m.run, m.station, time]), axis=0, return_inverse=True)
         known = m.direction != UNKNOWN
         flipped, model = np.zeros(len(groups), dtype=bool), self
-        for _ in range(ASSUMED.mode_rounds):
+        for _ in range(MODE_ROUNDS):
             ratio = np.bincount(group.ravel(), known * model._reversal_ratio(block.part))
             if np.maximum(ratio, 0.0).sum() < np.log(ASSUMED.mixup_odds):
                 break
@@ -331,8 +339,8 @@ class _Fitted:
                 flipped = by_run[:, runs] @ chosen
                 name = f"{what}{len(listed)} of {len(runs)} runs ({title}): sign reversed"
                 tried.append((_screened(gram, flipped), len(runs) * np.log(2.0), name, flipped))
-        tried = sorted((t for t in tried if t[0] > 0.0), key=lambda t: -t[0])[: ASSUMED.mixup_finalists]
-        rounds = ASSUMED.mixup_rounds
+        tried = sorted((t for t in tried if t[0] > 0.0), key=lambda t: -t[0])[:FINALISTS]
+        rounds = ROUNDS
         return [
             self.compared(name, self.with_target(target(flipped), unscaled), unscaled, rounds, choices)
             for _, choices, name, flipped in tried
@@ -368,9 +376,9 @@ class _Fitted:
             scale[kinds] = factor
             change = self.estimation.free_of_nuisance(((scale[self.problem.kind] - 1.0) * values)[:, None])[:, 0]
             problem = self.with_target(self.problem.target + change, scale)
-            tried.append((self.compared(name, problem, scale, ASSUMED.mixup_first_rounds), problem, scale))
+            tried.append((self.compared(name, problem, scale, FEW_ROUNDS), problem, scale))
         tried = sorted(tried, key=lambda t: -t[0].gain)[:1]
-        return [self.compared(t.name, problem, scale, ASSUMED.mixup_rounds) for t, problem, scale in tried]
+        return [self.compared(t.name, problem, scale, ROUNDS) for t, problem, scale in tried]
 
     def otherwise(self, others: Iterator[tuple[str, MeasurementSet]]) -> list[Alternative]:
         """Return alternatives with other derivatives, the most probable ones."""
@@ -380,9 +388,9 @@ class _Fitted:
         for name, measurements in others:
             problem = _linearised(measurements, self.space, prediction if measurements.stations is here else None)
             if problem is not None:
-                tried.append((self.compared(name, problem, unscaled, ASSUMED.mixup_first_rounds), problem))
-        tried = sorted(tried, key=lambda t: -t[0].gain)[: ASSUMED.mixup_finalists]
-        return [self.compared(t.name, problem, unscaled, ASSUMED.mixup_rounds) for t, problem in tried]
+                tried.append((self.compared(name, problem, unscaled, FEW_ROUNDS), problem))
+        tried = sorted(tried, key=lambda t: -t[0].gain)[:FINALISTS]
+        return [self.compared(t.name, problem, unscaled, ROUNDS) for t, problem in tried]
 
     def _cell_values(self, values: np.ndarray) -> np.ndarray:
         of_reading, weights = self.estimation.cells.of_reading, self.estimation.uncertainty**-2
@@ -462,7 +470,7 @@ def _elsewhere(m: MeasurementSet, model: _Fitted, blocks: Collection[str]) -> li
     """Return alternatives in which the machine stood elsewhere, of as many readings as tell; by all where one does."""
     if not np.allclose(m.stations.commands, _nominal(m.geometry, m), rtol=0.0, atol=1e-9):
         return []
-    few = _thinned(m, ASSUMED.mixup_few)
+    few = _thinned(m, FEW_READINGS)
     settings = replace(model.space.settings, blocks=tuple(blocks))
     small = _of(few, settings, blocks, model)
     clear = []
@@ -476,7 +484,7 @@ def _elsewhere(m: MeasurementSet, model: _Fitted, blocks: Collection[str]) -> li
             if gain > np.log(ASSUMED.mixup_odds):
                 clear.append((gain, name, moved))
     found = []
-    for _, name, moved in sorted(clear, key=lambda c: -c[0])[: ASSUMED.mixup_finalists]:
+    for _, name, moved in sorted(clear, key=lambda c: -c[0])[:FINALISTS]:
         if (other := _of(moved(m), settings, blocks)) is not None:
             better = float((model.posterior.noise / other.posterior.noise)[model.kinds].max())
             found.append(Alternative(name, other.evidence - model.evidence, better))
@@ -660,7 +668,7 @@ def misread(
     chi_square
         Returns χ² per number of readings against the model and what its fit knows.
     """
-    if as_they_are < ASSUMED.strange_check:
+    if as_they_are < STRANGE:
         return []
     clear = []
     for name, tried in _checked_otherwise(m, model):
@@ -668,11 +676,11 @@ def misread(
             value = chi_square(tried())
         except HexapodError:  # out of reach that way
             continue
-        if value < ASSUMED.plausible_check:
+        if value < PLAUSIBLE:
             clear.append((value, name))
     best = min(clear, default=(0.0, ""))[0]
     times = [(value, f"{name} fits {np.sqrt(as_they_are / value):.3g} times better") for value, name in sorted(clear)]
-    return [text for value, text in times if value <= ASSUMED.as_good_check * best]
+    return [text for value, text in times if value <= AS_GOOD * best]
 
 
 def _checked_otherwise(m: MeasurementSet, model: MachineModel) -> Iterator[tuple[str, Callable[[], MeasurementSet]]]:

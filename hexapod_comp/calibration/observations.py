@@ -20,6 +20,11 @@ from ..machine.arrays import different_rows, rms
 from ..measurements.readings import ABSOLUTE_KINDS, KINDS, LEAST_TRAVEL, LENGTH, MeasurementSet
 from .assumptions import ASSUMED
 
+FAR = 5.0  # a centre further off its place is refused, σ of its prior
+UNMOVED = 1e-3  # change of lengths by a body's motion that hardly shows it: a circle's centre
+FRAME_STATIONS = 4  # tracker runs with fewer stations share a frame: six unknowns need three
+FRAME_RANK = 1e-9  # what moves readings less, in proportion, is rounding
+
 ROUNDS, SETTLED = 20, 1e-10
 """Most Gauss–Newton steps to a body's place, and the step, m, after which it has settled."""
 
@@ -136,14 +141,14 @@ class Lengths:
         if not self.known_zero:
             columns -= columns.mean(axis=0)
         squares, directions = np.linalg.eigh(columns.T @ columns / len(columns))
-        return directions * np.where(squares > ASSUMED.unmoved**2, ASSUMED.centre, ASSUMED.across)
+        return directions * np.where(squares > UNMOVED**2, ASSUMED.centre, ASSUMED.across)
 
     def _refuse_far(self, place: np.ndarray) -> None:
         """Raise when the body is at another place, m, than the file's."""
-        if np.abs(place).max() > ASSUMED.far * ASSUMED.centre:
+        if np.abs(place).max() > FAR * ASSUMED.centre:
             shown = ", ".join(f"{v * 1e3:.1f}" for v in place)
             problem = f"the lengths of run {self.name} put their centre {shown} mm (in base) off its place in the file"
-            known = f"it must be known to {ASSUMED.far * ASSUMED.centre * 1e3:g} mm"
+            known = f"it must be known to {FAR * ASSUMED.centre * 1e3:g} mm"
             hint = f"{known}; do places, units and commanded poses fit?"
             raise CalibrationError("centre", f"{problem}; {hint}")
 
@@ -180,7 +185,7 @@ class Frame:
             along = np.hstack([turn.apply(directions[:, :3]), turn.apply(moving)])
             turning = np.cross(away, along[:, :3]) + along[:, 3:]
             u, s, v = np.linalg.svd(-scale[:, None] * np.hstack([along[:, :3], turning / size]), full_matrices=False)
-            rank = int((s > ASSUMED.frame_rank * s[0]).sum())
+            rank = int((s > FRAME_RANK * s[0]).sum())
             step = v[:rank].T @ (u[:, :rank].T @ (scale * (value - expected)) / s[:rank])
             shift = shift + step[:3]
             turn = Rotation.from_rotvec(step[3:] / size) * turn
@@ -267,7 +272,7 @@ class Cells:
         m, absolute = measurements, np.flatnonzero(self.group < 0)
         run, points = m.run[self.first[absolute]], m.points()
         for n in np.unique(run):
-            if len(np.unique(self.station[absolute[run == n]])) < ASSUMED.frame_stations:
+            if len(np.unique(self.station[absolute[run == n]])) < FRAME_STATIONS:
                 run[run == n] = -1
         return [Frame(own, points[self.station[own]]) for n in np.unique(run) for own in [absolute[run == n]]]
 

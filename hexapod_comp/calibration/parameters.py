@@ -20,10 +20,13 @@ from ..machine.region import Region
 from ..machine.struts import StrutErrors
 from ..machine.temperatures import PARTS, LateGrowth
 from ..measurements.readings import MeasurementSet, spans
-from .assumptions import ASSUMED
 from .blocks import ERRORS, Block, growth
 from .blocks.block import Draft, Facts
 from .blocks.field import SmoothField
+
+LEADS = 0.1e-3, 1.0  # shortest and longest of a screw, m
+LARGEST_EXPANSION, LARGEST_MOISTURE = 100e-6, 1e-2  # 1/K: three times zinc's; m/m from dry to damp: more than wood's
+BEYOND_STROKE = 50e-3  # encoders may read so far beyond the stroke, m: zeros of their own
 
 TOLERANCES = {block.name: block.tolerance for block in ERRORS}
 """First guess of the blocks' standard deviations, m, m/m, rad or 1/K; the fit goes on from there."""
@@ -87,7 +90,7 @@ class FitSettings:
         unknown = set(self.blocks) - set(BLOCKS)
         if unknown:
             raise ModelError("blocks", f"must be of {', '.join(BLOCKS)}", sorted(unknown))
-        shortest, longest = ASSUMED.shortest_lead, ASSUMED.longest_lead
+        shortest, longest = LEADS[0], LEADS[1]
         if self.lead is not None and not shortest <= self.lead <= longest:
             allowed = f"{shortest * 1e3:g} mm to {longest * 1e3:g} mm"
             raise ModelError("lead", f"must be {allowed}", self.lead * 1e3)
@@ -95,8 +98,8 @@ class FitSettings:
             if not 0.0 < value < np.inf:
                 raise ModelError(f"tolerance of {name}", "must be finite and above zero", value)
         bodies = "strut", "base", "platform"
-        growths = {f"{body}_expansion": (ASSUMED.largest_expansion, 1e6, "ppm/K") for body in bodies}
-        growths["strut_moisture"] = ASSUMED.largest_moisture, 1e4, "ppm per % of relative humidity"
+        growths = {f"{body}_expansion": (LARGEST_EXPANSION, 1e6, "ppm/K") for body in bodies}
+        growths["strut_moisture"] = LARGEST_MOISTURE, 1e4, "ppm per % of relative humidity"
         for name, (largest, factor, unit) in growths.items():
             value = getattr(self, name) or 0.0
             if not 0.0 <= value <= largest:
@@ -279,7 +282,7 @@ class ParameterSpace:
 
 def _check_commands(geometry: HexapodGeometry, commands: np.ndarray) -> None:
     """Refuse strut readings that are no lengths of this machine's struts."""
-    stroke, beyond = geometry.limits.stroke, ASSUMED.beyond_stroke
+    stroke, beyond = geometry.limits.stroke, BEYOND_STROKE
     low, high = stroke.min() - beyond, stroke.max() + beyond
     if not (low <= commands.min() and commands.max() <= high):
         span = f"{commands.min():.4g}…{commands.max():.4g} m"

@@ -10,10 +10,11 @@ import hashlib
 import io
 import json
 import zipfile
-from collections.abc import Callable
 from dataclasses import asdict, fields, replace
+from itertools import repeat
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -204,45 +205,30 @@ def _noise(path: Path, arrays: dict[str, np.ndarray], kinds: Any) -> np.ndarray:
     return np.array([known.get(name, 1.0) for name in KINDS])
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
-
-
-def _is_list(value: Any, fits: Callable[[Any], bool]) -> bool:
-    return isinstance(value, list) and len(value) <= MOST_LISTED and all(map(fits, value))
-
-
-def _is_named(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and isinstance(value[0], str) and _is_number(value[1])
-
-
-FITS: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "bool": ("true or false", lambda value: isinstance(value, bool)),
-    "int": ("a whole number", lambda value: type(value) is int),
-    "float": ("a number", _is_number),
-    "float | None": ("a number or null", lambda value: value is None or _is_number(value)),
-    "str": ("text", lambda value: isinstance(value, str)),
-    "tuple[str, ...]": ("a list of names", lambda value: _is_list(value, lambda v: isinstance(v, str))),
-    "tuple[float, ...] | None": (
-        "a list of numbers, or null",
-        lambda value: value is None or _is_list(value, _is_number),
-    ),
-    "tuple[tuple[str, float], ...]": ("a list of names and numbers", lambda value: _is_list(value, _is_named)),
-}
-"""What a setting of a fit may be in a file, by the type of its field in :class:`FitSettings`."""
+def _fits(value: Any, hint: Any) -> bool:
+    """Return whether a value of a JSON file is of the type of a field: a number, text, or a list of such."""
+    if get_origin(hint) in (Union, UnionType):
+        return any(_fits(value, one) for one in get_args(hint))
+    if get_origin(hint) is tuple:
+        *first, last = get_args(hint)
+        kinds = repeat(first[0]) if last is Ellipsis else (*first, last)
+        listed = isinstance(value, list) and len(value) <= MOST_LISTED
+        return listed and (last is Ellipsis or len(value) == 1 + len(first)) and all(map(_fits, value, kinds))
+    if hint is float:
+        return type(value) in (int, float) and abs(value) <= LARGEST
+    return type(value) is hint
 
 
 def _settings(path: Path, given: Any) -> FitSettings:
     """Return the settings of a file's head, each of the type of its field."""
     if not isinstance(given, dict):
         raise InputFileError(path, "head.settings", "must be an object", given)
-    types = {one.name: str(one.type) for one in fields(FitSettings)}
+    types, words = get_type_hints(FitSettings), {one.name: str(one.type) for one in fields(FitSettings)}
     for name, value in given.items():
         if name not in types:
             raise InputFileError(path, f"head.settings.{name}", "is not known to this release", value)
-        allowed, fits = FITS[types[name]]
-        if not fits(value):
-            raise InputFileError(path, f"head.settings.{name}", f"must be {allowed}", value)
+        if not _fits(value, types[name]):
+            raise InputFileError(path, f"head.settings.{name}", f"must be of the type {words[name]}", value)
     lists = {name: tuple(tuple(v) if isinstance(v, list) else v for v in value)
              for name, value in given.items() if isinstance(value, list)}  # fmt: skip
     return FitSettings(**{"tracker_frame": "known", **given, **lists})  # files of 0.2 do not say: it was taken so

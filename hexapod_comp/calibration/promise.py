@@ -45,8 +45,10 @@ def upper_factor(ratio: float, freedom: float, believed: float = ASSUMED.jackkni
     """Return the factor on standard deviations that is not exceeded with 97.5 %, by variances' `ratio` as runs show it.
 
     The variance's scale has an inverse χ² prior about 1 of so many degrees of freedom as it is `believed` with, which
-    the runs' own freedom outvotes.
+    the runs' own freedom outvotes. A ratio below 1 does not make it smaller: lines cross others, which foretell them
+    better than what lies between lines.
     """
+    ratio = max(1.0, ratio)
     least = 2.0 * float(gammaincinv(0.5 * (believed + freedom), 0.025))
     return float(np.sqrt(max(1.0, (believed + freedom * ratio) / least)))
 

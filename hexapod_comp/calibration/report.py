@@ -11,8 +11,8 @@ import numpy as np
 from ..formats.texts import aligned, number
 from ..machine.field import COMPONENTS
 from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, SAME_ATTITUDE
-from .assumptions import ASSUMED
 from .design import Plan
+from .estimator import SETTLED
 from .fit import ChannelFit, ModelFit, Outlier
 from .lead import ScrewLead
 from .lines import LineFit, LinesFit
@@ -50,7 +50,7 @@ def fit_report(fit: ModelFit) -> str:
 def _headline(fit: ModelFit) -> str:
     m = fit.measurements
     kept = ", ".join(block.name for block in fit.space.blocks)
-    settled = "settled after" if fit.solution.change < ASSUMED.settled else "NOT settled after"
+    settled = "settled after" if fit.solution.change < SETTLED else "NOT settled after"
     return (
         f"machine {m.geometry.name}: {len(m)} readings of {len(m.runs)} runs at {len(m.stations)} stations\n"
         f"scheme joint: {fit.space.size} parameters ({kept}), {settled} {fit.solution.steps} steps"
@@ -205,7 +205,7 @@ def as_json(fit: ModelFit) -> dict:
         "channels": [_channel_json(c) for c in fit.channels],
         **_expected_json(fit.level, fit.tilted, fit.observability, fit.unseen_errors),
         "datum": fit.held.as_json(),
-        "settled": fit.solution.change < ASSUMED.settled,
+        "settled": fit.solution.change < SETTLED,
         "doubts": (*fit.verdict.refusals, *fit.verdict.doubts),
         "unexplained": fit.verdict.unexplained.as_json(),
         "chi_squares": [c._asdict() for c in fit.verdict.chi_squares],

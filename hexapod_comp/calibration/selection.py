@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from .assumptions import ASSUMED
-from .estimator import LinearProblem, Posterior, solve
+from .estimator import FEW_ROUNDS, ROUNDS, LinearProblem, Posterior, solve
 from .parameters import ParameterSpace
 
 SILENT = 1e-9
@@ -35,7 +35,7 @@ def select(
     space: ParameterSpace, problem: LinearProblem, noise: np.ndarray, progress: Callable[[str], object]
 ) -> tuple[list[Decision], Posterior, Posterior]:
     """Return a decision for each block but the structure; the posterior with all blocks in, and with those kept."""
-    everything = fit = solve(space, problem, space.start_tolerances(), noise, ASSUMED.first_rounds)
+    everything = fit = solve(space, problem, space.start_tolerances(), noise, ROUNDS)
     silent = everything.used[everything.determined < SILENT]
     kept = [block.name for block in space.blocks[1:]]
     evidence: dict[str, float] = {}
@@ -47,7 +47,7 @@ def select(
         progress(f"without {least}: its evidence is {evidence[least]:.1f}")
         kept.remove(least)
         kept_in = np.array([block.name in ("structure", *kept) for block in space.blocks])
-        fit = solve(space, problem, kept_in * fit.tolerances, fit.noise, ASSUMED.selection_rounds, silent)
+        fit = solve(space, problem, kept_in * fit.tolerances, fit.noise, FEW_ROUNDS, silent)
     return [Decision(b.name, b.name in kept, evidence[b.name]) for b in space.blocks[1:]], everything, fit
 
 

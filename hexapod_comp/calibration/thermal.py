@@ -40,6 +40,8 @@ from .estimator import Estimation, Posterior, Solution, physical_covariance, sol
 from .parameters import TOLERANCES, ParameterSpace
 from .sensitivity import predict
 
+BIN = 60.0  # readings of a sensor within that count as one, s: twice its filter
+
 SEEN_SHARE = 0.5
 """A parameter is determined when more than this share of it comes from the readings."""
 
@@ -48,7 +50,7 @@ MEMBERS = {"struts": slice(0, 6), "base": slice(6, 7), "platform": slice(7, 8)}
 
 LEAST_KNOWN = {
     "expansion": ASSUMED.known_expansion,
-    "late": ASSUMED.known_late,
+    "late": 3.0 * ASSUMED.known_expansion,
     "moisture": ASSUMED.known_moisture,
 }
 
@@ -97,12 +99,12 @@ def _stairs(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
     Values that are all multiples of a step are rounded to it; a stair is the mean time of reading per step.
     """
     pauses = np.diff(times)
-    shortest = max(ASSUMED.thermometer_bin, float(pauses.sum()) / MOST_BINS)
+    shortest = max(BIN, float(pauses.sum()) / MOST_BINS)
     steps = np.diff(np.unique(values))
     step = float(steps.min())
     if np.abs(steps / step - np.round(steps / step)).max() > 1e-3:
         return shortest, 0.0
-    read = float(np.minimum(pauses, ASSUMED.thermometer_bin).sum())
+    read = float(np.minimum(pauses, BIN).sum())
     stair = read / (1.0 + float(np.abs(np.diff(values)).sum()) / step)
     return max(shortest, stair), step**2 / 12.0 * min(1.0, stair / shortest)
 

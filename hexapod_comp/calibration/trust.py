@@ -16,7 +16,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import gammaincinv
+from scipy.special import gammaincinv, ndtr
 
 from ..machine.arrays import different_rows
 from ..measurements.readings import (
@@ -32,6 +32,7 @@ from .assumptions import ASSUMED
 from .blocks import EXPECTED
 from .estimator import (
     MEDIAN_TO_SIGMA,
+    SETTLED,
     DesignMatrix,
     Estimation,
     Omitted,
@@ -58,6 +59,9 @@ DRIFT_RUNS, DRIFT_TERMS = 6, 2
 LEAST_PAIRS, LEAST_LEFT, LEAST_FREE = 30, 0.25, 3.0
 """Fewest pairs, or repeats, that tell a variance (to 26 %); least share of a discrepancy that parameters leave; fewest
 degrees of freedom of a χ² that is listed."""
+
+HELD = 0.5
+"""Share of a promise that may come from the priors."""
 
 FIELDS = ("field displacement", "field rotation")
 
@@ -198,9 +202,9 @@ def judge(
         for tilt in (0.0, TILT)
     )
     families, runs = chi_squares(residuals)
-    far_off, doubtful = (measurements.misfit(noise, n) for n in (ASSUMED.refused_noise, ASSUMED.doubtful_noise))
+    far_off, doubtful = (measurements.misfit(noise, n) for n in ASSUMED.misfit[:0:-1])
     refusals, doubts, remarks = [far_off], ["" if far_off else doubtful, *beyond.doubts()], [*beyond.remarks()]
-    if solution.change >= ASSUMED.settled:
+    if solution.change >= SETTLED:
         moved = f"a parameter still moves by {solution.change:.2g} standard deviations"
         doubts.append(f"the fit has not settled: after {solution.steps} steps {moved}")
     if level is not None and level.after > level.before:
@@ -226,7 +230,7 @@ def unexplained(r: Residuals, scale: float, left_out: LeftOut) -> Unexplained:
         averaged += left_out.probability * (left_out.square / r.expected - 1.0)
     averaged = float(np.sqrt(max(1.0, averaged)))
     upper = max(averaged, upper_factor(ratio, freedom))
-    clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - ASSUMED.by_chance) / freedom
+    clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - 2.0 * ndtr(-ASSUMED.clear)) / freedom
     factor = np.sqrt(ratio) if clear else 1.0
     prior, prior_of_rotation = (_of_priors(r, metric) for metric in r.metrics)
     displacement, rotation = discrepancy(r)
@@ -264,13 +268,14 @@ def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
 def variance_ratio(r: Residuals) -> tuple[float, float]:
     """Return by how much more than expected leaving out each run changes the tool's squared error, and the freedom.
 
-    By Satterthwaite the sum over runs is about a χ² of as many degrees of freedom as its variance says.
+    By Satterthwaite the sum over runs is about a χ² of as many degrees of freedom as its variance says; of G clusters,
+    no more than G − 1 are independent.
     """
     if not r.expected > 0.0 or len(r.omitted) < 2:
         return 1.0, 0.0
     sums = [(o.moved @ o.moved, np.trace(o.covariance), np.vdot(o.covariance, o.covariance)) for o in r.omitted]
     shown, expected, squares = np.transpose(sums).sum(axis=1)
-    return float(shown / expected), float(expected**2 / squares)
+    return float(shown / expected), float(min(expected**2 / squares, len(r.omitted) - 1))
 
 
 def with_drift(estimation: Estimation, solution: Solution) -> tuple[Solution, Drift]:
@@ -481,7 +486,7 @@ def _held_by_priors(r: Residuals) -> bool:
     prior, left = (np.sqrt(np.trace(metric @ part)) for part in (np.diag(posterior.spread**2), posterior.covariance))
     noise = r.estimation.uncertainty * posterior.noise[m.kind]
     lengths = ~np.isin(m.kind, [KINDS.index(kind) for kind in ANGULAR_KINDS])
-    return bool(left > ASSUMED.held * prior and (not lengths.any() or left > np.median(noise[lengths])))
+    return bool(left > HELD * prior and (not lengths.any() or left > np.median(noise[lengths])))
 
 
 def _unstated(m: MeasurementSet) -> str:

@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.distance import cdist
 
 from hexapod_comp.calibration.assumptions import ASSUMED
-from hexapod_comp.calibration.blocks.field import SmoothField
+from hexapod_comp.calibration.blocks.field import GRID_TOLERANCE, SmoothField
 from hexapod_comp.calibration.parameters import BLOCKS, FitSettings, ParameterSpace
 from hexapod_comp.cli.app import main
 from hexapod_comp.errors import ModelError
@@ -107,7 +107,7 @@ def grid_difference(field: SmoothField, coefficients: tuple[np.ndarray, np.ndarr
     return np.abs(found - field.evaluate(*coefficients, points, sense)).max(axis=0)
 
 
-@pytest.mark.parametrize(("degree", "allowed"), [(1, ASSUMED.grid_tolerance), (3, ASSUMED.grid_tolerance), (6, 100e-9)])
+@pytest.mark.parametrize(("degree", "allowed"), [(1, GRID_TOLERANCE), (3, GRID_TOLERANCE), (6, 100e-9)])
 def test_grid_field_is_the_same_field(degree: int, allowed: float):
     """Stated: 30 nm and 30 nrad at points of its own; twice that elsewhere.
 
@@ -133,7 +133,7 @@ def test_flat_boxes_carry_no_power_across(flat: list[int]):
     grid = field.as_grid(*coefficients)
     found = np.array([grid.evaluate(p, np.ones(3))[0] for p in points])
     wanted = field.evaluate(*coefficients, points, np.ones((20, 3)))
-    np.testing.assert_allclose(found, wanted, atol=2.0 * ASSUMED.grid_tolerance)
+    np.testing.assert_allclose(found, wanted, atol=2.0 * GRID_TOLERANCE)
 
 
 def test_boxes_flat_but_for_rounding_are_flat():

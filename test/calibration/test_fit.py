@@ -255,7 +255,7 @@ def log_evidence(space: ParameterSpace, problem: LinearProblem, tolerances: np.n
 @pytest.fixture
 def exact(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let rounds of hyperparameters go on to the fixed point."""
-    monkeypatch.setattr("hexapod_comp.calibration.estimator.ASSUMED", replace(ASSUMED, rounds_settled=1e-6))
+    monkeypatch.setattr("hexapod_comp.calibration.estimator.ROUNDS_SETTLED", 1e-6)
 
 
 def test_tolerances_and_noise_are_the_most_probable_ones(exact: None):
@@ -448,7 +448,7 @@ def test_struts_without_backlash_do_not_upset_the_fit():
 
 def test_a_fit_that_does_not_settle_says_what_still_moves(monkeypatch):
     """One step from the nominal machine, with nothing but the struts' pitch: only that can have moved."""
-    monkeypatch.setattr("hexapod_comp.calibration.estimator.ASSUMED", replace(ASSUMED, steps=1))
+    monkeypatch.setattr("hexapod_comp.calibration.estimator.STEPS", 1)
     settings = replace(FEW, blocks=("pitch",), tolerances=(("structure", 1e-12), ("pitch", 100e-6)))
     space = ParameterSpace(readings(), settings)
     start = np.zeros(space.size), space.start_tolerances(), ONES

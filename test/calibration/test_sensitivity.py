@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import central_difference, general_machine, poses_about
 
-from hexapod_comp.calibration.assumptions import ASSUMED
+from hexapod_comp.calibration.blocks.field import GRID_TOLERANCE
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.sensitivity import derivatives, predict
 from hexapod_comp.machine.geometry import HexapodGeometry
@@ -128,9 +128,9 @@ def test_prediction_is_the_machine_that_the_compensator_runs(settings: FitSettin
         commanded = stations.pose(n)
         actual, _ = machine.pose_for(stations.commands[n], stations.sense[n], commanded)
         moved = actual.position + actual.rotation @ PROBE - commanded.position - commanded.rotation @ PROBE
-        np.testing.assert_allclose(found[n, :3], moved, atol=2.0 * ASSUMED.grid_tolerance)
+        np.testing.assert_allclose(found[n, :3], moved, atol=2.0 * GRID_TOLERANCE)
         turned = attitude_error(actual.rotation, commanded.rotation)
-        np.testing.assert_allclose(found[n, 3:], turned, atol=2.0 * ASSUMED.grid_tolerance + 0.5 * 1e-3 * 50e-6)
+        np.testing.assert_allclose(found[n, 3:], turned, atol=2.0 * GRID_TOLERANCE + 0.5 * 1e-3 * 50e-6)
 
 
 def test_the_ideal_machine_has_no_error():

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from ..sensitivity import Prediction
     from .field import SmoothField
 
+DIGITS = 11  # after the point in a model file: a hundredth of a nanometre
+
 
 class Facts(NamedTuple):
     """What blocks are made for."""

@@ -13,7 +13,11 @@ from numpy.polynomial import legendre
 from ...machine.field import CROSS_AXES, GridField
 from ...measurements.readings import AXES, LEAST_SIDE
 from ..assumptions import ASSUMED
-from .block import Block, Columns, Draft, Errors, Facts, Linkage
+from .block import DIGITS, Block, Columns, Draft, Errors, Facts, Linkage
+
+GRID_TOLERANCE = 30e-9  # what a grid may add to its polynomial, m or rad: below readings
+MOST_NODES = 17  # of a field along its longest axis: a readable model file
+CHECKS = 400  # random points at which a grid is checked
 
 COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")
 
@@ -63,14 +67,14 @@ class SmoothField:
         power: across it their powers are small, and bilinear interpolation is exact up to 1. What changes sign
         with the motion along an axis stands on the lines along that axis.
         """
-        points = np.random.default_rng(0).uniform(self.box[0], self.box[1], (ASSUMED.field_checks, 3))
-        sense = np.where(np.arange(ASSUMED.field_checks)[:, None] % 2, 1.0, -1.0) * np.ones(3)
+        points = np.random.default_rng(0).uniform(self.box[0], self.box[1], (CHECKS, 3))
+        sense = np.where(np.arange(CHECKS)[:, None] % 2, 1.0, -1.0) * np.ones(3)
         wanted = self.evaluate(coefficients, reversal, points, sense)
         nodes = 2
         while True:
             field = self._on_lines(coefficients, reversal, nodes)
             values = np.array([field.evaluate(p, s)[0] for p, s in zip(points, sense, strict=True)])
-            if nodes >= ASSUMED.field_nodes or (np.abs(values - wanted).max(axis=0) <= ASSUMED.grid_tolerance).all():
+            if nodes >= MOST_NODES or (np.abs(values - wanted).max(axis=0) <= GRID_TOLERANCE).all():
                 return field
             nodes = 2 * nodes - 1
 
@@ -89,7 +93,7 @@ class SmoothField:
             family[..., : mean.shape[-1]] += mean
             family[0, ..., : half.shape[-1]] += half
             family[1, ..., : half.shape[-1]] -= half
-            families.append(family.round(ASSUMED.digits) if family.any() else family[..., :0])
+            families.append(family.round(DIGITS) if family.any() else family[..., :0])
         return GridField((grid[0], grid[1], grid[2]), (families[0], families[1], families[2]))
 
     def _family(self, grid: tuple, axis: int, coefficients: np.ndarray, powers: np.ndarray) -> np.ndarray:
