@@ -31,7 +31,6 @@ ROUNDS, FEW_ROUNDS = 12, 2  # of hyperparameters at one step, and where they sta
 ROUNDS_SETTLED = 1e-3  # relative change after which rounds stop: hyperparameters are known to 1/√(2n)
 LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # longest extrapolation, in rounds, and largest change by it, logarithm
 LEAST_FREEDOM = 10.0  # fewest readings beyond the parameters for a noise: its own error is then 22 %
-LARGEST_STRUCTURE = 5e-3  # tolerance of joints, m: no machine is built worse
 CHUNK, THREADED = 512, 500  # cells of a processor's cache; rows from which on threads share the work
 
 
@@ -292,10 +291,7 @@ def _tolerances(space: ParameterSpace, posterior: Posterior, z: np.ndarray) -> n
             factor = np.sqrt(
                 (z[members] @ z[members] + first) / (posterior.determined[members].sum() + ASSUMED.hyperprior)
             )
-            result[n] = min(
-                result[n] * np.clip(factor, 0.1, 10.0),
-                LARGEST_STRUCTURE if block.name == "structure" else np.inf,
-            )
+            result[n] *= np.clip(factor, 0.1, 10.0)
     return result
 
 
