@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,6 +53,23 @@ def table_lengths() -> np.ndarray:
     """Return the ideal strut lengths of 000, Table 2, shape (10, 6), m."""
     table = read_table("table2_strut_lengths_ideal.csv")
     return np.stack([table[f"L{i}"] for i in range(1, 7)], axis=1)
+
+
+def places(tree: Any, at: tuple = ()) -> Iterator[tuple]:
+    """Yield the places of nested mappings and lists, of each list the first only."""
+    yield at
+    items = tree.items() if isinstance(tree, dict) else enumerate(tree[:1]) if isinstance(tree, list) else ()
+    for key, item in items:
+        yield from places(item, (*at, key))
+
+
+def put(tree: Any, at: tuple, value: Any) -> Any:
+    """Return a tree with another value at a place."""
+    if not at:
+        return value
+    tree = copy.copy(tree)
+    tree[at[0]] = put(tree[at[0]], at[1:], value)
+    return tree
 
 
 @contextmanager

@@ -6,17 +6,17 @@ bounds' own values are not waited for: sparse files have any size, and the bound
 
 from __future__ import annotations
 
-import copy
 import os
 import re
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from helpers import places, put
 
 from hexapod_comp.calibration.certificate import load_details
 from hexapod_comp.errors import InputFileError
@@ -133,24 +133,6 @@ def test_configurations_of_linuxcnc_too(tmp_path: Path, name: str) -> None:
         read_genhexkins(tmp_path, "mm")
 
 
-def paths(tree: Any, at: tuple = ()) -> Iterator[tuple]:
-    """Yield the places of a tree, of each list the first only."""
-    yield at
-    items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
-    for key, item in items:
-        if isinstance(tree, dict) or key == 0:
-            yield from paths(item, (*at, key))
-
-
-def put(tree: Any, at: tuple, value: Any) -> Any:
-    """Return a tree with another value at a place."""
-    if not at:
-        return value
-    tree = copy.copy(tree)
-    tree[at[0]] = put(tree[at[0]], at[1:], value)
-    return tree
-
-
 VALUES = [[], {}, None, "x", 1e308, float("inf"), [None]]
 
 # A field of four lines in place of the shipped model's hundred
@@ -181,7 +163,7 @@ def test_any_value_in_any_place_is_read_or_refused_in_words(kind: str, monkeypat
     name = CONFIG / shipped
     dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
     with np.errstate(all="raise"):
-        for at in paths(tree):
+        for at in places(tree):
             for value in VALUES:
                 texts["now"] = yaml.dump(put(tree, at, value), Dumper=dumper, sort_keys=False)
                 try:

@@ -172,6 +172,10 @@ def test_no_name_is_a_formula(name, tmp_path):
     assert shown.count("$") == name.count("$")
 
 
+ENDS = (("> /dev/full", 2), ("| true", 141), (">&-", 0))
+"""Where an output goes that nobody takes, and the exit code then."""
+
+
 def run(command: str, **options: object) -> subprocess.CompletedProcess[str]:
     """Run shell words with `hc` as the command line, in bash, whose exit code is the verb's own."""
     words = re.sub(r"\bhc\b", f"{sys.executable} -m hexapod_comp", command)
@@ -187,8 +191,10 @@ def run(command: str, **options: object) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("verb", ["--help", "ik poses.csv --machine paper"])
-@pytest.mark.parametrize(("to", "code"), [("> /dev/full", 2), ("| true", 141), (">&-", 0)])
+@pytest.mark.parametrize(
+    ("verb", "to", "code"),
+    [("--help", "> /dev/full", 2), *(("ik poses.csv --machine paper", *end) for end in ENDS)],
+)
 def test_an_output_that_nobody_takes_is_no_traceback(verb, to, code, tmp_path):
     """Before: tracebacks from `print`, and "Exception ignored" with exit code 120 from the end of Python."""
     (tmp_path / "poses.csv").write_text("sequence,x_mm,y_mm,z_mm\n" + "".join(f"{n},0,0,400\n" for n in range(3000)))

@@ -26,7 +26,6 @@ from hexapod_comp.errors import (
     KinematicsError,
     NotFiniteError,
     OtherAssemblyModeError,
-    PoseError,
     SingularError,
     UnreachableError,
 )
@@ -43,7 +42,7 @@ from hexapod_comp.machine.kinematics import (
     strut_lengths,
     strut_lengths_batch,
 )
-from hexapod_comp.pose import Pose, angles_from_rotation, rotation_from_angles
+from hexapod_comp.pose import Pose
 
 PAPER = paper_geometry()
 IDEAL = Structure.of(PAPER)
@@ -56,13 +55,6 @@ REAL = IDEAL.moved(*DEVIATION)
 POSES = 100_000
 
 machines = pytest.mark.parametrize("machine", MACHINES.values(), ids=MACHINES.keys())
-
-
-def solve_in_core(
-    structure: Structure, lengths: np.ndarray, position: np.ndarray, rotation: np.ndarray
-) -> tuple[int, float]:
-    """Call the core's solver; `position` and `rotation` are the guess and receive the answer."""
-    return solve_one(structure, lengths, position, rotation)
 
 
 # --- the paper's tables ------------------------------------------------------------------------------------
@@ -224,7 +216,7 @@ def test_condition_number_and_sign_against_linear_algebra(machine: HexapodGeomet
 def test_solver_reports_the_condition_number_at_its_answer() -> None:
     """The same quantity by two ways; both round, so to 1e-12."""
     pose = table_poses()[4]
-    _, condition = solve_in_core(IDEAL, strut_lengths(IDEAL, pose), HOME.position.copy(), HOME.rotation.copy())
+    _, condition = solve_one(IDEAL, strut_lengths(IDEAL, pose), HOME.position.copy(), HOME.rotation.copy())
     assert condition == pytest.approx(condition_number(IDEAL, pose)[0], rel=1e-12)
 
 
@@ -243,7 +235,7 @@ def test_batch_equals_single_bit_for_bit(machine: HexapodGeometry, count: int) -
     batch = solve_poses(structure, lengths, machine.home)
     for n in range(count):
         position, rotation = machine.home.position.copy(), machine.home.rotation.copy()
-        outcome, condition = solve_in_core(structure, lengths[n], position, rotation)
+        outcome, condition = solve_one(structure, lengths[n], position, rotation)
         assert outcome == batch.outcomes[n]
         assert condition == batch.conditions[n] or (np.isnan(condition) and np.isnan(batch.conditions[n]))
         if outcome == Status.OK:
@@ -394,43 +386,6 @@ def seen_half_done(count: int) -> bool:
     return seen
 
 
-# --- rotations ---------------------------------------------------------------------------------------------
-
-
-def test_rotation_is_y_x_z_written_out() -> None:
-    """000, T_BASE^TOP: R = Ry(β)·Rx(α)·Rz(γ), three elementary matrices from a textbook."""
-    alpha, beta, gamma = 0.3, -0.5, 0.7
-    (sa, sb, sg), (ca, cb, cg) = np.sin([alpha, beta, gamma]), np.cos([alpha, beta, gamma])
-    about_x = np.array([[1, 0, 0], [0, ca, -sa], [0, sa, ca]])
-    about_y = np.array([[cb, 0, sb], [0, 1, 0], [-sb, 0, cb]])
-    about_z = np.array([[cg, -sg, 0], [sg, cg, 0], [0, 0, 1]])
-    ours = rotation_from_angles(np.array([alpha, beta, gamma]))
-    np.testing.assert_allclose(ours, about_y @ about_x @ about_z, atol=1e-15)
-
-
-def test_angles_against_scipy() -> None:
-    """scipy's intrinsic Y-X-Z decomposition of random rotations; 1e-12 allows for its own rounding."""
-    rotations = Rotation.random(200, rng(11)).as_matrix()
-    beta, alpha, gamma = Rotation.from_matrix(rotations).as_euler("YXZ").T
-    expected = np.stack([alpha, beta, gamma], axis=1)
-    np.testing.assert_allclose(angles_from_rotation(rotations), expected, atol=1e-12)
-    np.testing.assert_allclose(rotation_from_angles(angles_from_rotation(rotations)), rotations, atol=1e-14)
-
-
-def test_quaternion_by_hand_and_against_scipy() -> None:
-    """A quarter turn about z is (0, 0, √½, √½); others as scipy says, with w ≥ 0."""
-    quarter = Pose(np.zeros(3), [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    np.testing.assert_allclose(quarter.quaternion(), [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-15)
-    for turn in Rotation.random(50, rng(12)):
-        quaternion = Pose.from_quaternion(np.zeros(3), turn.as_quat()).quaternion()
-        assert quaternion[3] >= 0.0
-        assert abs(abs(quaternion @ turn.as_quat()) - 1.0) < 1e-15 * 8
-
-
-def rng(seed: int) -> np.random.Generator:
-    return np.random.default_rng(seed)
-
-
 @pytest.mark.parametrize("size", [1e-12, 1e-7, 1e-5, 0.3, 3.0])
 def test_rotate_is_the_exponential(size: float) -> None:
     """scipy's rotation vectors, on both sides of the kernel's switch between series and sine."""
@@ -439,12 +394,6 @@ def test_rotate_is_the_exponential(size: float) -> None:
     expected = Rotation.from_rotvec(vector).as_matrix() @ rotation
     rotate(rotation, *vector)
     np.testing.assert_allclose(rotation, expected, atol=4e-16)
-
-
-@pytest.mark.parametrize("quaternion", [[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.01], [np.nan, 0.0, 0.0, 1.0]], ids=str)
-def test_quaternion_that_is_none_is_refused(quaternion: list[float]) -> None:
-    with pytest.raises(PoseError):
-        Pose.from_quaternion(np.zeros(3), np.array(quaternion))
 
 
 # --- errors ------------------------------------------------------------------------------------------------
@@ -527,7 +476,7 @@ def test_failure_leaves_the_guess_untouched(outcome: int, spoil) -> None:
     position, rotation = HOME.position.copy(), HOME.rotation.copy()
     spoil(lengths, position, rotation)
     before = position.copy(), rotation.copy()
-    found, _ = solve_in_core(IDEAL, lengths, position, rotation)
+    found, _ = solve_one(IDEAL, lengths, position, rotation)
     assert found == outcome
     np.testing.assert_array_equal(position, before[0])
     np.testing.assert_array_equal(rotation, before[1])
@@ -536,7 +485,7 @@ def test_failure_leaves_the_guess_untouched(outcome: int, spoil) -> None:
 def test_singular_answer_leaves_the_guess_untouched() -> None:
     singular = Pose.from_angles(HOME.position, np.deg2rad([0.0, 0.0, 88.0]))
     position, rotation = singular.position.copy(), singular.rotation.copy()
-    outcome, condition = solve_in_core(IDEAL, strut_lengths(IDEAL, singular), position, rotation)
+    outcome, condition = solve_one(IDEAL, strut_lengths(IDEAL, singular), position, rotation)
     assert outcome == Status.SINGULAR
     assert condition > IDEAL.max_condition
     assert (position == singular.position).all()

@@ -266,15 +266,15 @@ def test_round_trip_of_sequences_and_of_another_point(tmp_path: Path) -> None:
     assert_same(read_tidy(tmp_path / "c.csv", paper_geometry(), probe), expected)
 
 
-def test_25000_rows_take_two_seconds(tmp_path: Path) -> None:
+def test_8000_rows_take_half_a_second(tmp_path: Path) -> None:
     """5-D lines of two cycles. Measured 1.5 s of a core for 25,000 rows; 4 s are an alarm."""
-    campaign = Campaign(np.array([[-0.2, -0.2, 0.35], [0.2, 0.2, 0.55]]), 0.1, 0.01, "5-D", 16, cycles=2)
+    campaign = Campaign(np.array([[-0.2, -0.2, 0.35], [0.2, 0.2, 0.55]]), 0.1, 0.04, "5-D", 16, cycles=2)
     plan = template(campaign, paper_geometry())
     plan = plan.with_values(np.random.default_rng(0).normal(0.0, 1e-5, len(plan)))
     write_measurements(plan, tmp_path / "c.csv")
     start = time.process_time()
     found = read_tidy(tmp_path / "c.csv", paper_geometry())
-    assert len(found) > 25_000
+    assert len(found) > 8_000
     assert time.process_time() - start < 4.0 * len(found) / 25_000
 
 

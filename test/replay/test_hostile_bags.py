@@ -6,16 +6,14 @@ here: only that it comes to an end without a traceback.
 
 from __future__ import annotations
 
-import copy
 import json
 import os
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from helpers import places, put
 
 pytest.importorskip("rosbags")
 
@@ -44,28 +42,10 @@ def bag(tmp_path: Path, machine: RecordedMachine) -> Path:
     return write_bag(tmp_path / "run", machine.messages)
 
 
-def paths(tree: Any, at: tuple = ()) -> Iterator[tuple]:
-    """Yield the places of a tree, of each list the first only."""
-    yield at
-    if isinstance(tree, dict):
-        for key, item in tree.items():
-            yield from paths(item, (*at, key))
-    elif isinstance(tree, list) and tree:
-        yield from paths(tree[0], (*at, 0))
-
-
-def put(tree: Any, at: tuple, value: Any) -> Any:
-    if not at:
-        return value
-    tree = copy.copy(tree)
-    tree[at[0]] = put(tree[at[0]], at[1:], value)
-    return tree
-
-
 def test_any_value_in_any_place_of_the_metadata(bag: Path) -> None:
     file = bag / "metadata.yaml"
     tree = yaml.safe_load(file.read_text())
-    for at in paths(tree):
+    for at in places(tree):
         for value in VALUES:
             file.write_text(yaml.dump(put(tree, at, value), Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper)))
             try:
@@ -151,7 +131,7 @@ def test_any_value_in_any_place_of_the_journal(machine: RecordedMachine, monkeyp
         for n in (0, len(texts) - 1):
             name, time, content = texts[n]
             tree = json.loads(content)
-            for at in paths(tree):
+            for at in places(tree):
                 for value in VALUES:
                     other = [*texts[:n], (name, time, json.dumps(put(tree, at, value))), *texts[n + 1 :]]
                     try:

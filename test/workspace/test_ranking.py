@@ -215,22 +215,6 @@ def test_the_ways_of_adding_up_keep_their_order():
     assert (np.linalg.norm(np.einsum("de,nec->dnc", drawn, vectors[..., :3]), axis=2) <= worst[:, 0]).all()
 
 
-def test_strut_errors_stay_within_the_singular_values_bound():
-    # Kim and Choi (2000): |δx| ≤ σ_max(J⁻¹)·|δL|, and with all six at ±δ, |δL| = √6·δ.
-    errors, vectors = linear({"strut_length": 10e-6}, count=20)
-    worst = worst_case(errors, vectors)[:, 0]
-    largest = np.linalg.svd(vectors[..., :3] / 10e-6, compute_uv=False)[:, 0]
-    assert (worst <= largest * np.sqrt(6.0) * 10e-6 * (1 + 1e-12)).all()
-    assert (worst >= largest * 10e-6).all()
-
-
-def test_tool_errors_along_three_axes_add_up_to_the_diagonal():
-    errors, vectors = linear({"tool_offset": 5e-6})
-    for found in (worst_case(errors, vectors), root_sum_of_squares(vectors)):
-        np.testing.assert_allclose(found[:, 0], 5e-6 * np.sqrt(3.0), rtol=1e-12)
-        np.testing.assert_array_equal(found[:, 1], 0.0)
-
-
 def test_monte_carlo_finds_known_percentiles():
     # One uniform error: |u| is uniform, the p-th percentile is p. Three normal ones across each other: chi, 3 degrees.
     _, vectors = linear({"tool_offset": 5e-6})
