@@ -151,10 +151,8 @@ class CorrectionGuard:
 
     def update(self, now: float, enabled: bool) -> list[float]:
         """Move the output on and return it."""
-        elapsed, self._updated_at = (
-            now - self._updated_at,
-            now,
-        )  # the first update, and a clock that went back, move nothing
+        # The first update moves nothing, nor does one after the clock went back.
+        elapsed, self._updated_at = now - self._updated_at, now
         reach = self._ramp_rate * (min(elapsed, LONGEST_STEP) if 0.0 < elapsed < math.inf else 0.0)
         target, arrived = self._aim(now, enabled)
         ways = [there - here for there, here in zip(target, self.output, strict=True)]

@@ -11,7 +11,7 @@ import importlib
 import sqlite3
 import struct
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -103,7 +103,13 @@ def zstd_stream(packed: bytes | Path) -> BinaryIO:
 
 def messages(file: Path, allowance: Allowance) -> Iterator[Message]:
     """Yield all messages of a file; raises whatever its parts happen to raise on damaged bytes."""
-    yield from _sqlite(file) if file.suffix == ".db3" else _mcap(file, allowance)
+    if file.suffix == ".db3":
+        yield from _sqlite(file)
+        return
+    with open(file, "rb") as stream:
+        if (head := stream.read(len(MCAP_MAGIC))) != MCAP_MAGIC:
+            raise ValueError("is no MCAP file" if head else "seems to be empty")
+        yield from _in_records(stream, allowance, {}, {})
 
 
 def _sqlite(file: Path) -> Iterator[Message]:
@@ -122,69 +128,49 @@ def _sqlite(file: Path) -> Iterator[Message]:
         database.close()
 
 
-class _Records:
-    """MCAP records, read one after the other."""
-
-    def __init__(self, allowance: Allowance) -> None:
-        self._allowance = allowance
-        self._schemas: dict[int, str] = {}
-        self._channels: dict[int, tuple[str, str]] = {}
-
-    def of(self, records: Iterable[tuple[int, bytes, int, int]]) -> Iterator[Message]:
-        """Yield the messages of records, and of the chunks in them."""
-        for kind, buffer, at, end in records:
-            if kind == MESSAGE:
-                number, _, time, _ = MESSAGE_HEAD.unpack_from(buffer, at)
-                if time >= LATEST:
-                    raise ValueError(f"has a message of the time {time} ns")
-                if number in self._channels:
-                    yield Message(*self._channels[number], time, buffer[at + MESSAGE_HEAD.size : end])
-            elif kind == CHUNK:
-                yield from self.of(_in_chunk(self._chunk(buffer[at:end])))
-            elif kind == SCHEMA:
-                (number,) = struct.unpack_from("<H", buffer, at)
-                self._schemas[number] = _text(buffer, at + 2)[0]
-            elif kind == CHANNEL:
-                number, schema = struct.unpack_from("<HH", buffer, at)
-                topic, after = _text(buffer, at + 4)
-                if _text(buffer, after)[0] == "cdr":
-                    self._channels[number] = topic, self._schemas[schema]
-            elif kind == DATA_END:
-                return
-            elif kind not in KINDS:
-                raise ValueError(f"holds a record of an unknown kind, {kind}")
-
-    def _chunk(self, body: bytes) -> bytes:
-        *_, size, checksum = struct.unpack_from("<QQQI", body)
-        packing, at = _text(body, 28)
-        (length,) = struct.unpack_from("<Q", body, at)
-        records = body[at + 8 : at + 8 + length]
-        if packing:
-            records = self._allowance.unpacked(UNPACK[packing](records))
-        if len(records) != size or (checksum and crc32(records) != checksum):
-            raise ValueError("holds a chunk that is damaged")
-        return records
-
-
-def _in_file(stream: BinaryIO) -> Iterator[tuple[int, bytes, int, int]]:
-    """Yield the records of a file: kind, bytes, where in them it begins and ends."""
+def _records(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
+    """Yield the records of a file or a chunk: kind and content."""
     while head := stream.read(HEAD.size):
         kind, length = HEAD.unpack(head)
         refuse_too_much_at_once(length, "a record")
         if len(body := stream.read(length)) < length:
             raise ValueError("ends within a record")
-        yield kind, body, 0, length
+        yield kind, body
 
 
-def _in_chunk(records: bytes) -> Iterator[tuple[int, bytes, int, int]]:
-    """Yield the records of a chunk."""
-    at = 0
-    while at < len(records):
-        kind, length = HEAD.unpack_from(records, at)
-        begin, at = at + HEAD.size, at + HEAD.size + length
-        if at > len(records):
-            raise ValueError("ends within a record")
-        yield kind, records, begin, at
+def _in_records(
+    stream: BinaryIO, allowance: Allowance, schemas: dict[int, str], channels: dict[int, tuple[str, str]]
+) -> Iterator[Message]:
+    """Yield the messages of MCAP records, and of the chunks in them; schemas and channels are collected on the way."""
+    for kind, body in _records(stream):
+        if kind == MESSAGE:
+            number, _, time, _ = MESSAGE_HEAD.unpack_from(body)
+            if time >= LATEST:
+                raise ValueError(f"has a message of the time {time} ns")
+            if number in channels:
+                yield Message(*channels[number], time, body[MESSAGE_HEAD.size :])
+        elif kind == CHUNK:
+            *_, size, checksum = struct.unpack_from("<QQQI", body)
+            packing, at = _text(body, 28)
+            (length,) = struct.unpack_from("<Q", body, at)
+            records = body[at + 8 : at + 8 + length]
+            if packing:
+                records = allowance.unpacked(UNPACK[packing](records))
+            if len(records) != size or (checksum and crc32(records) != checksum):
+                raise ValueError("holds a chunk that is damaged")
+            yield from _in_records(BytesIO(records), allowance, schemas, channels)
+        elif kind == SCHEMA:
+            (number,) = struct.unpack_from("<H", body)
+            schemas[number] = _text(body, 2)[0]
+        elif kind == CHANNEL:
+            number, schema = struct.unpack_from("<HH", body)
+            topic, after = _text(body, 4)
+            if _text(body, after)[0] == "cdr":
+                channels[number] = topic, schemas[schema]
+        elif kind == DATA_END:
+            return
+        elif kind not in KINDS:
+            raise ValueError(f"holds a record of an unknown kind, {kind}")
 
 
 def _text(body: bytes, at: int) -> tuple[str, int]:
@@ -200,13 +186,6 @@ def _lz4(packed: bytes) -> Any:
 
 
 UNPACK: dict[str, Callable[[bytes], Any]] = {"zstd": zstd_stream, "lz4": _lz4}
-
-
-def _mcap(file: Path, allowance: Allowance) -> Iterator[Message]:
-    with open(file, "rb") as stream:
-        if (head := stream.read(len(MCAP_MAGIC))) != MCAP_MAGIC:
-            raise ValueError("is no MCAP file" if head else "seems to be empty")
-        yield from _Records(allowance).of(_in_file(stream))
 
 
 def cut_off(file: Path) -> bool:
