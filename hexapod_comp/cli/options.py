@@ -247,14 +247,8 @@ def pose(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return tuple(v * 1e-3 for v in values[:3]), tuple(map(math.radians, values[3:] or (0.0, 0.0, 0.0)))
 
 
-def point(text: str) -> tuple[float, ...]:
-    """Read ``x,y,z`` in mm; return m."""
-    return tuple(v * 1e-3 for v in numbers(text, (3,), "three numbers, mm"))
-
-
-def lengths(text: str) -> tuple[float, ...]:
-    """Read six lengths in mm; return them in m."""
-    return tuple(v * 1e-3 for v in numbers(text, (6,), "six lengths in mm"))
+point = scaled(partial(numbers, counts=(3,), what="three numbers, mm"), 1e-3)  # ``x,y,z`` in mm as m
+lengths = scaled(partial(numbers, counts=(6,), what="six lengths in mm"), 1e-3)  # in mm as m
 
 
 def line(text: str) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:

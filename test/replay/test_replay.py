@@ -56,13 +56,15 @@ from hexapod_comp.compensation.journal import (
 )
 from hexapod_comp.errors import HexapodError, InputFileError, ModelError
 from hexapod_comp.formats.files import MEGABYTE
-from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.model_file import load_model, save_model
 from hexapod_comp.pose import Pose
 from hexapod_comp.replay import storage
 from hexapod_comp.replay.bag import Recording, read_recording
+from hexapod_comp.replay.pictures import commands_figure
 from hexapod_comp.replay.replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Replay, replay_recording
+from hexapod_comp.replay.report import Report
 
 FAR = Pose([0.2, 0.0, 0.4], np.eye(3))  # from home, struts would change by some 90 mm in one command: refused
 
@@ -389,6 +391,29 @@ def test_the_journal_is_enough_and_other_topics_do_not_disturb(run, tmp_path, al
     if also:
         assert recording.topics["strut_states"].values.tolist() == [[5.0, 4.0, 3.0, 2.0, 1.0, 0.0]]
         assert "1 messages of strut_states left out" in recording.notes[0]
+
+
+def test_struts_without_stamps_stand_at_the_recorders_times(tmp_path):
+    """Measured 7 µm beside each command, at its time by the recorder's clock: so it is told, and so it is drawn."""
+    machine = RecordedMachine()
+    machine.wave(60)
+    machine.page()
+    commands = read_recording(write_bag(tmp_path / "bare", machine.messages)).commands
+    measured = [
+        TYPES[JOINT_STATE](machine.header(0), list(STRUT_NAMES), lengths + 7e-6, np.zeros(0), np.zeros(0))
+        for lengths in commands["lengths"][:, 0]
+    ]
+    messages = [
+        (int(stamp), "/strut_states", JOINT_STATE, serialized(JOINT_STATE, message))
+        for stamp, message in zip(commands["stamp"], measured, strict=True)
+    ]
+    recording, result = opened(write_bag(tmp_path / "run", machine.messages + messages))
+    report = Report(recording, result)
+    shown = [line for line in report.shown()[0].splitlines() if line.startswith("following error")]
+    assert [line.split(": ")[1] for line in shown] == [" ".join(["7.00/7.00"] * 6)]
+    for axes in commands_figure(report).axes:
+        drawn = {line.get_label(): line.get_xydata() for line in axes.lines}
+        np.testing.assert_allclose(drawn["measured"] - drawn["command"], [[0.0, 7e-3]] * 60, rtol=0.0, atol=1e-9)
 
 
 def test_spare_bytes_behind_messages_do_no_harm(run, tmp_path):
