@@ -59,6 +59,7 @@ LARGEST = 1e12  # no number of a file is larger, in whatever unit: products of s
 MICROS = "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"
 
 PER_STRUT = "per strut"  # shape of six numbers that may be given as one for all
+PAIRS_PER_STRUT = "pairs per strut"  # and of six pairs that may be given as one
 Shape = tuple[int | None, ...]  # lengths of an array's axes; None leaves one free
 
 
@@ -284,16 +285,19 @@ class Numbers(Kind):
     """Finite numbers: in SI where they have a unit, and read in any unit of its kind; plain ones with unit ""."""
 
     unit: str  # in which it is written
-    shape: Shape | str = ()  # or PER_STRUT
+    shape: Shape | str = ()  # or PER_STRUT, PAIRS_PER_STRUT
+    key: str = ""  # as the file has it, where that is not the field's name
 
     def read(self, section: Section, name: str, default: Any) -> Any:
+        name = self.key or name
         if default is not MISSING and self.unit and section.quantity_key(name, DIMENSIONS[self.unit]) is None:
             return default
         return super().read(section, name, MISSING if self.unit else default)
 
     def take(self, section: Section, name: str) -> Any:
         if isinstance(self.shape, str):
-            return section.per_strut(name, DIMENSIONS[self.unit])
+            read_in = section.per_strut if self.shape == PER_STRUT else section.pairs_per_strut
+            return read_in(name, DIMENSIONS[self.unit])
         values = (
             section.quantity(name, DIMENSIONS[self.unit], self.shape) if self.unit else section.array(name, self.shape)
         )

@@ -17,7 +17,7 @@ from ..core.batch import check_stage
 from ..errors import FrameError, GeometryError, InputFileError, KinematicsError, LimitError, PoseError, shorten
 from ..formats.files import read_text
 from ..formats.paths import input_file
-from ..formats.schema import Section
+from ..formats.schema import Section, read_whole
 from ..formats.texts import number
 from ..formats.yaml import parse_yaml
 from ..pose import Pose
@@ -320,7 +320,7 @@ def parse_geometry(text: str, name: str | Path = "geometry") -> HexapodGeometry:
     machine = top.text("machine")
     base, platform, axes = _read_joints(top)
     home = read_pose(top, "home")
-    limits = _read_limits(top.section("limits"))
+    limits = read_whole(Limits, top.section("limits"))
     lead = np.zeros(6)
     if "screw" in top:
         screw = top.section("screw")
@@ -358,26 +358,6 @@ def _read_joints(top: Section) -> tuple[np.ndarray, np.ndarray, dict[str, np.nda
                 axes[name] = section.array(key, (6, 3))
         section.finish()
     return joints["base"], joints["platform"], axes
-
-
-def _read_limits(section: Section) -> Limits:
-    stroke = section.pairs_per_strut("stroke", "length")
-    values = {
-        "stroke": stroke,
-        "base_cone": section.per_strut("base_cone", "angle"),
-        "platform_cone": section.per_strut("platform_cone", "angle"),
-        "condition": float(section.array("condition_number")),
-        "correction": float(section.quantity("correction", "length")),
-        "step": float(section.quantity("step", "length")),
-        "speed": float(section.quantity("speed", "speed")),
-        "clearance": float(section.quantity("clearance", "length", default=0.0)),
-        "acceleration": float(section.quantity("acceleration", "acceleration", default=0.0)),
-    }
-    section.finish()
-    try:
-        return Limits(**values)  # type: ignore[arg-type]
-    except GeometryError as error:
-        raise InputFileError(section.path, error.key, error.problem, error.value) from error
 
 
 def coincident(joints: np.ndarray) -> np.ndarray:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
 from ..core import Status, Struct, ffi, lib
 from ..errors import GeometryError, KinematicsError, LimitError, NotFiniteError, TooEarlyError
+from ..formats.schema import PAIRS_PER_STRUT, PER_STRUT, Numbers
 
 STRUT_NAMES = tuple(f"strut_{i}" for i in range(1, 7))  # Names of the six struts, in order, as they stand in messages
 
@@ -45,15 +47,15 @@ class Limits:
         the core's SMOOTHED_OVER, 20 ms.
     """
 
-    stroke: np.ndarray
-    base_cone: np.ndarray
-    platform_cone: np.ndarray
-    condition: float
-    correction: float
-    step: float
-    speed: float
-    clearance: float = 0.0
-    acceleration: float = 0.0
+    stroke: Annotated[np.ndarray, Numbers("mm", PAIRS_PER_STRUT)]
+    base_cone: Annotated[np.ndarray, Numbers("deg", PER_STRUT)]
+    platform_cone: Annotated[np.ndarray, Numbers("deg", PER_STRUT)]
+    condition: Annotated[float, Numbers("", key="condition_number")]
+    correction: Annotated[float, Numbers("um")]
+    step: Annotated[float, Numbers("mm")]
+    speed: Annotated[float, Numbers("mm_s")]
+    clearance: Annotated[float, Numbers("mm")] = 0.0
+    acceleration: Annotated[float, Numbers("mm_s2")] = 0.0
     cone_cosines: np.ndarray = field(init=False, repr=False)
     """Of the cones' angles, at the base and at the platform, shape (2, 6): what the angles themselves are judged by."""
 
