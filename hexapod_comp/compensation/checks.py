@@ -69,12 +69,12 @@ class LimitSummary:
         index = int(self.margin.argmin())
         return None if np.isposinf(self.margin.flat[index]) else divmod(index, 2)
 
-    def take(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
-        """Take in margins and values, (n, 2, k), of n poses that belong to the rows `owner`, ascending."""
+    def add(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
+        """Keep the worst of these margins and values, (n, 2, k), of n poses that belong to the rows `owner`, ascending,
+        and of those before; of equals the nominal stage."""
         margin = np.where(np.isnan(margin), -np.inf, margin)
         starts = np.flatnonzero(np.diff(owner, prepend=-1))
-        rows = owner[starts]
-        of_pose = margin.min(axis=2)
+        rows, of_pose = owner[starts], margin.min(axis=2)
         for stage in range(2):
             first = np.lexsort((of_pose[:, stage], owner))[starts]  # the worst pose of each row
             better = of_pose[first, stage] < self.margin[rows, stage]
@@ -84,18 +84,16 @@ class LimitSummary:
             self.value[into, stage] = value[first, stage, strut]
             self.strut[into, stage] = strut if margin.shape[2] == 6 else -1
             self.share[into, stage] = share[first]
-        self._take_broken(margin, value, owner, share)
-
-    def _take_broken(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
-        pose, stage, strut = np.nonzero(margin < 0.0)
-        # The worst of each row and strut first; of equals the nominal stage.
-        order = np.lexsort((stage, margin[pose, stage, strut], strut, owner[pose]))
-        pose, stage, strut = pose[order], stage[order], strut[order]
-        new = np.ones(len(pose), dtype=bool)
+        pose, stages, strut = np.nonzero(margin < 0.0)
+        order = np.lexsort((stages, margin[pose, stages, strut], strut, owner[pose]))
+        pose, stages, strut = pose[order], stages[order], strut[order]
+        new = np.ones(len(pose), dtype=bool)  # the worst of each row and strut stands first
         new[1:] = (np.diff(owner[pose]) != 0) | (np.diff(strut) != 0)
-        for p, s, k in zip(pose[new], stage[new], strut[new], strict=True):
-            key = int(owner[p]), int(k)
-            breach = float(margin[p, s, k]), float(value[p, s, k]), int(s), float(share[p])
+        for p, s, k in zip(pose[new], stages[new], strut[new], strict=True):
+            key, breach = (
+                (int(owner[p]), int(k)),
+                (float(margin[p, s, k]), float(value[p, s, k]), int(s), float(share[p])),
+            )
             if key not in self.broken or breach[0] < self.broken[key][0]:
                 self.broken[key] = breach
 
@@ -231,7 +229,7 @@ class _PathCheck:
             for owner in alike:
                 if senses is not None:
                     self.motion.sense[:] = senses[owner[0]]
-                self.take(positions[owner], rotations[owner], owner, np.ones(len(owner)), stream)
+                self.examine(positions[owner], rotations[owner], owner, np.ones(len(owner)), stream)
             progress(len(rows))
 
     def check_moves(self, positions: np.ndarray, rotations: np.ndarray, progress: Callable[[int], object]) -> None:
@@ -243,91 +241,65 @@ class _PathCheck:
         self.unchecked[1:] = bad[1:] | bad[:-1]
         legs_at_once = int(np.clip(CHUNK / self.rate, 1, 64))
         for start in range(0, self.count - 1, legs_at_once):
-            rows = np.arange(start, min(start + legs_at_once, self.count - 1) + 1)
-            good = np.flatnonzero(~self.unchecked[rows[1:]])
+            part = np.arange(start, min(start + legs_at_once, self.count - 1) + 1)
+            good = np.flatnonzero(~self.unchecked[part[1:]])
             for legs in np.split(good, np.flatnonzero(np.diff(good) > 1) + 1):
-                if len(legs):
-                    self._take_moves(positions, rotations, rows[legs[0] : legs[-1] + 2])
-            progress(len(rows) - 1)
+                if not len(legs):
+                    continue
+                rows = part[legs[0] : legs[-1] + 2]
+                if rows[0] == 0 or self.unchecked[rows[0]]:
+                    self._start()
+                    self.examine(positions[rows[:1]], rotations[rows[:1]], rows[:1], np.ones(1), True)
+                path, counts = moves(self.geometry, positions[rows], rotations[rows], self.rate)
+                owner = np.repeat(rows[1:], counts)
+                done = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
+                share = done / np.repeat(counts, counts)
+                for first in range(0, len(owner), CHUNK):
+                    cut = slice(first, first + CHUNK)
+                    self.examine(path.positions[cut], path.rotations[cut], owner[cut], share[cut], True)
+            progress(len(part) - 1)
 
-    def _take_moves(self, positions: np.ndarray, rotations: np.ndarray, rows: np.ndarray) -> None:
-        """Check the moves that join consecutive rows."""
-        if rows[0] == 0 or self.unchecked[rows[0]]:
-            self._start()
-            self.take(positions[rows[:1]], rotations[rows[:1]], rows[:1], np.ones(1), True)
-        path, counts = moves(self.geometry, positions[rows], rotations[rows], self.rate)
-        owner = np.repeat(rows[1:], counts)
-        done = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
-        share = done / np.repeat(counts, counts)
-        for start in range(0, len(owner), CHUNK):
-            part = slice(start, start + CHUNK)
-            self.take(path.positions[part], path.rotations[part], owner[part], share[part], True)
-
-    def take(
-        self,
-        positions: np.ndarray,
-        rotations: np.ndarray,
-        owner: np.ndarray,
-        share: np.ndarray,
-        in_sequence: bool,
+    def examine(
+        self, positions: np.ndarray, rotations: np.ndarray, owner: np.ndarray, share: np.ndarray, in_sequence: bool
     ) -> None:
-        """Examine tool poses, (n, …), of the rows `owner`; `in_sequence`: after the ones before."""
-        quantities, flags = self._examine(*self.geometry.platform_poses(positions, rotations), in_sequence)
-        lengths = quantities["lengths"]
-        at_rows = share == 1.0
-        self.lengths[owner[at_rows]] = lengths[at_rows]
+        """Examine tool poses, (n, …), of the rows `owner`; `in_sequence`: after the ones before.
+
+        Of each limit the worst is kept: margins and values, (n, 2, 6 or 1), ∞ and −1 for what is so or not.
+        """
+        poses = (np.ascontiguousarray(part) for part in self.geometry.platform_poses(positions, rotations))
+        state, motion, limits = self.machine.state.at, self.motion, self.geometry.limits
+        quantities, flags = examine_poses(state, *poses, not in_sequence, motion.low, motion.sense)
+        unsolved = flags == Status.NOT_CONVERGED
+        for name in QUANTITIES.names or ():
+            quantities[name][unsolved, 1] = np.nan
+        lengths, sign = quantities["lengths"], quantities["sign"][:, :, None]
+        self.lengths[owner[share == 1.0]] = lengths[share == 1.0]
         self.examined += len(owner)
         self.outside_field[owner[flags == Status.OUTSIDE_FIELD]] = True
-        solved = flags != Status.NOT_CONVERGED
         with np.errstate(invalid="ignore", over="ignore"):
-            measured = {**self._static(quantities, solved), **self._other(quantities["sign"][:, :, None], flags)}
+            correction = np.zeros_like(lengths)
+            correction[:, 1] = lengths[:, 1] - lengths[:, 0]
+            found = {**limits.margins(quantities), "correction": (limits.correction - np.abs(correction), correction)}
+            for margin, _ in found.values():
+                margin[unsolved, 1] = np.inf  # said once, as not converged
+            found["correction"][0][:, 0] = np.inf
+            outside = (flags == Status.OUTSIDE_FIELD) & (self.machine.model.field.outside == "refuse")
+            never = np.zeros(len(flags), dtype=bool)
+            for name, is_so in (
+                ("not_converged", np.stack([never, unsolved], axis=1)[:, :, None]),
+                ("outside_field", np.stack([never, outside], axis=1)[:, :, None]),
+                ("assembly", (sign != self.geometry.home_sign) & ~np.isnan(sign)),
+            ):
+                found[name] = np.where(is_so, -1.0, np.inf), sign
             if in_sequence:
                 changes = np.diff(np.concatenate([self.previous, lengths]), axis=0)
-                measured |= self._changes(changes)
                 self.previous = lengths[-1:].copy()
-        for name, (margin, value) in measured.items():
-            self.worst[name].take(margin, value, owner, share)
-
-    def _examine(
-        self, positions: np.ndarray, rotations: np.ndarray, in_sequence: bool
-    ) -> tuple[np.ndarray, np.ndarray]:
-        given = np.ascontiguousarray(positions), np.ascontiguousarray(rotations), not in_sequence
-        quantities, flags = examine_poses(self.machine.state.at, *given, self.motion.low, self.motion.sense)
-        for name in QUANTITIES.names or ():
-            quantities[name][flags == Status.NOT_CONVERGED, 1] = np.nan
-        return quantities, flags
-
-    def _static(self, quantities: np.ndarray, solved: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Return margin and value, (n, 2, k), of the limits of single poses."""
-        limits, correction = self.geometry.limits, np.zeros_like(quantities["lengths"])
-        correction[:, 1] = quantities["lengths"][:, 1] - quantities["lengths"][:, 0]
-        measured = {**limits.margins(quantities), "correction": (limits.correction - np.abs(correction), correction)}
-        for margin, _ in measured.values():
-            margin[~solved, 1] = np.inf  # said once, as not converged
-        measured["correction"][0][:, 0] = np.inf
-        return measured
-
-    def _changes(self, changes: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Return margin and value, (n, 2, 6), of step and speed from the changes of length, m."""
-        limits = self.geometry.limits
-        measured = {
-            "step": (limits.step - np.abs(changes), changes),
-            "speed": (limits.speed - np.abs(changes) * self.rate, changes * self.rate),
-        }
-        for margin, _ in measured.values():
-            margin[np.isnan(changes)] = np.inf  # nothing to compare with
-        return measured
-
-    def _other(self, sign: np.ndarray, flags: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Return what is so or not as margins of −1 or ∞, with the value that matters."""
-        refusing = self.machine.model.field.outside == "refuse"
-        never = np.zeros(len(flags), dtype=bool)
-        broken = {
-            "not_converged": np.stack([never, flags == Status.NOT_CONVERGED], axis=1)[:, :, None],
-            "outside_field": np.stack([never, (flags == Status.OUTSIDE_FIELD) & refusing], axis=1)[:, :, None],
-            "assembly": (sign != self.geometry.home_sign) & ~np.isnan(sign),
-        }
-        return {name: (np.where(is_so, -1.0, np.inf), sign) for name, is_so in broken.items()}
+                found["step"] = limits.step - np.abs(changes), changes
+                found["speed"] = limits.speed - np.abs(changes) * self.rate, changes * self.rate
+                for name in ("step", "speed"):
+                    found[name][0][np.isnan(changes)] = np.inf  # nothing to compare with
+        for name, (margin, value) in found.items():
+            self.worst[name].add(margin, value, owner, share)
 
     def result(self, mode: str, platforms: Poses) -> CheckResult:
         """Return what was found."""
@@ -359,12 +331,8 @@ class _PathCheck:
         if not np.isfinite(value) and name != "condition":
             return NotFiniteError(f"{STRUT_NAMES[strut]}: {name} cannot be computed, the pose is degenerate")
         if name == "speed":
-            limit = self.geometry.limits.speed
-            problem = (
-                f"{STRUT_NAMES[strut]}: the {STAGES[stage]} length would change at "
-                f"{abs(value) * 1e3:.3f} mm/s, "
-                f"allowed {limit * 1e3:g} mm/s"
-            )
-            return LimitError("speed", problem, value, limit, strut, STAGES[stage])
+            limit, speed = self.geometry.limits.speed, f"{abs(value) * 1e3:.3f} mm/s"
+            problem = f"{STRUT_NAMES[strut]}: the {STAGES[stage]} length would change at {speed}"
+            return LimitError("speed", f"{problem}, allowed {limit * 1e3:g} mm/s", value, limit, strut, STAGES[stage])
         without_strut = name in ("condition", "assembly")
         return self.geometry.limits.error(REASONS.index(name), -1 if without_strut else strut, stage, value)

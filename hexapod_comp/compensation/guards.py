@@ -328,10 +328,9 @@ class StampGate(Guard):
         if not self._run or made < self._run_made:
             self._run, self._run_since = 0, now
         self._run, self._run_made = self._run + 1, made
-        if self._run < RUN or now - self._run_since < RUN_LASTS - 1e-6:
-            return False
-        self.sender_set_back += 1
-        return True
+        run = self._run >= RUN and now - self._run_since >= RUN_LASTS - 1e-6
+        self.sender_set_back += run
+        return run
 
 
 # ---- senders ----
@@ -341,11 +340,10 @@ class OneSender(Guard):
     """Only one node may publish on a topic of commands or of readings, and no message goes missing unseen.
 
     The graph tells the publishers' names, but keeps a node that was killed for as long as its own lease (20 s by
-    default): two of one name may be one and its ghost. How long that is, its own DDS profile says, not ours, so a
-    shorter lease in config/fastdds.xml would not help against any controller but our own programs, and would lose
-    these on a busy computer. Sequence numbers tell ghosts apart: every publisher counts its messages from 1, and only
-    the living send. A second node of this node's `own` name on a topic that it publishes is not seen: it may be this
-    one's predecessor that was killed; who listens finds out.
+    default, said by its own DDS profile, not by ours): two of one name may be one and its ghost. Sequence numbers tell
+    ghosts apart: every publisher counts its messages from 1, and only the living send. A second node of this node's
+    `own` name on a topic that it publishes is not seen: it may be this one's predecessor that was killed; who listens
+    finds out.
 
     `count` returns how many publishers there are, cheap; `names` their full names, each once, and why they cannot be
     told, empty where they can: who cannot tell who commands must not obey. Where several are `allowed` they are named
@@ -386,12 +384,24 @@ class OneSender(Guard):
             self._judge(now)
 
     def hear(self, number: int | None, now: float) -> bool:
-        """Take a message's sequence number, None where none are counted; return whether it showed a second sender."""
-        if number is not None and number == self._last + 1:
-            self._last = number
+        """Note a message's sequence number, None where none are counted; return whether it showed a second sender."""
+        last, self._last = self._last, number or 0
+        if number is not None and number == last + 1:
             return False
         counted, self._counted = self._counted, number is not None
-        if self._in_turn(number, now) or (counted and not self._counted):
+        returned = False
+        if number is not None and last:  # it does not follow the last one: two send in turn, or messages are missing
+            back = number <= last
+            returned = now - self._changed_at < SPEAKERS_WITHIN and (back or last < self._other < number)
+            lost = number - 1 - (self._other if returned else last)
+            if lost > 0 and (returned or not back):
+                self.missed += lost
+                self._misses.note(now)
+            if returned:
+                self._turned_at = now
+            if back or returned:
+                self._other, self._changed_at = last, now
+        if returned or (counted and not self._counted):
             self._judge(now)
             return bool(self.problem)
         return False
@@ -399,23 +409,6 @@ class OneSender(Guard):
     def missing(self, now: float) -> bool:
         """Return whether messages have gone missing of late."""
         return self._misses.holds(now)
-
-    def _in_turn(self, number: int | None, now: float) -> bool:
-        """Return whether a number that does not follow the last one shows that two send in turn."""
-        last, self._last = self._last, number or 0
-        if number is None or not last:
-            return False
-        back = number <= last
-        returned = now - self._changed_at < SPEAKERS_WITHIN and (back or last < self._other < number)
-        lost = number - 1 - (self._other if returned else last)
-        if lost > 0 and (returned or not back):
-            self.missed += lost
-            self._misses.note(now)
-        if returned:
-            self._turned_at = now
-        if back or returned:
-            self._other, self._changed_at = last, now
-        return returned
 
     def _judge(self, now: float) -> None:
         names, both = ", ".join(self.names), ", ".join(self.names) or UNKNOWN_NAME
@@ -432,7 +425,5 @@ class OneSender(Guard):
         elif self._count > 1 and now - self._turned_at < SPEAKERS_HELD:
             self.problem = f"two publishers of {self.topic} speak in turn, both called {both}"
         elif self._count > 1 and not self._counted:
-            self.problem = (
-                f"two publishers of {self.topic} are called {both}; whether both speak cannot be told, as this "
-                "middleware (RMW) does not count messages"
-            )
+            told = "whether both speak cannot be told, as this middleware (RMW) does not count messages"
+            self.problem = f"two publishers of {self.topic} are called {both}; {told}"

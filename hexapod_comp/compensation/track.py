@@ -84,10 +84,9 @@ class StrutTrack(Guard):
         A strut that has really jumped is believed when so much time has passed, by stamps or by arrival, whichever is
         longer, that it may have got there: transports delay.
         """
-        struts, now = sample.values or (), sample.now
         both = sample.stamp and self._read_stamp
         by_stamp = (sample.stamp - self._read_stamp) * 1e-9 if both else -math.inf
-        excess = self._jumps.excess(struts, now, by_stamp)
+        excess = self._jumps.excess(sample.values or (), sample.now, by_stamp)
         if excess is not None:
             moved, allowed = f"{excess.moved * 1e3:.3f} mm", f"{excess.allowed * 1e3:.3f} mm"
             text = f"{STRUT_NAMES[excess.which]} has jumped by {moved}, in {excess.elapsed:.3f} s it can have moved "
@@ -98,7 +97,7 @@ class StrutTrack(Guard):
         short, long = list(map(sub, self._low, struts)), list(map(sub, struts, self._high))
         if max(short) <= 0.0 and max(long) <= 0.0:
             return
-        beyond = [max(pair) for pair in zip(short, long, strict=True)]
+        beyond = list(map(max, short, long))
         strut = beyond.index(max(beyond))
         length, low, high = struts[strut], self._low[strut], self._high[strut]
         text = f"{STRUT_NAMES[strut]} cannot be {length * 1e3:.3f} mm long, only {low * 1e3:g}…{high * 1e3:g} mm"

@@ -54,38 +54,29 @@ class Travel:
 def travel(
     machine: RealMachine, tool_pose: Pose, frame: Pose | None = None, compensates: bool = True
 ) -> tuple[Travel, ...]:
-    """Return how far the tool may go from a pose, by each of its six coordinates, forward and backward."""
-    start = _Outset(machine, tool_pose, machine.geometry.work if frame is None else frame, compensates)
-    return tuple(start.travel(coordinate, sign) for coordinate in COORDINATES for sign in (1, -1))
-
-
-class _Outset:
-    """Where a machine's tool starts from, as the core takes it."""
-
-    def __init__(self, machine: RealMachine, tool_pose: Pose, frame: Pose, compensates: bool) -> None:
-        self._machine = machine
-        self._frame, self._start, self._state = pack_pose(frame), pack_pose(tool_pose), Struct("hc_state")
-        self._state.copy_from(machine.state)
-        self._state.view["last"]["enabled"] = compensates
-        _, beta, _ = tool_pose.angles()
-        # R = Ry(β)·Rx(α)·Rz(γ): α turns about x as Ry(β) leaves it, β about y, γ about the tool's own z.
-        axes = np.array([[math.cos(beta), 0.0, -math.sin(beta)], [0.0, 1.0, 0.0], tool_pose.rotation[:, 2]])
-        self._axes = np.concatenate([np.eye(3), axes])
-
-    def travel(self, coordinate: str, sign: int) -> Travel:
-        """Return how far the tool may go; raise what is wrong with where it starts."""
-        index = COORDINATES.index(coordinate)
-        turns, axis = index >= 3, sign * self._axes[index]
-        shift, turn = (np.zeros(3), axis) if turns else (axis, np.zeros(3))
-        stroke = float(self._machine.geometry.limits.stroke.max())
-        step, longest = (TURN_STEP, LONGEST_TURN) if turns else (stroke / STEPS, 4.0 * stroke)
-        way = go(self._state.at, self._start.at, self._frame.at, shift, turn, step, longest)
-        if way.refused.status == Status.OK:
-            return Travel(coordinate, sign, way.inside, None)
-        error = refusal(way.refused, self._machine.geometry, self._machine.model)
-        if way.outside == 0.0:
-            raise error
-        return Travel(coordinate, sign, way.inside, error)
+    """Return how far the tool may go from a pose, by each of its six coordinates, forward and backward; raise what is
+    wrong with where it starts."""
+    geometry, state = machine.geometry, Struct("hc_state")
+    state.copy_from(machine.state)
+    state.view["last"]["enabled"] = compensates
+    start, work = pack_pose(tool_pose), pack_pose(geometry.work if frame is None else frame)
+    _, beta, _ = tool_pose.angles()
+    # R = Ry(β)·Rx(α)·Rz(γ): α turns about x as Ry(β) leaves it, β about y, γ about the tool's own z.
+    turns = np.array([[math.cos(beta), 0.0, -math.sin(beta)], [0.0, 1.0, 0.0], tool_pose.rotation[:, 2]])
+    stroke, none, ways = float(geometry.limits.stroke.max()), np.zeros(3), []
+    for coordinate, axis in zip(COORDINATES, (*np.eye(3), *turns), strict=True):
+        turning = coordinate in COORDINATES[3:]
+        step, longest = (TURN_STEP, LONGEST_TURN) if turning else (stroke / STEPS, 4.0 * stroke)
+        for sign in (1, -1):
+            shift, turn = (none, sign * axis) if turning else (sign * axis, none)
+            way = go(state.at, start.at, work.at, shift, turn, step, longest)
+            error = None
+            if way.refused.status != Status.OK:
+                error = refusal(way.refused, geometry, machine.model)
+                if way.outside == 0.0:
+                    raise error
+            ways.append(Travel(coordinate, sign, way.inside, error))
+    return tuple(ways)
 
 
 def travel_text(ways: Sequence[Travel]) -> str:
