@@ -529,8 +529,8 @@ class LinuxcncBridgeNode(MachineNode):
             self._last_text = text
             if level != OK:
                 self.warn_of(text, text)
-            elif self._throttle.passes(text) is not None:
-                self.get_logger().info(text)
+            else:
+                self.note(text, text)
         self.tell(level, text, lambda: self._status.values(", ".join(self._source.names), now))
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
@@ -35,8 +37,8 @@ class Sent:
     """One command on its way."""
 
     sent_at: float  # monotonic times, s; NaN while unanswered
-    refused: str
-    too_old: str
+    refused: int  # commands refused before, and those of them for their age
+    too_old: int
     message: PoseStamped
     answered_at: float = float("nan")  # monotonic times, s; NaN while unanswered
     command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # shape (6,): The answer, m
@@ -48,53 +50,40 @@ class LoopClient:
 
     def __init__(self, frame_id: str = "base", namespace: str = "") -> None:
         self._session = RosSession("hexapod_comp_client", namespace)
-        self.node, self._spin_once = self._session.node, self._session.spin_once
-        self._message = pose_message(Pose.identity(), frame_id)
-        self._commands, self._corrections = StrutReader(), StrutReader()
-        self.sent: dict[int, Sent] = {}
-        self.track: list[tuple[np.ndarray, int]] = []
+        self.node, self._spin_once, self.close = self._session.node, self._session.spin_once, self._session.close
+        self._frame_id, self._reader = frame_id, StrutReader()
+        self.sent: dict[int, Sent] = {}  # by their stamps, ns
+        self.track: list[tuple[np.ndarray, int]] = []  # where the tool went, m, and how many commands were sent by then
+        self.diagnostics: dict[str, str] = {}  # values of the compensator's newest status
+        self.true_count = 0  # true poses that came
         self._streamed: int | None = None
-        self.diagnostics: dict[str, str] = {}
         self._status_name = status_prefix(self.node.get_namespace(), "compensator")
         self._counted_before: tuple[int, int] | None = None
-        self._true: PoseStamped | None = None
-        self._estimate: PoseStamped | None = None
-        self.true_count = 0
+        self._newest: dict[str, PoseStamped] = {}
         node = self.node
         self._publisher = node.create_publisher(PoseStamped, "tool_pose_command", COMMAND_QOS)
-        node.create_subscription(JointState, "strut_commands", self._on_command, LISTENER_QOS)
-        node.create_subscription(JointState, "strut_corrections", self._on_correction, LISTENER_QOS)
-        node.create_subscription(PoseStamped, "tool_pose_true", self._on_true, TRACK_QOS)
-        node.create_subscription(PoseStamped, "tool_pose_estimate", self._on_estimate, NEWEST_QOS)
+        for topic in ("strut_commands", "strut_corrections"):
+            node.create_subscription(JointState, topic, partial(self._on_answer, topic), LISTENER_QOS)
+        for topic, qos in (("tool_pose_true", TRACK_QOS), ("tool_pose_estimate", NEWEST_QOS)):
+            node.create_subscription(PoseStamped, topic, partial(self._on_pose, topic), qos)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
         self._enable = node.create_client(SetBool, "compensator/enable_compensation")
 
-    def close(self) -> None:
-        """Leave ROS."""
-        self._session.close()
+    def _on_answer(self, topic: str, message: JointState) -> None:
+        if (entry := self.sent.get(nanoseconds_of(message.header.stamp))) is not None:
+            self._reader.read(message)
+            if topic == "strut_commands":
+                entry.answered_at, entry.command = time.monotonic(), self._reader.lengths.copy()
+            else:
+                entry.correction = self._reader.lengths.copy()
 
-    def _on_command(self, message: JointState) -> None:
-        entry = self.sent.get(nanoseconds_of(message.header.stamp))
-        if entry is not None:
-            entry.answered_at = time.monotonic()
-            self._commands.read(message)
-            entry.command = self._commands.lengths.copy()
-
-    def _on_correction(self, message: JointState) -> None:
-        entry = self.sent.get(nanoseconds_of(message.header.stamp))
-        if entry is not None:
-            self._corrections.read(message)
-            entry.correction = self._corrections.lengths.copy()
-
-    def _on_true(self, message: PoseStamped) -> None:
-        self._true = message
-        self.true_count += 1
-        if self._streamed is not None:
-            p = message.pose.position
-            self.track.append((np.array([p.x, p.y, p.z]), self._streamed))
-
-    def _on_estimate(self, message: PoseStamped) -> None:
-        self._estimate = message
+    def _on_pose(self, topic: str, message: PoseStamped) -> None:
+        self._newest[topic] = message
+        if topic == "tool_pose_true":
+            self.true_count += 1
+            if self._streamed is not None:
+                p = message.pose.position
+                self.track.append((np.array([p.x, p.y, p.z]), self._streamed))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -106,21 +95,22 @@ class LoopClient:
     @property
     def has_true_pose(self) -> bool:
         """Whether somebody tells where the tool really is."""
-        return self._true is not None
+        return "tool_pose_true" in self._newest
 
     @property
     def true_pose(self) -> Pose:
         """The newest true tool pose in ``base``."""
-        if self._true is None:
-            raise NoAnswerError("no tool_pose_true has been received")
-        return message_pose(self._true)
+        return self._pose("tool_pose_true")
 
     @property
     def estimate(self) -> Pose:
         """The newest estimated tool pose in ``base``."""
-        if self._estimate is None:
-            raise NoAnswerError("no tool_pose_estimate has been received")
-        return message_pose(self._estimate)
+        return self._pose("tool_pose_estimate")
+
+    def _pose(self, topic: str) -> Pose:
+        if topic not in self._newest:
+            raise NoAnswerError(f"no {topic} has been received")
+        return message_pose(self._newest[topic])
 
     def spin_until(self, condition: Callable[[], bool], timeout: float, what: str) -> None:
         """Handle messages until a condition holds."""
@@ -136,7 +126,7 @@ class LoopClient:
         return (
             self._publisher.get_subscription_count() > 0
             and self.node.count_publishers("strut_commands") > 0
-            and self._estimate is not None
+            and "tool_pose_estimate" in self._newest
             and self._enable.service_is_ready()
             and "commands" in self.diagnostics  # a node that is not configured yet has none
         )
@@ -166,14 +156,18 @@ class LoopClient:
 
     def send(self, pose: Pose) -> Sent:
         """Send one command and return its record, which the answer will fill."""
-        return self._send(pose_message(pose, self._message.header.frame_id))
+        return self._send(pose_message(pose, self._frame_id))
 
     def _send(self, message: PoseStamped) -> Sent:
         stamp = self.node.get_clock().now()
         message.header.stamp = stamp.to_msg()
-        entry = self.sent[stamp.nanoseconds] = Sent(time.monotonic(), self._refused(), self._too_old(), message)
+        entry = self.sent[stamp.nanoseconds] = Sent(time.monotonic(), *self._refused(), message)
         self._publisher.publish(message)
         return entry
+
+    def _refused(self) -> tuple[int, int]:
+        """Return how many commands were refused so far, and how many of them for their age."""
+        return int(self.diagnostics.get("refused", "0")), int(self.diagnostics.get("refused.stamp_past", "0"))
 
     def wait_for_answer(self, entry: Sent, timeout: float = ANSWER_TIMEOUT) -> Sent:
         """Wait until command and correction have come back; return the record that was answered.
@@ -182,30 +176,18 @@ class LoopClient:
         and the next pose on a path would be too far from there.
         """
         end = entry.sent_at + timeout
-        while not _answered(entry):
-            if self._refused() != entry.refused:
-                if time.monotonic() < end and self._only_too_old(entry):
+        while not (np.isfinite(entry.command[0]) and np.isfinite(entry.correction[0])):
+            refused, too_old = self._refused()
+            if refused != entry.refused:
+                if time.monotonic() < end and refused - entry.refused == too_old - entry.too_old:
                     entry = self._send(entry.message)
                     continue
-                raise NoAnswerError(f"a command was refused: {self._refusal()}")
+                why, advice = self.diagnostics["last_refusal"], self.diagnostics.get("what_to_do", "")
+                raise NoAnswerError(f"a command was refused: {why}" + (f"; {advice}" if advice else ""))
             if time.monotonic() > end:
                 raise NoAnswerError(f"no answer to a command within {timeout:g} s")
             self._spin_once(0.01)
         return entry
-
-    def _refused(self) -> str:
-        return self.diagnostics.get("refused", "0")
-
-    def _too_old(self) -> str:
-        return self.diagnostics.get("refused.stamp_past", "0")
-
-    def _only_too_old(self, entry: Sent) -> bool:
-        """Return whether all that was refused since a command had waited for too long."""
-        return int(self._refused()) - int(entry.refused) == int(self._too_old()) - int(entry.too_old)
-
-    def _refusal(self) -> str:
-        advice = self.diagnostics.get("what_to_do", "")
-        return self.diagnostics["last_refusal"] + (f"; {advice}" if advice else "")
 
     def stream(self, path: Path, each: Callable[[int], None] | None = None) -> list[Sent]:
         """Send a path at its rate and return the records; :attr:`track` then holds where the tool went.
@@ -215,7 +197,7 @@ class LoopClient:
         """
         entries: list[Sent] = []
         self.track = []
-        messages = [pose_message(path.pose(n), self._message.header.frame_id) for n in range(len(path))]
+        messages = [pose_message(path.pose(n), self._frame_id) for n in range(len(path))]
         due = time.monotonic()
         for index, message in enumerate(messages):
             while (left := due - time.monotonic()) > 0.0:
@@ -246,7 +228,7 @@ class LoopClient:
 
     def settled(self) -> Callable[[], bool]:
         """Return a condition: the true tool has not moved by more than 20 nm over the last 25 readings."""
-        history: list[np.ndarray] = []
+        history: deque[np.ndarray] = deque(maxlen=25)
         seen = self.true_count
 
         def quiet() -> bool:
@@ -255,11 +237,6 @@ class LoopClient:
                 return False
             seen = self.true_count
             history.append(self.true_pose.position)
-            recent = np.array(history[-25:])
-            return len(recent) == 25 and float(np.ptp(recent, axis=0).max()) < 20e-9
+            return len(history) == 25 and float(np.ptp(np.array(history), axis=0).max()) < 20e-9
 
         return quiet
-
-
-def _answered(entry: Sent) -> bool:
-    return bool(np.isfinite(entry.command[0]) and np.isfinite(entry.correction[0]))

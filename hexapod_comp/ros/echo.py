@@ -29,6 +29,7 @@ RATE_WINDOW = 2.0  # The rate is that of the messages of this last time, s
 QUEUE = 1000  # Messages that may wait while the terminal is slow: a second of commands
 
 ANGLES = ("alpha", "beta", "gamma")
+LEVELS = {b"\x00": "OK", b"\x01": "WARN", b"\x02": "ERROR", b"\x03": "STALE"}
 
 
 class MessageField(NamedTuple):
@@ -54,17 +55,35 @@ DIGITS = {"mm": 6, "um": 3, "deg": 6, "urad": 3, "mm_s": 3, "degC": 2, "percent"
 def message_fields(topic: str, message: Any) -> list[MessageField]:
     """Return a message's numbers with their units; types and topics that are not the package's are shown in SI."""
     if isinstance(message, PoseStamped):
-        return _pose_rows(message)
-    if isinstance(message, PoseWithCovarianceStamped):
-        return _error_rows(message)
+        p, q = message.pose.position, message.pose.orientation
+        quaternion, rows = (q.x, q.y, q.z, q.w), [MessageField("frame", message.header.frame_id)]
+        rows += [MessageField(axis, value * 1e3, "mm") for axis, value in zip("xyz", (p.x, p.y, p.z), strict=True)]
+        try:
+            degrees = np.degrees(Pose.from_quaternion((0.0, 0.0, 0.0), quaternion).angles()).tolist()
+        except HexapodError:  # not of norm 1: a listener shows what was sent
+            return rows + [MessageField(f"q{axis}", value) for axis, value in zip("xyzw", quaternion, strict=True)]
+        return rows + [MessageField(name, angle, "deg") for name, angle in zip(ANGLES, degrees, strict=True)]
+    if isinstance(message, PoseWithCovarianceStamped):  # a small displacement and rotation vector
+        p, q = message.pose.pose.position, message.pose.pose.orientation
+        deviations = np.sqrt(np.diag(np.reshape(message.pose.covariance, (6, 6)))).tolist()
+        twice = 2.0 * math.copysign(1.0, q.w)  # sin(ω/2) = ω/2 to 1e-13 at 100 µrad
+        values = p.x, p.y, p.z, twice * q.x, twice * q.y, twice * q.z
+        rows = [MessageField("frame", message.header.frame_id)]
+        for name, value, sigma in zip(("x", "y", "z", "rx", "ry", "rz"), values, deviations, strict=True):
+            unit = "urad" if name.startswith("r") else "um"
+            rows += [MessageField(name, value * 1e6, unit), MessageField(f"{name}_sigma", sigma * 1e6, unit)]
+        return rows
     if isinstance(message, JointState) and set(message.name) == set(STRUT_NAMES) and not message.effort:
         return _strut_rows(message.name, message.position, message.velocity, topic.endswith("strut_corrections"))
     if isinstance(message, Float64MultiArray) and topic.endswith("strut_commands_array"):
         return _strut_rows(STRUT_NAMES, message.data, (), False)
-    if isinstance(message, DiagnosticArray):
-        return [row for status in message.status for row in _status_rows(status)]
-    if isinstance(message, DiagnosticStatus):
-        return _status_rows(message)
+    if isinstance(message, DiagnosticArray | DiagnosticStatus):
+        rows = []
+        for status in message.status if isinstance(message, DiagnosticArray) else [message]:
+            level = LEVELS.get(status.level, repr(status.level))
+            rows.append(MessageField(status.name, f"{level}: {status.message}"))
+            rows += [MessageField(f"  {entry.key}", entry.value) for entry in status.values]
+        return rows
     if isinstance(message, Temperature):
         return [MessageField(message.header.frame_id or "temperature", message.temperature, "degC")]
     if isinstance(message, RelativeHumidity):
@@ -75,30 +94,6 @@ def message_fields(topic: str, message: Any) -> list[MessageField]:
     return list(_plain_rows("", message))
 
 
-def _pose_rows(message: PoseStamped) -> list[MessageField]:
-    p, q = message.pose.position, message.pose.orientation
-    quaternion = (q.x, q.y, q.z, q.w)
-    try:
-        degrees = np.degrees(Pose.from_quaternion((0.0, 0.0, 0.0), quaternion).angles())
-        turned = [MessageField(name, angle, "deg") for name, angle in zip(ANGLES, degrees.tolist(), strict=True)]
-    except HexapodError:  # not of norm 1: a listener shows what was sent
-        turned = [MessageField(f"q{axis}", value) for axis, value in zip("xyzw", quaternion, strict=True)]
-    places = [MessageField(axis, value * 1e3, "mm") for axis, value in zip("xyz", (p.x, p.y, p.z), strict=True)]
-    return [MessageField("frame", message.header.frame_id), *places, *turned]
-
-
-def _error_rows(message: PoseWithCovarianceStamped) -> list[MessageField]:
-    """Return a small displacement and rotation vector, each with its standard deviation."""
-    p, q = message.pose.pose.position, message.pose.pose.orientation
-    deviations = np.sqrt(np.diag(np.reshape(message.pose.covariance, (6, 6)))) * 1e6
-    vector = [2.0 * math.copysign(1.0, q.w) * part for part in (q.x, q.y, q.z)]  # sin(ω/2) = ω/2 to 1e-13 at 100 µrad
-    rows = [MessageField("frame", message.header.frame_id)]
-    for n, (name, value) in enumerate(zip(("x", "y", "z", "rx", "ry", "rz"), (p.x, p.y, p.z, *vector), strict=True)):
-        unit = "um" if n < 3 else "urad"
-        rows += [MessageField(name, value * 1e6, unit), MessageField(f"{name}_sigma", float(deviations[n]), unit)]
-    return rows
-
-
 def _strut_rows(
     names: Sequence[str], lengths: Sequence[float], speeds: Sequence[float], micro: bool
 ) -> list[MessageField]:
@@ -107,17 +102,6 @@ def _strut_rows(
     if any(speeds):
         rows += [MessageField(f"{name}_speed", speed * 1e3, "mm_s") for name, speed in zip(names, speeds, strict=False)]
     return rows
-
-
-LEVELS = {b"\x00": "OK", b"\x01": "WARN", b"\x02": "ERROR", b"\x03": "STALE"}
-
-
-def _status_rows(status: DiagnosticStatus) -> list[MessageField]:
-    level = LEVELS.get(status.level, repr(status.level))
-    return [
-        MessageField(status.name, f"{level}: {status.message}"),
-        *(MessageField(f"  {v.key}", v.value) for v in status.values),
-    ]
 
 
 def _plain_rows(prefix: str, value: Any) -> Iterator[MessageField]:
@@ -151,21 +135,18 @@ class EchoedMessage(NamedTuple):
         parts = [self.topic]
         parts += [f"{self.rate:.1f} Hz"] if math.isfinite(self.rate) else []
         parts += [f"{self.age * 1e3:.1f} ms old"] if math.isfinite(self.age) else ["no stamp"]
-        width = max((len(row.name) for row in self.rows), default=0)
-        lines = [f"  {row.name:<{width}}  {_shown(row)}".rstrip() for row in self.rows]
-        return "\n".join([", ".join(parts), *lines])
+        lines, width = [", ".join(parts)], max((len(row.name) for row in self.rows), default=0)
+        for row in self.rows:
+            shown, digits = printable(str(row.value), 1000), DIGITS.get(row.unit, 9)
+            if isinstance(row.value, float):
+                shown = f"{row.value + 0.0:{digits + 6}.{digits}f} {UNITS.get(row.unit, row.unit)}"
+            lines.append(f"  {row.name:<{width}}  {shown}".rstrip())
+        return "\n".join(lines)
 
     def record(self) -> dict[str, Any]:
         """Return it for programs: one flat object, units in the keys."""
         head = {"topic": self.topic, "stamp_s": self.stamp, "age_ms": self.age * 1e3, "rate_hz": self.rate}
         return {**head, **{row.key.strip(): row.value for row in self.rows}}
-
-
-def _shown(row: MessageField) -> str:
-    if not isinstance(row.value, float):
-        return printable(str(row.value), 1000)
-    digits = DIGITS.get(row.unit, 9)
-    return f"{row.value + 0.0:{digits + 6}.{digits}f} {UNITS.get(row.unit, row.unit)}"
 
 
 class Echo:
@@ -182,31 +163,33 @@ class Echo:
                 f"{printable(topic)!r} is not a valid topic name: {str(error).partition(', at ')[0]}"
             ) from error
         self.intervals = MessageIntervals()  # times between the messages so far
-        self._kind = _message_type(self._wait_for_type(spin_once))
-        node.create_subscription(self._kind, self.topic, self._on_message, self._offered_qos(), raw=True)
-
-    def _wait_for_type(self, spin_once: Callable[[float], None]) -> str:
         end = time.monotonic() + DISCOVERY_TIME
-        while time.monotonic() < end:
-            publishers = self._node.get_publishers_info_by_topic(self.topic)
-            if publishers:
-                return str(publishers[0].topic_type)
+        while not (publishers := node.get_publishers_info_by_topic(self.topic)):
+            if time.monotonic() >= end:
+                known = published_topics(node)
+                close = get_close_matches(self.topic, known, n=3)
+                listed = f"published are: {', '.join(known) or 'none'}"
+                listed = f"did you mean {' or '.join(close)}?" if close else listed
+                problem = f"nobody publishes {self.topic} in this ROS domain (waited {DISCOVERY_TIME:g} s)"
+                raise HexapodError(f"{problem}; {listed}")
             spin_once(0.05)
-        known = published_topics(self._node)
-        close = get_close_matches(self.topic, known, n=3)
-        listed = f"did you mean {' or '.join(close)}?" if close else f"published are: {', '.join(known) or 'none'}"
-        raise HexapodError(f"nobody publishes {self.topic} in this ROS domain (waited {DISCOVERY_TIME:g} s); {listed}")
-
-    def _offered_qos(self) -> QoSProfile:
-        """Return reliable and latched only where all publishers are: a stricter subscription would get nothing."""
-        offered = [info.qos_profile for info in self._node.get_publishers_info_by_topic(self.topic)]
+        name = str(publishers[0].topic_type)
+        package, _, kind = name.partition("/msg/")
+        try:
+            self._kind: type = getattr(importlib.import_module(f"{package}.msg"), kind)
+        except (ImportError, AttributeError) as error:
+            text = f"messages of type {name} cannot be read: {package} is not installed here"
+            raise HexapodError(text) from error
+        # Reliable and latched only where all publishers are: a stricter subscription would get nothing.
+        offered = [info.qos_profile for info in publishers]
         reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
         latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
-        return QoSProfile(
+        qos = QoSProfile(
             depth=QUEUE,
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
+        node.create_subscription(self._kind, self.topic, self._on_message, qos, raw=True)
 
     def _on_message(self, data: bytes) -> None:
         came, now = time.monotonic(), self._node.get_clock().now().nanoseconds
@@ -274,12 +257,3 @@ def published_topics(node: Node) -> dict[str, str]:
     """Return the topics that somebody publishes, by name, each with its type."""
     topics = sorted(node.get_topic_names_and_types())
     return {name: kinds[0] for name, kinds in topics if node.count_publishers(name)}
-
-
-def _message_type(name: str) -> type:
-    """Return the class of ``package/msg/Type``."""
-    package, _, kind = name.partition("/msg/")
-    try:
-        return getattr(importlib.import_module(f"{package}.msg"), kind)  # type: ignore[no-any-return]
-    except (ImportError, AttributeError) as error:
-        raise HexapodError(f"messages of type {name} cannot be read: {package} is not installed here") from error

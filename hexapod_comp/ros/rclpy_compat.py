@@ -108,15 +108,15 @@ class LateAnswer:
     has no such thing: executors send what the callback returns. Only one request at a time may be left so."""
 
     def __init__(self, service: Service) -> None:
-        self.service = service
-        self._send, self._header = service.send_response, cast(Any, None)
-        service.send_response = self._send_or_keep  # type: ignore[method-assign]
+        self.service, self._send, self._header = service, service.send_response, cast(Any, None)
 
-    def _send_or_keep(self, response: Any, header: Any) -> None:
-        if response is None:
-            self._header = header
-        else:
-            self._send(response, header)
+        def send_or_keep(response: Any, header: Any) -> None:
+            if response is None:
+                self._header = header
+            else:
+                self._send(response, header)
+
+        service.send_response = send_or_keep  # type: ignore[method-assign]
 
     def answer(self, response: Any) -> None:
         """Answer the request that waits, if one does."""
@@ -214,19 +214,15 @@ class Throttle:
         self._last: dict[str, float] = {}
         self._held: dict[str, int] = {}
 
-    def passes(self, cause: str) -> int | None:
-        """Return how many of this cause were held back since the last, or None to hold this one back."""
+    def allow(self, cause: str, text: str) -> str | None:
+        """Return the text to be logged, which says what was held back, or None to hold this one back."""
         now = time.monotonic()
         if now - self._last.get(cause, -1e9) < self._period:
             self._held[cause] = self._held.get(cause, 0) + 1
             return None
         self._last[cause] = now
-        return self._held.pop(cause, 0)
-
-    def allow(self, cause: str, text: str) -> str | None:
-        """Return the text to be logged, which says what was held back, or None to hold this one back."""
-        held = self.passes(cause)
-        return None if held is None else text + (f" ({held} more like it)" if held else "")
+        held = self._held.pop(cause, 0)
+        return text + (f" ({held} more like it)" if held else "")
 
 
 class PlainLogger(rcutils_logger.RcutilsLogger):

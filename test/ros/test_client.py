@@ -24,7 +24,7 @@ class StandIn(LoopClient):
 
     def _send(self, message) -> Sent:
         self.poses.append(message.pose.position.z)
-        self._entry = Sent(0.0, self._refused(), self._too_old(), message)
+        self._entry = Sent(0.0, *self._refused(), message)
         self._entry.sent_at = 1e12  # never overdue
         return self._entry
 

@@ -983,7 +983,8 @@ def test_log_lets_one_line_per_cause_and_second_through(monkeypatch):
     monkeypatch.setattr(rclpy_compat, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     throttle = Throttle()
     causes = ["nan", "nan", "step", "nan", "nan", "step"]
-    assert [throttle.passes(cause) for cause in causes] == [0, None, 0, None, 2, 0]
+    said = ["it", None, "it", None, "it (2 more like it)", "it"]
+    assert [throttle.allow(cause, "it") for cause in causes] == said
 
 
 def test_counters_by_reason():
