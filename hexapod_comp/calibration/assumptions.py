@@ -100,6 +100,7 @@ class Assumptions:
     )
     drift: float = assumed(11.5e-6, "m/m", "prior of the scale's change over a campaign", "steel by 1 K")
     clear: float = assumed(3.0, "σ", "a drift, a discrepancy or runs that differ by no chance", "1 in 370")
+    lack_margin: float = assumed(1.5, "", "a discrepancy elsewhere, at most, over that of the readings", "chosen")
     fine_terms: float = assumed(0.3, "", "how well coarse terms of a field tell the fine ones, log", "factor of 1.35")
     scales: tuple = assumed(
         (("linear", 0.5e-6), ("length", 0.5e-6), ("position", 10e-6)), "m/m", "scale of an instrument, 1 σ", "classes"

@@ -540,14 +540,16 @@ def iterate(
     progress: Callable[[str], object],
 ) -> Solution:
     """Run Gauss–Newton steps until the parameters settle, from the nominal machine or from an answer."""
-    weights, robust = np.ones(len(estimation.measurements)), estimation.space.settings.robust
+    space, weights = estimation.space, np.ones(len(estimation.measurements))
+    robust = space.settings.robust
     all_alike = 0 if x.any() else 1  # steps whose residuals are the machine's errors: they weigh no reading
     for step in range(1, STEPS + 1):
         problem, residuals = estimation.linearise(x, weights)
-        posterior = solve(estimation.space, problem, tolerances, noise)
+        posterior = solve(space, problem, tolerances, noise)
         tolerances, noise = posterior.tolerances, posterior.noise
-        moved, x = estimation.space.physical(posterior.y) - x, estimation.space.physical(posterior.y)
-        change, block = _change(moved, estimation.space, posterior)
+        moved, x = space.physical(posterior.y) - x, space.physical(posterior.y)
+        sizes = np.abs(moved) / np.sqrt(np.diag(physical_covariance(space, posterior)))
+        change = float(sizes.max())
         progress(f"step {step}: largest change {change:.2g} standard deviations")
         if (change < SETTLED and (step > all_alike + 1 or not robust)) or step == STEPS:
             break
@@ -555,7 +557,8 @@ def iterate(
             weights = estimation.robust_weights(residuals)
     solution = Solution(problem, posterior, x, residuals, weights, step, change)
     if change > 1.0:
-        moving = f"did not settle within {STEPS} steps: {block} still changes by {change:.2g} standard deviations"
+        block = max(space.blocks, key=lambda block: sizes[block.part].max())
+        moving = f"did not settle within {STEPS} steps: {block.name} still changes by {change:.2g} standard deviations"
         raise NotSettled(f"{moving}; are all blocks allowed, and is it measured in enough places?", solution)
     return solution
 
@@ -611,11 +614,3 @@ def influence(run: np.ndarray, solution: Solution) -> np.ndarray:
     left = scale * problem.target - rows.times(p.y / p.spread)
     omitted = jackknife(rows, left, precision, run, np.linalg.cholesky(precision))
     return np.array([np.linalg.norm(one.moved) for one in omitted])
-
-
-def _change(change: np.ndarray, space: ParameterSpace, posterior: Posterior) -> tuple[float, str]:
-    """Return the largest change of a parameter x in its standard deviation, and the block that it belongs to."""
-    deviations = np.sqrt(np.diag(physical_covariance(space, posterior)))
-    sizes = np.abs(change) / deviations
-    block = max(space.blocks, key=lambda block: sizes[block.part].max())
-    return float(sizes[block.part].max()), block.name

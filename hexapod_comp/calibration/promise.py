@@ -11,11 +11,8 @@ from scipy.special import gammaincinv
 from ..machine.arrays import rms
 from .assumptions import ASSUMED
 
-TWICE, LACK_MARGIN = 2.0, 1.5
-"""An end of an interval stands so far out: in standard deviations, and in sizes of a lack."""
-
-DOUBTFUL_FACTOR = 3.0
-"""Parts of the readings that differ so many times as much as their noise explains put the whole fit in doubt."""
+TWICE = 2.0
+"""An end of an interval stands so many standard deviations out."""
 
 STEEL = 11.5e-6
 """Expansion of steel, 1/K."""
@@ -108,13 +105,13 @@ class Unexplained:
             low, high = size / down, size * up
         high = self.upper * high
         after = np.linalg.norm([self.factor * size, scatter.lack, scatter.stops])
-        high = np.linalg.norm([high, LACK_MARGIN * scatter.lack, scatter.most_stops])
+        high = np.linalg.norm([high, ASSUMED.lack_margin * scatter.lack, scatter.most_stops])
         return Promise(float(after), float(low), float(high))
 
     def doubts(self) -> list[str]:
         """Return what puts a fit in doubt."""
         listed = []
-        if self.factor > DOUBTFUL_FACTOR:
+        if self.factor > ASSUMED.misfit[1]:
             listed.append(f"{self._outcome()}: lines, or what they were read with, disagree with each other")
         if self.drift > ASSUMED.clear * self.drift_error:
             size = f"{self.drift * 1e6:.2g} ppm, as steel's does in {self.drift / STEEL:.2g} K"
@@ -125,7 +122,7 @@ class Unexplained:
     def remarks(self) -> list[str]:
         """Return what a reader must know of how the promise came about."""
         listed = []
-        if 1.0 < self.factor <= DOUBTFUL_FACTOR:
+        if 1.0 < self.factor <= ASSUMED.misfit[1]:
             listed.append(f"{self._outcome()}; the expected tool error allows for it")
         lack, stops = (
             _sizes(getattr(self.displacement, name), getattr(self.rotation, name)) for name in ("lack", "stops")

@@ -3,9 +3,9 @@
 A covariance of parameters is right if the model is. Three terms say by how much it may not be. A *cluster jackknife*
 over runs: what the tool's error changes by when each run is left out, by the linear problem, beside what the covariance
 expects of it, for errors of a run are not independent. A *discrepancy*: what is left beyond the instruments' noise, and
-alike there and back, is an error of the machine that no parameter describes (Kennedy & O'Hagan 2001). And a *drift*: a
-scale of all lengths that changes over the campaign is a parameter with a prior of its own, taken into the fit where the
-evidence is for it. The scale of an instrument, which no reading shows, is stated.
+is not what repeats show, is an error of the machine that no parameter describes (Kennedy & O'Hagan 2001). And a
+*drift*: a scale of all lengths that changes over the campaign is a parameter with a prior of its own, taken into the
+fit where the evidence is for it. The scale of an instrument, which no reading shows, is stated.
 """
 
 from __future__ import annotations
@@ -88,9 +88,8 @@ class Drift:
         """Change of the scale from the first to the last reading and its standard deviation, m/m; (0, 0): none."""
         if not len(self.values):
             return 0.0, 0.0
-        return 2.0 * ASSUMED.drift * float(abs(self.values[0])), 2.0 * ASSUMED.drift * float(
-            self.covariance[0, 0] ** 0.5
-        )
+        size, error = 2.0 * ASSUMED.drift * np.array([abs(self.values[0]), self.covariance[0, 0] ** 0.5])
+        return float(size), float(error)
 
 
 @dataclass(frozen=True)
