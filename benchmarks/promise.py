@@ -37,7 +37,6 @@ from hexapod_comp.calibration.estimator import physical_covariance
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import BLOCKS, FitSettings
 from hexapod_comp.calibration.posterior import box_errors, expected_error
-from hexapod_comp.calibration.promise import upper_factor
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -63,7 +62,7 @@ KNOWN = tuple(block for block in BLOCKS if block not in WAVES or WAVES[block] ==
 
 BAR, WIDTH_BAR = 0.95, 2.0
 
-BELIEVED = (3.0, 6.0, 8.0, 12.0, 24.0, 70.0, np.inf)
+BELIEVED = (2.0, 3.0, 5.0, 8.0, 12.0, 24.0, 70.0, np.inf)
 """Degrees of freedom with which the covariance is believed, for ``--ablate``."""
 
 HARMONICS = {2: (0.5e-6, 2e-6), 3: (0.3e-6, 1e-6)}
@@ -274,12 +273,12 @@ def other_promises(fit: ModelFit) -> tuple[float, tuple[tuple[float, float], ...
         return np.nan, ()
     product = errors.mean_squares()[0] @ covariance
 
-    def high(upper: float) -> float:
-        error = expected_error(fit.space, fit.solution.x, covariance, beyond=replace(beyond, upper=upper))
+    def high(believed: float, averaged: float) -> float:
+        other = replace(beyond, believed=min(believed, 1e9), averaged=averaged)
+        error = expected_error(fit.space, fit.solution.x, covariance, beyond=other)
         return np.nan if error is None else error.high
 
-    factors = [upper_factor(beyond.ratio, beyond.freedom, min(believed, 1e9)) for believed in BELIEVED]
-    highs = tuple((high(max(factor, beyond.averaged)), high(factor)) for factor in factors)
+    highs = tuple((high(believed, beyond.averaged), high(believed, 1.0)) for believed in BELIEVED)
     return float(np.trace(product) ** 2 / np.vdot(product.T, product)), highs
 
 

@@ -96,7 +96,7 @@ class Assumptions:
         (1.5, 3.0, 10.0), "", "noise found over noise stated: remarked on, in doubt, refused", "χ² of 2.25, 9, 100"
     )
     jackknife_prior: float = assumed(
-        8.0, "", "freedom with which a covariance is believed", "most likely by benchmarks.promise --ablate"
+        3.0, "", "freedom with which a covariance is believed", "most likely by benchmarks.promise --ablate"
     )
     drift: float = assumed(11.5e-6, "m/m", "prior of the scale's change over a campaign", "steel by 1 K")
     clear: float = assumed(3.0, "σ", "a drift, a discrepancy or runs that differ by no chance", "1 in 370")

@@ -38,18 +38,6 @@ class Scatter(NamedTuple):
 NO_SCATTER = Scatter()
 
 
-def upper_factor(ratio: float, freedom: float, believed: float = ASSUMED.jackknife_prior) -> float:
-    """Return the factor on standard deviations that is not exceeded with 97.5 %, by variances' `ratio` as runs show it.
-
-    The variance's scale has an inverse χ² prior about 1 of so many degrees of freedom as it is `believed` with, which
-    the runs' own freedom outvotes. A ratio below 1 does not make it smaller: lines cross others, which foretell them
-    better than what lies between lines.
-    """
-    ratio = max(1.0, ratio)
-    least = 2.0 * float(gammaincinv(0.5 * (believed + freedom), 0.025))
-    return float(np.sqrt(max(1.0, (believed + freedom * ratio) / least)))
-
-
 class Promise(NamedTuple):
     """RMS error of the tool to expect, and between what it lies with 95 %: m, or rad."""
 
@@ -63,7 +51,7 @@ class Unexplained:
     """What widens a promise."""
 
     factor: float = 1.0  # on the standard deviations of all parameters: what runs left out in turn show clearly
-    upper: float = 1.0  # on the upper end of an interval: what they may show, with 97.5 %
+    believed: float = np.inf  # degrees of freedom with which the covariance's scale is believed to be 1
     prior: float = 0.0  # standard deviation of the logarithm of the tool error to expect: priors' sizes are estimates
     prior_rotation: float = 0.0  # the same of the tool's rotation
     displacement: Scatter = NO_SCATTER  # what the tool does that no parameter describes
@@ -100,13 +88,26 @@ class Unexplained:
         Whether the machine or its instrument scatters more than stated nobody can say: the lower end is without it.
         """
         size, (low, high) = rms(left), np.percentile(left, [2.5, 97.5])
+        high = max(self.averaged * high, float(np.percentile(left * self._scales(len(left)), 97.5)))
         if low > 0.0:
             down, up = (np.exp(np.hypot(np.log(end / size), TWICE * prior)) for end in (low, high))
             low, high = size / down, size * up
-        high = self.upper * high
         after = np.linalg.norm([self.factor * size, scatter.lack, scatter.stops])
         high = np.linalg.norm([high, ASSUMED.lack_margin * scatter.lack, scatter.most_stops])
         return Promise(float(after), float(low), float(high))
+
+    def _scales(self, count: int) -> np.ndarray:
+        """Return draws of what standard deviations may have to be multiplied by, (count,): draws are multivariate t's.
+
+        The variance's scale has an inverse χ² prior about 1 of so many degrees of freedom as it is `believed` with,
+        which the runs' own freedom outvotes. A ratio below 1 does not make it smaller: lines cross others, which
+        foretell them better than what lies between lines.
+        """
+        if not np.isfinite(self.believed):
+            return np.ones(count)
+        places = np.random.default_rng(3).permutation(count) + 0.5  # one draw from each of as many equal shares
+        sums = self.believed + self.freedom * max(1.0, self.ratio)
+        return np.sqrt(sums / (2.0 * gammaincinv(0.5 * (self.believed + self.freedom), places / count)))
 
     def doubts(self) -> list[str]:
         """Return what puts a fit in doubt."""
@@ -138,7 +139,7 @@ class Unexplained:
         """Return this as plain numbers; units are in the keys."""
         return {
             "factor": self.factor,
-            "factor_of_upper_end": self.upper,
+            "believed_freedom": self.believed,
             "prior_log_deviation": self.prior,
             "prior_rotation_log_deviation": self.prior_rotation,
             **{f"{name}_m": value for name, value in self.displacement._asdict().items()},

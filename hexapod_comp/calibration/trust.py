@@ -44,7 +44,7 @@ from .estimator import (
 from .mixups import FAMILIES, family_of_run
 from .parameters import FitSettings, ParameterSpace
 from .posterior import ToolError, box_errors, expected_error
-from .promise import Scatter, Unexplained, upper_factor
+from .promise import Scatter, Unexplained
 
 TILT = np.radians(10.0)
 """Tilt at which the report states the tool error of a tilted tool."""
@@ -228,14 +228,13 @@ def unexplained(r: Residuals, scale: float, left_out: LeftOut) -> Unexplained:
     if r.expected > 0.0:
         averaged += left_out.probability * (left_out.square / r.expected - 1.0)
     averaged = float(np.sqrt(max(1.0, averaged)))
-    upper = max(averaged, upper_factor(ratio, freedom))
     clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - 2.0 * ndtr(-ASSUMED.clear)) / freedom
     factor = np.sqrt(ratio) if clear else 1.0
     prior, prior_of_rotation = (_of_priors(r, metric) for metric in r.metrics)
     displacement, rotation = discrepancy(r)
     return Unexplained(
         factor=float(factor),
-        upper=upper,
+        believed=ASSUMED.jackknife_prior,
         prior=prior,
         prior_rotation=prior_of_rotation,
         displacement=displacement,
