@@ -38,6 +38,7 @@ HOME = PAPER.home
 HAIR = 1e-9
 WIDE = Limits(np.tile([0.1, 2.0], (6, 1)), np.full(6, np.pi), np.full(6, np.pi), 100.0, 0.01, 1.0, 1.0)
 CROSSED = Pose.from_angles([0.01, -0.02, 0.42], np.deg2rad([3.0, -2.0, 60.0]))
+LOW = Pose(HOME.position - np.array([0.0, 0.0, 0.05]), HOME.rotation)
 TILTED = Pose.from_angles([0.02, -0.03, 0.52], np.deg2rad([12.0, -9.0, 15.0]))
 
 
@@ -86,30 +87,19 @@ def accepted(geometry: HexapodGeometry, pose: Pose, model: MachineModel | None =
 
 
 @pytest.mark.parametrize("strut", range(6))
-def test_longest_stroke(strut: int) -> None:
-    length = np.linalg.norm(struts(TILTED), axis=1)[strut]
+@pytest.mark.parametrize(("end", "pose"), [(1, TILTED), (0, LOW)], ids=["longest", "shortest"])
+def test_stroke(end: int, pose: Pose, strut: int) -> None:
+    length, inside = np.linalg.norm(struts(pose), axis=1)[strut], HAIR if end else -HAIR
     bounds = WIDE.stroke.copy()
-    bounds[strut, 1] = length * (1.0 + HAIR)
-    accepted(with_limits(stroke=bounds), TILTED)
-    bounds[strut, 1] = length * (1.0 - HAIR)
-    error = refusal(with_limits(stroke=bounds), TILTED)
+    bounds[strut, end] = length * (1.0 + inside)
+    accepted(with_limits(stroke=bounds), pose)
+    bounds[strut, end] = length * (1.0 - inside)
+    error = refusal(with_limits(stroke=bounds), pose)
     assert (error.reason, error.strut, error.stage) == ("stroke", strut, "nominal")
     assert error.value == pytest.approx(length, rel=1e-14)
-    assert error.limit == bounds[strut, 1]
+    assert error.limit == bounds[strut, end]
     assert f"strut_{strut + 1}" in str(error)
     assert f"{length * 1e3:.4f} mm" in str(error)
-
-
-@pytest.mark.parametrize("strut", range(6))
-def test_shortest_stroke(strut: int) -> None:
-    low = Pose(HOME.position - np.array([0.0, 0.0, 0.05]), HOME.rotation)
-    length = np.linalg.norm(struts(low), axis=1)[strut]
-    bounds = WIDE.stroke.copy()
-    bounds[strut, 0] = length * (1.0 - HAIR)
-    accepted(with_limits(stroke=bounds), low)
-    bounds[strut, 0] = length * (1.0 + HAIR)
-    error = refusal(with_limits(stroke=bounds), low)
-    assert (error.reason, error.strut, error.limit) == ("stroke", strut, bounds[strut, 0])
 
 
 @pytest.mark.parametrize("strut", range(6))

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import yaml
 from hypothesis import given
-from hypothesis import strategies as st
 from strategies import UNEVEN_GRID, fixed, paper_geometry, random_field, random_model, seeds, skewed_geometry
 
 from hexapod_comp.errors import InputFileError, ModelError
@@ -428,17 +427,6 @@ def test_many_nodes_with_few_lines_take_no_memory(tmp_path):
     text = BY_HAND.replace("[-200, 200]", nodes, 1).replace("grid_y_in: [-8, 8]", f"grid_y_mm: {nodes}")
     with pytest.raises(InputFileError, match="is missing"):
         load(tmp_path, text)
-
-
-@fixed
-@given(st.data())
-def test_no_damage_to_a_file_gets_through_as_another_error(tmp_path_factory, data):
-    """Truth: a damaged file is either still a model or an InputFileError; nothing else ever comes out."""
-    start = data.draw(st.integers(0, len(BY_HAND) - 1))
-    end = data.draw(st.integers(start, min(len(BY_HAND), start + 12)))
-    junk = data.draw(st.text("0123456789.-+eE[]{}:,#&*!|>'\"% \n\tnax\x00é", max_size=6))
-    with contextlib.suppress(InputFileError):
-        load(tmp_path_factory.getbasetemp(), BY_HAND[:start] + junk + BY_HAND[end:])
 
 
 # Writing.

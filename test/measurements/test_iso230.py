@@ -156,13 +156,6 @@ def test_seen_from_the_other_end(seed: int) -> None:
 
 
 @fixed
-@given(seeds, st.floats(0.1, 10.0))
-def test_everything_scales(seed: int, scale: float) -> None:
-    targets, deviations = drawn(seed)
-    assert evaluate(targets, scale * deviations).figures == same(evaluate(targets, deviations).figures, scale)
-
-
-@fixed
 @given(seeds)
 def test_intervals_contain_each_other(seed: int) -> None:
     """A figure that looks at more cannot be smaller; and R at a target is what its two intervals span together."""
