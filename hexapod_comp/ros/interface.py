@@ -174,8 +174,11 @@ class MachineFiles:
     """
 
     def __init__(self, options: dict[str, Any]) -> None:
-        self._options = options
-        self._folders = {kind: _folder(options[f"{kind}_file"], options) for kind in ("geometry", "model")}
+        self._options, configured = options, options["model_folder"]
+        folder = Path(configured).expanduser() if configured else None
+        if folder is not None and not folder.is_dir():
+            raise ParameterError(f"parameter model_folder: {configured!r} is not a folder")
+        self._folders = {kind: folder or folder_of(options[f"{kind}_file"]) for kind in ("geometry", "model")}
         self.sources: dict[str, Source] = {}
 
     @property
@@ -211,17 +214,6 @@ class MachineFiles:
     def _read(self, kind: str) -> Source:
         folder = self._folders[kind]
         return Source.read(confined_file(self._options[f"{kind}_file"], folder, kind), confined_opener(folder))
-
-
-def _folder(name: str, options: dict[str, Any]) -> Path | None:
-    """Return the folder from which a file may be read."""
-    configured = options["model_folder"]
-    if not configured:
-        return folder_of(name)
-    folder = Path(configured).expanduser()
-    if not folder.is_dir():
-        raise ParameterError(f"parameter model_folder: {configured!r} is not a folder")
-    return folder
 
 
 # ---- what comes in ----
@@ -269,18 +261,15 @@ class StrutInput(PoseInput):
         if np.isnan(lengths).all():
             return
         self._reader.check(lengths.tolist())
-        tool = self._pose(lengths) @ self._compensator.geometry.tool
-        sample.values = (*tool.position.tolist(), *quaternion_of(tool.rotation))
-
-    def _pose(self, lengths: np.ndarray) -> Pose:
-        """Return ``pose_platform_in_base`` of the machine without errors."""
         guesses = [self._compensator.geometry.home]
         if np.isfinite(self._compensator.nominal).all():  # else there was no command yet
             guesses.insert(0, self._compensator.platform)
         for guess in guesses:
             solved = solve_poses(self._structure, lengths[None], guess, threads=1)
             if solved.ok[0]:
-                return Pose(solved.positions[0], solved.rotations[0])
+                tool = Pose(solved.positions[0], solved.rotations[0]) @ self._compensator.geometry.tool
+                sample.values = (*tool.position.tolist(), *quaternion_of(tool.rotation))
+                return
         raise forward_error(int(solved.outcomes[0]), float(solved.conditions[0]), self._structure.max_condition)
 
 
@@ -455,19 +444,27 @@ def machine_markers(
     """Return the machine at a platform pose."""
     base = geometry.base_joints
     platform = position + geometry.platform_joints @ rotation.T
-    struts = _marker(frame_id, stamp, 0, Marker.LINE_LIST, STRUT_DIAMETER)
-    for start, end, amount in zip(base, platform, correction, strict=True):
-        struts.points += [_point(start), _point(end)]
-        struts.colors += [correction_colour(amount)] * 2
-    joints = _marker(frame_id, stamp, 1, Marker.SPHERE_LIST, JOINT_DIAMETER, GREY)
-    joints.points = [_point(joint) for joint in (*base, *platform)]
-    outline = _marker(frame_id, stamp, 2, Marker.LINE_STRIP, STRUT_DIAMETER, STEEL)
-    outline.points = [_point(joint) for joint in (*platform, platform[0])]
-    frame = _marker(frame_id, stamp, 3, Marker.LINE_STRIP, STRUT_DIAMETER, GREY)
-    frame.points = [_point(joint) for joint in (*base, base[0])]
-    tool = _marker(frame_id, stamp, 4, Marker.ARROW, STRUT_DIAMETER, STEEL)
-    tool.points = [_point(position), _point(position + rotation @ geometry.tool.position + 0.1 * rotation[:, 2])]
-    return MarkerArray(markers=[struts, joints, outline, frame, tool])
+    tip = position + rotation @ geometry.tool.position + 0.1 * rotation[:, 2]
+    markers: list[Marker] = []
+    for kind, size, colour, points in (
+        (Marker.LINE_LIST, STRUT_DIAMETER, None, [end for ends in zip(base, platform, strict=True) for end in ends]),
+        (Marker.SPHERE_LIST, JOINT_DIAMETER, GREY, (*base, *platform)),
+        (Marker.LINE_STRIP, STRUT_DIAMETER, STEEL, (*platform, platform[0])),
+        (Marker.LINE_STRIP, STRUT_DIAMETER, GREY, (*base, base[0])),
+        (Marker.ARROW, STRUT_DIAMETER, STEEL, (position, tip)),
+    ):
+        marker = Marker(ns="hexapod", id=len(markers), type=kind, action=Marker.ADD, lifetime=LIFETIME)
+        marker.header.frame_id, marker.header.stamp = frame_id, stamp
+        marker.pose.orientation.w = 1.0
+        marker.scale.x = marker.scale.y = marker.scale.z = size
+        marker.points = [Point(x=x, y=y, z=z) for x, y, z in np.array(points).tolist()]
+        if colour is not None:
+            marker.color = colour
+        else:  # the struts, each of a colour of its own
+            marker.color.a = 1.0
+            marker.colors = [correction_colour(amount) for amount in correction for _ in range(2)]
+        markers.append(marker)
+    return MarkerArray(markers=markers)
 
 
 def correction_colour(correction: float, full: float = 100e-6) -> ColorRGBA:
@@ -475,20 +472,3 @@ def correction_colour(correction: float, full: float = 100e-6) -> ColorRGBA:
     share = max(-1.0, min(1.0, correction / full))
     rest = 1.0 - abs(share)
     return ColorRGBA(r=1.0 if share > 0 else rest, g=rest, b=1.0 if share < 0 else rest, a=1.0)
-
-
-def _marker(frame_id: str, stamp: Time, number: int, kind: int, size: float, colour: ColorRGBA | None = None) -> Marker:
-    marker = Marker(ns="hexapod", id=number, type=kind, action=Marker.ADD, lifetime=LIFETIME)
-    marker.header.frame_id = frame_id
-    marker.header.stamp = stamp
-    marker.pose.orientation.w = 1.0
-    marker.scale.x = marker.scale.y = marker.scale.z = size
-    if colour is not None:
-        marker.color = colour
-    else:
-        marker.color.a = 1.0
-    return marker
-
-
-def _point(values: np.ndarray) -> Point:
-    return Point(x=float(values[0]), y=float(values[1]), z=float(values[2]))

@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from html import escape
 from http import HTTPStatus
 from ipaddress import ip_address
@@ -39,6 +40,7 @@ STREAM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 SILENT_AFTER = 2.0  # What nobody has said for this long is not known any more, s: diagnostics come once a second
 WINDOW = 5.0  # Latencies are those of the last so many seconds
+MOST_DELAYS = 10_000  # commands of that time at 2 kHz
 UPDATE_PERIOD = 0.1  # How often what is seen is shown anew, s
 
 NODES = ("compensator", "strut_drive")
@@ -89,7 +91,7 @@ class Watcher:
         self._guess = geometry.home
         self._newest: dict[str, tuple[bytes, float]] = {}
         self._states: dict[str, tuple[DiagnosticStatus, float]] = {}
-        self._delays: deque[tuple[float, float]] = deque()
+        self._delays: deque[tuple[float, float]] = deque(maxlen=MOST_DELAYS)
         self.node = node
         self._prefixes = {name: status_prefix(node.get_namespace(), name) for name in NODES}
         node.create_subscription(JointState, "strut_commands", self._on_command, STREAM_QOS, raw=True)
@@ -101,7 +103,7 @@ class Watcher:
             ("tool_pose_true", PoseStamped),
             ("compensator/predicted_error", PoseWithCovarianceStamped),
         ):
-            node.create_subscription(kind, topic, self._keeper(topic), NEWEST_QOS, raw=True)
+            node.create_subscription(kind, topic, partial(self._keep, topic), NEWEST_QOS, raw=True)
 
     def view(self) -> View:
         """Return what is known now."""
@@ -110,7 +112,11 @@ class Watcher:
         commands = self._read("strut_commands", self._lengths, now)
         commanded = None if commands is None or corrections is None else self._pose_of(commands - corrections)
         tool, true = (self._read(topic, _tool, now) for topic in ("tool_pose_estimate", "tool_pose_true"))
-        in_use = self._tool_in_use()
+        # The tool that the compensator names; before it does the geometry's.
+        status, _ = self._states.get("compensator", (DiagnosticStatus(), 0.0))
+        named = next((entry.value for entry in status.values if entry.key == "tool"), "")
+        in_use = self._geometry.tools.get(named, self._geometry.tool)
+        delays = [delay for at, delay in self._delays if now - at <= WINDOW]
         return View(
             platform=None if tool is None else tool @ in_use.inverse(),
             commanded=commanded,
@@ -119,42 +125,27 @@ class Watcher:
             predicted=self._read("compensator/predicted_error", _predicted, now),
             left=self._error(tool, commanded, in_use),
             seen=self._error(true, commanded, self._geometry.tool),
-            latency=self._latency(now),
+            latency=Latency(float(np.median(delays)), max(delays), len(delays)) if delays else None,
             states={name: status for name, (status, at) in self._states.items() if now - at < SILENT_AFTER},
         )
 
-    def _keeper(self, topic: str) -> Callable[[bytes], None]:
-        """Return what keeps a topic's newest message; it is read when it is wanted, ten times a second."""
-
-        def keep(data: bytes) -> None:
-            self._newest[topic] = (data, time.monotonic())
-
-        return keep
+    def _keep(self, topic: str, data: bytes) -> None:
+        """Keep a topic's newest message; it is read when it is wanted, ten times a second."""
+        self._newest[topic] = (data, time.monotonic())
 
     def _on_command(self, data: bytes) -> None:
-        now = time.monotonic()
-        self._newest["strut_commands"] = (data, now)
+        self._keep("strut_commands", data)
         try:
             stamp = nanoseconds_of(read_message(data, JointState).header.stamp)
         except HexapodError:
             return
-        self._delays.append((now, (self.node.get_clock().now().nanoseconds - stamp) * 1e-9))
-        self._forget(now)
+        self._delays.append((time.monotonic(), (self.node.get_clock().now().nanoseconds - stamp) * 1e-9))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             for name, prefix in self._prefixes.items():
                 if status.name.startswith(prefix):
                     self._states[name] = (status, time.monotonic())
-
-    def _forget(self, now: float) -> None:
-        while self._delays and now - self._delays[0][0] > WINDOW:
-            self._delays.popleft()
-
-    def _latency(self, now: float) -> Latency | None:
-        self._forget(now)
-        delays = [delay for _, delay in self._delays]
-        return Latency(float(np.median(delays)), max(delays), len(delays)) if delays else None
 
     def _read(self, topic: str, read: Callable[[bytes], T], now: float) -> T | None:
         """Return what a topic's newest message holds, None where it is old or cannot be used."""
@@ -178,12 +169,6 @@ class Watcher:
             self._guess = self._geometry.home
             return None
         return self._guess
-
-    def _tool_in_use(self) -> Pose:
-        """Return ``pose_tool_in_platform`` of the tool that the compensator names; of the geometry's before it does."""
-        status, _ = self._states.get("compensator", (DiagnosticStatus(), 0.0))
-        names = [entry.value for entry in status.values if entry.key == "tool"]
-        return self._geometry.tools.get(names[0], self._geometry.tool) if names else self._geometry.tool
 
     def _error(self, tool: Pose | None, commanded: Pose | None, in_platform: Pose) -> WatchedError | None:
         """Return how far a tool, in ``base``, is from where a platform pose would have it."""
@@ -319,37 +304,45 @@ def strut_colours(corrections: np.ndarray | None) -> np.ndarray:
 def words(view: View, machine: str) -> str:
     """Return what is known as HTML: states and refusals, errors, corrections, latencies. All of it is escaped."""
     parts = [_heading(escape(machine))]
-    parts += [_state(name, view.states.get(name), machine) for name in NODES]
+    for name in NODES:
+        parts.append(_heading(TITLES[name]))
+        if (status := view.states.get(name)) is None:
+            parts.append(f'<div style="color: {SILENT}">not heard</div>')
+            continue
+        values = {entry.key: escape(entry.value) for entry in status.values}
+        shown = {title: values[key] for key, title in KEYS.items() if values.get(key)}
+        shown |= {f"refused: {escape(key[8:])}": text for key, text in values.items() if key.startswith("refused.")}
+        colour, message = COLOURS.get(status.level, SILENT), escape(status.message)
+        parts += [f'<div style="color: {colour}"><b>{message}</b></div>', _table(shown)]
+        runs = status.hardware_id  # empty before the machine is known, and behind the namespace
+        if runs and not f"/{runs}".endswith(f"/{machine}"):
+            other = f"runs the machine {escape(runs)}, not {escape(machine)}"
+            parts.append(f'<div style="color: {COLOURS[ERROR]}">{other}</div>')
     errors = {
         "without compensation, by the model": view.predicted,
         "left, by the estimate": view.left,
         "left, by tool_pose_true": view.seen,
     }
-    parts.append(_heading("Tool error, axes of work"))
-    parts.append(_table({name: _error(error) for name, error in errors.items()}))
-    parts.append("<small>Left is tool − command: while the machine moves it holds the drives' lag too.</small>")
-    parts.append(_heading("Struts"))
-    parts.append(_struts(view))
-    parts.append("<small>blue −100 µm, white 0, red +100 µm; grey: not heard</small>")
-    parts.append(_heading("Latency, stamp of a command to its answer here"))
-    parts.append(f"<div>{_latency(view.latency)}</div>")
+    struts = {}
+    for number in range(6):
+        measured = "–" if view.measured is None else f"{1e3 * view.measured[number]:.4f} mm"
+        correction = "–" if view.corrections is None else f"{1e6 * view.corrections[number]:+.1f} µm"
+        struts[str(number + 1)] = f"{measured} &nbsp; {correction}"
+    waited = "no commands"
+    if (latency := view.latency) is not None:
+        waited = f"median {1e3 * latency.median:.2f} ms, largest {1e3 * latency.largest:.2f} ms"
+        waited += f", of {latency.count} in {WINDOW:g} s"
+    parts += [
+        _heading("Tool error, axes of work"),
+        _table({name: _error(error) for name, error in errors.items()}),
+        "<small>Left is tool − command: while the machine moves it holds the drives' lag too.</small>",
+        _heading("Struts"),
+        _table(struts),
+        "<small>blue −100 µm, white 0, red +100 µm; grey: not heard</small>",
+        _heading("Latency, stamp of a command to its answer here"),
+        f"<div>{waited}</div>",
+    ]
     return f'<div style="padding: 0 1em 1em; font-size: 0.85em; line-height: 1.35">{"".join(parts)}</div>'
-
-
-def _state(name: str, status: DiagnosticStatus | None, machine: str) -> str:
-    if status is None:
-        return f'{_heading(TITLES[name])}<div style="color: {SILENT}">not heard</div>'
-    values = {entry.key: entry.value for entry in status.values}
-    shown = {title: escape(values[key]) for key, title in KEYS.items() if values.get(key)}
-    shown.update(
-        {f"refused: {escape(key[8:])}": escape(value) for key, value in values.items() if key.startswith("refused.")}
-    )
-    colour = COLOURS.get(status.level, SILENT)
-    text = f'{_heading(TITLES[name])}<div style="color: {colour}"><b>{escape(status.message)}</b></div>{_table(shown)}'
-    runs = status.hardware_id  # empty before the machine is known, and behind the namespace
-    if runs and not f"/{runs}".endswith(f"/{machine}"):
-        text += f'<div style="color: {COLOURS[ERROR]}">runs the machine {escape(runs)}, not {escape(machine)}</div>'
-    return text
 
 
 def _error(error: WatchedError | None) -> str:
@@ -360,23 +353,6 @@ def _error(error: WatchedError | None) -> str:
     spread = f" ± {1e6 * error.deviation:.1f}" if np.isfinite(error.deviation) else ""
     length = 1e6 * float(np.linalg.norm(error.displacement))
     return f"<b>{length:.1f}{spread} µm</b>, {1e6 * error.turn:.0f} µrad<br>{x:+.1f}, {y:+.1f}, {z:+.1f} µm"
-
-
-def _struts(view: View) -> str:
-    """Return measured lengths, mm, and corrections, µm."""
-    rows = {}
-    for number in range(6):
-        measured = "–" if view.measured is None else f"{1e3 * view.measured[number]:.4f} mm"
-        correction = "–" if view.corrections is None else f"{1e6 * view.corrections[number]:+.1f} µm"
-        rows[str(number + 1)] = f"{measured} &nbsp; {correction}"
-    return _table(rows)
-
-
-def _latency(latency: Latency | None) -> str:
-    if latency is None:
-        return "no commands"
-    median, largest = 1e3 * latency.median, 1e3 * latency.largest
-    return f"median {median:.2f} ms, largest {largest:.2f} ms, of {latency.count} in {WINDOW:g} s"
 
 
 def _heading(text: str) -> str:

@@ -45,11 +45,22 @@ def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, frame
     markers = [clear]
     for number, layer in enumerate(layers):
         marker = _marker(frame_id, stamp, number, Marker.TRIANGLE_LIST)
-        share = number / max(1, len(layers) - 1)
-        _fill(marker, layer, (low, high), OPACITY[0] + share * (OPACITY[1] - OPACITY[0]))
+        opacity = OPACITY[0] + number / max(1, len(layers) - 1) * (OPACITY[1] - OPACITY[0])
+        shares = (layer.values.ravel() - low) / (high - low if high > low else 1.0)
+        colours = [ColorRGBA(r=r, g=g, b=b, a=opacity) for r, g, b, _ in shades(shares).tolist()]
+        points = [Point(x=x, y=y, z=z) for x, y, z in layer.points.reshape(-1, 3).tolist()]
+        corners = triangles(layer.points).ravel().tolist()
+        marker.points = [points[corner] for corner in corners]
+        marker.colors = [colours[corner] for corner in corners]
         markers.append(marker)
-    text = f"{title}\n{quantity.label}: {low * quantity.factor:.4g} (dark) … {high * quantity.factor:.4g} (yellow)"
-    markers.append(_text(_marker(frame_id, stamp, len(layers), Marker.TEXT_VIEW_FACING), layers[-1].points, text))
+    text = _marker(frame_id, stamp, len(layers), Marker.TEXT_VIEW_FACING)  # above the outermost shell
+    values_shown = f"{low * quantity.factor:.4g} (dark) … {high * quantity.factor:.4g} (yellow)"
+    text.text = f"{title}\n{quantity.label}: {values_shown}"
+    below, above = (end(layers[-1].points.reshape(-1, 3), axis=0) for end in (np.min, np.max))
+    centre, text.scale.z = 0.5 * (below + above), TEXT_SHARE * float(above[0] - below[0])
+    text.pose.position = Point(x=float(centre[0]), y=float(centre[1]), z=float(above[2]) + 3.0 * text.scale.z)
+    text.color = ColorRGBA(r=0.9, g=0.9, b=0.9, a=1.0)
+    markers.append(text)
     return MarkerArray(markers=markers)
 
 
@@ -87,32 +98,10 @@ def triangles(points: np.ndarray) -> np.ndarray:
     return facets[(corners != np.roll(corners, 1, axis=1)).any(axis=2).all(axis=1)]
 
 
-def _fill(marker: Marker, layer: Layer, limits: tuple[float, float], opacity: float) -> None:
-    """Write a layer's triangles and colours."""
-    width = limits[1] - limits[0]
-    shares = (layer.values.ravel() - limits[0]) / (width if width > 0.0 else 1.0)
-    colours = [ColorRGBA(r=r, g=g, b=b, a=opacity) for r, g, b, _ in shades(shares).tolist()]
-    points = [Point(x=x, y=y, z=z) for x, y, z in layer.points.reshape(-1, 3).tolist()]
-    corners = triangles(layer.points).ravel().tolist()
-    marker.points = [points[corner] for corner in corners]
-    marker.colors = [colours[corner] for corner in corners]
-
-
 def _marker(frame_id: str, stamp: Time, number: int, kind: int) -> Marker:
     marker = Marker(ns=NAMESPACE, id=number, type=kind, action=Marker.ADD)
     marker.header.frame_id, marker.header.stamp = frame_id, stamp
     marker.pose.orientation.w = 1.0
     marker.scale.x = marker.scale.y = marker.scale.z = 1.0
     marker.color.a = 1.0
-    return marker
-
-
-def _text(marker: Marker, points: np.ndarray, text: str) -> Marker:
-    """Put a text above the outermost shell."""
-    low, high = points.reshape(-1, 3).min(axis=0), points.reshape(-1, 3).max(axis=0)
-    height = TEXT_SHARE * float(high[0] - low[0])
-    centre = 0.5 * (low + high)
-    marker.text, marker.scale.z = text, height
-    marker.pose.position = Point(x=float(centre[0]), y=float(centre[1]), z=float(high[2]) + 3.0 * height)
-    marker.color = ColorRGBA(r=0.9, g=0.9, b=0.9, a=1.0)
     return marker
