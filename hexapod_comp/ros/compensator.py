@@ -2,7 +2,7 @@
 
 It holds no mathematics. A command is read, passes the guards, goes through the core, is published, written into the
 journal and added to the track of the struts: :meth:`CompensatorNode._take`. A reading passes its own guards, and is
-estimated and published: :meth:`CompensatorNode._take_states`. Run it with ``ros2 run hexapod_comp compensator`` or
+estimated and published: :meth:`CompensatorNode._on_states`. Run it with ``ros2 run hexapod_comp compensator`` or
 ``python -m hexapod_comp.ros.compensator``; doc/nodes.md lists topics, services and parameters.
 """
 
@@ -272,46 +272,41 @@ class CompensatorNode(MachineNode):
     # ---- a reading ----
 
     def _on_states(self, data: bytes, number: int | None) -> None:
-        now = time.monotonic()
+        """Use measured struts, also while the node is inactive: a start must begin where they are."""
+        sample, track, status = Sample(time.monotonic()), self._track, self._status
+        now = sample.now
         try:
-            self._take_states(data, number, now)
+            if self._measuring.hear(number, now):
+                self._look_at_publishers()
+            self._measuring.check(sample)
+            self._reader.sample(data, sample)
+            status.reading_stamps.check(sample)
+            struts = sample.values or ()
+            track.check_stroke(struts)
+            # Before the check for a jump: one reading off its command stops the machine, be it strut or encoder.
+            if self._active and track.follow(struts, now - sample.age):
+                status.bad_feedback.add(track.reason, track.problem, now)
+            track.check_jump(sample)
+            pose = self.compensator.estimate(struts)
+            track.accept(sample)
+            status.reading_stamps.accept(sample)
+            status.feedback.count += 1
+            status.feedback.last = now
+            if self._active:
+                self._outputs.estimate(pose, sample.stamp)
+                self._outputs.nominal(sample.stamp, track.mean)
         except HexapodError as error:
             self._ignore("feedback " + error.reason, error.reason, f"strut_states ignored: {error}", str(error), now)
-
-    def _take_states(self, data: bytes, number: int | None, now: float) -> None:
-        """Take measured struts, also while the node is inactive: a start must begin where they are."""
-        sample, track = Sample(now), self._track
-        self._hear(self._measuring, number, sample)
-        self._reader.sample(data, sample)
-        self._status.reading_stamps.check(sample)
-        struts = sample.values or ()
-        track.check_stroke(struts)
-        # Before the check for a jump: one reading off its command stops the machine, be it the strut or its encoder.
-        if self._active and track.follow(struts, now - sample.age):
-            self._status.bad_feedback.add(track.reason, track.problem, now)
-        track.check_jump(sample)
-        pose = self.compensator.estimate(struts)
-        track.accept(sample)
-        self._status.reading_stamps.accept(sample)
-        feedback = self._status.feedback
-        feedback.count += 1
-        feedback.last = now
-        if self._active:
-            self._outputs.estimate(pose, sample.stamp)
-            self._outputs.nominal(sample.stamp, track.mean)
-
-    def _hear(self, sender: OneSender, number: int | None, sample: Sample) -> None:
-        """Refuse a reading while it is not clear whose it is."""
-        if sender.hear(number, sample.now):
-            self._look_at_publishers()
-        sender.check(sample)
 
     def _on_sensor(self, topic: str, kind: type, data: bytes, number: int | None) -> None:
         # Dated by arrival: sensors need not stamp, clocks may be set, and what a transport delays a drift does not
         # notice.
         now, what = time.monotonic(), topic.removesuffix("s")
         try:
-            self._hear(self._status.sensing[topic], number, Sample(now))
+            sender = self._status.sensing[topic]
+            if sender.hear(number, now):
+                self._look_at_publishers()
+            sender.check(Sample(now))
             message = read_message(data, kind)
             if kind is RelativeHumidity:
                 self.compensator.set_humidity(self._thermometers.take(HUMIDITY, message.relative_humidity, now), now)

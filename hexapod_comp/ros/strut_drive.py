@@ -167,20 +167,19 @@ class StrutDriveNode(MachineNode):
     # ---- faults ----
 
     def on_parameters(self, names: set[str]) -> None:
-        """Take what has been set while the node runs; a knock only where it has been asked for anew."""
+        """Go by what has been set while the node runs; a knock only where it has been asked for anew."""
         if self._drive is not None:
             self._stamps.max_age = self._options["command_validity"]
             faults = self._faults()
             self._drive.faults = faults if "fault_jump" in names else replace(faults, jump=None)
 
     def _faults(self) -> Faults:
-        def index(number: int) -> int | None:
-            return number - 1 if number else None
-
         options, jump = self._options, self._options["fault_jump"]
+        struts = options["fault_stuck_strut"], options["fault_encoder_lost"]
+        stuck, lost = (number - 1 if number else None for number in struts)
         return Faults(
-            stuck=index(options["fault_stuck_strut"]),
-            encoder_lost=index(options["fault_encoder_lost"]),
+            stuck=stuck,
+            encoder_lost=lost,
             feedback_delay=options["fault_feedback_delay"],
             feedback_drop=options["fault_feedback_drop"],
             jump=(options["fault_jump_strut"] - 1, jump) if jump else None,
