@@ -247,28 +247,18 @@ def _fit(
     """Choose blocks, fit them, and judge what comes of it."""
     everything, nominal, lead, constants = begun
     settings = everything.space.settings
-    decisions, possible, answer = _choose(everything, nominal, settings, progress, settles)
-    space, estimation, solution = answer
+    decisions, possible, estimation, solution = _choose(everything, nominal, progress, settles)
+    space = estimation.space
     solution, drift = with_drift(estimation, solution)
     residuals = Residuals(estimation, solution, drift)
-    held_out = residuals.held_out
-    channels = tuple(_channels(estimation, solution, held_out))
-    notes = [
-        *_about_lead(lead),
-        *_ignored(measurements, space),
-        *_check_backlash(space, solution),
-        *_check_noise(channels),
-    ]
+    channels = tuple(_channels(residuals))
+    notes = [*_about_lead(lead), *_ignored(measurements, space), *_check_backlash(space, solution)]
+    notes += _check_noise(channels)
     progress("what is it worth?")
     noise = {KINDS.index(c.kind): c.estimated for c in channels}
     mixed = mixups(everything, nominal, [d.block for d in decisions if d.kept], progress)
-    verdict = judge(
-        residuals,
-        settings,
-        noise,
-        mixed,
-        _averaged(space, solution, everything.space, possible, decisions),
-    )
+    left_out = _averaged(space, solution, everything.space, possible, decisions)
+    verdict = judge(residuals, settings, noise, mixed, left_out)
     no_trace = unseen_errors(measurements, settings)
     if rolls := [error for error in no_trace if error.name.startswith("roll")]:
         verdict = verdict.without_rotation(listed(rolls))
@@ -290,7 +280,7 @@ def _fit(
         held=held,
         warming=HeatSeen.of(measurements, estimation, solution, constants, verdict.unexplained.factor),
         lead=lead,
-        held_out=held_out,
+        held_out=residuals.held_out,
     )
 
 
@@ -315,75 +305,60 @@ def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callab
     return _Begun(everything, problem, lead, constants)
 
 
+Start = tuple[ParameterSpace, np.ndarray, np.ndarray, np.ndarray]
+"""An answer from which a fit with other blocks starts: its space, parameters, tolerances and noise."""
+
+
 def _choose(
-    everything: Estimation,
-    problem: LinearProblem,
-    settings: FitSettings,
-    progress: Callable[[str], object],
-    settles: bool = True,
-) -> tuple[list[Decision], Posterior, tuple[ParameterSpace, Estimation, Solution]]:
-    """Return what is fitted, what the readings allow with all blocks in, and the fit."""
-    space, measurements = everything.space, everything.measurements
+    everything: Estimation, problem: LinearProblem, progress: Callable[[str], object], settles: bool
+) -> tuple[list[Decision], Posterior, Estimation, Solution]:
+    """Return what became of blocks, what the readings allow with all of them in, and the fit with those kept."""
+    space = everything.space
     decisions, possible, kept = select(space, problem, np.ones(len(KINDS)), progress)
     y = np.zeros(space.size)
     y[kept.used] = kept.y
-    start = _Start(space, space.physical(y), kept.tolerances, kept.noise)
+    start = space, space.physical(y), kept.tolerances, kept.noise
     if not any(d.kept for d in decisions):  # too few runs to leave one out, or none that shows anything: from the start
-        start = _Start(space, 0.0 * y, space.start_tolerances(), np.ones(len(KINDS)))
-    answer = _solve(measurements, decisions, settings, start, progress, settles)
-    if answer[-1].weights.min() < ASSUMED.huber / ASSUMED.outlier:  # it was made with readings that are wrong
-        start = _Start.of(answer[0], answer[-1])
+        start = space, 0.0 * y, space.start_tolerances(), np.ones(len(KINDS))
+    estimation, solution = _solve(everything, decisions, start, progress, settles)
+    if solution.weights.min() < ASSUMED.huber / ASSUMED.outlier:  # it was made with readings that are wrong
+        start = estimation.space, solution.x, solution.posterior.tolerances, solution.posterior.noise
         x, _, noise = _carried_over(start, space)
-        problem, _ = everything.linearise(x, answer[-1].weights)
+        problem, _ = everything.linearise(x, solution.weights)
         again, possible, _ = select(space, problem, noise, progress)
         if [d.kept for d in again] != [d.kept for d in decisions]:
-            answer = _solve(measurements, again, settings, start, progress, settles)
+            estimation, solution = _solve(everything, again, start, progress, settles)
         decisions = again
-    return decisions, possible, answer
-
-
-class _Start(NamedTuple):
-    """An answer from which a fit with other blocks starts: parameters, tolerances and noise."""
-
-    space: ParameterSpace
-    x: np.ndarray
-    tolerances: np.ndarray
-    noise: np.ndarray
-
-    @staticmethod
-    def of(space: ParameterSpace, solution: Solution) -> _Start:
-        """Return a settled fit as a start."""
-        return _Start(space, solution.x, solution.posterior.tolerances, solution.posterior.noise)
+    return decisions, possible, estimation, solution
 
 
 def _solve(
-    measurements: MeasurementSet,
+    everything: Estimation,
     decisions: list[Decision],
-    settings: FitSettings,
-    start: _Start,
+    start: Start,
     progress: Callable[[str], object],
     settles: bool,
-) -> tuple[ParameterSpace, Estimation, Solution]:
+) -> tuple[Estimation, Solution]:
     """Return a settled fit with the blocks decided on; where none `settles`, what the last step gives."""
-    space = ParameterSpace(measurements, replace(settings, blocks=tuple(d.block for d in decisions if d.kept)))
-    estimation = Estimation(measurements, space)
+    settings = replace(everything.space.settings, blocks=tuple(d.block for d in decisions if d.kept))
+    estimation = Estimation(everything.measurements, ParameterSpace(everything.measurements, settings))
     try:
-        return space, estimation, iterate(estimation, *_carried_over(start, space), progress)
+        return estimation, iterate(estimation, *_carried_over(start, estimation.space), progress)
     except NotSettled as error:
         if settles:
             raise
-        return space, estimation, error.solution
+        return estimation, error.solution
 
 
-def _carried_over(start: _Start, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _carried_over(start: Start, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return parameters, tolerances and noise of a start in another space; what it lacks is zero, and as at first."""
+    old, given, sizes, noise = start
     x, tolerances = np.zeros(space.size), space.start_tolerances()
     for n, block in enumerate(space.blocks):
-        for m, old in enumerate(start.space.blocks):
-            if old.name == block.name:
-                x[block.part] = start.x[old.part]
-                tolerances[n] = start.tolerances[m]
-    return x, tolerances, start.noise
+        for m, same in enumerate(old.blocks):
+            if same.name == block.name:
+                x[block.part], tolerances[n] = given[same.part], sizes[m]
+    return x, tolerances, noise
 
 
 def _averaged(
@@ -477,9 +452,10 @@ def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:
     return [f"{problem} ({', '.join(noisy)}); the expected tool error allows for it"]
 
 
-def _channels(estimation: Estimation, solution: Solution, errors: np.ndarray) -> list[ChannelFit]:
-    """Return how each kind of channel was met; `errors` (C,) are those of cells that were held out."""
-    problem, posterior, kinds = solution.problem, solution.posterior, estimation.measurements.kind
+def _channels(residuals: Residuals) -> list[ChannelFit]:
+    """Return how each kind of channel was met."""
+    estimation, problem, posterior = residuals.estimation, residuals.solution.problem, residuals.solution.posterior
+    kinds, errors = estimation.measurements.kind, residuals.held_out
     readings_of_cell = np.bincount(estimation.cells.of_reading, minlength=len(problem.kind))
     result = []
     for k in np.unique(kinds):

@@ -168,7 +168,7 @@ class Residuals:
         rows = self.rows.beside(self.drift.columns)
         return jackknife(rows, self.residual, precision, self.estimation.cells.fold, effects)
 
-    @property
+    @cached_property
     def held_out(self) -> np.ndarray:
         """Errors at cells whose fold a fit did not see, over the stated standard deviations, shape (C,)."""
         problem, posterior = self.solution.problem, self.solution.posterior
