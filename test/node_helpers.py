@@ -25,6 +25,7 @@ from rclpy.time import Time
 from scipy.spatial.transform import Rotation
 from std_srvs.srv import Trigger
 
+from hexapod_comp.cli.jobs import Jobs
 from hexapod_comp.compensation.guards import StampClock
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros import rclpy_compat, worker
@@ -168,7 +169,7 @@ class Rig(Bench):
 
         class Process(worker._Process):  # none, but what it is asked and answers is pickled as ever
             def talk(self, request: Any, within: float | None) -> Any:
-                self.jobs = getattr(self, "jobs", None) or worker.Jobs()
+                self.jobs = getattr(self, "jobs", None) or Jobs()
                 return pickle.loads(pickle.dumps(self.jobs.do(*pickle.loads(pickle.dumps(request)))))
 
         for name, module in list(sys.modules.items()):

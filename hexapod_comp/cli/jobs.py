@@ -1,0 +1,113 @@
+"""The process beside a node, ``python -m hexapod_comp.cli.jobs FD``: does jobs that would stop the node's loop.
+
+:mod:`hexapod_comp.ros.worker` starts it and gives it its end of a socket; jobs come, and results go, pickled.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..compensation.journal import LARGEST_SOURCE, Source
+from ..compensation.travel import travel, travel_text
+from ..errors import HexapodError, InputFileError
+from ..formats.paths import confined_file, confined_opener
+from ..machine.model import MachineModel, RealMachine
+from ..machine.temperatures import Temperatures
+from ..pose import Pose
+
+NICENESS = 10  # Commands come first
+
+
+def load_model(name: str, place: str, folder: str | None, machine: str) -> tuple[MachineModel, Source]:
+    """Find and read a machine's model file, relative to a place, in a folder; return the model and its source, without
+    the text where that is too long for the journal."""
+    os.chdir(place)
+    inside = None if folder is None else Path(folder)
+    source = Source.read(confined_file(name, inside, "model"), confined_opener(inside))
+    model = source.model(machine)
+    return model, source if len(source.text or "") <= LARGEST_SOURCE else Source(source.name, None, source.sha256)
+
+
+class Machine:
+    """A machine and its model, made of the texts in use: what else is needed of them is made when it is."""
+
+    def __init__(self, geometry: Source, model: Source, folder: str | None) -> None:
+        self._opener = confined_opener(None if folder is None else Path(folder))
+        self._source = model
+        if model.text is None:  # it was too long to be kept
+            self._source = Source.read(model.name, self._opener)
+            if self._source.sha256 != model.sha256:
+                raise InputFileError(model.name, "", "has changed since it was loaded")
+        self.geometry = geometry.geometry()
+        self.model = self._source.model(self.geometry.name)
+        self._fitted: Any = None
+        self._at: Any = None
+
+    def predict(self, platform: Pose, sense: np.ndarray, tool: str, warmth: Temperatures) -> dict[str, Any]:
+        """Return the errors ``standing`` and ``aligned`` at a pose: values and covariance, None where not known."""
+        from ..calibration.posterior import ErrorPredictor  # only this job needs a second of imports
+        from ..calibration.posterior_file import load_posterior
+
+        if self._fitted is None:
+            self._fitted = load_posterior(self.model, self.geometry, self._source.name, self._opener)
+        if self._at != (at := (tool, warmth.snapshot())):
+            machine = RealMachine(self.geometry.using(tool=tool), self.model, warmth)
+            self._predictor, self._at = ErrorPredictor(machine, self._fitted[0]), at
+        errors = self._predictor.predict((platform.position[None], platform.rotation[None]), sense[None])
+        found: dict[str, Any] = dict.fromkeys(("standing", "aligned"))
+        for name, error in zip(found, errors, strict=True):
+            if error is not None:
+                found[name] = error.values[0], None if error.covariance is None else error.covariance[0]
+        return found
+
+    def travel(self, pose: Pose, tool: str, work: str, warmth: Temperatures, enabled: bool) -> tuple[str, dict]:
+        """Return how far a tool may go from a pose in a frame: a text, and values by their keys."""
+        geometry = self.geometry.using(tool, work)
+        ways = travel(RealMachine(geometry, self.model, warmth), pose, geometry.work, enabled)
+        stops = {f"{one.way} stops at": str(one.error or "") for one in ways}
+        return travel_text(ways), {**{one.key: f"{one.shown:.6f}" for one in ways}, **stops}
+
+
+class Jobs:
+    """Does one job after another; the machine that they are about stays until another is given."""
+
+    def __init__(self) -> None:
+        self._made_of: dict[str, Any] = {}
+        self._machine: Machine | None = None
+
+    def do(self, task: str, machine: dict[str, Any] | None, arguments: dict[str, Any]) -> tuple[str, Any]:
+        """Return the problem, empty where there is none, and the result."""
+        if machine is not None:
+            self._made_of, self._machine = machine, None
+        try:
+            if task == "load_model":
+                return "", load_model(**arguments)
+            self._machine = self._machine or Machine(**self._made_of)
+            return "", (self._machine.predict if task == "predict" else self._machine.travel)(**arguments)
+        except (HexapodError, OSError) as error:
+            return str(error), None
+        except Exception as error:  # else the process would end, and nobody know why
+            return f"{task}: {type(error).__name__}: {error}", None
+
+
+def main() -> int:
+    """Answer until the node's end closes."""
+    os.nice(NICENESS)
+    os.dup2(2, 1)  # what a library prints goes to the log
+    jobs = Jobs()
+    with Connection(int(sys.argv[1])) as connection:
+        while True:
+            try:
+                connection.send(jobs.do(*connection.recv()))
+            except (EOFError, ConnectionError):
+                return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
