@@ -34,9 +34,13 @@ from tqdm import tqdm
 
 from benchmarks.calibration import LARGE, LEAD
 from benchmarks.smooth_imperfections import with_wavy_field
-from hexapod_comp.calibration.changes import AGEING, DATUM, OTHER, STRUT, TEMPERATURE
 from hexapod_comp.calibration.check import (
+    AGEING,
+    DATUM,
     NAMED,
+    OTHER,
+    STRUT,
+    TEMPERATURE,
     UNDECIDED,
     UNEXPLAINED,
     VALID,

@@ -1,37 +1,328 @@
-"""Is a model still valid? A few check readings, weighed against what may have happened since the fit."""
+"""Is a model still valid? A few check readings, weighed by the Bayes factor of each change that may have happened.
+
+The readings of an unchanged machine scatter about its model by N(0, S), S = J·Σ·Jᵀ + noise. A change moves parameters
+by A·θ, θ ~ N(0, s²), with several scales s, equally likely: under it they are N(0, S + s²·J·A·Aᵀ·Jᵀ).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import date
 
 import numpy as np
 
 from ..errors import CalibrationError, ModelError
+from ..formats.texts import aligned, number
 from ..machine.arrays import rms
+from ..machine.geometry import STRUT_NAMES
 from ..machine.model import MachineModel, RealMachine
-from ..measurements.readings import MeasurementSet
+from ..machine.region import region_json, region_text
+from ..measurements.readings import ABSOLUTE_KINDS, AXES, BACKWARD, CHANNELS, KINDS, MeasurementSet
 from .assumptions import ASSUMED
 from .blocks.block import DIGITS
-from .changes import (
-    DATUM,
-    FAMILIES,
-    OTHER,
-    READING,
-    STRUT,
-    TEMPERATURE,
-    Change,
-    CheckReadings,
-    Evidence,
-    Explanation,
-    possible_changes,
-    widened,
-)
 from .datum import hold, unseen_part
+from .design import TILTS, information, laid_out
 from .estimator import Estimation
-from .follow_up import Settling, settle
 from .mixups import misread
+from .parameters import BLOCKS, ParameterSpace
 from .posterior import ErrorPredictor, FittedParameters
+
+MOST_READINGS = 500  # of a check; more are a calibration
+UNCHANGED_DRAWS = 4000  # machines drawn to find the false alarms: 1 % to ± 0.16 %
+
+DATUM, STRUT, TEMPERATURE, AGEING, READING, OTHER = "datum", "strut", "temperature", "ageing", "reading", "other"
+# Kinds of change, and what each is called. All but the last two are parameters that few readings can repair.
+FAMILIES = {
+    DATUM: "the datum has moved",
+    STRUT: "a strut's offset has changed",
+    TEMPERATURE: "a temperature acts",
+    AGEING: "the whole machine has aged",
+    READING: "a single reading is wrong",
+    OTHER: "it has changed in a way that none of these explains",
+}
+
+ROUNDING = 1e-9  # directions of readings or effects that are smaller, beside the largest, are rounding
+
+
+@dataclass(frozen=True)
+class Change:
+    """One thing that may have happened: parameters move by `columns`·θ, θ ~ N(0, scale²)."""
+
+    family: str  # of FAMILIES
+    name: str
+    scales: np.ndarray  # (m,): standard deviations of θ
+    columns: np.ndarray | None = None  # (size, k), SI; None: readings have changed, not the machine
+    shown: tuple[tuple[str, float, str], ...] = ()  # label, factor, unit of each θ; empty: they mean nothing one by one
+    group: str = ""  # changes of a kind that are alike; all groups of a kind are equally likely beforehand
+
+
+def widened(fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS) -> FittedParameters:
+    """Return what a fit knows, in a space that has more blocks; these are zero and, so far, certain."""
+    old = fitted.space
+    kept = {block.name for block in old.blocks}
+    settings = replace(old.settings, blocks=tuple(name for name in BLOCKS if name in kept or name in blocks))
+    space = ParameterSpace((old.geometry, old.region), settings)
+    places = np.concatenate([np.arange(b.part.start, b.part.stop) for b in space.blocks if b.name in kept])
+    x, covariance = np.zeros(space.size), np.zeros((space.size, space.size))
+    x[places], covariance[np.ix_(places, places)] = fitted.x, fitted.covariance
+    known = {block.name: value for block, value in zip(old.blocks, fitted.tolerances, strict=True)}
+    start = space.start_tolerances()
+    tolerances = np.array([known.get(b.name, value) for b, value in zip(space.blocks, start, strict=True)])
+    return FittedParameters(space, x, covariance, tolerances, fitted.noise, fitted.held)
+
+
+def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Change]:
+    """Return what may have happened to a machine, in a space that has all blocks; those of its fit, `modelled`, age."""
+    geometry, unit = space.geometry, np.eye(space.size)
+    start, count = space.blocks[0].part.start, int(space.platform_groups.max()) + 1
+    base = start + np.arange(18).reshape(6, 3)
+    platform = start + 18 + np.arange(3 * count).reshape(count, 3)
+    offsets = np.arange(space.size)[space.offsets]
+    lengths, growths = np.array(ASSUMED.moved), np.array(ASSUMED.grown)
+
+    def shown(names: Sequence[str], factor: float = 1e6, what: str = "µm") -> tuple[tuple[str, float, str], ...]:
+        return tuple((name, factor, what) for name in names)
+
+    # The datum turns about the box's centre; a turn is counted by how far it moves the box's corners.
+    size = 0.5 * float(np.linalg.norm(np.ptp(space.work_box, axis=0))) or 1.0
+    arms, rigid = geometry.base_joints - space.places(space.work_box.mean(axis=0)), np.zeros((space.size, 6))
+    for n, axis in enumerate(geometry.work.rotation.T):
+        rigid[base, n], rigid[base, 3 + n] = axis, np.cross(axis, arms) / size
+    turns = shown([f"about {a}" for a in AXES], 1e6 / size, "µrad")
+    changes = [Change(DATUM, "base or workpiece, in the work frame", lengths, rigid, shown(AXES) + turns)]
+
+    for name, place in zip(STRUT_NAMES, offsets, strict=True):
+        changes.append(Change(STRUT, name, lengths, unit[:, [place]], shown([name])))
+    changes.append(Change(STRUT, "several struts", lengths, unit[:, offsets], shown(STRUT_NAMES)))
+
+    grown, bodies = np.zeros((space.size, 3)), ("struts", "base", "platform")
+    grown[offsets, 0] = space.home_lengths
+    if pitch := space.block("pitch"):
+        grown[pitch.part, 0] = 1.0
+    grown[base, 1], grown[platform[space.platform_groups], 2] = geometry.base_joints, geometry.platform_joints
+    for name, labels, columns in (
+        ("struts", ["struts"], grown[:, :1]),
+        ("base", ["base"], grown[:, 1:2]),
+        ("all alike", ["all"], grown.sum(axis=1, keepdims=True)),
+        ("each by itself", bodies, grown),
+    ):
+        changes.append(Change(TEMPERATURE, name, growths, columns, shown(labels, 1e6, "ppm")))
+
+    # Ageing and a bend can stand for each other: were one's scales coarser, the other would win, whichever is true.
+    prior = space.physical(np.diag(space.spread(space.start_tolerances())))
+    owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
+    aged, bend = prior[:, np.isin(owner, modelled)], prior[:, np.isin(owner, ("field displacement", "field rotation"))]
+    changes.append(Change(AGEING, "all of it, a little", np.array(ASSUMED.aged), aged))
+    for body, joints in (("base", base), ("platform", platform)):
+        for n, places in enumerate(joints, start=1):
+            changes.append(Change(OTHER, f"{body} joint {n}", lengths, unit[:, places], shown(AXES), "joints"))
+    for name, ends, what in (("pitch", ASSUMED.worn_pitch, "ppm"), ("backlash", ASSUMED.worn_backlash, "µm")):
+        for strut, column in zip(STRUT_NAMES, unit.T[owner == name], strict=False):  # no such block: none
+            screw = Change(
+                OTHER, f"{name} of {strut}", np.array(ends), column[:, None], shown([strut], 1e6, what), "screws"
+            )
+            changes.append(screw)
+    changes.append(Change(OTHER, "a smooth bend in space", np.array(ASSUMED.bent), bend, group="bend"))
+    return changes
+
+
+@dataclass(frozen=True)
+class CheckReadings:
+    """Check readings beside what a model and its fit expect, as n numbers free of what the instruments do not know."""
+
+    residuals: np.ndarray  # (n,): what the fit does not expect of them, in standard deviations
+    rows: np.ndarray  # (n, size): how the parameters move them
+    noise: np.ndarray  # (n, n): their covariance where the machine is known
+    single: np.ndarray  # (n, places): the effect of one reading that is wrong by one of its standard deviations
+    names: tuple[str, ...]  # of the places
+    seen: np.ndarray = field(repr=False)  # (n, places): the numbers, as orthonormal combinations of the places
+
+    @staticmethod
+    def of(fitted: FittedParameters, measurements: MeasurementSet, x: np.ndarray | None = None) -> CheckReadings:
+        """Return readings beside a fit in a space that has all blocks; linearised at `x` where that is given."""
+        space = fitted.space
+        away = float(np.abs(measurements.probe - space.probe).max())
+        if away > ROUNDING:
+            problem = f"are of a point {away * 1e3:.4g} mm from that of the fit; give its place (--probe-mm)"
+            raise CalibrationError("measurements", problem)
+        estimation = Estimation(measurements, space, alone=False)
+        cells = estimation.cells
+        if len(cells.kind) > MOST_READINGS:
+            problem = f"{len(cells.kind)} readings at distinct places are no check"
+            raise CalibrationError("measurements", f"{problem} (at most {MOST_READINGS}); fit them")
+        linear, _ = estimation.linearise(fitted.x if x is None else x, np.ones(len(measurements)))
+        free, sizes, _ = np.linalg.svd(estimation.free_of_nuisance(np.eye(len(cells.kind))))
+        seen = free[:, sizes > ROUNDING * sizes.max(initial=0.0)].T
+        if not len(seen):
+            problem = "tell nothing: the unknown zeros of their runs take all of them; read more places of each run"
+            raise CalibrationError("measurements", problem)
+        rows, sigma = seen @ space.unwhitened(linear.rows.dense()), fitted.noise[cells.kind]
+        m = measurements
+        names = tuple(f"{m.sources[n]}: {CHANNELS[m.channel[n]]} of run {m.runs[m.run[n]].name}" for n in cells.first)
+        residuals = seen @ linear.target - rows @ fitted.x
+        return CheckReadings(residuals, rows, (seen * sigma**2) @ seen.T, seen * sigma, names, seen)
+
+    def covariance(self, of_parameters: np.ndarray) -> np.ndarray:
+        """Return the readings' covariance when the parameters have one, shape (n, n)."""
+        return self.noise + self.rows @ of_parameters @ self.rows.T
+
+    def chi_square(self, of_parameters: np.ndarray | float = 0.0) -> float:
+        """Return the squared differences over those to expect when the parameters have a covariance, per number."""
+        covariance = self.noise if np.isscalar(of_parameters) else self.covariance(np.asarray(of_parameters))
+        return float(self.residuals @ np.linalg.solve(covariance, self.residuals)) / len(self.residuals)
+
+    def effects(self, changes: Sequence[Change]) -> Iterator[tuple[Change, np.ndarray]]:
+        """Yield what may have happened with its effect (n, k): changes, one wrong reading, or more scatter in all."""
+        for change in changes:
+            yield change, self.rows @ change.columns
+        yield from wrong_readings(self.single, self.names)
+
+
+def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
+    """Yield that one of some readings is wrong, or all scatter, by the effect (n, places) of a standard deviation."""
+    for name, column in zip(names, single.T, strict=True):
+        yield Change(READING, name, np.array(ASSUMED.wrong_reading)), column[:, None]
+    yield Change(OTHER, "each reading by itself", np.array(ASSUMED.scattered), group="scatter"), single
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A change as readings see it, in coordinates in which those of an unchanged machine are N(0, 1)."""
+
+    change: Change
+    directions: np.ndarray  # (n, k), orthonormal
+    gains: np.ndarray  # (k,): how large the effect of θ = 1 is along them
+    least_gain: float  # of all θ; 0 where one moves no reading
+    log_prior: float = 0.0  # of each of its scales
+
+    @staticmethod
+    def of(change: Change, effect: np.ndarray, log_prior: float = 0.0) -> Hypothesis:
+        """Return a change with its effect (n, k) on whitened readings."""
+        if effect.shape[1] == 1:  # most of them: no need to decompose
+            gains = np.linalg.norm(effect, axis=0)
+            directions = effect / (gains or 1.0)
+        else:
+            directions, gains, _ = np.linalg.svd(effect, full_matrices=False)
+        felt = gains > ROUNDING * max(gains.max(initial=0.0), 1.0)
+        least = float(gains.min(initial=np.inf)) if felt.sum() == effect.shape[1] else 0.0
+        return Hypothesis(change, directions[:, felt], gains[felt], least, log_prior)
+
+    def log_bayes_factors(self, z: np.ndarray) -> np.ndarray:
+        """Return log evidence over that of no change for whitened readings (N, n), scale by scale: (N, m)."""
+        grown = np.outer(self.change.scales**2, self.gains**2)
+        along = (z @ self.directions) ** 2
+        return 0.5 * (along @ (grown / (1.0 + grown)).T - np.log1p(grown).sum(axis=1))
+
+
+class Evidence:
+    """Changes, given with their effects (n, k) on readings that have a covariance where nothing has changed."""
+
+    def __init__(self, covariance: np.ndarray, effects: Iterable[tuple[Change, np.ndarray]]) -> None:
+        self._whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+        self.hypotheses, effects = [], list(effects)
+        groups = Counter((change.family, change.group) for change, _ in effects)
+        in_kind = Counter(family for family, _ in groups)
+        odds = dict(zip(FAMILIES, ASSUMED.prior_odds, strict=True))
+        for change, effect in effects:
+            alike = in_kind[change.family] * groups[change.family, change.group] * len(change.scales)
+            log_prior = float(np.log(odds[change.family] / sum(odds.values()) / alike))
+            self.hypotheses.append(Hypothesis.of(change, self._whitening @ effect, log_prior))
+
+    def log_weights(self, readings: np.ndarray) -> list[np.ndarray]:
+        """Return the log weight of each hypothesis over that of no change for sets of readings (N, n): (N, m) each."""
+        return self._of_whitened(readings @ self._whitening.T)
+
+    def _of_whitened(self, z: np.ndarray) -> list[np.ndarray]:
+        return [h.log_bayes_factors(z) + h.log_prior for h in self.hypotheses]
+
+    def probability_unchanged(self, readings: np.ndarray) -> float:
+        """Return in which share of checks a machine that has not changed reads as strangely as this, or more so."""
+        z = np.random.default_rng(11).standard_normal((UNCHANGED_DRAWS, len(readings)))
+        z = np.vstack([self._whitening @ readings, z])
+        changed = np.logaddexp.reduce(np.concatenate(self._of_whitened(z), axis=1), axis=1)
+        return float((changed >= changed[0]).mean())
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Mean and covariance of the parameters' difference from the fit's if one explanation of readings is right."""
+
+    mean: np.ndarray  # (size,), SI
+    covariance: np.ndarray  # (size, size)
+
+    @staticmethod
+    def of(check: CheckReadings, fitted: FittedParameters, change: Change | None, scale: float = 0.0) -> Explanation:
+        """Return what readings make of the parameters if a change of one scale has happened; None: no change."""
+        prior = fitted.covariance
+        if change is not None and change.columns is not None:
+            prior = prior + scale**2 * change.columns @ change.columns.T
+        reached = check.rows @ prior
+        gain = np.linalg.solve(check.covariance(prior), reached).T
+        return Explanation(gain @ check.residuals, prior - gain @ reached)
+
+
+# Which readings tell two explanations apart
+
+
+def places(readings: MeasurementSet) -> Iterator[tuple[str, tuple[str, ...], np.ndarray]]:
+    """Yield each line and each scattered pose of readings: where, which channels, and the readings' numbers."""
+    on_line = np.array([run.is_line for run in readings.runs])[readings.run]
+    key = np.where(on_line, -1 - readings.run, readings.station)
+    tips, _ = readings.geometry.tool_poses(readings.stations.positions, readings.stations.rotations)
+    for group in dict.fromkeys(key.tolist()):
+        members = np.flatnonzero(key == group)
+        run = readings.runs[readings.run[members[0]]]
+        at = [", ".join(f"{1e3 * v:.1f}" for v in tips[s] + 0.0) for s in dict.fromkeys(readings.station[members])]
+        where = f"{run.name}: {at[0]} – {at[-1]} mm" if run.is_line else f"pose {at[0]} mm"
+        yield where, tuple(dict.fromkeys(CHANNELS[c] for c in readings.channel[members])), members
+
+
+@dataclass(frozen=True)
+class Settling:
+    """Readings that would tell two explanations apart."""
+
+    name: str  # a line with its ends, or a pose
+    channels: tuple[str, ...]  # what to read there
+    readings: int
+    odds: float  # log of the odds to expect for the right explanation over the wrong one, whichever is right
+
+
+def settle(
+    fitted: FittedParameters, measured: MeasurementSet, explanations: tuple[Explanation, Explanation]
+) -> list[Settling]:
+    """Return the three readings that would tell two explanations of `measured` apart best, with its instruments."""
+    space, kinds = fitted.space, np.unique(measured.kind)
+    by_pose = np.isin(np.array(KINDS)[kinds], ABSOLUTE_KINDS)
+    sets = [laid_out(space, lines=2)] if not by_pose.all() else []
+    sets += [laid_out(space, poses=8, tilts=(*TILTS, 0.0))] if by_pose.any() else []
+    proposals = []
+    for readings, _ in sets:
+        readings = readings.select(np.isin(readings.kind, kinds) & (readings.direction != BACKWARD))
+        if not len(readings):
+            continue
+        rows, cells = information(space, readings, fitted.x)
+        rows = space.unwhitened(rows)
+        for where, channels, members in places(readings):
+            chosen = np.unique(cells.of_reading[members])
+            noise, a = np.diag(fitted.noise[cells.kind[chosen]] ** 2), rows[chosen]
+            difference = a @ (explanations[0].mean - explanations[1].mean)
+            first, second = (noise + a @ e.covariance @ a.T for e in explanations)
+            odds = min(_divergence(difference, first, second), _divergence(difference, second, first))
+            proposals.append(Settling(where, channels, len(chosen), odds))
+    return sorted(proposals, key=lambda p: -p.odds)[:3]
+
+
+def _divergence(difference: np.ndarray, right: np.ndarray, wrong: np.ndarray) -> float:
+    """Return the Kullback–Leibler divergence of two normal distributions."""
+    solved = np.linalg.solve(wrong, np.column_stack([right, difference]))
+    logs = np.linalg.slogdet(wrong)[1] - np.linalg.slogdet(right)[1]
+    return 0.5 * float(np.trace(solved[:, :-1]) - len(right) + difference @ solved[:, -1] + logs)
+
+
+# Verify and update
 
 VALID, NAMED, UNDECIDED, UNEXPLAINED = "valid", "named", "undecided", "unexplained"  # verdicts
 
@@ -324,3 +615,142 @@ def _mixture(check: CheckReadings, prior: FittedParameters, changes: list[Change
     for share, part in zip(shares, parts, strict=True):
         covariance += share * part.covariance
     return Explanation(mean, covariance)
+
+
+# What they print
+
+
+def verification_report(result: Verification) -> str:
+    """Return what check readings say of a model, for people."""
+    m, region = result.measurements, result.model.measured
+    parts = [
+        f"machine {m.geometry.name}, model {result.model.name!r}: {len(m)} check readings of {len(np.unique(m.run))} "
+        f"runs, {result.independent} numbers without what the instruments leave open\n"
+        f"{region_text(region, m.geometry)}",
+        "\n".join(_verdict(result)),
+    ]
+    if result.doubts:
+        parts.insert(0, "IN DOUBT:\n" + "\n".join(f"  {doubt}" for doubt in result.doubts))
+    slack = 1e-3  # m: so far outside the box is still in it
+    inside = region is None or region.contains(m.stations.positions, m.stations.rotations, slack)
+    if not np.all(inside):
+        outside = np.logical_not(inside)
+        parts.append(f"{outside.sum()} of {outside.size} places lie outside the box in which the model was fitted")
+    if m.notes:
+        parts.append("\n".join(f"note: {note}" for note in m.notes))
+    if result.verdict != VALID:
+        least = 0.001  # kinds of change less probable than this are not listed
+        rows = [
+            (FAMILIES[c.family], number(100.0 * result.families[c.family], 1), _described(c))
+            for c in result.candidates
+            if result.families[c.family] >= least
+        ]
+        parts.append(aligned(("kind of change", "%", "its best explanation"), rows))
+    if result.settling:
+        first, second = (FAMILIES[c.family] for c in result.candidates[:2])
+        reads = [(s.name, str(s.readings), ", ".join(s.channels), _odds(s.odds)) for s in result.settling]
+        table = aligned(("read", "readings", "channels", "odds to expect"), reads)
+        parts.append(f'to tell "{first}" from "{second}", with the instruments used so far\n{table}')
+    return "\n\n".join([*parts, "\n".join(_visible_text(result))]) + "\n"
+
+
+def _verdict(result: Verification) -> Iterator[str]:
+    """Yield whether the model is valid, and what has happened."""
+    best, percent = result.candidates[0], f"{100.0 * result.usual:.2g} %"
+    if result.verdict == VALID:
+        yield f"VALID: a machine that has not changed reads as strangely as this in {percent} of checks"
+    else:
+        nothing = "in a way that no motion of the datum, strut, temperature or ageing explains"
+        yield "CHANGED: " + {
+            NAMED: f"{FAMILIES[best.family]}: {_described(best)}",
+            UNDECIDED: f"either {', or '.join(FAMILIES[c.family] for c in result.candidates[:2])}",
+        }.get(result.verdict, f"{nothing} (nearest: {_described(best)})")
+        share = f"in {'fewer than ' if result.usual < 1e-3 else ''}{percent}"
+        yield f"a machine that has not changed reads as strangely as this {share} of checks"
+        doubted = [c.name for c in result.candidates[: 1 + (result.verdict == UNDECIDED)] if c.family == READING]
+        yield from (f"take {name} again: the machine itself need not have changed" for name in doubted)
+    yield f"χ² {result.chi_square:.3g} per number against the model and what its fit knows"
+    if result.tool is not None:
+        standing, with_datum = (1e6 * size for size in result.tool)
+        text = f"{standing:.3g} µm RMS in the measured box, {with_datum:.3g} µm with the datum aligned"
+        yield f"what the most probable change does to the tool: {text}"
+
+
+def _described(candidate: Candidate) -> str:
+    """Return what a candidate is, with sizes where they mean something."""
+    shown = candidate.change.shown
+    sizes = [
+        f"{value * factor:+.3g} ± {deviation * factor:.2g} {unit}"
+        for (_, factor, unit), value, deviation in zip(shown, candidate.coefficients, candidate.deviations, strict=True)
+    ]
+    if len(sizes) < 2:
+        return " by ".join((candidate.name, *sizes))
+    return f"{candidate.name}: " + ", ".join(f"{label} {size}" for (label, *_), size in zip(shown, sizes, strict=True))
+
+
+def _odds(logarithm: float) -> str:
+    most = 1e6  # odds above this are all the same to a reader
+    return f"{math.exp(logarithm):.3g} : 1" if logarithm < math.log(most) else "over a million : 1"
+
+
+def _visible_text(result: Verification) -> Iterator[str]:
+    """Yield the smallest changes that these readings surely show."""
+    most = 1e-3  # m or m/m: larger ones are not worth naming
+    for family, name, unit in ((STRUT, "any strut's offset", "µm"), (TEMPERATURE, "growth by temperature", "ppm")):
+        size = result.visible.get(family, math.inf)
+        if size > most:
+            yield f"these readings do not surely show {name}"
+        else:
+            yield f"these readings surely show {name} from {1e6 * size:.2g} {unit} on"
+    if result.visible.get(DATUM, math.inf) > most:
+        yield "where base and workpiece stand as a whole these readings do not show, or not in all directions"
+
+
+def update_report(update: Update, written: str) -> str:
+    """Return what renewing a model did, for people."""
+    head = (
+        f"renewed; χ² of the readings against the new model: {update.chi_square:.3g} per number, by their noise alone"
+    )
+    held = update.fitted.held
+    return "\n\n".join([head, *([held.report()] if held else []), f"model: {written}\n"])
+
+
+def verification_json(result: Verification) -> dict:
+    """Return a check as plain numbers; SI units are in the keys, or stand beside numbers as ``unit``."""
+    return {
+        "machine": result.measurements.geometry.name,
+        "model": result.model.name,
+        "verdict": result.verdict,
+        "measured_box": region_json(result.model.measured, result.measurements.geometry),
+        "readings": len(result.measurements),
+        "independent": result.independent,
+        "chi_square": result.chi_square,
+        "unchanged_reads_so": result.usual,
+        "false_alarms": result.false_alarms,
+        "probabilities": result.families,
+        "candidates": [
+            {
+                "kind": c.family,
+                "name": c.name,
+                "probability": c.probability,
+                "sizes": [
+                    {"name": label, "value": value * factor, "standard_error": deviation * factor, "unit": unit}
+                    for (label, factor, unit), value, deviation in zip(
+                        c.change.shown, c.coefficients, c.deviations, strict=True
+                    )
+                ],
+            }
+            for c in result.candidates
+        ],
+        "tool_m": None if result.tool is None else {"standing": result.tool[0], "aligned": result.tool[1]},
+        "surely_seen": {
+            f"{kind}{'' if kind == TEMPERATURE else '_m'}": size if math.isfinite(size) else None
+            for kind, size in result.visible.items()
+        },
+        "settling": [
+            {"read": s.name, "channels": s.channels, "readings": s.readings, "log_odds": s.odds}
+            for s in result.settling
+        ],
+        "doubts": result.doubts,
+        "notes": result.measurements.notes,
+    }

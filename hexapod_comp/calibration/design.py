@@ -7,19 +7,34 @@ gains most for what it costs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
-from ..errors import CalibrationError, InputFileError
+from ..core import Status
+from ..errors import CalibrationError, GeometryError, InputFileError
+from ..formats.texts import aligned, number
+from ..machine.field import CROSS_AXES
+from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths_batch
-from ..measurements.campaign import Campaign, CampaignRun, template
-from ..measurements.readings import DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
-from .candidates import MeasuringBox, candidates
+from ..measurements.campaign import (
+    LINE_INSTRUMENTS,
+    PLANES,
+    POSE_INSTRUMENTS,
+    Campaign,
+    CampaignRun,
+    circle_run,
+    line_run,
+    template,
+    tilts,
+)
+from ..measurements.readings import AXES, DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
+from ..pose import rotation_from_angles
+from ..workspace.reach import Examiner
 from .estimator import Estimation, physical_covariance, solve
 from .fit import unseen_errors
 from .observations import Cells
@@ -38,6 +53,8 @@ def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) 
     problem, _ = estimation.linearise(x, np.ones(len(readings)))
     return problem.rows.dense(), estimation.cells
 
+
+TILTS = (10.0, 5.0, 2.0)  # of scattered poses, °: the first within reach
 
 # The planner
 
@@ -208,6 +225,170 @@ def noise_factors(campaign: Campaign) -> np.ndarray:
     default = np.array([DEFAULT_UNCERTAINTY[kind] for kind in KINDS])
     stops = np.where(np.isin(KINDS, ("rotation", "attitude")), 0.0, campaign.repeatability)
     return np.maximum(np.hypot(campaign.noise, stops), 1e-3 * default) / default
+
+
+# What could be measured in a box: lines along and across it, circles, poses; level and tilted
+
+FEW_POINTS, USUAL_POINTS = (5, 13), (13,)
+# Points of a line, by instrument: few at little cost, or enough to see the screws' waves
+LINE_POINTS = {"linear": (8, 21), "5-D": FEW_POINTS, "6-D": FEW_POINTS}
+# The same where each is read once, on the way there or back: more places for as many readings
+ALTERNATE_POINTS = {"linear": (4, 6, 10), "5-D": (4, 8), "6-D": (4, 8)}
+
+
+@dataclass(frozen=True)
+class MeasuringBox:
+    """Where a machine is to be measured."""
+
+    geometry: HexapodGeometry  # the machine as designed
+    box: np.ndarray  # (2, 3): lowest and highest corner of the tool's way, m in the work frame
+    level: np.ndarray  # (3, 3): attitude of the level tool in the work frame
+    tilt: float  # largest tilt of the tool from there, rad
+
+    def attitudes(self) -> list[tuple[str, np.ndarray]]:
+        """Return the level attitude and, where the tool tilts, four tilted ones, with their names."""
+        names = {"level": (0.0, 0.0)}
+        if self.tilt > 0.0:
+            shown = f"{np.degrees(self.tilt):g}°"
+            names |= {f"+{shown} about x": (1.0, 0.0), f"−{shown} about x": (-1.0, 0.0)}
+            names |= {f"+{shown} about y": (0.0, 1.0), f"−{shown} about y": (0.0, -1.0)}
+        return [(name, self.turned(self.tilt * np.array(about))) for name, about in names.items()]
+
+    def turned(self, about: np.ndarray) -> np.ndarray:
+        """Return the tool's attitude(s) after small tilts about x and y of the work frame, shape (..., 2), rad."""
+        return np.asarray(rotation_from_angles(np.concatenate([about, 0.0 * about[..., :1]], axis=-1)) @ self.level)
+
+    def reaches(self, positions: np.ndarray, rotations: np.ndarray, threads: int | None = 1) -> np.ndarray:
+        """Return which poses of the tool the nominal machine's limits allow, shape (n,)."""
+        return Examiner(self.geometry).findings(positions, rotations, threads=threads)[0] == Status.OK
+
+
+def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[CampaignRun]:
+    """Return the runs to choose from, all within the limits of the nominal machine; without any a GeometryError."""
+    runs: list[CampaignRun] = []
+    lines = list(_lines(place)) if any(name in LINE_INSTRUMENTS for name in instruments) else []
+    for instrument in instruments:
+        if instrument in POSE_INSTRUMENTS:
+            runs += [CampaignRun(f"{instrument}, poses", instrument, *poses) for poses in _sets_of_poses(place)]
+        elif instrument not in LINE_INSTRUMENTS:
+            runs += {"ball_bar": _circles, "r_test": _tilted_at, "station": _lengths}[instrument](place)
+        else:
+            for name, ends, rotation in lines:
+                if instrument in ("straightness", "rotation") and name.startswith("diagonal"):
+                    continue
+                title = f"{instrument}, {name}"
+                for points in LINE_POINTS.get(instrument, USUAL_POINTS):
+                    runs.append(line_run(title, instrument, ends, points, rotation))
+                for points in ALTERNATE_POINTS.get(instrument, ()):
+                    runs.append(replace(line_run(title, instrument, ends, points, rotation), alternate=True))
+    if not runs:
+        raise GeometryError("limits", "leave nothing to be measured in the box", place.box.tolist())
+    return runs
+
+
+def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield name, ends (2, 3), m, and attitude of each line, as far as the limits let it go."""
+    low, size = place.box[0], np.ptp(place.box, axis=0)
+    level, tilted = [], []
+    for axis, (a, b) in enumerate(CROSS_AXES):
+        for first, second in np.ndindex(3, 3):
+            ends = place.box.copy()
+            ends[:, [a, b]] = low[[a, b]] + 0.5 * np.array([first, second]) * size[[a, b]]
+            where = f"{AXES[a]} {ends[0, a] * 1e3:.0f}, {AXES[b]} {ends[0, b] * 1e3:.0f}"
+            level.append((f"{AXES[axis]} at {where}", ends))
+            if (first == 1) == (second == 1):  # no middle of a face
+                tilted.append(level[-1])
+    corners = [(np.array(c), 1 - np.array(c)) for c in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0))]
+    for a, b in CROSS_AXES:
+        for side, turned in np.ndindex(2, 2):
+            start, stop = np.full((2, 3), side)
+            start[[a, b]], stop[[a, b]] = (0, turned), (1, 1 - turned)
+            corners.append((start, stop))
+    diagonals = [(f"diagonal {n}", low + np.array(pair) * size) for n, pair in enumerate(corners, start=1)]
+    level += diagonals
+    tilted += diagonals[:4]
+
+    share = np.linspace(0.0, 1.0, 41)  # points that are examined
+    least = 0.4  # lines of which the limits leave a smaller share are left out
+    for attitude, rotation in place.attitudes():
+        for name, ends in level if attitude == "level" else tilted:
+            points = ends[0] + share[:, None] * (ends[1] - ends[0])
+            first, last = _longest(place.reaches(points, rotation[None]))
+            if last - first >= least * (len(share) - 1):
+                yield f"{name}, {attitude}", points[[first, last]].round(6), rotation
+
+
+def _longest(within: np.ndarray) -> tuple[int, int]:
+    """Return first and last index of the longest stretch; one less at an end where a limit cuts it."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], within, [False]]).astype(int)))
+    if not len(edges):
+        return 0, -1
+    starts, stops = edges[::2], edges[1::2] - 1
+    first, last = max(zip(starts.tolist(), stops.tolist(), strict=True), key=lambda pair: pair[1] - pair[0])
+    return first + (first > 0), last - (last < len(within) - 1)
+
+
+def _sets_of_poses(place: MeasuringBox) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield positions and rotations of 25 sets of 12 random poses within the limits."""
+    rng, together, sets = np.random.default_rng(11), 12, 25
+    count = 4 * together * sets
+    positions = rng.uniform(place.box[0], place.box[1], (count, 3)).round(6)
+    rotations = place.turned(rng.uniform(-place.tilt, place.tilt, (count, 2)).round(6))
+    good = np.flatnonzero(place.reaches(positions, rotations, threads=None))[: together * sets]
+    for start in range(0, len(good) - together + 1, together):
+        part = good[start : start + together]
+        yield positions[part], rotations[part]
+
+
+def _circles(place: MeasuringBox) -> Iterator[CampaignRun]:
+    """Yield circles of a ball bar in the box: in three planes each, level and tilted; of 100 mm, or what fits."""
+    sides = np.ptp(place.box, axis=0)
+    for attitude, rotation in place.attitudes():
+        for plane, axes in PLANES.items():
+            radius = min(0.1, 0.45 * float(sides[list(axes)].min()))
+            room = np.where(np.isin(range(3), axes), radius, 0.0)
+            for share in _shares(attitude == "level"):
+                centre = (place.box[0] + room + share * (sides - 2.0 * room)).round(6)
+                name = f"ball_bar, {plane} at {_millimetres(centre)}, {attitude}"
+                run = circle_run(name, centre, radius, 17, np.eye(3)[list(axes)], rotation)
+                if place.reaches(run.positions, rotation[None]).all():
+                    yield run
+
+
+def _shares(corners: bool) -> Iterator[np.ndarray]:
+    """Yield where in a box, in shares of its sides: its middle, the middles of its faces, and its corners."""
+    for index in np.ndindex(3, 3, 3):
+        off = sum(i != 1 for i in index)
+        if off in (0, 1) or (corners and off == 3):
+            yield 0.5 * np.array(index)
+
+
+def _tilted_at(place: MeasuringBox) -> Iterator[CampaignRun]:
+    """Yield R-tests in the box, for a tool that tilts: one ball, the tool turning about it."""
+    if place.tilt == 0.0:
+        return
+    count = 13
+    rotations = tilts(count, place.tilt) @ place.level
+    for share in _shares(True):
+        ball = (place.box[0] + share * np.ptp(place.box, axis=0)).round(6)
+        positions = np.tile(ball, (count, 1))
+        if place.reaches(positions, rotations).all():
+            yield CampaignRun(f"r_test, at {_millimetres(ball)}", "r_test", positions, rotations)
+
+
+def _lengths(place: MeasuringBox) -> Iterator[CampaignRun]:
+    """Yield sets of poses read from a tracking interferometer that stands beside a lower corner of the box."""
+    off = 0.3  # how far outside the box, in shares of its sides
+    for corner in np.ndindex(2, 2):
+        share = np.array([*(side + off * (2 * side - 1) for side in corner), -off])
+        station = (place.box[0] + share * np.ptp(place.box, axis=0)).round(4)
+        for positions, rotations in _sets_of_poses(place):
+            centres = np.tile(station, (len(positions), 1))
+            yield CampaignRun(f"station at {_millimetres(station)}", "station", positions, rotations, centres)
+
+
+def _millimetres(place: np.ndarray) -> str:
+    return ", ".join(f"{value * 1e3:.0f}" for value in place)
 
 
 # A campaign for a goal
@@ -436,3 +617,110 @@ def propose(
         shares=dict(sorted(shares.items(), key=lambda item: -item[1])),
         needed=needed,
     )
+
+
+# What a proposal prints
+
+
+def stops_text(stops: float) -> str:
+    """Return how much of a planned tool error is the machine's repeatability: RMS over all three axes, m."""
+    if stops:
+        return f"counted in: the machine's repeatability, {stops * 1e6:.3g} µm RMS over all three axes"
+    return "not counted: the machine's repeatability, for none is stated (--repeatability-um)"
+
+
+def proposal_report(plan: Proposal) -> str:
+    """Return the report of a proposed plan: the goal, what may be expected, what limits it, the runs in their order."""
+    expected = ["expected tool error at random points of the box, both directions, the datum aligned:"]
+    for name, after in plan.expected.items():
+        shown = "level tool: " if name == "level" else f"tilted {np.degrees(plan.goal.tilt):g}°:"
+        before = plan.before[name]
+        expected.append(f"  {shown}  {um(before)} → {um(after)} RMS, {100.0 * (1.0 - after / before):.1f} % less")
+    expected.append(f"  {stops_text(plan.campaign.stops)}")
+    rows = [
+        [run.name, str(len(run.positions)), str(run.count(plan.campaign.cycles)), number(seconds / 60.0, 0), "min"]
+        for run, seconds in zip(plan.campaign.runs, plan.each, strict=True)
+    ]
+    used = {run.instrument: plan.goal.times[run.instrument] for run in plan.campaign.runs}
+    assumed = [
+        f"  {name}: {t.first / 60.0:g} min to put it up, {t.run / 60.0:g} min a run, {t.stop:g} s a stop"
+        for name, t in used.items()
+    ]
+    head = f"{plan.readings} readings in {plan.seconds / 3600.0:.2f} h, in measuring order, if"
+    runs = "\n".join([head, *assumed, aligned(("run", "places", "readings", "takes", ""), rows)])
+    name = f"machine {plan.space.geometry.name}: {_goal(plan)}"
+    return "\n\n".join([name, "\n".join(expected), verdict(plan), runs]) + "\n"
+
+
+def proposal_json(plan: Proposal) -> dict[str, Any]:
+    """Return a proposed plan as plain numbers; units are in the keys."""
+    goal = plan.goal
+    return {
+        "machine": plan.space.geometry.name,
+        "goal_m": goal.error,
+        "tilt_rad": goal.tilt,
+        "instruments": goal.instruments,
+        "allowed_s": goal.seconds,
+        "met": plan.met,
+        "verdict": verdict(plan),
+        "before_m": plan.before,
+        "expected_m": plan.expected,
+        "takes_s": plan.seconds,
+        "needed_s": plan.needed,
+        "all_candidates_m": plan.all_of_them,
+        "unseen_m": plan.unseen,
+        "repeatability_m": plan.campaign.stops,
+        "shares": plan.shares,
+        "readings": plan.readings,
+        "runs": [
+            {**run.content(), "takes_s": seconds} for run, seconds in zip(plan.campaign.runs, plan.each, strict=True)
+        ],
+    }
+
+
+def remarks(plan: Proposal) -> list[str]:
+    """Return what stands on top of the campaign's file."""
+    return [
+        f"Proposed for machine {plan.space.geometry.name}: {_goal(plan)}.",
+        f"Expected: {', '.join(f'{name} {um(value)}' for name, value in plan.expected.items())} RMS, datum aligned.",
+        f"{plan.readings} readings in {plan.seconds / 3600.0:.1f} h, in this order.",
+    ]
+
+
+def verdict(plan: Proposal) -> str:
+    """Say whether the goal is met and, where it is not, what limits it."""
+    if plan.met:
+        return f"the goal is met: {um(plan.worst)} in {plan.seconds / 3600.0:.1f} h"
+    goal, named, stops = um(plan.goal.error), ", ".join(plan.goal.instruments), plan.campaign.stops
+    if stops > plan.goal.error:
+        beyond = f"its stops alone are {um(stops)} off, {um(stops - plan.goal.error)} more than the goal"
+        limit = f"the machine's repeatability: {beyond}, and no model takes that away"
+    elif plan.needed is not None:
+        limit = f"time: {plan.needed / 3600.0:.1f} h would do"
+    elif plan.unseen > plan.goal.error:
+        left = f"{um(plan.unseen)} would be left by any number of readings of {named} in this box"
+        limit = f"what these instruments do not see: {left}"
+    elif plan.all_of_them > plan.goal.error:
+        limit = f"the instruments' noise: all runs considered, once each, leave {um(plan.all_of_them)}"
+    else:
+        limit = f"time: many more runs would do; all considered leave {um(plan.all_of_them)}"
+    least = 0.1  # blocks that make up less of what is left are not named
+    blocks = [f"{name} {100.0 * share:.0f} %" for name, share in plan.shares.items() if share >= least]
+    return "\n".join(
+        [
+            f"the goal is NOT met: {um(plan.worst)} can be had in {plan.goal.seconds / 3600.0:g} h, not {goal}",
+            f"  what limits it is {limit}",
+            f"  of what is left: {', '.join(blocks)}",
+        ]
+    )
+
+
+def um(value: float) -> str:
+    """Return a length in µm, three digits."""
+    return f"{value * 1e6:#.3g} µm"
+
+
+def _goal(plan: Proposal) -> str:
+    goal = plan.goal
+    tilt = f" with the tool level and tilted by {np.degrees(goal.tilt):g}°" if goal.tilt else ""
+    return f"goal {um(goal.error)} RMS{tilt}, with {', '.join(goal.instruments)} in {goal.seconds / 3600.0:g} h"

@@ -1,82 +1,28 @@
-"""What to read once there is a fit: for a check, to decide between explanations of one, and what remains unknown."""
+"""What to read once there is a fit: readings for a check, and what remains unknown."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ..errors import CalibrationError, InputFileError
+from ..formats.texts import aligned, number
 from ..machine.geometry import STRUT_NAMES
 from ..machine.model import RealMachine, measured_region
 from ..machine.passes import Poses
-from ..measurements.readings import ABSOLUTE_KINDS, BACKWARD, CHANNELS, KINDS, MeasurementSet
+from ..machine.region import region_json, region_text
+from ..measurements.readings import BACKWARD, CHANNELS, DEFAULT_UNCERTAINTY, MeasurementSet
 from ..workspace.combined import NORMAL, covariance_factor, monte_carlo, root_sum_of_squares
-from .changes import STRUT, TEMPERATURE, CheckReadings, Evidence, Explanation, possible_changes, widened, wrong_readings
-from .design import ErrorLeft, Greedy, information, laid_out
+from .check import STRUT, TEMPERATURE, CheckReadings, Evidence, places, possible_changes, widened, wrong_readings
+from .design import TILTS, ErrorLeft, Greedy, information, laid_out
 from .posterior import POINTS, ErrorPredictor, FittedParameters
 
-TILTS = (10.0, 5.0, 2.0)  # of scattered poses, °: the first within reach
 CRASH, WARMTH = 20e-6, 12e-6  # what a proposed check is to name: a light collision, m; a kelvin of steel, m/m
 CHECK_READINGS = 12  # of a proposed check: 20 µm are named in 95 % (benchmarks.upkeep)
 MACHINES_DRAWN = 2000  # for the percentile of the worst pose: 95 % to ± 0.5 %
-
-
-def places(readings: MeasurementSet) -> Iterator[tuple[str, tuple[str, ...], np.ndarray]]:
-    """Yield each line and each scattered pose of readings: where, which channels, and the readings' numbers."""
-    on_line = np.array([run.is_line for run in readings.runs])[readings.run]
-    key = np.where(on_line, -1 - readings.run, readings.station)
-    tips, _ = readings.geometry.tool_poses(readings.stations.positions, readings.stations.rotations)
-    for number in dict.fromkeys(key.tolist()):
-        members = np.flatnonzero(key == number)
-        run = readings.runs[readings.run[members[0]]]
-        at = [", ".join(f"{1e3 * v:.1f}" for v in tips[s] + 0.0) for s in dict.fromkeys(readings.station[members])]
-        where = f"{run.name}: {at[0]} – {at[-1]} mm" if run.is_line else f"pose {at[0]} mm"
-        yield where, tuple(dict.fromkeys(CHANNELS[c] for c in readings.channel[members])), members
-
-
-@dataclass(frozen=True)
-class Settling:
-    """Readings that would tell two explanations apart."""
-
-    name: str  # a line with its ends, or a pose
-    channels: tuple[str, ...]  # what to read there
-    readings: int
-    odds: float  # log of the odds to expect for the right explanation over the wrong one, whichever is right
-
-
-def settle(
-    fitted: FittedParameters, measured: MeasurementSet, explanations: tuple[Explanation, Explanation]
-) -> list[Settling]:
-    """Return the three readings that would tell two explanations of `measured` apart best, with its instruments."""
-    space, kinds = fitted.space, np.unique(measured.kind)
-    by_pose = np.isin(np.array(KINDS)[kinds], ABSOLUTE_KINDS)
-    sets = [laid_out(space, lines=2)] if not by_pose.all() else []
-    sets += [laid_out(space, poses=8, tilts=(*TILTS, 0.0))] if by_pose.any() else []
-    proposals = []
-    for readings, _ in sets:
-        readings = readings.select(np.isin(readings.kind, kinds) & (readings.direction != BACKWARD))
-        if not len(readings):
-            continue
-        rows, cells = information(space, readings, fitted.x)
-        rows = space.unwhitened(rows)
-        for where, channels, members in places(readings):
-            chosen = np.unique(cells.of_reading[members])
-            noise, a = np.diag(fitted.noise[cells.kind[chosen]] ** 2), rows[chosen]
-            difference = a @ (explanations[0].mean - explanations[1].mean)
-            first, second = (noise + a @ e.covariance @ a.T for e in explanations)
-            odds = min(_divergence(difference, first, second), _divergence(difference, second, first))
-            proposals.append(Settling(where, channels, len(chosen), odds))
-    return sorted(proposals, key=lambda p: -p.odds)[:3]
-
-
-def _divergence(difference: np.ndarray, right: np.ndarray, wrong: np.ndarray) -> float:
-    """Return the Kullback–Leibler divergence of two normal distributions."""
-    solved = np.linalg.solve(wrong, np.column_stack([right, difference]))
-    logs = np.linalg.slogdet(wrong)[1] - np.linalg.slogdet(right)[1]
-    return 0.5 * float(np.trace(solved[:, :-1]) - len(right) + difference @ solved[:, -1] + logs)
-
 
 # What each instrument of a check reads: on diagonals the displacement alone; of rotations pitch and yaw, no roll
 READ_BY = {
@@ -305,3 +251,83 @@ def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]
             continue
         rows = space.unwhitened(information(space, readings, fitted.x)[0])
         yield f"tracker, {poses} poses, {f'tilted up to {tilt:g}°' if tilt else 'level'}", len(readings), rows
+
+
+# What it prints
+
+
+def remaining_text(result: Remaining) -> str:
+    """Return what a calibration leaves, for people."""
+    geometry, model = result.machine.geometry, result.machine.model
+    head = (
+        f"machine {geometry.name}, model {model.name!r}: what is left of the tool's error after compensation, by the "
+        f"covariance of the fit's {result.parameters} parameters.\n{region_text(model.measured, geometry)}\nThe datum "
+        "is aligned over that box. Where nothing was measured, only what the fit's parameters describe counts."
+    )
+    titles = ["where", "poses", "RMS µm", "worst pose µm", "there, tool in work: x, y, z mm"]
+    titles += ["95 % of machines below µm", "rotation µrad", "datum as it stands, RMS µm"]
+    rows = []
+    for part in result.left:
+        sizes = [number(v * 1e6, 2) for v in (part.rms[0], part.worst, part.most, part.rms[1], part.standing)]
+        place = ", ".join(number(v * 1e3, 1) for v in part.at)
+        rows.append((part.where, str(part.poses), *sizes[:2], place, *sizes[2:]))
+    noise = ", ".join(f"{name} {value * 1e6:g}" for name, value in DEFAULT_UNCERTAINTY.items())
+
+    def shares(given: Iterable[Share], counted: str) -> str:
+        now, table = np.array([part.rms[0] for part in result.left]), []
+        for share in given:
+            less = 100.0 * (1.0 - share.left / now)
+            pairs = ((number(v * 1e6, 2), f"{r:.0f} % less") for v, r in zip(share.left, less, strict=True))
+            table.append((share.name, str(share.count), *(cell for pair in pairs for cell in pair)))
+        return aligned(("", counted, *(title for part in result.left for title in (part.where, ""))), table)
+
+    return "\n\n".join(
+        (
+            head,
+            aligned(titles, rows),
+            "if these parameters were known exactly, RMS µm\n" + shares(result.blocks, "parameters"),
+            f"with one more measurement in the measured box (noise, µm and µrad: {noise}), RMS µm\n"
+            + shares(result.measurements, "readings"),
+        )
+    )
+
+
+def measurement_rows(result: Remaining) -> list[dict[str, Any]]:
+    """Return the measurements for CSV: a record each, µm."""
+    return [
+        {"rank": rank, "measurement": share.name, "readings": share.count}
+        | {f"left_{key}_um": float(value) * 1e6 for key, value in zip(("box", "workspace"), share.left, strict=True)}
+        for rank, share in enumerate(result.measurements, start=1)
+    ]
+
+
+def remaining_json(result: Remaining) -> dict[str, Any]:
+    """Return what a calibration leaves as plain numbers; units are in the keys."""
+
+    def shares(given: Iterable[Share], counted: str) -> list[dict[str, Any]]:
+        return [
+            {"name": s.name, counted: s.count, "left_box_m": s.left[0], "left_workspace_m": s.left[1]} for s in given
+        ]
+
+    return {
+        "machine": result.machine.geometry.name,
+        "model": result.machine.model.name,
+        "parameters": result.parameters,
+        "frame": "work",
+        "measured_box": region_json(result.machine.model.measured, result.machine.geometry),
+        "left": [
+            {
+                "where": part.where,
+                "poses": part.poses,
+                "rms_m": part.rms[0],
+                "rms_rotation_rad": part.rms[1],
+                "worst_m": part.worst,
+                "worst_at_m": part.at,
+                "machines_95_m": part.most,
+                "rms_datum_as_it_stands_m": part.standing,
+            }
+            for part in result.left
+        ],
+        "if_known": shares(result.blocks, "parameters"),
+        "if_measured": shares(result.measurements, "readings"),
+    }

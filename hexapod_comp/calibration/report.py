@@ -11,7 +11,7 @@ import numpy as np
 from ..formats.texts import aligned, number
 from ..machine.field import COMPONENTS
 from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, SAME_ATTITUDE
-from .design import Plan
+from .design import Plan, stops_text
 from .estimator import SETTLED
 from .fit import ChannelFit, ModelFit, Outlier
 from .lead import ScrewLead
@@ -91,13 +91,6 @@ def tool_error_text(error: ToolError) -> str:
         f"rotation {error.rotation_before * 1e6:.1f} → {error.rotation_after * 1e6:.2f} µrad RMS"
         + rotation_interval(error)
     )
-
-
-def stops_text(stops: float) -> str:
-    """Return how much of a planned tool error is the machine's repeatability: RMS over all three axes, m."""
-    if stops:
-        return f"counted in: the machine's repeatability, {stops * 1e6:.3g} µm RMS over all three axes"
-    return "not counted: the machine's repeatability, for none is stated (--repeatability-um)"
 
 
 def rotation_interval(error: ToolError) -> str:

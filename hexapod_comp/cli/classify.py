@@ -94,8 +94,7 @@ def classify(args: argparse.Namespace) -> int | Result:
 
 def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry, turned: np.ndarray) -> Result:
     """Show what a model's calibration leaves, and which measurement would remove most of it."""
-    from ..calibration.design_report import measurement_rows, remaining_json, remaining_text
-    from ..calibration.follow_up import remaining
+    from ..calibration.follow_up import measurement_rows, remaining, remaining_json, remaining_text
     from ..calibration.pictures import predicted_error_figure
     from ..calibration.posterior_file import load_posterior
 

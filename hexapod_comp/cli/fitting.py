@@ -12,8 +12,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..calibration.blocks import HARMONICS
-from ..calibration.check import VALID, Verification, refusal, update_model, verify_model
-from ..calibration.check_report import update_report, verification_json, verification_report
+from ..calibration.check import (
+    VALID,
+    Verification,
+    refusal,
+    update_model,
+    update_report,
+    verification_json,
+    verification_report,
+    verify_model,
+)
 from ..calibration.evaluation import Worth, worth, worth_json, worth_text
 from ..calibration.fit import ModelFit, fit_model
 from ..calibration.lines import fit_lines
@@ -75,9 +83,17 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
 
 def plan(args: argparse.Namespace) -> Result:
     """Say what a campaign determines, or propose one for a goal; 1 when the goal cannot be met."""
-    from ..calibration.candidates import MeasuringBox
-    from ..calibration.design import TIMES, Goal, Times, plan, propose
-    from ..calibration.design_report import proposal_json, proposal_report, remarks
+    from ..calibration.design import (
+        TIMES,
+        Goal,
+        MeasuringBox,
+        Times,
+        plan,
+        proposal_json,
+        proposal_report,
+        propose,
+        remarks,
+    )
 
     geometry = load_geometry(args.machine)
     campaign = results.load_campaign(args, geometry)
@@ -314,7 +330,8 @@ def verify(args: argparse.Namespace) -> Result:
         result = checked(args, args.model).verification
         code = 0 if result.verdict == VALID else 1
         return Result(lambda: verification_report(result), lambda: verification_json(result), code=code)
-    from ..calibration.follow_up import places, propose_check
+    from ..calibration.check import places
+    from ..calibration.follow_up import propose_check
 
     _, fitted = _known(args, args.model)
     with results.stage("choosing readings"):

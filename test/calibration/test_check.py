@@ -13,30 +13,29 @@ import pytest
 from calibration_helpers import BOX, campaign, fitted, measured, paper
 from scipy.stats import multivariate_normal
 
-from hexapod_comp.calibration.changes import (
+from hexapod_comp.calibration.check import (
     DATUM,
     FAMILIES,
+    NAMED,
     OTHER,
     READING,
     STRUT,
     TEMPERATURE,
-    Change,
-    Evidence,
-    Hypothesis,
-    possible_changes,
-    widened,
-)
-from hexapod_comp.calibration.check import (
-    NAMED,
     UNDECIDED,
     UNEXPLAINED,
     VALID,
+    Change,
+    Evidence,
+    Hypothesis,
     Verification,
+    possible_changes,
     refusal,
     update_model,
+    verification_json,
+    verification_report,
     verify_model,
+    widened,
 )
-from hexapod_comp.calibration.check_report import verification_json, verification_report
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.follow_up import propose_check
 from hexapod_comp.errors import CalibrationError, ModelError

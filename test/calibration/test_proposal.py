@@ -7,9 +7,19 @@ import numpy as np
 import pytest
 from foreign_machines import machine_names, machines
 
-from hexapod_comp.calibration.candidates import MeasuringBox, candidates
-from hexapod_comp.calibration.design import TIMES, ErrorLeft, Goal, Proposal, Times, plan, propose
-from hexapod_comp.calibration.design_report import proposal_report, verdict
+from hexapod_comp.calibration.design import (
+    TIMES,
+    ErrorLeft,
+    Goal,
+    MeasuringBox,
+    Proposal,
+    Times,
+    candidates,
+    plan,
+    proposal_report,
+    propose,
+    verdict,
+)
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.cli.verbs import INSTRUMENTS
 from hexapod_comp.errors import CalibrationError
