@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import date
+from typing import Any
 
 import numpy as np
 
@@ -347,6 +348,16 @@ class Candidate:
         """The change's name."""
         return self.change.name
 
+    @property
+    def sizes(self) -> list[dict[str, Any]]:
+        """Each θ that is shown: name, value, standard_error and unit, as JSON lists it and the text prints it."""
+        return [
+            {"name": label, "value": value * factor, "standard_error": deviation * factor, "unit": unit}
+            for (label, factor, unit), value, deviation in zip(
+                self.change.shown, self.coefficients, self.deviations, strict=True
+            )
+        ]
+
 
 @dataclass(frozen=True)
 class Verification:
@@ -678,14 +689,10 @@ def _verdict(result: Verification) -> Iterator[str]:
 
 def _described(candidate: Candidate) -> str:
     """Return what a candidate is, with sizes where they mean something."""
-    shown = candidate.change.shown
-    sizes = [
-        f"{value * factor:+.3g} ± {deviation * factor:.2g} {unit}"
-        for (_, factor, unit), value, deviation in zip(shown, candidate.coefficients, candidate.deviations, strict=True)
-    ]
+    sizes = {s["name"]: f"{s['value']:+.3g} ± {s['standard_error']:.2g} {s['unit']}" for s in candidate.sizes}
     if len(sizes) < 2:
-        return " by ".join((candidate.name, *sizes))
-    return f"{candidate.name}: " + ", ".join(f"{label} {size}" for (label, *_), size in zip(shown, sizes, strict=True))
+        return " by ".join((candidate.name, *sizes.values()))
+    return f"{candidate.name}: " + ", ".join(f"{label} {size}" for label, size in sizes.items())
 
 
 def _odds(logarithm: float) -> str:
@@ -729,17 +736,7 @@ def verification_json(result: Verification) -> dict:
         "false_alarms": result.false_alarms,
         "probabilities": result.families,
         "candidates": [
-            {
-                "kind": c.family,
-                "name": c.name,
-                "probability": c.probability,
-                "sizes": [
-                    {"name": label, "value": value * factor, "standard_error": deviation * factor, "unit": unit}
-                    for (label, factor, unit), value, deviation in zip(
-                        c.change.shown, c.coefficients, c.deviations, strict=True
-                    )
-                ],
-            }
+            {"kind": c.family, "name": c.name, "probability": c.probability, "sizes": c.sizes}
             for c in result.candidates
         ],
         "tool_m": None if result.tool is None else {"standing": result.tool[0], "aligned": result.tool[1]},

@@ -105,12 +105,18 @@ def fit_lines(
     left = measurements.value - means[groups]
     if np.abs(left).max() <= LEAST_NOISE:  # one silent kind among others does this scheme no harm
         refuse_unmoved(measurements, left)
+    chosen = f"of order {order}" if isinstance(order, int) else f"of an order chosen by {order}"
+    note = (
+        f"Scheme lines (Mou & King 1998): polynomials {chosen} along grid lines. Datum: displacements and rotations "
+        "are zero (mean of both directions) at home's coordinate along each line; straightness without its straight "
+        "line."
+    )
     model = MachineModel(
         machine=measurements.geometry.name,
         name=name or f"lines, {'5-D' if (readings.component >= 3).any() else '1-D'}",
         field=field,
         region=Region(np.array([[nodes[0] for nodes in grid], [nodes[-1] for nodes in grid]]), measurements.probe),
-        origin=ModelOrigin(date or calendar.today().isoformat(), measurements.files, None, _origin_note(order)),
+        origin=ModelOrigin(date or calendar.today().isoformat(), measurements.files, None, note),
     )
     notes = list(dict.fromkeys((*measurements.notes, *notes)))
     model, held = hold(measurements.geometry, model, measurements.geometry.home if datum is None else datum, np.eye(6))
@@ -137,15 +143,6 @@ def _kind(fit: LineFit) -> str:
     if fit.component >= 3:
         return "rotation"
     return "linear" if fit.component == fit.axis else "straightness"
-
-
-def _origin_note(order: OrderRule) -> str:
-    chosen = f"of order {order}" if isinstance(order, int) else f"of an order chosen by {order}"
-    return (
-        f"Scheme lines (Mou & King 1998): polynomials {chosen} along grid lines. Datum: displacements and rotations "
-        "are zero (mean of both directions) at home's coordinate along each line; straightness without its straight "
-        "line."
-    )
 
 
 # Readings on the grid
