@@ -172,9 +172,9 @@ def _too_fast(record: Record, limits: Limits) -> list[str]:
     for n, struts in enumerate(record.commands):
         if n and _fresh(record, record.commands[n - 1], struts):
             begin = n
-        while begin + 1 < n and record.commands[begin + 1].published <= struts.published - SPEED_OVER:
+        while begin + 1 < n and record.commands[begin + 1].time <= struts.time - SPEED_OVER:
             begin += 1
-        since = struts.published - record.commands[begin].published
+        since = struts.time - record.commands[begin].time
         if since < SPEED_OVER - CLOCK_ROUNDING:
             continue
         speed = _distance(struts.lengths, record.commands[begin].lengths) / since

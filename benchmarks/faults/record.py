@@ -29,14 +29,11 @@ class Struts:
     Attributes
     ----------
     time : float
-        When it came, or was delivered, monotonic, s.
-    published : float
-        When its publisher's middleware sent it, s on the system's clock; NaN where that does not matter.
+        When it came or was delivered, or, a command, when the compensator's middleware sent it, monotonic, s.
     """
 
     time: float
     lengths: np.ndarray
-    published: float = math.nan
 
 
 @dataclass(frozen=True)

@@ -282,9 +282,9 @@ class Rig:
         if link == "feedback":
             self.record.measured.append(Struts(now, lengths_of(message.position)))
 
-    def _on_commands(self, message: JointState, published: float) -> None:
+    def _on_commands(self, message: JointState, sent: float) -> None:
         now = time.monotonic()
-        self.record.commands.append(Struts(now, lengths_of(message.position), published))
+        self.record.commands.append(Struts(sent, lengths_of(message.position)))  # read late by a starved harness
         stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
         entry = self.record.sent.get(stamp)
         if entry is not None and math.isnan(entry.answered_at):
@@ -368,14 +368,14 @@ class Rig:
 
 
 def dated(callback: Callable[[Any, float], None]) -> Callable[..., None]:
-    """Return a callback for rclpy that hands on a message and when its publisher sent it, s on the system's clock.
+    """Return a callback for rclpy that hands on a message and when its publisher sent it, s, monotonic.
 
     As :func:`hexapod_comp.ros.callbacks.numbered`: rclpy asks the signature, and its executors differ.
     """
 
     def called(*arguments: Any) -> None:
         message, info = arguments[0] if len(arguments) == 1 else arguments
-        callback(message, info["source_timestamp"] * 1e-9)
+        callback(message, info["source_timestamp"] * 1e-9 - (time.time() - time.monotonic()))
 
     called.__signature__ = inspect.signature(lambda message, info: None)  # type: ignore[attr-defined]
     return called

@@ -28,9 +28,6 @@ from hexapod_comp.ros.status import LogSpace
 
 LIMITS = Limits(np.tile([0.33, 0.88], (6, 1)), 2e-3, 2e-3, 0.25)
 
-CLOCK = 1.8e9
-"""What the system's clock reads when the records begin, s."""
-
 PERIOD = 0.004
 """Of the commands in the records made here, s."""
 
@@ -43,7 +40,7 @@ def quiet(seconds: float = 6.0) -> Record:
         now = index * PERIOD
         lengths = np.full(6, 0.5 + 0.01 * math.sin(4.0 * now))
         record.sent[index] = Sent(now, now + 0.001)
-        record.commands.append(Struts(now + 0.001, lengths, CLOCK + now))
+        record.commands.append(Struts(now, lengths))
         record.corrections.append(Struts(now + 0.001, np.full(6, 1e-4)))
         record.measured.append(Struts(now + 0.002, lengths.copy()))
         for link in record.delivered:
