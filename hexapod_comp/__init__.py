@@ -43,6 +43,9 @@ if TYPE_CHECKING:
     from .machine.model import Temperatures as Temperatures
     from .machine.model_file import load_model as load_model
     from .machine.model_file import save_model as save_model
+    from .machine.path import Motion as Motion
+    from .machine.path import StrutRates as StrutRates
+    from .machine.path import plan_motion as plan_motion
     from .machine.pose_files import read_poses as read_poses
     from .measurements.files import read_measurements as read_measurements
     from .measurements.readings import MeasurementSet as MeasurementSet
@@ -73,6 +76,7 @@ _HOMES = {
     "machine.limits": ("Limits",),
     "machine.model": ("MachineModel", "RealMachine", "Temperatures"),
     "machine.model_file": ("load_model", "save_model"),
+    "machine.path": ("Motion", "StrutRates", "plan_motion"),
     "machine.pose_files": ("read_poses",),
     "measurements.files": ("read_measurements",),
     "measurements.readings": ("MeasurementSet",),

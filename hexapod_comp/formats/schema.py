@@ -48,6 +48,7 @@ UNITS: dict[str, dict[str, float]] = {
     "difference": {"K": 1.0},
     "speed": {"m_s": 1.0, "mm_s": 1e-3, "m_min": 1.0 / 60.0},
     "acceleration": {"m_s2": 1.0, "mm_s2": 1e-3},
+    "jerk": {"m_s3": 1.0, "mm_s3": 1e-3},
     "time": {"s": 1.0, "ms": 1e-3},
     "pressure": {"Pa": 1.0, "hPa": 1e2, "kPa": 1e3},
 }

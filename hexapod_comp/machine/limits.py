@@ -45,6 +45,8 @@ class Limits:
     acceleration : float, optional
         Largest strut acceleration, m/s²; 0: not limited. Of the speed smoothed over
         the core's SMOOTHED_OVER, 20 ms.
+    jerk : float, optional
+        Largest strut jerk of planned motions, m/s³; 0: not limited. Commands are not held against it.
     """
 
     stroke: Annotated[np.ndarray, Numbers("mm", PAIRS_PER_STRUT)]
@@ -56,6 +58,7 @@ class Limits:
     speed: Annotated[float, Numbers("mm_s")]
     clearance: Annotated[float, Numbers("mm")] = 0.0
     acceleration: Annotated[float, Numbers("mm_s2")] = 0.0
+    jerk: Annotated[float, Numbers("mm_s3")] = 0.0
     cone_cosines: np.ndarray = field(init=False, repr=False)
     """Of the cones' angles, at the base and at the platform, shape (2, 6): what the angles themselves are judged by."""
 
@@ -74,7 +77,7 @@ class Limits:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > least):
                 raise GeometryError(f"limits.{name}", f"must be finite and above {least:g}", value)
-        for name, unit in (("clearance", "m"), ("acceleration", "m/s²")):
+        for name, unit in (("clearance", "m"), ("acceleration", "m/s²"), ("jerk", "m/s³")):
             if not 0.0 <= getattr(self, name) < np.inf:
                 raise GeometryError(f"limits.{name}", f"must be finite and not negative, {unit}", getattr(self, name))
         object.__setattr__(self, "cone_cosines", np.cos(np.array([self.base_cone, self.platform_cone])))

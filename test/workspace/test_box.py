@@ -175,7 +175,9 @@ def test_the_example_explains_every_key():
     """All that parse_geometry takes, but the dimensions of the paper's machine."""
     text = (ROOT / "config" / "example_6_6.yaml").read_text(encoding="utf-8")
     keys = "base platform joints joint_axes cone_axes home position rotation limits stroke base_cone platform_cone "
-    keys += "condition_number correction step speed acceleration clearance tool work screw lead machine format version"
+    keys += (
+        "condition_number correction step speed acceleration jerk clearance tool work screw lead machine format version"
+    )
     assert [key for key in keys.split() if f"{key}:" not in text and f"{key}_" not in text] == []
     geometry = load_geometry("example_6_6")
     assert geometry.screw_lead.min() < 0.0 < geometry.screw_lead.max()

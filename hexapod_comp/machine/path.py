@@ -1,0 +1,372 @@
+"""Least-time straight motions between tool poses, from rest to rest, within the struts' speed, acceleration and jerk.
+
+A leg is a straight line of one point of the tool, its tip or another pivot, and the shortest turn about that point;
+s from 0 to 1 is the share of both. The struts' lengths and three derivatives by s are closed forms. Speed and
+acceleration without jerk are time-optimal path parameterisation by reachability (Pham & Pham 2018): on a grid of s the
+largest ṡ² from which the end can still be reached is found backwards, and the largest acceleration is taken forwards.
+A moving average over a time w then makes of a change of acceleration by A a jerk of A/w. How much of the limits of
+speed and acceleration the optimum may use before it is averaged (a short move has no time to reach them) is searched
+for the shortest motion; for one strut this is the optimal profile of seven phases. What remains above a limit is
+removed by running the whole motion more slowly, so that no limit is ever exceeded, whatever the search found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..errors import GeometryError, PoseError
+from ..pose import Pose
+from .geometry import HexapodGeometry
+from .trajectory import SHARE_OF_LIMIT, Path
+
+# Where the machine file has no limit: times in which a strut reaches its speed, and its acceleration, s
+SPEED_UP, JERK_UP = 0.1, 0.02
+SECTIONS = 200  # Of a leg, between which ṡ² is linear in s
+SPREADS = (1.0, 0.3, 0.1)  # How far the search looks around the best yet, in logarithms of a share of a limit
+CANDIDATES = 6  # Each way in one round of the search
+SLACK = 1e-4  # By which limits are kept more tightly: s is examined at the grid's times and between, not everywhere
+STOPS = np.geomspace(0.01, 30.0, 60)  # Durations of slowing down that are tried when a motion is stopped, s
+DELAYS = 41  # Moments at which slowing down may begin, from now to the motion's end
+HALF_TURN = 1e-6  # Within this of 180°, rad, there are two shortest turns
+
+
+@dataclass(frozen=True)
+class StrutRates:
+    """What every strut may do.
+
+    Parameters
+    ----------
+    speed, acceleration : float
+        m/s and m/s².
+    jerk : float, optional
+        m/s³; infinite: not limited.
+
+    Raises
+    ------
+    GeometryError
+        A rate that is not positive; a speed or acceleration that is not finite.
+    """
+
+    speed: float
+    acceleration: float
+    jerk: float = np.inf
+
+    def __post_init__(self) -> None:
+        for name, unit in (("speed", "m/s"), ("acceleration", "m/s²"), ("jerk", "m/s³")):
+            value = getattr(self, name)
+            if not (value > 0.0 and (name == "jerk" or np.isfinite(value))):
+                raise GeometryError(name, f"must be positive{'' if name == 'jerk' else ' and finite'}, {unit}", value)
+
+    @staticmethod
+    def of(geometry: HexapodGeometry, rate: float, share: float = SHARE_OF_LIMIT) -> StrutRates:
+        """Return a share of the machine's limits at a rate of commands, Hz; the rest is left to the corrections.
+
+        Where the machine file has no acceleration, a strut takes 0.1 s to reach its speed; where it has no jerk,
+        0.02 s to reach its acceleration. The largest step of a command limits the speed too.
+        """
+        limits = geometry.limits
+        if not (np.isfinite(rate) and rate > 0.0):
+            raise GeometryError("rate", "must be finite and positive, Hz", rate)
+        if not 0.0 < share <= 1.0:
+            raise GeometryError("share", "must lie in (0, 1]", share)
+        acceleration = limits.acceleration or limits.speed / SPEED_UP
+        jerk = limits.jerk or acceleration / JERK_UP
+        return StrutRates(share * min(limits.speed, limits.step * rate), share * acceleration, share * jerk)
+
+    def excess(self, speed: np.ndarray, acceleration: np.ndarray, jerk: np.ndarray) -> np.ndarray:
+        """Return how many times slower a motion must run to keep the rates: largest over the last two axes."""
+        most = [np.abs(values).max(axis=(-2, -1)) for values in (speed, acceleration, jerk)]
+        roots = most[0] / self.speed, (most[1] / self.acceleration) ** 0.5, (most[2] / self.jerk) ** (1.0 / 3.0)
+        return np.max(roots, axis=0)
+
+
+class Leg:
+    """A straight leg between two tool poses: a pivot on a line, and the shortest turn about it."""
+
+    def __init__(self, geometry: HexapodGeometry, start: Pose, end: Pose, pivot: np.ndarray) -> None:
+        self.start, self.end, self.pivot = start, end, pivot
+        self.turn = Rotation.from_matrix(end.rotation @ start.rotation.T).as_rotvec()  # In ``work``
+        if np.linalg.norm(self.turn) > np.pi - HALF_TURN:
+            raise PoseError("a turn by 180° has two shortest ways: give a way point between", np.degrees(self.turn))
+        self.origin = start.position + start.rotation @ pivot
+        self.travel = end.position + end.rotation @ pivot - self.origin
+        # In ``work``: base joints, and platform joints seen from the pivot
+        self.base = (geometry.base_joints - geometry.work.position) @ geometry.work.rotation
+        in_tool = (geometry.platform_joints - geometry.tool.position) @ geometry.tool.rotation
+        self.arms = (in_tool - pivot) @ start.rotation.T
+
+    def poses(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the tool's positions, (n, 3), and rotations, (n, 3, 3), at shares s; at 0 and 1 as given."""
+        rotations = Rotation.from_rotvec(s[:, None] * self.turn).as_matrix() @ self.start.rotation
+        positions = self.origin + s[:, None] * self.travel - rotations @ self.pivot
+        for at, pose in ((0.0, self.start), (1.0, self.end)):
+            positions[s == at], rotations[s == at] = pose.position, pose.rotation
+        return positions, rotations
+
+    def struts(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the struts' nominal lengths and their first three derivatives by s, each (n, 6)."""
+        arms = np.einsum("nij,kj->nki", Rotation.from_rotvec(s[:, None] * self.turn).as_matrix(), self.arms)
+        d = self.origin + s[:, None, None] * self.travel + arms - self.base
+        swing = np.cross(self.turn, arms)
+        d1, d2, d3 = self.travel + swing, np.cross(self.turn, swing), -(self.turn @ self.turn) * swing
+
+        def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+            return np.asarray((a * b).sum(axis=2))
+
+        # Derivatives of L² = d·d
+        q = np.sqrt(dot(d, d))
+        q1 = dot(d, d1) / q
+        q2 = (dot(d1, d1) + dot(d, d2) - q1 * q1) / q
+        q3 = (3.0 * dot(d1, d2) + dot(d, d3) - 3.0 * q1 * q2) / q
+        return q, q1, q2, q3
+
+
+def time_optimal(q1: np.ndarray, q2: np.ndarray, speed: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
+    """Return ṡ², (N + 1, C), on N equal sections of s from rest to rest, for C pairs of limits.
+
+    q1 and q2, (N + 1, 6), are the struts' derivatives by s. Each section's acceleration is held against the limits
+    at both its ends.
+    """
+    sections = len(q1) - 1
+    width = 2.0 / sections  # ṡ² grows by this times s̈
+    a = np.concatenate([q1[:-1], q1[1:] + width * q2[1:]], axis=1)  # Each limit is |a s̈ + b ṡ²| ≤ acceleration
+    b = np.concatenate([q2[:-1], q2[1:]], axis=1)
+    b, a = np.where(a < 0.0, -b, b), np.maximum(np.abs(a), 1e-12 * np.abs(q1).max())
+    slope = (b / a)[:, :, None]  # The limits are −most − slope ṡ² ≤ s̈ ≤ most − slope ṡ²
+    most = acceleration / a[:, :, None]
+    highest = (speed / np.maximum(np.abs(q1), 1e-300).max(axis=1)[:, None]) ** 2
+    with np.errstate(divide="ignore"):
+        for i in range(a.shape[1]):  # Where the upper limit of one strut meets the lower one of another
+            fall = slope[:, [i]] - slope
+            meet = np.where(fall > 0.0, (most[:, [i]] + most) / np.maximum(fall, 1e-300), np.inf)
+            np.minimum(highest[:-1], meet.min(axis=1), out=highest[:-1])
+    highest[-1] = 0.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for n in range(sections - 1, -1, -1):
+            # ṡ² + width s̈ must lie in [0, highest[n + 1]], at the least and at the largest s̈
+            fall = 1.0 / width - slope[n]
+            reach = np.where(fall > 0.0, (highest[n + 1] / width + most[n]) / fall, np.inf)
+            rest = np.where(-fall > 0.0, most[n] / -fall, np.inf)
+            highest[n] = np.minimum(highest[n], np.minimum(reach, rest).min(axis=0))
+    square = np.zeros_like(highest)
+    for n in range(sections):
+        largest = (most[n] - slope[n] * square[n]).min(axis=0)
+        square[n + 1] = np.clip(square[n] + width * largest, 0.0, highest[n + 1])
+    return square
+
+
+@dataclass(frozen=True)
+class Profile:
+    """s over time: sections of constant acceleration, averaged over a window, run `slowed` times as slowly."""
+
+    times: np.ndarray  # (N + 1,) at which sections begin and the last one ends, s
+    speeds: np.ndarray  # (N + 1,) ṡ there
+    window: float  # s; 0: not averaged
+    slowed: float = 1.0
+
+    @staticmethod
+    def of(square: np.ndarray, window: float) -> Profile:
+        """Return the profile of ṡ² on equal sections of s."""
+        speeds = np.sqrt(square)
+        steps = 2.0 / (len(square) - 1) / np.maximum(speeds[1:] + speeds[:-1], 1e-300)
+        return Profile(np.concatenate([[0.0], np.cumsum(steps)]), speeds, window)
+
+    @property
+    def duration(self) -> float:
+        """Time from rest to rest, s."""
+        return float(self.times[-1] + self.window) * self.slowed
+
+    def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return s and its first three derivatives by time."""
+        times = np.asarray(times) / self.slowed
+        v, steps = self.speeds, np.diff(self.times)
+        a = np.diff(v) / steps
+        s = np.linspace(0.0, 1.0, len(v))
+
+        def integrals(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+            n = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, len(a) - 1)
+            inside = (t >= 0.0) & (t < self.times[-1])
+            dt = np.clip(t, 0.0, self.times[-1]) - self.times[n]
+            areas = np.concatenate([[0.0], np.cumsum(steps * (s[:-1] + steps * (v[:-1] / 2.0 + steps * a / 6.0)))])
+            area = areas[n] + dt * (s[n] + dt * (v[n] / 2.0 + dt * a[n] / 6.0)) + np.maximum(t - self.times[-1], 0.0)
+            return area, s[n] + dt * (v[n] + dt * a[n] / 2.0), v[n] + dt * a[n], np.where(inside, a[n], 0.0)
+
+        now = integrals(times)
+        if self.window:
+            before = integrals(times - self.window)
+            share, speed, bend, jerk = ((x - y) / self.window for x, y in zip(now, before, strict=True))
+        else:
+            (_, share, speed, bend), jerk = now, np.zeros_like(times)
+        share = np.where(times <= 0.0, 0.0, np.where(times >= self.times[-1] + self.window, 1.0, share))
+        return np.clip(share, 0.0, 1.0), speed / self.slowed, bend / self.slowed**2, jerk / self.slowed**3
+
+    def breaks(self) -> np.ndarray:
+        """Return the moments just after and before which a derivative jumps, and those halfway between."""
+        edges = np.unique(np.concatenate([self.times, self.times + self.window] if self.window else [self.times]))
+        near = 1e-9 * edges[-1]
+        return (
+            np.sort(np.concatenate([edges[:-1] + near, edges[1:] - near, (edges[1:] + edges[:-1]) / 2.0])) * self.slowed
+        )
+
+
+def strut_motion(
+    leg: Leg, s: np.ndarray, v: np.ndarray, a: np.ndarray, j: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the struts' speeds, accelerations and jerks, each (n, 6), of s and its derivatives by time, each (n,)."""
+    _, q1, q2, q3 = leg.struts(s)
+    v, a, j = v[:, None], a[:, None], j[:, None]
+    return q1 * v, q1 * a + q2 * v**2, q1 * j + 3.0 * q2 * v * a + q3 * v**3
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A straight motion in time, from rest to rest, as :func:`plan_motion` returns it.
+
+    Attributes
+    ----------
+    leg : Leg
+        The way.
+    profile : Profile
+        The share of the way over time.
+    rates : StrutRates
+        What the struts may do.
+    """
+
+    leg: Leg
+    profile: Profile
+    rates: StrutRates
+
+    @property
+    def duration(self) -> float:
+        """Time from start to end, s."""
+        return self.profile.duration
+
+    def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the tool's positions, (n, 3), and rotations, (n, 3, 3), at times since the start, s."""
+        return self.leg.poses(self.profile.at(np.asarray(times, dtype=float))[0])
+
+    def sample(self, rate: float) -> Path:
+        """Return the poses to send at a rate, Hz, start and end included; the last period may be cut short."""
+        return Path(*self.at(_ticks(self.duration, rate)), rate)
+
+    def stop(self, now: float, rate: float) -> Path:
+        """Return the poses, at a rate in Hz, that brake the motion to rest on its path, from the time `now` on.
+
+        The motion's own time is slowed to a halt, as early as the struts' rates allow; while it brakes at the limit
+        anyway, the slowing begins later, at the latest when the motion ends by itself.
+        """
+        if not 0.0 <= now <= self.duration:
+            raise GeometryError("now", f"must lie in the motion's 0…{self.duration:.6g} s", now)
+        best, clock = self.duration - now, None
+        for delay in np.linspace(0.0, self.duration - now, DELAYS):
+            for length in STOPS[delay + STOPS < best]:
+                if self._kept(now, delay, length):
+                    best, clock = delay + length, (delay, length)
+                    break
+        since = _ticks(best, rate)
+        times = now + since if clock is None else now + _slowing(since, *clock)[0]
+        return Path(*self.at(times), rate)
+
+    def _kept(self, now: float, delay: float, length: float) -> bool:
+        """Return whether the rates are kept when slowing begins after the delay, s, and is done `length` later."""
+        after = np.linspace(0.0, length, 200)
+        clock, r, r1, r2 = _slowing(delay + after, delay, length)
+        if now + clock[-1] > self.duration:
+            return False
+        s, v, a, j = self.profile.at(now + clock)
+        found = strut_motion(self.leg, s, v * r, a * r**2 + v * r1, j * r**3 + 3.0 * a * r * r1 + v * r2)
+        return bool(self.rates.excess(*found) <= 1.0)
+
+
+def _ticks(duration: float, rate: float) -> np.ndarray:
+    """Return the times of a rate's ticks, s, and for the last one the duration itself."""
+    return np.minimum(np.arange(int(np.ceil(duration * rate * (1.0 - 1e-12))) + 1) / rate, duration)
+
+
+def _slowing(since: np.ndarray, delay: float, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the time gone by of a motion whose clock halts, and that clock's rate with two derivatives."""
+    x = np.clip((since - delay) / length, 0.0, 1.0)
+    gone = np.minimum(since, delay) + length * (x - x**3 + x**4 / 2.0)
+    inside = (since >= delay).astype(float)
+    rate = 1.0 - x * x * (3.0 - 2.0 * x)
+    return gone, rate, -6.0 * x * (1.0 - x) / length * inside, -6.0 * (1.0 - 2.0 * x) / length**2 * inside
+
+
+def plan_motion(
+    geometry: HexapodGeometry,
+    poses: Sequence[Pose],
+    rates: StrutRates,
+    pivot: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+) -> list[Motion]:
+    """Return the least-time motions through tool poses, with a rest at each.
+
+    Between two poses the pivot goes straight and the tool turns the shortest way about it. Neither strokes nor joints
+    are looked at: :func:`hexapod_comp.check` does that, with the mode ``stream``, on what is to be sent.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        The machine, with the tool and the work frame that are used.
+    poses : sequence of Pose
+        ``pose_tool_in_work``, from where the tool stands on. Equal neighbours give no motion.
+    rates : StrutRates
+        What the struts may do.
+    pivot : array_like, shape (3,)
+        The point that goes straight, in the tool's frame, m; the tool's tip by default.
+
+    Raises
+    ------
+    GeometryError
+        A pivot that is not three finite numbers; a machine with a strut of no length on the way.
+    PoseError
+        A turn by 180°, which has two shortest ways.
+    """
+    point = np.asarray(pivot, dtype=float)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise GeometryError("pivot", "must be three finite numbers, m", point.tolist())
+    legs = [Leg(geometry, a, b, point) for a, b in pairwise(poses)]
+    return [Motion(leg, _fastest(leg, rates), rates) for leg in legs if leg.travel.any() or leg.turn.any()]
+
+
+def _fastest(leg: Leg, rates: StrutRates) -> Profile:
+    """Return the profile of least time along a leg."""
+    _, q1, q2, _ = leg.struts(np.linspace(0.0, 1.0, SECTIONS + 1))
+    largest = np.abs(q1).max()
+    if not (np.isfinite(largest) and largest > 0.0):
+        raise GeometryError("poses", "must move the struts by finite lengths", float(largest))
+    if not np.isfinite(rates.jerk):
+        square = time_optimal(q1, q2, np.array([rates.speed]), np.array([rates.acceleration]))
+        return _kept_within(leg, Profile.of(square[:, 0], 0.0), rates)
+    # Seven phases of the strut that goes farthest, as if its length were linear in s: where the search begins
+    way = largest
+    acceleration = min(
+        rates.acceleration, (rates.jerk**2 * way / 2.0) ** (1.0 / 3.0), (rates.speed * rates.jerk) ** 0.5
+    )
+    ramp = acceleration / rates.jerk
+    speed = min(rates.speed, acceleration * (np.sqrt(ramp**2 + 4.0 * way / acceleration) - ramp) / 2.0)
+    best = Profile(np.array([np.inf]), np.zeros(1), 0.0)
+    for spread in SPREADS:
+        around = np.exp(spread * np.linspace(-1.0, 1.0, CANDIDATES + 1))
+        tried_a, tried_v = np.meshgrid(
+            np.unique(np.minimum(acceleration * around, rates.acceleration)),
+            np.unique(np.minimum(speed * around, rates.speed)),
+        )
+        squares = time_optimal(q1, q2, tried_v.ravel(), tried_a.ravel())
+        for square, v, a in zip(squares.T, tried_v.ravel(), tried_a.ravel(), strict=True):
+            found = Profile.of(square, float(a / rates.jerk))
+            if found.duration < best.duration:
+                found = _kept_within(leg, found, rates)
+            if found.duration < best.duration:
+                best, speed, acceleration = found, float(v), float(a)
+    return best
+
+
+def _kept_within(leg: Leg, profile: Profile, rates: StrutRates) -> Profile:
+    """Return a profile, run slowly enough for the rates; a slower one scales all derivatives by time."""
+    excess = rates.excess(*strut_motion(leg, *profile.at(profile.breaks())))
+    return Profile(profile.times, profile.speeds, profile.window, float(excess) * (1.0 + SLACK))

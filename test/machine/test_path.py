@@ -1,0 +1,177 @@
+"""Straight motions of least time: closed forms, limits by finite differences of what is sent, ways by geometry."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foreign_machines import machines
+from scipy.spatial.transform import Rotation
+from strategies import paper_geometry
+
+from hexapod_comp.errors import GeometryError, PoseError
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.path import Motion, StrutRates, plan_motion
+from hexapod_comp.pose import Pose
+
+RATES = StrutRates(0.2, 2.0, 40.0)
+
+
+def machine_of(name: str, folder: Path) -> HexapodGeometry:
+    return load_geometry("example_6_6" if name == "example_6_6" else machines()[name].write(folder / "machine.yaml"))
+
+
+def lengths(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Return strut lengths of tool poses in work by vectors alone, shape (N, 6)."""
+    turned = geometry.work.rotation @ rotations @ geometry.tool.rotation.T
+    tips = geometry.work.position + positions @ geometry.work.rotation.T
+    joints = tips[:, None] + np.einsum("nij,kj->nki", turned, geometry.platform_joints - geometry.tool.position)
+    return np.linalg.norm(joints - geometry.base_joints, axis=2)
+
+
+def random_targets(geometry: HexapodGeometry, count: int, seed: int) -> list[Pose]:
+    """Return poses around home, 0.1 mm to 50 mm and up to 9° apart."""
+    rng, home = np.random.default_rng(seed), geometry.tool_pose(geometry.home)
+    result = []
+    for size in 10.0 ** rng.uniform(-3.0, 0.0, count):
+        turn = Rotation.from_rotvec(size * rng.uniform(-0.1, 0.1, 3)).as_matrix()
+        result.append(Pose(home.position + size * rng.uniform(-0.05, 0.05, 3), home.rotation @ turn))
+    return result
+
+
+def shares(
+    geometry: HexapodGeometry, path: tuple[np.ndarray, np.ndarray], rate: float, rates: StrutRates
+) -> list[float]:
+    """Return the largest speed, acceleration and jerk sent, from rest to rest, as shares of those allowed."""
+    sent = lengths(geometry, *path)
+    sent = np.concatenate([np.repeat(sent[:1], 3, axis=0), sent, np.repeat(sent[-1:], 3, axis=0)])
+    allowed = rates.speed, rates.acceleration, rates.jerk
+    return [
+        float(np.abs(np.diff(sent, n + 1, axis=0)).max() * rate ** (n + 1) / most) for n, most in enumerate(allowed)
+    ]
+
+
+def seven_phases(way: float, rates: StrutRates) -> float:
+    """Return the least time of one axis from rest to rest: ramps of jerk and of acceleration and a coast."""
+    v, a, j = rates.speed, rates.acceleration, rates.jerk
+    if math.isinf(j):
+        return way / v + v / a if way >= v * v / a else 2.0 * math.sqrt(way / a)
+    a = min(a, math.sqrt(v * j))
+    if way >= v * (v / a + a / j):
+        return way / v + v / a + a / j
+    if way >= 2.0 * a**3 / j**2:
+        return a / j + math.sqrt((a / j) ** 2 + 4.0 * way / a)
+    return 4.0 * (way / (2.0 * j)) ** (1.0 / 3.0)
+
+
+@pytest.mark.parametrize("jerk", [math.inf, 40.0, 4.0])
+@pytest.mark.parametrize("rise", [0.0001, 0.002, 0.01, 0.06, -0.06])
+def test_straight_up_all_struts_are_one_axis(rise: float, jerk: float) -> None:
+    """Over the middle of the paper's machine all struts are alike: the optimum in their length is in the textbooks."""
+    geometry, rates = paper_geometry(), replace(RATES, jerk=jerk)
+    home = Pose(np.array([0.0, 0.0, geometry.home.position[2]]), geometry.home.rotation)
+    start = geometry.tool_pose(home)
+    end = geometry.tool_pose(Pose(home.position + np.array([0.0, 0.0, rise]), home.rotation))
+    (motion,) = plan_motion(geometry, [start, end], rates)
+    both = lengths(geometry, *(np.array([getattr(p, name) for p in (start, end)]) for name in ("position", "rotation")))
+    assert np.ptp(both, axis=1).max() < 1e-9
+    optimum = seven_phases(abs(both[1, 0] - both[0, 0]), rates)
+    assert optimum * (1.0 - 1e-6) <= motion.duration <= optimum * (1.001 if math.isinf(jerk) else 1.01)
+
+
+@pytest.mark.parametrize("name", ["paper", "example_6_6", "hanging", "inches"])
+def test_random_motions_keep_every_limit_and_go_straight(name: str, tmp_path: Path) -> None:
+    geometry, rate = machine_of(name, tmp_path), 1000.0
+    rng, targets = np.random.default_rng(5), random_targets(geometry, 51, 4)
+    for start, end in pairwise(targets):
+        pivot = rng.uniform(-0.1, 0.1, 3)
+        (motion,) = plan_motion(geometry, [start, end], RATES, pivot)
+        path = motion.sample(rate)
+        assert max(shares(geometry, (path.positions, path.rotations), rate, RATES)) <= 1.0 + 1e-6
+        assert np.array_equal(path.positions[[0, -1]], [start.position, end.position])
+        assert np.array_equal(path.rotations[[0, -1]], [start.rotation, end.rotation])
+        assert 0.0 <= (len(path) - 1) / rate - motion.duration < 1.0 / rate
+        points = path.positions + path.rotations @ pivot
+        way = points[-1] - points[0]
+        share = (points - points[0]) @ way / (way @ way)
+        assert (np.diff(share) > -1e-9).all()
+        assert np.allclose(points, points[0] + share[:, None] * way, atol=1e-12)
+        turns = Rotation.from_matrix(path.rotations @ start.rotation.T).as_rotvec()
+        assert np.allclose(turns, share[:, None] * turns[-1], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["paper", "hanging"])
+def test_a_stop_keeps_every_limit_stays_on_the_way_and_is_never_later_than_the_end(name: str, tmp_path: Path) -> None:
+    geometry, rate = machine_of(name, tmp_path), 500.0
+    rng, targets = np.random.default_rng(6), random_targets(geometry, 13, 7)
+    for start, end in pairwise(targets):
+        (motion,) = plan_motion(geometry, [start, end], RATES)
+        sent = motion.sample(rate)
+        for tick in rng.integers(0, len(sent), 3):
+            stop = motion.stop(min(tick / rate, motion.duration), rate)
+            assert len(stop) <= len(sent) - tick + 1
+            both = (
+                np.concatenate([sent.positions[:tick], stop.positions]),
+                np.concatenate([sent.rotations[:tick], stop.rotations]),
+            )
+            assert max(shares(geometry, both, rate, RATES)) <= 1.0 + 2e-3
+            way = end.position - start.position
+            share = (stop.positions - start.position) @ way / (way @ way)
+            assert (np.diff(share) > -1e-9).all()
+            assert np.allclose(stop.positions, start.position + share[:, None] * way, atol=1e-12)
+
+
+def test_a_stop_from_full_speed_is_early() -> None:
+    """In the middle of a long way: at most three times as long as by the largest acceleration throughout."""
+    geometry = paper_geometry()
+    home = geometry.tool_pose(geometry.home)
+    (motion,) = plan_motion(geometry, [home, Pose(home.position + np.array([0.0, 0.0, 0.15]), home.rotation)], RATES)
+    stop = motion.stop(motion.duration / 2.0, 1000.0)
+    assert len(stop) < 1000.0 * 3.0 * RATES.speed / RATES.acceleration < 1000.0 * motion.duration / 2.0
+
+
+def test_a_program_rests_at_each_way_point_and_skips_equal_ones() -> None:
+    geometry = paper_geometry()
+    a, b, c = random_targets(geometry, 3, 2)
+    motions = plan_motion(geometry, [a, b, b, c], RATES)
+    assert [(m.leg.start, m.leg.end) for m in motions] == [(a, b), (b, c)]
+    assert plan_motion(geometry, [a, a], RATES) == []
+
+
+def test_rates_are_a_share_of_the_machines_limits() -> None:
+    """The step of 2 mm limits below 125 Hz; without acceleration and jerk in the file they follow from times."""
+    geometry = paper_geometry()
+    assert StrutRates.of(geometry, 50.0, 1.0).speed == pytest.approx(0.1)
+    rates = StrutRates.of(geometry, 250.0, 0.8)
+    assert (rates.speed, rates.acceleration, rates.jerk) == pytest.approx((0.2, 2.0, 100.0))
+    given = replace(geometry, limits=replace(geometry.limits, acceleration=1.0, jerk=10.0))
+    rates = StrutRates.of(given, 250.0, 0.5)
+    assert (rates.speed, rates.acceleration, rates.jerk) == pytest.approx((0.125, 0.5, 5.0))
+    assert load_geometry("example_6_6").limits.jerk == pytest.approx(100.0)
+
+
+def test_what_makes_no_motion_is_refused() -> None:
+    geometry = paper_geometry()
+    home = geometry.tool_pose(geometry.home)
+    (motion,) = plan_motion(geometry, [home, Pose(home.position + np.array([0.0, 0.0, 0.01]), home.rotation)], RATES)
+    assert isinstance(motion, Motion)
+    with pytest.raises(PoseError, match="180° has two shortest ways"):
+        plan_motion(geometry, [home, Pose(home.position, home.rotation @ np.diag([-1.0, -1.0, 1.0]))], RATES)
+    for refused, words in (
+        (
+            lambda: plan_motion(geometry, [home, home], RATES, [0.0, math.nan, 0.0]),
+            "pivot: must be three finite numbers",
+        ),
+        (lambda: StrutRates(0.2, math.inf), "acceleration: must be positive and finite"),
+        (lambda: StrutRates(0.2, 1.0, 0.0), "jerk: must be positive"),
+        (lambda: StrutRates.of(geometry, 250.0, 1.1), "share: must lie in"),
+        (lambda: StrutRates.of(geometry, math.nan), "rate: must be finite and positive"),
+        (lambda: motion.stop(-0.1, 250.0), "now: must lie in the motion's"),
+        (lambda: replace(geometry.limits, jerk=-1.0), "limits.jerk: must be finite and not negative, m/s³"),
+    ):
+        with pytest.raises(GeometryError, match=words):
+            refused()
