@@ -30,8 +30,11 @@ SECTIONS = 200  # Of a leg, between which ṡ² is linear in s
 SPREADS = (1.0, 0.3, 0.1)  # How far the search looks around the best yet, in logarithms of a share of a limit
 CANDIDATES = 6  # Each way in one round of the search
 SLACK = 1e-4  # By which limits are kept more tightly: s is examined at the grid's times and between, not everywhere
-STOPS = np.geomspace(0.01, 30.0, 60)  # Durations of slowing down that are tried when a motion is stopped, s
-DELAYS = 41  # Moments at which slowing down may begin, from now to the motion's end
+DELAYS = 8  # Moments at which a stop may begin to slow down, within a window of the average and again up to the end
+HALVINGS = 10  # Of the span in which the shortest slowing down from each moment is sought
+SHORTEST = 1e-3  # Share of that span below which none is sought
+LENGTHENED = (1.0, 1.01, 1.03, 1.1)  # What was found at few times is examined at all, and this many times as long
+COARSE, FINE = 24, 200  # Times of slowing down that are examined while it is sought, and in the end
 HALF_TURN = 1e-6  # Within this of 180°, rad, there are two shortest turns
 
 
@@ -262,25 +265,59 @@ class Motion:
         """
         if not 0.0 <= now <= self.duration:
             raise GeometryError("now", f"must lie in the motion's 0…{self.duration:.6g} s", now)
-        best, clock = self.duration - now, None
-        for delay in np.linspace(0.0, self.duration - now, DELAYS):
-            for length in STOPS[delay + STOPS < best]:
-                if self._kept(now, delay, length):
-                    best, clock = delay + length, (delay, length)
-                    break
-        since = _ticks(best, rate)
-        times = now + since if clock is None else now + _slowing(since, *clock)[0]
-        return Path(*self.at(times), rate)
+        left = self.duration - now
+        to_its_end = Path(*self.at(now + _ticks(left, rate)), rate)
+        if len(to_its_end) <= 2:  # Nothing is sent before the end
+            return to_its_end
+        window = self.profile.window * self.profile.slowed
+        delays = np.unique(
+            np.concatenate([np.linspace(0.0, window, DELAYS // 2 + 1), np.linspace(0.0, left, DELAYS, endpoint=False)])
+        )
+        delays = delays[delays < left]
+        # The struts' derivatives by time, taken once: what any slowing down makes of them is sums and products
+        moments = now + left * np.linspace(0.0, 1.0, SECTIONS + 1)
+        known = strut_motion(self.leg, *self.profile.at(moments))
+        shares = np.linspace(0.0, 1.0, COARSE)
+
+        def kept(lengths: np.ndarray) -> np.ndarray:
+            clock, *rates = _slowing(delays[:, None] + lengths[:, None] * shares, delays[:, None], lengths[:, None])
+            at = np.minimum((clock * (SECTIONS / left) + 0.5).astype(int), SECTIONS)
+            found = _slowed([q[at] for q in known], *(r[:, :, None] for r in rates))
+            return np.asarray(self.rates.excess(*found) <= 1.0)
+
+        low, high = (left - delays) * SHORTEST, left - delays
+        useful = kept(high)
+        for _ in range(HALVINGS):
+            middle = np.sqrt(low * high)
+            good = kept(middle)
+            low, high = np.where(good, low, middle), np.where(good, middle, high)
+        for n in np.argsort(delays + high)[: np.count_nonzero(useful)] if useful.any() else ():
+            for longer in LENGTHENED:
+                delay, length = float(delays[n]), float(high[n] * longer)
+                if useful[n] and delay + length < left and self._kept(now, delay, length):
+                    since = _ticks(delay + length, rate)
+                    return Path(*self.at(now + _slowing(since, delay, length)[0]), rate)
+        return to_its_end
 
     def _kept(self, now: float, delay: float, length: float) -> bool:
         """Return whether the rates are kept when slowing begins after the delay, s, and is done `length` later."""
-        after = np.linspace(0.0, length, 200)
-        clock, r, r1, r2 = _slowing(delay + after, delay, length)
-        if now + clock[-1] > self.duration:
-            return False
-        s, v, a, j = self.profile.at(now + clock)
-        found = strut_motion(self.leg, s, v * r, a * r**2 + v * r1, j * r**3 + 3.0 * a * r * r1 + v * r2)
-        return bool(self.rates.excess(*found) <= 1.0)
+        shares = np.linspace(0.0, 1.0, FINE)
+        edges = self.profile.breaks() - now - delay
+        edges = edges[(edges > 0.0) & (edges < length / 2.0)]
+        gone, *_ = _slowing(shares, 0.0, 1.0)
+        shares = np.concatenate([shares, np.interp(edges / length, gone, shares)])
+        clock, *rates = _slowing(delay + length * shares, delay, length)
+        clock[FINE:] = delay + edges  # On the side of the break on which they are
+        known = strut_motion(self.leg, *self.profile.at(now + clock))
+        return bool(self.rates.excess(*_slowed(known, *(r[:, None] for r in rates))) <= 1.0)
+
+
+def _slowed(
+    known: Sequence[np.ndarray], r: np.ndarray, r1: np.ndarray, r2: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return speeds, accelerations and jerks on a clock of rate r, with its derivatives, from those on time's own."""
+    v, a, j = known
+    return v * r, a * r**2 + v * r1, j * r**3 + 3.0 * a * r * r1 + v * r2
 
 
 def _ticks(duration: float, rate: float) -> np.ndarray:
@@ -288,7 +325,9 @@ def _ticks(duration: float, rate: float) -> np.ndarray:
     return np.minimum(np.arange(int(np.ceil(duration * rate * (1.0 - 1e-12))) + 1) / rate, duration)
 
 
-def _slowing(since: np.ndarray, delay: float, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _slowing(
+    since: np.ndarray, delay: float | np.ndarray, length: float | np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the time gone by of a motion whose clock halts, and that clock's rate with two derivatives."""
     x = np.clip((since - delay) / length, 0.0, 1.0)
     gone = np.minimum(since, delay) + length * (x - x**3 + x**4 / 2.0)

@@ -118,7 +118,7 @@ def test_a_stop_keeps_every_limit_stays_on_the_way_and_is_never_later_than_the_e
                 np.concatenate([sent.positions[:tick], stop.positions]),
                 np.concatenate([sent.rotations[:tick], stop.rotations]),
             )
-            assert max(shares(geometry, both, rate, RATES)) <= 1.0 + 2e-3
+            assert max(shares(geometry, both, rate, RATES)) <= 1.0 + 1e-3
             way = end.position - start.position
             share = (stop.positions - start.position) @ way / (way @ way)
             assert (np.diff(share) > -1e-9).all()
