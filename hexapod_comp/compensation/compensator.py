@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..core import QUATERNION_NORM_TOLERANCE, Status, Struct, ffi, lib
 from ..core.batch import backwards, given, solve_linear
@@ -50,7 +51,9 @@ PARTS = {
 }
 
 PLACES = ("platform_", "model_")  # Beginnings of the names of parts that are poses
-BESIDE_NUMBERS = ("temperatures", "lags", "tool")  # What a compensator's snapshot holds beside the numbers of its state
+BESIDE_NUMBERS = ("temperatures", "lags", "tool", "drift")  # What a snapshot holds beside the numbers of the state
+
+DRIFT_STATES = 12  # Three displacements and three rotations of the base, six struts, all in m: :func:`drifted`
 
 
 @dataclass(frozen=True)
@@ -137,6 +140,25 @@ TRANSITIONS = {
 }
 
 
+def drifted(geometry: HexapodGeometry, model: MachineModel, drift: np.ndarray) -> MachineModel:
+    """Return the model of a machine that has drifted so, m, since it was fitted.
+
+    The drift, shape (12,): three displacements of the base in ``base``, three rotations of it about the platform's home
+    times the machine's characteristic length, and what six struts are longer than their encoders tell.
+    """
+    if not drift.any():
+        return model
+    centre, turn = geometry.home.position, drift[3:6] / geometry.characteristic_length
+    joints = geometry.base_joints + model.base_deviation
+    moved = centre + drift[:3] + (joints - centre) @ Rotation.from_rotvec(turn).as_matrix().T
+    return replace(
+        model,
+        base_deviation=model.base_deviation + (moved - joints),
+        base_axes_turn=model.base_axes_turn + turn,
+        struts=replace(model.struts, offset=model.struts.offset + drift[6:]),
+    )
+
+
 def pack_pose(pose: Pose) -> Struct:
     """Return a pose as the core takes it."""
     return Struct("hc_pose", {"position": pose.position, "rotation": pose.rotation})
@@ -184,8 +206,8 @@ class Compensator:
         Directions of motion after the last command.
     on_change : callable
         Called after each change from outside, with its name and value: ``temperature`` (name, °C, time), ``humidity``
-        (fraction, time), ``model``, ``enable`` (bool), ``tool`` (name), ``ramp_rate`` (m/s), ``reset`` (measured struts
-        or None). Together with the commands these decide all answers.
+        (fraction, time), ``model``, ``drift`` (shape (12,), m), ``enable`` (bool), ``tool`` (name), ``ramp_rate``
+        (m/s), ``reset`` (measured struts or None). Together with the commands these decide all answers.
     """
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, ramp_rate: float = DEFAULT_RAMP_RATE) -> None:
@@ -197,6 +219,7 @@ class Compensator:
         self._time, self._estimated = ffi.new("hc_time *"), ffi.new("hc_estimated *")
         lib.hc_init(self._at, self._constants.at, ramp_rate)
         self._sensed: set[str] = set()
+        self.drift = np.zeros(DRIFT_STATES)
         self._machine: RealMachine | None = None
         self._parts = parts = named_parts(self._state)
         self.command, self.nominal, self.correction = (parts[name] for name in ("command", "nominal", "correction"))
@@ -246,11 +269,30 @@ class Compensator:
     def machine(self) -> RealMachine:
         """The machine in use, with its model, at the present temperatures."""
         if self._machine is None:
-            self._machine = RealMachine(self.geometry, self.model, self.temperatures)
+            self._machine = RealMachine(self.geometry, self._believed, self.temperatures)
         return self._machine
 
+    @property
+    def _believed(self) -> MachineModel:
+        return drifted(self.geometry, self.model, self.drift)
+
+    def set_drift(self, drift: np.ndarray) -> None:
+        """Take what the machine has drifted since its model was fitted, m, as :func:`drifted` has it; it ramps.
+
+        Raises
+        ------
+        LimitError, KinematicsError, OutsideFieldError, ModelError
+            As for :meth:`set_model`, or it is not twelve finite numbers; the old drift stays.
+        """
+        drift = np.array(drift, dtype=float)
+        if drift.shape != (DRIFT_STATES,) or not np.isfinite(drift).all():
+            raise ModelError("drift", f"must be {DRIFT_STATES} finite numbers, m", drift.tolist())
+        if not np.array_equal(drift, self.drift):
+            self._take_model(self.model, drift)
+            self.on_change("drift", drift)
+
     def set_model(self, model: MachineModel) -> None:
-        """Replace the model; the corrections ramp from the old one's to the new one's.
+        """Replace the model; the corrections ramp from the old one's to the new one's, which begins without drift.
 
         Raises
         ------
@@ -260,12 +302,15 @@ class Compensator:
             What it would correct at the last command, before the first one at home, breaks a limit: the ramp would
             drag the struts there and be refused on its way. The old model stays.
         """
-        constants = core_model(self.geometry, model)
+        self._take_model(model, np.zeros(DRIFT_STATES))
+        self.on_change("model", model)
+
+    def _take_model(self, model: MachineModel, drift: np.ndarray) -> None:
+        constants = core_model(self.geometry, drifted(self.geometry, model, drift))
         if lib.hc_check(self._at, constants.at, self._answer):
             raise refusal(self._answer, self.geometry, model)
         lib.hc_set_model(self._at, constants.at)
-        self._constants, self.model, self._machine = constants, model, None
-        self.on_change("model", model)
+        self._constants, self.model, self.drift, self._machine = constants, model, drift, None
 
     def check(self) -> None:
         """Raise what is wrong with all that the model would correct, as :meth:`set_model` does."""
@@ -320,7 +365,7 @@ class Compensator:
         self.on_change("tool", name)
 
     def _use(self, geometry: HexapodGeometry) -> None:
-        constants = core_model(geometry, self.model)
+        constants = core_model(geometry, self._believed)
         lib.hc_set_tool(self._at, constants.at)
         self.geometry, self._constants, self._machine = geometry, constants, None
 
@@ -377,10 +422,11 @@ class Compensator:
         """Return what, beside geometry and model, decides the next answer, by name.
 
         ``temperatures``, °C by name, and ``humidity`` among them, ``lags`` of what follows them late, ``tool``, and
-        each of :data:`PARTS`: a list of numbers, matrices by rows.
+        each of :data:`PARTS`: a list of numbers, matrices by rows; ``drift``, where there is any.
         """
         parts = {name: np.ravel(part).astype(float).tolist() for name, part in self._parts.items()}
-        return {**parts, **self.temperatures.snapshot(), "tool": self.geometry.tool_name}
+        drift = {"drift": self.drift.tolist()} if self.drift.any() else {}  # older releases read what has none
+        return {**parts, **self.temperatures.snapshot(), "tool": self.geometry.tool_name, **drift}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Take over a :meth:`snapshot` of a compensator with this geometry and model.
@@ -397,10 +443,13 @@ class Compensator:
             raise ModelError("snapshot.temperatures", "is missing")
         constants = self.model.late_growth.time_constants
         temperatures = Temperatures.restored(snapshot["temperatures"], snapshot.get("lags", {}), len(constants))
+        drift = np.asarray(snapshot.get("drift", np.zeros(DRIFT_STATES)), dtype=float)
+        if drift.shape != (DRIFT_STATES,) or not np.isfinite(drift).all():
+            raise ModelError("snapshot.drift", f"must be {DRIFT_STATES} finite numbers, m", drift.tolist())
         parts, geometry = read_parts(snapshot), self.geometry.using(tool=snapshot.get("tool", TOOL))
         lib.hc_init(self._at, self._constants.at, 0.0)
         write_temperatures(self._state, temperatures)
-        self._sensed = set(temperatures.values)
+        self._sensed, self.drift = set(temperatures.values), drift
         self._use(geometry)
         for name, part in self._parts.items():
             if not name.startswith(PLACES) or np.isfinite(parts[name]).all():

@@ -130,9 +130,9 @@ class Entry:
     after: int  # commands answered before it since the session began
     what: str
     # ``name``, ``value`` (°C) and ``time`` (s; NaN: not known) of a temperature; ``value`` (a fraction) and
-    # ``time`` of a humidity; ``name`` and ``sha256`` of a model; ``on``; ``name`` of a tool; ``value`` (m/s) of
-    # a ramp rate; ``measured`` (m, or None) of a reset; ``stamp`` (ns), ``reason`` and ``text`` of a refused
-    # command
+    # ``time`` of a humidity; ``value`` (twelve, m) of a drift; ``name`` and ``sha256`` of a model; ``on``; ``name``
+    # of a tool; ``value`` (m/s) of a ramp rate; ``measured`` (m, or None) of a reset; ``stamp`` (ns), ``reason`` and
+    # ``text`` of a refused command
     values: Mapping[str, Any]
 
 
@@ -213,6 +213,8 @@ class Journal:
             }
         elif what == "model":
             entry |= {"name": value.name, "sha256": self._sources["model"].sha256}
+        elif what == "drift":
+            entry["value"] = value.tolist()
         elif what == "reset":
             entry["measured"] = None if value is None else value.tolist()
             # Every refused first command resets anew; only the last reset counts, and a page stays short.
@@ -359,6 +361,7 @@ ENTRIES: dict[str, dict[str, Callable[[Any], Any]]] = {
     "temperature": {"name": str, "value": float, "time": lambda found: math.nan if found is None else float(found)},
     "humidity": {"value": float, "time": lambda found: math.nan if found is None else float(found)},
     "model": {"name": str, "sha256": str},
+    "drift": {"value": lambda found: [float(value) for value in found]},
     "enable": {"on": bool},
     "ramp_rate": {"value": float},
     "tool": {"name": str},
@@ -387,6 +390,8 @@ def _read_snapshot(content: Any) -> Snapshot:
         "lags": {name: [float(v) for v in numbers] for name, numbers in lags},
         "tool": str(state.get("tool", TOOL)),
     }
+    if "drift" in state:
+        beside["drift"] = [float(value) for value in state["drift"]]
 
     def words(key: str, *required: str) -> dict[str, str]:
         found = {name: str(value) for name, value in _object(content[key], f"snapshot.{key}").items()}

@@ -15,7 +15,7 @@ from .report import LONGEST_GAP, Report, following_error, tool_positions
 
 EVENT_COLOURS = {
     "temperature": "#8a6d3b", "humidity": "#1f78b4", "model": "#7b3294", "enable": "#2e8b57", "tool": "#b8860b",
-    "reset": "#555555",
+    "reset": "#555555", "drift": "#d95f02",
 }  # fmt: skip
 
 MOST_LABELS = 12  # more changes than this are drawn without their names

@@ -185,6 +185,8 @@ class _Run:
             self.compensator.set_temperature(values["name"], float(values["value"]), float(values["time"]))
         elif entry.what == "humidity":
             self.compensator.set_humidity(float(values["value"]), float(values["time"]))
+        elif entry.what == "drift" and self._files is not None:
+            self.compensator.set_drift(np.array(values["value"]))
         elif entry.what == "enable":
             self.compensator.enable(bool(values["on"]))
         elif entry.what == "ramp_rate":
@@ -227,7 +229,7 @@ class _Run:
 
 def _same_state(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Return whether two snapshots are the same, all NaN being one number."""
-    if one.keys() != other.keys() or any(one[name] != other[name] for name in BESIDE_NUMBERS):
+    if one.keys() != other.keys() or any(one.get(name) != other.get(name) for name in BESIDE_NUMBERS):
         return False
     nowhere = np.isnan(other["nominal"]).any()  # and where the platform is then means nothing
     names = [name for name in one if name not in BESIDE_NUMBERS and not (nowhere and name.startswith(PLACES))]

@@ -35,6 +35,7 @@ from .base import (
     SENSOR_QOS,
     MachineNode,
 )
+from .fusion import PoseInstrument
 from .interface import (
     PARAMETERS,
     PROGRAM,
@@ -101,6 +102,7 @@ class CompensatorNode(MachineNode):
         self._logged_problem = ""
         self._unestimated = 0  # stamp of an answer whose pose was not estimated yet, ns
         self._compensator: Compensator | None = None
+        self._instrument: PoseInstrument | None = None  # there with ``fusion.enabled``
 
     @property
     def compensator(self) -> Compensator:
@@ -153,8 +155,10 @@ class CompensatorNode(MachineNode):
         self._journal.finish(time.monotonic())
         self._forget()
         self.close_ends(*self._ends)
-        for part in (self._requests, self._pacing, self._outputs, self._journal):
-            part.close()
+        for part in (self._requests, self._pacing, self._outputs, self._journal, self._instrument):
+            if part is not None:
+                part.close()
+        self._instrument = None
         self._compensator = None
         return super().on_cleanup(state)
 
@@ -164,6 +168,8 @@ class CompensatorNode(MachineNode):
         if self._compensator is not None:
             self._thermometers.follow(*temperature_rules(self._options))
             self._compensator.set_ramp_rate(self._options["ramp_rate"])
+        if self._instrument is not None:
+            self._instrument.follow()
 
     def say_goodbye(self) -> None:
         """Publish a last status and wait until it has arrived."""
@@ -214,6 +220,9 @@ class CompensatorNode(MachineNode):
         )
         self._requests = Requests(self, status, self._files, self._forget)
         self._journal = JournalTopics(self, compensator, self._files.sources, ids)
+        if options["fusion.enabled"]:
+            frames = {ids[name]: pose for name, pose in compensator.geometry.work_frames.items()}
+            self._instrument = PoseInstrument(self, compensator, status, frames)
         self._ends.append(self.every(CHECK_PERIOD, self._check_state))
         self._ends.append(self.every(ESTIMATE_PERIOD, self._estimate_from_commands))
 
@@ -292,9 +301,12 @@ class CompensatorNode(MachineNode):
             status.reading_stamps.accept(sample)
             status.feedback.count += 1
             status.feedback.last = now
+            instrument = self._instrument
             if self._active:
-                self._outputs.estimate(pose, sample.stamp)
+                self._outputs.estimate(pose if instrument is None else instrument.weighed(pose), sample.stamp)
                 self._outputs.nominal(sample.stamp, track.mean)
+                if instrument is not None:  # last: readings of earlier moments go through the same core
+                    instrument.add_struts(struts, now - sample.age)
         except HexapodError as error:
             self._ignore("feedback " + error.reason, error.reason, f"strut_states ignored: {error}", str(error), now)
 
@@ -326,11 +338,16 @@ class CompensatorNode(MachineNode):
 
     def _estimate_from_commands(self) -> None:
         """Without feedback, estimate the pose from the newest command, at a rate that leaves the loop alone."""
-        stamp, self._unestimated = self._unestimated, 0
-        if not stamp or not self._active or self._status.fed(time.monotonic()):
+        stamp, self._unestimated, now = self._unestimated, 0, time.monotonic()
+        instrument = self._instrument if self._status.commands.count else None
+        if not (stamp or instrument) or not self._active or self._status.fed(now):
             return
         try:
-            self._outputs.estimate(self.compensator.estimate(self.compensator.command), stamp)
+            if stamp:
+                pose = self.compensator.estimate(self.compensator.command)
+                self._outputs.estimate(pose if instrument is None else instrument.weighed(pose), stamp)
+            if instrument is not None:
+                instrument.add_struts(self.compensator.command.tolist(), now)
         except HexapodError as error:
             self._status.bad_feedback.add(error.reason, str(error), time.monotonic())
             self.warn_of("estimate " + error.reason, f"no pose estimate: {error}")
@@ -340,6 +357,8 @@ class CompensatorNode(MachineNode):
     def _forget(self) -> None:
         """Forget the last command, but not where it has sent the struts."""
         self.compensator.reset()
+        if self._instrument is not None:
+            self._instrument.reset()
         for part in (self._track, self._stamps, self._pacing):
             part.reset()
         self._unestimated = self._outputs.answered = 0  # the velocity of the next command is zero
@@ -359,6 +378,8 @@ class CompensatorNode(MachineNode):
             self.get_logger().error(f"refusing commands: {problem}")
         self._logged_problem = problem
         self._requests.look(now)
+        if self._instrument is not None:
+            self._instrument.look(now)
         self._journal.tick(now)
         self._outputs.stop(not self._active or status.stops(now))
         level, text = status.judged(now) if self._active else (WARN, "not active")

@@ -21,6 +21,7 @@ from std_msgs.msg import Bool, ColorRGBA, String, UInt64
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ..compensation.compensator import DEFAULT_RAMP_RATE, Compensator
+from ..compensation.fusion import FusionRules
 from ..compensation.guards import Sample
 from ..compensation.journal import IDEAL_SOURCE, Journal, Source, sources_text
 from ..compensation.thermal import DEFAULT_TIME_CONSTANT, HUMIDITY_RATE, Plausibility
@@ -54,6 +55,8 @@ JOURNAL_QOS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
+
+RULES = FusionRules()
 
 PARAMETERS = read_table(f"""
 autostart | true |  | start | configure and activate at the start
@@ -104,6 +107,28 @@ humidity_rate_limit | {HUMIDITY_RATE} | 0 to 1 1/s | always | a humidity that ju
     refused; 0 = off
 heartbeat_rate | 50.0 | 0 to 1000 Hz | always | heartbeats per second; 0 = none
 marker_rate | 10.0 | 0 to 10 Hz | always | markers and joint states per second; 0 = none
+fusion.enabled | false |  | configure | weigh the tool's pose that an instrument measures, `tool_pose_measured`, with
+    that of the struts, and follow the machine's slow drift
+fusion.compensate | false |  | always | also correct that drift: it ramps as a change of model does; false ramps it out
+fusion.message | pose_with_covariance | pose_with_covariance, pose | configure | the instrument's message:
+    PoseWithCovarianceStamped, or PoseStamped
+fusion.position_deviation | {RULES.position_deviation:.1e} | 1e-09 to 0.01 m | always | standard deviation of the
+    instrument's positions where its message states none
+fusion.rotation_deviation | {RULES.rotation_deviation:.1e} | 1e-09 to 0.1 rad | always | the same of its rotations
+fusion.strut_deviation | {RULES.strut_deviation:.1e} | 0 to 0.001 m | always | standard deviation of a strut: its
+    encoder, and what the model leaves
+fusion.time_deviation | {RULES.time_deviation:.1e} | 0 to 0.1 s | always | standard deviation between the stamps of
+    instrument and struts: it lessens the weight of readings made on the way
+fusion.drift_rate | {RULES.drift_rate:.1e} | 0 to 0.001 m | always | by how much each of the base's displacements and
+    the struts may drift in a second (standard deviation; it grows with the root of time)
+fusion.initial_deviation | {RULES.initial:.1e} | 1e-09 to 0.001 m | always | by how much they may be off at the start,
+    and after `~/reset`
+fusion.limit | {RULES.limit:.1e} | 1e-06 to 0.005 m | always | no drift is larger: a reading that would make it so is
+    refused, and the drift stays
+fusion.gate_probability | {RULES.gate} | 0.5 to 0.999999 | always | a reading further off than this share of true ones
+    is wild and moves nothing (chi-square with six degrees of freedom)
+fusion.timeout | 10.0 | 0 to 86400 s | always | without a reading that counts for this long, diagnostics warn; the last
+    drift stays; 0 = off
 publish_array | false |  | configure | also publish `strut_commands_array` for ros2_controllers, in the order of
     joint_names
 publish_description | true |  | configure | publish the machine for robot_state_publisher and RViz: its URDF on
@@ -117,6 +142,7 @@ in   tool_pose_command       PoseStamped: commanded tool pose, frame_id a work f
      select_tool             String: tool by its name, for controllers; as parameter tool
      temperatures            Temperature: °C; frame_id names strut_1 to strut_6, base or platform
      humidity                RelativeHumidity: 0 to 1; for struts that swell
+     tool_pose_measured      PoseWithCovarianceStamped: an instrument's, with fusion.enabled
 out  strut_commands          JointState: compensated strut lengths, m
      strut_commands_array    Float64MultiArray: the commands in joint order, with publish_array
      strut_corrections       JointState: command − nominal, m

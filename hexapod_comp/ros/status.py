@@ -19,6 +19,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.logging import get_logging_directory
 
 from ..compensation.compensator import Compensator
+from ..compensation.fusion import Fusion
 from ..compensation.guards import Guard, Lately, OneSender, StampClock, StampGate
 from ..compensation.thermal import Thermometers
 from ..compensation.track import StrutTrack
@@ -188,13 +189,16 @@ class CompensatorStatus:
     def __init__(self, options: dict[str, Any], clock: StampClock) -> None:
         self.options, self.clock = options, clock
         self.command_stamps, self.reading_stamps = StampGate("command", clock), StampGate("reading", clock, capped=True)
+        self.pose_stamps = StampGate("measured pose", clock, capped=True)
+        self.fusion: Fusion | None = None
         self.track, self.log_space = StrutTrack(), LogSpace()
         self.commands, self.feedback = Flow(), Flow()  # accepted commands, usable measured struts
-        self.refusals, self.bad_feedback = Refusals(), Refusals()
+        self.refusals, self.bad_feedback, self.bad_poses = Refusals(), Refusals(), Refusals()
         self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
         self.waited = self.dropped = 0  # commands that have waited, and that a newer one has replaced
         self.behind = Lately()  # commands were handled late, by more than jitter
         self.frame_id = self.prediction_problem = ""  # of the last command; why no error is predicted
+        self.drift_problem = ""  # why the drift that an instrument shows is not compensated
         self.last_answered = 0  # stamp, ns; 0 before the first
         self.fresh_start = True  # no command is in force
         self.take_parameters()
@@ -220,7 +224,7 @@ class CompensatorStatus:
     def take_parameters(self) -> None:
         """Go by the parameters as they are now; others are looked up where they are needed."""
         self.command_stamps.max_age = self.options["max_command_age"]
-        self.reading_stamps.max_age = self.options["max_reading_age"]
+        self.reading_stamps.max_age = self.pose_stamps.max_age = self.options["max_reading_age"]
         self.track.limit = self.options["following_error_limit"]
         self.track.anywhere_after = self.options["start_without_feedback_after"]
 
@@ -259,6 +263,8 @@ class CompensatorStatus:
             yield ERROR, f"bad feedback: {reasons}"
         for topic, sender in disputed:
             yield ERROR, f"{topic} ignored: {sender.reason}: {sender.problem}"
+        if reasons := self.bad_poses.reasons(now):
+            yield WARN, f"measured poses rejected: {reasons}"
         if self.failed_reloads.recent(now):
             yield WARN, "the old model stays"
         if self.refused_resets.recent(now):
@@ -278,8 +284,11 @@ class CompensatorStatus:
             yield WARN, "running, commands are being missed"
         if self.behind.holds(now):
             yield WARN, "running, catching up with commands that came late"
-        for problem in filter(None, (self.prediction_problem, self.log_space.problem)):
+        problems = self.prediction_problem, self.drift_problem, self.log_space.problem
+        for problem in filter(None, (*problems, self.fusion.held if self.fusion is not None else "")):
             yield WARN, problem
+        if self.fusion is not None and 0.0 < self.options["fusion.timeout"] < now - self.fusion.last:
+            yield WARN, "no measured pose counts" if self.fusion.count else "waiting for the first measured pose"
         if self.track.waits(now):
             yield WARN, "waiting for strut_states: where the struts stand is not known"
         if not self.commands.count:
@@ -343,9 +352,32 @@ class CompensatorStatus:
         elif model.struts.moisture.any():
             values["humidity_percent"] = f"not known, taken as {100.0 * REFERENCE_HUMIDITY:g}"
         values |= {f"temperature.{name}_degC": f"{value:.2f}" for name, value in heard.items()}
+        values |= self._drift(now)
         if (unknown := temperatures.unknown_for(model.late_growth, now)) > 0.0:
             values["late_parts"] = f"not known for another {unknown:.0f} s: the readings began too short ago"
         return {**values, **self.refusals.values()}
+
+    def _drift(self, now: float) -> dict[str, str]:
+        """Return what is known by the pose instrument as key and value; nothing without one."""
+        if (fusion := self.fusion) is None:
+            return {}
+
+        def micro(values: np.ndarray) -> str:
+            return ", ".join(f"{1e6 * value:.2f}" for value in values)
+
+        return {
+            "fusion": "compensating" if self.options["fusion.compensate"] else "estimating",
+            "measured_poses": str(fusion.count),
+            "measured_pose_age_s": seconds(now - fusion.last),
+            "rejected_poses": str(self.bad_poses.total),
+            "last_rejected_pose": self.bad_poses.last_text,
+            "innovation_chi_square": f"{fusion.filter.chi_square:.2f}",
+            "drift_um": micro(fusion.drift[:3]),
+            "drift_turn_urad": micro(fusion.turn),
+            "drift_struts_um": micro(fusion.drift[6:]),
+            "drift_deviation_um": micro(np.sqrt(np.diagonal(fusion.filter.covariance))),
+            "drift_compensated_um": micro(self.compensator.drift),
+        }
 
     def stale(self, now: float) -> str:
         """Return the parts whose last temperature is too old."""

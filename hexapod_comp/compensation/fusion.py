@@ -1,0 +1,234 @@
+"""A pose instrument on the machine beside the struts: both weighed by their covariances in one Kalman filter.
+
+The state is what the machine has drifted since its model was fitted, twelve lengths, m: a rigid offset of the base in
+``base`` (three displacements, three rotations about the platform's home, times the machine's length) and six offsets
+of the struts. It walks at random. A reading is the tool's measured pose minus the one that forward kinematics find of
+the struts at the same moment. At one pose struts and base cannot be told apart: the covariance says so, and the
+struts' part shows as the machine moves. doc/theory.md, 11.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.special import gammaincinv
+
+from ..errors import CommandError, HexapodError
+from ..machine.geometry import HexapodGeometry
+from ..machine.kinematics import jacobian
+from ..pose import Pose
+from .compensator import DRIFT_STATES, Compensator
+
+KEPT = 1024  # Struts remembered: a second at 1 kHz
+MOST_WAITING = 32  # Readings that wait for the struts of their moment
+LONGEST_GAP = 0.1  # Struts further apart than this, s, are not interpolated
+
+
+@dataclass(frozen=True)
+class FusionRules:
+    """What is assumed of machine and instrument."""
+
+    drift_rate: float = 5e-8  # standard deviation that each state gains in a second, m; grows with the root of time
+    initial: float = 5e-6  # standard deviation of each state at the start, m
+    limit: float = 2e-4  # largest state, m: beyond, the filter holds
+    gate: float = 0.999  # probability that a reading as stated passes the gate
+    strut_deviation: float = 1e-6  # of a strut's reading, and of what the model leaves, m
+    time_deviation: float = 1e-3  # between the stamps of instrument and struts, s
+    position_deviation: float = 2e-6  # of the instrument, where its message states no covariance, m
+    rotation_deviation: float = 1e-5  # the same, rad
+
+    def covariance(self) -> np.ndarray:
+        """Return the covariance of a reading that states none, (6, 6), m and rad."""
+        return np.diag(np.repeat([self.position_deviation, self.rotation_deviation], 3) ** 2)
+
+
+class DriftFilter:
+    """A Kalman filter of a random walk, whose readings z = H·x + v pass a chi-square gate."""
+
+    def __init__(self, rules: FusionRules, states: int = DRIFT_STATES) -> None:
+        self.rules = rules
+        self.state, self.covariance = np.zeros(states), rules.initial**2 * np.eye(states)
+        self.time = math.nan  # of the newest reading, s
+        self.chi_square = 0.0  # of the last innovation
+
+    def predict(self, time: float) -> None:
+        """Let time pass up to `time`, s; earlier times change nothing."""
+        if time > self.time:
+            self.covariance = self.covariance + self.rules.drift_rate**2 * (time - self.time) * np.eye(len(self.state))
+        if not time <= self.time:
+            self.time = time
+
+    def update(self, reading: np.ndarray, observation: np.ndarray, noise: np.ndarray) -> None:
+        """Weigh a reading; a CommandError, ``wild_pose`` or ``drift_limit``, leaves state and covariance.
+
+        The covariance is written as a sum of squares (Joseph), which stays positive whatever is rounded.
+        """
+        innovation = reading - observation @ self.state
+        spread = observation @ self.covariance @ observation.T + noise
+        self.chi_square = float(innovation @ np.linalg.solve(spread, innovation))
+        allowed = 2.0 * float(gammaincinv(len(innovation) / 2.0, self.rules.gate))
+        if not self.chi_square <= allowed:
+            off = f"{1e3 * np.linalg.norm(innovation[:3]):.4f} mm, {1e3 * np.linalg.norm(innovation[3:]):.4f} mrad"
+            rule = f"{allowed:.3g} (probability {self.rules.gate:g})"
+            problem = f"the measured pose is {off} from the estimate: chi-square {self.chi_square:.4g}, allowed {rule}"
+            raise CommandError("wild_pose", problem)
+        gain = np.linalg.solve(spread, observation @ self.covariance).T
+        state = self.state + gain @ innovation
+        if (worst := float(np.abs(state).max())) > self.rules.limit:
+            limit = f"{self.rules.limit * 1e3:g} mm"
+            raise CommandError("drift_limit", f"the drift would be {worst * 1e3:.4f} mm, allowed {limit}: it is held")
+        kept = np.eye(len(state)) - gain @ observation
+        self.state, self.covariance = state, kept @ self.covariance @ kept.T + gain @ noise @ gain.T
+
+
+@dataclass(frozen=True)
+class PoseReading:
+    """What the instrument has measured."""
+
+    pose: Pose  # pose_tool_in_base
+    made: float  # monotonic time, s
+    covariance: np.ndarray  # (6, 6): displacement, m, and rotation vector, rad, along the axes of ``base``
+
+
+def checked_covariance(numbers: Sequence[float], rules: FusionRules) -> np.ndarray:
+    """Return the 36 numbers of a message as a matrix, (6, 6); all zero: what the rules state.
+
+    A CommandError, ``covariance``: they are no covariance, which is symmetric and positive definite.
+    """
+    matrix = np.array(numbers, dtype=float).reshape(6, 6)
+    if not matrix.any():
+        return rules.covariance()
+    size = np.sqrt(np.abs(matrix.diagonal()))
+    if np.isfinite(matrix).all() and (matrix.diagonal() > 0.0).all():
+        relative = matrix / np.outer(size, size)
+        if np.allclose(relative, relative.T, rtol=0.0, atol=1e-6) and np.linalg.eigvalsh(relative)[0] > 1e-9:
+            return matrix
+    raise CommandError("covariance", "the covariance must be symmetric and positive definite, or all zero: as stated")
+
+
+def strut_effect(geometry: HexapodGeometry, platform: Pose, tool: Pose) -> np.ndarray:
+    """Return how the tool is displaced (m) and turned (rad), along ``base``, per metre of each strut, (6, 6)."""
+    effect = np.linalg.inv(jacobian(geometry, platform))
+    effect[:3] += np.cross(effect[3:].T, tool.position - platform.position).T
+    return effect
+
+
+def observation(geometry: HexapodGeometry, platform: Pose, tool: Pose) -> np.ndarray:
+    """Return how the tool is displaced (m) and turned (rad), along ``base``, per unit of the state, (6, 12)."""
+    turns = np.eye(3) / geometry.characteristic_length
+    lift = np.cross(turns, tool.position - geometry.home.position).T
+    base = np.block([[np.eye(3), lift], [np.zeros((3, 3)), turns]])
+    return np.hstack([base, strut_effect(geometry, platform, tool)])
+
+
+class Fusion:
+    """The drift of one compensator's machine, by what a pose instrument measures: followed, and fed to it where asked.
+
+    Struts come in with the monotonic time of their making; a reading waits for the struts on either side of its own.
+    """
+
+    def __init__(self, compensator: Compensator, rules: FusionRules) -> None:
+        self._compensator, self.rules = compensator, rules
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew: no drift. What the compensator corrects of it already is taken back by :meth:`feed`."""
+        self.filter, self.held = DriftFilter(self.rules), ""
+        self._model, self._tool = self._compensator.model, self._compensator.geometry.tool_name
+        self._struts: deque[tuple[float, np.ndarray]] = deque(maxlen=KEPT)
+        self._waiting: deque[PoseReading] = deque(maxlen=MOST_WAITING)
+        self.count, self.last = 0, -math.inf  # readings weighed, and when the last of them was made
+
+    @property
+    def drift(self) -> np.ndarray:
+        """The state, shape (12,), m."""
+        return self.filter.state
+
+    @property
+    def turn(self) -> np.ndarray:
+        """The base's rotation vector, rad."""
+        return self.drift[3:6] / self._compensator.geometry.characteristic_length
+
+    def add(self, reading: PoseReading) -> list[CommandError]:
+        """Weigh a reading, now or when its struts come; return why what was ready is rejected."""
+        self._waiting.append(reading)
+        return self._weigh()
+
+    def add_struts(self, struts: Sequence[float], made: float) -> list[CommandError]:
+        """Remember struts; return why readings that waited for them are rejected."""
+        if not self._struts or made > self._struts[-1][0]:
+            self._struts.append((made, np.array(struts)))
+        return self._weigh() if self._waiting else []
+
+    def weighed(self, tool: np.ndarray) -> np.ndarray:
+        """Return the tool's pose as struts and instrument have it together, of what :meth:`.Compensator.estimate` just
+        returned for the struts; both as it has them, shape (12,)."""
+        left = self.drift - self._compensator.drift
+        if not left.any():
+            return tool
+        pose = Pose(tool[:3], tool[3:].reshape((3, 3)))
+        moved = self._observation(pose) @ left
+        turned = Rotation.from_rotvec(moved[3:]).as_matrix() @ pose.rotation
+        return np.concatenate([pose.position + moved[:3], turned.ravel()])
+
+    def feed(self, compensate: bool) -> None:
+        """Let the compensator correct the drift, or none; it ramps as any change of model does.
+
+        Another model begins without drift, and another tool with struts of its own. A HexapodError: what it would
+        correct breaks a limit, and what is corrected stays.
+        """
+        if self._compensator.model is not self._model:
+            self.reset()
+        self._compensator.set_drift(self.drift if compensate else np.zeros(DRIFT_STATES))
+
+    def _observation(self, tool: Pose) -> np.ndarray:
+        return observation(self._compensator.geometry, Pose(*self._compensator.platform_estimate), tool)
+
+    def _weigh(self) -> list[CommandError]:
+        rejected = []
+        if self._compensator.geometry.tool_name != self._tool or self._compensator.model is not self._model:
+            self._waiting.clear()  # measured with another tool, or judged by another model
+            self._tool = self._compensator.geometry.tool_name
+        while self._waiting and self._struts and self._waiting[0].made <= self._struts[-1][0]:
+            reading = self._waiting.popleft()
+            try:
+                self._take(reading)
+            except CommandError as error:
+                rejected.append(error)
+            except HexapodError as error:
+                rejected.append(CommandError("no_estimate", f"no pose of the struts at that moment: {error}"))
+        return rejected
+
+    def _take(self, reading: PoseReading) -> None:
+        struts, speed = self._struts_at(reading.made)
+        estimated = self._compensator.estimate(struts)
+        tool = Pose(estimated[:3].copy(), estimated[3:].reshape((3, 3)).copy())
+        rules, matrix = self.rules, self._observation(tool)
+        seen = np.concatenate([
+            reading.pose.position - tool.position,
+            Rotation.from_matrix(reading.pose.rotation @ tool.rotation.T).as_rotvec(),
+        ])  # fmt: skip
+        effect, moving = matrix[:, 6:], matrix[:, 6:] @ speed * rules.time_deviation
+        noise = reading.covariance + rules.strut_deviation**2 * effect @ effect.T + np.outer(moving, moving)
+        self.filter.predict(reading.made)
+        try:
+            self.filter.update(seen + matrix @ self._compensator.drift, matrix, noise)
+        except CommandError as error:
+            self.held = str(error) if error.reason == "drift_limit" else self.held
+            raise
+        self.held, self.count, self.last = "", self.count + 1, reading.made
+
+    def _struts_at(self, made: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return struts, m, and their speed, m/s, at a time, on the straight line between those before and after."""
+        times = np.array([at for at, _ in self._struts])
+        after = int(np.searchsorted(times, made))
+        if not 0 < after < len(times) or times[after] - times[after - 1] > LONGEST_GAP:
+            raise CommandError("no_struts", f"no struts within {LONGEST_GAP:g} s on either side of the measured pose")
+        (then, struts), (end, later) = self._struts[after - 1], self._struts[after]
+        speed = (later - struts) / (end - then)
+        return struts + speed * (made - then), speed

@@ -1,0 +1,125 @@
+"""The pose instrument of a compensator: reads and judges ``tool_pose_measured``, and feeds what it shows of the drift.
+
+What is made of the readings is :mod:`hexapod_comp.compensation.fusion`'s; doc/nodes.md has topic and parameters.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+
+from ..compensation.compensator import Compensator
+from ..compensation.fusion import Fusion, FusionRules, PoseReading, checked_covariance
+from ..compensation.guards import Sample
+from ..errors import CommandError, HexapodError, shorten
+from ..pose import Pose
+from .base import SENSOR_QOS, MachineNode
+from .messages import command_stamp, message_pose, read_message
+from .status import CompensatorStatus
+
+TOPIC = "tool_pose_measured"
+MESSAGES = {"pose_with_covariance": PoseWithCovarianceStamped, "pose": PoseStamped}
+FEED_PERIOD = 1.0  # How often the drift is handed to the compensation, s: it is slow, and each time a model is made
+
+
+def fusion_rules(options: dict[str, Any]) -> FusionRules:
+    """Return what is assumed, as parameters say."""
+    return FusionRules(
+        drift_rate=options["fusion.drift_rate"],
+        initial=options["fusion.initial_deviation"],
+        limit=options["fusion.limit"],
+        gate=options["fusion.gate_probability"],
+        strut_deviation=options["fusion.strut_deviation"],
+        time_deviation=options["fusion.time_deviation"],
+        position_deviation=options["fusion.position_deviation"],
+        rotation_deviation=options["fusion.rotation_deviation"],
+    )
+
+
+class PoseInstrument:
+    """Hears the instrument of a configured node; made only with ``fusion.enabled``."""
+
+    def __init__(
+        self, node: MachineNode, compensator: Compensator, status: CompensatorStatus, frames: dict[str, Pose]
+    ) -> None:
+        self._node, self._status, self._options, self._frames = node, status, status.options, frames
+        self._kind = MESSAGES[self._options["fusion.message"]]
+        self.end = node.obey(self._kind, TOPIC, self._on_reading, self._look, qos=SENSOR_QOS)
+        several = self._options["allow_several_publishers"]
+        status.sensing[TOPIC] = self._sender = node.sender_of(self.end, several)
+        self.fusion, self._fed = Fusion(compensator, fusion_rules(self._options)), -math.inf
+        status.fusion = self.fusion
+
+    def follow(self) -> None:
+        """Go by the parameters as they are now, from the next reading on."""
+        self.fusion.rules = self.fusion.filter.rules = fusion_rules(self._options)
+
+    def reset(self) -> None:
+        """Forget the drift; what is corrected of it ramps out."""
+        self.fusion.reset()
+        self._status.pose_stamps.reset()
+        self._fed = -math.inf
+        self.look(time.monotonic())
+
+    def look(self, now: float) -> None:
+        """Feed what is due."""
+        if now - self._fed < FEED_PERIOD:
+            return
+        self._fed, self._status.drift_problem = now, ""
+        try:
+            self.fusion.feed(bool(self._options["fusion.compensate"]))
+        except HexapodError as error:
+            self._status.drift_problem = f"drift not compensated: {error.reason}: {error}"
+            self._node.warn_of("drift", self._status.drift_problem)
+
+    def add_struts(self, struts: Sequence[float], made: float) -> None:
+        """Take struts, m, of a monotonic time, s, for the readings about them."""
+        self._reject(self.fusion.add_struts(struts, made))
+
+    def weighed(self, pose: np.ndarray) -> np.ndarray:
+        """Return what the compensator just estimated, weighed with the readings."""
+        return self.fusion.weighed(pose)
+
+    def close(self) -> None:
+        """Hear no more."""
+        self._status.fusion, self._status.drift_problem = None, ""
+        self._node.close_ends(self.end)
+
+    def _look(self) -> None:
+        self._status.look(time.monotonic())
+
+    def _on_reading(self, data: bytes, number: int | None) -> None:
+        sample, gate = Sample(now := time.monotonic()), self._status.pose_stamps
+        try:
+            if self._sender.hear(number, now):
+                self._look()
+            self._sender.check(sample)
+            message = read_message(data, self._kind)
+            sample.stamp, frame_id = command_stamp(message.header.stamp), message.header.frame_id
+            if frame_id not in self._frames:
+                allowed = ", ".join(self._frames)
+                raise CommandError("frame_id", f"frame_id must be one of {allowed}, not {shorten(frame_id)}")
+            gate.check(sample)
+            stated = [0.0] * 36
+            if self._kind is PoseWithCovarianceStamped:
+                stated, message = message.pose.covariance, message.pose
+            pose, frame = message_pose(message), self._frames[frame_id]
+            turn = np.kron(np.eye(2), frame.rotation)
+            covariance = turn @ checked_covariance(stated, self.fusion.rules) @ turn.T
+            gate.accept(sample)
+        except HexapodError as error:
+            self._reject([error])
+            return
+        if self._node.active:
+            self._reject(self.fusion.add(PoseReading(frame @ pose, now - sample.age, covariance)))
+
+    def _reject(self, errors: Sequence[HexapodError]) -> None:
+        for error in errors:
+            if self._node.active:
+                self._status.bad_poses.add(error.reason, str(error), time.monotonic())
+                self._node.warn_of(f"{TOPIC} {error.reason}", f"{TOPIC} ignored: {error}")

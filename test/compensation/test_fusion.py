@@ -1,0 +1,308 @@
+"""The drift that a pose instrument shows: a Kalman filter, and what the compensator makes of it.
+
+Truth: the Gaussian posterior of all readings at once, by dense matrices; chi-square intervals over seeds; rigid motion
+of the whole machine; finite differences of the core's forward kinematics; a machine of its own that has drifted.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foreign_machines import machines as zoo
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from hexapod_comp.compensation.compensator import Compensator, drifted
+from hexapod_comp.compensation.fusion import (
+    DRIFT_STATES,
+    DriftFilter,
+    Fusion,
+    FusionRules,
+    PoseReading,
+    checked_covariance,
+    observation,
+)
+from hexapod_comp.compensation.journal import Journal, Source, read_page
+from hexapod_comp.errors import CommandError, ModelError
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.model import MachineModel
+from hexapod_comp.pose import Pose
+
+CONFIG = Path(__file__).resolve().parents[2] / "config"
+
+RULES = FusionRules()
+MACHINES = ("paper", "framed", "hanging", "inches")
+
+
+@pytest.fixture(scope="module", params=[*MACHINES, "example_6_6"])
+def geometry(request, tmp_path_factory) -> HexapodGeometry:
+    if request.param == "example_6_6":
+        return load_geometry(CONFIG / "example_6_6.yaml")
+    return load_geometry(zoo()[request.param].write(tmp_path_factory.mktemp("machine") / "geometry.yaml"))
+
+
+@pytest.fixture(scope="module")
+def paper() -> HexapodGeometry:
+    return load_geometry(CONFIG / "paper.yaml")
+
+
+def poses(geometry: HexapodGeometry, count: int, seed: int = 0, reach: float = 0.03) -> list[Pose]:
+    """Return platform poses about home."""
+    rng, home = np.random.default_rng(seed), geometry.home
+    turns = Rotation.from_rotvec(0.05 * rng.standard_normal((count, 3))).as_matrix()
+    shifts = reach * rng.uniform(-1.0, 1.0, (count, 3))
+    return [Pose(home.position + shift, home.rotation @ turn) for shift, turn in zip(shifts, turns, strict=True)]
+
+
+def observed(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
+    return observation(geometry, platform, platform @ geometry.tool)
+
+
+def lengths(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
+    tips = platform.position + geometry.platform_joints @ platform.rotation.T
+    return np.linalg.norm(tips - geometry.base_joints, axis=1)
+
+
+# ---- the filter alone ----
+
+
+def test_the_filter_is_the_posterior_of_all_readings_at_once():
+    """Random walk and readings are jointly Gaussian: conditioned by dense matrices, without a recursion."""
+    rng, count, states = np.random.default_rng(1), 12, 5
+    rules = FusionRules(drift_rate=0.7, initial=1.3, limit=1e9, gate=1.0 - 1e-12)
+    times = np.sort(rng.uniform(0.0, 20.0, count))
+    matrices = rng.standard_normal((count, 3, states))
+    noises = [root @ root.T + np.eye(3) for root in rng.standard_normal((count, 3, 3))]
+    readings = 3.0 * rng.standard_normal((count, 3))
+    ours = DriftFilter(rules, states)
+    for time, reading, matrix, noise in zip(times, readings, matrices, noises, strict=True):
+        ours.predict(time)
+        ours.update(reading, matrix, noise)
+    since = times - times[0]
+    walk = np.kron(rules.initial**2 + rules.drift_rate**2 * np.minimum.outer(since, since), np.eye(states))
+    big, noise = np.zeros((3 * count, states * count)), np.zeros((3 * count, 3 * count))
+    for n in range(count):
+        big[3 * n : 3 * n + 3, states * n : states * n + states] = matrices[n]
+        noise[3 * n : 3 * n + 3, 3 * n : 3 * n + 3] = noises[n]
+    gain = walk @ big.T @ np.linalg.inv(big @ walk @ big.T + noise)
+    mean, covariance = gain @ readings.ravel(), walk - gain @ big @ walk
+    np.testing.assert_allclose(ours.state, mean[-states:], rtol=1e-9)
+    np.testing.assert_allclose(ours.covariance, covariance[-states:, -states:], rtol=1e-9, atol=1e-12)
+
+
+def test_the_stated_covariance_is_true(paper):
+    """Normalised squared errors over seeds are chi-square with twelve degrees of freedom, their mean within 99.9 %."""
+    seeds, steps, squares, passed = 60, 40, [], 0
+    matrices = [observed(paper, pose) for pose in poses(paper, steps, 3)]
+    noise = RULES.covariance()
+    for seed in range(seeds):
+        rng = np.random.default_rng([seed, 7])
+        true, ours = RULES.initial * rng.standard_normal(DRIFT_STATES), DriftFilter(RULES)
+        for step, matrix in enumerate(matrices):
+            true = true + (RULES.drift_rate * 3.0 * rng.standard_normal(DRIFT_STATES) if step else 0.0)
+            ours.predict(9.0 * step)
+            with suppress(CommandError):
+                ours.update(matrix @ true + rng.multivariate_normal(np.zeros(6), noise), matrix, noise)
+                passed += 1
+        off = true - ours.state
+        squares.append(off @ np.linalg.solve(ours.covariance, off))
+    low, high = chi2.ppf([0.0005, 0.9995], DRIFT_STATES * seeds) / seeds
+    assert low < np.mean(squares) < high
+    assert 0.995 < passed / (seeds * steps) < 1.0  # the gate lets 99.9 % pass
+
+
+@pytest.mark.parametrize("size", [np.nan, 5e-5, 1e-3, 10.0])
+def test_a_wild_reading_moves_nothing(paper, size):
+    ours, matrix = DriftFilter(RULES), observed(paper, paper.home)
+    ours.predict(0.0)
+    for _ in range(10):
+        ours.update(np.zeros(6), matrix, RULES.covariance())
+    before = ours.state.copy(), ours.covariance.copy()
+    with pytest.raises(CommandError, match=r"chi-square .*, allowed 22\.5 \(probability 0\.999\)") as caught:
+        ours.update(np.array([size, 0, 0, 0, 0, 0]), matrix, RULES.covariance())
+    assert caught.value.reason == "wild_pose"
+    np.testing.assert_array_equal(ours.state, before[0])
+    np.testing.assert_array_equal(ours.covariance, before[1])
+
+
+def test_a_drift_beyond_the_limit_is_held(paper):
+    rules = FusionRules(initial=1e-3, limit=5e-5)
+    ours, matrix = DriftFilter(rules), observed(paper, paper.home)
+    with pytest.raises(CommandError, match=r"allowed 0\.05 mm: it is held") as caught:
+        ours.update(matrix @ np.append(np.zeros(6), np.full(6, 3e-4)), matrix, rules.covariance())
+    assert caught.value.reason == "drift_limit"
+    assert not ours.state.any()
+
+
+def test_struts_and_base_are_told_apart_by_many_poses(geometry):
+    """At one pose the tool is known and six combinations keep what was assumed; many poses determine all twelve."""
+    rules = FusionRules(initial=1e-3, drift_rate=0.0, limit=1.0)
+    spreads = []
+    for places in ([geometry.home] * 200, poses(geometry, 200, 5, 0.08)):
+        ours = DriftFilter(rules)
+        for place in places:
+            ours.update(np.zeros(6), observed(geometry, place), rules.covariance())
+        spreads.append(np.sqrt(np.linalg.eigvalsh(ours.covariance)))
+        there = observed(geometry, geometry.home)
+        assert np.sqrt(np.diag(there @ ours.covariance @ there.T)[:3]).max() < 1e-6  # the tool
+    np.testing.assert_allclose(spreads[0][6:], rules.initial, rtol=1e-6)
+    assert spreads[1].max() < 0.1 * rules.initial
+
+
+# ---- the machine ----
+
+
+def test_what_is_observed_is_how_the_tool_moves(geometry):
+    """Finite differences of the core's forward kinematics; a rigid drift moves the tool with the whole machine."""
+    compensator = Compensator(geometry, MachineModel(geometry.name))
+    close = 0.05 if geometry.name == "example_6_6" else 1e-3  # its screws turn in their nuts as the platform turns
+    for place in poses(geometry, 3, 2):
+        struts, tool = lengths(geometry, place), place @ geometry.tool
+        expected, step = observation(geometry, place, tool), 1e-4
+        for state in range(DRIFT_STATES):
+            seen = []
+            for sign in (1.0, -1.0):
+                compensator.set_drift(sign * step * np.eye(DRIFT_STATES)[state])
+                found = compensator.estimate(struts)
+                turn = Rotation.from_matrix(found[3:].reshape(3, 3) @ tool.rotation.T).as_rotvec()
+                seen.append(np.concatenate([found[:3] - tool.position, turn]))
+            np.testing.assert_allclose((seen[0] - seen[1]) / (2.0 * step), expected[:, state], atol=close)
+    compensator.set_drift(np.zeros(DRIFT_STATES))
+    undrifted = compensator.estimate(struts)
+    tool = Pose(undrifted[:3].copy(), undrifted[3:].reshape(3, 3).copy())
+    drift = np.array([1e-4, -2e-4, 3e-4, 1e-4, 2e-4, -1e-4, *[0.0] * 6])
+    compensator.set_drift(drift)
+    found = compensator.estimate(struts)
+    turn = Rotation.from_rotvec(drift[3:6] / geometry.characteristic_length).as_matrix()
+    about = geometry.home.position
+    np.testing.assert_allclose(found[:3], about + drift[:3] + turn @ (tool.position - about), atol=2e-7)
+    np.testing.assert_allclose(found[3:].reshape(3, 3), turn @ tool.rotation, atol=2e-7)
+
+
+def followed(geometry: HexapodGeometry, drift: np.ndarray, wild: float = 0.0) -> tuple[Compensator, Fusion]:
+    """Return a compensator whose fusion has heard 300 readings of a machine that has drifted so."""
+    compensator, rng = Compensator(geometry, MachineModel(geometry.name)), np.random.default_rng(11)
+    truth = Compensator(geometry, drifted(geometry, MachineModel(geometry.name), drift))
+    fusion = Fusion(compensator, FusionRules(initial=3e-5))
+    rejected = 0
+    for n, place in enumerate(poses(geometry, 300, 4)):
+        struts, at = lengths(geometry, place), float(n)
+        real = truth.estimate(struts)
+        position = real[:3] + 1e-6 * rng.standard_normal(3)
+        if rng.random() < wild:
+            position = position + rng.choice([-1.0, 1.0]) * rng.uniform(3e-4, 1e-2, 3)
+        fusion.add_struts(struts, at - 0.01)
+        assert not fusion.add(PoseReading(Pose(position, real[3:].reshape(3, 3)), at, RULES.covariance()))
+        rejected += len(fusion.add_struts(struts, at + 0.01))
+        if n % 10 == 9:
+            fusion.feed(compensate=True)
+    assert (rejected > 0) == (wild > 0.0)
+    return compensator, fusion
+
+
+@pytest.mark.parametrize("wild", [0.0, 0.05])
+def test_the_compensator_follows_the_drift(geometry, wild):
+    """Commands for poses that it has not visited bring the drifted machine's tool there within its noise."""
+    drift = np.array([20, -15, 10, 8, -5, 12, 20, -10, 15, -20, 5, 10]) * 1e-6
+    compensator, fusion = followed(geometry, drift, wild)
+    truth = Compensator(geometry, drifted(geometry, MachineModel(geometry.name), drift))
+    left, before = [], []
+    compensator.set_ramp_rate(1.0)
+    for place in poses(geometry, 20, 9):
+        compensator.reset()
+        for n in range(3):  # the first begins where the struts stand, the next take the drift up
+            commands = compensator.correct(geometry.tool_pose(place), 0.02 * n).command
+        wanted = (place @ geometry.tool).position
+        left.append(truth.estimate(commands)[:3] - wanted)
+        before.append(truth.estimate(lengths(geometry, place))[:3] - wanted)
+    assert np.sqrt(np.mean(np.square(left))) < 0.1 * np.sqrt(np.mean(np.square(before)))
+    np.testing.assert_array_equal(compensator.drift, fusion.drift)
+
+
+def test_the_estimate_is_the_weighted_pose_and_the_compensation_need_not_follow(paper):
+    compensator, fusion = followed(paper, np.array([0, 0, 2e-5, *[0.0] * 9]))
+    fusion.feed(compensate=False)
+    assert not compensator.drift.any()
+    struts = lengths(paper, paper.home)
+    seen = fusion.weighed(compensator.estimate(struts))
+    compensator.set_drift(fusion.drift)
+    np.testing.assert_allclose(seen, compensator.estimate(struts), atol=1e-9)
+    assert seen[2] - (paper.home @ paper.tool).position[2] == pytest.approx(2e-5, abs=1e-6)
+
+
+def test_another_model_and_a_reset_begin_without_drift(paper):
+    compensator, fusion = followed(paper, np.array([0, 0, 2e-5, *[0.0] * 9]))
+    compensator.set_model(MachineModel(paper.name, "new"))
+    assert not compensator.drift.any()
+    fusion.feed(compensate=True)
+    assert (fusion.drift.any(), compensator.drift.any(), fusion.count) == (False, False, 0)
+
+
+def test_a_snapshot_and_the_journal_hold_the_drift(paper):
+    compensator = Compensator(paper, MachineModel(paper.name))
+    assert "drift" not in compensator.snapshot()
+    sources = {name: Source.of(name, "") for name in ("geometry", "model")}
+    journal = Journal(compensator, sources, {"base": "base", "work": "work"})
+    drift = 1e-6 * np.arange(12.0)
+    compensator.set_drift(drift)
+    page = read_page(journal.page(0.0))
+    assert [(entry.what, entry.values["value"]) for entry in page.entries] == [("drift", drift.tolist())]
+    again = Compensator(paper, MachineModel(paper.name))
+    assert page.snapshot is not None
+    again.restore(page.snapshot.state)
+    np.testing.assert_array_equal(again.drift, drift)
+    struts = lengths(paper, paper.home)
+    np.testing.assert_array_equal(again.estimate(struts), compensator.estimate(struts))
+
+
+@pytest.mark.parametrize("wrong", [np.zeros(6), np.full(12, np.nan)])
+def test_a_drift_that_is_none_is_refused(paper, wrong):
+    compensator = Compensator(paper, MachineModel(paper.name))
+    with pytest.raises(ModelError, match="12 finite numbers"):
+        compensator.set_drift(wrong)
+    with pytest.raises(ModelError, match="12 finite numbers"):
+        compensator.restore({**compensator.snapshot(), "drift": wrong.tolist()})
+
+
+def test_a_reading_needs_struts_of_its_moment(paper):
+    fusion, struts = Fusion(Compensator(paper, MachineModel(paper.name)), RULES), lengths(paper, paper.home)
+    reading = PoseReading(paper.home @ paper.tool, 1.0, RULES.covariance())
+    assert not fusion.add(reading)
+    for made, since in ((1.1, "none before"), (1.2, "")):
+        (error,) = fusion.add_struts(struts, made) or [None]
+        assert (error is None) == (not since)
+        assert error is None or error.reason == "no_struts"
+    assert fusion.count == 0
+
+
+def test_a_machine_that_moves_makes_its_own_reading_uncertain(paper):
+    """A millisecond between the clocks is 0.1 mm at 100 mm/s: no wild reading, and hardly a weight."""
+    fusion = Fusion(Compensator(paper, MachineModel(paper.name)), RULES)
+
+    def moved(way: float) -> Pose:
+        return Pose(paper.home.position + np.array([way, 0.0, 0.0]), np.eye(3))
+
+    home, ahead = lengths(paper, paper.home), lengths(paper, moved(1e-3))
+    fusion.add_struts(home, 0.0)
+    fusion.add_struts(ahead, 0.01)
+    late = moved(6e-4) @ paper.tool
+    assert not fusion.add(PoseReading(late, 0.005, RULES.covariance()))
+    assert fusion.count == 1
+    assert np.abs(fusion.drift).max() < 1e-6
+
+
+@pytest.mark.parametrize("change", [(0, np.nan), (0, -1.0), (0, 0.0), (1, 0.5), (7, np.inf)])
+def test_a_covariance_that_is_none_is_rejected(change):
+    numbers = np.eye(6).ravel()
+    numbers[change[0]] = change[1]
+    with pytest.raises(CommandError, match="symmetric and positive definite") as caught:
+        checked_covariance(numbers.tolist(), RULES)
+    assert caught.value.reason == "covariance"
+
+
+def test_a_covariance_of_zeros_is_the_stated_one():
+    np.testing.assert_array_equal(checked_covariance([0.0] * 36, RULES), RULES.covariance())
+    np.testing.assert_array_equal(checked_covariance((4.0 * np.eye(6)).ravel().tolist(), RULES), 4.0 * np.eye(6))
