@@ -73,7 +73,7 @@ class DriftFilter:
         self.chi_square = float(innovation @ np.linalg.solve(spread, innovation))
         allowed = 2.0 * float(gammaincinv(len(innovation) / 2.0, self.rules.gate))
         if not self.chi_square <= allowed:
-            off = f"{1e3 * np.linalg.norm(innovation[:3]):.4f} mm, {1e3 * np.linalg.norm(innovation[3:]):.4f} mrad"
+            off = f"{1e3 * math.hypot(*innovation[:3]):.4g} mm, {1e3 * math.hypot(*innovation[3:]):.4g} mrad"
             rule = f"{allowed:.3g} (probability {self.rules.gate:g})"
             problem = f"the measured pose is {off} from the estimate: chi-square {self.chi_square:.4g}, allowed {rule}"
             raise CommandError("wild_pose", problem)

@@ -181,3 +181,29 @@ def test_a_machine_without_feedback_is_measured_beside_its_commands(rig, tmp_pat
         rig.ask(HOME)
     rig.step(0.1)
     assert off(rig) == pytest.approx(1e-5, abs=1e-6)
+
+
+def test_nothing_steps_whatever_the_instrument_says(rig, tmp_path):
+    """Two hundred messages, good, wild, late, NaN, doubled: no correction changes by more than the ramp."""
+    started(rig, tmp_path, **{"fusion.compensate": True, "ramp_rate": 1e-4})
+    say, rng = instrument(rig).say, np.random.default_rng(5)
+    wrong = [
+        {"x": math.nan},
+        {"x": 1e300},
+        {"w": 0.5},
+        {"late": 0.3},
+        {"late": 3.0},
+        {"late": -3.0},
+        {"variance": -1.0},
+    ]
+    rows = []
+    for _ in range(200):
+        size = float(rng.choice([0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1.0]))
+        kind = rng.integers(3)
+        measured(rig, say, 1, size * rng.standard_normal(), **(rng.choice(wrong) if kind == 0 else {}))
+        if kind == 1:
+            say(1e-5)
+            say(1e-5, late=0.001)
+        rows.append(rig.seen["strut_corrections"][-1].position.tolist())
+    assert np.abs(np.diff(rows, axis=0)).max() <= 1e-4 * 0.02 + 1e-12  # ramps count 20 ms of a pause at most
+    assert int(rig.values()["rejected_poses"]) > 50
