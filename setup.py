@@ -39,7 +39,15 @@ def shared_files(folder: str) -> list[tuple[str, list[str]]]:
     return found
 
 
-INTERFACES = ("diagnostic-msgs", "geometry-msgs", "sensor-msgs", "std-msgs", "std-srvs", "visualization-msgs")
+INTERFACES = (
+    "diagnostic-msgs",
+    "geometry-msgs",
+    "sensor-msgs",
+    "std-msgs",
+    "std-srvs",
+    "trajectory-msgs",
+    "visualization-msgs",
+)
 
 setup(
     name=NAME,
@@ -139,6 +147,7 @@ setup(
             f"hexapod_comp = {NAME}.cli:main",
             f"compensator = {NAME}.ros:start_compensator",
             f"strut_drive = {NAME}.ros:start_strut_drive",
+            f"mover = {NAME}.ros:start_mover",
             f"linuxcnc_bridge = {NAME}.linuxcnc:start_bridge",
             f"linuxcnc_machine = {NAME}.linuxcnc:start_machine",
             f"hal_sweep = {NAME}.linuxcnc.hal:main",

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from .machine.path import Motion as Motion
     from .machine.path import StrutRates as StrutRates
     from .machine.path import plan_motion as plan_motion
+    from .machine.path import plan_program as plan_program
     from .machine.pose_files import read_poses as read_poses
     from .measurements.files import read_measurements as read_measurements
     from .measurements.readings import MeasurementSet as MeasurementSet
@@ -76,7 +77,7 @@ _HOMES = {
     "machine.limits": ("Limits",),
     "machine.model": ("MachineModel", "RealMachine", "Temperatures"),
     "machine.model_file": ("load_model", "save_model"),
-    "machine.path": ("Motion", "StrutRates", "plan_motion"),
+    "machine.path": ("Motion", "StrutRates", "plan_motion", "plan_program"),
     "machine.pose_files": ("read_poses",),
     "measurements.files": ("read_measurements",),
     "measurements.readings": ("MeasurementSet",),

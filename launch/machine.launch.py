@@ -21,6 +21,13 @@ from launch_ros.actions import Node
 from hexapod_comp.formats.paths import config_file
 
 FLAG = ["true", "false"]
+MOVERS = (
+    "autostart",
+    "use_sim_time",
+    "base_frame",
+    "work_frame",
+    "frame_prefix",
+)  # What mover has of compensator's parameters
 RANGES = ["LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT"]
 DESCRIBED = f"{shlex.quote(sys.executable)} -m hexapod_comp.ros.described"
 """Starts robot_state_publisher with the URDF that the compensator publishes: of the machine that it runs."""
@@ -41,6 +48,7 @@ def generate_launch_description() -> LaunchDescription:
             "autostart", default_value="", choices=["", *FLAG], description="Activate unasked; empty: as in the node."
         ),
         argument("simulate", default_value="true", choices=FLAG, description="Start strut_drive too."),
+        argument("mover", default_value="false", choices=FLAG, description="Start mover too: it commands the tool."),
         argument("description", default_value="false", choices=FLAG, description="Start robot_state_publisher."),
         argument("rviz", default_value="false", choices=FLAG, description="Start RViz and robot_state_publisher."),
         argument("frame_prefix", default_value="", description="In front of all frames, as left/ of left/base."),
@@ -88,6 +96,9 @@ def _nodes(context: LaunchContext) -> list[Node]:
     nodes = [_node("compensator", given, [*files, common | model])]
     if given("simulate") == "true":
         nodes.append(_node("strut_drive", given, [*files, common | truth]))
+    if given("mover") == "true":
+        frames = {key: value for key, value in (common | model).items() if key in MOVERS}
+        nodes.append(_node("mover", given, [*files, frames]))
     if "true" in (given("description"), given("rviz")):
         nodes.append(_helper("robot_state_publisher", given, [{"frame_prefix": prefix, **clock}], prefix=DESCRIBED))
     if given("rviz") == "true":

@@ -7,18 +7,23 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..compensation.checks import check
 from ..compensation.journal import LARGEST_SOURCE, Source
 from ..compensation.travel import travel, travel_text
 from ..errors import HexapodError, InputFileError
 from ..formats.paths import confined_file, confined_opener
+from ..machine.geometry import BASE
 from ..machine.model import MachineModel, RealMachine
+from ..machine.path import Motion, StrutRates, plan_motion, plan_program
 from ..machine.temperatures import Temperatures
+from ..machine.trajectory import join
 from ..pose import Pose
 
 NICENESS = 10  # Commands come first
@@ -73,6 +78,37 @@ class Machine:
         stops = {f"{one.way} stops at": str(one.error or "") for one in ways}
         return travel_text(ways), {**{one.key: f"{one.shown:.6f}" for one in ways}, **stops}
 
+    def plan_move(
+        self, poses: list[Pose], times: list[float], pivot: np.ndarray, tool: str, rate: float, share: float
+    ) -> list[Motion]:
+        """Return the motions from the first pose to the others, in ``base``; a program where there are times.
+
+        Raises the first limit that is broken on the way.
+        """
+        geometry = self.geometry.using(tool, BASE)
+        rates = StrutRates.of(geometry, rate, share)
+        if times:
+            motions = plan_motion(geometry, poses[:2], rates, pivot)
+            motions.append(plan_program(geometry, poses[1:], times, rates))
+        else:
+            motions = plan_motion(geometry, poses, rates, pivot)
+        if motions:
+            path = join([motion.sample(rate) for motion in motions])
+            checked = check(geometry, self.model, (path.positions, path.rotations), "stream", rate)
+            if checked.breaches:
+                first = checked.breaches[0]
+                place = ", ".join(f"{1e3 * value:.3f}" for value in path.positions[first.row])
+                raise PlanError(
+                    f"{first.error}, {first.row / rate:.2f} s after the start, at x, y, z {place} mm in base"
+                )
+        return motions
+
+
+class PlanError(HexapodError):
+    """A limit would be broken on the way."""
+
+    reason = "limit"
+
 
 class Jobs:
     """Does one job after another; the machine that they are about stays until another is given."""
@@ -89,7 +125,12 @@ class Jobs:
             if task == "load_model":
                 return "", load_model(**arguments)
             self._machine = self._machine or Machine(**self._made_of)
-            return "", (self._machine.predict if task == "predict" else self._machine.travel)(**arguments)
+            tasks: dict[str, Callable[..., Any]] = {
+                "predict": self._machine.predict,
+                "travel": self._machine.travel,
+                "plan_move": self._machine.plan_move,
+            }
+            return "", tasks[task](**arguments)
         except (HexapodError, OSError) as error:
             return str(error), None
         except Exception as error:  # else the process would end, and nobody know why

@@ -1,4 +1,4 @@
-"""Running machines, simulated or your own: ``run``, ``demo``, ``watch``, ``echo``, ``record``, ``replay``."""
+"""Running machines, simulated or your own: ``run``, ``move``, ``demo``, ``watch``, ``echo``, ``record``, ``replay``."""
 
 from __future__ import annotations
 
@@ -118,6 +118,30 @@ def demo(args: argparse.Namespace) -> Result:
         pictures=lambda: _drawn(args, result, rows, title, calibration),
         code=1 if complaints else 0,
     )
+
+
+def move(args: argparse.Namespace) -> Result:
+    """Have the mover move the tool, or stop it; 0 when it has arrived, or stands."""
+    from ..pose import Pose
+    from ..ros import heard_signals, keep_discovery_local
+    from ..ros.client import Machine, MoveState
+
+    keep_discovery_local()
+    signals = heard_signals()
+    with Machine(args.namespace) as machine, results.stage_line() as say:
+        if args.stop:
+            machine.stop()
+        else:
+
+            def shown(state: MoveState) -> None:
+                say(f"{state.state} {100.0 * state.share:3.0f} %, {state.time_left:.1f} s left")
+                if signals:
+                    machine.stop()
+
+            machine.move(Pose.from_angles(*args.pose), args.frame, args.relative, args.timeout_s, shown)
+        state = machine.last
+    content = {"state": state.state, "text": state.text, "stopped_by": state.stopped_by}
+    return Result(lambda: f"{state.state}: {state.text}", lambda: content)
 
 
 def watch(args: argparse.Namespace) -> int:

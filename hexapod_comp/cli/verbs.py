@@ -269,6 +269,30 @@ example:
   $ hexapod_comp run poses.csv --machine mine.yaml --truth random:7 --model model.yaml
   $ hexapod_comp run poses.csv --attach --rate-hz 100     (nodes already running in this ROS domain)""",
     ),
+    "move": Verb(
+        "running", "loop",
+        "move the tool of a running machine to a pose, and wait until it has arrived",
+        (
+            value("--pose", pose, SHAPE, f"where to, {POSE_HELP}"),
+            value("--frame", None, "NAME", "frame of the pose: work (default), base or a named one; with --relative "
+                  "also tool", default="work"),
+            flag("--relative", "go on from where the tool stands, along and about the frame's axes"),
+            flag("--stop", "brake the move that is under way, within the struts' limits"),
+            value("--timeout-s", above_zero, "S", "stop a move that takes longer (default 3600)", default=3600.0),
+            NAMESPACE,
+            JSON,
+        ),
+        """Asks the node mover, which plans a straight line and the shortest turn in the least time that the struts'
+speed, acceleration and jerk allow, checks every limit along it first, and holds the tool at its end. The tool has
+arrived when its estimate has settled within the mover's tolerances. Ctrl-C brakes. Exit code: 0 arrived, or stopped by
+--stop; 2 refused, or stopped on the way, with the reason.
+
+example:
+  $ ros2 run hexapod_comp mover     (beside the compensator)
+  $ hexapod_comp move --pose 0,0,410,0,0,5
+  $ hexapod_comp move --pose 0,0,2 --relative --frame tool""",
+        (exactly_one("--pose", "--stop"),),
+    ),
     "demo": Verb(
         "running", "loop",
         "measure, fit and compensate a machine: what is left of its errors",

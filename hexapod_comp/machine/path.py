@@ -17,7 +17,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.interpolate import CubicSpline, make_interp_spline
+from scipy.spatial.transform import Rotation, RotationSpline
 
 from ..errors import GeometryError, PoseError
 from ..pose import Pose
@@ -26,7 +27,7 @@ from .trajectory import SHARE_OF_LIMIT, Path
 
 # Where the machine file has no limit: times in which a strut reaches its speed, and its acceleration, s
 SPEED_UP, JERK_UP = 0.1, 0.02
-SECTIONS = 200  # Of a leg, between which ṡ² is linear in s
+SECTIONS, MOST_SECTIONS = 200, 4000  # Of a leg, and of a program, between which ṡ² is linear in s
 SPREADS = (1.0, 0.3, 0.1)  # How far the search looks around the best yet, in logarithms of a share of a limit
 CANDIDATES = 6  # Each way in one round of the search
 SLACK = 1e-4  # By which limits are kept more tightly: s is examined at the grid's times and between, not everywhere
@@ -129,11 +130,43 @@ class Leg:
         return q, q1, q2, q3
 
 
-def time_optimal(q1: np.ndarray, q2: np.ndarray, speed: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
+class Course:
+    """The way of a program: a smooth curve through tool poses, with s the share of the program's own time."""
+
+    def __init__(self, geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequence[float]) -> None:
+        shares = (np.asarray(times, dtype=float) - times[0]) / (times[-1] - times[0])
+        self._ends = poses[0], poses[-1]
+        self._line = CubicSpline(shares, [pose.position for pose in poses], bc_type="clamped")
+        self._turns = RotationSpline(shares, Rotation.from_matrix(np.array([pose.rotation for pose in poses])))
+        self.longest = 1.0 / (times[-1] - times[0])  # ṡ that the program's own times allow
+        self.sections = int(np.clip(4 * len(poses), SECTIONS, MOST_SECTIONS))
+        fine = np.linspace(0.0, 1.0, 4 * self.sections + 1)
+        base = (geometry.base_joints - geometry.work.position) @ geometry.work.rotation
+        in_tool = (geometry.platform_joints - geometry.tool.position) @ geometry.tool.rotation
+        positions, rotations = self.poses(fine)
+        joints = positions[:, None] + np.einsum("nij,kj->nki", rotations, in_tool)
+        self._lengths = make_interp_spline(fine, np.linalg.norm(joints - base, axis=2), k=5)
+
+    def poses(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the tool's positions, (n, 3), and rotations, (n, 3, 3), at shares s; at 0 and 1 as given."""
+        positions, rotations = self._line(s), self._turns(s).as_matrix()
+        for at, pose in zip((0.0, 1.0), self._ends, strict=True):
+            positions[s == at], rotations[s == at] = pose.position, pose.rotation
+        return positions, rotations
+
+    def struts(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the struts' nominal lengths and their first three derivatives by s, each (n, 6)."""
+        q, q1, q2, q3 = (self._lengths(s, nu=order) for order in range(4))
+        return q, q1, q2, q3
+
+
+def time_optimal(
+    q1: np.ndarray, q2: np.ndarray, speed: np.ndarray, acceleration: np.ndarray, fastest: float = np.inf
+) -> np.ndarray:
     """Return ṡ², (N + 1, C), on N equal sections of s from rest to rest, for C pairs of limits.
 
     q1 and q2, (N + 1, 6), are the struts' derivatives by s. Each section's acceleration is held against the limits
-    at both its ends.
+    at both its ends; ṡ is nowhere above `fastest`.
     """
     sections = len(q1) - 1
     width = 2.0 / sections  # ṡ² grows by this times s̈
@@ -142,8 +175,8 @@ def time_optimal(q1: np.ndarray, q2: np.ndarray, speed: np.ndarray, acceleration
     b, a = np.where(a < 0.0, -b, b), np.maximum(np.abs(a), 1e-12 * np.abs(q1).max())
     slope = (b / a)[:, :, None]  # The limits are −most − slope ṡ² ≤ s̈ ≤ most − slope ṡ²
     most = acceleration / a[:, :, None]
-    highest = (speed / np.maximum(np.abs(q1), 1e-300).max(axis=1)[:, None]) ** 2
-    with np.errstate(divide="ignore"):
+    highest = np.minimum(speed / np.maximum(np.abs(q1), 1e-300).max(axis=1)[:, None], fastest) ** 2
+    with np.errstate(divide="ignore", over="ignore"):
         for i in range(a.shape[1]):  # Where the upper limit of one strut meets the lower one of another
             fall = slope[:, [i]] - slope
             meet = np.where(fall > 0.0, (most[:, [i]] + most) / np.maximum(fall, 1e-300), np.inf)
@@ -218,7 +251,7 @@ class Profile:
 
 
 def strut_motion(
-    leg: Leg, s: np.ndarray, v: np.ndarray, a: np.ndarray, j: np.ndarray
+    leg: Leg | Course, s: np.ndarray, v: np.ndarray, a: np.ndarray, j: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the struts' speeds, accelerations and jerks, each (n, 6), of s and its derivatives by time, each (n,)."""
     _, q1, q2, q3 = leg.struts(s)
@@ -232,7 +265,7 @@ class Motion:
 
     Attributes
     ----------
-    leg : Leg
+    leg : Leg or Course
         The way.
     profile : Profile
         The share of the way over time.
@@ -240,7 +273,7 @@ class Motion:
         What the struts may do.
     """
 
-    leg: Leg
+    leg: Leg | Course
     profile: Profile
     rates: StrutRates
 
@@ -372,15 +405,43 @@ def plan_motion(
     return [Motion(leg, _fastest(leg, rates), rates) for leg in legs if leg.travel.any() or leg.turn.any()]
 
 
-def _fastest(leg: Leg, rates: StrutRates) -> Profile:
-    """Return the profile of least time along a leg."""
-    _, q1, q2, _ = leg.struts(np.linspace(0.0, 1.0, SECTIONS + 1))
+def plan_program(geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequence[float], rates: StrutRates) -> Motion:
+    """Return the motion along a program of tool poses with times, from rest to rest.
+
+    The tool goes on a smooth curve through the poses, never ahead of the program's own pace, and slows down where a
+    strut would be too fast.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        The machine, with the tool and the work frame that are used.
+    poses : sequence of Pose
+        ``pose_tool_in_work``; neighbours turned by less than 180°.
+    times : sequence of float
+        Ascending, s.
+    rates : StrutRates
+        What the struts may do.
+
+    Raises
+    ------
+    GeometryError
+        Fewer than two poses, other times than poses, or times that do not ascend.
+    """
+    if not (len(poses) == len(times) >= 2 and np.isfinite(times).all() and (np.diff(times) > 0.0).all()):
+        raise GeometryError("times", "must ascend and be as many as the poses, at least 2", list(times)[:5])
+    course = Course(geometry, poses, times)
+    return Motion(course, _fastest(course, rates, course.sections, course.longest), rates)
+
+
+def _fastest(leg: Leg | Course, rates: StrutRates, sections: int = SECTIONS, fastest: float = np.inf) -> Profile:
+    """Return the profile of least time along a leg, with ṡ no more than `fastest`."""
+    _, q1, q2, _ = leg.struts(np.linspace(0.0, 1.0, sections + 1))
     largest = np.abs(q1).max()
     if not (np.isfinite(largest) and largest > 0.0):
         raise GeometryError("poses", "must move the struts by finite lengths", float(largest))
     if not np.isfinite(rates.jerk):
-        square = time_optimal(q1, q2, np.array([rates.speed]), np.array([rates.acceleration]))
-        return _kept_within(leg, Profile.of(square[:, 0], 0.0), rates)
+        square = time_optimal(q1, q2, np.array([rates.speed]), np.array([rates.acceleration]), fastest)
+        return _kept_within(leg, Profile.of(square[:, 0], 0.0), rates, fastest)
     # Seven phases of the strut that goes farthest, as if its length were linear in s: where the search begins
     way = largest
     acceleration = min(
@@ -395,17 +456,18 @@ def _fastest(leg: Leg, rates: StrutRates) -> Profile:
             np.unique(np.minimum(acceleration * around, rates.acceleration)),
             np.unique(np.minimum(speed * around, rates.speed)),
         )
-        squares = time_optimal(q1, q2, tried_v.ravel(), tried_a.ravel())
+        squares = time_optimal(q1, q2, tried_v.ravel(), tried_a.ravel(), fastest)
         for square, v, a in zip(squares.T, tried_v.ravel(), tried_a.ravel(), strict=True):
             found = Profile.of(square, float(a / rates.jerk))
             if found.duration < best.duration:
-                found = _kept_within(leg, found, rates)
+                found = _kept_within(leg, found, rates, fastest)
             if found.duration < best.duration:
                 best, speed, acceleration = found, float(v), float(a)
     return best
 
 
-def _kept_within(leg: Leg, profile: Profile, rates: StrutRates) -> Profile:
-    """Return a profile, run slowly enough for the rates; a slower one scales all derivatives by time."""
-    excess = rates.excess(*strut_motion(leg, *profile.at(profile.breaks())))
-    return Profile(profile.times, profile.speeds, profile.window, float(excess) * (1.0 + SLACK))
+def _kept_within(leg: Leg | Course, profile: Profile, rates: StrutRates, fastest: float) -> Profile:
+    """Return a profile, run slowly enough for the rates and `fastest`; a slower one scales all derivatives by time."""
+    excess = float(rates.excess(*strut_motion(leg, *profile.at(profile.breaks()))))
+    slowed = max(excess * (1.0 + SLACK), float(profile.speeds.max()) / fastest)
+    return Profile(profile.times, profile.speeds, profile.window, slowed)

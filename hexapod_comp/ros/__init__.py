@@ -99,3 +99,8 @@ def start_compensator() -> int:
 def start_strut_drive() -> int:
     """Run the executable ``strut_drive``."""
     return start("hexapod_comp.ros.strut_drive")
+
+
+def start_mover() -> int:
+    """Run the executable ``mover``."""
+    return start("hexapod_comp.ros.mover")

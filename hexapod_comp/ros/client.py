@@ -1,4 +1,5 @@
-"""A client of the two nodes: sends poses, keeps what comes back. Used by ``run``, ``demo`` and benchmarks."""
+"""Clients of the nodes: :class:`LoopClient` sends poses one by one, for ``run``, ``demo`` and benchmarks;
+:class:`Machine` has the mover move the tool."""
 
 from __future__ import annotations
 
@@ -9,16 +10,16 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
-from ..errors import NoAnswerError
+from ..errors import HexapodError, NoAnswerError
 from ..machine.trajectory import Path
 from ..pose import Pose
-from .base import COMMAND_QOS, EVENT_QOS, NEWEST_QOS
+from .base import COMMAND_QOS, EVENT_QOS, LATCHED_QOS, NEWEST_QOS
 from .messages import StrutReader, message_pose, nanoseconds_of, pose_message
 from .process import RosSession
 from .status import status_prefix
@@ -240,3 +241,170 @@ class LoopClient:
             return len(history) == 25 and float(np.ptp(np.array(history), axis=0).max()) < 20e-9
 
         return quiet
+
+
+class MoveError(HexapodError):
+    """A move was refused, or has ended before its target; ``reason`` is what ended it: limit, refusal, person, …"""
+
+    def __init__(self, reason: str, text: str) -> None:
+        super().__init__(f"{reason}: {text}")
+        self.reason = reason
+
+
+@dataclass(frozen=True)
+class MoveState:
+    """What the mover reports of a move."""
+
+    state: str  # idle, planning, moving, settling, arrived, stopped
+    text: str
+    share: float  # of the way, 0 to 1
+    time_left: float  # s
+    stopped_by: str  # empty: it was not stopped
+    request: int  # stamp of the message that asked for it, ns
+    refused_request: int  # stamp of the newest message that was refused, ns
+    refusal: str
+
+
+class Machine:
+    """A running machine with a mover: moves its tool and waits until it has arrived.
+
+    Parameters
+    ----------
+    namespace : str, optional
+        Where the machine's nodes are.
+    mover : str, optional
+        Name of the mover's node.
+
+    Raises
+    ------
+    NoAnswerError
+        No mover was found within 10 s.
+    """
+
+    def __init__(self, namespace: str = "", mover: str = "mover") -> None:
+        self._session = RosSession("hexapod_comp_machine", namespace)
+        self.state: MoveState | None = None
+        node = self._session.node
+        self._to = node.create_publisher(PoseStamped, "move_to", EVENT_QOS)
+        self._by = node.create_publisher(PoseStamped, "move_by", EVENT_QOS)
+        self._stop = node.create_client(Trigger, f"{mover}/stop")
+        node.create_subscription(DiagnosticStatus, f"{mover}/state", self._on_state, LATCHED_QOS)
+        try:
+            self._wait(self._connected, 10.0, f"the node {mover}: ros2 run hexapod_comp mover")
+        except NoAnswerError:
+            self.close()
+            raise
+
+    def __enter__(self) -> Machine:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def last(self) -> MoveState:
+        """The newest state."""
+        if self.state is None:
+            raise NoAnswerError("the mover has not reported a state yet")
+        return self.state
+
+    def close(self) -> None:
+        """Leave ROS; a move that is under way goes on."""
+        self._session.close()
+
+    def move(
+        self,
+        pose: Pose,
+        frame_id: str = "work",
+        relative: bool = False,
+        timeout: float = 3600.0,
+        progress: Callable[[MoveState], object] = lambda state: None,
+    ) -> MoveState:
+        """Move the tool along a straight line, with the shortest turn, and return when it has arrived.
+
+        It has arrived when its estimate, from measured struts, has stayed within the mover's tolerances of the target
+        for the settling time. A move that is under way is braked first, and its caller gets a MoveError, ``replaced``.
+
+        Parameters
+        ----------
+        pose : Pose
+            ``pose_tool_in_work`` of the target, m; of a relative move the way and the turn.
+        frame_id : str, optional
+            Frame of the target: ``base``, ``work`` or a named work frame; of a relative move also ``tool``.
+        relative : bool, optional
+            Go on from where the tool stands, along and about the frame's axes.
+        timeout : float, optional
+            Longest time that it may take, s; then it is stopped.
+        progress : callable, optional
+            Called with each state.
+
+        Returns
+        -------
+        MoveState
+            The last one, ``arrived``.
+
+        Raises
+        ------
+        MoveError
+            The move was refused or stopped; ``reason`` says by what.
+        NoAnswerError
+            The mover did not answer, or the tool had not arrived in time.
+        """
+        stamp = self._session.node.get_clock().now()
+        message = pose_message(pose, frame_id)
+        message.header.stamp = stamp.to_msg()
+        asked, seen = stamp.nanoseconds, self.state
+        taken = False
+        (self._by if relative else self._to).publish(message)
+        end, answer = time.monotonic() + timeout, time.monotonic() + ANSWER_TIMEOUT
+        while True:
+            self._session.spin_once(0.02)
+            state, now = self.state, time.monotonic()
+            if state is not seen and state is not None:
+                seen = state
+                if state.refused_request == asked:
+                    raise MoveError("refused", state.refusal)
+                if state.request == asked:
+                    taken = True
+                    progress(state)
+                    if state.state == "arrived":
+                        return state
+                    if state.state == "stopped":
+                        raise MoveError(state.stopped_by, state.text)
+                elif taken:
+                    raise MoveError("replaced", "another move was asked for")
+            if not taken and now > answer and (state is None or state.state in ("idle", "arrived", "stopped")):
+                raise NoAnswerError(f"the mover has not begun the move within {ANSWER_TIMEOUT:g} s")
+            if now > end:
+                self.stop()
+                raise NoAnswerError(f"the tool has not arrived within {timeout:g} s, and was stopped")
+
+    def stop(self) -> None:
+        """Brake within the struts' limits; returns when the tool stands."""
+        future = self._stop.call_async(Trigger.Request())
+        self._wait(future.done, ANSWER_TIMEOUT, "the mover's answer to stop")
+        self._wait(lambda: self.state is not None and self.state.state in ("idle", "arrived", "stopped"), 60.0, "rest")
+
+    def _connected(self) -> bool:
+        found = self._to.get_subscription_count() and self._by.get_subscription_count()
+        return bool(found) and self.state is not None and self._stop.service_is_ready()
+
+    def _on_state(self, message: DiagnosticStatus) -> None:
+        v = {entry.key: entry.value for entry in message.values}
+        self.state = MoveState(
+            v["state"],
+            message.message.partition(": ")[2],
+            float(v["share"]),
+            float(v["time_left_s"]),
+            v["stopped_by"],
+            int(v["request"]),
+            int(v["refused_request"]),
+            v["refusal"],
+        )
+
+    def _wait(self, condition: Callable[[], bool], timeout: float, what: str) -> None:
+        end = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > end:
+                raise NoAnswerError(f"waited {timeout:g} s in vain for {what}")
+            self._session.spin_once(0.02)

@@ -43,7 +43,7 @@ class WorkerError(HexapodError):
 class Job:
     """What the process is asked for."""
 
-    task: str  # load_model, predict or travel
+    task: str  # load_model, predict, travel or plan_move
     arguments: dict[str, Any]
     done: Callable[[Any], None]  # called with the result, from Worker.look
     failed: Callable[[WorkerError], None]

@@ -15,7 +15,7 @@ from strategies import paper_geometry
 
 from hexapod_comp.errors import GeometryError, PoseError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.machine.path import Motion, StrutRates, plan_motion
+from hexapod_comp.machine.path import Motion, StrutRates, plan_motion, plan_program
 from hexapod_comp.pose import Pose
 
 RATES = StrutRates(0.2, 2.0, 40.0)
@@ -175,3 +175,38 @@ def test_what_makes_no_motion_is_refused() -> None:
     ):
         with pytest.raises(GeometryError, match=words):
             refused()
+
+
+@pytest.mark.parametrize("name", ["paper", "example_6_6", "hanging", "inches"])
+def test_a_program_keeps_every_limit_passes_its_poses_and_is_never_ahead(name: str, tmp_path: Path) -> None:
+    """Poses of a random walk at times of which some leave the struts too little: truth is differentiation here."""
+    geometry, rate = machine_of(name, tmp_path), 1000.0
+    poses = random_targets(geometry, 23, 6)
+    times = np.cumsum([0.0, *np.random.default_rng(24).uniform(0.02, 2.0, len(poses) - 1)])
+    motion = plan_program(geometry, poses, times.tolist(), RATES)
+    assert motion.duration >= times[-1]
+    path = motion.sample(rate)
+    assert max(shares(geometry, (path.positions, path.rotations), rate, RATES)) <= 1.0 + 1e-3
+    step = np.linalg.norm(np.diff(path.positions, axis=0), axis=1).max()
+    for pose, earliest in zip(poses, times, strict=True):
+        after = path.positions[max(0, int(earliest * rate) - 1) :]
+        assert np.linalg.norm(after - pose.position, axis=1).min() <= step
+    stop = motion.stop(motion.duration / 2.0, rate)
+    assert len(stop) <= len(path) / 2 + 1
+
+
+def test_a_slow_program_keeps_its_own_time() -> None:
+    """A sine of 0.1 mm, 2 s long, needs no more than its start and its end to gather and to lose speed."""
+    geometry, (home, *_) = paper_geometry(), random_targets(paper_geometry(), 1, 2)
+    times = np.linspace(0.0, 2.0, 41)
+    poses = [
+        Pose(home.position + 1e-4 * math.sin(math.pi * t) * np.array([0.0, 0.0, 1.0]), home.rotation) for t in times
+    ]
+    assert 2.0 <= plan_program(geometry, poses, times.tolist(), RATES).duration < 2.2
+
+
+@pytest.mark.parametrize("times", [[0.0], [0.0, 0.0], [1.0, 0.5], [0.0, math.nan], [0.0, 1.0, 2.0]])
+def test_times_of_a_program_that_do_not_ascend_are_refused(times: list[float]) -> None:
+    geometry = paper_geometry()
+    with pytest.raises(GeometryError, match="times: must ascend"):
+        plan_program(geometry, random_targets(geometry, 1, 2), times, RATES)

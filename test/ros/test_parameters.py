@@ -15,12 +15,13 @@ from rcl_interfaces.srv import DescribeParameters
 from std_msgs.msg import UInt64
 
 from hexapod_comp.ros.compensator import CompensatorNode
+from hexapod_comp.ros.mover import MoverNode
 from hexapod_comp.ros.parameters import Taken
 from hexapod_comp.ros.strut_drive import StrutDriveNode
 
 MAKER = runpy.run_path(str(CONFIG.parent / "tools" / "make_parameter_files.py"))
 TABLES = MAKER["TABLES"]
-KINDS = {"compensator": CompensatorNode, "strut_drive": StrutDriveNode}
+KINDS = {"compensator": CompensatorNode, "strut_drive": StrutDriveNode, "mover": MoverNode}
 
 COMPENSATOR = "compensator"
 
@@ -116,6 +117,7 @@ def test_another_model_is_taken_by_reload(rig, tmp_path):
 def test_descriptors_say_range_and_when(rig):
     rig.compensator(start=False)
     rig.drive(start=False)
+    rig.add(MoverNode, False, {})
     for name in KINDS:
         table = TABLES[name]
         request = DescribeParameters.Request(names=[p.name for p in table])
@@ -169,8 +171,8 @@ def test_a_file_of_other_values_is_loaded_also_through_the_launch_file(rig, monk
     path.write_text(yaml.safe_dump({f"/**/{name}": {"ros__parameters": others}}))
     node = rig.add(KINDS[name], False, {}, cli_args=["--ros-args", "--params-file", str(path)])
     assert {key: value for key, value in in_force(node).items() if key in others} == others
-    given = LaunchFile(monkeypatch).start(f"params_file:={path}", "model:=table.yaml")[name]["parameters"]
-    arguments = ["--ros-args"]
+    given = LaunchFile(monkeypatch).start(f"params_file:={path}", "model:=table.yaml", "mover:=true")[name]
+    arguments, given = ["--ros-args"], given["parameters"]
     for number, part in enumerate(given):
         if isinstance(part, dict):
             (tmp_path / f"{number}.yaml").write_text(yaml.safe_dump({"/**": {"ros__parameters": part}}))
@@ -178,7 +180,7 @@ def test_a_file_of_other_values_is_loaded_also_through_the_launch_file(rig, monk
         arguments += ["--params-file", part]
     values = in_force(rig.add(KINDS[name], False, {}, cli_args=arguments))
     assert values == in_force(node) | {k: v for k, v in given[-1].items() if k in others}
-    assert values["command_timeout"] == 3600.0
+    assert values.get("command_timeout", 3600.0) == 3600.0
     assert values.get("model_file", "table.yaml") == "table.yaml"
 
 

@@ -29,6 +29,7 @@ from hexapod_comp.formats.paths import config_file
 from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.ros.client import LoopClient
+from hexapod_comp.ros.mover import MoverNode
 from hexapod_comp.ros.process import QUIET, RosSession, autostart
 from hexapod_comp.ros.recorder import BagRecorder
 from hexapod_comp.viewer.page import Watcher
@@ -43,7 +44,7 @@ TOOLS = "_ros2cli_*"
 """Names of the nodes that the ``ros2`` tools make; permissions of DDS take patterns (POSIX fnmatch)."""
 
 COMMANDS = {
-    "/tool_pose_command": {"commander", "linuxcnc_bridge"},
+    "/tool_pose_command": {"commander", "linuxcnc_bridge", "mover"},
     "/select_tool": {"commander"},
     "/strut_commands": {"compensator"},
 }
@@ -123,7 +124,7 @@ def test_operators_and_thermometers_hear_and_ask_only_what_there_is() -> None:
         assert all(reply.startswith(f"/{TOOLS}/") for reply in allowed["reply"])
 
 
-@pytest.mark.parametrize("name", ["compensator", "strut_drive", "linuxcnc_bridge"])
+@pytest.mark.parametrize("name", ["compensator", "strut_drive", "mover", "linuxcnc_bridge"])
 def test_lifecycle_nodes_open_what_the_policy_allows(
     name: str, ros_context: Context, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -134,6 +135,9 @@ def test_lifecycle_nodes_open_what_the_policy_allows(
             rig.compensator(publish_array=True)
         elif name == "strut_drive":
             rig.drive()
+        elif name == "mover":
+            rig.hush("tool_pose_command")
+            rig.add(MoverNode, True, {})
         else:
             assert autostart(rig.add(LinuxcncBridgeNode, False, {}, hal=StandInHal()))
         expect_equal(rig, name, read_policy(namespace)[name])

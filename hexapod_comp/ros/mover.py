@@ -1,0 +1,540 @@
+"""The mover node: a target pose or a program in, a stream of tool poses for the compensator out.
+
+A move is planned in the process beside the node, from where the machine stands, in the least time that the struts'
+speed, acceleration and jerk allow; all limits of the machine are checked along it before it begins. It is sent at one
+rate, and the last pose is sent on: a machine at standstill keeps following its temperatures. ``~/state`` says what
+becomes of it. Run it with ``ros2 run hexapod_comp mover`` or ``python -m hexapod_comp.ros.mover``.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PointStamped, PoseStamped
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import MultiDOFJointTrajectory
+
+from ..compensation.journal import Source, read_sources
+from ..errors import CommandError, HexapodError, shorten
+from ..machine.geometry import BASE, TOOL, HexapodGeometry
+from ..machine.path import Motion
+from ..machine.trajectory import Path
+from ..pose import Pose, rotation_angle
+from . import keep_discovery_local
+from .base import ACKNOWLEDGED_WITHIN, CHECK_PERIOD, COMMAND_QOS, EVENT_QOS, LATCHED_QOS, NEWEST_QOS, MachineNode
+from .interface import frame_ids
+from .messages import message_pose, nanoseconds_of, pose_message, stamp_of
+from .parameters import Program, read_table
+from .process import run
+from .rclpy_compat import callers
+from .status import ERROR, OK, WARN, status_of, status_prefix
+from .worker import Job, Worker
+
+ANSWERED_WITHIN = 0.4  # A command that the compensator has not answered after this long was refused, s
+ESTIMATE_WITHIN = 1.0  # An estimate older than this does not say where the machine stands, s
+STATE_PERIOD = 0.1  # Between two messages of ``~/state`` while the machine moves, s
+
+IDLE, PLANNING, MOVING, SETTLING, ARRIVED, STOPPED = "idle", "planning", "moving", "settling", "arrived", "stopped"
+UNDER_WAY = (PLANNING, MOVING, SETTLING)
+
+PARAMETERS = read_table(f"""
+autostart | true |  | start | configure and activate at the start
+compensator | compensator |  | configure | name of the compensator's node, in this node's namespace
+base_frame | base |  | configure | frame_id of poses in the machine base
+work_frame | work | not base_frame | configure | frame_id of poses in the geometry file's work frame
+frame_prefix | '' |  | configure | in front of the names of its other work frames
+tool_frame | {TOOL} |  | configure | frame_id of relative moves in the tool's own frame
+rate | 250.0 | 10 to 1000 Hz | configure | tool poses sent per second
+limit_share | 0.9 | 0.01 to 1 | always | share of the struts' speed, acceleration and jerk that a move may use; the
+    rest is left to the corrections
+position_tolerance | 5.0e-6 | 1e-9 to 0.01 m | always | the tool has arrived when its estimate is this close to the
+    target
+rotation_tolerance | 2.0e-5 | 1e-9 to 0.1 rad | always | and turned from it by no more than this
+settling_time | 0.1 | 0 to 60 s | always | for this long without a break
+settling_timeout | 5.0 | 0.1 to 3600 s | always | a tool that has not settled this long after the last pose was sent is
+    reported as stopped
+""")
+
+TOPICS = """
+in   move_to                 PoseStamped: target of the tool, frame_id a work frame; a new one replaces the present one
+     move_by                 PoseStamped: relative move, frame_id `tool`: in the tool's frame, or a work frame: along
+                             and about its axes
+     pivot                   PointStamped: point of the tool, in its frame, that moves go straight with, usually its tip
+     program                 MultiDOFJointTrajectory: poses of the tool with times, which it never passes earlier
+     tool_pose_estimate      PoseStamped: from the compensator, as its ~/files, ~/tool and strut_commands
+out  tool_pose_command       PoseStamped: to the compensator, in base
+     ~/state                 DiagnosticStatus, latched: idle, planning, moving, settling, arrived, stopped
+     /diagnostics
+ask  ~/stop                  Trigger: brake on the way, within the struts' limits, and stay there
+"""
+
+PROGRAM = Program(
+    "mover", "Moves a hexapod's tool to target poses, within the struts' limits.", PARAMETERS, TOPICS, "-p rate:=500.0"
+)
+
+
+@dataclass
+class Request:
+    """What somebody asked for: poses of the tool in ``base``, with times where it is a program."""
+
+    stamp: int  # of the message, ns
+    poses: list[Pose]
+    times: list[float] = field(default_factory=list)  # of a program, s
+    relative: Pose | None = None  # of a relative move: the turn and the way, in the frame of `axes`
+    axes: np.ndarray | None = None  # (3, 3) the frame's axes in ``base``; None: the tool's own
+
+    def from_pose(self, start: Pose) -> list[Pose]:
+        """Return the poses, those of a relative move as seen from where it starts."""
+        if self.relative is None:
+            return self.poses
+        if self.axes is None:
+            return [start @ self.relative]
+        turn = self.axes @ self.relative.rotation @ self.axes.T
+        return [Pose(start.position + self.axes @ self.relative.position, turn @ start.rotation)]
+
+
+class MoverNode(MachineNode):
+    """Lifecycle node that moves the tool of one compensator; arguments are those of ``rclpy`` nodes."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("mover", PARAMETERS, **options)
+        self._state, self._text, self._by = IDLE, "no move yet", ""
+        self._request = self._refused_request = 0  # stamps, ns
+        self._refusal = ""
+        self._moves = 0  # that were begun
+        self._forget()
+
+    def _forget(self) -> None:
+        """Forget machine, motion and everything that was heard."""
+        self._sources: dict[str, Source] = {}
+        self._geometry: HexapodGeometry | None = None
+        self._tool = TOOL
+        self._pivot = np.zeros(3)
+        self._estimate: tuple[Pose, float] | None = None  # and when it came, monotonic
+        self._compensator_says: dict[str, str] = {}
+        self._halt()
+
+    def _halt(self) -> None:
+        """Send nothing more, and forget where the last command led."""
+        self._held: Pose | None = None  # the pose that is sent at standstill
+        self._queue: deque[Motion] = deque()
+        self._motion: Motion | None = None
+        self._path_is_motion = False  # else it is the stop that leaves it
+        self._path: Path | None = None
+        self._index = 0
+        self._pending: Request | None = None  # is planned when the machine stands
+        self._stamp = 0  # of the last command, ns
+        self._unanswered: deque[tuple[int, float]] = deque()  # stamps, and when they were sent
+        self._ended = self._near_since = 0.0
+        self._braking = ""  # who asked for it
+
+    # ---- lifecycle ----
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Open topics."""
+        with self.all_or_nothing():
+            self._open_topics()
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take targets from now on; nothing moves before the first one."""
+        self._halt()
+        self._commands = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS)
+        self._active = True
+        self._change(IDLE, "no move yet")
+        self.get_logger().info("ready")
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Send nothing more and leave the topic of commands to others."""
+        if self._state in UNDER_WAY:
+            self._stopped("deactivated", "the node was deactivated on the way")
+        self._halt()
+        self.close_ends(self._commands)
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close topics and forget the machine."""
+        self._active = False
+        self._worker.close()
+        self._ticker.close()
+        self.close_ends(*self._ends)
+        self._forget()
+        return super().on_cleanup(state)
+
+    def say_goodbye(self) -> None:
+        """Publish how a move ended that the end of the node cuts short."""
+        if self._active and self._state in UNDER_WAY:
+            self._stopped("shut down", "the node ended on the way")
+            self._states.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+
+    def _open_topics(self) -> None:
+        name = self._options["compensator"]
+        self._worker = Worker()
+        self._states = self.create_publisher(DiagnosticStatus, "~/state", LATCHED_QOS)
+        self._diagnosed = status_prefix(self.get_namespace(), name)
+        self._ends: list[Any] = [
+            self._states,
+            self.listen_to(PoseStamped, "move_to", self._on_move_to, EVENT_QOS),
+            self.listen_to(PoseStamped, "move_by", self._on_move_by, EVENT_QOS),
+            self.listen_to(PointStamped, "pivot", self._on_pivot, EVENT_QOS),
+            self.listen_to(MultiDOFJointTrajectory, "program", self._on_program, EVENT_QOS),
+            self.listen_to(PoseStamped, "tool_pose_estimate", self._on_estimate, NEWEST_QOS),
+            self.listen_to(JointState, "strut_commands", self._on_answer, COMMAND_QOS),
+            self.listen_to(String, f"{name}/files", self._on_files, LATCHED_QOS),
+            self.listen_to(String, f"{name}/tool", self._on_tool, LATCHED_QOS),
+            self.listen_to(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS),
+            self.every(CHECK_PERIOD, self._check_state),
+        ]
+        self._stop_service = self.create_service(Trigger, "~/stop", self._on_stop)
+        self._ends.append(self._stop_service)
+        self._ticker = self.at_rate("rate", self._tick)
+        self._state_due = 0.0
+        self._change(IDLE, "no move yet")
+
+    # ---- what the compensator says ----
+
+    def _on_files(self, message: String) -> None:
+        self._sources = read_sources(message.data)
+        self._use_machine()
+
+    def _on_tool(self, message: String) -> None:
+        self._tool = message.data
+        self._use_machine()
+
+    def _use_machine(self) -> None:
+        """Go by the compensator's geometry with its tool; another tool ends what was held with the one before."""
+        if not {"geometry", "model"} <= self._sources.keys():
+            return
+        geometry = self._sources["geometry"].geometry()
+        if self._tool not in geometry.tools:
+            return  # of another file, which comes next
+        before, self._geometry = self._geometry, geometry.using(tool=self._tool, work=BASE)
+        self._frames = {
+            frame_id: geometry.work_frames[name] for name, frame_id in frame_ids(geometry, self._options).items()
+        }
+        self.speak_for(geometry.name)
+        if before is not None and self._active and before.tool_name != self._tool:
+            if self._state in UNDER_WAY:
+                self._stopped("refusal", f"the tool was changed to {self._tool!r} on the way")
+            self._halt()
+
+    def _on_estimate(self, message: PoseStamped) -> None:
+        if message.header.frame_id == self._options["base_frame"]:
+            self._estimate = message_pose(message), time.monotonic()
+
+    def _on_answer(self, message: JointState) -> None:
+        stamp = nanoseconds_of(message.header.stamp)
+        while self._unanswered and self._unanswered[0][0] <= stamp:
+            self._unanswered.popleft()
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name.startswith(self._diagnosed):
+                self._compensator_says = {entry.key: entry.value for entry in status.values}
+                self._compensator_says["message"] = status.message
+
+    # ---- what is asked for ----
+
+    def _on_move_to(self, message: PoseStamped) -> None:
+        self._ask(message, lambda: self._absolute(message))
+
+    def _on_move_by(self, message: PoseStamped) -> None:
+        def request() -> Request:
+            frame_id, pose = message.header.frame_id, message_pose(message)
+            axes = None if frame_id == self._options["tool_frame"] else self._frame(frame_id, also_tool=True).rotation
+            return Request(nanoseconds_of(message.header.stamp), [], relative=pose, axes=axes)
+
+        self._ask(message, request)
+
+    def _on_program(self, message: MultiDOFJointTrajectory) -> None:
+        def request() -> Request:
+            frame = self._frame(message.header.frame_id)
+            if len(message.joint_names) != 1 or len(message.points) < 2:
+                found = f"{len(message.joint_names)} and {len(message.points)}"
+                raise CommandError("program", f"a program names one joint and has at least 2 points, not {found}")
+            poses, times = [], []
+            for n, point in enumerate(message.points):
+                if len(point.transforms) != 1:
+                    raise CommandError("program", f"points[{n}] must have 1 transform, not {len(point.transforms)}")
+                t, q = point.transforms[0].translation, point.transforms[0].rotation
+                pose = Pose.from_quaternion(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
+                poses.append(frame @ pose)
+                times.append(point.time_from_start.sec + point.time_from_start.nanosec * 1e-9)
+            for n in range(1, len(times)):
+                if not times[n] > times[n - 1]:
+                    problem = f"must be later than {times[n - 1]:.9g} s, that of the point before, not {times[n]:.9g} s"
+                    raise CommandError("program", f"points[{n}].time_from_start {problem}")
+            return Request(nanoseconds_of(message.header.stamp), poses, times)
+
+        self._ask(message, request)
+
+    def _on_pivot(self, message: PointStamped) -> None:
+        point = np.array([message.point.x, message.point.y, message.point.z])
+        if message.header.frame_id not in ("", self._options["tool_frame"]) or not np.isfinite(point).all():
+            where = f"finite and in {self._options['tool_frame']}"
+            self.warn_of("pivot", f"pivot refused: must be {where}, not {point} in {shorten(message.header.frame_id)}")
+            return
+        self._pivot = point
+
+    def _absolute(self, message: PoseStamped) -> Request:
+        frame = self._frame(message.header.frame_id)
+        return Request(nanoseconds_of(message.header.stamp), [frame @ message_pose(message)])
+
+    def _frame(self, frame_id: str, also_tool: bool = False) -> Pose:
+        if frame_id not in self._frames:
+            allowed = ", ".join([*self._frames, *([self._options["tool_frame"]] if also_tool else [])])
+            raise CommandError("frame_id", f"frame_id must be one of {allowed}, not {shorten(frame_id)}")
+        return self._frames[frame_id]
+
+    def _ask(self, message: Any, read: Any) -> None:
+        """Plan what a message asks for, at once or when the present move has been braked; a bad one changes nothing."""
+        if not self._active:
+            return
+        try:
+            if self._geometry is None:
+                raise CommandError("not_ready", "the compensator has not yet published its machine on ~/files")
+            request = read()
+            if self._motion is None and self._held is None:
+                self._standing()  # raises where that is not known
+        except HexapodError as error:
+            self._refused_request, self._refusal = nanoseconds_of(message.header.stamp), str(error)
+            self.warn_of("request", f"move refused ({error.reason}): {error}")
+            self._publish_state()
+            return
+        self._pending = request
+        if self._motion is not None:
+            self._brake("")
+        elif self._state != PLANNING:
+            self._plan()
+
+    def _standing(self) -> Pose:
+        """Return where the tool stands, in ``base``: as it was sent, or before that as it is estimated."""
+        if self._held is not None:
+            return self._held
+        if self._estimate is None or time.monotonic() - self._estimate[1] > ESTIMATE_WITHIN:
+            raise CommandError("no_estimate", f"no tool_pose_estimate for {ESTIMATE_WITHIN:g} s: where does it stand?")
+        return self._estimate[0]
+
+    # ---- planning ----
+
+    def _plan(self) -> None:
+        """Have the pending request planned, from where the machine stands."""
+        request, self._pending = self._pending, None
+        if request is None or self._geometry is None:
+            return
+        start = self._standing()
+        self._request, self._refused_request, self._refusal = request.stamp, 0, ""
+        self._moves += 1
+        arguments = {
+            "poses": [start, *request.from_pose(start)],
+            "times": request.times,
+            "pivot": self._pivot,
+            "tool": self._tool,
+            "rate": self._options["rate"],
+            "share": self._options["limit_share"],
+        }
+        machine = {**self._sources, "folder": None}
+        number = self._moves
+        self._change(PLANNING, "planning")
+        self._worker.ask(
+            Job(
+                "plan_move",
+                arguments,
+                lambda motions: self._begin(number, start, motions),
+                lambda error: self._cannot(number, error),
+                machine,
+            )
+        )
+
+    def _cannot(self, number: int, error: HexapodError) -> None:
+        if number == self._moves and self._state == PLANNING:
+            self._stopped("limit", str(error))
+            self._plan()  # what was asked for meanwhile
+
+    def _begin(self, number: int, start: Pose, motions: list[Motion]) -> None:
+        """Begin a move that was planned, unless it was given up meanwhile."""
+        if number != self._moves or self._state != PLANNING:
+            return
+        if self._pending is not None:
+            self._plan()
+            return
+        self._held = self._held or start
+        self._queue = deque(motions)
+        self._whole = sum(motion.duration for motion in motions)
+        self._change(MOVING, "moving")
+        self._next()
+
+    def _next(self) -> None:
+        """Go on with the next motion, or settle."""
+        if self._queue:
+            self._motion, self._path_is_motion = self._queue.popleft(), True
+            self._follow(self._motion.sample(self._options["rate"]))
+            return
+        self._motion = self._path = None
+        self._ended = time.monotonic()
+        self._near_since = np.inf
+        if self._pending is not None:
+            self._plan()
+        elif self._braking:
+            self._stopped(self._braking, "stopped on the way")
+        else:
+            self._change(SETTLING, "settling")
+        self._braking = ""
+
+    def _follow(self, path: Path) -> None:
+        self._path, self._index = path, 1  # the first pose is where it stands
+
+    def _brake(self, why: str) -> None:
+        """Leave the present motion by the earliest stop on its way; why: what the end of the move is put down to."""
+        self._braking = self._braking or why
+        if self._motion is None or self._path is None or not self._path_is_motion:
+            return
+        rate = self._options["rate"]
+        now = min((self._index - 1) / rate, self._motion.duration)
+        self._queue.clear()
+        self._follow(self._motion.stop(now, rate))
+        self._path_is_motion = False
+
+    def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self.note("stop", f"stop: asked for by {callers(self, self._stop_service)}")
+        self._pending = None
+        response.success = True
+        if self._motion is not None:
+            self._brake("person")
+            response.message = "braking"
+        elif self._state in UNDER_WAY:
+            self._stopped("person", "stopped before it moved" if self._state == PLANNING else "stopped at its end")
+            response.message = "nothing was moving any more"
+        else:
+            response.message = "nothing was moving"
+        return response
+
+    # ---- moving ----
+
+    def _tick(self) -> None:
+        """Send the next pose, or the same again."""
+        if not self._active or self._held is None:
+            return
+        period = round(1e9 / self._options["rate"])
+        now = int(self.get_clock().now().nanoseconds)
+        # Stamped with the times for which they were computed; after a pause the path goes on from there
+        stamp = max(self._stamp + period, now - period) if self._stamp else now
+        if stamp > now + period:
+            return
+        if self._path is not None:
+            self._held = self._path.pose(min(self._index, len(self._path) - 1))
+            self._index += 1
+        message = pose_message(self._held, self._options["base_frame"])
+        message.header.stamp, self._stamp = stamp_of(stamp), stamp
+        self._unanswered.append((stamp, time.monotonic()))
+        self._commands.publish(message)
+        if self._path is not None and self._index >= len(self._path):
+            self._next()
+
+    def _settle(self, now: float) -> None:
+        """Report the arrival of a tool that stays at its target, or that it does not get there."""
+        options, pose = self._options, self._estimate[0] if self._estimate else None
+        if pose is not None and self._held is not None and self._estimate and self._estimate[1] > self._ended:
+            away = float(np.linalg.norm(pose.position - self._held.position))
+            turned = rotation_angle(pose.rotation.T @ self._held.rotation)
+            if away > options["position_tolerance"] or turned > options["rotation_tolerance"]:
+                self._near_since = np.inf
+            elif now - (since := min(self._near_since, now)) >= options["settling_time"]:
+                self._change(ARRIVED, f"arrived, {away * 1e6:.2f} µm and {turned * 1e6:.2f} µrad from the target")
+                return
+            else:
+                self._near_since = since
+        if now - self._ended > options["settling_timeout"]:
+            where = (
+                "no estimate" if pose is None or self._held is None else f"{away * 1e6:.2f} µm, {turned * 1e6:.2f} µrad"
+            )
+            allowed = f"{options['position_tolerance'] * 1e6:g} µm, {options['rotation_tolerance'] * 1e6:g} µrad"
+            self._stopped(
+                "settling", f"{where} from the target after {options['settling_timeout']:g} s, allowed {allowed}"
+            )
+
+    # ---- state ----
+
+    def _stopped(self, by: str, text: str) -> None:
+        self._change(STOPPED, text, by)
+        self.get_logger().warning(f"move stopped ({by}): {text}")
+
+    def _change(self, state: str, text: str, by: str = "") -> None:
+        self._state, self._text, self._by = state, text, by
+        self._publish_state()
+
+    def _publish_state(self) -> None:
+        done = left = 0.0
+        if self._motion is not None and self._path is not None:
+            queued = sum(motion.duration for motion in self._queue)
+            left = queued + max(len(self._path) - self._index, 0) / self._options["rate"]
+            done = max(0.0, 1.0 - left / self._whole) if self._whole else 1.0
+        elif self._state in (SETTLING, ARRIVED):
+            done = 1.0
+        values = {
+            "state": self._state,
+            "move": str(self._moves),
+            "request": str(self._request),
+            "share": f"{done:.4f}",
+            "time_left_s": f"{left:.3f}",
+            "stopped_by": self._by,
+            "refused_request": str(self._refused_request),
+            "refusal": self._refusal,
+        }
+        level = ERROR if self._state == STOPPED and self._by not in ("person",) else OK
+        name = f"{self.get_fully_qualified_name()[1:]}: move"
+        self._states.publish(status_of(name, self.hardware_id, level, f"{self._state}: {self._text}", values))
+        self._state_due = time.monotonic() + STATE_PERIOD
+
+    def _check_state(self) -> None:
+        now = time.monotonic()
+        self._worker.look(now)
+        if self._active:
+            if self._unanswered and now - self._unanswered[0][1] > ANSWERED_WITHIN:
+                self._refused()
+            if self._state == SETTLING:
+                self._settle(now)
+            if self._state == MOVING and now >= self._state_due:
+                self._publish_state()
+        level, text = (OK, self._state) if self._active else (WARN, "not active")
+        if self._active and self._geometry is None:
+            level, text = WARN, f"waiting for {self._options['compensator']}/files"
+        elif self._active and self._state == STOPPED and self._by != "person":
+            level, text = WARN, f"stopped ({self._by}): {self._text}"
+        self.tell(level, text, lambda: {"state": self._state, "moves": str(self._moves), "tool": self._tool})
+
+    def _refused(self) -> None:
+        """Stop sending: the compensator answers no more."""
+        said = self._compensator_says
+        alive = self.count_publishers("strut_commands")
+        reason = (
+            said.get("last_refusal") or said.get("message", "no answer") if alive else "the compensator is not there"
+        )
+        by = "following error" if "following_error" in said.get("message", "") else "refusal"
+        under_way = self._state in UNDER_WAY
+        self._halt()
+        if under_way:
+            self._stopped(by, reason)
+        else:
+            self._change(STOPPED, f"at standstill: {reason}", by)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node; the entry of the executable ``mover``."""
+    keep_discovery_local()
+    return run(MoverNode, PROGRAM, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
