@@ -271,7 +271,7 @@ example:
     ),
     "move": Verb(
         "running", "loop",
-        "move the tool of a running machine to a pose, and wait until it has arrived",
+        "move a running machine's tool to a pose, and wait until it is there",
         (
             value("--pose", pose, SHAPE, f"where to, {POSE_HELP}"),
             value("--frame", None, "NAME", "frame of the pose: work (default), base or a named one; with --relative "
