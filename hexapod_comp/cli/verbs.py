@@ -271,7 +271,7 @@ example:
     ),
     "move": Verb(
         "running", "loop",
-        "move a running machine's tool to a pose, and wait until it is there",
+        "move a running machine's tool to a pose and wait for it",
         (
             value("--pose", pose, SHAPE, f"where to, {POSE_HELP}"),
             value("--frame", None, "NAME", "frame of the pose: work (default), base or a named one; with --relative "
