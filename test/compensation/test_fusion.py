@@ -258,6 +258,29 @@ def test_a_snapshot_and_the_journal_hold_the_drift(paper):
     np.testing.assert_array_equal(again.estimate(struts), compensator.estimate(struts))
 
 
+def test_a_drift_is_replayed_to_the_bit(paper):
+    """From a snapshot before it, and from one after it, as a replay goes on after a lost page."""
+    compensator, again, later = (Compensator(paper, MachineModel(paper.name)) for _ in range(3))
+    drift = 1e-6 * np.arange(12.0)
+
+    def asked(one: Compensator, n: int) -> bytes:
+        shifted = Pose(paper.home.position + np.array([1e-4 * n, 0.0, 0.0]), paper.home.rotation)
+        return one.correct(paper.tool_pose(shifted), 0.01 * n).command.tobytes()
+
+    asked(compensator, 0)
+    again.restore(compensator.snapshot())
+    for one in (compensator, again):
+        one.set_drift(drift)
+    answers = []
+    for n in range(1, 20):
+        if n == 5:
+            later.restore(compensator.snapshot())
+        answers.append(asked(compensator, n))
+        assert answers[-1] == asked(again, n)
+        assert n < 5 or answers[-1] == asked(later, n)
+    assert len(set(answers)) == len(answers)
+
+
 @pytest.mark.parametrize("wrong", [np.zeros(6), np.full(12, np.nan)])
 def test_a_drift_that_is_none_is_refused(paper, wrong):
     compensator = Compensator(paper, MachineModel(paper.name))

@@ -207,3 +207,15 @@ def test_nothing_steps_whatever_the_instrument_says(rig, tmp_path):
         rows.append(rig.seen["strut_corrections"][-1].position.tolist())
     assert np.abs(np.diff(rows, axis=0)).max() <= 1e-4 * 0.02 + 1e-12  # ramps count 20 ms of a pause at most
     assert int(rig.values()["rejected_poses"]) > 50
+
+
+def test_another_configuration_begins_without_drift(rig, tmp_path):
+    started(rig, tmp_path, **{"fusion.compensate": True})
+    say = instrument(rig).say
+    measured(rig, say, 30, 1e-5)
+    assert rig.nodes[0].compensator.drift.any()
+    for transition in ("deactivate", "cleanup", "configure", "activate"):
+        assert rig.change(transition)
+    assert not rig.nodes[0].compensator.drift.any()
+    measured(rig, say, 3)
+    assert abs(off(rig)) < 1e-7
