@@ -182,7 +182,10 @@ class _Fitted:
             tolerances = np.array([known[block.name] for block in space.blocks])
             self.posterior = solve(space, problem, tolerances, start.posterior.noise, FEW_ROUNDS)
         self.kinds = np.unique(problem.kind)
-        self.evidence = log_evidence(problem, self.posterior)
+        self.evidence = self.evidence_early = log_evidence(problem, self.posterior)
+        if start is None:
+            few = solve(space, problem, self._first_guess, np.ones(len(KINDS)), FEW_ROUNDS)
+            self.evidence_early = log_evidence(problem, few)
         self._rows = problem.rows.dense()[:, self.posterior.used]
 
     def compared(
@@ -190,13 +193,15 @@ class _Fitted:
     ) -> Alternative:
         """Return an alternative by its linear problem; values that were scaled have their density scaled (Jacobian).
 
+        After few rounds it is compared with the readings as they are after as few.
         `choices` is the logarithm of how many equally probable alternatives this one was chosen from.
         """
         p = self.posterior
         # From the first guess on, as the fit itself: noise that a mix-up has blown up can hold its own ground.
         tried = solve(self.space, problem, self._first_guess, np.ones(len(KINDS)), rounds)
         jacobian = float(problem.freedom[self.kinds] @ np.log(scale[self.kinds]))
-        gain = log_evidence(problem, tried) + jacobian - self.evidence - choices
+        as_read = self.evidence if rounds == ROUNDS else self.evidence_early
+        gain = log_evidence(problem, tried) + jacobian - as_read - choices
         return Alternative(name, gain, float((p.noise * scale / tried.noise)[self.kinds].max()))
 
     def common_modes(self) -> list[Alternative]:
@@ -208,8 +213,13 @@ class _Fitted:
         tolerances and noise are estimated anew under either prior.
         """
         found = []
-        for mode in common_modes(self.estimation, self.space):
-            effect = self.estimation.free_of_nuisance(mode.effect[:, None])[:, 0]
+        modes = list(common_modes(self.estimation, self.space))
+        effects = self.estimation.free_of_nuisance(np.column_stack([mode.effect for mode in modes]))
+        # A mistake shows where the tolerances are those of a right machine, if it does not where it has blown them up.
+        usual_machine = solve(self.space, self.problem, self._first_guess, self.posterior.noise, rounds=0)
+        suspect = self._suspect(effects, modes, self.posterior) | self._suspect(effects, modes, usual_machine)
+        for n in np.flatnonzero(suspect):
+            mode, effect = modes[n], effects[:, n]
             usual, posterior = self._with_mode(effect, mode, 1.0, self.posterior)
             if abs(usual.amplitude) < usual.deviation:
                 continue
@@ -229,6 +239,14 @@ class _Fitted:
             rest = self.with_target(self.problem.target - way.amplitude * effect, np.ones(len(KINDS)))
             posterior = solve(self.space, rest, posterior.tolerances, posterior.noise, FEW_ROUNDS)
         return self._by_mode(effect, mode, times, posterior), posterior
+
+    def _suspect(self, effects: np.ndarray, modes: list[Mode], posterior: Posterior) -> np.ndarray:
+        """Return which modes (columns), allowed to be mistakes, exceed what is usual under a posterior's tolerances."""
+        gram = self._gram(np.column_stack([self.problem.target, effects]), posterior)
+        tolerances = dict(zip([b.name for b in self.space.blocks], posterior.tolerances, strict=True))
+        usual = np.array([max(mode.usual, tolerances.get(mode.block, 0.0)) for mode in modes])
+        precision = (ASSUMED.mistaken * usual) ** -2.0
+        return np.asarray(np.abs(gram[0, 1:]) >= usual * (precision + np.diag(gram)[1:]))
 
     def _by_mode(self, effect: np.ndarray, mode: Mode, times: float, posterior: Posterior) -> _Way:
         """Return amplitude, prior and evidence of a mode, by the tolerances and the noise of a posterior."""
@@ -377,7 +395,7 @@ class _Fitted:
             change = self.estimation.free_of_nuisance(((scale[self.problem.kind] - 1.0) * values)[:, None])[:, 0]
             problem = self.with_target(self.problem.target + change, scale)
             tried.append((self.compared(name, problem, scale, FEW_ROUNDS), problem, scale))
-        tried = sorted(tried, key=lambda t: -t[0].gain)[:1]
+        tried = sorted((t for t in tried if t[0].gain > 0.0), key=lambda t: -t[0].gain)[:1]
         return [self.compared(t.name, problem, scale, ROUNDS) for t, problem, scale in tried]
 
     def otherwise(self, others: Iterator[tuple[str, MeasurementSet]]) -> list[Alternative]:
@@ -389,7 +407,7 @@ class _Fitted:
             problem = _linearised(measurements, self.space, prediction if measurements.stations is here else None)
             if problem is not None:
                 tried.append((self.compared(name, problem, unscaled, FEW_ROUNDS), problem))
-        tried = sorted(tried, key=lambda t: -t[0].gain)[:FINALISTS]
+        tried = sorted((t for t in tried if t[0].gain > 0.0), key=lambda t: -t[0].gain)[:FINALISTS]
         return [self.compared(t.name, problem, unscaled, ROUNDS) for t, problem in tried]
 
     def _cell_values(self, values: np.ndarray) -> np.ndarray:
