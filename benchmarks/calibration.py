@@ -22,7 +22,7 @@ import numpy as np
 
 from benchmarks import drawn
 from benchmarks.smooth_imperfections import with_wavy_field
-from hexapod_comp.calibration.evaluation import Worth, worth
+from hexapod_comp.calibration.evaluation import ModelEvaluation, evaluate_model
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.lines import fit_lines
 from hexapod_comp.calibration.parameters import FitSettings
@@ -93,7 +93,7 @@ def truth_of(geometry: HexapodGeometry, kind: str, seed: int, box: np.ndarray) -
 class Machine:
     """One machine measured, fitted and judged; `expected`: what the fit promises."""
 
-    worth: Worth
+    worth: ModelEvaluation
     seconds: float
     expected: ToolError | None
 
@@ -111,7 +111,7 @@ def one_machine(number: int, seed: int) -> Machine:
         fit = fit_model(measured, FitSettings(lead=LEAD))
         model, expected = fit.model, fit.level
     seconds = time.perf_counter() - began
-    judged = worth(truth, model, campaign.box, seed=seed, repeatability=campaign.repeatability)
+    judged = evaluate_model(truth, model, campaign.box, seed=seed, repeatability=campaign.repeatability)
     return Machine(judged, seconds, expected)
 
 

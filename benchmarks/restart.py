@@ -47,10 +47,10 @@ class Restarting:
 
     def __init__(self, bench: Bench, command_input: str, step: float, seed: int) -> None:
         self._bench, self._lengths = bench, command_input == "struts"
-        bench.hush("tool_pose_command" if self._lengths else "strut_setpoints")
+        bench.remove_publisher("tool_pose_command" if self._lengths else "strut_setpoints")
         bench.drive(noise_seed=seed, truth_file=MACHINE, step=step)
         if self._lengths:
-            bench.speak("strut_setpoints")
+            bench.add_publisher("strut_setpoints")
             self._told = bench.seen["nominal_strut_states"]
             topic = "nominal_strut_states"
             bench.witness.create_subscription(JointState, topic, self._told.append, BEST_EFFORT)

@@ -27,7 +27,7 @@ from hexapod_comp.calibration.blocks import HARMONICS
 from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
-from hexapod_comp.calibration.lead import ScrewLead, look_for_lead
+from hexapod_comp.calibration.lead import ScrewLead, detect_lead
 from hexapod_comp.calibration.parameters import BLOCKS, FitSettings, ParameterSpace
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.loop.story import demo_campaign, demo_place
@@ -131,7 +131,7 @@ def lead_of(measured: MeasurementSet, given: float | None = None) -> tuple[Screw
     estimation = Estimation(measured, ParameterSpace(measured, FitSettings(lead=given)))
     problem, _ = estimation.linearise(np.zeros(estimation.space.size), np.ones(len(measured)))
     began = time.process_time()
-    return look_for_lead(estimation, problem), time.process_time() - began
+    return detect_lead(estimation, problem), time.process_time() - began
 
 
 def _right(true: float | None, lead: ScrewLead) -> bool:

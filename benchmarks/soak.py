@@ -33,7 +33,7 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_msgs.msg import UInt64
 
-from hexapod_comp.loop.processes import PrivateDomain, waited_for_processor
+from hexapod_comp.loop.processes import PrivateDomain, processor_wait
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.base import COMMAND_QOS, EVENT_QOS
 from hexapod_comp.ros.messages import nanoseconds_of, pose_message
@@ -236,7 +236,7 @@ class Commander:
 
     def _run_queue(self) -> dict[str, float]:
         """Return how long the threads of each process have waited for a processor up to now, s."""
-        return {name: waited_for_processor(pid) for name, pid in {**self._pids, "client": os.getpid()}.items()}
+        return {name: processor_wait(pid) for name, pid in {**self._pids, "client": os.getpid()}.items()}
 
 
 def _resident(pid: int) -> int:

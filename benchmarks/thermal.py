@@ -127,7 +127,7 @@ def warm_up(
     readings = true + settings.noise * rng.standard_normal(true.shape)
     low_pass = TemperatureFilter(settings.time_constant)
     filtered = [
-        [low_pass.take(part, value, float(second)) for part, value in zip(drift.parts, row, strict=True)]
+        [low_pass.update(part, value, float(second)) for part, value in zip(drift.parts, row, strict=True)]
         for second, row in enumerate(readings)
     ]
     return true, (readings, np.array(filtered))

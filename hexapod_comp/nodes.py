@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from .ros import __path__, heard_signals, open_streams, start
+from .ros import __path__, open_streams, received_signals, start
 
-__all__ = ["__path__", "heard_signals", "open_streams", "start"]
+__all__ = ["__path__", "open_streams", "received_signals", "start"]

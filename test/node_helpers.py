@@ -168,7 +168,7 @@ class Rig(Bench):
                 return future
 
         class Process(worker._Process):  # none, but what it is asked and answers is pickled as ever
-            def talk(self, request: Any, within: float | None) -> Any:
+            def exchange(self, request: Any, within: float | None) -> Any:
                 self.jobs = getattr(self, "jobs", None) or Jobs()
                 return pickle.loads(pickle.dumps(self.jobs.do(*pickle.loads(pickle.dumps(request)))))
 
@@ -206,7 +206,7 @@ class Rig(Bench):
         patch.setattr(Publisher, "publish", lambda end, message: self._published(end, message))
         patch.setattr(Service, "send_response", lambda service, response, header: header.append(response))
         for topic in SENT.keys() - {"strut_commands", "strut_setpoints"}:
-            self.speak(topic)
+            self.add_publisher(topic)
 
     def __exit__(self, *_: object) -> None:
         for node in self.nodes:
@@ -219,10 +219,10 @@ class Rig(Bench):
         ours = [f"/{node.get_name()}" for node in self.nodes for end in node.publishers if end.topic_name == topic]
         return ours + [voice.name for voice in self.voices if voice.topic_name == topic]
 
-    def speak(self, topic: str) -> None:
+    def add_publisher(self, topic: str) -> None:
         self._publishers[topic] = Voice(self, topic, SENT[topic], "/witness")
 
-    def hush(self, topic: str) -> None:
+    def remove_publisher(self, topic: str) -> None:
         if topic in self._publishers:
             self._publishers.pop(topic).close()
 

@@ -234,7 +234,7 @@ def test_the_fault_of_the_first_commands_stops_the_machine_at_home(bench: Bench)
     rows = [c.words for c in COMMANDS if c.place.startswith("doc/ros.md") and c.words[:3] == ["ros2", "param", "set"]]
     name, value = next(words[4:] for words in rows if words[3] == "/strut_drive")
     bench.machine()
-    bench.speak("tool_pose_command")
+    bench.add_publisher("tool_pose_command")
     bench.witness.create_timer(0.01, lambda: bench.send(HOME))
     bench.until(lambda: len(bench.seen["strut_commands"]) > 10, "commands")
     bench.fault(name.removeprefix("fault_"), yaml.safe_load(value))

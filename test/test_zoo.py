@@ -513,7 +513,7 @@ def test_run_and_replay(animal: Animal, bench: Any, monkeypatch: pytest.MonkeyPa
     patience = {"max_command_age": 0.0, "following_error_limit": 0.0}
     bench.compensator(model_file=animal.model, ramp_rate=0.01, **patience, **files)
     recorder = Recorder(bench)
-    bench.hush("tool_pose_command")  # only one may command
+    bench.remove_publisher("tool_pose_command")  # only one may command
     with spinning(bench):
         found = animal.tells("run", animal.file("poses.csv"), "--attach")
     recorder.stop()

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hexapod_comp.calibration.evaluation import INCH, Worth, worth, worth_text
+from hexapod_comp.calibration.evaluation import INCH, ModelEvaluation, evaluate_model, evaluation_text
 from hexapod_comp.calibration.lines import fit_lines
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
@@ -92,13 +92,13 @@ def tidy(values: np.ndarray, decimals: int) -> np.ndarray:
     return np.round(values * 1e6, decimals) / 1e6
 
 
-def make_lines_model(truth: RealMachine, truth_hash: str) -> tuple[MachineModel, Worth]:
+def make_lines_model(truth: RealMachine, truth_hash: str) -> tuple[MachineModel, ModelEvaluation]:
     """Return the paper's 1-D model of a machine, and what it is worth."""
     measured = measure(template(CAMPAIGN, truth.geometry), CAMPAIGN, truth, SEED)
     model = fit_lines(measured, date=DATE, name="paper's 1-D lines").model
     x, y, z = (tidy(family, 4) for family in model.field.lines)
     model = replace(model, field=replace(model.field, lines=(x, y, z)))
-    found = worth(truth, model, BOX)
+    found = evaluate_model(truth, model, BOX)
     note = (
         "The scheme of Mou & King (1998) on simulated laser lines of paper_machine.yaml (1 um noise, 3 runs), by "
         "tools/make_example_models.py. Datum: every line is zero (mean of both directions) at home's "
@@ -129,7 +129,7 @@ def main(arguments: list[str] | None = None) -> int:
     digest = hashlib.sha256(machine_file.read_bytes()).hexdigest()
     model, found = make_lines_model(truth, digest)
     save_model(model, out / "paper_lines_model.yaml")
-    print(worth_text(found))
+    print(evaluation_text(found))
     return 0
 
 

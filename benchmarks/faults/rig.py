@@ -196,7 +196,7 @@ class Rig:
     def waited(self) -> dict[int, float]:
         """Return how long each process, this one included, has waited for a processor so far, s, by process id."""
         ids = [os.getpid(), *(process.pid for process in self.processes.values() if process.exit_code() is None)]
-        return {pid: waited_for_processor(pid) for pid in ids}
+        return {pid: processor_wait(pid) for pid in ids}
 
     # ---- faults of processes ----
 
@@ -381,7 +381,7 @@ def dated(callback: Callable[[Any, float], None]) -> Callable[..., None]:
     return called
 
 
-def waited_for_processor(pid: int) -> float:
+def processor_wait(pid: int) -> float:
     """Return how long a process's main thread was ready to run and did not get a processor, s."""
     try:
         return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()[1]) * 1e-9

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hexapod_comp.calibration.evaluation import INCH, Worth, worth
+from hexapod_comp.calibration.evaluation import INCH, ModelEvaluation, evaluate_model
 from hexapod_comp.calibration.lines import LinesFit, fit_lines
 from hexapod_comp.calibration.pictures import strut_error_figure, strut_length_errors
 from hexapod_comp.formats.texts import number
@@ -47,7 +47,7 @@ class Scheme:
     campaign: Campaign
     fit: LinesFit
     smooth: LinesFit  # of the same machine with screws that have no waves
-    worth: Worth  # at points that were not measured
+    worth: ModelEvaluation  # at points that were not measured
 
 
 def fitted(truth: RealMachine, name: str, seed: int = 1) -> tuple[Campaign, MeasurementSet, LinesFit]:
@@ -63,7 +63,7 @@ def scheme(truth: RealMachine, name: str, seed: int = 1) -> Scheme:
     model = truth.model
     even = replace(model, struts=replace(model.struts, cosine=np.zeros(6), sine=np.zeros(6)))
     smooth = fitted(RealMachine(truth.geometry, even), name, seed)[2]
-    return Scheme(name, campaign, fit, smooth, worth(truth, fit.model, measured.tool_box()))
+    return Scheme(name, campaign, fit, smooth, evaluate_model(truth, fit.model, measured.tool_box()))
 
 
 def paper(geometry: HexapodGeometry, seed: int = 1) -> Paper:

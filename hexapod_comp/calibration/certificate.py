@@ -81,7 +81,7 @@ def load_details(path: str | Path) -> Details:
     section = read_yaml(input_file(path, "details"), FORMAT, VERSION)
 
     def texts(key: str) -> tuple[str, ...]:
-        given = section.take(key) if key in section else []
+        given = section.require(key) if key in section else []
         if not isinstance(given, list) or not all(isinstance(text, str) and text.strip() for text in given):
             raise section.error(key, "must be a list of texts", given)
         return tuple(given)

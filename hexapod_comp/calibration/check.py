@@ -27,7 +27,7 @@ from .blocks.block import DIGITS
 from .datum import hold, unseen_part
 from .design import TILTS, information, laid_out
 from .estimator import Estimation
-from .mixups import misread
+from .mixups import best_alternative_reading
 from .parameters import BLOCKS, ParameterSpace
 from .posterior import ErrorPredictor, FittedParameters
 
@@ -449,7 +449,7 @@ def verify_model(
     evidence = Evidence(check.covariance(wide.covariance), check.effects(changes))
     families, candidates = _candidates(check, wide, evidence)
     chi_square = check.chi_square(wide.covariance)
-    doubts = misread(
+    doubts = best_alternative_reading(
         measurements, model, chi_square, lambda tried: CheckReadings.of(wide, tried).chi_square(wide.covariance)
     )
     result = Verification(

@@ -65,7 +65,7 @@ class Criterion(Protocol):
     def gains(self, allowed: np.ndarray) -> np.ndarray:
         """Return by how much each allowed candidate would improve it."""
 
-    def take(self, n: int) -> None:
+    def add(self, n: int) -> None:
         """Take a candidate."""
 
 
@@ -107,7 +107,7 @@ class Greedy(Generic[C]):
             best = int(gains.argmax())
             if not possible.any() or gains[best] == 0.0:
                 return
-            self.criterion.take(best)
+            self.criterion.add(best)
             self.picks.append(best)
             self.spent = float(totals[best])
 
@@ -147,7 +147,7 @@ class ErrorLeft:
                 gains[n] = np.vdot(shown, np.linalg.solve(np.eye(len(gram)) + gram, shown))
         return gains
 
-    def take(self, n: int) -> None:
+    def add(self, n: int) -> None:
         """Add a candidate's readings, also once more."""
         root = cholesky(np.eye(len(self.grams[n])) + self.grams[n], lower=True)
         step = solve_triangular(root, self.known[self.parts[n]], lower=True)

@@ -103,7 +103,7 @@ class DesignMatrix:
         for n in np.unique(owner):
             at = np.flatnonzero(owner == n)
             part = self.parts[n]
-            parts.append(Alike(at, part.columns, part.values[in_a_row(self._place[cells[at]])]))
+            parts.append(Alike(at, part.columns, part.values[as_slice(self._place[cells[at]])]))
         return DesignMatrix((len(cells), self.shape[1]), parts)
 
     def using(self, used: np.ndarray, factors: np.ndarray, spread: np.ndarray | None = None) -> DesignMatrix:
@@ -114,7 +114,7 @@ class DesignMatrix:
         for part in self.parts:
             kept = np.flatnonzero(place[part.columns] >= 0)
             columns = place[part.columns[kept]]
-            values = factors[part.cells, None] * part.values[:, in_a_row(kept)]
+            values = factors[part.cells, None] * part.values[:, as_slice(kept)]
             if spread is not None:
                 values *= spread[columns]
             parts.append(Alike(part.cells, columns, values))
@@ -151,12 +151,12 @@ class DesignMatrix:
 
         def clear(part: int) -> None:
             for n in np.flatnonzero(owner == part).tolist():
-                unknowns[n].project_out(self.parts[part].values, in_a_row(self._place[unknowns[n].members]))
+                unknowns[n].project_out(self.parts[part].values, as_slice(self._place[unknowns[n].members]))
 
         at_once(clear, range(len(self.parts)), self.shape[0])
 
 
-def in_a_row(indices: np.ndarray) -> np.ndarray | slice:
+def as_slice(indices: np.ndarray) -> np.ndarray | slice:
     """Return indices as a slice where they follow each other: then indexing copies nothing."""
     if len(indices) and indices[-1] - indices[0] == len(indices) - 1 and (np.diff(indices) == 1).all():
         return slice(int(indices[0]), int(indices[-1]) + 1)

@@ -1,4 +1,4 @@
-"""What a model is worth: the virtual machine told what the model says, seen where nothing was fitted."""
+"""Tool errors of a virtual machine without and with a model, at points to which nothing was fitted."""
 
 from __future__ import annotations
 
@@ -97,8 +97,8 @@ def paper_metric(
 
 
 @dataclass(frozen=True)
-class Worth:
-    """What a model is worth on a virtual machine."""
+class ModelEvaluation:
+    """Tool errors of a virtual machine without and with a model."""
 
     before: HeldOut  # the tool's error in space without and with the model
     after: HeldOut
@@ -111,7 +111,7 @@ class Worth:
         return None if self.promised is None else self.promised[0] <= self.after.aligned.rms <= self.promised[1]
 
 
-def worth(
+def evaluate_model(
     truth: RealMachine,
     model: MachineModel,
     box: np.ndarray,
@@ -120,16 +120,16 @@ def worth(
     repeatability: float = 0.0,
     sensed: Temperatures | None = None,
     level: np.ndarray | None = None,
-) -> Worth:
-    """Return what a model is worth on a virtual machine; `repeatability` spoils the points in space alone."""
+) -> ModelEvaluation:
+    """Return the tool errors of a virtual machine without and with a model; `repeatability` acts in space alone."""
     before = held_out(truth, None, box, points, seed, repeatability, level=level)
     after = held_out(truth, model, box, points, seed, repeatability, sensed=sensed, level=level)
-    return Worth(before, after, paper_metric(truth, model, box, seed=seed, sensed=sensed, level=level))
+    return ModelEvaluation(before, after, paper_metric(truth, model, box, seed=seed, sensed=sensed, level=level))
 
 
-def worth_text(worth: Worth) -> str:
-    """Return what a model is worth on a virtual machine: the paper's measure next to the honest one."""
-    before, after, paper = worth.before, worth.after, worth.paper
+def evaluation_text(evaluation: ModelEvaluation) -> str:
+    """Return these errors as text: by the paper's metric along lines, and in space."""
+    before, after, paper = evaluation.before, evaluation.after, evaluation.paper
     compared = {
         f"metric of Mou & King, mean |displacement error| along {paper.lines} lines": (paper.before, paper.after, "µm"),
         "error vector in space, RMS, datum aligned": (before.aligned.rms, after.aligned.rms, "µm"),
@@ -141,13 +141,13 @@ def worth_text(worth: Worth) -> str:
     for name, (without, left, unit) in compared.items():
         removed = f" ({100.0 * (1.0 - left / without):.1f} % less)" if without > 0.0 else ""
         lines.append(f"  {name}: {without * 1e6:.2f} → {left * 1e6:.2f} {unit}{removed}")
-    if worth.promised is not None:
-        low, high = (f"{end * 1e6:.2f}" for end in worth.promised)
-        lines.insert(3, f"  promised by the fit: {low} to {high} µm, {'kept' if worth.kept else 'NOT KEPT'}")
+    if evaluation.promised is not None:
+        low, high = (f"{end * 1e6:.2f}" for end in evaluation.promised)
+        lines.insert(3, f"  promised by the fit: {low} to {high} µm, {'kept' if evaluation.kept else 'NOT KEPT'}")
     return "\n".join(lines)
 
 
-def worth_json(worth: Worth) -> dict[str, Any]:
+def evaluation_json(evaluation: ModelEvaluation) -> dict[str, Any]:
     """Return the same as plain numbers; SI units are in the keys."""
     error = {
         name: {
@@ -157,8 +157,16 @@ def worth_json(worth: Worth) -> dict[str, Any]:
             "aligned_max_m": one.aligned.largest,
             "rotation_rms_rad": one.rotation.rms,
         }
-        for name, one in (("error_without", worth.before), ("error_with", worth.after))
+        for name, one in (("error_without", evaluation.before), ("error_with", evaluation.after))
     }
-    along = {"without_m": worth.paper.before, "with_m": worth.paper.after, "lines": worth.paper.lines}
-    promised = {"promised_m": worth.promised, "kept": worth.kept}
+    along = {"without_m": evaluation.paper.before, "with_m": evaluation.paper.after, "lines": evaluation.paper.lines}
+    promised = {"promised_m": evaluation.promised, "kept": evaluation.kept}
     return {**error, **promised, "mean_displacement_error_along_lines": along}
+
+
+Worth, worth, worth_text, worth_json = (
+    ModelEvaluation,
+    evaluate_model,
+    evaluation_text,
+    evaluation_json,
+)  # for one version

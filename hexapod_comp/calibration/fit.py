@@ -30,12 +30,12 @@ from .estimator import (
     iterate,
     physical_covariance,
 )
-from .lead import ScrewLead, look_for_lead
+from .lead import ScrewLead, detect_lead
 from .mixups import SWAPPED, mixups, swapped_directions
 from .parameters import FitSettings, ParameterSpace
 from .posterior import Observability, ToolError, UnseenError, box_errors, listed, observe, without_trace
 from .selection import Decision, select
-from .thermal import HeatSeen, TimeConstants, seek_time_constants, with_courses
+from .thermal import ThermalEvidence, TimeConstants, estimate_time_constants, with_courses
 from .trust import LeftOut, Residuals, Verdict, judge, with_drift
 
 LARGEST_NOISE = 0.02  # A machine that leaves more than this of its readings, m or rad, is not the one that was measured
@@ -97,7 +97,7 @@ class ModelFit:
         What a reader must know.
     held : HeldDatum
         Where the tool is held: the model is the solution's machine, shifted and turned as a whole.
-    warming : HeatSeen
+    warming : ThermalEvidence
         What they tell of heat.
     lead : ScrewLead or None
         What is known of the screws' lead; None where it was not looked for.
@@ -117,7 +117,7 @@ class ModelFit:
     outliers: tuple[Outlier, ...]
     notes: tuple[str, ...]
     held: HeldDatum
-    warming: HeatSeen
+    warming: ThermalEvidence
     lead: ScrewLead | None
     held_out: np.ndarray
 
@@ -181,7 +181,7 @@ def fit_model(
         try:
             return _fit(measurements, begun, progress, datum)
         except NotSettled as error:
-            return _without_pulling(measurements, begun, error, progress, datum)
+            return _drop_outlier_runs(measurements, begun, error, progress, datum)
     except HexapodError as error:
         blocks = [block.name for block in begun.everything.space.blocks]
         named = mixups(begun.everything, begun.problem, blocks, progress)
@@ -192,7 +192,7 @@ def fit_model(
         raise
 
 
-def _without_pulling(
+def _drop_outlier_runs(
     measurements: MeasurementSet,
     begun: _Begun,
     unsettled: NotSettled,
@@ -278,7 +278,7 @@ def _fit(
         outliers=tuple(_outliers(estimation, solution)),
         notes=(*measurements.notes, *notes, *verdict.remarks),
         held=held,
-        warming=HeatSeen.of(measurements, estimation, solution, constants, verdict.unexplained.factor),
+        warming=ThermalEvidence.of(measurements, estimation, solution, constants, verdict.unexplained.factor),
         lead=lead,
         held_out=residuals.held_out,
     )
@@ -287,7 +287,7 @@ def _fit(
 def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object]) -> _Begun:
     """Return what a fit starts from; the lead is left alone where no screw wave is fitted or screws differ."""
     measurements = with_courses(measurements)
-    constants = seek_time_constants(measurements, ParameterSpace(measurements, settings), progress)
+    constants = estimate_time_constants(measurements, ParameterSpace(measurements, settings), progress)
     if constants.values:
         settings = replace(settings, time_constants=constants.values)
     everything = Estimation(measurements, ParameterSpace(measurements, settings))
@@ -298,7 +298,7 @@ def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callab
     if not set(settings.blocks) & set(WAVES) or len(np.unique(known)) > 1:
         return _Begun(everything, problem, None, constants)
     progress("looking for the screws' lead")
-    lead = look_for_lead(everything, problem)
+    lead = detect_lead(everything, problem)
     if lead.given is None and lead.used is not None:
         everything = Estimation(measurements, ParameterSpace(measurements, replace(settings, lead=lead.used)))
         problem, _ = everything.linearise(np.zeros(everything.space.size), trust)

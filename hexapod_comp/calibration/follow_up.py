@@ -60,7 +60,7 @@ class Detectability:
         ]
         return np.array(tries) - self.now
 
-    def take(self, n: int) -> None:
+    def add(self, n: int) -> None:
         """Read a candidate."""
         self.taken = np.concatenate([self.taken, self.of_candidate[n]])
         self.now = self._value(self.taken)
@@ -139,7 +139,7 @@ def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]
 
 
 @dataclass(frozen=True)
-class Left:
+class ErrorOverPoses:
     """What is left over some poses, the datum aligned."""
 
     where: str
@@ -166,7 +166,7 @@ class Remaining:
 
     machine: RealMachine  # as calibrated
     parameters: int  # how many the fit has
-    left: tuple[Left, ...]  # in the measured box with a level tool, and in the workspace
+    left: tuple[ErrorOverPoses, ...]  # in the measured box with a level tool, and in the workspace
     blocks: tuple[Share, ...]
     measurements: tuple[Share, ...]  # the one that removes most from the workspace first
 
@@ -206,7 +206,7 @@ def remaining(
     return Remaining(machine, space.size, tuple(left), tuple(blocks), tuple(measurements))
 
 
-def _left(predictor: ErrorPredictor, poses: Poses, factor: np.ndarray, where: str) -> tuple[Left, np.ndarray]:
+def _left(predictor: ErrorPredictor, poses: Poses, factor: np.ndarray, where: str) -> tuple[ErrorOverPoses, np.ndarray]:
     """Return what is left over some poses, and M, (p, p): its mean square is tr(M) of independent effects."""
     tips, standing, slopes, given_up = predictor.slopes(poses)
     reached = np.isfinite(slopes).all(axis=(1, 2))
@@ -215,7 +215,7 @@ def _left(predictor: ErrorPredictor, poses: Poses, factor: np.ndarray, where: st
     as_it_stands = np.concatenate([standing[reached] @ factor, given_up[reached, :, None]], axis=2)[:, :3]
     drawn = monte_carlo(effects, MACHINES_DRAWN, percentiles=(95.0,), distribution=NORMAL)
     worst = int(sizes[:, 0].argmax())
-    left = Left(
+    left = ErrorOverPoses(
         where=where,
         poses=len(tips),
         rms=np.sqrt((sizes**2).mean(axis=0)),

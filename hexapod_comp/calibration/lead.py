@@ -68,7 +68,7 @@ class ScrewLead:
         return f"{given}, {shown}{'' if self.agrees else ': THEY DISAGREE'}"
 
 
-def look_for_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
+def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
     """Return what readings show of the screws' lead, beside what is given; `problem` is at the nominal machine.
 
     Where readings are plenty a random part is tried first.

@@ -672,7 +672,7 @@ def _nominal(geometry: HexapodGeometry, m: MeasurementSet) -> np.ndarray:
     return strut_lengths_batch(Structure.of(geometry), m.stations.positions, m.stations.rotations)
 
 
-def misread(
+def best_alternative_reading(
     m: MeasurementSet, model: MachineModel, as_they_are: float, chi_square: Callable[[MeasurementSet], float]
 ) -> list[str]:
     """Return by name how check readings must be taken to be those of a machine that has not changed; the best, or none.

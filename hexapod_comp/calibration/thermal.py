@@ -166,7 +166,7 @@ class TimeConstants:
     deviations: tuple[float, ...] = ()
 
 
-def seek_time_constants(
+def estimate_time_constants(
     measurements: MeasurementSet, space: ParameterSpace, progress: Callable[[str], object]
 ) -> TimeConstants:
     """Return the time constants that readings show beyond a fit without late parts; none where nothing tells."""
@@ -293,7 +293,7 @@ class Swelling:
 
 
 @dataclass(frozen=True)
-class HeatSeen:
+class ThermalEvidence:
     """What readings tell of heat, and of humidity."""
 
     changes: tuple[tuple[str, float], ...]  # of each thermometer that was read, K
@@ -310,7 +310,7 @@ class HeatSeen:
         solution: Solution,
         time_constants: TimeConstants,
         factor: float,
-    ) -> HeatSeen:
+    ) -> ThermalEvidence:
         """Return what a fit to readings tells; deviations are wider by a `factor`."""
         space, stations = estimation.space, measurements.stations
         read = (stations.temperatures != REFERENCE_TEMPERATURE).any(axis=0)
@@ -319,7 +319,7 @@ class HeatSeen:
         if growth.time_constants and not time_constants.values:  # given
             time_constants = TimeConstants(growth.time_constants, (0.0,) * len(growth.time_constants))
         known, block = _Known.of(estimation, solution, time_constants, factor), space.block("expansion")
-        return HeatSeen(
+        return ThermalEvidence(
             changes=tuple((name, change) for name, change, is_read in changes if is_read),
             thermometer=space.settings.thermometer,
             parts=() if block is None else tuple(_parts(space, solution, known, block.part.start, growth)),
@@ -406,12 +406,12 @@ def _swelling(measurements: MeasurementSet, space: ParameterSpace, solution: Sol
 NOT_DETERMINED = "; these readings do not determine it"
 
 
-def warming_text(warming: HeatSeen) -> str:
+def warming_text(warming: ThermalEvidence) -> str:
     """Return what readings tell of heat and humidity, for people; empty where neither was read."""
     return "\n".join([*_heat_lines(warming), *_swelling_lines(warming.swelling)])
 
 
-def _heat_lines(warming: HeatSeen) -> Iterator[str]:
+def _heat_lines(warming: ThermalEvidence) -> Iterator[str]:
     if not warming.changes:
         return
     listed = ", ".join(f"{name} {change:.2f} K" for name, change in warming.changes)
@@ -447,7 +447,7 @@ def _swelling_lines(swelling: Swelling | None) -> Iterator[str]:
         yield f"{head} ± {1e4 * swelling.deviation:.2f} {stated}{unsure}"
 
 
-def warming_json(warming: HeatSeen) -> dict:
+def warming_json(warming: ThermalEvidence) -> dict:
     """Return what readings tell of heat as plain numbers; units are in the keys."""
     constants, swelling = warming.time_constants, warming.swelling
     parts = [

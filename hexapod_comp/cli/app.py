@@ -62,7 +62,7 @@ def _run(arguments: Sequence[str]) -> int:
     verb = VERBS[args.verb]
     named = {role: {o.label: getattr(args, o.dest) for o in verb.options if o.role == role} for role in ROLES}
     try:
-        _refuse_what_does_not_go_together(verb, args)
+        _check_conflicts(verb, args)
         _refuse_numbers_as_files(verb, args)
         with protected(*named.values()):
             if args.verb in ONE_THREAD:  # NumPy reads this when it is loaded, and nothing has loaded it yet
@@ -106,7 +106,7 @@ def _with_negative_values(arguments: Sequence[str]) -> list[str]:
     return joined
 
 
-def _refuse_what_does_not_go_together(verb: Verb, args: argparse.Namespace) -> None:
+def _check_conflicts(verb: Verb, args: argparse.Namespace) -> None:
     """Raise CommandError where the options break a rule of the verb."""
     options = {option.name: option for option in verb.options}
 

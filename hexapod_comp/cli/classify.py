@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import CommandError, HexapodError, InputFileError
 from ..formats.paths import input_file
-from ..formats.schema import complaints_about
+from ..formats.schema import file_errors
 from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.model import RealMachine
 from ..machine.model_file import load_model
@@ -47,7 +47,7 @@ def classify(args: argparse.Namespace) -> int | Result:
         return _after_calibration(args, geometry, turned)
     path = input_file(args.budget, "error_budget")
     budget = load_budget(path)
-    with complaints_about(path):  # what does not fit the machine is refused before the work starts
+    with file_errors(path):  # what does not fit the machine is refused before the work starts
         budget.single_errors(geometry)
     reached = reaches(geometry, turned, args.cells)
     names = tuple(f"α {math.degrees(a):g}°, β {math.degrees(b):g}°" for a, b in product(args.tilt_deg, args.tilt_deg))

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..export.worth import Comparison, ExportCheck, ExportTrial, Size
+from ..export.trial import Comparison, ExportCheck, ExportTrial, Size
 from ..formats import texts
 from ..formats.outputs import write_text
 from ..formats.paths import input_file
@@ -24,7 +24,7 @@ from .results import Result
 HARMLESS = 10e-9
 
 
-class Tried(NamedTuple):
+class ExportMethod(NamedTuple):
     """One way to use an export, driven through the machine that the model describes."""
 
     name: str
@@ -35,7 +35,7 @@ class Tried(NamedTuple):
 def export(args: argparse.Namespace) -> Result:
     """Write a model in other forms, and show what they leave; 1 when one would make the error larger."""
     geometry, model = results.load_machine(args)
-    written, tried = _exact(args, geometry, model), list[Tried]()
+    written, tried = _exact(args, geometry, model), list[ExportMethod]()
     title, known = f"machine {model.machine}, model {model.name}", {"machine": model.machine, "model": model.name}
     if args.linuxcnc is None and args.table is None:  # what was written has the very numbers: nothing is to be judged
         text = f"{title}\nwritten: {', '.join(written)}"
@@ -109,7 +109,7 @@ def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineMo
 
 def _linuxcnc(
     args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles: list[str]
-) -> tuple[list[str], Tried]:
+) -> tuple[list[str], ExportMethod]:
     """Write LinuxCNC's files, read them back and drive the machine through them."""
     from ..export.linuxcnc import make_genhexkins, read_genhexkins, table_misfit, write_genhexkins
 
@@ -125,10 +125,10 @@ def _linuxcnc(
         f"what bends between the {points} points of a strut's .comp file: {rms:.3f} µm RMS, {largest:.3f} at most",
         f"the error field: moves the tool by {_size(check.field)}",
     ]
-    return [str(file) for file in files], Tried("LinuxCNC", check, notes)
+    return [str(file) for file in files], ExportMethod("LinuxCNC", check, notes)
 
 
-def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles: list[str]) -> list[Tried]:
+def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles: list[str]) -> list[ExportMethod]:
     """Write the table, read it back, and drive the machine through its strut and through its pose corrections."""
     from ..export.table import commands_by_poses, commands_by_struts, make_table, read_table, write_table
 
@@ -140,12 +140,12 @@ def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles
     lost = model.struts.largest_backlash.max() * 1e6
     backlash = [f"backlash of struts, up to {lost:.3f} µm: no pose correction fits six directions"] if lost else []
     return [
-        Tried("table, struts", trial.check(partial(commands_by_struts, back)), left_out),
-        Tried("table, poses", trial.check(partial(commands_by_poses, back)), [*left_out, *backlash]),
+        ExportMethod("table, struts", trial.check(partial(commands_by_struts, back)), left_out),
+        ExportMethod("table, poses", trial.check(partial(commands_by_poses, back)), [*left_out, *backlash]),
     ]
 
 
-def _shown(tried: Tried, tilt_deg: float) -> tuple[list[str], dict[str, Any]]:
+def _shown(tried: ExportMethod, tilt_deg: float) -> tuple[list[str], dict[str, Any]]:
     """Return lines about one way to use an export, and the same for programs."""
     name, check, notes = tried
     heat, damp = check.per_kelvin, check.per_humidity

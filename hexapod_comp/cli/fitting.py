@@ -22,7 +22,7 @@ from ..calibration.check import (
     verification_report,
     verify_model,
 )
-from ..calibration.evaluation import Worth, worth, worth_json, worth_text
+from ..calibration.evaluation import ModelEvaluation, evaluate_model, evaluation_json, evaluation_text
 from ..calibration.fit import ModelFit, fit_model
 from ..calibration.lines import fit_lines
 from ..calibration.parameters import TOLERANCES, FitSettings
@@ -117,7 +117,7 @@ def plan(args: argparse.Namespace) -> Result:
     place = MeasuringBox(geometry, campaign.box, campaign.level, goal.tilt)
     with results.stage_line() as say:
         proposal = propose(place, goal, fit_settings(args), campaign, say)
-    results.say_notes(_detours(geometry, proposal.campaign))
+    results.print_notes(_detours(geometry, proposal.campaign))
     if args.out is not None:
         write_text(args.out, campaign_text(proposal.campaign, remarks(proposal)))
     return Result(
@@ -163,7 +163,7 @@ def fit(args: argparse.Namespace) -> int | Result:
     try:
         result = _joint(args, measured, settings, datum) if args.scheme == "joint" else _lines(args, measured, datum)
     except CalibrationError:
-        results.say_notes(measured.notes)  # they may say why
+        results.print_notes(measured.notes)  # they may say why
         raise
     if beyond := beyond_limits(measured, result.model):
         result = replace(result, misfit="; ".join(filter(None, (result.misfit, beyond))))
@@ -243,7 +243,7 @@ def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
     return f"{problem}, first at {at} mm, tool in work: {breaches[0].error}"
 
 
-def _worth(truth: RealMachine, result: Fitted, measured: MeasurementSet) -> Worth:
+def _worth(truth: RealMachine, result: Fitted, measured: MeasurementSet) -> ModelEvaluation:
     """Return what the model is worth on the virtual machine that was measured."""
     box, geometry = measured.tool_box(), measured.geometry
     if not spans(box):
@@ -251,22 +251,22 @@ def _worth(truth: RealMachine, result: Fitted, measured: MeasurementSet) -> Wort
     level = geometry.work.rotation.T @ measured.level() @ geometry.tool.rotation
     tool = None if result.fit is None else result.fit.level
     promised = None if tool is None else (tool.low, tool.high)
-    return replace(worth(truth, result.model, box, level=level), promised=promised)
+    return replace(evaluate_model(truth, result.model, box, level=level), promised=promised)
 
 
-def _write(args: argparse.Namespace, result: Fitted, measured: MeasurementSet, tried: Worth | None) -> int:
+def _write(args: argparse.Namespace, result: Fitted, measured: MeasurementSet, tried: ModelEvaluation | None) -> int:
     """Write the model and what else was asked for, and show it."""
     judged = judge(measured)
     parts = [result.text, region_text(result.model.measured, measured.geometry) + "\n"]
     parts += [standards_text(judged) + "\n"] if judged else []
-    parts += [worth_text(tried) + "\n"] if tried else []
+    parts += [evaluation_text(tried) + "\n"] if tried else []
     text = "\n".join(parts)
     if result.misfit:
         text = f"{FORCED}: {result.misfit}. {ADVICE}\n\n{text}"
     beside = save_with_posterior(_forced(result.model, result.misfit), result.fitted, args.out)
 
     def content() -> dict[str, Any]:
-        more = {"standards": standards_json(judged), "worth": worth_json(tried) if tried else None}
+        more = {"standards": standards_json(judged), "worth": evaluation_json(tried) if tried else None}
         more["measured_box"] = region_json(result.model.measured, measured.geometry)
         files = {"misfit": result.misfit, "written": args.out, "written_beside": beside}
         return {**result.content(), **more, **files}

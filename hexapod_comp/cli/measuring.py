@@ -58,7 +58,7 @@ def imagine(args: argparse.Namespace) -> Result:
         )
         tool = {"frame": "work", "box_m": box, "rms_m": error.raw.rms, "aligned_rms_m": error.aligned.rms}
     except GeometryError as problem:
-        results.say_notes([f"what the tool does is not shown: {problem}"])
+        results.print_notes([f"what the tool does is not shown: {problem}"])
     content = {
         "machine": model.machine,
         "name": model.name,
@@ -151,7 +151,7 @@ def iso230(args: argparse.Namespace) -> Result:
     geometry = load_geometry(args.machine)
     with results.stage("reading measurements"):
         measured = read_measurements(args.files, geometry, args.columns, args.probe_mm, in_reach=False)
-    results.say_notes(measured.notes)
+    results.print_notes(measured.notes)
     judged = judge(measured)
     if not judged:
         text = "no linear run has two cycles or more with every target read from both sides in each; no circle either"

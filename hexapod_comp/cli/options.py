@@ -110,7 +110,7 @@ class Renamed(argparse.Action):
         parser.error(f"argument {option}: is now {self.const}")
 
 
-class Given(argparse.Action):
+class StoreMachine(argparse.Action):
     """Store a machine, and that it was given."""
 
     def __call__(self, _: object, namespace: argparse.Namespace, given: Any, __: str | None = None) -> None:
@@ -336,7 +336,7 @@ COMPENSATED = flag("--compensated", "check readings: taken with the compensation
 def machine(default: str = "paper.yaml") -> Option:
     """Return the option that names the geometry file."""
     text = f"geometry file, or the name of a shipped one (default {default})"
-    return reads("--machine", text, kind="geometry", default=default, action=Given)
+    return reads("--machine", text, kind="geometry", default=default, action=StoreMachine)
 
 
 MACHINE = machine()

@@ -152,7 +152,7 @@ def ik(args: argparse.Namespace) -> Result:
         if outside := int(found.outside_box.sum()):
             lie = "the pose lies" if count == 1 else f"{outside} of {count} poses lie"
             note = f"{lie} outside the box in which the model was measured; the predicted error there is extrapolated"
-            results.say_notes([f"{note} ({region_text(model.measured, geometry)})"])
+            results.print_notes([f"{note} ({region_text(model.measured, geometry)})"])
     # Also an ideal machine's commands are not its lengths where screws turn with the joints.
     corrected = predicted is not None or bool(geometry.screw_lead.any())
     rows = [targets.row(n, lengths[n], corrected or args.line is not None) for n in range(count)]
@@ -163,7 +163,7 @@ def ik(args: argparse.Namespace) -> Result:
 
     def text() -> str:
         if args.out is not None or args.poses is not None or args.line is not None:
-            results.mention_default(args, geometry)
+            results.print_default_machine(args, geometry)
             return "" if args.out is not None else Table(rows).csv()
         (nominal, command), direction = lengths[0] * 1e3, targets.directions[0]
         columns = {"strut": STRUT_NAMES, "nominal_mm": nominal.tolist()}
@@ -240,7 +240,7 @@ def fk(args: argparse.Namespace) -> Result:
         sets = "these lengths" if len(rows) == 1 else "each row's lengths"
         how = f"Newton sought the poses of {sets} from home and {2 * ORIENTATIONS} starts all around"
         proof = "each closes the loops, but nothing proves that there are no others"
-        results.say_notes([f"machine {geometry.name} is no 6-3 machine: {how}; {proof}"])
+        results.print_notes([f"machine {geometry.name} is no 6-3 machine: {how}; {proof}"])
     if args.all_modes:
         return _all_modes(args, geometry, lengths[0])
     poses = zip(rows, _solved(args, geometry, model, rows, lengths), strict=True)
@@ -250,7 +250,7 @@ def fk(args: argparse.Namespace) -> Result:
 
     def text() -> str:
         if args.lengths is None:
-            results.mention_default(args, geometry)
+            results.print_default_machine(args, geometry)
             return "" if args.out is not None else Table(table).csv()
         title = f"{results.machine_title(geometry, model)}: pose of {results.whose(geometry)}"
         title += f", {_moved(args.direction)}" if args.direction else ""
@@ -327,7 +327,7 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
 # ---- check ----
 
 
-class Shown(NamedTuple):
+class LimitFormat(NamedTuple):
     """How a limit is shown."""
 
     column: str
@@ -345,14 +345,14 @@ class Shown(NamedTuple):
 
 STAGES = ("nominal", "compensated")
 LIMITS_SHOWN = {
-    "stroke": Shown("stroke_margin", "mm", 1e3, 3, margin=True),
-    "base_cone": Shown("base_cone_margin", "deg", 180.0 / math.pi, 3, margin=True),
-    "platform_cone": Shown("platform_cone_margin", "deg", 180.0 / math.pi, 3, margin=True),
-    "clearance": Shown("clearance_margin", "mm", 1e3, 3, margin=True),
-    "condition": Shown("condition", "", 1.0, 3),
-    "correction": Shown("correction", "um", 1e6, 2, stages=(1,)),
-    "step": Shown("step", "mm", 1e3, 4, unsigned=True),
-    "speed": Shown("speed", "mm_s", 1e3, 2, unsigned=True),
+    "stroke": LimitFormat("stroke_margin", "mm", 1e3, 3, margin=True),
+    "base_cone": LimitFormat("base_cone_margin", "deg", 180.0 / math.pi, 3, margin=True),
+    "platform_cone": LimitFormat("platform_cone_margin", "deg", 180.0 / math.pi, 3, margin=True),
+    "clearance": LimitFormat("clearance_margin", "mm", 1e3, 3, margin=True),
+    "condition": LimitFormat("condition", "", 1.0, 3),
+    "correction": LimitFormat("correction", "um", 1e6, 2, stages=(1,)),
+    "step": LimitFormat("step", "mm", 1e3, 4, unsigned=True),
+    "speed": LimitFormat("speed", "mm_s", 1e3, 2, unsigned=True),
 }
 
 
@@ -365,7 +365,7 @@ def check(args: argparse.Namespace) -> Result:
     with results.progress_bar(len(rows), " poses") as bar:
         result = check_limits(geometry, model, (positions, rotations), mode, args.rate_hz, bar.update)
     if not args.json:
-        results.mention_default(args, geometry)
+        results.print_default_machine(args, geometry)
     margins = [_margins(row, n, result) for n, row in enumerate(rows)]
     smallest = _smallest(geometry.limits, rows, result)
 
@@ -441,7 +441,7 @@ def _margins(row: Row, n: int, result: CheckResult) -> dict[str, Any]:
 def _margin_table(margins: list[dict[str, Any]], result: CheckResult, ideal: bool) -> str:
     """Return the table of margins; with a model, nominal and compensated stand side by side."""
 
-    def cell(row: dict[str, Any], shown: Shown) -> str:
+    def cell(row: dict[str, Any], shown: LimitFormat) -> str:
         values = [row[shown.name(stage)] for stage in (shown.stages[:1] if ideal else shown.stages)]
         return "/".join(texts.number(v, shown.digits) if math.isfinite(v) else "–" for v in values)
 

@@ -82,7 +82,7 @@ class Result:
             write_text(args.out, Table(list(self.rows)).csv())
         if text:
             print(text, end="" if text.endswith("\n") else "\n")
-        say_notes(self.notes)
+        print_notes(self.notes)
         if self.pictures is not None and args.pictures is not None:
             save_pictures(args, self.pictures)
         return self.code
@@ -96,10 +96,10 @@ def load_machine(args: argparse.Namespace) -> tuple[HexapodGeometry, MachineMode
     return geometry, find_model(getattr(args, "model", "ideal"), geometry)
 
 
-def mention_default(args: argparse.Namespace, geometry: HexapodGeometry) -> None:
+def print_default_machine(args: argparse.Namespace, geometry: HexapodGeometry) -> None:
     """Say on stderr that the default machine was taken, where nobody named one."""
     if not getattr(args, "machine_given", False):
-        say_notes([f"no --machine was given: this is machine {geometry.name}, the default"])
+        print_notes([f"no --machine was given: this is machine {geometry.name}, the default"])
 
 
 def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campaign:
@@ -113,7 +113,7 @@ def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campai
 
     def own_box() -> tuple[np.ndarray, np.ndarray]:
         largest = machine_box(geometry)
-        say_notes([f"{args.campaign} gives no box: the largest that {geometry.name} reaches, {corners(largest.box)}"])
+        print_notes([f"{args.campaign} gives no box: the largest that {geometry.name} reaches, {corners(largest.box)}"])
         return largest.box, largest.rotation
 
     return load_campaign(args.campaign, own_box)
@@ -145,7 +145,7 @@ def mention(args: argparse.Namespace, text: str) -> None:
     print(text, file=sys.stderr if args.json else sys.stdout)
 
 
-def say_notes(notes: Iterable[str]) -> None:
+def print_notes(notes: Iterable[str]) -> None:
     """Say on stderr what a reader of files found odd."""
     for note in notes:
         print(f"hexapod_comp: note: {note}", file=sys.stderr)

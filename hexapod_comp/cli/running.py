@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> Result:
     started = nullcontext(()) if args.attach else session.simulated(args.machine, model, truth)
     compare = not (args.attach or args.no_compare)  # nobody switches a real machine's compensation off in passing
     with results.ended_in_order(), started as nodes:
-        result = session.witnessed(geometry, nodes, poses, None, rate, compare, args.namespace)
+        result = session.run_poses(geometry, nodes, poses, None, rate, compare, args.namespace)
     errors, unanswered = report.error_rows(result), result.lost + result.refused
     blocks = [report.pose_block(f"pose {row.label}", record) for row, record in zip(rows, result.poses, strict=True)]
     return Result(
@@ -101,7 +101,7 @@ def demo(args: argparse.Namespace) -> Result:
             print(f"{begun}\n{story.calibration_text(calibration)}", flush=True)
     model = _chosen_model(args, geometry, truth) if calibration is None else calibration.fit.model
     with results.ended_in_order(), session.simulated(args.machine, model, truth) as nodes:
-        result = session.witnessed(geometry, nodes, poses, path, rate, compare=True)
+        result = session.run_poses(geometry, nodes, poses, path, rate, compare=True)
     rows = report.error_rows(result)
     if args.model in (TRUE, FITTED):
         promised = story.EXACT if calibration is None else story.promises(calibration.fit, poses, path)
@@ -123,11 +123,11 @@ def demo(args: argparse.Namespace) -> Result:
 def move(args: argparse.Namespace) -> Result:
     """Have the mover move the tool, or stop it; 0 when it has arrived, or stands."""
     from ..pose import Pose
-    from ..ros import heard_signals, keep_discovery_local
+    from ..ros import keep_discovery_local, received_signals
     from ..ros.client import Machine, MoveState
 
     keep_discovery_local()
-    signals = heard_signals()
+    signals = received_signals()
     with Machine(args.namespace) as machine, results.stage_line() as say:
         if args.stop:
             machine.stop()
@@ -146,12 +146,12 @@ def move(args: argparse.Namespace) -> Result:
 
 def watch(args: argparse.Namespace) -> int:
     """Serve a page that shows a running machine until Ctrl-C."""
-    from ..ros import heard_signals
+    from ..ros import received_signals
     from ..viewer.page import WatchPage, watch
 
     geometry = load_geometry(args.machine)
     page = WatchPage(geometry, args.host, args.port)
-    heard = heard_signals()
+    heard = received_signals()
     print(f"hexapod_comp: {geometry.name} is shown on {page.address} until Ctrl-C", file=sys.stderr)
     try:
         watch(geometry, page.show, lambda: not heard, args.namespace)
@@ -162,12 +162,12 @@ def watch(args: argparse.Namespace) -> int:
 
 def echo(args: argparse.Namespace) -> int | Result:
     """Print a topic's messages until Ctrl-C, --count or --seconds; 0 when one has come."""
-    from ..ros import heard_signals, keep_discovery_local
+    from ..ros import keep_discovery_local, received_signals
     from ..ros.echo import DISCOVERY_TIME, Echo, published_topics
     from ..ros.process import QUIET, SPIN_PERIOD, RosSession
 
     keep_discovery_local()
-    signals = heard_signals()
+    signals = received_signals()
     began = time.monotonic()
 
     def going_on(until: float) -> bool:
@@ -203,10 +203,10 @@ def echo(args: argparse.Namespace) -> int | Result:
 
 def record(args: argparse.Namespace) -> int:
     """Write a machine's topics into a bag; 0 when there is something to be replayed."""
-    from ..ros import heard_signals
+    from ..ros import received_signals
     from ..ros.recorder import BagRecorder
 
-    heard, end = heard_signals(), time.monotonic() + (args.seconds or math.inf)
+    heard, end = received_signals(), time.monotonic() + (args.seconds or math.inf)
     with BagRecorder(args.folder, args.namespace) as recorder, results.progress_bar(0, " messages") as bar:
         print(f"hexapod_comp: recording to {args.folder} until Ctrl-C", file=sys.stderr)
         recorder.run(lambda: not heard and time.monotonic() < end, bar.update)

@@ -79,7 +79,7 @@ class Guard:
         """Forget all samples; a latched problem stays."""
 
 
-class Lately:
+class EventWindow:
     """Whether something has happened of late: within :data:`SHOWN_FOR`, or since this was asked before.
 
     So a node that is asked now and then shows everything at least once, however long it stood still in between.
@@ -366,14 +366,14 @@ class OneSender(Guard):
         self._counted = True  # whether the middleware counts messages at all
         self._turned_at = self._changed_at = -math.inf
         self._last = self._other = 0
-        self._misses = Lately()
+        self._misses = EventWindow()
 
     @property
     def reason(self) -> str:  # type: ignore[override]
         """Name under which refusals are counted."""
         return "unknown_publisher" if self._unknown else "several_publishers"
 
-    def look(self, now: float) -> None:
+    def update(self, now: float) -> None:
         """Look who publishes: at the names only when they may have changed, or when they matter."""
         count = self._count_now()
         if count != self._count or count > 1 or self._unknown or UNKNOWN_NAME in self.names:
@@ -383,7 +383,7 @@ class OneSender(Guard):
         if count > 1 or self.problem or self._unknown or (self._own and self.names):
             self._judge(now)
 
-    def hear(self, number: int | None, now: float) -> bool:
+    def receive(self, number: int | None, now: float) -> bool:
         """Note a message's sequence number, None where none are counted; return whether it showed a second sender."""
         last, self._last = self._last, number or 0
         if number is not None and number == last + 1:

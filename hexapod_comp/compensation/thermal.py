@@ -46,7 +46,7 @@ class TemperatureFilter:
         self.time_constant = float(time_constant)
         self._means: dict[str, _Mean] = {}
 
-    def take(self, name: str, value: float, time: float) -> float:
+    def update(self, name: str, value: float, time: float) -> float:
         """Take a reading, °C or of humidity a fraction, made at a time, s, on a clock that is never set (a clock put
         back makes all that follows late); return the mean. A ModelError, as :meth:`.Temperatures.set`, changes nothing.
         """
@@ -86,7 +86,7 @@ class Thermometers:
         """Take other rules and another time constant, s, from the next reading on."""
         self._rules, self._filter.time_constant = rules, time_constant
 
-    def take(self, name: str, value: float, time: float) -> float:
+    def update(self, name: str, value: float, time: float) -> float:
         """Take a reading and return what counts from now on; a ModelError, also where it has jumped or does not fit
         the other parts, changes nothing."""
         reading, rules = Temperatures({name: value}).values[name], self._rules
@@ -104,7 +104,7 @@ class Thermometers:
             whose = f"the other parts' {middle:.2f} °C" if others else f"{middle:g} °C, and no other part is known"
             problem = f"reads {reading:.2f} °C, {off:.1f} K from {whose}; allowed {rules.spread:g} K"
             raise ModelError(f"temperature of {name}", problem)
-        mean = self._filter.take(name, reading, time)
+        mean = self._filter.update(name, reading, time)
         limit.accept((reading,), time)
         self._limits[name] = limit
         return mean

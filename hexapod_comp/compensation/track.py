@@ -74,7 +74,7 @@ class StrutTrack(Guard):
 
     # ---- what comes ----
 
-    def tell(self, command: Struts, now: float) -> None:
+    def add_command(self, command: Struts, now: float) -> None:
         """Add a command that was published."""
         self._told.append((now, command))
 

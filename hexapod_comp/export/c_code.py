@@ -128,20 +128,20 @@ def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> 
     quarter = max(1, len(stream) // 4)
     recorder.commands(stream[:quarter])
     for part, temperature in ((2.0, 24.5), (6.0, 21.25), (7.0, 1e3), (6.0, 22.25)):
-        recorder.take("t", (part, temperature))
+        recorder.record("t", (part, temperature))
     recorder.commands(stream[quarter : 2 * quarter])
-    recorder.take("e", (0.0,))
+    recorder.record("e", (0.0,))
     recorder.commands(stream[2 * quarter : 3 * quarter])
-    recorder.take("e", (1.0,))
+    recorder.record("e", (1.0,))
     for strange in ((np.nan, 0, 0, 0, 0, 0, 1), (0, 0, 0, 0, 0, 0, 2), (9.9, 0, 0, 0, 0, 0, 1)):
-        recorder.take("c", strange)
+        recorder.record("c", strange)
     recorder.commands(stream[3 * quarter :])
     struts = tuple(recorder.compensator.command.tolist())
-    recorder.take("p", struts)
-    recorder.take("p", (*struts[:5], struts[5] * 3.0))
-    recorder.take("r", struts)
+    recorder.record("p", struts)
+    recorder.record("p", (*struts[:5], struts[5] * 3.0))
+    recorder.record("r", struts)
     recorder.commands(stream[::-1][: quarter + 1])
-    recorder.take("f", ())
+    recorder.record("f", ())
     recorder.commands(stream[:3])
     return recorder.vectors
 
@@ -171,9 +171,9 @@ class Recorder:
     def commands(self, poses: Iterable[Pose]) -> None:
         """Command tool poses in ``work``, one after the other."""
         for pose in poses:
-            self.take("c", (*pose.position, *pose.quaternion()))
+            self.record("c", (*pose.position, *pose.quaternion()))
 
-    def take(self, kind: str, values: tuple[float, ...]) -> None:
+    def record(self, kind: str, values: tuple[float, ...]) -> None:
         """Do one thing, and write it down."""
         compensator, status = self.compensator, 0
         self.time += PERIOD

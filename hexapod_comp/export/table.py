@@ -30,7 +30,7 @@ from ..machine.passes import Passes, at
 from ..machine.trial import model_commands
 from ..pose import Pose, attitude_error
 from .carried import refuse_unknown
-from .worth import DIAGONAL
+from .trial import DIAGONAL
 
 POSITION = ("x", "y", "z")
 CORRECTION = tuple(f"correction_L{i}" for i in range(1, 7))

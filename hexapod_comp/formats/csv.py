@@ -141,12 +141,12 @@ class Table:
                 before += 1
             self._separator = next((mark for mark in SEPARATORS if mark in QUOTED.sub("", header)), ",")
             lines = csv.reader(itertools.chain([header], text), delimiter=self._separator, skipinitialspace=True)
-            self._take_header(next(lines, []))
+            self._parse_header(next(lines, []))
             for _ in itertools.islice(lines, layout.below):
                 pass
             for row in lines:
                 if row and not row[0].startswith("#"):
-                    self._take_row(before + lines.line_num, row)
+                    self._parse_row(before + lines.line_num, row)
         except csv.Error as error:
             line_number = before + (lines.line_num if lines else 0)
             raise InputFileError(self.path, f"line {line_number}", f"is not CSV: {error}") from error
@@ -166,7 +166,7 @@ class Table:
                 raise InputFileError(self.path, f"line {number}", "is not text: it holds a zero byte")
             yield line
 
-    def _take_header(self, cells: list[str]) -> None:
+    def _parse_header(self, cells: list[str]) -> None:
         if len(cells) > MAX_COLUMNS:
             raise InputFileError(self.path, "header", f"has {len(cells)} columns, at most {MAX_COLUMNS} are allowed")
         self.header = [name.strip() for name in cells]
@@ -174,7 +174,7 @@ class Table:
         if twice is not None:
             raise InputFileError(self.path, "header", "column is given twice", twice)
 
-    def _take_row(self, line: int, cells: list[str]) -> None:
+    def _parse_row(self, line: int, cells: list[str]) -> None:
         if len(cells) != len(self.header):
             hint, own = "", SEPARATORS[self._separator]
             others = [name for mark, name in SEPARATORS.items() if name != own and any(mark in cell for cell in cells)]

@@ -125,7 +125,7 @@ class Section:
         """Return (not raise) an error about `key`."""
         return InputFileError(self.path, self.where(key), problem, value)
 
-    def take(self, key: str) -> Any:
+    def require(self, key: str) -> Any:
         """Take a required value of any kind."""
         if key not in self:
             raise self.error(key, f"is missing{self._meant([key], 0.6)}")
@@ -139,7 +139,7 @@ class Section:
 
     def text(self, key: str) -> str:
         """Take a required non-empty string."""
-        value = self.take(key)
+        value = self.require(key)
         if not isinstance(value, str) or not value.strip():
             raise self.error(key, "must be text", value)
         return value
@@ -148,32 +148,32 @@ class Section:
         """Take one of the `allowed` words, or numbers."""
         if default is not None and key not in self:
             return default
-        value = self.take(key)
+        value = self.require(key)
         if not any(value == one and type(value) is type(one) for one in allowed):
             raise self.error(key, f"must be one of {', '.join(map(str, allowed))}", value)
         return value
 
     def unit(self, key: str, dimension: str) -> float:
         """Take the name of a unit; return its size in SI."""
-        value = self.take(key)
+        value = self.require(key)
         if not isinstance(value, str) or value not in spellings(dimension):
             raise self.error(key, f"must be one of {', '.join(UNITS[dimension])}", value)
         return spellings(dimension)[value]
 
     def integer(self, key: str, default: int | None = None) -> int:
         """Take a whole number."""
-        value = default if default is not None and key not in self else self.take(key)
+        value = default if default is not None and key not in self else self.require(key)
         if type(value) is not int:
             raise self.error(key, "must be a whole number", value)
         return value
 
     def section(self, key: str) -> Section:
         """Take a required sub-mapping."""
-        return Section(self.path, self.where(key), self.take(key))
+        return Section(self.path, self.where(key), self.require(key))
 
     def sections(self, key: str) -> Iterator[Section]:
         """Take a list of sub-mappings."""
-        value = self.take(key)
+        value = self.require(key)
         if not isinstance(value, list):
             raise self.error(key, "must be a list", value)
         for index, item in enumerate(value):
@@ -181,7 +181,7 @@ class Section:
 
     def array(self, key: str, shape: Shape = ()) -> np.ndarray:
         """Take finite numbers of a given shape."""
-        value = self.take(key)
+        value = self.require(key)
         stack = [(key, value)]  # text, booleans or mappings anywhere inside nested lists are refused
         while stack:
             where, item = stack.pop()
@@ -258,7 +258,7 @@ def _shape_text(shape: Shape) -> str:
 
 
 @contextmanager
-def complaints_about(path: str | Path) -> Iterator[None]:
+def file_errors(path: str | Path) -> Iterator[None]:
     """Turn what a dataclass raises about its values (GeometryError, ModelError) into an error that names the file."""
     try:
         yield
@@ -274,9 +274,9 @@ class Kind:
 
     def read(self, section: Section, name: str, default: Any) -> Any:
         """Return the value of a key; the default where there is no such key, unless it is MISSING."""
-        return default if default is not MISSING and name not in section else self.take(section, name)
+        return default if default is not MISSING and name not in section else self.parse(section, name)
 
-    def take(self, section: Section, name: str) -> Any:
+    def parse(self, section: Section, name: str) -> Any:
         """Return the value of a key that must be there."""
         raise NotImplementedError
 
@@ -295,7 +295,7 @@ class Numbers(Kind):
             return default
         return super().read(section, name, MISSING if self.unit else default)
 
-    def take(self, section: Section, name: str) -> Any:
+    def parse(self, section: Section, name: str) -> Any:
         if isinstance(self.shape, str):
             read_in = section.per_strut if self.shape == PER_STRUT else section.pairs_per_strut
             return read_in(name, DIMENSIONS[self.unit])
@@ -312,13 +312,13 @@ class Numbers(Kind):
 
 
 @dataclass(frozen=True)
-class Whole(Kind):
+class Integer(Kind):
     """A whole number within bounds."""
 
     low: int
     high: int
 
-    def take(self, section: Section, name: str) -> int:
+    def parse(self, section: Section, name: str) -> int:
         value = section.integer(name)
         if not self.low <= value <= self.high:
             raise section.error(name, f"must be {self.low} to {self.high}", value)
@@ -331,14 +331,14 @@ class Choice(Kind):
     def __init__(self, *words: Any) -> None:
         self.words = words
 
-    def take(self, section: Section, name: str) -> Any:
+    def parse(self, section: Section, name: str) -> Any:
         return section.choice(name, self.words)
 
 
 class Text(Kind):
     """A text that is not empty."""
 
-    def take(self, section: Section, name: str) -> str:
+    def parse(self, section: Section, name: str) -> str:
         return section.text(name)
 
 
@@ -348,8 +348,8 @@ class Names(Kind):
     def __init__(self, *counts: int, what: str = "column names") -> None:
         self.counts, self.what = counts, what
 
-    def take(self, section: Section, name: str) -> tuple[str, ...]:
-        given = section.take(name)
+    def parse(self, section: Section, name: str) -> tuple[str, ...]:
+        given = section.require(name)
         well = isinstance(given, list) and given and all(isinstance(text, str) and text.strip() for text in given)
         if not well or (self.counts and len(given) not in self.counts):
             count = f"{' or '.join(map(str, self.counts))} " if self.counts else ""
@@ -363,7 +363,7 @@ class Unit(Kind):
 
     dimension: str
 
-    def take(self, section: Section, name: str) -> float:
+    def parse(self, section: Section, name: str) -> float:
         return section.unit(name, self.dimension)
 
 
@@ -373,7 +373,7 @@ class Nested(Kind):
 
     schema: Any
 
-    def take(self, section: Section, name: str) -> Any:
+    def parse(self, section: Section, name: str) -> Any:
         return read_whole(self.schema, section.section(name))
 
 
@@ -403,7 +403,7 @@ def read(schema: Callable[..., T], section: Section, **given: Any) -> T:
     """Return what a section holds; fields that are `given` are not looked for in it."""
     keys: dict[str, tuple[Any, Any]] = keys_of(schema)  # type: ignore[arg-type]
     values = {name: kind.read(section, name, default) for name, (kind, default) in keys.items() if name not in given}
-    with complaints_about(section.path):
+    with file_errors(section.path):
         return schema(**values, **given)
 
 

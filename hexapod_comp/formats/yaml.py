@@ -81,7 +81,7 @@ def parse_yaml(text: str, name: str | Path, file_format: str, version: int) -> S
     given = section.text("format")
     if given != file_format:
         raise section.error("format", f"must be {file_format!r}", given)
-    given_version = section.take("version")
+    given_version = section.require("version")
     if type(given_version) is not int or given_version != version:
         raise section.error("version", f"only version {version} is understood", given_version)
     return section
@@ -90,7 +90,7 @@ def parse_yaml(text: str, name: str | Path, file_format: str, version: int) -> S
 def yaml_content(text: str, name: str | Path, most_nodes: int = MAX_NODES) -> Any:
     """Return what YAML holds: plain values, lists and mappings, not too many and not too deep."""
     try:
-        _refuse_tricks(text, most_nodes)
+        _reject_aliases_and_tags(text, most_nodes)
         return yaml.load(text, Loader=_StrictLoader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         problem = getattr(error, "problem", None) or type(error).__name__
@@ -101,7 +101,7 @@ def yaml_content(text: str, name: str | Path, most_nodes: int = MAX_NODES) -> An
         raise InputFileError(name, where, f"is not valid YAML: {problem}") from error
 
 
-def _refuse_tricks(text: str, most_nodes: int) -> None:
+def _reject_aliases_and_tags(text: str, most_nodes: int) -> None:
     """Raise on what lets a short file stand for something else, before anything is made of it."""
     # Nested references (`*name`) stand for more values than memory holds, and so do short lists; nesting overflows the
     # parser's stack and ends the process, a tag (`!!float`) makes the loader read a value as another type.

@@ -262,15 +262,15 @@ class CompensatorReset:
         self._node, self._status, self._options = node, status, options
         self._name = status_prefix(node.get_namespace(), "compensator")
         self._asked_at = self._complained_at = -math.inf
-        self._in_vain = 0
+        self._unanswered = 0
         self._question: Future | None = None
-        self._complaints = node.listen_to(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
+        self._complaints = node.subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
         self._client = node.create_client(Trigger, "compensator/reset")
 
     @property
-    def in_vain(self) -> bool:
+    def unanswered(self) -> bool:
         """Whether it has been asked again, and still nothing was heard."""
-        return self._in_vain > 1
+        return self._unanswered > 1
 
     def close(self) -> None:
         """Stop listening."""
@@ -285,7 +285,7 @@ class CompensatorReset:
     def ask(self, streaming_since: float, heard_at: float, now: float) -> None:
         """Ask if nothing was heard for too long, though commands have been sent since a while; monotonic times, s."""
         if heard_at > self._asked_at:
-            self._in_vain = 0
+            self._unanswered = 0
         waited = now - max(streaming_since, heard_at)
         if waited < self._options["timeout"] + RESET_AFTER or now - self._asked_at < RESET_PERIOD:
             return
@@ -298,8 +298,8 @@ class CompensatorReset:
             self._client.remove_pending_request(self._question)
         self._question = self._client.call_async(Trigger.Request())
         self._status.resets += 1
-        self._in_vain += 1
-        self._node.warn_of("reset", "the compensator refuses every command; asked it to start anew")
+        self._unanswered += 1
+        self._node.log_warning("reset", "the compensator refuses every command; asked it to start anew")
 
 
 class StopInput:
@@ -307,8 +307,8 @@ class StopInput:
 
     def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:
         self._stopped, self._beat_at, self._options = True, -math.inf, options
-        node.listen_to(Bool, "compensator/stopped", self._on_stopped, LATCHED_QOS)
-        node.listen_to(UInt64, "compensator/heartbeat", self._on_beat, EVENT_QOS)
+        node.subscribe(Bool, "compensator/stopped", self._on_stopped, LATCHED_QOS)
+        node.subscribe(UInt64, "compensator/heartbeat", self._on_beat, EVENT_QOS)
 
     def stopped(self, now: float) -> bool:
         """Return whether it refuses commands, or is not heard, at the monotonic time `now`, s."""
@@ -366,15 +366,17 @@ class LinuxcncBridgeNode(MachineNode):
         """Open topics."""
         self.on_parameters(set())
         self._pose_out.header.frame_id = self._options["frame_id"]
-        with self.all_or_nothing():
+        with self.rolled_back_on_error():
             self._open_topics()
         return super().on_configure(state)
 
     def _open_topics(self) -> None:
         self._pose_pub = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS, self._options["timeout"])
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
-        self.speak_for(self._options["component"])
-        self._subscription = self.obey(JointState, "strut_corrections", self._on_correction, self._look)
+        self.set_hardware_id(self._options["component"])
+        self._subscription = self.subscribe_exclusive(
+            JointState, "strut_corrections", self._on_correction, self._update_publishers
+        )
         self._source = self.sender_of(self._subscription, self._options["allow_several_publishers"])
         self._check = self.every(CHECK_PERIOD, self._check_state)
         self._reset = CompensatorReset(self, self._status, self._options)
@@ -401,7 +403,7 @@ class LinuxcncBridgeNode(MachineNode):
         """Take what has been set while the node runs; the rest is looked up where it is needed."""
         self._guard.follow(*(self._options[name] for name in GUARDED))
 
-    def say_goodbye(self) -> None:
+    def publish_last_status(self) -> None:
         """Ramp the corrections out if that is quick, and publish a last status."""
         self._active = False
         period, end = 1.0 / self._options["rate"], time.monotonic() + LONGEST_FAREWELL
@@ -480,9 +482,9 @@ class LinuxcncBridgeNode(MachineNode):
         message = out.made([value * self._metres for value in feedback], stamp, since if followed else 0.0)
         if not followed or max(map(abs, out.velocity.tolist())) > STANDING:
             self._moved_at = now
-        in_vain = self._reset is not None and self._reset.in_vain
+        unanswered = self._reset is not None and self._reset.unanswered
         silent = self._status.heard.age(now) > self._options["timeout"]
-        if silent and now - self._moved_at < self._options["timeout"] and not in_vain:
+        if silent and now - self._moved_at < self._options["timeout"] and not unanswered:
             return
         self._states_pub.publish(message)
 
@@ -493,16 +495,16 @@ class LinuxcncBridgeNode(MachineNode):
         which, listed = ", ".join(bad), ", ".join(f"{name} = {value}" for name, value in bad.items())
         text = f"pins that are no numbers within ±{LARGEST_PIN:g}: {listed}"
         self._status.bad_pins.add(which, text, now)
-        self.warn_of(which, text)
+        self.log_warning(which, text)
         return False
 
-    def _look(self) -> None:
-        self._source.look(time.monotonic())
+    def _update_publishers(self) -> None:
+        self._source.update(time.monotonic())
 
     def _on_correction(self, data: bytes, number: int | None) -> None:
         sample = Sample(time.monotonic())
         self._status.heard.tick(sample.now)
-        self._source.hear(number, sample.now)
+        self._source.receive(number, sample.now)
         try:
             self._source.check(sample)
             self._reader.sample(data, sample)
@@ -515,7 +517,7 @@ class LinuxcncBridgeNode(MachineNode):
             self._stamps.accept(sample)
         except CommandError as error:
             self._status.refusals.add(error.reason, str(error), sample.now)
-            self.warn_of(error.reason, f"correction refused ({error.reason}): {error}")
+            self.log_warning(error.reason, f"correction refused ({error.reason}): {error}")
 
     # ---- state ----
 
@@ -523,15 +525,15 @@ class LinuxcncBridgeNode(MachineNode):
         if self._reset is None:
             return
         now = time.monotonic()
-        self._source.look(now)
+        self._source.update(now)
         level, text = self._status.judged(self._active, now)
         if text != self._last_text:
             self._last_text = text
             if level != OK:
-                self.warn_of(text, text)
+                self.log_warning(text, text)
             else:
                 self.note(text, text)
-        self.tell(level, text, lambda: self._status.values(", ".join(self._source.names), now))
+        self.publish_status(level, text, lambda: self._status.values(", ".join(self._source.names), now))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

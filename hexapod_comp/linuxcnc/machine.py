@@ -29,7 +29,7 @@ from ..formats.texts import plain_number
 from ..machine.geometry import load_geometry
 from ..machine.model import MotionState, RealMachine
 from ..pose import Pose
-from ..ros import heard_signals
+from ..ros import received_signals
 from ..virtual.named import find_model
 from .hal import METRES, HalComponent, pins, quaternion_from_axes
 
@@ -57,7 +57,7 @@ class WatchedMachine:
         self._guess = geometry.home
         self._base_in_work, self._platform_in_tool = geometry.work.inverse(), geometry.tool.inverse()
 
-    def look(self, struts: np.ndarray, command: Pose, tool_length: float = 0.0) -> tuple[Pose, np.ndarray]:
+    def observe(self, struts: np.ndarray, command: Pose, tool_length: float = 0.0) -> tuple[Pose, np.ndarray]:
         """Return where the tool is, as LinuxCNC's axes would put it, and its tip's error."""
         geometry, model, up = self.machine.geometry, self.machine.model, np.array([0.0, 0.0, tool_length])
         commanded = Pose(command.position - up + command.rotation @ up, command.rotation)
@@ -89,7 +89,7 @@ class MachineComponent:
         struts = np.array(self._read_struts()) * self._metres
         command = Pose.from_quaternion(axes[:3] * self._metres, np.array(quaternion_from_axes(*axes[3:])))
         try:
-            true, error = self._watched.look(struts, command, self._read_tool()[0] * self._metres)
+            true, error = self._watched.observe(struts, command, self._read_tool()[0] * self._metres)
         except KinematicsError:
             self._write_valid([False])
             return
@@ -110,7 +110,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"cannot start: {error}", file=sys.stderr)
         return 1
     shown.cycle()  # the pins hold values before LinuxCNC goes on
-    heard = heard_signals()
+    heard = received_signals()
     shown.component.ready()
     period, due = 1.0 / options.rate, time.monotonic()
     while not heard:

@@ -133,7 +133,7 @@ class NodeProcess:
         return code, output
 
 
-def waited_for_processor(pid: int) -> float:
+def processor_wait(pid: int) -> float:
     """Return how long the threads of a process have waited for a processor up to now, added up, s; 0 if untold."""
     waited = 0
     for path in glob.glob(f"/proc/{pid}/task/*/schedstat"):

@@ -24,7 +24,7 @@ from ..machine.model import MachineModel
 from ..machine.model_file import save_model
 from ..machine.trajectory import Path, commanded_in_base, move
 from ..pose import Pose
-from .processes import NodeProcess, PrivateDomain, waited_for_processor
+from .processes import NodeProcess, PrivateDomain, processor_wait
 from .report import Answering, PathRecord, PoseRecord, SessionResult, Track, busy_text
 
 if TYPE_CHECKING:
@@ -106,11 +106,11 @@ class Watch:
 
     def __init__(self, nodes: Sequence[NodeProcess]) -> None:
         self._pids = [os.getpid(), *(node.pid for node in nodes)]
-        self._began, self._waited = time.monotonic(), sum(map(waited_for_processor, self._pids))
+        self._began, self._waited = time.monotonic(), sum(map(processor_wait, self._pids))
 
     def answering(self, client: LoopClient, rate: float, latencies: np.ndarray | None = None) -> Answering:
         """Return how fast a client's commands at some rate, Hz, were answered since then."""
-        every, waited = _latencies(client.sent.values()), sum(map(waited_for_processor, self._pids))
+        every, waited = _latencies(client.sent.values()), sum(map(processor_wait, self._pids))
         return Answering(
             latencies=np.zeros(0) if latencies is None else latencies,
             answered=len(every),
@@ -223,7 +223,7 @@ def simulated(machine: str, model: MachineModel, truth: MachineModel) -> Iterato
                 raise HexapodError(f"{node.name} ended with code {code}:").with_lines(output)
 
 
-def witnessed(
+def run_poses(
     geometry: HexapodGeometry,
     nodes: Sequence[NodeProcess],
     poses: list[Pose],

@@ -19,7 +19,7 @@ from ..errors import ModelError
 from ..formats.files import read_text
 from ..formats.outputs import write_text
 from ..formats.paths import input_file
-from ..formats.schema import PER_STRUT, Numbers, Section, complaints_about, in_unit
+from ..formats.schema import PER_STRUT, Numbers, Section, file_errors, in_unit
 from ..formats.yaml import block_text, parse_yaml
 from .field import COMPONENTS, CROSS_AXES, LARGEST, OUTSIDE_POLICIES, GridField, no_field
 from .geometry import HexapodGeometry
@@ -79,7 +79,7 @@ def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineM
     given = top.text("machine")
     if given != machine:
         raise top.error("machine", f"the model is for another machine, must be {machine!r}", given)
-    with complaints_about(name):
+    with file_errors(name):
         origin = replace(_read_origin(top), text_sha256=text_sha256(text))
         values: dict[str, Any] = {"name": top.text("name"), "origin": origin}
         values |= {"region": _read_region(top)} | read_terms(MachineModel, top, "")
@@ -162,7 +162,7 @@ def _refuse_cut_off(top: Section) -> None:
     """Raise when a closed file has lost its end: every block is optional, so what is left may read well."""
     marks = [key for key in ("closed", "end") if key in top]
     for key in marks:
-        value = top.take(key)
+        value = top.require(key)
         if value is not True:
             raise top.error(key, "must be true, or be left out together with its fellow", value)
     if marks == ["closed"]:
@@ -172,24 +172,24 @@ def _refuse_cut_off(top: Section) -> None:
 
 
 def _read_origin(top: Section) -> ModelOrigin:
-    given = top.take("date")
+    given = top.require("date")
     if isinstance(given, date):  # YAML makes one of an unquoted date
         given = given.isoformat()
     sources = []
     for entry in top.sections("sources"):
-        sources.append((entry.text("file"), entry.take("sha256")))
+        sources.append((entry.text("file"), entry.require("sha256")))
         entry.finish()
     residual = UM.read(top, "held_out_residual", None)
     note, posterior, datum = top.text("note") if "note" in top else "", None, None
     if "posterior" in top:
         section = top.section("posterior")
-        posterior = section.text("file"), section.take("sha256")
+        posterior = section.text("file"), section.require("sha256")
         section.finish()
     if "datum" in top:
         section = top.section("datum")
         position = section.quantity("position", "length", (3,))
         angles = section.quantity("rotation", "angle", (3,), np.zeros(3))
-        datum = Datum(tuple(position.tolist()), tuple(angles.tolist()), section.take("held"))
+        datum = Datum(tuple(position.tolist()), tuple(angles.tolist()), section.require("held"))
         section.finish()
     origin = ModelOrigin(given, tuple(sources), residual, note, posterior, datum)
     _check_origin(origin)
@@ -288,7 +288,7 @@ def _read_wave(section: Section) -> dict[str, np.ndarray]:
     waves = {1: amplitudes(section)}
     period = section.per_strut("period", "length")
     for harmonic in section.sections("harmonics") if "harmonics" in section else ():
-        times = harmonic.take("times")
+        times = harmonic.require("times")
         if type(times) is not int or not 2 <= times <= MOST_HARMONICS:
             raise harmonic.error("times", f"must be a whole number, 2…{MOST_HARMONICS}", times)
         if times in waves:
@@ -343,7 +343,7 @@ def _read_line(entry: Section, grid: tuple[np.ndarray, ...], families: dict[str,
     """Read one line of the field into its family, for one direction or both."""
     axis = entry.choice("axis", ("x", "y", "z"))
     counts = [len(grid[other]) for other in CROSS_AXES["xyz".index(axis)]]
-    nodes = entry.take("at")
+    nodes = entry.require("at")
     if not (
         isinstance(nodes, list)
         and len(nodes) == 2

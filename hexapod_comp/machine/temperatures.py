@@ -67,7 +67,7 @@ class Lag:
     newest: float  # Time of the first reading and of the newest one, s
     behind: list[float]  # d_k, K
 
-    def take(self, change: float, time: float, time_constants: Sequence[float]) -> None:
+    def add(self, change: float, time: float, time_constants: Sequence[float]) -> None:
         """Take a reading that differs from the last one by a `change`, K, at a time, s."""
         elapsed = max(0.0, time - self.newest)
         self.newest = max(self.newest, time)
@@ -189,7 +189,7 @@ class Temperatures:
             raise ModelError(f"time of the temperature of {name}", "must be finite, s: the model has time constants")
         self.set(name, value)
         if name in self.lags:
-            self.lags[name].take(self.values[name] - before, time, time_constants)
+            self.lags[name].add(self.values[name] - before, time, time_constants)
         elif late_parts:
             self.lags[name] = Lag(time, time, [0.0] * len(time_constants))
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import ModelError
 from ..formats.paths import input_file
-from ..formats.schema import Choice, Numbers, Section, Text, Whole, complaints_about, in_unit, read_whole
+from ..formats.schema import Choice, Integer, Numbers, Section, Text, file_errors, in_unit, read_whole
 from ..formats.yaml import block_text, read_yaml
 from ..machine.field import CROSS_AXES
 from ..machine.geometry import HexapodGeometry
@@ -236,7 +236,7 @@ class LineEntry:
     """A line between two places."""
 
     line: Annotated[np.ndarray, Numbers("mm", (2, 3))]
-    points: Annotated[int, Whole(2, MOST_POINTS)] = 2
+    points: Annotated[int, Integer(2, MOST_POINTS)] = 2
     angles: Angles = field(default_factory=_level)
     stops: Annotated[str, Choice("all", "alternate")] = "all"
     slope: Annotated[str, Text()] = ""
@@ -257,7 +257,7 @@ class CircleEntry:
     plane: Annotated[str, Choice(*PLANES)]
     centre: Annotated[np.ndarray, Numbers("mm", (3,))]
     radius: Annotated[float, Numbers("mm")]
-    points: Annotated[int, Whole(5, MOST_POINTS)]
+    points: Annotated[int, Integer(5, MOST_POINTS)]
     angles: Angles = field(default_factory=_level)
     zero: Zero = "unknown"
 
@@ -273,7 +273,7 @@ class SphereEntry:
 
     centres: Annotated[np.ndarray, Numbers("mm", (None, 3))]
     radius: Annotated[float, Numbers("mm")]
-    points: Annotated[int, Whole(4, MOST_POINTS)]
+    points: Annotated[int, Integer(4, MOST_POINTS)]
     angles: Angles = field(default_factory=_level)
     zero: Zero = "unknown"
 
@@ -293,7 +293,7 @@ class TiltsEntry:
     """An R-test at one place."""
 
     position: Annotated[np.ndarray, Numbers("mm", (3,))]
-    points: Annotated[int, Whole(4, MOST_POINTS)]
+    points: Annotated[int, Integer(4, MOST_POINTS)]
     tilt: Annotated[float, Numbers("deg")]
 
     def run(self, name: str, instrument: str) -> CampaignRun:
@@ -340,7 +340,7 @@ def read_runs(top: Section) -> tuple[CampaignRun, ...]:
         given = {}
         if schema is PosesEntry and instrument in LENGTH_INSTRUMENTS and not entry.quantity_key("centres", "length"):
             given["centre"] = entry.quantity("centre", "length", (3,))
-        with complaints_about(entry.path):
+        with file_errors(entry.path):
             runs.append(read_whole(schema, entry, **given).run(name, instrument))
     return tuple(runs)
 
@@ -357,8 +357,8 @@ class Campaign:
     step: Annotated[float, Numbers("mm")]  # distance of the readings along a line, m
     instrument: str | None = "5-D"  # one of INSTRUMENTS on every grid line; None for no lines
     diagonals: int = 4  # one of DIAGONALS, read by a 1-D laser
-    cycles: Annotated[int, Whole(1, MOST_READINGS)] = 1  # passes forward and backward over each line
-    poses: Annotated[int, Whole(0, MOST_READINGS)] = 0  # scattered in the box, read in position and attitude
+    cycles: Annotated[int, Integer(1, MOST_READINGS)] = 1  # passes forward and backward over each line
+    poses: Annotated[int, Integer(0, MOST_READINGS)] = 0  # scattered in the box, read in position and attitude
     tilt: Annotated[float, Numbers("deg")] = 0.0  # largest tilt about x and y of the scattered poses, rad
     noise: tuple[float, ...] = tuple(DEFAULT_UNCERTAINTY.values())  # 1 σ of a reading by kind (KINDS), m or rad
     beam_slope: Annotated[float, Numbers("urad")] = 100e-6  # 1 σ of a straightness beam's unknown slope, rad

@@ -13,7 +13,18 @@ import numpy as np
 
 from ..errors import InputFileError, ModelError, PoseError
 from ..formats.csv import AS_USUAL, ENCODINGS, MOST_SKIPPED, Layout, Table
-from ..formats.schema import MOST_NEIGHBOURS, PER_STRUT, Choice, Names, Numbers, Section, Text, Unit, Whole, read_whole
+from ..formats.schema import (
+    MOST_NEIGHBOURS,
+    PER_STRUT,
+    Choice,
+    Integer,
+    Names,
+    Numbers,
+    Section,
+    Text,
+    Unit,
+    read_whole,
+)
 from ..formats.yaml import read_yaml
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, solve_poses, strut_lengths_batch
@@ -47,7 +58,7 @@ class UncertaintyColumns:
         if name not in section:
             return float(section.quantity(name, dimension, default=np.nan))
         part, (low, high) = section.section(name), COVERAGE_FACTORS
-        columns, unit = Names(1, 3).take(part, "columns"), part.unit("unit", dimension)
+        columns, unit = Names(1, 3).parse(part, "columns"), part.unit("unit", dimension)
         factor = float(part.array("coverage_factor"))
         if not low <= factor <= high:
             raise part.error("coverage_factor", f"must be {low:g}…{high:g}; 1 where the column is a deviation", factor)
@@ -163,7 +174,7 @@ def load_columns(path: str | Path) -> Columns:
     layout, commanded, temperature = AS_USUAL, None, dict[str, str]()
     if "table" in top:
         section = top.section("table")
-        skipped = (Whole(0, MOST_SKIPPED).read(section, f"rows_{side}_header", 0) for side in ("above", "below"))
+        skipped = (Integer(0, MOST_SKIPPED).read(section, f"rows_{side}_header", 0) for side in ("above", "below"))
         layout = Layout(Choice(*ENCODINGS).read(section, "encoding", ""), *skipped)
         section.finish()
     if "commanded" in top:

@@ -26,7 +26,7 @@ from ..formats.schema import Section
 from ..formats.yaml import yaml_content
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.model import MachineModel
-from .storage import Allowance, Message, UnpackingError, cut_off, messages, refuse_too_much_at_once, zstd_stream
+from .storage import Allowance, Message, UnpackingError, check_size, cut_off, messages, zstd_stream
 
 POSE, STRUTS, TEXT = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState", "std_msgs/msg/String"
 
@@ -168,7 +168,7 @@ def read_recording(
         for part in ((m for m in texts if m.topic in wanted), others):  # the journal first: it names the struts
             for message in part:
                 key = f"{message.topic} at {message.time} ns"
-                collected.take(wanted[message.topic], message.time, _deserialized(path, key, store, message))
+                collected.add(wanted[message.topic], message.time, _deserialized(path, key, store, message))
                 progress(1)
     heard = counts[f"{_namespace(node)}/{COMMANDS}", POSE]
     return collected.recording(notes, heard)
@@ -205,13 +205,13 @@ def _files(path: Path) -> tuple[list[Path], str, list[str]]:
         return files, "", [note]
     top = Section(file, "", yaml_content(read_text(file, most=MOST_METADATA), file, MOST_NODES))
     about = top.section("rosbag2_bagfile_information")
-    names = about.take("relative_file_paths")
+    names = about.require("relative_file_paths")
     if not isinstance(names, list) or not all(isinstance(name, str) and Path(name).name for name in names):
         raise about.error("relative_file_paths", "must be a list of names", names)
     files = [path / Path(name).name for name in names]
     if missing := next((one for one in files if not one.exists()), None):
         raise about.error("relative_file_paths", f"there is no file {missing.name}")
-    packing, by = (about.take(key) if key in about else "" for key in ("compression_mode", "compression_format"))
+    packing, by = (about.require(key) if key in about else "" for key in ("compression_mode", "compression_format"))
     packing = str(packing or "").lower()
     if packing in ("file", "message") and by != "zstd":
         raise about.error("compression_format", "must be zstd", by)
@@ -234,8 +234,8 @@ def _messages(path: Path, files: list[Path], packing: str, size: int) -> Iterato
     for file in files:
         try:
             for message in messages(file, allowance):
-                refuse_too_much_at_once(len(message.raw), "a message")
-                told.take(len(message.raw))  # rows of a database may share one piece of the file
+                check_size(len(message.raw), "a message")
+                told.charge(len(message.raw))  # rows of a database may share one piece of the file
                 if packing == "message":
                     message = message._replace(raw=allowance.unpacked(zstd_stream(message.raw)))
                 yield message
@@ -316,10 +316,10 @@ class _Collected:
         self._odd = Counter[str]()
         self._joints: tuple[str, ...] = STRUT_NAMES
 
-    def take(self, name: str, time: int, message: Any) -> None:
+    def add(self, name: str, time: int, message: Any) -> None:
         """Add one message."""
         if name in (JOURNAL, FILES):
-            self.take_text(name, time, message.data)
+            self.add_text(name, time, message.data)
             return
         place = getattr(message, "pose", None) and message.pose.position
         numbers = (place.x, place.y, place.z) if place else _lengths(message, self._joints)
@@ -331,7 +331,7 @@ class _Collected:
         stamps.append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
         values.extend(numbers)
 
-    def take_text(self, name: str, time: int, text: str) -> None:
+    def add_text(self, name: str, time: int, text: str) -> None:
         """Add a page of the journal, or the files in use."""
         try:
             if name == JOURNAL:

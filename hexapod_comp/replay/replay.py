@@ -128,7 +128,7 @@ def what_if(
     fresh = compensator.snapshot() | {name: value for name, value in state.items() if name in kept}
     compensator.restore(fresh | {"motion_sense": np.nan_to_num(fresh["motion_sense"])})
     run = _Run(recording, progress, None)
-    run.take(compensator)
+    run.use(compensator)
     return run.run()
 
 
@@ -144,7 +144,7 @@ class _Run:
         self._known = files is None  # whether the compensator is in the recorded state
         self._in_use = "", ""  # hashes of its geometry and model
 
-    def take(self, compensator: Compensator) -> None:
+    def use(self, compensator: Compensator) -> None:
         """Give the commands from now on to a compensator."""
         self.compensator = compensator
         self._frames = {name: pack_pose(pose) for name, pose in compensator.geometry.work_frames.items()}
@@ -219,7 +219,7 @@ class _Run:
         same = in_use == self._in_use
         if not same:
             geometry = files.geometry(snapshot.geometry)
-            self.take(Compensator(geometry, files.model(snapshot.model, geometry)))
+            self.use(Compensator(geometry, files.model(snapshot.model, geometry)))
         if not same or not _same_state(self.compensator.snapshot(), snapshot.state):
             self.compensator.restore(snapshot.state)
             if self._known:

@@ -64,7 +64,7 @@ class Allowance:
     def __init__(self, size: int) -> None:
         self._size, self._taken = size, 0
 
-    def take(self, count: int) -> None:
+    def charge(self, count: int) -> None:
         """Count bytes; raise UnpackingError when they are too many."""
         self._taken += count
         most = FREE + RATIO * self._size
@@ -77,7 +77,7 @@ class Allowance:
     def blocks(self, stream: BinaryIO) -> Iterator[bytes]:
         """Yield what a packed stream holds, block by block."""
         while block := stream.read(MEGABYTE):
-            self.take(len(block))
+            self.charge(len(block))
             yield block
 
     def unpacked(self, stream: BinaryIO) -> bytes:
@@ -85,11 +85,11 @@ class Allowance:
         content = bytearray()
         for block in self.blocks(stream):
             content += block
-            refuse_too_much_at_once(len(content), "a message or chunk")
+            check_size(len(content), "a message or chunk")
         return bytes(content)
 
 
-def refuse_too_much_at_once(size: int, what: str) -> None:
+def check_size(size: int, what: str) -> None:
     """Raise UnpackingError for what cannot be held in memory at one time."""
     if size > AT_ONCE:
         raise UnpackingError(f"{what} unpacks to more than the allowed {AT_ONCE // MEGABYTE} MB")
@@ -132,7 +132,7 @@ def _records(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
     """Yield the records of a file or a chunk: kind and content."""
     while head := stream.read(HEAD.size):
         kind, length = HEAD.unpack(head)
-        refuse_too_much_at_once(length, "a record")
+        check_size(length, "a record")
         if len(body := stream.read(length)) < length:
             raise ValueError("ends within a record")
         yield kind, body

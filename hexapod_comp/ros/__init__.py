@@ -21,7 +21,7 @@ def start(module: str) -> int:
 
     A signal while the module is loaded ends the process at once: there is nothing yet to put in order.
     """
-    _at_the_end(lambda *_: os._exit(0))
+    _handle_stop_signals(lambda *_: os._exit(0))
     try:
         main = importlib.import_module(module).main
     except ImportError as error:
@@ -32,18 +32,18 @@ def start(module: str) -> int:
     return int(main())
 
 
-def heard_signals() -> list[int]:
+def received_signals() -> list[int]:
     """Return a list that SIGINT, SIGTERM and SIGHUP are added to, from now on, in place of their usual effect.
 
     Not an event: setting one takes its lock, and the signal may have interrupted whoever holds that, a main thread
     about to wait for the event or another signal's handler. Then the process waits for itself for ever.
     """
     heard: list[int] = []
-    _at_the_end(lambda number, _: heard.append(number))
+    _handle_stop_signals(lambda number, _: heard.append(number))
     return heard
 
 
-def _at_the_end(handler: Callable[[int, FrameType | None], object]) -> None:
+def _handle_stop_signals(handler: Callable[[int, FrameType | None], object]) -> None:
     """Let a function handle the signals that end a program, from now on; a hang-up that nohup ignores stays ignored."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number is not signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:

@@ -160,7 +160,7 @@ class MachineNode(LifecycleNode):
     def __init__(self, name: str, table: Sequence[Parameter] = (), **options: Any) -> None:
         self._active = False
         self._throttle = Throttle()
-        self.guard = CallbackGuard(self.warn_of, self.complain_of)
+        self.guard = CallbackGuard(self.log_warning, self.log_error)
         for change in TRANSITIONS:  # rclpy would swallow what they raise, and say nothing
             setattr(self, change, self.guard.around(change, getattr(self, change), TransitionCallbackReturn.ERROR))
         super().__init__(name, **options)
@@ -171,7 +171,7 @@ class MachineNode(LifecycleNode):
             service.callback = self.guard.answering(service.srv_name, service.srv_type, callback)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", EVENT_QOS)
-        self.speak_for("")
+        self.set_hardware_id("")
         self._tickers: dict[str, Alarm] = {}
         self._options = Parameters(self, table, self._on_parameters)
         self.clock = StampClock(self.simulated_time())
@@ -197,12 +197,12 @@ class MachineNode(LifecycleNode):
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop acting for good: say so, then close what is open, so that nothing more is published."""
-        self.say_goodbye()
+        self.publish_last_status()
         if state.state_id != State.PRIMARY_STATE_UNCONFIGURED:
             self.on_cleanup(state)
         return super().on_shutdown(state)
 
-    def say_goodbye(self) -> None:
+    def publish_last_status(self) -> None:
         """Publish what must still be said before the node ends."""
 
     def destroy_node(self) -> None:
@@ -213,7 +213,7 @@ class MachineNode(LifecycleNode):
         end_lifecycle(self)
 
     @contextmanager
-    def all_or_nothing(self) -> Iterator[None]:
+    def rolled_back_on_error(self) -> Iterator[None]:
         """Close what is opened in this block where it raises, so that the node is as it was before."""
 
         def ends() -> list[Any]:
@@ -296,12 +296,12 @@ class MachineNode(LifecycleNode):
         qos.deadline = Duration(seconds=deadline)
         return self.create_publisher(message_type, topic, qos, qos_overriding_options=OVERRIDES)
 
-    def listen_to(
+    def subscribe(
         self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
     ) -> Subscription:
         """Return a subscription of what anybody may say; what cannot be read, or is too long, is left aside."""
 
-        def hear(data: bytes) -> None:
+        def receive(data: bytes) -> None:
             try:
                 message = read_message(data, message_type)
             except CommandError:
@@ -309,9 +309,9 @@ class MachineNode(LifecycleNode):
             callback(message)
 
         qos = copy.copy(qos)
-        return self.create_subscription(message_type, topic, hear, qos, qos_overriding_options=OVERRIDES, raw=True)
+        return self.create_subscription(message_type, topic, receive, qos, qos_overriding_options=OVERRIDES, raw=True)
 
-    def obey(
+    def subscribe_exclusive(
         self,
         message_type: type,
         topic: str,
@@ -356,12 +356,12 @@ class MachineNode(LifecycleNode):
 
     # ---- log and diagnostics ----
 
-    def warn_of(self, cause: str, text: str) -> None:
+    def log_warning(self, cause: str, text: str) -> None:
         """Log a warning, once per cause and second."""
         if (line := self._throttle.allow(cause, text)) is not None:
             self.get_logger().warning(line, throttled=True)
 
-    def complain_of(self, cause: str, text: str) -> None:
+    def log_error(self, cause: str, text: str) -> None:
         """Log an error, once per cause and second."""
         if (line := self._throttle.allow(cause, text)) is not None:
             self.get_logger().error(line, throttled=True)
@@ -371,20 +371,20 @@ class MachineNode(LifecycleNode):
         if (line := self._throttle.allow(f"note {cause}", text)) is not None:
             self.get_logger().info(line)
 
-    def speak_for(self, what: str) -> None:
+    def set_hardware_id(self, what: str) -> None:
         """Name the machine or component that this node serves from now on in its status: within its namespace, so that
         two of a kind are told apart. The status's name stays: an aggregator would wait for the old one for ever."""
         self.hardware_id = f"{self.get_namespace()}/{what}".strip("/")
         self._report = HealthReport(f"{self.get_fully_qualified_name()[1:]}: state", self.hardware_id)
 
-    def tell(self, level: bytes, text: str, values: Callable[[], dict[str, str]]) -> None:
+    def publish_status(self, level: bytes, text: str, values: Callable[[], dict[str, str]]) -> None:
         """Publish level, text and values when they are due, with what the guard has caught; log steps of the clock."""
         now = time.monotonic()
         self.clock.read()
         if (steps := self.clock.set_back + self.clock.set_forward) != self._steps_logged:
             self._steps_logged = steps
             step = self.clock.last_step * 1e-9
-            self.warn_of("clock", f"the clock was set {'back' if step < 0 else 'forward'} by {abs(step):.3f} s")
+            self.log_warning("clock", f"the clock was set {'back' if step < 0 else 'forward'} by {abs(step):.3f} s")
         level, text = joined([*self.guard.findings(now), (level, text)])
         if self._report.due(level, text, now):
             stamp = self.get_clock().now().to_msg()

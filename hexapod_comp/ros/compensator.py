@@ -1,8 +1,8 @@
 """The compensator node: tool pose commands in, compensated strut commands and pose estimates out.
 
 It holds no mathematics. A command is read, passes the guards, goes through the core, is published, written into the
-journal and added to the track of the struts: :meth:`CompensatorNode._take`. A reading passes its own guards, and is
-estimated and published: :meth:`CompensatorNode._on_states`. Run it with ``ros2 run hexapod_comp compensator`` or
+journal and added to the track of the struts: :meth:`CompensatorNode._process_command`. A reading passes its own guards,
+and is estimated and published: :meth:`CompensatorNode._on_states`. Run it with ``ros2 run hexapod_comp compensator`` or
 ``python -m hexapod_comp.ros.compensator``; doc/nodes.md lists topics, services and parameters.
 """
 
@@ -56,7 +56,7 @@ ESTIMATE_PERIOD = 0.02  # How often the pose is estimated from the node's own co
 JITTER = 0.02  # A wait of a command up to this, s, is nothing to speak of, nor is an alarm that rings so late
 
 
-class Standing(Guard):
+class StateGuard(Guard):
     """Refuses commands in a frame that the machine has not, and while one of the standing guards has a problem."""
 
     def __init__(self, frames: dict[str, Struct], status: CompensatorStatus) -> None:
@@ -123,14 +123,14 @@ class CompensatorNode(MachineNode):
             self._compensator.enable(self._options["enable_compensation"])
             self._compensator.set_tool(self._options["tool"])
             ids = frame_ids(geometry, self._options)
-            self._status.take_parameters()
+            self._status.apply_parameters()
         except HexapodError as error:
             self._compensator = None
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
         self._frames = {ids[name]: pack_pose(pose) for name, pose in geometry.work_frames.items()}
         try:
-            with self.all_or_nothing():
+            with self.rolled_back_on_error():
                 self._open_topics(ids)
         except Exception:
             self._compensator = None  # else the end would say goodbye on topics that there are not
@@ -143,7 +143,7 @@ class CompensatorNode(MachineNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start to take commands; of those that came before none is replayed."""
-        self._forget()
+        self._forget_commands()
         self._track.begin(time.monotonic())
         self._active = True
         self.get_logger().info("ready")
@@ -153,7 +153,7 @@ class CompensatorNode(MachineNode):
         """Close topics and forget the machine."""
         self._active = False
         self._journal.finish(time.monotonic())
-        self._forget()
+        self._forget_commands()
         self.close_ends(*self._ends)
         for part in (self._requests, self._pacing, self._outputs, self._journal, self._instrument):
             if part is not None:
@@ -164,14 +164,14 @@ class CompensatorNode(MachineNode):
 
     def on_parameters(self, names: set[str]) -> None:
         """Take what has been set while the node runs; the rest is looked up where it is needed."""
-        self._status.take_parameters()
+        self._status.apply_parameters()
         if self._compensator is not None:
             self._thermometers.follow(*temperature_rules(self._options))
             self._compensator.set_ramp_rate(self._options["ramp_rate"])
         if self._instrument is not None:
             self._instrument.follow()
 
-    def say_goodbye(self) -> None:
+    def publish_last_status(self) -> None:
         """Publish a last status and wait until it has arrived."""
         if self._compensator is None:
             return
@@ -184,7 +184,7 @@ class CompensatorNode(MachineNode):
 
     def _open_topics(self, ids: dict[str, str]) -> None:
         compensator, options, names = self.compensator, self._options, self._options["joint_names"]
-        self.speak_for(compensator.geometry.name)
+        self.set_hardware_id(compensator.geometry.name)
         deadline, several = options["command_timeout"], options["allow_several_publishers"]
         self._commands = self.publish_on(JointState, "strut_commands", COMMAND_QOS, deadline)
         self._corrections = self.publish_on(JointState, "strut_corrections", COMMAND_QOS, deadline)
@@ -195,15 +195,17 @@ class CompensatorNode(MachineNode):
             self._array = self.publish_on(Float64MultiArray, "strut_commands_array", COMMAND_QOS, deadline)
         self._outputs = Outputs(self, compensator, options, self._commands.topic_name)
         self._input = asked = command_input(compensator, options)
-        heard = self.obey(asked.kind, asked.topic, self._on_command, self._look_at_publishers)
-        states = self.obey(JointState, "strut_states", self._on_states, self._look_at_publishers, qos=NEWEST_QOS)
+        heard = self.subscribe_exclusive(asked.kind, asked.topic, self._on_command, self._update_publishers)
+        states = self.subscribe_exclusive(
+            JointState, "strut_states", self._on_states, self._update_publishers, qos=NEWEST_QOS
+        )
         self._reader = StrutReader(names)
         self._ends: list[Any] = [self._commands, self._corrections, self._array, heard, states]
         self._thermometers = Thermometers(*temperature_rules(options))
         sensing: dict[str, OneSender] = {}
         for topic, kind in (("temperatures", Temperature), (HUMIDITY, RelativeHumidity)):
             callback = partial(self._on_sensor, topic, kind)
-            sensor = self.obey(kind, topic, callback, self._look_at_publishers, qos=SENSOR_QOS)
+            sensor = self.subscribe_exclusive(kind, topic, callback, self._update_publishers, qos=SENSOR_QOS)
             self._ends.append(sensor)
             sensing[topic] = self.sender_of(sensor, several or options["allow_several_thermometers"])
         self._source, self._measuring = self.sender_of(heard, several), self.sender_of(states, several)
@@ -211,14 +213,14 @@ class CompensatorNode(MachineNode):
         status = self._status
         status.configure(compensator, self._thermometers, ids, self._source, own, self._measuring, sensing)
         self._command_guards: tuple[Guard, ...] = (
-            Standing(self._frames, status),
+            StateGuard(self._frames, status),
             Start(compensator, status),
             self._stamps,
         )
         self._pacing = Pacing(
-            self, self._take, lambda data, error, now: self._refuse(self._input.stamp(data), error, now)
+            self, self._process_command, lambda data, error, now: self._refuse(self._input.stamp(data), error, now)
         )
-        self._requests = Requests(self, status, self._files, self._forget)
+        self._requests = Requests(self, status, self._files, self._forget_commands)
         self._journal = JournalTopics(self, compensator, self._files.sources, ids)
         if options["fusion.enabled"]:
             frames = {ids[name]: pose for name, pose in compensator.geometry.work_frames.items()}
@@ -232,13 +234,13 @@ class CompensatorNode(MachineNode):
         if not self._active:
             return
         now = time.monotonic()
-        self._source.hear(number, now)
+        self._source.receive(number, now)
         if self._pacing.waiting:
             self._pacing.add(data, now)
-        elif (wait := self._take(data, now)) > 0.0:
+        elif (wait := self._process_command(data, now)) > 0.0:
             self._pacing.begin(data, now, wait)
 
-    def _take(self, data: bytes, now: float) -> float:
+    def _process_command(self, data: bytes, now: float) -> float:
         """Answer or refuse a command that came, or whose turn it is, now; return how long it must wait instead, s."""
         sample, compensator, status = Sample(now), self.compensator, self._status
         try:
@@ -265,7 +267,7 @@ class CompensatorNode(MachineNode):
         compensator.published(out := time.monotonic())
         self._journal.answered(when, sample.frame_id, sample.values, (now, out), bool(stamp))
         self._stamps.accept(sample)
-        self._track.tell(compensator.command.tolist(), now)
+        self._track.add_command(compensator.command.tolist(), now)
         self._flow.count += 1
         self._flow.last = now
         status.fresh_start, status.last_answered, status.frame_id = False, when, sample.frame_id
@@ -276,7 +278,9 @@ class CompensatorNode(MachineNode):
         self._journal.refused(stamp, error.reason, str(error))
         self._status.refusals.add(error.reason, str(error), now)
         self._outputs.stop(True)
-        self.warn_of(error.reason, f"command refused ({error.reason}): {error}; {ADVICE.get(error.reason, OTHERWISE)}")
+        self.log_warning(
+            error.reason, f"command refused ({error.reason}): {error}; {ADVICE.get(error.reason, OTHERWISE)}"
+        )
 
     # ---- a reading ----
 
@@ -285,8 +289,8 @@ class CompensatorNode(MachineNode):
         sample, track, status = Sample(time.monotonic()), self._track, self._status
         now = sample.now
         try:
-            if self._measuring.hear(number, now):
-                self._look_at_publishers()
+            if self._measuring.receive(number, now):
+                self._update_publishers()
             self._measuring.check(sample)
             self._reader.sample(data, sample)
             status.reading_stamps.check(sample)
@@ -316,15 +320,15 @@ class CompensatorNode(MachineNode):
         now, what = time.monotonic(), topic.removesuffix("s")
         try:
             sender = self._status.sensing[topic]
-            if sender.hear(number, now):
-                self._look_at_publishers()
+            if sender.receive(number, now):
+                self._update_publishers()
             sender.check(Sample(now))
             message = read_message(data, kind)
             if kind is RelativeHumidity:
-                self.compensator.set_humidity(self._thermometers.take(HUMIDITY, message.relative_humidity, now), now)
+                self.compensator.set_humidity(self._thermometers.update(HUMIDITY, message.relative_humidity, now), now)
             else:
                 check_part(name := message.header.frame_id)
-                self.compensator.set_temperature(name, self._thermometers.take(name, message.temperature, now), now)
+                self.compensator.set_temperature(name, self._thermometers.update(name, message.temperature, now), now)
         except CommandError as error:
             self._ignore(topic, error.reason, f"{what} ignored: {error}", str(error), now)
         except HexapodError as error:
@@ -334,7 +338,7 @@ class CompensatorNode(MachineNode):
         """Count and log what was not usable."""
         if self._active:
             self._status.bad_feedback.add(reason, text, now)
-            self.warn_of(cause, warning)
+            self.log_warning(cause, warning)
 
     def _estimate_from_commands(self) -> None:
         """Without feedback, estimate the pose from the newest command, at a rate that leaves the loop alone."""
@@ -350,11 +354,11 @@ class CompensatorNode(MachineNode):
                 instrument.add_struts(self.compensator.command.tolist(), now)
         except HexapodError as error:
             self._status.bad_feedback.add(error.reason, str(error), time.monotonic())
-            self.warn_of("estimate " + error.reason, f"no pose estimate: {error}")
+            self.log_warning("estimate " + error.reason, f"no pose estimate: {error}")
 
     # ---- state ----
 
-    def _forget(self) -> None:
+    def _forget_commands(self) -> None:
         """Forget the last command, but not where it has sent the struts."""
         self.compensator.reset()
         if self._instrument is not None:
@@ -364,26 +368,26 @@ class CompensatorNode(MachineNode):
         self._unestimated = self._outputs.answered = 0  # the velocity of the next command is zero
         self._status.fresh_start = True
 
-    def _look_at_publishers(self) -> None:
+    def _update_publishers(self) -> None:
         """Look who publishes what only one may: now and then, and when somebody comes or goes."""
-        self._status.look(time.monotonic())
+        self._status.update(time.monotonic())
 
     def _check_state(self) -> None:
         now, status = time.monotonic(), self._status
-        status.look(now)
-        status.log_space.look()
+        status.update(now)
+        status.log_space.check()
         guard = status.problem()
         problem = guard.problem if guard is not None and self._active else ""
         if problem and problem != self._logged_problem:
             self.get_logger().error(f"refusing commands: {problem}")
         self._logged_problem = problem
-        self._requests.look(now)
+        self._requests.update(now)
         if self._instrument is not None:
-            self._instrument.look(now)
+            self._instrument.update(now)
         self._journal.tick(now)
         self._outputs.stop(not self._active or status.stops(now))
         level, text = status.judged(now) if self._active else (WARN, "not active")
-        self.tell(level, text, lambda: status.values(now))
+        self.publish_status(level, text, lambda: status.values(now))
 
 
 class Pacing:
@@ -400,10 +404,10 @@ class Pacing:
         take: Callable[[bytes, float], float],
         refuse: Callable[[bytes, HexapodError, float], None],
     ) -> None:
-        self._node, self._status, self._take, self._refuse = node, node._status, take, refuse
+        self._node, self._status, self._process_command, self._refuse = node, node._status, take, refuse
         self.waiting: deque[tuple[float, bytes]] = deque()
         self._due = self._stood_still = 0.0
-        self._alarm = Alarm(node, node.guard.around("go_on", self._go_on))
+        self._alarm = Alarm(node, node.guard.around("process_next", self._process_next))
 
     @property
     def _longest(self) -> float:
@@ -411,7 +415,7 @@ class Pacing:
 
     def begin(self, message: bytes, now: float, wait: float) -> None:
         """Let a command wait, s, that came too early."""
-        self._wait_in_line(message, now)
+        self._enqueue(message, now)
         self._wait_for_struts(now, wait)
 
     def add(self, message: bytes, now: float) -> None:
@@ -422,7 +426,7 @@ class Pacing:
             self._status.behind.note(now)
         elif len(self.waiting) == COMMAND_QOS.depth:
             self._refuse_all(now)
-        self._wait_in_line(message, now)
+        self._enqueue(message, now)
 
     def reset(self) -> None:
         """Forget what waits."""
@@ -433,7 +437,7 @@ class Pacing:
         self.reset()
         self._alarm.close()
 
-    def _wait_in_line(self, message: bytes, now: float) -> None:
+    def _enqueue(self, message: bytes, now: float) -> None:
         self.waiting.append((now - self._stood_still, message))  # when it came, without the time the node stood still
         self._status.waited += 1
 
@@ -444,7 +448,7 @@ class Pacing:
     def _age(self, came: float, now: float) -> float:
         return now - self._stood_still - came
 
-    def _go_on(self) -> None:
+    def _process_next(self) -> None:
         """Take what waits, as far as the struts may go by now."""
         if (late := time.monotonic() - self._due) > JITTER:
             self._stood_still += late
@@ -456,7 +460,7 @@ class Pacing:
             if 0.0 < self._longest < self._age(came, now):
                 self._refuse_all(now)
                 return
-            if (wait := self._take(message, now)) > 0.0:
+            if (wait := self._process_command(message, now)) > 0.0:
                 self._wait_for_struts(now, wait)
                 return
             if self._age(came, now) > JITTER:

@@ -49,7 +49,9 @@ class PoseInstrument:
     ) -> None:
         self._node, self._status, self._options, self._frames = node, status, status.options, frames
         self._kind = MESSAGES[self._options["fusion.message"]]
-        self.end = node.obey(self._kind, TOPIC, self._on_reading, self._look, qos=SENSOR_QOS)
+        self.end = node.subscribe_exclusive(
+            self._kind, TOPIC, self._on_reading, self._update_publishers, qos=SENSOR_QOS
+        )
         several = self._options["allow_several_publishers"]
         status.sensing[TOPIC] = self._sender = node.sender_of(self.end, several)
         self.fusion, self._fed = Fusion(compensator, fusion_rules(self._options)), -math.inf
@@ -64,9 +66,9 @@ class PoseInstrument:
         self.fusion.reset()
         self._status.pose_stamps.reset()
         self._fed = -math.inf
-        self.look(time.monotonic())
+        self.update(time.monotonic())
 
-    def look(self, now: float) -> None:
+    def update(self, now: float) -> None:
         """Feed what is due."""
         if now - self._fed < FEED_PERIOD:
             return
@@ -75,7 +77,7 @@ class PoseInstrument:
             self.fusion.feed(bool(self._options["fusion.compensate"]))
         except HexapodError as error:
             self._status.drift_problem = f"drift not compensated: {error.reason}: {error}"
-            self._node.warn_of("drift", self._status.drift_problem)
+            self._node.log_warning("drift", self._status.drift_problem)
 
     def add_struts(self, struts: Sequence[float], made: float) -> None:
         """Take struts, m, of a monotonic time, s, for the readings about them."""
@@ -86,18 +88,18 @@ class PoseInstrument:
         return self.fusion.weighed(pose)
 
     def close(self) -> None:
-        """Hear no more."""
+        """Close the subscription."""
         self._status.fusion, self._status.drift_problem = None, ""
         self._node.close_ends(self.end)
 
-    def _look(self) -> None:
-        self._status.look(time.monotonic())
+    def _update_publishers(self) -> None:
+        self._status.update(time.monotonic())
 
     def _on_reading(self, data: bytes, number: int | None) -> None:
         sample, gate = Sample(now := time.monotonic()), self._status.pose_stamps
         try:
-            if self._sender.hear(number, now):
-                self._look()
+            if self._sender.receive(number, now):
+                self._update_publishers()
             self._sender.check(sample)
             message = read_message(data, self._kind)
             sample.stamp, frame_id = command_stamp(message.header.stamp), message.header.frame_id
@@ -122,4 +124,4 @@ class PoseInstrument:
         for error in errors:
             if self._node.active:
                 self._status.bad_poses.add(error.reason, str(error), time.monotonic())
-                self._node.warn_of(f"{TOPIC} {error.reason}", f"{TOPIC} ignored: {error}")
+                self._node.log_warning(f"{TOPIC} {error.reason}", f"{TOPIC} ignored: {error}")

@@ -223,7 +223,7 @@ class StrutReader:
             self.check(values)
             sample.stamp, sample.values = seconds * _SECOND + nanoseconds, values
             return
-        message = self.take(data)
+        message = self.parse(data)
         sample.stamp, sample.values = nanoseconds_of(message.header.stamp), tuple(self.lengths.tolist())
         at, fast = len(_before_positions(message.header.frame_id, message.name)), len(message.velocity)
         efforts, self._shape = at + (104 if fast else 52), (0, b"", 0, b"", 0)
@@ -231,7 +231,7 @@ class StrutReader:
         if six and data[:2] == LITTLE_ENDIAN and data[at : at + 48] == message.position.tobytes():
             self._shape = (len(data), data[:4] + data[12:at], at, _COUNT.pack(fast), efforts)
 
-    def take(self, data: bytes) -> JointState:
+    def parse(self, data: bytes) -> JointState:
         """Read a message that came as bytes, and return it; errors as :func:`read_message` and :meth:`read`."""
         message: JointState = read_message(data, JointState)
         self.read(message)

@@ -142,7 +142,7 @@ class MoverNode(MachineNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Open topics."""
-        with self.all_or_nothing():
+        with self.rolled_back_on_error():
             self._open_topics()
         return super().on_configure(state)
 
@@ -172,7 +172,7 @@ class MoverNode(MachineNode):
         self._forget()
         return super().on_cleanup(state)
 
-    def say_goodbye(self) -> None:
+    def publish_last_status(self) -> None:
         """Publish how a move ended that the end of the node cuts short."""
         if self._active and self._state in UNDER_WAY:
             self._stopped("shut down", "the node ended on the way")
@@ -185,15 +185,15 @@ class MoverNode(MachineNode):
         self._diagnosed = status_prefix(self.get_namespace(), name)
         self._ends: list[Any] = [
             self._states,
-            self.listen_to(PoseStamped, "move_to", self._on_move_to, EVENT_QOS),
-            self.listen_to(PoseStamped, "move_by", self._on_move_by, EVENT_QOS),
-            self.listen_to(PointStamped, "pivot", self._on_pivot, EVENT_QOS),
-            self.listen_to(MultiDOFJointTrajectory, "program", self._on_program, EVENT_QOS),
-            self.listen_to(PoseStamped, "tool_pose_estimate", self._on_estimate, NEWEST_QOS),
-            self.listen_to(JointState, "strut_commands", self._on_answer, COMMAND_QOS),
-            self.listen_to(String, f"{name}/files", self._on_files, LATCHED_QOS),
-            self.listen_to(String, f"{name}/tool", self._on_tool, LATCHED_QOS),
-            self.listen_to(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS),
+            self.subscribe(PoseStamped, "move_to", self._on_move_to, EVENT_QOS),
+            self.subscribe(PoseStamped, "move_by", self._on_move_by, EVENT_QOS),
+            self.subscribe(PointStamped, "pivot", self._on_pivot, EVENT_QOS),
+            self.subscribe(MultiDOFJointTrajectory, "program", self._on_program, EVENT_QOS),
+            self.subscribe(PoseStamped, "tool_pose_estimate", self._on_estimate, NEWEST_QOS),
+            self.subscribe(JointState, "strut_commands", self._on_answer, COMMAND_QOS),
+            self.subscribe(String, f"{name}/files", self._on_files, LATCHED_QOS),
+            self.subscribe(String, f"{name}/tool", self._on_tool, LATCHED_QOS),
+            self.subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS),
             self.every(CHECK_PERIOD, self._check_state),
         ]
         self._stop_service = self.create_service(Trigger, "~/stop", self._on_stop)
@@ -223,7 +223,7 @@ class MoverNode(MachineNode):
         self._frames = {
             frame_id: geometry.work_frames[name] for name, frame_id in frame_ids(geometry, self._options).items()
         }
-        self.speak_for(geometry.name)
+        self.set_hardware_id(geometry.name)
         if before is not None and self._active and before.tool_name != self._tool:
             if self._state in UNDER_WAY:
                 self._stopped("refusal", f"the tool was changed to {self._tool!r} on the way")
@@ -283,7 +283,9 @@ class MoverNode(MachineNode):
         point = np.array([message.point.x, message.point.y, message.point.z])
         if message.header.frame_id not in ("", self._options["tool_frame"]) or not np.isfinite(point).all():
             where = f"finite and in {self._options['tool_frame']}"
-            self.warn_of("pivot", f"pivot refused: must be {where}, not {point} in {shorten(message.header.frame_id)}")
+            self.log_warning(
+                "pivot", f"pivot refused: must be {where}, not {point} in {shorten(message.header.frame_id)}"
+            )
             return
         self._pivot = point
 
@@ -309,7 +311,7 @@ class MoverNode(MachineNode):
                 self._standing()  # raises where that is not known
         except HexapodError as error:
             self._refused_request, self._refusal = nanoseconds_of(message.header.stamp), str(error)
-            self.warn_of("request", f"move refused ({error.reason}): {error}")
+            self.log_warning("request", f"move refused ({error.reason}): {error}")
             self._publish_state()
             return
         self._pending = request
@@ -499,7 +501,7 @@ class MoverNode(MachineNode):
 
     def _check_state(self) -> None:
         now = time.monotonic()
-        self._worker.look(now)
+        self._worker.poll(now)
         if self._active:
             if self._unanswered and now - self._unanswered[0][1] > ANSWERED_WITHIN:
                 self._refused()
@@ -512,7 +514,7 @@ class MoverNode(MachineNode):
             level, text = WARN, f"waiting for {self._options['compensator']}/files"
         elif self._active and self._state == STOPPED and self._by != "person":
             level, text = WARN, f"stopped ({self._by}): {self._text}"
-        self.tell(level, text, lambda: {"state": self._state, "moves": str(self._moves), "tool": self._tool})
+        self.publish_status(level, text, lambda: {"state": self._state, "moves": str(self._moves), "tool": self._tool})
 
     def _refused(self) -> None:
         """Stop sending: the compensator answers no more."""

@@ -24,7 +24,7 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.signals import SignalHandlerOptions
 
 from ..errors import LONGEST_TEXT, HexapodError, printable
-from . import avoid_shared_memory, heard_signals, open_streams
+from . import avoid_shared_memory, open_streams, received_signals
 from .base import MachineNode
 from .parameters import Program
 
@@ -78,7 +78,7 @@ def run(
     if refusal is not None:
         return refusal
     open_streams()
-    heard = heard_signals()
+    heard = received_signals()
     try:  # as it is now, whatever will stand in its place
         stderr = os.fdopen(os.dup(sys.stderr.fileno()), "w")
     except (AttributeError, OSError):  # closed, or a test's
@@ -119,7 +119,7 @@ def _run_until(
     executor.add_node(node)
     spin = node.guard.around("spinning", functools.partial(executor.spin_once, timeout_sec=SPIN_PERIOD))
     with ExitStack() as ending:  # the last is called first
-        for end in (rclpy.try_shutdown, node.destroy_node, executor.shutdown, node.say_goodbye):
+        for end in (rclpy.try_shutdown, node.destroy_node, executor.shutdown, node.publish_last_status):
             ending.callback(end)
         ending.callback(_end_within, ENDED_WITHIN, stderr)
         if node.wants_autostart and node.unconfigured and not autostart(node, heard):
@@ -170,7 +170,7 @@ class LogRelay:
             os.set_blocking(sink, False)
             os.dup2(sink, stream)
             os.close(sink)
-            thread = threading.Thread(target=_carry, args=(source, real), name=f"log of stream {stream}", daemon=True)
+            thread = threading.Thread(target=_forward, args=(source, real), name=f"log of stream {stream}", daemon=True)
             thread.start()
             self._relays.append((stream, real, thread))
         return self
@@ -183,7 +183,7 @@ class LogRelay:
             thread.join(LEAVING_WITHIN)  # for what is on its way
 
 
-def _carry(source: int, real: int) -> None:
+def _forward(source: int, real: int) -> None:
     """Hand on what was written, until the last writer has gone; go on emptying when the reader has gone."""
     while data := os.read(source, 1 << 16):
         with suppress(OSError):

@@ -88,7 +88,7 @@ class BagWriter:
         if self._since_look > LOOK_AFTER:
             self._check()
 
-    def look(self) -> None:
+    def check_disk(self) -> None:
         """Notice, once in a while, that the bag was removed or its disk gets full."""
         if not self.problem and time.monotonic() - self._looked >= LOOK_PERIOD:
             self._check()
@@ -123,9 +123,9 @@ class BagRecorder:
         self._session = RosSession("hexapod_comp_recorder", namespace, **QUIET)
         for topic, (kind, reliable) in TOPICS.items():
             reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-            self._hear(topic, kind, QoSProfile(depth=DEPTH, reliability=reliability))
+            self._subscribe(topic, kind, QoSProfile(depth=DEPTH, reliability=reliability))
         for topic in KEPT:
-            self._hear(topic, String, QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+            self._subscribe(topic, String, QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL))
 
     def __enter__(self) -> BagRecorder:
         return self
@@ -141,7 +141,7 @@ class BagRecorder:
         reported = 0
         while going_on() and not self.problem:
             self._session.spin_once(SPIN_PERIOD)
-            self._bag.look()
+            self._bag.check_disk()
             total = sum(self.counts.values())
             progress(total - reported)
             reported = total
@@ -156,7 +156,7 @@ class BagRecorder:
         """Messages of the compensator's journal: without one nothing can be replayed."""
         return sum(count for topic, count in self.counts.items() if topic.endswith(JOURNAL))
 
-    def _hear(self, topic: str, kind: Any, qos: QoSProfile) -> None:
+    def _subscribe(self, topic: str, kind: Any, qos: QoSProfile) -> None:
         name = self._session.node.resolve_topic_name(topic)
         text = f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
 

@@ -58,10 +58,11 @@ class Requests:
         self._travel = TravelReports(node, status, files, self._worker)
         self._predicted = PredictedError(node, status, files, self._worker)
 
-    def look(self, now: float) -> None:
-        """Hand on what the worker has done, and ask for what is due."""
-        for part in (self._worker, self._travel, self._predicted):
-            part.look(now)
+    def update(self, now: float) -> None:
+        """Handle the worker's results, and ask it for what is due."""
+        self._worker.poll(now)
+        self._travel.update(now)
+        self._predicted.update(now)
 
     def close(self) -> None:
         """Destroy services and topics, leave no request without an answer, and end the worker."""
@@ -83,7 +84,7 @@ class Requests:
         if moving := self._status.track.moving(now):
             response.message = f"refused while the machine moves: {moving}"
             self._status.refused_resets.add("moving", response.message, now)
-            self._node.warn_of("reset", f"reset {response.message}; asked for by {who}")
+            self._node.log_warning("reset", f"reset {response.message}; asked for by {who}")
             return response
         self._forget()
         self._status.track.release()
@@ -142,8 +143,8 @@ class ToolChoice:
 
     def __init__(self, node: MachineNode, status: CompensatorStatus) -> None:
         self._node, self._compensator, self._status = node, status.compensator, status
-        look = lambda: status.look(time.monotonic())  # noqa: E731
-        self._selected = node.obey(String, "select_tool", self._on_message, look)
+        update = lambda: status.update(time.monotonic())  # noqa: E731
+        self._selected = node.subscribe_exclusive(String, "select_tool", self._on_message, update)
         several = bool(status.options["allow_several_publishers"])
         self._sender = status.sensing["select_tool"] = node.sender_of(self._selected, several)
         self._publisher = node.create_publisher(String, "~/tool", LATCHED_QOS)
@@ -184,8 +185,8 @@ class ToolChoice:
         """Set the parameter. Where the commander's choice is refused, its next command must be where the struts are:
         commands for the tool that it did not get may follow. Whoever else asks in vain stops nothing."""
         now, status = time.monotonic(), self._status
-        status.look(now)  # who has just come may have sent already, and who commands may not have been looked up yet
-        self._sender.hear(number, now)
+        status.update(now)  # who has just come may have sent already, and who commands may not have been looked up yet
+        self._sender.receive(number, now)
         try:
             self._sender.check(Sample(now))
             name = read_message(data, String).data
@@ -196,7 +197,7 @@ class ToolChoice:
                 raise CommandError("tool", result.reason)
         except CommandError as error:
             status.refused_tools.add(error.reason, str(error), now)
-            self._node.warn_of("tool", f"select_tool refused: {error}")
+            self._node.log_warning("tool", f"select_tool refused: {error}")
 
     def _publish(self) -> None:
         self._publisher.publish(String(data=self._compensator.geometry.tool_name))
@@ -218,7 +219,7 @@ class TravelReports:
         self._late.answer(Trigger.Response(message="the node was cleaned up"))
         self._node.close_ends(self._late.service, self._publisher)
 
-    def look(self, now: float) -> None:
+    def update(self, now: float) -> None:
         """Begin anew when it is due."""
         if not self._busy and now >= self._due and self._publisher.get_subscription_count():
             self._due = now + TRAVEL_PERIOD
@@ -294,7 +295,7 @@ class PredictedError:
         self._status.prediction_problem = ""
         self._node.close_ends(*self._topics.values())
 
-    def look(self, now: float) -> None:
+    def update(self, now: float) -> None:
         """Ask for the newest pose, while somebody listens."""
         compensator, source = self._status.compensator, self._files.sources["model"]
         wanted = any(publisher.get_subscription_count() for publisher in self._topics.values())
@@ -322,7 +323,7 @@ class PredictedError:
     def _failed(self, error: WorkerError) -> None:
         self._busy, self._due = False, time.monotonic() + self._wait
         self._status.prediction_problem = f"no predicted error: {error}"
-        self._node.warn_of("predicted error", f"{self._status.prediction_problem}; tried again in {self._wait:g} s")
+        self._node.log_warning("predicted error", f"{self._status.prediction_problem}; tried again in {self._wait:g} s")
         self._wait = min(2.0 * self._wait, TRY_AGAIN_AFTER[1])
 
 

@@ -20,7 +20,7 @@ from rclpy.logging import get_logging_directory
 
 from ..compensation.compensator import Compensator
 from ..compensation.fusion import Fusion
-from ..compensation.guards import Guard, Lately, OneSender, StampClock, StampGate
+from ..compensation.guards import EventWindow, Guard, OneSender, StampClock, StampGate
 from ..compensation.thermal import Thermometers
 from ..compensation.track import StrutTrack
 from ..errors import LONGEST_TEXT, printable
@@ -88,7 +88,7 @@ class Refusals:
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self._lately: dict[str, Lately] = {}
+        self._lately: dict[str, EventWindow] = {}
         self.last_reason = self.last_text = ""
 
     @property
@@ -99,7 +99,7 @@ class Refusals:
     def add(self, reason: str, text: str, now: float) -> None:
         """Count one."""
         self.counts[reason] += 1
-        self._lately.setdefault(reason, Lately()).note(now)
+        self._lately.setdefault(reason, EventWindow()).note(now)
         self._lately[reason] = self._lately.pop(reason)  # the newest stands last
         self.last_reason, self.last_text = reason, text
 
@@ -125,7 +125,7 @@ class LogSpace:
         self._folder = Path(get_logging_directory()) if folder is None else folder
         self.problem = ""
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Look again; takes a few microseconds on a local file system."""
         self.problem = ""
         try:
@@ -196,12 +196,12 @@ class CompensatorStatus:
         self.refusals, self.bad_feedback, self.bad_poses = Refusals(), Refusals(), Refusals()
         self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
         self.waited = self.dropped = 0  # commands that have waited, and that a newer one has replaced
-        self.behind = Lately()  # commands were handled late, by more than jitter
+        self.behind = EventWindow()  # commands were handled late, by more than jitter
         self.frame_id = self.prediction_problem = ""  # of the last command; why no error is predicted
         self.drift_problem = ""  # why the drift that an instrument shows is not compensated
         self.last_answered = 0  # stamp, ns; 0 before the first
         self.fresh_start = True  # no command is in force
-        self.take_parameters()
+        self.apply_parameters()
 
     def configure(
         self,
@@ -221,17 +221,17 @@ class CompensatorStatus:
         self.standing: tuple[Guard, ...] = (source, own_topic, measuring, self.track)
         self.track.watch(compensator.geometry)
 
-    def take_parameters(self) -> None:
+    def apply_parameters(self) -> None:
         """Go by the parameters as they are now; others are looked up where they are needed."""
         self.command_stamps.max_age = self.options["max_command_age"]
         self.reading_stamps.max_age = self.pose_stamps.max_age = self.options["max_reading_age"]
         self.track.limit = self.options["following_error_limit"]
         self.track.anywhere_after = self.options["start_without_feedback_after"]
 
-    def look(self, now: float) -> None:
+    def update(self, now: float) -> None:
         """Look who publishes."""
         for sender in (self.source, self.own_topic, self.measuring, *self.sensing.values()):
-            sender.look(now)
+            sender.update(now)
 
     def problem(self) -> Guard | None:
         """Return the guard that stops the machine at present, if any."""

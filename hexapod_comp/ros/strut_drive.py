@@ -119,7 +119,7 @@ class StrutDriveNode(MachineNode):
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
         try:
-            with self.all_or_nothing():
+            with self.rolled_back_on_error():
                 self._open_topics()
         except Exception:
             self._drive = None  # else the end would say goodbye on topics that there are not
@@ -145,7 +145,7 @@ class StrutDriveNode(MachineNode):
         self._drive = None
         return super().on_cleanup(state)
 
-    def say_goodbye(self) -> None:
+    def publish_last_status(self) -> None:
         """Publish a last status and wait until it has arrived."""
         if self._drive is None:
             return
@@ -156,8 +156,10 @@ class StrutDriveNode(MachineNode):
     def _open_topics(self) -> None:
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
         self._true_pub = self.publish_on(PoseStamped, "tool_pose_true", STATE_QOS)
-        self.speak_for(self.drive.machine.geometry.name)
-        self._subscription = self.obey(JointState, "strut_commands", self._on_commands, self._look_at_publishers)
+        self.set_hardware_id(self.drive.machine.geometry.name)
+        self._subscription = self.subscribe_exclusive(
+            JointState, "strut_commands", self._on_commands, self._update_publishers
+        )
         self._source = self.sender_of(self._subscription, self._options["allow_several_publishers"])
         self._own_timers = [
             self.every(1.0 / self._options["rate"], self._run),
@@ -187,21 +189,21 @@ class StrutDriveNode(MachineNode):
 
     # ---- the machine ----
 
-    def _look_at_publishers(self) -> None:
-        self._source.look(time.monotonic())
+    def _update_publishers(self) -> None:
+        self._source.update(time.monotonic())
 
     def _on_commands(self, data: bytes, number: int | None) -> None:
         if not self._active:
             return
         sample = Sample(time.monotonic())
-        self._source.hear(number, sample.now)
+        self._source.receive(number, sample.now)
         try:
             self._reader.sample(data, sample)
             for guard in self._command_guards:
                 guard.check(sample)
         except HexapodError as error:
             self._refusals.add(error.reason, str(error), sample.now)
-            self.warn_of(error.reason, f"command refused ({error.reason}): {error}")
+            self.log_warning(error.reason, f"command refused ({error.reason}): {error}")
             return
         self.drive.set_command(np.array(sample.values))
         for guard in self._command_guards:
@@ -223,7 +225,7 @@ class StrutDriveNode(MachineNode):
         try:
             self._tool_in_base()
         except KinematicsError as error:
-            self.warn_of("true pose", f"the machine cannot stand where its struts are: {error}")
+            self.log_warning("true pose", f"the machine cannot stand where its struts are: {error}")
             return
         self._true_out.header.stamp = stamp_of(stamp)
         self._true_pub.publish(self._true_out)
@@ -254,11 +256,11 @@ class StrutDriveNode(MachineNode):
         yield OK, "running" if self._commands.count else "waiting for the first command"
 
     def _check_state(self) -> None:
-        self._look_at_publishers()
-        self._log_space.look()
+        self._update_publishers()
+        self._log_space.check()
         now = time.monotonic()
         level, text = joined(self._findings(now)) if self._active else (WARN, "not active")
-        self.tell(level, text, lambda: self._values(now))
+        self.publish_status(level, text, lambda: self._values(now))
 
     def _values(self, now: float) -> dict[str, str]:
         return {

@@ -45,7 +45,7 @@ class Job:
 
     task: str  # load_model, predict, travel or plan_move
     arguments: dict[str, Any]
-    done: Callable[[Any], None]  # called with the result, from Worker.look
+    done: Callable[[Any], None]  # called with the result, from Worker.poll
     failed: Callable[[WorkerError], None]
     machine: dict[str, Any] | None = None  # which one, as Machine takes it
     within: float | None = None  # s, from its beginning; then the process is killed
@@ -53,7 +53,7 @@ class Job:
 
 
 class Worker:
-    """The node's end: a thread sends one job at a time to the process; `look` calls back with the results."""
+    """The node's end: a thread sends one job at a time to the process; `poll` calls back with the results."""
 
     def __init__(self) -> None:
         self._process, self._thread = _Process(), ThreadPoolExecutor(1, "worker")
@@ -69,7 +69,7 @@ class Worker:
         """Have a job done."""
         self._jobs.append((job, self._thread.submit(self._process.do, job)))
 
-    def look(self, now: float) -> None:
+    def poll(self, now: float) -> None:
         """Call back with a result; end a process that is idle for IDLE_AFTER."""
         if self._jobs and self._jobs[0][1].done():
             job, future = self._jobs.popleft()
@@ -104,7 +104,7 @@ class _Process:
         machine = None if job.machine == self._machine else job.machine
         self._machine = job.machine or self._machine
         try:
-            answer = self.talk((job.task, machine, job.arguments), job.within)
+            answer = self.exchange((job.task, machine, job.arguments), job.within)
         except (EOFError, ConnectionError):
             answer = "the process beside the node ended", None
         except OSError as error:
@@ -115,7 +115,7 @@ class _Process:
             raise WorkerError(job.late if answer is None else answer[0])
         return answer[1]
 
-    def talk(self, request: tuple[Any, ...], within: float | None) -> tuple[str, Any] | None:
+    def exchange(self, request: tuple[Any, ...], within: float | None) -> tuple[str, Any] | None:
         """Return problem and result of a request, None where neither comes within a time, s."""
         if self.popen is None or self.popen.poll() is not None:
             self._start()

@@ -121,7 +121,7 @@ class Bench:
             self.witness.create_subscription(kind, topic, self.seen[topic].append, qos)
         self._publishers: dict[str, Any] = {}
         for topic in SENT.keys() - {"strut_commands", "strut_setpoints"}:  # a test asks for these
-            self.speak(topic)
+            self.add_publisher(topic)
         self._clients: dict[str, Any] = {}
 
     def __enter__(self) -> Bench:
@@ -139,19 +139,19 @@ class Bench:
 
     def compensator(self, start: bool = True, **parameters: object) -> CompensatorNode:
         """Add a compensator; `start` configures and activates it and waits until it is connected."""
-        self.hush("strut_commands")
+        self.remove_publisher("strut_commands")
         return self.add(CompensatorNode, start, parameters)
 
     def drive(self, start: bool = True, **parameters: object) -> StrutDriveNode:
         """Add a strut drive, which the witness commands unless there is a compensator to do it; it alone measures."""
-        self.hush("strut_states")
+        self.remove_publisher("strut_states")
         if not self.nodes:
-            self.speak("strut_commands")
+            self.add_publisher("strut_commands")
         return self.add(StrutDriveNode, start, parameters)
 
     def machine(self, geometry: str = "paper.yaml", model: str = "ideal", truth: str = "ideal") -> None:
         """Add a drive with a hidden truth, and a compensator with a model; files, shipped names, ``random:7``."""
-        self.hush("tool_pose_command")
+        self.remove_publisher("tool_pose_command")
         self.drive(geometry_file=geometry, truth_file=truth)
         if is_random(model):
             drawn = find_model(model, load_geometry(config_file(geometry, "geometry")))
@@ -253,11 +253,11 @@ class Bench:
 
     # ---- messages ----
 
-    def speak(self, topic: str) -> None:
+    def add_publisher(self, topic: str) -> None:
         """Let the witness publish on a topic."""
         self._publishers[topic] = self.witness.create_publisher(SENT[topic], topic, RELIABLE)
 
-    def hush(self, topic: str) -> None:
+    def remove_publisher(self, topic: str) -> None:
         """Let the witness publish on a topic no longer."""
         if topic in self._publishers:
             self.witness.destroy_publisher(self._publishers.pop(topic))
@@ -339,10 +339,12 @@ class Bench:
         self.publish("temperatures", message)
         self.barrier()
 
-    def moisten(self, humidity: float) -> None:
+    def publish_humidity(self, humidity: float) -> None:
         """Publish a relative humidity, a fraction, and wait until it has been handled."""
         self.publish("humidity", RelativeHumidity(relative_humidity=humidity))
         self.barrier()
+
+    speak, hush, moisten = add_publisher, remove_publisher, publish_humidity  # their names in 0.2, for one version
 
     def now(self) -> Any:
         """Return the ROS time as a stamp."""

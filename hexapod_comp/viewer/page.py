@@ -158,7 +158,7 @@ class Watcher:
             return None
 
     def _lengths(self, data: bytes) -> np.ndarray:
-        self._reader.take(data)
+        self._reader.parse(data)
         return self._reader.lengths.copy()
 
     def _pose_of(self, lengths: np.ndarray) -> Pose | None:

@@ -119,7 +119,7 @@ class WarmUp:
         for name in self.sensors:
             column, sigma = SENSED.index(name), self.noise[name == HUMIDITY]
             readings = true[:, column] + sigma * rng.standard_normal(len(true))
-            result[:, column] = [low_pass.take(name, value, float(n)) for n, value in enumerate(readings)]
+            result[:, column] = [low_pass.update(name, value, float(n)) for n, value in enumerate(readings)]
         return result
 
     def campaign(self, cold: Campaign) -> Campaign:
@@ -192,7 +192,7 @@ def load_warm_up(path: str | Path, seed: int = 0) -> tuple[WarmUp, np.ndarray]:
     constants.append(float(top.quantity("humidity_time_constant", "time", default=math.nan if damp else 1.0)))
     noise = top.quantity("noise", "difference", default=0.05), top.quantity("humidity_noise", "ratio", default=0.01)
     default = [*PARTS, *([HUMIDITY] if damp else [])]
-    sensors = top.take("sensors") if "sensors" in top else default
+    sensors = top.require("sensors") if "sensors" in top else default
     share = float(top.quantity("strut_spread", "ratio", default=0.0))
     if not 0.0 <= share <= MOST_APART:
         raise top.error("strut_spread", f"must be 0…{100.0 * MOST_APART:g} %", 100.0 * share)

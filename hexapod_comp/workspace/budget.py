@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import ModelError
 from ..formats.paths import input_file
-from ..formats.schema import complaints_about
+from ..formats.schema import file_errors
 from ..formats.yaml import read_yaml
 from ..machine.geometry import HexapodGeometry, first_of_same
 
@@ -182,6 +182,6 @@ def load_budget(path: str | Path) -> Budget:
     if unknown := section.left():
         known = ", ".join(source.name for source in SOURCE_TYPES)
         problem = f"is no error type with its unit; types are {known}"
-        raise section.error(unknown[0], problem, section.take(unknown[0]))
-    with complaints_about(path):
+        raise section.error(unknown[0], problem, section.require(unknown[0]))
+    with file_errors(path):
         return Budget(machine, sizes)

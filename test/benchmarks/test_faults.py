@@ -283,21 +283,21 @@ def test_a_full_log_disk_is_a_problem(monkeypatch, tmp_path, blocks, said):
     """64 KiB are 16 blocks of 4,096 byte."""
     monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=blocks, f_frsize=4096))
     space = LogSpace(tmp_path)
-    space.look()
+    space.check()
     assert space.problem.startswith(said)
     assert bool(space.problem) == bool(said)
 
 
 def test_a_log_folder_that_is_not_there_is_no_problem_and_one_that_fails_is(monkeypatch, tmp_path):
     space = LogSpace(tmp_path / "nowhere")
-    space.look()
+    space.check()
     assert space.problem == ""
 
     def fail(_):
         raise OSError(5, "Input/output error")
 
     monkeypatch.setattr(os, "statvfs", fail)
-    space.look()
+    space.check()
     assert space.problem == "log folder lost: Input/output error"
 
 

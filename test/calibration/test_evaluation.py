@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.calibration.evaluation import INCH, held_out, paper_metric, worth
+from hexapod_comp.calibration.evaluation import INCH, evaluate_model, held_out, paper_metric
 from hexapod_comp.errors import ModelError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.field import GridField
@@ -164,7 +164,7 @@ def test_equal_seeds_equal_figures(truth):
 
 
 def test_worth_collects_all_three(truth):
-    found = worth(truth, truth.model, BOX, 50)
+    found = evaluate_model(truth, truth.model, BOX, 50)
     assert found.before == held_out(truth, None, BOX, 50)
     assert found.paper == paper_metric(truth, truth.model, BOX)
     for name in ("raw", "aligned", "rotation"):

@@ -11,7 +11,7 @@ import pytest
 
 from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.fit import fit_model
-from hexapod_comp.calibration.lead import ScrewLead, look_for_lead
+from hexapod_comp.calibration.lead import ScrewLead, detect_lead
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.errors import ModelError
 from hexapod_comp.measurements.readings import MeasurementSet
@@ -35,7 +35,7 @@ def readings(seed: int, **changes: object) -> MeasurementSet:
 def lead_of(measured: MeasurementSet, settings: FitSettings = FEW) -> ScrewLead:
     estimation = Estimation(measured, ParameterSpace(measured, settings))
     problem, _ = estimation.linearise(np.zeros(estimation.space.size), np.ones(len(measured)))
-    return look_for_lead(estimation, problem)
+    return detect_lead(estimation, problem)
 
 
 @pytest.mark.parametrize(("seed", "true"), [(1, 2.0), (2, 3.7), (3, 10.0), (4, 12.7), (5, 19.3)])

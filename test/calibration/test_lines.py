@@ -7,7 +7,7 @@ import pytest
 from foreign_machines import machines
 from scipy.stats import linregress
 
-from hexapod_comp.calibration.evaluation import PaperMetric, held_out, paper_metric, worth, worth_text
+from hexapod_comp.calibration.evaluation import PaperMetric, evaluate_model, evaluation_text, held_out, paper_metric
 from hexapod_comp.calibration.lines import LinesFit, _kind, fit_lines
 from hexapod_comp.calibration.pictures import fitted_lines_figure, strut_error_figure, strut_length_errors
 from hexapod_comp.calibration.report import lines_report
@@ -443,10 +443,10 @@ def test_the_model_goes_through_its_file(real_fit, geometry, tmp_path):
 
 
 def test_report(real, real_fit):
-    found = worth(real, real_fit.model, BOX, 50)
+    found = evaluate_model(real, real_fit.model, BOX, 50)
     text = lines_report(real_fit, every_line=True)
     assert text.count("x line at y -203.2, z 350.0 mm\n") == 6  # dx, ry, rz, there and back
-    assert f"({100.0 * reduction(found.paper):.1f} % less)" in worth_text(found)
+    assert f"({100.0 * reduction(found.paper):.1f} % less)" in evaluation_text(found)
     assert "σ repeated" in text
     assert "σ repeated" not in lines_report(real_fit)
 

@@ -55,7 +55,7 @@ def test_gains_are_those_of_the_whole_matrices() -> None:
     for n in (2, 0, 2):
         wanted = [left(chosen) - left([*chosen, k]) for k in range(4)]
         np.testing.assert_allclose(criterion.gains(), wanted, rtol=1e-9)
-        criterion.take(n)
+        criterion.add(n)
         chosen.append(n)
         assert (square * criterion.covariance).sum() == pytest.approx(left(chosen), rel=1e-9)
     assert (square * criterion.after_all()).sum() == pytest.approx(left([0, 1, 2, 3]), rel=1e-9)

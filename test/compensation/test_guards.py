@@ -17,8 +17,8 @@ from strategies import fixed
 from hexapod_comp.compensation.guards import (
     SPEAKERS_HELD,
     UNKNOWN_NAME,
+    EventWindow,
     Guard,
-    Lately,
     OneSender,
     RateLimit,
     Sample,
@@ -130,60 +130,60 @@ def test_unnamed_counts_as_another():
     """What DDS has found but not yet named, or never will: not a ROS node."""
     graph = Graph("/left/controller", UNKNOWN_NAME)
     sender = graph.sender
-    sender.look(0.0)
+    sender.update(0.0)
     assert sender.problem == "several publishers of /commands: /left/controller, _NODE_NAME_UNKNOWN_"
     assert reason(sender, Sample(0.0)) == "several_publishers"
     graph.names = ("/left/controller", "/left/controller")
-    sender.look(0.1)
+    sender.update(0.1)
     assert (sender.problem, sender.names) == ("", ("/left/controller",))
     graph.names = (UNKNOWN_NAME,)
-    sender.look(0.2)
+    sender.update(0.2)
     assert not sender.problem, "alone, it is the one who commands"
     graph.names = ()
-    sender.look(0.3)
+    sender.update(0.3)
     assert sender.names == ()
 
 
 def test_two_names_are_refused_until_one_is_left_and_named_where_they_are_allowed():
     for allowed in (False, True):
         graph = Graph("/a", "/b", allowed=allowed)
-        graph.sender.look(0.0)
+        graph.sender.update(0.0)
         assert bool(graph.sender.problem) is not allowed
         assert graph.sender.names == ("/a", "/b")
         graph.names = ("/b",)
-        graph.sender.look(0.1)
+        graph.sender.update(0.1)
         assert not graph.sender.problem
 
 
 def test_who_cannot_be_told_is_refused():
     graph = Graph("/a", unknown="a node's name is not UTF-8")
-    graph.sender.look(0.0)
+    graph.sender.update(0.0)
     assert reason(graph.sender, Sample(0.0)) == "unknown_publisher"
     assert graph.sender.problem == "who publishes /commands cannot be told: a node's name is not UTF-8"
     graph.unknown = ""
-    graph.sender.look(0.1)
+    graph.sender.update(0.1)
     assert reason(graph.sender, Sample(0.1)) == ""
 
 
 def test_another_on_an_own_topic_is_a_problem_and_one_of_the_same_name_is_not():
     graph = Graph("/me", own="/me")
-    graph.sender.look(0.0)
+    graph.sender.update(0.0)
     assert (graph.sender.problem, graph.sender.names) == ("", ())
     graph.names = ("/me", "/me")
-    graph.sender.look(0.1)
+    graph.sender.update(0.1)
     assert not graph.sender.problem
     graph.names = ("/me", "/stranger")
-    graph.sender.look(0.2)
+    graph.sender.update(0.2)
     assert graph.sender.problem == "/commands is also published by /stranger"
     graph.names, graph.fixed_count = ("/stranger",), 1  # its own has not been found yet
-    graph.sender.look(0.3)
+    graph.sender.update(0.3)
     assert graph.sender.problem
 
 
 def test_names_are_looked_up_only_when_they_may_have_changed():
     graph = Graph("/a")
     for n in range(10):
-        graph.sender.look(0.05 * n)
+        graph.sender.update(0.05 * n)
     assert graph.asked == 1
 
 
@@ -205,11 +205,11 @@ def test_sequence_numbers_tell(case):
     """Counted by hand; two of one name stand in the graph, one of which may be a ghost."""
     numbers, missed, two = NUMBERS[case]
     graph = Graph("/a", "/a")
-    graph.sender.look(0.0)
-    found = [graph.sender.hear(number, 0.01 * n) for n, number in enumerate(numbers)]
+    graph.sender.update(0.0)
+    found = [graph.sender.receive(number, 0.01 * n) for n, number in enumerate(numbers)]
     assert (graph.sender.missed, any(found), bool(graph.sender.problem)) == (missed, two, two)
     assert graph.sender.missing(0.1) is (missed > 0)
-    graph.sender.look(0.1 + SPEAKERS_HELD)
+    graph.sender.update(0.1 + SPEAKERS_HELD)
     assert not graph.sender.problem
 
 
@@ -217,13 +217,13 @@ def test_two_of_one_name_are_refused_where_the_middleware_does_not_count():
     """As rmw_cyclonedds: whether one is the other's ghost cannot be told; one alone is obeyed."""
     for publishers, number, refused in ((1, None, False), (2, None, True), (2, 1, False)):
         sender = Graph(*["/controller"] * publishers).sender
-        sender.look(0.0)
+        sender.update(0.0)
         assert not sender.problem
-        assert sender.hear(number, 0.01) is refused
+        assert sender.receive(number, 0.01) is refused
         assert ("does not count" in sender.problem) is refused
-        sender.look(10.0)
+        sender.update(10.0)
         assert bool(sender.problem) is refused
-        assert not sender.hear(number, 10.1)
+        assert not sender.receive(number, 10.1)
         assert sender.missed == 0
 
 
@@ -241,7 +241,7 @@ def test_a_problem_refuses_until_it_ends():
 
 
 def test_what_happened_while_nobody_asked_holds_once():
-    lately = Lately()
+    lately = EventWindow()
     lately.note(1.0)
     assert lately.holds(6.0)
     assert lately.holds(6.0)

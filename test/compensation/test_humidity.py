@@ -77,18 +77,18 @@ def test_a_jump_is_refused_until_it_may_have_come() -> None:
     """0.45 to 0.80: 0.35, of which 0.05 at once and 0.02 a second."""
     rules = Plausibility(rate=0.2, spread=40.0, timeout=60.0)
     sensors = Thermometers(rules, time_constant=0.0)
-    assert sensors.take("humidity", 0.45, 0.0) == 0.45
+    assert sensors.update("humidity", 0.45, 0.0) == 0.45
     with pytest.raises(ModelError, match=r"humidity: has jumped from 0\.45 to 0\.80 in 14\.9 s, allowed 0\.348"):
-        sensors.take("humidity", 0.80, 14.9)
-    assert sensors.take("humidity", 0.80, 15.1) == 0.80
+        sensors.update("humidity", 0.80, 14.9)
+    assert sensors.update("humidity", 0.80, 15.1) == 0.80
 
 
 def test_humidity_is_smoothed_goes_stale_and_judges_no_temperature() -> None:
     """Two readings at one moment count alike. 60 °C is 40 K from 20 °C, and of no concern to the air's 0.5."""
     sensors = Thermometers(Plausibility(rate=0.0, spread=41.0, timeout=60.0, humidity_rate=0.0))
-    sensors.take("humidity", 0.4, 0.0)
-    assert sensors.take("humidity", 0.6, 0.0) == pytest.approx(0.5, abs=1e-15)
-    assert sensors.take("base", 60.0, 0.0) == 60.0
+    sensors.update("humidity", 0.4, 0.0)
+    assert sensors.update("humidity", 0.6, 0.0) == pytest.approx(0.5, abs=1e-15)
+    assert sensors.update("base", 60.0, 0.0) == 60.0
     assert sensors.stale(60.5) == ("base", "humidity")
 
 

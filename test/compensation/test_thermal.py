@@ -27,7 +27,7 @@ ROUNDING = 1e-10
 
 
 def taken(low_pass: TemperatureFilter, values: np.ndarray, times: np.ndarray, name: str = "base") -> np.ndarray:
-    return np.array([low_pass.take(name, value, time) for value, time in zip(values, times, strict=True)])
+    return np.array([low_pass.update(name, value, time) for value, time in zip(values, times, strict=True)])
 
 
 def test_regular_readings_are_scipys_low_pass() -> None:
@@ -95,15 +95,17 @@ def test_after_a_long_gap_it_starts_anew() -> None:
     """Ten time constants leave e^-10 of up to 31 readings: 0.14 % of the step of 5 K; then two count alike."""
     low_pass = TemperatureFilter(30.0)
     taken(low_pass, np.full(200, 20.0), np.arange(200.0))
-    assert low_pass.take("base", 25.0, 500.0) == pytest.approx(25.0, abs=0.01)
-    assert low_pass.take("base", 25.2, 500.0) == pytest.approx(25.1, abs=0.01)
-    assert low_pass.take("base", 30.0, 1e9) == 30.0, "a year later nothing is left, and nothing overflows"
+    assert low_pass.update("base", 25.0, 500.0) == pytest.approx(25.0, abs=0.01)
+    assert low_pass.update("base", 25.2, 500.0) == pytest.approx(25.1, abs=0.01)
+    assert low_pass.update("base", 30.0, 1e9) == 30.0, "a year later nothing is left, and nothing overflows"
 
 
 def test_a_gap_of_one_time_constant_leaves_the_past_its_share() -> None:
     low_pass = TemperatureFilter(30.0)
-    low_pass.take("base", 20.0, 0.0)
-    assert low_pass.take("base", 21.0, 30.0) == pytest.approx((20.0 / math.e + 21.0) / (1.0 / math.e + 1.0), abs=1e-12)
+    low_pass.update("base", 20.0, 0.0)
+    assert low_pass.update("base", 21.0, 30.0) == pytest.approx(
+        (20.0 / math.e + 21.0) / (1.0 / math.e + 1.0), abs=1e-12
+    )
 
 
 @given(st.permutations(range(12)))
@@ -118,16 +120,16 @@ def test_the_order_of_arrival_does_not_matter(order: list[int]) -> None:
 
 def test_a_reading_of_yesterday_counts_for_nothing() -> None:
     low_pass = TemperatureFilter(30.0)
-    low_pass.take("base", 20.0, 86_400.0)
-    assert low_pass.take("base", 90.0, 0.0) == 20.0
-    assert low_pass.take("base", 22.0, 86_400.0) == 21.0
+    low_pass.update("base", 20.0, 86_400.0)
+    assert low_pass.update("base", 90.0, 0.0) == 20.0
+    assert low_pass.update("base", 22.0, 86_400.0) == 21.0
 
 
 @given(st.lists(st.tuples(st.floats(-40.0, 120.0), st.floats(-1e9, 1e9)), min_size=1, max_size=30))
 def test_never_outside_what_was_read(readings: list[tuple[float, float]]) -> None:
     low_pass = TemperatureFilter(30.0)
     for n, (value, time) in enumerate(readings):
-        found = low_pass.take("base", value, time)
+        found = low_pass.update("base", value, time)
         seen = [v for v, _ in readings[: n + 1]]
         assert min(seen) - ROUNDING <= found <= max(seen) + ROUNDING
 
@@ -135,9 +137,9 @@ def test_never_outside_what_was_read(readings: list[tuple[float, float]]) -> Non
 def test_every_sensor_has_its_own_mean() -> None:
     low_pass = TemperatureFilter(30.0)
     for n, name in enumerate(Temperatures.NAMES):
-        assert low_pass.take(name, 20.0 + n, 0.0) == 20.0 + n
+        assert low_pass.update(name, 20.0 + n, 0.0) == 20.0 + n
     for n, name in enumerate(Temperatures.NAMES):
-        assert low_pass.take(name, 22.0 + n, 0.0) == 21.0 + n
+        assert low_pass.update(name, 22.0 + n, 0.0) == 21.0 + n
 
 
 def test_zero_is_off() -> None:
@@ -158,10 +160,10 @@ def test_zero_is_off() -> None:
 )
 def test_what_is_refused_leaves_no_trace(name: str, value: float, time: float, text: str) -> None:
     low_pass = TemperatureFilter(30.0)
-    low_pass.take("base", 20.0, 0.0)
+    low_pass.update("base", 20.0, 0.0)
     with pytest.raises(ModelError, match=text):
-        low_pass.take(name, value, time)
-    assert low_pass.take("base", 21.0, 0.0) == 20.5
+        low_pass.update(name, value, time)
+    assert low_pass.update("base", 21.0, 0.0) == 20.5
 
 
 @pytest.mark.parametrize("time_constant", [-1.0, math.nan, math.inf])
@@ -191,40 +193,40 @@ def thermometers(rate: float = 0.2, spread: float = 40.0, timeout: float = 60.0)
 def test_a_part_warms_no_faster_than_its_rate(value: float, seconds: float, taken: bool) -> None:
     """From 20.9 °C: 1 K at once, and 0.2 K/s."""
     made = thermometers()
-    made.take("base", 20.9, 100.0)
+    made.update("base", 20.9, 100.0)
     if taken:
-        assert made.take("base", value, 100.0 + seconds) == value
+        assert made.update("base", value, 100.0 + seconds) == value
         return
     with pytest.raises(ModelError, match=r"temperature of base: has jumped from 20\.90 to"):
-        made.take("base", value, 100.0 + seconds)
-    assert made.take("base", 20.9, 100.0 + seconds) == 20.9, "what is refused shuts nothing out"
+        made.update("base", value, 100.0 + seconds)
+    assert made.update("base", 20.9, 100.0 + seconds) == 20.9, "what is refused shuts nothing out"
 
 
 def test_a_part_is_judged_by_the_median_of_the_others() -> None:
     """23 °C is the middle of 70, 22 and 23, 46.5 °C that of 70, 22, 23 and 82."""
     made = thermometers(rate=0.0, spread=60.0)
     for part, value in (("base", 70.0), ("strut_1", 22.0), ("strut_2", 23.0)):
-        made.take(part, value, 0.0)
-    assert made.take("strut_3", 82.0, 1.0) == 82.0
+        made.update(part, value, 0.0)
+    assert made.update("strut_3", 82.0, 1.0) == 82.0
     with pytest.raises(ModelError, match=r"63\.5 K from the other parts' 46\.50 °C; allowed 60 K"):
-        made.take("strut_4", 110.0, 1.0)
+        made.update("strut_4", 110.0, 1.0)
 
 
 def test_what_is_stale_is_no_measure_for_others() -> None:
     """Yesterday's 0 °C in the yard: after 60 s the reference of 20 °C counts again."""
     made = thermometers(rate=0.0)
-    made.take("base", 0.0, 0.0)
+    made.update("base", 0.0, 0.0)
     with pytest.raises(ModelError, match=r"the other parts' 0\.00 °C"):
-        made.take("platform", 45.0, 59.0)
+        made.update("platform", 45.0, 59.0)
     assert made.stale(59.0) == ()
     assert made.stale(61.0) == ("base",)
-    assert made.take("platform", 45.0, 61.0) == 45.0
+    assert made.update("platform", 45.0, 61.0) == 45.0
 
 
 def test_a_rule_of_zero_is_none() -> None:
     made = thermometers(0.0, 0.0, 0.0)
     for value in (-40.0, 120.0):
-        assert made.take("base", value, 0.0) == value
+        assert made.update("base", value, 0.0) == value
     assert made.stale(1e9) == ()
 
 
@@ -232,7 +234,7 @@ def test_a_rule_of_zero_is_none() -> None:
 def test_what_is_no_temperature_is_refused_before_all(name: str, value: float) -> None:
     made = thermometers(0.0, 0.0, 0.0)
     with pytest.raises(ModelError):
-        made.take(name, value, 0.0)
+        made.update(name, value, 0.0)
     assert made.stale(0.0) == ()
 
 

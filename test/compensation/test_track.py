@@ -74,7 +74,7 @@ def test_lag_is_no_following_error():
     """At 0.1 m/s a strut is 5 mm behind after 50 ms: right, since that was commanded in the last 0.1 s."""
     track = StrutTrack(limit=1e-3)
     for n in range(200):
-        track.tell(six(0.5 + 1e-4 * n), 1e-3 * n)
+        track.add_command(six(0.5 + 1e-4 * n), 1e-3 * n)
     for behind, wrong in ((0.0, False), (5e-3, False), (10e-3, False), (12e-3, True), (-2e-3, True)):
         assert track.follow(six(0.5199 - behind), 0.2) == wrong, behind
         assert not track.follow(six(0.5199 - behind), 0.2), "found once"
@@ -89,10 +89,10 @@ def test_lag_is_no_following_error():
         track.release()
         track.check(Sample(0.2))
         for n in range(200):
-            track.tell(six(0.5 + 1e-4 * n), 1e-3 * n)
+            track.add_command(six(0.5 + 1e-4 * n), 1e-3 * n)
     track.reset()
     assert not track.follow(six(0.0), 0.2), "nothing is in force"
-    track.tell(six(0.5), 1.0)
+    track.add_command(six(0.5), 1.0)
     track.limit = 0.0
     assert not track.follow(six(0.0), 1.0), "switched off"
 
@@ -102,7 +102,7 @@ def test_what_counts_as_moving():
     track = StrutTrack()
     assert track.moving(1.0) == ""
     for n in range(100):
-        track.tell(six(0.5, 1e-6 * n), 1.0 + 1e-3 * n)
+        track.add_command(six(0.5, 1e-6 * n), 1.0 + 1e-3 * n)
     assert track.moving(1.04) == "strut_3 was told to go 0.099 mm in the last 0.1 s"
     assert track.moving(1.1 + FOLLOWED_WITHIN) == ""
     read(track, six(0.5), 2.0)
@@ -161,7 +161,7 @@ def test_a_start_from_struts_at_rest_is_from_the_mean_of_their_readings():
 def test_what_is_known_last_counts(measured_at, fresh, wanted, late):
     """A drive follows and tells within 0.1 s; the last command was at 10 s. A reading counts from when it was made."""
     track = StrutTrack()
-    track.tell(six(0.4), 10.0)
+    track.add_command(six(0.4), 10.0)
     track.reset()
     np.testing.assert_array_equal(track.start(11.0, fresh), 0.4)
     read(track, six(0.5), measured_at + late, age=late)

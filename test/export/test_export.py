@@ -37,7 +37,7 @@ from hexapod_comp.export.table import (
     read_table,
     write_table,
 )
-from hexapod_comp.export.worth import ExportTrial, diagonal_passes
+from hexapod_comp.export.trial import ExportTrial, diagonal_passes
 from hexapod_comp.machine.field import GridField, no_field
 from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine, commanded_box

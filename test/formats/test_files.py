@@ -222,13 +222,13 @@ def test_choice():
 
 def test_key_paths_of_nested_lists():
     first, second = section(lines=[{"at": 1}, {}]).sections("lines")
-    assert first.take("at") == 1
+    assert first.require("at") == 1
     with pytest.raises(InputFileError, match=r"some\.yaml: lines\[1\]\.at: is missing"):
-        second.take("at")
+        second.require("at")
 
 
 def test_what_nobody_asked_for_is_an_error():
     left = section(known=1, unknwon=2)
-    left.take("known")
+    left.require("known")
     with pytest.raises(InputFileError, match=r"unknwon: is not a known key here; did you mean 'known'\? \(found 2\)"):
         left.finish()

@@ -12,12 +12,12 @@ from hexapod_comp.errors import InputFileError, ModelError
 from hexapod_comp.formats.schema import (
     PER_STRUT,
     Choice,
+    Integer,
     Names,
     Numbers,
     Section,
     Text,
     Unit,
-    Whole,
     read,
     read_whole,
 )
@@ -38,7 +38,7 @@ class Machine:
     name: Annotated[str, Text()]
     stroke: Annotated[np.ndarray, Numbers("mm", (2,))]
     ratio: Annotated[float, Numbers("")] = 1.0
-    points: Annotated[int, Whole(2, 9)] = 2
+    points: Annotated[int, Integer(2, 9)] = 2
     outside: Annotated[str, Choice("hold", "refuse")] = "hold"
     columns: Annotated[tuple[str, ...], Names(3)] = ()
     unit: Annotated[float, Unit("angle")] = 1.0

@@ -49,7 +49,7 @@ class Machine:
         self.bench, self.hal, self._metres = bench, StandInHal(), metres
         self.node = bench.add(LinuxcncBridgeNode, False, {**SLOW, **parameters}, hal=self.hal)
         for topic in ("tool_pose_command", "strut_states"):  # the compensator hears no two publishers
-            bench.hush(topic)
+            bench.remove_publisher(topic)
         self.poses: list[PoseStamped] = []
         bench.witness.create_subscription(PoseStamped, "tool_pose_command", self.poses.append, RELIABLE)
         self.place(HOME)
@@ -447,7 +447,7 @@ def test_end_ramps_out_what_is_quick(bench, speak, ramp_rate, left):
 
     bench.until(compensating, "compensation")
     assert bench.set_parameter(NODE, "ramp_rate", ramp_rate).successful
-    machine.node.say_goodbye()
+    machine.node.publish_last_status()
     np.testing.assert_allclose(machine.hal.corrections, left, rtol=1e-9)
     assert bool(bench.logged("corrections stay as they are")) is bool(left)
     assert_never_steps(machine.hal)
@@ -468,7 +468,7 @@ def test_what_guards_the_drives_is_taken_at_configure(bench, speak):
 
 def test_ends_without_ever_having_been_configured(bench):
     machine = Machine(bench)
-    machine.node.say_goodbye()
+    machine.node.publish_last_status()
     assert not machine.hal.corrections.any()
 
 

@@ -119,7 +119,7 @@ def test_a_perfect_machine_is_where_it_is_told(geometry: HexapodGeometry, tool_l
     """To a nanometre, which is the forward kinematics' tolerance many times over."""
     command = Pose(TILTED[:3], Rotation.from_euler("xyz", TILTED[3:], degrees=True).as_matrix())
     watched = WatchedMachine(RealMachine(geometry, MachineModel("paper")))
-    true, error = watched.look(lengths(geometry, TILTED, tool_length), command, tool_length)
+    true, error = watched.observe(lengths(geometry, TILTED, tool_length), command, tool_length)
     np.testing.assert_allclose(error, 0.0, atol=1e-9)
     np.testing.assert_allclose(true.position, command.position, atol=1e-9)
     np.testing.assert_allclose(true.rotation, command.rotation, atol=1e-8)
@@ -132,7 +132,7 @@ def test_a_machine_that_is_off_as_a_whole(geometry: HexapodGeometry, tool_length
     truth = MachineModel("paper", base_deviation=np.tile(moved, (6, 1)), platform_deviation=np.tile(left, (6, 1)))
     command = Pose(TILTED[:3], Rotation.from_euler("xyz", TILTED[3:], degrees=True).as_matrix())
     watched = WatchedMachine(RealMachine(geometry, truth))
-    _, error = watched.look(lengths(geometry, TILTED, tool_length), command, tool_length)
+    _, error = watched.observe(lengths(geometry, TILTED, tool_length), command, tool_length)
     turn = Rotation.from_euler("ZYX", TILTED[5:2:-1], degrees=True).as_matrix()
     np.testing.assert_allclose(error, moved - turn @ left, atol=1e-9)
 

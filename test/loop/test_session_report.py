@@ -66,7 +66,7 @@ def result(monkeypatch: pytest.MonkeyPatch) -> SessionResult:
         monkeypatch.setattr(session, name, stand_in)
     monkeypatch.setattr(session, "loop_client", lambda _: client)
     geometry = replace(paper_geometry(), work=TURNED_WORK, tool=TURNED_TOOL)
-    found = session.witnessed(geometry, (), [GIVEN], None, 100.0, False)
+    found = session.run_poses(geometry, (), [GIVEN], None, 100.0, False)
     in_base = TURNED_WORK.position + TURNED_WORK.rotation @ GIVEN.position
     np.testing.assert_allclose(told[0].position, in_base, rtol=0, atol=1e-15)
     return found
@@ -202,4 +202,4 @@ def test_a_busy_computer_is_named_when_an_answer_does_not_come(monkeypatch: pyte
         monkeypatch.setattr(session, name, stand_in)
     monkeypatch.setattr(session, "loop_client", lambda _: SimpleNamespace(close=lambda: None))
     with pytest.raises(NoAnswerError, match="within 5 s; the computer was busy: 50 of 100"):
-        session.witnessed(paper_geometry(), (), [GIVEN], None, 100.0, False)
+        session.run_poses(paper_geometry(), (), [GIVEN], None, 100.0, False)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from hexapod_comp.calibration.evaluation import worth
+from hexapod_comp.calibration.evaluation import evaluate_model
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine
 from hexapod_comp.machine.model_file import load_model
@@ -140,7 +140,7 @@ def test_every_line_is_zero_at_the_datum(lines_model, geometry):
 
 def test_lines_model_is_worth_what_its_file_says(tool, truth, lines_model):
     """On the same held-out points; the paper's own figure, about 70 %, is reached on its own metric."""
-    found = worth(truth, lines_model, tool.BOX)
+    found = evaluate_model(truth, lines_model, tool.BOX)
     assert lines_model.origin.held_out_residual == pytest.approx(found.after.raw.rms, abs=2e-9)
     assert found.after.raw.rms < found.before.raw.rms
     assert found.after.aligned.rms < 0.8 * found.before.aligned.rms

@@ -117,7 +117,7 @@ def test_any_value_in_any_place_of_the_journal(machine: RecordedMachine, monkeyp
     def replayed(now: list[tuple[str, int, str]]) -> None:
         collected = _Collected("bag", "/compensator")
         for name, time, content in now:
-            collected.take_text(name, time, content)
+            collected.add_text(name, time, content)
         recording = collected.recording([], 0)
         report = Report(recording, replay_recording(recording, Files(recording, {})), tolerance=1e-6)
         report.shown(), list(rows_of(report))

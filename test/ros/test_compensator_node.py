@@ -880,7 +880,7 @@ def test_home_out_of_limits_fails_and_says_why(rig, tmp_path):
     assert rig.state() == "unconfigured"
     (line,) = rig.logged("cannot configure")
     assert "larger than ±100 µm" in line
-    node.say_goodbye()
+    node.publish_last_status()
 
 
 # ---- parameters ----
@@ -1162,7 +1162,7 @@ def test_discovery_stays_on_this_machine_unless_told_otherwise(monkeypatch, envi
 
 
 def test_standard_messages_on_the_topics_of_the_readme(bench):
-    bench.speak("strut_setpoints")
+    bench.add_publisher("strut_setpoints")
     bench.compensator(publish_array=True)
     found = dict(bench.witness.get_topic_names_and_types())
     for topic, kind in SENT.items():
@@ -1176,7 +1176,7 @@ def test_standard_messages_on_the_topics_of_the_readme(bench):
 
 def test_a_bare_start_corrects_nothing_and_says_so(rig):
     """Somebody else's errors must not move a machine whose model was not named."""
-    rig.hush("strut_commands")
+    rig.remove_publisher("strut_commands")
     rig.add(CompensatorNode, True, {"start_without_feedback_after": AT_ONCE})
     assert rig.logged("with the ideal model, which corrects nothing (parameter model_file)")
     answer = rig.settle(near(HOME, (0.01, 0.02, 0.03), 3.0))

@@ -10,7 +10,7 @@ import pytest
 from rclpy.context import Context
 
 from hexapod_comp.linuxcnc import bridge as bridge_module
-from hexapod_comp.ros import base, heard_signals
+from hexapod_comp.ros import base, received_signals
 from hexapod_comp.ros import compensator as compensator_module
 from hexapod_comp.ros import strut_drive as drive_module
 
@@ -37,11 +37,11 @@ def test_a_hang_up_ends_a_node_as_other_signals_do_unless_it_is_ignored() -> Non
     """As nohup has it."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
-        heard = heard_signals()
+        heard = received_signals()
         signal.raise_signal(signal.SIGHUP)
         assert heard == [signal.SIGHUP]
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
-        heard = heard_signals()
+        heard = received_signals()
         signal.raise_signal(signal.SIGHUP)
         signal.raise_signal(signal.SIGTERM)
         assert heard == [signal.SIGTERM]
@@ -70,11 +70,11 @@ def test_a_topic_that_cannot_be_opened_is_said_and_leaves_nothing_open(
         node.trigger_configure()
     assert "RuntimeError: no more topics" in capfd.readouterr().err
     assert [len(list(ends)) for ends in (node.publishers, node.subscriptions, node.services, node.timers)] == before
-    node.say_goodbye()
+    node.publish_last_status()
     assert node.unconfigured
     node.trigger_configure()
     assert not node.unconfigured
-    node.say_goodbye()
+    node.publish_last_status()
     node.destroy_node()
 
 
@@ -91,5 +91,5 @@ def test_the_bridge_too(ros_context: Context, monkeypatch: pytest.MonkeyPatch) -
         patch.setattr(bridge_module, "CompensatorReset", fails)
         node.trigger_configure()
     assert [len(list(ends)) for ends in (node.publishers, node.subscriptions, node.timers)] == before
-    node.say_goodbye()
+    node.publish_last_status()
     node.destroy_node()

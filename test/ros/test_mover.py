@@ -34,7 +34,7 @@ class Moved:
     """A simulated machine with a mover, and who asks it for moves."""
 
     def __init__(self, rig: Rig, geometry: str = "paper.yaml", **parameters: object) -> None:
-        rig.hush("tool_pose_command")
+        rig.remove_publisher("tool_pose_command")
         self.rig, self.states, self.sent, self.geometry = rig, list[Any](), list[Any](), load_geometry(geometry)
         rig.listeners += [("/mover/state", self.states.append), ("/tool_pose_command", self.sent.append)]
         self.node: MoverNode = rig.add(MoverNode, True, dict(parameters))

@@ -116,13 +116,13 @@ def test_a_signal_within_anothers_handler_does_not_wait_for_it():
     """``ros2 launch`` and its terminal send one each. At every line that Python runs for the first comes a second."""
     program = """
 import signal, sys
-from hexapod_comp.ros import heard_signals
+from hexapod_comp.ros import received_signals
 
 def second(*_):
     signal.raise_signal(signal.SIGTERM)
     return second
 
-heard = heard_signals()
+heard = received_signals()
 sys.settrace(second)
 signal.raise_signal(signal.SIGINT)
 sys.settrace(None)

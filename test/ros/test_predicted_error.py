@@ -88,7 +88,7 @@ def test_nothing_is_worked_out_while_nobody_listens(bench, tmp_path, monkeypatch
     node = bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
     bench.ask(small.paper().home)
     beside = node._requests._worker
-    node._requests.look(1e12)
+    node._requests.update(1e12)
     assert beside.process is None
     subscription = bench.witness.create_subscription(
         PoseWithCovarianceStamped, STANDING, bench.seen[STANDING].append, RELIABLE
@@ -141,11 +141,11 @@ def test_a_process_that_fails_every_time_is_tried_less_and_less_often(monkeypatc
     topics = PredictedError(node, status, files, SimpleNamespace(ask=ask))
     for tick in range(1000):
         now = 100.0 + 0.2 * tick
-        topics.look(now)
+        topics.update(now)
         assert status.prediction_problem == "no predicted error: it cannot"
     np.testing.assert_allclose(np.diff(began), [2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0], atol=0.21)
     listeners.return_value = 0
-    topics.look(now)
+    topics.update(now)
     assert status.prediction_problem == ""
 
 

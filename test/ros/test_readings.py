@@ -246,7 +246,7 @@ def test_struts_that_swell_follow_the_humidity(rig, tmp_path):
     assert not dry.corrections.any()
     unknown = "not known, taken as 50"
     rig.until(lambda: rig.values().get("humidity_percent") == unknown, "that nobody tells the humidity")
-    rig.moisten(0.6)
+    rig.publish_humidity(0.6)
     rig.settle(HOME)
     np.testing.assert_allclose(rig.ask(HOME).lengths, dry.lengths / (1.0 + 20e-6), rtol=0.0, atol=1e-15)
     rig.until(lambda: rig.values().get("humidity_percent") == "60.0", "the humidity")
@@ -256,7 +256,7 @@ def test_struts_that_swell_follow_the_humidity(rig, tmp_path):
 @pytest.mark.parametrize("wrong", [45.0, 0.0045, math.nan], ids=["percent", "twice a fraction", "NaN"])
 def test_a_humidity_that_cannot_be_is_refused(rig, wrong):
     rig.compensator(command_timeout=0.0)
-    rig.moisten(wrong)
+    rig.publish_humidity(wrong)
     values = rig.until_status(ERROR, "bad feedback: humidity")
     assert "humidity: must lie within 0.01…1, as a fraction" in values["last_bad_feedback"]
     assert "humidity_percent" not in values
@@ -272,8 +272,8 @@ def test_a_temperature_called_humidity_is_refused(rig):
 def test_a_hygrometer_that_jumps_is_refused_and_one_that_falls_silent_is_said(rig):
     rig.compensator(command_timeout=0.0, temperature_timeout=0.3)
     rig.ask(HOME)
-    rig.moisten(0.4)
-    rig.moisten(0.9)
+    rig.publish_humidity(0.4)
+    rig.publish_humidity(0.9)
     assert (
         "humidity: has jumped from 0.40 to 0.90"
         in rig.until_status(ERROR, "bad feedback: humidity")["last_bad_feedback"]

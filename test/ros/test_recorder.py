@@ -72,10 +72,10 @@ def test_a_bag_that_was_removed_is_noticed(tmp_path: Path, monkeypatch: pytest.M
     bag = BagWriter(tmp_path / "run")
     record(bag, machine, 1)
     monkeypatch.setattr(recorder, "LOOK_PERIOD", 0.0)
-    bag.look()
+    bag.check_disk()
     assert not bag.problem
     shutil.rmtree(tmp_path / "run")
-    bag.look()
+    bag.check_disk()
     assert bag.problem == "was removed or moved while it was written"
     bag.close()
 

@@ -126,7 +126,7 @@ def outcome(name: str, arguments: dict, within: float = 60.0) -> list:
     beside.ask(Job(name, arguments, found.append, found.append, within=within, late=late))
     end = time.monotonic() + 60.0
     while not found and time.monotonic() < end:
-        beside.look(time.monotonic())
+        beside.poll(time.monotonic())
         time.sleep(0.01)
     beside.close()
     return found

@@ -136,7 +136,7 @@ def test_lifecycle_nodes_open_what_the_policy_allows(
         elif name == "strut_drive":
             rig.drive()
         elif name == "mover":
-            rig.hush("tool_pose_command")
+            rig.remove_publisher("tool_pose_command")
             rig.add(MoverNode, True, {})
         else:
             assert autostart(rig.add(LinuxcncBridgeNode, False, {}, hal=StandInHal()))

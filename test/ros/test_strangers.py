@@ -45,8 +45,8 @@ HUGE = FORGED + 10_000_000 * "x"
 
 def bridge(rig: Bench) -> LinuxcncBridgeNode:
     """Add a LinuxCNC bridge on a machine that is on; the witness no longer commands."""
-    rig.hush("tool_pose_command")
-    rig.hush("strut_states")
+    rig.remove_publisher("tool_pose_command")
+    rig.remove_publisher("strut_states")
     hal = StandInHal()
     node = rig.add(LinuxcncBridgeNode, True, {"rate": 250.0, "timeout": 1.0}, hal=hal)
     for n, length in enumerate(closed_form_lengths(HOME)):
@@ -188,7 +188,7 @@ def test_a_callback_that_raises_is_counted_and_said_and_the_node_goes_on(rig, mo
         rig.send(HOME)
         rig.feed(closed_form_lengths(HOME))
         rig.publish("temperatures", Temperature(temperature=20.0, header=pose_message(HOME, "base").header))
-        rig.speak("tool_pose_command") if what.startswith("matching") else None
+        rig.add_publisher("tool_pose_command") if what.startswith("matching") else None
         rig.until(lambda: what in node.guard.values()["last_callback_error"], "the error to be caught")
     values = rig.until_status(ERROR, "error in a callback")
     assert int(values["callback_errors"]) > 0

@@ -373,7 +373,7 @@ def test_bad_truth_file_fails_and_names_file_and_key(rig, tmp_path):
     (line,) = rig.logged("cannot configure")
     assert truth in line
     assert "struts.offset_um" in line
-    node.say_goodbye()
+    node.publish_last_status()
     model_file(tmp_path)
     assert rig.change("configure", NODE)
 
@@ -386,7 +386,7 @@ def test_drive_that_cannot_be_fails_and_says_why(rig, tmp_path):
     assert not rig.change("configure", NODE)
     (line,) = rig.logged("cannot configure")
     assert "drive.initial_lengths of strut_1" in line
-    node.say_goodbye()
+    node.publish_last_status()
 
 
 def test_quality_of_service(rig):

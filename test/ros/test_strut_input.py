@@ -90,7 +90,7 @@ def ask(rig: Bench, lengths: np.ndarray, **others: float) -> JointState:
 
 
 def test_a_controller_of_struts_commands_the_node(rig: Bench):
-    rig.speak("strut_setpoints")
+    rig.add_publisher("strut_setpoints")
     rig.compensator(command_input=STRUTS, enable_compensation=False, max_command_age=60.0)
     at_home = closed_form_lengths(HOME)
     for _ in range(3):  # as ros2_control does until a controller is active
@@ -122,7 +122,7 @@ def told(rig: Bench, measured: np.ndarray) -> np.ndarray:
 
 def test_a_controller_that_starts_again_moves_no_strut(rig: Bench):
     """It commands what it is told it stands at. Truth: closed-form lengths, and that told again nothing changes."""
-    rig.speak("strut_setpoints")
+    rig.add_publisher("strut_setpoints")
     rig.compensator(command_input=STRUTS, ramp_rate=1.0)
     at_home = closed_form_lengths(HOME)
     standing = told(rig, at_home)  # before any command: less what the model would correct there

@@ -218,7 +218,7 @@ def test_nothing_is_worked_out_while_nobody_listens(rig: Bench, machine: Machine
     started(rig, file)
     rig.ask(at_home(machine), "work")
     node = rig.nodes[0]
-    node._requests.look(1e12)
+    node._requests.update(1e12)
     assert node._requests._worker.process is None
 
 

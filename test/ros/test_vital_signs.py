@@ -106,7 +106,7 @@ def test_the_stop_output_says_when_commands_are_refused_and_to_who_comes_late_to
     until(True, "inactive")
     assert bench.change("activate")
     until(False, "active again")
-    node.say_goodbye()
+    node.publish_last_status()
     until(True, "the end")
     assert [stop.data for stop in stops] == [True, False] * (len(stops) // 2) + [True] * (len(stops) % 2)
 

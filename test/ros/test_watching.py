@@ -71,8 +71,8 @@ def test_the_error_left_is_along_the_axes_of_work(rig, geometry, close):
     """Truth: measured struts are the distances between the joints with the platform 20 µm off along base x, by plain
     closure; seen from work that is the first row of its rotation. 2e-9 m is the solvers' tolerance; the 6-6 machine's
     screws turn with their joints, which plain closure leaves out: 0.2 % of the way."""
-    rig.hush("strut_states")
-    rig.speak("strut_states")
+    rig.remove_publisher("strut_states")
+    rig.add_publisher("strut_states")
     machine = load_geometry(geometry)
     watcher, home = watched(rig, geometry), machine.home
 

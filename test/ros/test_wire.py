@@ -103,11 +103,11 @@ def test_struts_are_taken_from_bytes_that_are_theirs():
     reader, numbers = StrutReader(), [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
     message = JointState(name=list(STRUT_NAMES), position=numbers)
     message.header.stamp.sec = 7
-    assert reader.take(serialize_message(message)).header.stamp.sec == 7
+    assert reader.parse(serialize_message(message)).header.stamp.sec == 7
     assert reader.lengths.tolist() == numbers
     for data in (b"", serialize_message(message)[:40], b"\xff" * 80):
         with pytest.raises(CommandError, match="cannot be read") as caught:
-            reader.take(data)
+            reader.parse(data)
         assert caught.value.reason == "message"
     assert reader.lengths.tolist() == numbers
 

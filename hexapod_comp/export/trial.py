@@ -1,4 +1,4 @@
-"""What an export is worth: the tool error that a machine keeps when it is driven by the exported data.
+"""Try an export on the machine that its model describes: the tool error that remains with the exported data.
 
 The model is taken for the truth. Its machine makes the same random passes twice, with nominal strut lengths and
 with what the export makes of the same commands, and the tool's error is compared. Each point is passed along a
@@ -42,7 +42,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class ExportCheck:
-    """What one export leaves, and how large the effects are that it cannot carry."""
+    """Tool error without and with one export, and the size of the effects that it cannot represent."""
 
     level: Comparison  # Level tool, inside the box
     # The same places with the tool tilted; None where no such pose is within the machine's limits
