@@ -1,4 +1,5 @@
-"""Measuring: ``imagine`` draws a virtual machine, ``simulate`` measures it, ``iso230`` judges readings."""
+"""Measuring: ``imagine`` draws a virtual machine, ``simulate`` measures it, ``collect`` measures a running one,
+``iso230`` judges readings."""
 
 from __future__ import annotations
 
@@ -141,6 +142,37 @@ def simulate(args: argparse.Namespace) -> Result:
     in_json = [{f"{key}_{c['']}" if key in ("rms", "max") else key: c[key] for key in c if key} for c in channels]
     content |= {**counts, "channels": in_json, "written": args.out}
     return Result(lambda: "\n".join(lines), lambda: content)
+
+
+def collect(args: argparse.Namespace) -> Result:
+    """Measure a running machine: a campaign's readings, by the mover and an instrument's topic."""
+    from ..measurements.collect import collect as collect_readings
+    from ..ros import keep_discovery_local, received_signals
+    from ..ros.collector import WatchedMachine
+
+    geometry = load_geometry(args.machine)
+    campaign = results.load_campaign(args, geometry)
+    keep_discovery_local()
+    signals = received_signals()
+    with WatchedMachine(args.topic, args.namespace, samples=args.samples) as machine, results.stage_line() as say:
+        done = collect_readings(
+            campaign,
+            geometry,
+            machine,
+            args.out,
+            args.seed,
+            progress=lambda done, of, where: say(f"stop {done + 1} of {of}: {where}"),
+            going_on=lambda: not signals,
+        )
+    planned = len(template(campaign, geometry, args.seed, args.campaign))
+    count, missing = len(done.measurements), list(done.missing)
+    content = {"machine": geometry.name, "readings": count, "planned": planned, "missing": missing, "written": args.out}
+    return Result(
+        lambda: f"{count} of {planned} readings: {args.out}",
+        lambda: {**content, "resumed_stops": done.resumed},
+        code=0 if count == planned else 1,
+        notes=[f"nothing was read at {where}; run it again to go on" for where in missing],
+    )
 
 
 def iso230(args: argparse.Namespace) -> Result:

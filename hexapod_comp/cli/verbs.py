@@ -506,6 +506,35 @@ example:
   1670 readings of 59 runs at 1670 stations: measured.csv""",
         alias="measure",
     ),
+    "collect": Verb(
+        "measuring", "calibration",
+        "measure a running machine: a campaign's readings as a CSV file",
+        (
+            MACHINE,
+            reads("--campaign", "campaign file, or the name of a shipped one (default campaign_5d.yaml for the machine "
+                  "paper, else campaign)", kind="campaign"),
+            value("--topic", None, "TOPIC", "poses of the tool in base (PoseStamped), from a tracker or motion capture "
+                  "(default tool_pose_true, what strut_drive's tracker reads)", default="tool_pose_true"),
+            value("--samples", whole(3, 10_000), "N", "poses of which the median is taken at each stop (default 25)",
+                  default=25),
+            seed_of("the scattered poses"),
+            writes("--out", "write the readings to a CSV file; one of this campaign is completed", type=csv_file,
+                   required=True),
+            NAMESPACE,
+            JSON,
+        ),
+        """Has the mover visit a campaign's stations, each pass of a line from beside its first point, and reads the
+instrument there when the tool has settled; struts and temperatures are taken along. The file is what fit reads, and is
+whole at any time: Ctrl-C, or a mover that was stopped, ends the run, and the same command goes on with it. A stop at
+which the instrument reads nothing three times is left out, and visited by the next run. Ways and attitudes that no
+machine could err by (another unit, sign, frame or target) end the run after the first line. Exit code: 0 everything was
+read, 1 some is missing, 2 bad input.
+
+example:
+  $ ros2 launch hexapod_comp machine.launch.py mover:=true     (compensator, mover and a simulated machine)
+  $ hexapod_comp collect --campaign campaign_1d --out measured.csv
+  1670 of 1670 readings: measured.csv""",
+    ),
     "fit": Verb(
         "fitting", "calibration",
         "fit a model of the machine's errors to measurements",

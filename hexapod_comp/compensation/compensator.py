@@ -15,7 +15,6 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..core import QUATERNION_NORM_TOLERANCE, Status, Struct, ffi, lib
 from ..core.batch import backwards, given, solve_linear
@@ -150,6 +149,8 @@ def drifted(geometry: HexapodGeometry, model: MachineModel, drift: np.ndarray) -
         return model
     centre, turn = geometry.home.position, drift[3:6] / geometry.characteristic_length
     joints = geometry.base_joints + model.base_deviation
+    from scipy.spatial.transform import Rotation  # only a drift needs SciPy
+
     moved = centre + drift[:3] + (joints - centre) @ Rotation.from_rotvec(turn).as_matrix().T
     return replace(
         model,

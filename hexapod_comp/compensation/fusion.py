@@ -15,8 +15,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
-from scipy.special import gammaincinv
 
 from ..errors import CommandError, HexapodError
 from ..machine.geometry import HexapodGeometry
@@ -71,6 +69,8 @@ class DriftFilter:
         innovation = reading - observation @ self.state
         spread = observation @ self.covariance @ observation.T + noise
         self.chi_square = float(innovation @ np.linalg.solve(spread, innovation))
+        from scipy.special import gammaincinv  # a node without fusion need not load SciPy
+
         allowed = 2.0 * float(gammaincinv(len(innovation) / 2.0, self.rules.gate))
         if not self.chi_square <= allowed:
             off = f"{1e3 * math.hypot(*innovation[:3]):.4g} mm, {1e3 * math.hypot(*innovation[3:]):.4g} mrad"
@@ -173,6 +173,8 @@ class Fusion:
             return tool
         pose = Pose(tool[:3], tool[3:].reshape((3, 3)))
         moved = self._observation(pose) @ left
+        from scipy.spatial.transform import Rotation
+
         turned = Rotation.from_rotvec(moved[3:]).as_matrix() @ pose.rotation
         return np.concatenate([pose.position + moved[:3], turned.ravel()])
 
@@ -205,6 +207,8 @@ class Fusion:
         return rejected
 
     def _take(self, reading: PoseReading) -> None:
+        from scipy.spatial.transform import Rotation
+
         struts, speed = self._struts_at(reading.made)
         estimated = self._compensator.estimate(struts)
         tool = Pose(estimated[:3].copy(), estimated[3:].reshape((3, 3)).copy())

@@ -473,9 +473,17 @@ def campaign_text(campaign: Campaign, remarks: Sequence[str] = ()) -> str:
 
 def template(campaign: Campaign, geometry: HexapodGeometry, seed: int = 0, name: str = "campaign") -> MeasurementSet:
     """Return the readings of a campaign on a nominal machine with values of zero; a seed picks the scattered poses."""
-    listed = (reading for run in campaign.runs for reading in run.readings(campaign.cycles))
-    readings = [*_lines(campaign), *_diagonals(campaign), *_scattered(campaign, seed), *listed]
+    readings = campaign_readings(campaign, seed)
     return assemble(geometry, [reading._replace(source=FileLine(name, 0)) for reading in readings])
+
+
+def campaign_readings(campaign: Campaign, seed: int = 0) -> Iterator[Reading]:
+    """Yield a campaign's readings in measuring order, with values of zero."""
+    yield from _lines(campaign)
+    yield from _diagonals(campaign)
+    yield from _scattered(campaign, seed)
+    for run in campaign.runs:
+        yield from run.readings(campaign.cycles)
 
 
 def _lines(campaign: Campaign) -> Iterator[Reading]:

@@ -296,6 +296,14 @@ def read_tidy(
     return assemble(geometry, readings, probe, files, notes, in_reach)
 
 
+def tidy_readings(path: str | Path, geometry: HexapodGeometry) -> list[Reading]:
+    """Return the readings of one file as they stand in it."""
+    table = Table(path)
+    rows = read_rows(table)
+    (names,) = _run_names([table], [rows])
+    return _file_readings(table, rows, names, geometry, None)[0]
+
+
 def _refuse_twice(tables: Sequence[Table]) -> None:
     """Raise on a file given twice: its readings would count twice."""
     seen: dict[str, Table] = {}

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -243,6 +244,9 @@ class LoopClient:
         return quiet
 
 
+AnyMachine = TypeVar("AnyMachine", bound="Machine")
+
+
 class MoveError(HexapodError):
     """A move was refused, or has ended before its target; ``reason`` is what ended it: limit, refusal, person, …"""
 
@@ -263,6 +267,7 @@ class MoveState:
     request: int  # stamp of the message that asked for it, ns
     refused_request: int  # stamp of the newest message that was refused, ns
     refusal: str
+    ready: bool = True  # the mover knows the machine, and where its tool stands
 
 
 class Machine:
@@ -278,7 +283,7 @@ class Machine:
     Raises
     ------
     NoAnswerError
-        No mover was found within 10 s.
+        No mover that is ready was found within 10 s.
     """
 
     def __init__(self, namespace: str = "", mover: str = "mover") -> None:
@@ -290,12 +295,12 @@ class Machine:
         self._stop = node.create_client(Trigger, f"{mover}/stop")
         node.create_subscription(DiagnosticStatus, f"{mover}/state", self._on_state, LATCHED_QOS)
         try:
-            self._wait(self._connected, 10.0, f"the node {mover}: ros2 run hexapod_comp mover")
+            self._wait(self._connected, 10.0, f"the node {mover}, with a compensator and its pose estimate")
         except NoAnswerError:
             self.close()
             raise
 
-    def __enter__(self) -> Machine:
+    def __enter__(self: AnyMachine) -> AnyMachine:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -387,7 +392,7 @@ class Machine:
 
     def _connected(self) -> bool:
         found = self._to.get_subscription_count() and self._by.get_subscription_count()
-        return bool(found) and self.state is not None and self._stop.service_is_ready()
+        return bool(found) and self.state is not None and self.state.ready and self._stop.service_is_ready()
 
     def _on_state(self, message: DiagnosticStatus) -> None:
         v = {entry.key: entry.value for entry in message.values}
@@ -400,6 +405,7 @@ class Machine:
             int(v["request"]),
             int(v["refused_request"]),
             v["refusal"],
+            v["ready"] == "true",
         )
 
     def _wait(self, condition: Callable[[], bool], timeout: float, what: str) -> None:

@@ -41,6 +41,10 @@ from .status import ERROR, OK, WARN, status_of, status_prefix
 from .worker import Job, Worker
 
 ANSWERED_WITHIN = 0.4  # A command that the compensator has not answered after this long was refused, s
+IN_FLIGHT = 0.15  # While a command has waited for its answer this long, the path waits too, s
+RESUMED = 5  # A move that was held up is planned anew from the last answered pose so often, and then given up
+# What refuses all commands until somebody has mended it; other refusals may be a busy computer's
+STANDING = ("following_error", "several_publishers", "unknown_publisher", "no_feedback", "tool_changed")
 ESTIMATE_WITHIN = 1.0  # An estimate older than this does not say where the machine stands, s
 STATE_PERIOD = 0.1  # Between two messages of ``~/state`` while the machine moves, s
 
@@ -110,7 +114,9 @@ class MoverNode(MachineNode):
         super().__init__("mover", PARAMETERS, **options)
         self._state, self._text, self._by = IDLE, "no move yet", ""
         self._request = self._refused_request = 0  # stamps, ns
-        self._refusal = ""
+        self._refusal, self._ready_shown = "", False
+        self._resumed = 0  # how often the present move was planned anew
+        self._target: Request | None = None  # of the present move; None: a program, which cannot begin in its middle
         self._moves = 0  # that were begun
         self._forget()
 
@@ -134,7 +140,8 @@ class MoverNode(MachineNode):
         self._index = 0
         self._pending: Request | None = None  # is planned when the machine stands
         self._stamp = 0  # of the last command, ns
-        self._unanswered: deque[tuple[int, float]] = deque()  # stamps, and when they were sent
+        self._unanswered: deque[tuple[int, float, Pose]] = deque()  # stamps, when they were sent, and poses
+        self._answered: Pose | None = None  # the last pose that the compensator has answered
         self._ended = self._near_since = 0.0
         self._braking = ""  # who asked for it
 
@@ -236,7 +243,7 @@ class MoverNode(MachineNode):
     def _on_answer(self, message: JointState) -> None:
         stamp = nanoseconds_of(message.header.stamp)
         while self._unanswered and self._unanswered[0][0] <= stamp:
-            self._unanswered.popleft()
+            self._answered = self._unanswered.popleft()[2]
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -320,6 +327,11 @@ class MoverNode(MachineNode):
         elif self._state != PLANNING:
             self._plan()
 
+    def _ready(self) -> bool:
+        """Whether it knows the machine, and where its tool stands."""
+        fresh = self._estimate is not None and time.monotonic() - self._estimate[1] <= ESTIMATE_WITHIN
+        return self._active and self._geometry is not None and (fresh or self._held is not None)
+
     def _standing(self) -> Pose:
         """Return where the tool stands, in ``base``: as it was sent, or before that as it is estimated."""
         if self._held is not None:
@@ -330,12 +342,14 @@ class MoverNode(MachineNode):
 
     # ---- planning ----
 
-    def _plan(self) -> None:
-        """Have the pending request planned, from where the machine stands."""
+    def _plan(self, anew: bool = False) -> None:
+        """Have the pending request planned, from where the machine stands; anew: one that has begun already."""
         request, self._pending = self._pending, None
         if request is None or self._geometry is None:
             return
         start = self._standing()
+        self._resumed = self._resumed if anew else 0
+        self._target = None if request.times else Request(request.stamp, request.from_pose(start))
         self._request, self._refused_request, self._refusal = request.stamp, 0, ""
         self._moves += 1
         arguments = {
@@ -432,14 +446,15 @@ class MoverNode(MachineNode):
         now = int(self.get_clock().now().nanoseconds)
         # Stamped with the times for which they were computed; after a pause the path goes on from there
         stamp = max(self._stamp + period, now - period) if self._stamp else now
-        if stamp > now + period:
+        held_up = self._unanswered and time.monotonic() - self._unanswered[0][1] > IN_FLIGHT
+        if stamp > now + period or held_up:
             return
         if self._path is not None:
             self._held = self._path.pose(min(self._index, len(self._path) - 1))
             self._index += 1
         message = pose_message(self._held, self._options["base_frame"])
         message.header.stamp, self._stamp = stamp_of(stamp), stamp
-        self._unanswered.append((stamp, time.monotonic()))
+        self._unanswered.append((stamp, time.monotonic(), self._held))
         self._commands.publish(message)
         if self._path is not None and self._index >= len(self._path):
             self._next()
@@ -484,8 +499,10 @@ class MoverNode(MachineNode):
             done = max(0.0, 1.0 - left / self._whole) if self._whole else 1.0
         elif self._state in (SETTLING, ARRIVED):
             done = 1.0
+        self._ready_shown = self._ready()
         values = {
             "state": self._state,
+            "ready": str(self._ready_shown).lower(),
             "move": str(self._moves),
             "request": str(self._request),
             "share": f"{done:.4f}",
@@ -502,6 +519,8 @@ class MoverNode(MachineNode):
     def _check_state(self) -> None:
         now = time.monotonic()
         self._worker.poll(now)
+        if self._ready() != self._ready_shown:
+            self._publish_state()
         if self._active:
             if self._unanswered and now - self._unanswered[0][1] > ANSWERED_WITHIN:
                 self._refused()
@@ -517,19 +536,29 @@ class MoverNode(MachineNode):
         self.publish_status(level, text, lambda: {"state": self._state, "moves": str(self._moves), "tool": self._tool})
 
     def _refused(self) -> None:
-        """Stop sending: the compensator answers no more."""
+        """Go on from the last answered pose where a busy computer has held commands up; else stop sending."""
         said = self._compensator_says
-        alive = self.count_publishers("strut_commands")
-        reason = (
-            said.get("last_refusal") or said.get("message", "no answer") if alive else "the compensator is not there"
-        )
-        by = "following error" if "following_error" in said.get("message", "") else "refusal"
-        under_way = self._state in UNDER_WAY
+        message, alive = said.get("message", ""), self.count_publishers(self.resolve_topic_name("strut_commands"))
+        under_way, answered, target, request = self._state in UNDER_WAY, self._answered, self._target, self._request
+        stands = any(reason in message for reason in STANDING)
+        may_resume = alive and answered is not None and not stands and self._resumed < RESUMED
+        if may_resume and not under_way:
+            self._unanswered.clear()
+            self._resumed += 1
+            return
+        if may_resume and target is not None and not self._braking:
+            pending = self._pending or target
+            self._halt()
+            self._held, self._answered, self._pending = answered, answered, pending
+            self._resumed += 1
+            self.note("resume", "commands were held up: planned anew from the last one that was answered")
+            self._plan(anew=True)
+            return
+        reason = said.get("last_refusal") or message or "no answer" if alive else "the compensator is not there"
+        by = "following error" if "following_error" in message else "refusal"
         self._halt()
-        if under_way:
-            self._stopped(by, reason)
-        else:
-            self._change(STOPPED, f"at standstill: {reason}", by)
+        self._request = request
+        self._stopped(by, reason if under_way else f"at standstill: {reason}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

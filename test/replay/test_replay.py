@@ -777,18 +777,18 @@ def test_bag_that_unpacks_to_too_much_is_refused(run, tmp_path, monkeypatch, kin
     monkeypatch.setattr(storage, "RATIO", 1)
     monkeypatch.setattr(storage, bound, 2 * MEGABYTE)
     unpacked = []
-    monkeypatch.setattr(storage.Allowance, "take", spied(storage.Allowance.take, unpacked))
+    monkeypatch.setattr(storage.Allowance, "charge", spied(storage.Allowance.charge, unpacked))
     with pytest.raises(InputFileError, match=message):
         read_recording(bag)
     assert sum(unpacked) <= 4 * MEGABYTE or mode == CompressionMode.FILE  # files go to the disk first
 
 
-def spied(take: Callable, seen: list[int]) -> Callable:
-    """Return `take` that notes what it counts."""
+def spied(charge: Callable, seen: list[int]) -> Callable:
+    """Return `charge` that notes what it counts."""
 
     def noting(self: object, count: int) -> None:
         seen.append(count)
-        take(self, count)
+        charge(self, count)
 
     return noting
 

@@ -60,7 +60,7 @@ def test_a_strut_that_is_away_for_one_reading_is_said(rig):
 
 @pytest.mark.parametrize("node", ["compensator", "strut_drive"])
 def test_a_full_log_disk_is_said_beside_everything_else(rig, monkeypatch, node):
-    monkeypatch.setattr(LogSpace, "look", lambda space: setattr(space, "problem", "log disk full: /var/log"))
+    monkeypatch.setattr(LogSpace, "check", lambda space: setattr(space, "problem", "log disk full: /var/log"))
     made = rig.compensator() if node == "compensator" else rig.drive()
     rig.until(lambda: rig.status(node), "a status")
     assert rig.status(made.get_name()).message.endswith("log disk full: /var/log")

@@ -176,7 +176,7 @@ def broken(*_: object, **__: object) -> None:
         ("strut_states", "compensator", "estimate"),
         ("temperatures", "compensator", "set_temperature"),
         ("check_state", "_status", "problem"),
-        ("matching of tool_pose_command", "_status", "look"),
+        ("matching of tool_pose_command", "_status", "update"),
     ],
 )
 def test_a_callback_that_raises_is_counted_and_said_and_the_node_goes_on(rig, monkeypatch, what, owner, method):
