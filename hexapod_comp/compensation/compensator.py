@@ -220,7 +220,7 @@ class Compensator:
         self._time, self._estimated = ffi.new("hc_time *"), ffi.new("hc_estimated *")
         lib.hc_init(self._at, self._constants.at, ramp_rate)
         self._sensed: set[str] = set()
-        self.drift = np.zeros(DRIFT_STATES)
+        self.drift: np.ndarray = np.zeros(DRIFT_STATES)
         self._machine: RealMachine | None = None
         self._parts = parts = named_parts(self._state)
         self.command, self.nominal, self.correction = (parts[name] for name in ("command", "nominal", "correction"))

@@ -50,7 +50,8 @@ class DriftFilter:
 
     def __init__(self, rules: FusionRules, states: int = DRIFT_STATES) -> None:
         self.rules = rules
-        self.state, self.covariance = np.zeros(states), rules.initial**2 * np.eye(states)
+        self.state: np.ndarray = np.zeros(states)
+        self.covariance: np.ndarray = rules.initial**2 * np.eye(states)
         self.time = math.nan  # of the newest reading, s
         self.chi_square = 0.0  # of the last innovation
 

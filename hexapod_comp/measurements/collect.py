@@ -74,7 +74,7 @@ class Visit(NamedTuple):
     pose: Pose  # ``pose_tool_in_work``
     readings: tuple[int, ...]  # indices among the campaign's
     first_of_pass: bool
-    approach: Pose | None  # from where a pass over a line begins
+    approach: Pose | None  # from where it is reached in the direction of its pass
 
 
 @dataclass(frozen=True)
@@ -130,6 +130,7 @@ def collect(
     found: dict[int, Reading] = _resumed(path, geometry, listed) if Path(path).exists() else {}
     resumed = sum(all(n in found for n in visit.readings) for visit in visits)
     watch, missing, saved = _SetUp(geometry), list[str](), time.monotonic()
+    here = -1  # the stop at which the machine stands
     try:
         for done, visit in enumerate(visits):
             if all(n in found for n in visit.readings):
@@ -138,11 +139,10 @@ def collect(
                 break
             where = f"{visit.run}, cycle {visit.cycle}, at {(visit.pose.position * 1e3).round(3).tolist()} mm"
             progress(done, len(visits), where)
-            if visit.approach is not None and (
-                visit.first_of_pass or done == 0 or visits[done - 1].readings[0] not in found
-            ):
+            if visit.approach is not None and (visit.first_of_pass or here != done - 1):
                 _approach(machine, visit.approach)
             machine.move(visit.pose)
+            here = done
             seen = next((o for o in (machine.observe() for _ in range(attempts)) if o is not None), None)
             if seen is None:
                 missing.append(where)
@@ -160,7 +160,8 @@ def collect(
         if whole := _in_order(geometry, found):
             write_measurements(whole, path)
     if whole is None:
-        raise InputFileError(path, "", "nothing was read at any station, so there is no file")
+        read = "one point of a line only, which is too little for a file" if found else "nothing, so there is no file"
+        raise InputFileError(path, "", f"the instrument read {read}")
     return Collected(whole, resumed, tuple(missing))
 
 
@@ -190,17 +191,18 @@ def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
         r = listed[members[0]]
         this = r.run, r.cycle, r.direction
         approach = None
-        after = listed[stops[k + 1][0]] if k + 1 < len(stops) else None
-        if r.direction and after is not None and (after.run, after.cycle, after.direction) == this:
-            way = r.pose.position - after.pose.position
-            if (length := float(np.linalg.norm(way))) > 0.0:
-                approach = Pose(r.pose.position + way * (OVERRUN / length), r.pose.rotation)
+        for other, sign in ((k + 1, -1.0), (k - 1, 1.0)):  # the way from here to the next stop, or from the last one
+            there = listed[stops[other][0]] if 0 <= other < len(stops) else None
+            if approach is None and r.direction and there and (there.run, there.cycle, there.direction) == this:
+                way = sign * (there.pose.position - r.pose.position)
+                if (length := float(np.linalg.norm(way))) > 0.0:
+                    approach = Pose(r.pose.position + way * (OVERRUN / length), r.pose.rotation)
         yield Visit(*this, r.pose, members, this != before, approach)
         before = this
 
 
 def _approach(machine: MeasuredMachine, pose: Pose) -> None:
-    """Begin a pass before its first point; where a limit forbids it, at the point itself."""
+    """Begin a pass, or what is left of it, before its first point; where a limit forbids it, at the point itself."""
     try:
         machine.move(pose)
     except HexapodError as error:

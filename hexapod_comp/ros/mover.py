@@ -125,7 +125,7 @@ class MoverNode(MachineNode):
         self._sources: dict[str, Source] = {}
         self._geometry: HexapodGeometry | None = None
         self._tool = TOOL
-        self._pivot = np.zeros(3)
+        self._pivot: np.ndarray = np.zeros(3)
         self._estimate: tuple[Pose, float] | None = None  # and when it came, monotonic
         self._compensator_says: dict[str, str] = {}
         self._halt()

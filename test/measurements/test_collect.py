@@ -140,6 +140,32 @@ def test_a_killed_run_goes_on_where_it_stopped_wherever_that_was(tmp_path: Path)
         assert np.array_equal(ours.direction, theirs.direction)
 
 
+@pytest.mark.parametrize("done", [2, 3, 4, 5, 6])
+def test_what_is_left_of_a_pass_is_reached_in_its_direction(done: int, tmp_path: Path) -> None:
+    """A run goes on within a pass, or at its last stop; the machine may stand anywhere: each stop is reached from the
+    side that its file states, by the two places before and at it."""
+    geometry, campaign = load_geometry("paper"), small(load_geometry("paper"), poses=0)
+    first = StandIn(geometry)
+    collect(campaign, geometry, first, tmp_path / "out.csv", going_on=lambda: first.observed < done)
+    rest = StandIn(geometry)
+    rest.went.append(geometry.tool_pose(geometry.home))
+    reached: list[np.ndarray] = []
+    observe = rest.observe
+
+    def noting() -> Observation | None:
+        reached.append(rest.went[-1].position - rest.went[-2].position)
+        return observe()
+
+    rest.observe = noting  # type: ignore[method-assign]
+    again = collect(campaign, geometry, rest, tmp_path / "out.csv")
+    places = template(campaign, geometry)
+    new = len(again.measurements) // 5 - again.resumed
+    assert len(reached) == new
+    directions = places.direction[::5][-new:]
+    lines = np.array([run.axis for run in places.runs])[places.run[::5][-new:]]
+    assert (np.sign((np.array(reached) * lines).sum(axis=1)) == directions).all()
+
+
 def test_a_beam_that_is_broken_for_a_moment_is_asked_again_and_else_the_stop_is_left_out(tmp_path: Path) -> None:
     geometry, campaign = load_geometry("paper"), small(load_geometry("paper"))
     machine = StandIn(geometry)
