@@ -139,11 +139,12 @@ setup(
             "pin>=2.7",
             "toppra>=0.6",
         ],
-        # Imported where used. The first four have no rosdep keys, and a clear message says when one is missing.
+        # Imported where used. The first five have no rosdep keys, and a clear message says when one is missing.
         "pages": ["plotly>=5.18"],
         "cluster": ["distributed>=2023.12"],
         "bags": ["rosbags>=0.11"],
         "watch": ["viser>=1.0"],
+        "physics": ["mujoco-core>=4.0; python_version >= '3.11'"],  # without the viewer; has no wheels for 3.10
         "completion": ["argcomplete>=3.1"],  # rosdep: python3-argcomplete; nobody needs it to run anything
     },
     entry_points={

@@ -26,6 +26,7 @@ from hexapod_comp.core import ffi, lib
 from hexapod_comp.core.batch import given, written
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.load import Load
 from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.struts import StrutErrors
@@ -93,7 +94,7 @@ def compensators(geometry: HexapodGeometry) -> dict[tuple[str, str], Compensator
     warm = with_block(struts=grown, base_expansion=11.5e-6, platform_expansion=11.5e-6)
     for name in ("strut_1", "strut_4", "base", "platform"):
         warm.set_temperature(name, 23.0)
-    turning = cardan(geometry)
+    turning, weight = cardan(geometry), Load(stiffness=np.full(6, 20e6), lost_motion=np.full(6, 1e-6), mass=30.0)
     return {
         ("ideal", "the whole command, or estimate, without errors"): with_block(),
         ("structure", "twelve joints where they really are"): with_block(**joints),
@@ -103,6 +104,7 @@ def compensators(geometry: HexapodGeometry) -> dict[tuple[str, str], Compensator
         ("screw rotation", "cardan joints turn the screws, a lead"): Compensator(turning, ideal),
         ("thermal", "struts, base and platform at their temperatures"): warm,
         ("field", "three families of lines, cubic, six components"): with_block(field=whole.field),
+        ("load", "stiffness and lost motion under weight"): with_block(load=weight),
         ("all of them", "the shipped model: structure, scale, waves, field"): Compensator(geometry, whole),
     }
 

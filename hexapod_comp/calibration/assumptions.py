@@ -42,6 +42,8 @@ class Assumptions:
     struts_warmed_alike: float = assumed(0.9, "", "the same by another part's thermometer", "loaded, cooled unlike")
     least_warming: float = assumed(0.5, "K", "change that shows an expansion", "3 µm on 0.5 m of steel")
     least_damping: float = assumed(0.1, "", "change of humidity that shows swelling", "5 µm on 0.5 m of carbon fibre")
+    least_load: float = assumed(10.0, "N", "change of weight that shows a stiffness", "0.5 µm on 20 N/µm")
+
     # Posterior (posterior.py, datum.py)
     seen: float = assumed(1.0, "σ", "change of all readings from which on a direction is observable", "one σ of noise")
     weak: float = assumed(5.0, "σ", "observable directions below are listed as weak", "known to a fifth")
@@ -57,9 +59,9 @@ class Assumptions:
 
     # Changes of a machine since its fit (changes.py, check.py); each has some standard deviations, equally likely
     prior_odds: tuple[float, ...] = assumed(
-        (1.0, 1.0, 1.0, 0.125, 0.25, 0.5),
+        (1.0, 1.0, 1.0, 1.0, 0.125, 0.25, 0.5),
         "",
-        "of datum, strut, temperature, ageing, a wrong reading and all else",
+        "of datum, strut, temperature, payload, ageing, a wrong reading and all else",
         "ageing as likely as each of the last one's four groups: each can stand for the other",
     )
     moved: tuple[float, ...] = assumed(
@@ -68,6 +70,8 @@ class Assumptions:
     grown: tuple[float, ...] = assumed(
         (4e-6, 12e-6, 36e-6, 120e-6), "m/m", "growth of a body", "steel by a third of a kelvin to ten kelvin"
     )
+    loaded: tuple[float, ...] = assumed((1.0, 3.0, 10.0, 30.0), "kg", "change of a payload", "a probe to a workpiece")
+    stiffness: float = assumed(20e6, "N/m", "of a strut with its joints where none is stated", "ball screws of 16 mm")
     aged: tuple[float, ...] = assumed(
         (0.02, 0.05, 0.1, 0.2), "tolerances", "ageing of everything", "joints by 2 to 20 µm of 100"
     )

@@ -19,32 +19,39 @@ from ..errors import CalibrationError, ModelError
 from ..formats.texts import aligned, number
 from ..machine.arrays import rms
 from ..machine.geometry import STRUT_NAMES
+from ..machine.load import Payload, beyond_loads
 from ..machine.model import MachineModel, RealMachine
 from ..machine.region import region_json, region_text
 from ..measurements.readings import ABSOLUTE_KINDS, AXES, BACKWARD, CHANNELS, KINDS, MeasurementSet
 from .assumptions import ASSUMED
-from .blocks.block import DIGITS
+from .blocks.block import DIGITS, Linkage
+from .blocks.load import measured_loads, stated_load
 from .datum import hold, unseen_part
 from .design import TILTS, information, laid_out
 from .estimator import Estimation
 from .mixups import best_alternative_reading
 from .parameters import BLOCKS, ParameterSpace
-from .posterior import ErrorPredictor, FittedParameters
+from .posterior import ErrorPredictor, FittedParameters, box_stations
+from .sensitivity import derivatives, predict
+from .trust import TILT
 
 MOST_READINGS = 500  # of a check; more are a calibration
 UNCHANGED_DRAWS = 4000  # machines drawn to find the false alarms: 1 % to ± 0.16 %
 
-DATUM, STRUT, TEMPERATURE, AGEING, READING, OTHER = "datum", "strut", "temperature", "ageing", "reading", "other"
-# Kinds of change, and what each is called. All but the last two are parameters that few readings can repair.
+DATUM, STRUT, TEMPERATURE, PAYLOAD = "datum", "strut", "temperature", "payload"
+AGEING, READING, OTHER = "ageing", "reading", "other"
+# Kinds of change, and what each is called. All but payload and the last two few readings can repair.
 FAMILIES = {
     DATUM: "the datum has moved",
     STRUT: "a strut's offset has changed",
     TEMPERATURE: "a temperature acts",
+    PAYLOAD: "the payload has changed",
     AGEING: "the whole machine has aged",
     READING: "a single reading is wrong",
     OTHER: "it has changed in a way that none of these explains",
 }
 
+RIDGE = 1e-8  # beside the trace: parameters that stand for a payload then stay small at the corners of the box too
 ROUNDING = 1e-9  # directions of readings or effects that are smaller, beside the largest, are rounding
 
 
@@ -112,6 +119,8 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
     ):
         changes.append(Change(TEMPERATURE, name, growths, columns, shown(labels, 1e6, "ppm")))
 
+    changes += payload_changes(space)
+
     # Ageing and a bend can stand for each other: were one's scales coarser, the other would win, whichever is true.
     prior = space.physical(np.diag(space.spread(space.start_tolerances())))
     owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
@@ -128,6 +137,47 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
             changes.append(screw)
     changes.append(Change(OTHER, "a smooth bend in space", np.array(ASSUMED.bent), bend, group="bend"))
     return changes
+
+
+def payload_changes(space: ParameterSpace) -> list[Change]:
+    """Return that the machine carries more or less, in its centre or beside it, as parameters that move it alike.
+
+    The stretch of struts under a weight is a smooth function of the pose; over the measured box, level and tilted, the
+    parameters that do the same and surprise least stand for it. Where no stiffness is stated, all struts have an
+    assumed one, and masses are so many kg at that.
+    """
+    stations = [box_stations(space, tilt) for tilt in (0.0, TILT)]
+    if stations[0] is None or stations[1] is None:
+        return []
+    load, zero, parts = stated_load(space.settings), np.zeros(space.size), []
+    known = bool(load.stiffness.all())
+    compliance = load.compliance if known else np.full(6, 1.0 / ASSUMED.stiffness)
+    aside = space.geometry.characteristic_length * np.linalg.svd(load.gravity[None])[2][1:]  # lie across gravity
+    for at in filter(None, stations):
+        prediction = predict(space, zero, at)
+        linkage = Linkage(prediction, space.probe, at)
+        forces = [np.concatenate([load.gravity, np.zeros(3)])]
+        forces += [np.concatenate([np.zeros(3), np.cross(arm, load.gravity)]) for arm in aside]
+        stretched = [compliance * linkage.tensions(np.tile(force, (len(at), 1))) for force in forces]
+        errors = linkage.per_length @ np.stack(stretched, axis=2)
+        parts.append((derivatives(space, prediction, at), errors))
+    rows, errors = (np.concatenate(each) for each in zip(*parts, strict=True))
+    rows[:, 3:] *= space.geometry.characteristic_length
+    errors[:, 3:] *= space.geometry.characteristic_length
+    smooth = ("structure", "pitch", "map", "field displacement", "field rotation")  # none that hangs on load or warmth
+    owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
+    prior = space.physical(np.diag(space.spread(space.start_tolerances())))[:, np.isin(owner, smooth)]
+    design = rows.reshape(-1, space.size) @ prior
+    square = design.T @ design
+    square[np.diag_indices(len(square))] += RIDGE * np.trace(square)
+    columns = prior @ np.linalg.solve(square, design.T @ errors.reshape(-1, len(aside) + 1))
+    unit, sizes = "kg" if known else f"kg at {ASSUMED.stiffness * 1e-6:g} N/µm", np.array(ASSUMED.loaded)
+    radius = space.geometry.characteristic_length
+    shown = (("mass", 1.0, unit), *((f"moment {n}", radius, unit.replace("kg", "kg m", 1)) for n in (1, 2)))
+    return [
+        Change(PAYLOAD, "heavier or lighter", sizes, columns[:, :1], shown[:1]),
+        Change(PAYLOAD, "with its centre elsewhere too", sizes, columns, shown),
+    ]
 
 
 @dataclass(frozen=True)
@@ -444,6 +494,7 @@ def verify_model(
     if not 0.0 < false_alarms < 1.0:
         raise ModelError("false_alarms", "must be above 0 and below 1", false_alarms)
     wide = widened(fitted)
+    measurements = replace(measurements, notes=(*measurements.notes, *_beyond_loads(model, measurements)))
     check = CheckReadings.of(wide, measurements)
     changes = possible_changes(wide.space, [block.name for block in fitted.space.blocks])
     evidence = Evidence(check.covariance(wide.covariance), check.effects(changes))
@@ -470,6 +521,13 @@ def verify_model(
     tool = None if candidates[0].change.columns is None else _tool(model, wide, first)
     settling = tuple(settle(wide, measurements, (first, second))) if result.verdict == UNDECIDED else ()
     return replace(result, tool=tool, settling=settling)
+
+
+def _beyond_loads(model: MachineModel, readings: MeasurementSet) -> list[str]:
+    """Return remarks on readings taken under loads for which the model promises nothing."""
+    loads = measured_loads(model.load, readings.geometry, readings.stations)
+    said = (beyond_loads(model.origin.loads, Payload(row[0], (row[1], row[2], row[3])), row[4:]) for row in loads)
+    return [f"read under another load than the model: {text}" for text in dict.fromkeys(said) if text]
 
 
 def _candidates(
@@ -541,6 +599,11 @@ def refusal(verification: Verification) -> str:
         return ""
     if verification.verdict == UNEXPLAINED:
         return "the machine has changed in a way that few readings cannot repair: measure a campaign and fit anew"
+    if best.family == PAYLOAD:
+        advice = (
+            "state what it weighs now (payload_kg in the readings, mass_kg of the tool) beside the struts' stiffness"
+        )
+        return f"the payload has probably changed, {best.name}: {advice}, or measure with it and fit anew"
     if best.family == READING:
         return f"a single reading is probably wrong: {best.name}; take it again"
     if best.family == OTHER:
@@ -575,7 +638,7 @@ def update_model(
     warm = changed and verification.families[TEMPERATURE] > negligible
     prior = widened(fitted, ("pitch",) if warm else ())
     changes = possible_changes(prior.space, [block.name for block in fitted.space.blocks]) if changed else []
-    repairable = [c for c in changes if c.family not in (READING, OTHER)]
+    repairable = [c for c in changes if c.family not in (PAYLOAD, READING, OTHER)]
     x = prior.x
     for _ in range(3):  # Gauss–Newton: a change of a tenth of a millimetre settles in two steps
         check = CheckReadings.of(prior, measurements, x)
@@ -671,7 +734,7 @@ def _verdict(result: Verification) -> Iterator[str]:
     if result.verdict == VALID:
         yield f"VALID: a machine that has not changed reads as strangely as this in {percent} of checks"
     else:
-        nothing = "in a way that no motion of the datum, strut, temperature or ageing explains"
+        nothing = "in a way that no motion of the datum, strut, temperature, payload or ageing explains"
         yield "CHANGED: " + {
             NAMED: f"{FAMILIES[best.family]}: {_described(best)}",
             UNDECIDED: f"either {', or '.join(FAMILIES[c.family] for c in result.candidates[:2])}",

@@ -19,6 +19,7 @@ from ..pose import Pose
 from .assumptions import ASSUMED
 from .blocks import WAVES
 from .blocks.block import DIGITS
+from .blocks.load import measured_loads, stated_load
 from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
 from .estimator import (
     Estimation,
@@ -252,7 +253,12 @@ def _fit(
     solution, drift = with_drift(estimation, solution)
     residuals = Residuals(estimation, solution, drift)
     channels = tuple(_channels(residuals))
-    notes = [*_about_lead(lead), *_ignored(measurements, space), *_check_backlash(space, solution)]
+    notes = [
+        *_about_loads(measurements, space),
+        *_about_lead(lead),
+        *_ignored(measurements, space),
+        *_check_backlash(space, solution),
+    ]
     notes += _check_noise(channels)
     progress("what is it worth?")
     noise = {KINDS.index(c.kind): c.estimated for c in channels}
@@ -423,6 +429,24 @@ def _about_lead(lead: ScrewLead | None) -> list[str]:
     return []
 
 
+def _about_loads(measurements: MeasurementSet, space: ParameterSpace) -> list[str]:
+    """Return for which loads the promise holds, where any is stated."""
+    load = stated_load(space.settings)
+    loads = np.array(measured_loads(load, space.geometry, measurements.stations))
+    if not len(loads):
+        return []
+    low, high = loads[:, 0].min(), loads[:, 0].max()
+    masses = f"a tool of {low:g} kg" if low == high else f"tools of {low:g} to {high:g} kg"
+    directions = len(np.unique(loads[:, 4:], axis=0))
+    gravity = "one direction of gravity" if directions == 1 else f"{directions} directions of gravity"
+    text = f"read with {masses} and {gravity}: the promise holds for these"
+    if not load.bends:
+        return [f"{text}, for no struts' stiffness is stated (--load)"]
+    if space.block("compliance") is None:
+        return [f"{text}; elsewhere as far as the stated stiffness is right: readings at two loads show it"]
+    return [f"{text}, and between them; the stiffness was refined by them"]
+
+
 def _ignored(measurements: MeasurementSet, space: ParameterSpace) -> list[str]:
     """Return remarks on what the fit was not told and therefore takes for something else."""
     notes = []
@@ -503,5 +527,6 @@ def _named(
     if level is not None:
         note += f", expected tool error {level.after * 1e6:.3f} µm RMS, up to {level.high * 1e6:.3f} (95 %)"
     residual = rms(lengths) if lengths else None
-    origin = ModelOrigin(date.today().isoformat(), measurements.files, residual, note)
+    loads = measured_loads(stated_load(space.settings), space.geometry, measurements.stations)
+    origin = ModelOrigin(date.today().isoformat(), measurements.files, residual, note, loads=loads)
     return replace(space.model(solution.x.round(DIGITS)), origin=origin)

@@ -15,6 +15,7 @@ from ..core import MOST_HARMONICS
 from ..errors import CalibrationError, ModelError
 from ..machine.geometry import HexapodGeometry, first_of_same
 from ..machine.kinematics import Structure, strut_lengths
+from ..machine.load import Load, stiffness_of
 from ..machine.model import MachineModel
 from ..machine.region import Region
 from ..machine.struts import StrutErrors
@@ -23,6 +24,7 @@ from ..measurements.readings import MeasurementSet, spans
 from .blocks import ERRORS, Block, growth
 from .blocks.block import Draft, Facts
 from .blocks.field import SmoothField
+from .blocks.load import as_loaded, stated_load
 
 LEADS = 0.1e-3, 1.0  # shortest and longest of a screw, m
 LARGEST_EXPANSION, LARGEST_MOISTURE = 100e-6, 1e-2  # 1/K: three times zinc's; m/m from dry to damp: more than wood's
@@ -58,6 +60,9 @@ class FitSettings:
         The part whose sensor stands for all; empty: the one that has readings of its own, if only one has.
     time_constants : tuple of float or None
         How late parts follow their thermometers, s; None: sought from the readings.
+    load : tuple of float
+        What is stated of struts that give under weight (:meth:`hexapod_comp.machine.load.Load.numbers`); empty: they
+        are rigid. Where readings were taken under several loads, the fit starts from it.
     tolerances : dict
         Standard deviations to start from, by block.
     robust : bool
@@ -80,6 +85,7 @@ class FitSettings:
     strut_moisture: float | None = None
     thermometer: str = ""
     time_constants: tuple[float, ...] | None = None
+    load: tuple[float, ...] = ()
     tolerances: tuple[tuple[str, float], ...] = tuple(TOLERANCES.items())
     robust: bool = True
     scale: float | None = None
@@ -104,6 +110,8 @@ class FitSettings:
             value = getattr(self, name) or 0.0
             if not 0.0 <= value <= largest:
                 raise ModelError(name.replace("_", " "), f"must be 0…{largest * factor:g} {unit}", value * factor)
+        if self.load:
+            Load.from_numbers(self.load)  # refuses what cannot be
         constants = self.time_constants or ()
         LateGrowth(tuple(constants), np.zeros((len(PARTS), len(constants))), self.thermometer)  # refuses what cannot be
         for name, given, most, unit in (("scale", self.scale, 1e-2, "m/m"), ("alignment", self.alignment, 0.1, "rad")):
@@ -149,6 +157,7 @@ class ParameterSpace:
     def __init__(self, measurements: MeasurementSet | tuple[HexapodGeometry, Extent], settings: FitSettings) -> None:
         if isinstance(measurements, MeasurementSet):
             thermometer, hidden = growth.as_warmed(settings, measurements.stations)
+            hidden |= as_loaded(settings, measurements.geometry, measurements.stations)
             shown = tuple(name for name in settings.blocks if name not in hidden)
             settings = replace(settings, thermometer=thermometer, blocks=shown)
             measurements = measurements.geometry, Extent.of(measurements)
@@ -243,6 +252,7 @@ class ParameterSpace:
             struts={**struts, **waves},
             growth=self.stated_expansion,
             late=np.zeros((len(PARTS), 0)),
+            compliance=np.zeros(6),
             field=np.zeros((6, len(self.field.terms))),
             reversal=np.zeros((3, 6, len(self.field.reversal_terms))),
         )
@@ -271,8 +281,18 @@ class ParameterSpace:
             platform_expansion=float(draft.growth[7]),
             late_growth=LateGrowth(tuple(constants), draft.late, thermometer),
             region=self.measured,
+            load=self._load(draft.compliance),
             **machine,
         )
+
+    def _load(self, beyond: np.ndarray) -> Load:
+        """Return the load block as stated, with compliances that differ from it by some, m/N."""
+        stated = stated_load(self.settings)
+        if not beyond.any():
+            return stated
+        # A step on the way may overshoot: no strut is stiffer than ten times what is stated
+        compliance = np.maximum(stated.compliance + beyond, 0.1 * stated.compliance)
+        return replace(stated, stiffness=stiffness_of(compliance))
 
     def field_errors(self, x: np.ndarray, points: np.ndarray, sense: np.ndarray) -> np.ndarray:
         """Return the field at points (n, 3), m, passed in directions (n, 3), shape (n, 6), m and rad."""

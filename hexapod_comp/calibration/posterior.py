@@ -206,7 +206,11 @@ class ErrorPredictor:
             space, reached = fitted.space, int(solved.sum())
             warmth = np.tile([machine.temperatures.at(name) for name in Temperatures.NAMES], (reached, 1))
             air = np.full(reached, np.nan), np.full(reached, machine.temperatures.at(HUMIDITY))
-            stations = Stations(positions[solved], rotations[solved], nominal[solved], senses[solved], warmth, *air)
+            loads = np.tile([*[np.nan] * 4, *(machine.loading.gravity or [np.nan] * 3)], (reached, 1))
+            tool = machine.geometry.payload
+            loads[:, :4] = tool.mass, *tool.centre
+            at = positions[solved], rotations[solved], nominal[solved], senses[solved]
+            stations = Stations(*at, warmth, *air, loads)
             there = modelled[0][solved], modelled[1][solved]
             joints = (np.tile(j, (reached, 1, 1)) for j in (structure.base_joints, structure.platform_joints))
             rows = derivatives(space, Prediction(np.zeros((reached, 6)), *there, *joints), stations)

@@ -35,7 +35,7 @@ def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Predict
     """Return where the machine of a parameter vector goes at each station."""
     positive, sense = without_negative(space.blocks, x, stations.sense)
     model = space.model(positive, with_field=False)
-    air = stations.temperatures, stations.times, stations.humidity
+    air = stations.temperatures, stations.times, stations.humidity, stations.loads
     machines = MachinesByTemperature(space.geometry, model).at_each(*air)
     commanded = stations.positions, stations.rotations
     driven = drive(machines, commanded, sense, stations.commands)

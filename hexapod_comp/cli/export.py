@@ -80,7 +80,7 @@ def export(args: argparse.Namespace) -> Result:
 
 def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
     """Write what robot programs want to know, and the C core with this machine's constants; return the files."""
-    from ..export.robot_description import mjcf, urdf
+    from ..machine.robot_description import mjcf, urdf
 
     joints = args.joint_names or STRUT_NAMES
     written = [(file, form) for file, form in ((args.urdf, urdf), (args.mjcf, mjcf)) if file is not None]

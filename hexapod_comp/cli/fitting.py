@@ -36,7 +36,7 @@ from ..formats.paths import input_file
 from ..formats.texts import number
 from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.model import MachineModel, RealMachine
-from ..machine.model_file import load_model
+from ..machine.model_file import load_model, read_load
 from ..machine.region import region_json, region_text
 from ..measurements.campaign import Campaign, campaign_text, template
 from ..measurements.files import read_measurements
@@ -72,6 +72,8 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
         given["blocks"] = tuple(block for name in named for block in several.get(name, (name,)))
     if args.expansion_ppm is not None:
         given |= dict(zip(("strut_expansion", "base_expansion", "platform_expansion"), args.expansion_ppm, strict=True))
+    if args.load is not None:
+        given["load"] = read_load(args.load).numbers()
     if args.tolerance_um is not None:
         given["tolerances"] = tuple({**TOLERANCES, "structure": args.tolerance_um * 1e-6}.items())
     robust = not getattr(args, "not_robust", False)

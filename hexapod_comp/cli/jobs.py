@@ -20,6 +20,7 @@ from ..compensation.travel import travel, travel_text
 from ..errors import HexapodError, InputFileError
 from ..formats.paths import confined_file, confined_opener
 from ..machine.geometry import BASE
+from ..machine.load import Loading
 from ..machine.model import MachineModel, RealMachine
 from ..machine.path import Motion, StrutRates, plan_motion, plan_program
 from ..machine.temperatures import Temperatures
@@ -54,15 +55,17 @@ class Machine:
         self._fitted: Any = None
         self._at: Any = None
 
-    def predict(self, platform: Pose, sense: np.ndarray, tool: str, warmth: Temperatures) -> dict[str, Any]:
+    def predict(
+        self, platform: Pose, sense: np.ndarray, tool: str, warmth: Temperatures, loading: Loading
+    ) -> dict[str, Any]:
         """Return the errors ``standing`` and ``aligned`` at a pose: values and covariance, None where not known."""
         from ..calibration.posterior import ErrorPredictor  # only this job needs a second of imports
         from ..calibration.posterior_file import load_posterior
 
         if self._fitted is None:
             self._fitted = load_posterior(self.model, self.geometry, self._source.name, self._opener)
-        if self._at != (at := (tool, warmth.snapshot())):
-            machine = RealMachine(self.geometry.using(tool=tool), self.model, warmth)
+        if self._at != (at := (tool, warmth.snapshot(), loading)):
+            machine = RealMachine(self.geometry.using(tool=tool), self.model, warmth, loading)
             self._predictor, self._at = ErrorPredictor(machine, self._fitted[0]), at
         errors = self._predictor.predict((platform.position[None], platform.rotation[None]), sense[None])
         found: dict[str, Any] = dict.fromkeys(("standing", "aligned"))
@@ -71,10 +74,12 @@ class Machine:
                 found[name] = error.values[0], None if error.covariance is None else error.covariance[0]
         return found
 
-    def travel(self, pose: Pose, tool: str, work: str, warmth: Temperatures, enabled: bool) -> tuple[str, dict]:
+    def travel(
+        self, pose: Pose, tool: str, work: str, warmth: Temperatures, loading: Loading, enabled: bool
+    ) -> tuple[str, dict]:
         """Return how far a tool may go from a pose in a frame: a text, and values by their keys."""
         geometry = self.geometry.using(tool, work)
-        ways = travel(RealMachine(geometry, self.model, warmth), pose, geometry.work, enabled)
+        ways = travel(RealMachine(geometry, self.model, warmth, loading), pose, geometry.work, enabled)
         stops = {f"{one.way} stops at": str(one.error or "") for one in ways}
         return travel_text(ways), {**{one.key: f"{one.shown:.6f}" for one in ways}, **stops}
 

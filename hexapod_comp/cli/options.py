@@ -387,7 +387,7 @@ ESTIMATION = under(
     value("--lead-mm", scaled(bound, 1e-3), "MM", "period of the screws' errors (default: the geometry's; else what "
           "the readings show)", dest="lead"),
     value("--blocks", None, "A,B,…", "what may be fitted: pitch, wave, harmonics, backlash, map, field, expansion, "
-          "moisture, late (default all)"),
+          "moisture, late, compliance (default all)"),
     SEPARATE,
     value("--tolerance-um", bound, "UM", "how well joints are built, to start from, µm (default 100)"),
     choice("--tracker-frame", ("free", "known"), "free: a tracker stands anywhere, six unknowns a run (default); "
@@ -397,6 +397,8 @@ ESTIMATION = under(
           "ppm/K; a warm-up starts there (default 0)"),
     value("--moisture-ppm", scaled(bound, 1e-4), "PPM", "growth of struts by humidity, ppm per %% (1 to 5)",
           dest="strut_moisture"),
+    reads("--load", "file that states stiffness and weight, as a model's block load (default: the struts are rigid)",
+          kind="load"),
     value("--thermometer", None, "PART", "part whose sensor stands for all (default: the one that alone was read)"),
     value("--time-constants-s", time_constants, "S[,S]", "how late parts follow their sensors (default: sought from "
           "the readings)"),

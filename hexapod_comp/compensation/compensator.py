@@ -29,7 +29,8 @@ from ..errors import (
 )
 from ..machine.geometry import STRUT_NAMES, TOOL, HexapodGeometry, pose_text
 from ..machine.kinematics import forward_error, jacobian
-from ..machine.model import MachineModel, MotionState, RealMachine, core_model, write_temperatures
+from ..machine.load import FREE, Loading, beyond_loads
+from ..machine.model import MachineModel, MotionState, RealMachine, core_model, write_loading, write_temperatures
 from ..machine.temperatures import HUMIDITY, Lag, Temperatures, check_part
 from ..machine.temperatures import PARTS as MEASURED_PARTS
 from ..pose import Pose
@@ -50,7 +51,13 @@ PARTS = {
 }
 
 PLACES = ("platform_", "model_")  # Beginnings of the names of parts that are poses
-BESIDE_NUMBERS = ("temperatures", "lags", "tool", "drift")  # What a snapshot holds beside the numbers of the state
+BESIDE_NUMBERS = (
+    "temperatures",
+    "lags",
+    "tool",
+    "drift",
+    "loading",
+)  # What a snapshot holds beside the numbers of the state
 
 DRIFT_STATES = 12  # Three displacements and three rotations of the base, six struts, all in m: :func:`drifted`
 
@@ -207,8 +214,8 @@ class Compensator:
         Directions of motion after the last command.
     on_change : callable
         Called after each change from outside, with its name and value: ``temperature`` (name, °C, time), ``humidity``
-        (fraction, time), ``model``, ``drift`` (shape (12,), m), ``enable`` (bool), ``tool`` (name), ``ramp_rate``
-        (m/s), ``reset`` (measured struts or None). Together with the commands these decide all answers.
+        (fraction, time), ``load`` (Loading), ``model``, ``drift`` (shape (12,), m), ``enable`` (bool), ``tool`` (name),
+        ``ramp_rate`` (m/s), ``reset`` (measured struts or None). Together with the commands these decide all answers.
     """
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, ramp_rate: float = DEFAULT_RAMP_RATE) -> None:
@@ -220,6 +227,7 @@ class Compensator:
         self._time, self._estimated = ffi.new("hc_time *"), ffi.new("hc_estimated *")
         lib.hc_init(self._at, self._constants.at, ramp_rate)
         self._sensed: set[str] = set()
+        self.loading = FREE
         self.drift: np.ndarray = np.zeros(DRIFT_STATES)
         self._machine: RealMachine | None = None
         self._parts = parts = named_parts(self._state)
@@ -270,7 +278,7 @@ class Compensator:
     def machine(self) -> RealMachine:
         """The machine in use, with its model, at the present temperatures."""
         if self._machine is None:
-            self._machine = RealMachine(self.geometry, self._believed, self.temperatures)
+            self._machine = RealMachine(self.geometry, self._believed, self.temperatures, self.loading)
         return self._machine
 
     @property
@@ -351,8 +359,24 @@ class Compensator:
         self._machine = None
         self.on_change("humidity", (float(value), time))
 
+    def set_load(self, loading: Loading) -> None:
+        """Take gravity, and the forces that act on the platform beside weight; what they change ramps in.
+
+        A model without a load block bends under nothing, and keeps them for one that is set later.
+
+        Raises
+        ------
+        ModelError
+            As :meth:`.Loading.of`; nothing has changed.
+        """
+        loading = Loading.of(*loading)
+        if loading != self.loading:
+            lib.hc_set_load(self._at, loading.gravity or (math.nan,) * 3, loading.wrench)
+            self.loading, self._machine = loading, None
+            self.on_change("load", loading)
+
     def set_tool(self, name: str) -> None:
-        """Take another tool by its name; nothing moves, nothing ramps.
+        """Take another tool by its name; nothing moves. What a tool weighs otherwise ramps in with the next command.
 
         The next command must be where the struts are, with this tool. Until one is, and another tool or a reset may
         come first, each is refused: what was on its way for the old tool cannot step the struts.
@@ -423,11 +447,15 @@ class Compensator:
         """Return what, beside geometry and model, decides the next answer, by name.
 
         ``temperatures``, °C by name, and ``humidity`` among them, ``lags`` of what follows them late, ``tool``, and
-        each of :data:`PARTS`: a list of numbers, matrices by rows; ``drift``, where there is any.
+        each of :data:`PARTS`: a list of numbers, matrices by rows; ``drift`` and ``loading``, where there are any.
         """
         parts = {name: np.ravel(part).astype(float).tolist() for name, part in self._parts.items()}
-        drift = {"drift": self.drift.tolist()} if self.drift.any() else {}  # older releases read what has none
-        return {**parts, **self.temperatures.snapshot(), "tool": self.geometry.tool_name, **drift}
+        beside: dict[str, Any] = {"tool": self.geometry.tool_name}
+        if self.drift.any():  # older releases read what has none of these
+            beside["drift"] = self.drift.tolist()
+        if self.loading != FREE:
+            beside["loading"] = self.loading.numbers()
+        return {**parts, **self.temperatures.snapshot(), **beside}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Take over a :meth:`snapshot` of a compensator with this geometry and model.
@@ -447,10 +475,12 @@ class Compensator:
         drift = np.asarray(snapshot.get("drift", np.zeros(DRIFT_STATES)), dtype=float)
         if drift.shape != (DRIFT_STATES,) or not np.isfinite(drift).all():
             raise ModelError("snapshot.drift", f"must be {DRIFT_STATES} finite numbers, m", drift.tolist())
+        loading = Loading.from_numbers(snapshot.get("loading", FREE.numbers()))
         parts, geometry = read_parts(snapshot), self.geometry.using(tool=snapshot.get("tool", TOOL))
         lib.hc_init(self._at, self._constants.at, 0.0)
         write_temperatures(self._state, temperatures)
-        self._sensed, self.drift = set(temperatures.values), drift
+        write_loading(self._state, loading)
+        self._sensed, self.drift, self.loading = set(temperatures.values), drift, loading
         self._use(geometry)
         for name, part in self._parts.items():
             if not name.startswith(PLACES) or np.isfinite(parts[name]).all():
@@ -585,6 +615,12 @@ class Compensator:
         if region is None or not np.isfinite(platform.position).all():
             return False
         return not region.contains(platform.position, platform.rotation)
+
+    @property
+    def outside_load(self) -> str:
+        """How payload or gravity are outside those under which the model was measured; empty where they are not."""
+        gravity = self.loading.gravity or tuple(self.model.load.gravity.tolist())
+        return beyond_loads(self.model.origin.loads, self.geometry.payload, gravity)
 
     def predicted_error(self) -> np.ndarray:
         """Return the tool error that nominal lengths would leave at the last command (see `Correction`)."""

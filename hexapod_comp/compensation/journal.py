@@ -33,6 +33,7 @@ from ..errors import HexapodError, InputFileError, shorten
 from ..formats.files import Opener, read_text
 from ..formats.json import json_content
 from ..machine.geometry import BASE, STRUT_NAMES, TOOL, WORK, HexapodGeometry, parse_geometry
+from ..machine.load import Loading
 from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL, parse_model
 from .compensator import BESIDE_NUMBERS, Compensator
@@ -130,9 +131,9 @@ class Entry:
     after: int  # commands answered before it since the session began
     what: str
     # ``name``, ``value`` (°C) and ``time`` (s; NaN: not known) of a temperature; ``value`` (a fraction) and
-    # ``time`` of a humidity; ``value`` (twelve, m) of a drift; ``name`` and ``sha256`` of a model; ``on``; ``name``
-    # of a tool; ``value`` (m/s) of a ramp rate; ``measured`` (m, or None) of a reset; ``stamp`` (ns), ``reason`` and
-    # ``text`` of a refused command
+    # ``time`` of a humidity; ``value`` (twelve, m) of a drift; ``value`` of a load (Loading); ``name`` and ``sha256``
+    # of a model; ``on``; ``name`` of a tool; ``value`` (m/s) of a ramp rate; ``measured`` (m, or None) of a reset;
+    # ``stamp`` (ns), ``reason`` and ``text`` of a refused command
     values: Mapping[str, Any]
 
 
@@ -215,6 +216,8 @@ class Journal:
             entry |= {"name": value.name, "sha256": self._sources["model"].sha256}
         elif what == "drift":
             entry["value"] = value.tolist()
+        elif what == "load":
+            entry["value"] = value.numbers()
         elif what == "reset":
             entry["measured"] = None if value is None else value.tolist()
             # Every refused first command resets anew; only the last reset counts, and a page stays short.
@@ -362,6 +365,7 @@ ENTRIES: dict[str, dict[str, Callable[[Any], Any]]] = {
     "humidity": {"value": float, "time": lambda found: math.nan if found is None else float(found)},
     "model": {"name": str, "sha256": str},
     "drift": {"value": lambda found: [float(value) for value in found]},
+    "load": {"value": Loading.from_numbers},
     "enable": {"on": bool},
     "ramp_rate": {"value": float},
     "tool": {"name": str},
@@ -392,6 +396,8 @@ def _read_snapshot(content: Any) -> Snapshot:
     }
     if "drift" in state:
         beside["drift"] = [float(value) for value in state["drift"]]
+    if "loading" in state:
+        beside["loading"] = Loading.from_numbers(state["loading"]).numbers()
 
     def words(key: str, *required: str) -> dict[str, str]:
         found = {name: str(value) for name, value in _object(content[key], f"snapshot.{key}").items()}

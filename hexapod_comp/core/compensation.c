@@ -4,6 +4,40 @@
  */
 #include "core.h"
 
+/* By how much each strut is longer under the load at a pose, m */
+static void load_stretch(const hc_state *state, const hc_pose *pose, const six_struts *now, double stretch[6])
+{
+    const hc_load *load = &state->model->load;
+    const mat r = three_rows(pose->rotation);
+    const vec g = row_of(finite_number(state->gravity[0]) ? state->gravity : load->gravity);
+    const vec force = add(scale(load->mass, g), times(r.row, row_of(state->external)));
+    const vec torque = add(cross(times(r.row, row_of(load->moment)), g), times(r.row, row_of(state->external + 3)));
+    const blocks f = eliminate(now->strut, now->moment);
+    double per_length[6];
+    substitute_transposed(now->moment, &f, force, torque, per_length);
+    if (!(fabs(f.determinant_upper) >= COPLANAR * now->length[0] * now->length[2] * now->length[4])) {
+        double columns[6][6]; /* with pivoting */
+        for (int i = 0; i < 6; i++) {
+            const double row[6] = {now->strut[i].x,  now->strut[i].y,  now->strut[i].z,
+                                   now->moment[i].x, now->moment[i].y, now->moment[i].z};
+            for (int k = 0; k < 6; k++) {
+                columns[k][i] = row[k];
+            }
+        }
+        store(force, per_length);
+        store(torque, per_length + 3);
+        if (solve_six(columns, per_length) == 0.0) { /* singular: what follows refuses the pose */
+            store(vector(0.0, 0.0, 0.0), per_length);
+            store(vector(0.0, 0.0, 0.0), per_length + 3);
+        }
+    }
+    for (int i = 0; i < 6; i++) {
+        const double tension = per_length[i] * now->length[i];
+        const double taken_up = fmax(-1.0, fmin(1.0, tension / load->take_up));
+        stretch[i] = load->compliance[i] * tension + 0.5 * load->play[i] * taken_up;
+    }
+}
+
 /* The model backwards for one platform pose */
 static int run_backwards(const hc_state *state, const hc_pose *platform, double low[9], double sense[9], hc_pose *q,
                          six_struts *now, double commands[6], int *outside)
@@ -11,10 +45,15 @@ static int run_backwards(const hc_state *state, const hc_pose *platform, double 
     const hc_model *model = state->model;
     follow_point(point_at(platform, model->field.probe), model->axis_threshold, low, sense);
     const int solved = undo_field(&model->field, platform, sense, q, outside);
+    double stretch[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
     *now = struts_of(state->base_joints, state->platform_joints, q);
+    if (model->load.bends) {
+        load_stretch(state, q, now, stretch);
+    }
     for (int i = 0; i < 6; i++) {
         const double direction = follow(now->length[i], model->strut_threshold, low, sense, 3 + i);
-        commands[i] = command_for_length(state, i, now->length[i], direction, screw_shift(model, q, now, i));
+        const double shift = screw_shift(model, q, now, i);
+        commands[i] = command_for_length(state, i, now->length[i] - stretch[i], direction, shift);
     }
     return solved;
 }
@@ -267,34 +306,38 @@ void hc_published(hc_state *state, double time)
     state->last.published = time;
 }
 
-/* The model forwards; lengths and screw rotation are settled in turn */
+/* The model forwards; lengths, and what of them depends on the pose, are settled in turn */
 static solution run_forwards(const hc_state *state, const double commands[6], const double sense[9], hc_pose *q)
 {
     const hc_model *model = state->model;
     const judge by = judge_of(&model->limits);
-    double lengths[6], shifts[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
+    double lengths[6], shifts[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0}, stretch[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
     solution found = {HC_NOT_CONVERGED, 0, NAN};
-    int turning = 0;
+    int by_pose = model->load.bends;
     for (int i = 0; i < 6; i++) {
-        turning = turning || model->struts[i].lead != 0.0;
+        by_pose = by_pose || model->struts[i].lead != 0.0;
     }
-    for (int count = 0; count < LEAD_ITERATIONS; count++) {
+    for (int count = 0; count < TURN_ITERATIONS; count++) {
         six_struts now;
-        double change = 0.0;
-        if (turning) {
+        double change = 0.0, before[6];
+        copy_six(stretch, before);
+        if (by_pose) {
             now = struts_of(state->base_joints, state->platform_joints, q);
+        }
+        if (model->load.bends) {
+            load_stretch(state, q, &now, stretch);
         }
         for (int i = 0; i < 6; i++) {
             const double shift = screw_shift(model, q, &now, i);
-            change = fmax(change, fabs(shift - shifts[i]));
+            change = fmax(change, fabs(shift - shifts[i]) + fabs(stretch[i] - before[i]));
             shifts[i] = shift;
-            lengths[i] = actual_length(state, i, commands[i], sense[3 + i], shift);
+            lengths[i] = actual_length(state, i, commands[i], sense[3 + i], shift) + stretch[i];
         }
-        if (turning && found.status == HC_OK && change < 1e-15) {
+        if (by_pose && found.status == HC_OK && change < 1e-15) {
             break;
         }
         found = solve_pose(state->base_joints, state->platform_joints, lengths, &by, q);
-        if (found.status != HC_OK || !turning) {
+        if (found.status != HC_OK || !by_pose) {
             break;
         }
     }
@@ -389,7 +432,7 @@ static int followed(const hc_state *state, double values[9])
     return 1;
 }
 
-/* Take over a state whose model, temperatures or humidity have changed. The model's lengths jump, the struts do not: unless
+/* Take over a state whose model, temperatures, humidity or load have changed. The model's lengths jump, the struts do not: unless
  * the windows jump along, that would count as a motion, turn directions round, and a backlash would step. */
 static void renew(hc_state *state, const hc_state *changed)
 {
@@ -427,6 +470,32 @@ hc_status hc_set_humidity(hc_state *state, double value)
     }
     changed.humidity = value;
     renew(state, &changed);
+    return HC_OK;
+}
+
+hc_status hc_set_load(hc_state *state, const double gravity[3], const double wrench[6])
+{
+    hc_state changed = *state;
+    const int back = gravity && gravity[0] != gravity[0]; /* to the model's */
+    if (gravity && !back && !(norm(row_of(gravity)) <= LARGEST_GRAVITY)) {
+        return HC_LOAD;
+    }
+    for (int i = 0; wrench && i < 6; i++) {
+        if (!finite_number(wrench[i])) {
+            return HC_LOAD;
+        }
+    }
+    if (gravity) {
+        store(back ? vector(NAN, NAN, NAN) : row_of(gravity), changed.gravity);
+    }
+    if (wrench) {
+        copy_six(wrench, changed.external);
+    }
+    if (state->model->load.bends) {
+        renew(state, &changed);
+    } else {
+        *state = changed;
+    }
     return HC_OK;
 }
 
@@ -511,6 +580,7 @@ void hc_set_tool(hc_state *state, const hc_model *model)
     place_machine(state);
     if (finite_number(state->last.nominal[0])) {
         state->last.resumes = HC_WITH_NEW_TOOL;
+        state->last.changed = state->last.changed || model->load.bends; /* it weighs otherwise: that ramps */
     }
 }
 
@@ -565,6 +635,10 @@ void hc_init(hc_state *state, const hc_model *model, double ramp_rate)
         state->temperatures[i] = REFERENCE_TEMPERATURE;
     }
     state->humidity = REFERENCE_HUMIDITY;
+    store(vector(NAN, NAN, NAN), state->gravity);
+    for (int i = 0; i < 6; i++) {
+        state->external[i] = 0.0;
+    }
     rest(state);
     for (int i = 0; i < 6; i++) {
         state->last.correction[i] = NAN;
@@ -592,6 +666,6 @@ const char *hc_reason(hc_status status)
         "not_finite", "correction", "step", "speed", "speed", "acceleration",
         "not_converged", "outside_field", "quaternion",
         "singular", "unreachable", "other_assembly_mode",
-        "bad_model", "bad_model", "tool_changed"}; /* in the order of hc_status */
+        "bad_model", "bad_model", "tool_changed", "bad_model"}; /* in the order of hc_status */
     return (size_t)status < sizeof names / sizeof names[0] ? names[status] : "unknown";
 }

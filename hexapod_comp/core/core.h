@@ -31,12 +31,13 @@
 #define REFERENCE_HUMIDITY 0.5
 #define LOWEST_HUMIDITY 0.01
 #define SAME_PLACE 1e-5 /* m: nominal lengths that differ by no more are the same place, but for a controller's decimals */
+#define LARGEST_GRAVITY 100.0 /* m/s2 */
 #define LOWEST_TEMPERATURE (-40.0)
 #define HIGHEST_TEMPERATURE 120.0
 #define FIELD_ITERATIONS 50
 #define COMMAND_ITERATIONS 8
 #define SMALL_ANGLE (1.0 / 64.0) /* rad */
-#define LEAD_ITERATIONS 20
+#define TURN_ITERATIONS 20 /* of lengths against what depends on the pose: turning screws, load */
 
 /* What loops over lanes (lanes.c) call, and a loop of six in it: calls and loops would keep them from becoming vector code. */
 #ifdef __GNUC__

@@ -72,6 +72,16 @@ INLINED void substitute(const vec m[6], const blocks *f, const double right[6], 
     *v = combine_rows(subtract(even, vector(dot(m[0], *w), dot(m[2], *w), dot(m[4], *w))), f->upper);
 }
 
+/* Solve with the factors: sum of s_i f_i = force, sum of m_i f_i = torque. */
+INLINED void substitute_transposed(const vec m[6], const blocks *f, vec force, vec torque, double forces[6])
+{
+    const vec even = times(f->upper, force);
+    const vec odd = times(f->lower, subtract(torque, combine(even, m[0], m[2], m[4])));
+    const vec rest = subtract(even, combine_rows(odd, f->ratio));
+    const double all[6] = {rest.x, odd.x, rest.y, odd.y, rest.z, odd.z};
+    copy_six(all, forces);
+}
+
 /* Condition number and sign of det J; sign 0 where pivoting is needed. */
 INLINED double block_condition(const six_struts *now, double characteristic_length, double *sign)
 {

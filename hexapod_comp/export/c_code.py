@@ -20,6 +20,7 @@ from ..core import Status, dtype_of, ffi, lib
 from ..errors import HexapodError, TooEarlyError
 from ..formats.outputs import write_text
 from ..machine.geometry import HexapodGeometry
+from ..machine.load import Loading
 from ..machine.model import MachineModel, members
 from ..machine.temperatures import Temperatures
 from ..machine.trajectory import moves
@@ -39,7 +40,7 @@ MODEL_FILE, VECTORS_FILE = "hexapod_model.h", "hexapod_vectors.h"
 class Vector:
     """One line of the self-test: what the core is given, and what it must answer."""
 
-    kind: str  # command, pose estimate, temperature, enable, forget, reset to measured struts: c p t e f r
+    kind: str  # command, pose estimate, temperature, gravity, enable, forget, reset to measured struts: c p t g e f r
     values: tuple[float, ...]  # as the core's function takes them
     time: float  # of a command, s
     status: int  # hc_status
@@ -118,8 +119,9 @@ def _numbers(value: Any) -> str:
 def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> list[Vector]:
     """Return commands, refusals and estimates, answered by the Python compensator.
 
-    A stream of small moves around home, there and back; on the way temperatures change, compensation is switched,
-    a command is too far, one is not finite, one has no unit quaternion, and it starts again from measured struts.
+    A stream of small moves around home, there and back; on the way temperatures and gravity change, compensation
+    is switched, a command is too far, one is not finite, one has no unit quaternion, and it starts again from measured
+    struts.
     """
     recorder = Recorder(geometry, model)
     random = np.random.default_rng(seed)
@@ -129,6 +131,7 @@ def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> 
     recorder.commands(stream[:quarter])
     for part, temperature in ((2.0, 24.5), (6.0, 21.25), (7.0, 1e3), (6.0, 22.25)):
         recorder.record("t", (part, temperature))
+    recorder.record("g", (1.0, -2.0, -9.5))
     recorder.commands(stream[quarter : 2 * quarter])
     recorder.record("e", (0.0,))
     recorder.commands(stream[2 * quarter : 3 * quarter])
@@ -186,6 +189,8 @@ class Recorder:
                 expected = np.concatenate([pose[:3], pose[9:]])
             elif kind == "t":
                 compensator.set_temperature(Temperatures.NAMES[int(values[0])], values[1], self.time)
+            elif kind == "g":
+                compensator.set_load(Loading.of(values))
             elif kind == "e":
                 compensator.enable(bool(values[0]))
             else:

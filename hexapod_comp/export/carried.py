@@ -25,15 +25,16 @@ CARRIED = frozenset(
         *(f"field.{name}" for name in ("grid", "lines", "probe", "outside", "reversal_threshold")),
         *("base_expansion", "platform_expansion"),
         *(f"late_growth.{name}" for name in ("time_constants", "expansion", "thermometer")),
+        *(f"load.{name}" for name in ("stiffness", "lost_motion", "take_up", "mass", "centre", "gravity")),
     }
 )
 """What the C core holds. LinuxCNC's files and the table hold it or report it: field or tilt, growth, swelling."""
 
 
-def refuse_unknown(model: MachineModel, export: str) -> None:
-    """Refuse a model with a term that an export does not know."""
+def refuse_unknown(model: MachineModel, export: str, without: str = "-") -> None:
+    """Refuse a model with a term that an export does not know, or with one whose name begins with `without`."""
     for name, value in terms(model):
-        if name not in CARRIED:
+        if name not in CARRIED or name.startswith(without):
             problem = f"cannot be exported: {export} does not know it. Leave it out, or let the compensator run it"
             raise ModelError(name, problem, np.asarray(value).tolist())
 

@@ -16,8 +16,8 @@ from ..formats.outputs import write_text
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import strut_lengths
 from ..machine.model import MachineModel
+from ..machine.robot_description import urdf
 from .c_code import write_c
-from .robot_description import urdf
 
 TEMPLATES = Path(__file__).parent / "ros2_control"
 """The package's files; ``@NAME@`` stands for what differs from machine to machine."""

@@ -118,7 +118,7 @@ class Genhexkins:
 
 def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
     """Put a machine into LinuxCNC's terms."""
-    refuse_unknown(machine.model, "LinuxCNC's export")
+    refuse_unknown(machine.model, "genhexkins", without="load.")
     geometry, structure = machine.geometry, machine.structure
     lead = float(geometry.screw_lead[0])
     if (geometry.screw_lead != lead).any():

@@ -106,6 +106,10 @@ def make_table(
     passes.refuse_unreachable()
     carried, left_out = _without_fine_waves(model, step)
     machine = RealMachine(geometry, carried)
+    if model.load.bends:
+        left_out.append(
+            f"the load is that of tool {geometry.tool_name} in the model's gravity: of others it is left out"
+        )
     held = _outside_field(machine, passes)
     if held:
         left_out.append(f"{held} of {len(passes)} rows are outside the field's box: its boundary value is held")

@@ -23,6 +23,7 @@ from ..formats.yaml import parse_yaml
 from ..pose import Pose
 from .limits import STRUT_NAMES as STRUT_NAMES
 from .limits import Limits, frozen_array
+from .load import NOTHING, Payload
 
 # Frames that every machine has: its base, and the work frame and the tool that are used unless others are named
 BASE, WORK, TOOL = "base", "work", "tool"
@@ -32,9 +33,9 @@ USUAL_LEAD = 0.01  # m a turn, of ball screws for which the geometry file gives 
 TAKEN = re.compile("base|work|platform|tool|world|(platform|strut)_.*")  # What the package calls other frames
 
 
-def read_pose(parent: Section, key: str) -> Pose:
+def read_pose(parent: Section, key: str, section: Section | None = None) -> Pose:
     """Read a pose section: ``position_*`` and the paper's angles ``rotation_*`` (default zero)."""
-    section = parent.section(key)
+    section = parent.section(key) if section is None else section
     position = section.quantity("position", "length", (3,))
     angles = section.quantity("rotation", "angle", (3,), np.zeros(3))
     section.finish()
@@ -44,7 +45,20 @@ def read_pose(parent: Section, key: str) -> Pose:
         raise parent.error(key, str(error)) from error
 
 
-def read_named_poses(top: Section, key: str) -> dict[str, Pose]:
+def read_tool(parent: Section, key: str, payloads: dict[str, Payload]) -> Pose:
+    """Read a tool's pose, and into the payloads what it weighs, ``mass_*`` and ``centre_*`` in ``platform``."""
+    section = parent.section(key)
+    weighs = section.quantity_key("mass", "mass") is not None
+    mass = section.quantity("mass", "mass", (), None if weighs else 0.0)
+    centre = section.quantity("centre", "length", (3,), None if weighs else np.zeros(3))
+    try:
+        payloads[key] = Payload(float(mass), tuple(centre.tolist()))
+    except GeometryError as error:
+        raise section.error(error.key, error.problem, error.value) from error
+    return read_pose(parent, key, section)
+
+
+def read_named_poses(top: Section, key: str, read: Callable[[Section, str], Pose] = read_pose) -> dict[str, Pose]:
     """Read poses by name, as ``tools`` and ``work_frames`` give them; none where there is no such key."""
     if key not in top:
         return {}
@@ -54,7 +68,7 @@ def read_named_poses(top: Section, key: str) -> dict[str, Pose]:
     for name in (BASE, WORK, TOOL):
         if name in section:
             raise section.error(name, f"is what the machine's own {name} frame is called")
-    return {name: read_pose(section, name) for name in section.left()}
+    return {name: read(section, name) for name in section.left()}
 
 
 def pose_text(pose: Pose) -> str:
@@ -120,6 +134,8 @@ class HexapodGeometry:
         What else can be used, by name: see :meth:`using`. Afterwards with those in use; ``base`` is a work frame too.
     tool_name, work_name : str, optional
         Of those in use.
+    payloads : mapping of str to Payload, optional
+        What tools weigh, by their names; the others weigh nothing.
 
     Raises
     ------
@@ -143,6 +159,7 @@ class HexapodGeometry:
     work_frames: Mapping[str, Pose] = field(default_factory=dict)
     tool_name: str = TOOL
     work_name: str = WORK
+    payloads: Mapping[str, Payload] = field(default_factory=dict)
     home_sign: float = field(init=False)
     """Sign of det J at home: the other sign is another assembly mode."""
     kernel_joints: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False)
@@ -188,6 +205,11 @@ class HexapodGeometry:
                 put(name, _unit_vectors(vectors, key))
             elif self.screw_lead.any():
                 raise GeometryError(key, "are needed when a screw lead is given")
+
+    @property
+    def payload(self) -> Payload:
+        """What the tool in use weighs."""
+        return self.payloads.get(self.tool_name, NOTHING)
 
     @property
     def kernel_axes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -255,6 +277,12 @@ class HexapodGeometry:
                 raise FrameError(f"machine {self.name} has no {what} {shorten(name)}; it has {', '.join(named)}")
             object.__setattr__(other, kind, named[name])
             object.__setattr__(other, f"{kind}_name", name)
+        return other
+
+    def carrying(self, payload: Payload) -> HexapodGeometry:
+        """Return the same machine whose tool in use weighs something else."""
+        other = copy.copy(self)
+        object.__setattr__(other, "payloads", {**self.payloads, self.tool_name: payload})
         return other
 
     def platform_pose(self, tool_pose: Pose) -> Pose:
@@ -326,8 +354,13 @@ def parse_geometry(text: str, name: str | Path = "geometry") -> HexapodGeometry:
         screw = top.section("screw")
         lead = screw.per_strut("lead", "length")
         screw.finish()
-    frames: dict[str, Any] = {key: read_pose(top, key) for key in ("tool", "work") if key in top}
-    frames |= {key: read_named_poses(top, key) for key in ("tools", "work_frames")}
+    payloads: dict[str, Payload] = {}
+    frames: dict[str, Any] = {"tool": read_tool(top, TOOL, payloads)} if TOOL in top else {}
+    if WORK in top:
+        frames["work"] = read_pose(top, WORK)
+    frames["tools"] = read_named_poses(top, "tools", lambda section, name: read_tool(section, name, payloads))
+    frames["work_frames"] = read_named_poses(top, "work_frames")
+    frames["payloads"] = {name: payload for name, payload in payloads.items() if payload.mass}
     top.finish()
     try:
         return HexapodGeometry(machine, base, platform, home, limits, screw_lead=lead, **frames | axes)

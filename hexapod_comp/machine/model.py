@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +19,7 @@ from .arrays import changed_rows
 from .field import GridField, no_field
 from .geometry import HexapodGeometry
 from .kinematics import Structure, forward_error, over_chunks, strut_lengths
+from .load import FREE, Load, Loading, Payload
 from .region import Region
 from .struts import StrutErrors
 from .temperatures import AT_ONCE, EXPANSION, HUMIDITY, MOST_TIME_CONSTANTS, PARTS, Lag, LateGrowth, Temperatures, late
@@ -76,6 +78,9 @@ class ModelOrigin:
     posterior: tuple[str, str] | None = None
     # Where the tool is not moved, and by how much that was free to choose; None when nobody says
     datum: Datum | None = None
+    # Under which loads it was measured, each payload, kg, its centre in platform, m, and gravity in base, m/s²; none
+    # where nobody says
+    loads: tuple[tuple[float, ...], ...] = ()
     # Of the file that the model was read from, less the lines that name the posterior; empty when it was not read
     text_sha256: str = dataclasses.field(default="", compare=False)
 
@@ -102,6 +107,8 @@ class MachineModel:
         Thermal expansion of the two bodies about their origins, 1/K.
     late_growth : LateGrowth
         How parts follow their thermometers late, and which thermometer stands for all.
+    load : Load
+        How struts give under weight and other forces.
     reversal_threshold : float
         How far a strut must come back before its direction counts as reversed, m: above the noise of the
         commands, and as far below the backlash as that allows. The field has a threshold of its own.
@@ -132,6 +139,7 @@ class MachineModel:
     base_expansion: float = term("thermal", "ppm_per_K", "of the base about its origin", (), largest=EXPANSION)
     platform_expansion: float = term("thermal", "ppm_per_K", "of the platform", (), largest=EXPANSION)
     late_growth: LateGrowth = AT_ONCE
+    load: Load = dataclasses.field(default_factory=Load)
     reversal_threshold: float = term(
         "", "um", "way back until a strut's direction counts as reversed", (), default=0.2e-6, least=0.0
     )
@@ -183,6 +191,8 @@ class RealMachine:
         Its errors.
     temperatures : Temperatures, optional
         Readings; 20 °C everywhere, and 50 % of humidity, by default.
+    loading : Loading, optional
+        Gravity and other forces; the model's gravity and no force by default.
 
     Raises
     ------
@@ -191,20 +201,51 @@ class RealMachine:
     """
 
     def __init__(
-        self, geometry: HexapodGeometry, model: MachineModel, temperatures: Temperatures | None = None
+        self,
+        geometry: HexapodGeometry,
+        model: MachineModel,
+        temperatures: Temperatures | None = None,
+        loading: Loading = FREE,
     ) -> None:
         self.geometry, self.model = geometry, model
-        self.temperatures = temperatures or Temperatures()
+        self.temperatures, self.loading = temperatures or Temperatures(), loading
         self.constants, self.state = core_model(geometry, model), Struct("hc_state")
         lib.hc_init(self.state.at, self.constants.at, 0.0)
         self.state.keep(self.constants)
         write_temperatures(self.state, self.temperatures)
+        write_loading(self.state, loading)
         lib.hc_place(self.state.at)
         placed = self.state.view["base_joints"].copy(), self.state.view["platform_joints"].copy()
         self.structure = Structure(*placed, *Structure.of(geometry).solver, geometry.home)
 
     def __reduce__(self) -> tuple:
-        return RealMachine, (self.geometry, self.model, self.temperatures)
+        return RealMachine, (self.geometry, self.model, self.temperatures, self.loading)
+
+    @property
+    def bends(self) -> bool:
+        """Whether weight and forces move the platform."""
+        return self.model.load.bends
+
+    def at(
+        self, temperatures: Temperatures, payload: Payload | None = None, gravity: Sequence[float] | None = None
+    ) -> RealMachine:
+        """Return the same machine at other temperatures and, where they are told, under another load."""
+        geometry = self.geometry if payload is None else self.geometry.carrying(payload)
+        loading = self.loading if gravity is None else Loading.of(gravity)
+        return RealMachine(geometry, self.model, temperatures, loading)
+
+    def advance(
+        self,
+        seconds: float,
+        commands: np.ndarray,
+        sense: np.ndarray,
+        position: np.ndarray,
+        rotation: np.ndarray,
+        actual_position: np.ndarray,
+        actual_rotation: np.ndarray,
+    ) -> tuple[int, float]:
+        """Run :meth:`forward` after a time, s, in which the struts went to their commands: without inertia at once."""
+        return self.forward(commands, sense, position, rotation, actual_position, actual_rotation)
 
     @property
     def body(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -337,6 +378,12 @@ def write_temperatures(state: Struct, temperatures: Temperatures) -> None:
             view["behind"][index][: len(lag.behind)] = lag.behind
 
 
+def write_loading(state: Struct, loading: Loading) -> None:
+    """Write gravity and other forces into an ``hc_state``."""
+    state.view["gravity"] = loading.gravity or (math.nan,) * 3
+    state.view["external"] = loading.wrench
+
+
 def members(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str] = ("", "")) -> dict[str, Any]:
     """Return what ``hc_model`` holds."""
     model_texts = {"machine": model.machine, "model": model.name, "date": model.origin.date or ""}
@@ -360,6 +407,7 @@ def members(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, s
         },
         "field": model.field.members(),
         "late": _late(model),
+        "load": model.load.members(geometry),
         "axis_threshold": model.field.reversal_threshold,
         "strut_threshold": model.reversal_threshold,
     }
@@ -395,33 +443,49 @@ def _late(model: MachineModel) -> dict[str, Any]:
 class MachinesByTemperature:
     """Real machines at temperatures that come again and again, each made once."""
 
-    def __init__(self, geometry: HexapodGeometry, model: MachineModel) -> None:
-        self._geometry, self._model = geometry, model
-        self._known: dict[tuple[float, ...], RealMachine] = {}
+    def __init__(self, geometry: HexapodGeometry, model: MachineModel, machine: RealMachine | None = None) -> None:
+        self._machine = RealMachine(geometry, model) if machine is None else machine
+        self._model = model
+        self._known: dict[tuple[Any, ...], RealMachine] = {}
 
-    def at(self, values: np.ndarray, behind: np.ndarray | None = None, humidity: float = math.nan) -> RealMachine:
-        """Return the machine at the temperatures of struts 1–6, base and platform, °C, shape (8,), and a humidity."""
+    def at(
+        self,
+        values: np.ndarray,
+        behind: np.ndarray | None = None,
+        humidity: float = math.nan,
+        load: Sequence[float] = (),
+    ) -> RealMachine:
+        """Return the machine at the temperatures of struts 1–6, base and platform, °C, shape (8,), a humidity, and a
+        load: payload, kg, its centre, m, and gravity, m/s²; NaN or empty: the tool's and the model's."""
         swells = math.isfinite(humidity) and bool(self._model.struts.moisture.any())
         air = {HUMIDITY: humidity} if swells else {}
-        key = (*values.tolist(), *air.values(), *(() if behind is None else behind.ravel().tolist()))
+        told = tuple(load) if self._machine.bends else ()
+        key = (*values.tolist(), *air.values(), *(() if behind is None else behind.ravel().tolist()), repr(told))
         if key not in self._known:
             late_parts = {} if behind is None else dict(zip(PARTS, behind.tolist(), strict=True))
             lags = {name: Lag(math.nan, math.nan, row) for name, row in late_parts.items()}
             readings = dict(zip(PARTS, values.tolist(), strict=True)) | air
-            self._known[key] = RealMachine(self._geometry, self._model, Temperatures(readings, lags))
+            payload = Payload(told[0], (told[1], told[2], told[3])) if told and not math.isnan(told[0]) else None
+            gravity = told[4:] if told and not math.isnan(told[4]) else None
+            self._known[key] = self._machine.at(Temperatures(readings, lags), payload, gravity)
         return self._known[key]
 
-    def at_each(self, temperatures: np.ndarray, times: np.ndarray, humidities: np.ndarray) -> list[RealMachine]:
-        """Return the machine at rows of temperatures, °C, shape (N, 8), read at some times, s, and humidities, (N,)."""
+    def at_each(
+        self, temperatures: np.ndarray, times: np.ndarray, humidities: np.ndarray, loads: np.ndarray | None = None
+    ) -> list[RealMachine]:
+        """Return the machine at rows of temperatures, °C, shape (N, 8), read at some times, s, humidities, (N,), and
+        loads, (N, 7), as :meth:`at` has them."""
         constants = self._model.late_growth.time_constants
-        air = np.column_stack([temperatures, np.nan_to_num(humidities, nan=-1.0)])
+        loads = np.full((len(temperatures), 7), np.nan) if loads is None else loads
+        air = np.column_stack([temperatures, np.nan_to_num(humidities, nan=-1.0), np.nan_to_num(loads, nan=-1e9)])
         behind = None
         if constants and np.isfinite(times).all():
             behind = late(times, temperatures, constants)
             air = np.hstack([air, behind.reshape(len(air), -1)])
         rows, number = changed_rows(air)
         lags = [None] * len(rows) if behind is None else behind[rows]
-        machines = [self.at(*row) for row in zip(temperatures[rows], lags, humidities[rows].tolist(), strict=True)]
+        told = zip(temperatures[rows], lags, humidities[rows].tolist(), loads[rows].tolist(), strict=True)
+        machines = [self.at(*row) for row in told]
         return [machines[n] for n in number.tolist()]
 
 

@@ -23,6 +23,7 @@ from ..formats.schema import PER_STRUT, Numbers, Section, file_errors, in_unit
 from ..formats.yaml import block_text, parse_yaml
 from .field import COMPONENTS, CROSS_AXES, LARGEST, OUTSIDE_POLICIES, GridField, no_field
 from .geometry import HexapodGeometry
+from .load import LARGEST_GRAVITY, LARGEST_MASS, MOST_LOADS, Load
 from .model import Datum, MachineModel, ModelOrigin
 from .region import Region
 from .struts import WAVE_PARTS, StrutErrors
@@ -83,7 +84,13 @@ def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineM
         origin = replace(_read_origin(top), text_sha256=text_sha256(text))
         values: dict[str, Any] = {"name": top.text("name"), "origin": origin}
         values |= {"region": _read_region(top)} | read_terms(MachineModel, top, "")
-        blocks = {"structure": _read_structure, "thermal": _read_thermal, "struts": _read_struts, "field": _read_field}
+        blocks = {
+            "structure": _read_structure,
+            "thermal": _read_thermal,
+            "struts": _read_struts,
+            "field": _read_field,
+            "load": lambda section: {"load": Load(**read_terms(Load, section, "load"))},
+        }
         for key, read in blocks.items():
             if key in top:
                 section = top.section(key)
@@ -91,7 +98,7 @@ def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineM
                 section.finish()
         top.finish()
         model = MachineModel(machine, **values)
-        for part in (model, model.struts, model.late_growth):
+        for part in (model, model.struts, model.late_growth, model.load):
             check_magnitudes(part)
         _check_lines(model.field)
     return model
@@ -100,6 +107,18 @@ def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineM
 def text_sha256(text: str) -> str:
     """Return the hash of a model file's text less the block that names its posterior, which names this hash."""
     return hashlib.sha256(POSTERIOR_LINES.sub("", text).encode()).hexdigest()
+
+
+def read_load(path: str | Path) -> Load:
+    """Read what is stated of struts that give under weight: a file of the format ``hexapod_comp/load``, whose keys are
+    those of a model's block ``load``."""
+    file = input_file(path, "load")
+    top = parse_yaml(read_text(file), file, "hexapod_comp/load", 1)
+    with file_errors(file):
+        load = Load(**read_terms(Load, top, "load"))
+        check_magnitudes(load)
+    top.finish()
+    return load
 
 
 def save_model(model: MachineModel, path: str | Path) -> None:
@@ -140,19 +159,25 @@ def model_text(model: MachineModel) -> str:
     if origin.datum is not None:
         place, angles = in_unit(origin.datum.position, "mm"), in_unit(origin.datum.angles, "deg")
         content["datum"] = {"position_mm": place, "rotation_deg": angles, "held": origin.datum.held}
+    if origin.loads:
+        content["measured_loads"] = [
+            {"mass_kg": row[0], "centre_mm": in_unit(row[1:4], "mm"), "gravity_m_s2": list(row[4:])}
+            for row in origin.loads
+        ]
     content |= write_terms(model, "", whole=True)
     blocks = {
         "structure": write_terms(model, "structure"),
         "struts": _struts_block(model.struts),
         "thermal": _thermal_block(model),
         "field": _field_block(model.field),
+        "load": write_terms(model.load, "load"),
     }
     return block_text(content | {name: block for name, block in blocks.items() if block} | {"end": True})
 
 
 def terms_text() -> str:
     """Return the table of all terms, as doc/model_file.md has it."""
-    return table_text(MachineModel, StrutErrors, LateGrowth, GridField, Region)
+    return table_text(MachineModel, StrutErrors, LateGrowth, Load, GridField, Region)
 
 
 # Provenance
@@ -191,7 +216,18 @@ def _read_origin(top: Section) -> ModelOrigin:
         angles = section.quantity("rotation", "angle", (3,), np.zeros(3))
         datum = Datum(tuple(position.tolist()), tuple(angles.tolist()), section.require("held"))
         section.finish()
-    origin = ModelOrigin(given, tuple(sources), residual, note, posterior, datum)
+    loads = []
+    for entry in top.sections("measured_loads") if "measured_loads" in top else ():
+        parts = entry.quantity("mass", "mass"), entry.quantity("centre", "length", (3,))
+        gravity = entry.quantity("gravity", "acceleration", (3,))
+        if not (0.0 <= parts[0] <= LARGEST_MASS and 0.0 < np.linalg.norm(gravity) <= LARGEST_GRAVITY):
+            allowed = f"0…{LARGEST_MASS:g} kg and a gravity above 0, up to {LARGEST_GRAVITY:g} m/s²"
+            raise entry.error("mass, gravity", f"must be {allowed}", [float(parts[0]), gravity.tolist()])
+        loads.append((float(parts[0]), *parts[1].tolist(), *gravity.tolist()))
+        entry.finish()
+    if len(loads) > MOST_LOADS:
+        raise top.error("measured_loads", f"must be no more than {MOST_LOADS}", len(loads))
+    origin = ModelOrigin(given, tuple(sources), residual, note, posterior, datum, tuple(loads))
     _check_origin(origin)
     return origin
 

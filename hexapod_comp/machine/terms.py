@@ -127,7 +127,9 @@ def table_text(*schemas: Any) -> str:
         size = shape if isinstance(shape, str) else " × ".join(str(n or "n") for n in shape) or "one number"
         size_in_si = UNITS[DIMENSIONS[row.numbers.unit]][row.numbers.unit]
         usual = np.ravel(0.0 if made is MISSING else made)
-        default = "required" if made is MISSING else f"{usual[0] / size_in_si:g}" if len(usual) else "none"
+        values = usual if len(set(usual.tolist())) > 1 else usual[:1]
+        listed = ", ".join(f"{value / size_in_si:g}" for value in values)
+        default = "required" if made is MISSING else listed or "none"
         bounds = (
             ["≥ 0"] * (row.least == 0.0) + ["> 0"] * (row.least > 0.0) + [f"±{row.bound}"] * math.isfinite(row.largest)
         )

@@ -51,6 +51,10 @@ LARGEST_READING = 1.0  # no machine errs by more, m or rad
 LEAST_TRAVEL = 1e-6  # components of a line shorter than this, m, are no travel along that axis
 
 
+# What a reading's load is where nobody tells: NaN, the mass and centre of the tool in use, and the model's gravity
+NO_LOAD = (np.nan,) * 7
+
+
 class FileLine(NamedTuple):
     """Where a reading stands."""
 
@@ -80,6 +84,7 @@ class Reading(NamedTuple):
     centre: tuple[float, ...] | None = None
     known_zero: bool = False  # a length that is known as a whole, as with a calibrated bar
     humidity: float = np.nan  # relative humidity of the air, a fraction; NaN when not known
+    load: tuple[float, ...] = NO_LOAD  # mass, kg, its centre in platform, m, and gravity in base, m/s²; NaN: as usual
     slope: str = ""  # runs of this name read their straightness from one square, whose faces' slope they share
 
 
@@ -118,6 +123,11 @@ class Stations:
     temperatures: np.ndarray  # (M, 8): struts 1–6, base, platform, °C
     times: np.ndarray  # (M,): when these were read, s; NaN where that is not known
     humidity: np.ndarray  # (M,): relative humidity of the air, a fraction; NaN where that is not known
+    loads: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))  # (M, 7): as Reading.load; by default NO_LOAD
+
+    def __post_init__(self) -> None:
+        if not len(self.loads):
+            object.__setattr__(self, "loads", np.tile(NO_LOAD, (len(self.positions), 1)))
 
     def __len__(self) -> int:
         return len(self.positions)

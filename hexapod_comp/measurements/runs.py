@@ -299,13 +299,14 @@ def _collect_stations(
         came_from = before if r.direction == FROM_PREVIOUS else None
         time = r.time if warming else math.nan
         air = (None if math.isnan(time) else time, None if math.isnan(r.humidity) else r.humidity)
-        key = (place, r.direction, came_from, r.temperatures, air)
+        load = tuple(None if math.isnan(value) else value for value in r.load)
+        key = (place, r.direction, came_from, r.temperatures, air, load)
         if key not in known:
             own = poses[0][pose], poses[1][pose], lengths[pose]
             commands = own[2] if r.commands is None else np.array(r.commands, dtype=float)
             known[key] = len(rows)
             sense = _sense(own[0], commands, None if came_from is None else rows[came_from])
-            rows.append((*own[:2], commands, sense, r.temperatures, time, r.humidity))
+            rows.append((*own[:2], commands, sense, r.temperatures, time, r.humidity, r.load))
             ways.append(r.direction * run.axis if r.direction in (FORWARD, BACKWARD) else np.zeros(3))
         index.append(known[key])
     columns = [np.array(column, dtype=float) for column in zip(*rows, strict=True)]

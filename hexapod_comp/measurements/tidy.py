@@ -17,6 +17,7 @@ from ..formats.schema import UNITS, spellings
 from ..machine.arrays import changed_rows
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths
+from ..machine.load import LARGEST_GRAVITY, LARGEST_MASS
 from ..machine.pose_files import ANGLE_COLUMNS, POSITION_COLUMNS, poses_of
 from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
 from ..pose import Pose, angles_from_rotation, attitude_error
@@ -53,6 +54,8 @@ DIMENSIONS = {
 
 ALONG_LINES = (*LINE_KINDS, *TURNS)  # channels that light reads along a line, and that the air therefore bends
 LATEST = 1e11  # largest time, s: seconds since 1970 of the next three thousand years; nanoseconds are not seconds
+# Columns of a reading's load, in the order of Reading.load, and how many digits they move from SI
+LOAD_COLUMNS = {"payload_kg": 0, **{f"payload_{a}_mm": 3 for a in AXES}, **{f"gravity_{a}_m_s2": 0 for a in AXES}}
 FURTHEST_CENTRE = 100.0  # no instrument stands further away, m
 
 
@@ -75,6 +78,7 @@ class TidyRow(NamedTuple):
     line: int
     time: float
     humidity: float
+    load: tuple[float, ...]
     slope: str
 
 
@@ -87,6 +91,7 @@ def read_rows(table: Table) -> list[TidyRow]:
     temperatures, (air, humidity) = _temperatures(table), _air(table)
     centres, known = _centres(table), _known_zeros(table)
     times = _optional(table, "time", "time", lambda v: abs(v) <= LATEST, f"±{LATEST:g} s", blank=True)
+    loads = _loads(table)
     slopes = [""] * len(runs) if table.column("slope", None) is None else table.texts("slope")
     table.refuse_unknown()
     sizes: dict[tuple[str, str], float] = {}
@@ -104,7 +109,11 @@ def read_rows(table: Table) -> list[TidyRow]:
         place = (runs[n], cycles[n], directions[n], poses[n], channels[n])
         set_up = air[n], centres[n], known[n]
         rows.append(
-            TidyRow(*place, *value, uncertainty, temperatures[n], *set_up, line, times[n], humidity[n], slopes[n])
+            TidyRow(
+                *(*place, *value, uncertainty, temperatures[n], *set_up, line, times[n], humidity[n]),
+                load=loads[n],
+                slope=slopes[n],
+            )
         )
     return rows
 
@@ -225,6 +234,35 @@ def _air(table: Table) -> tuple[list[tuple[float, ...] | None], list[float]]:
             raise InputFileError(table.path, f"line {line}", problem)
         air.append(tuple(row))
     return air, columns[-1]
+
+
+def _loads(table: Table) -> list[tuple[float, ...]]:
+    """Return payload, kg, its centre in platform, m, and gravity in base, m/s²; NaN where a row has none."""
+    groups = (
+        [("payload", "mass", LARGEST_MASS), *((f"payload_{axis}", "length", FURTHEST_CENTRE) for axis in AXES)],
+        [(f"gravity_{axis}", "acceleration", LARGEST_GRAVITY) for axis in AXES],
+    )
+    columns: list[list[float]] = []
+    for names in groups:
+        own = []
+        for name, dimension, largest in names:
+            low = 0.0 if name == "payload" else -largest
+            own.append(
+                _optional(
+                    table,
+                    name,
+                    dimension,
+                    lambda v, low=low, largest=largest: low <= v <= largest,  # type: ignore[misc]
+                    f"{low:g}…{largest:g}, in SI",
+                    blank=True,
+                )
+            )
+        for (line, _), *row in zip(table.rows, *own, strict=True):
+            missing = [name for (name, _, _), value in zip(names, row, strict=True) if math.isnan(value)]
+            if missing and len(missing) < len(names):
+                raise InputFileError(table.path, f"line {line}", f"has a load without its {missing[0]}")
+        columns += own
+    return list(zip(*columns, strict=True))
 
 
 def _centres(table: Table) -> list[tuple[float, ...] | None]:
@@ -352,7 +390,7 @@ def _file_readings(
             reading = (names[row.run], row.cycle, row.direction, row.pose, channel, value, row.uncertainty)
             source = FileLine(file, row.line)
             state = row.temperatures, commands.get(visits[n]) if commands else None, source, row.time
-            readings.append(Reading(*reading, *state, row.centre, row.known_zero, row.humidity, row.slope))
+            readings.append(Reading(*reading, *state, row.centre, row.known_zero, row.humidity, row.load, row.slope))
     if not readings:
         raise InputFileError(file, "", "holds strut readings only: nothing that was measured")
     return readings, len(corrected)
@@ -512,7 +550,9 @@ def _csv_rows(measurements: MeasurementSet) -> Iterator[list[str]]:
     commanded = positions + rotations @ offset if offset.any() else positions
     pose_names, poses = _pose_cells(positions, rotations)
     temperature_names, temperatures = _temperature_cells(measurements)
-    for name, values, digits in (("humidity_percent", stations.humidity, 2), ("time_s", stations.times, 0)):
+    loads = zip(LOAD_COLUMNS.items(), stations.loads.T, strict=True)
+    optional = [("humidity_percent", stations.humidity, 2), ("time_s", stations.times, 0)]
+    for name, values, digits in (*optional, *((name, values, digits) for (name, digits), values in loads)):
         if np.isfinite(values).any():
             temperature_names = [*temperature_names, name]
             texts = ("" if math.isnan(value) else _scaled(value, digits) for value in values.tolist())

@@ -46,6 +46,7 @@ from .interface import (
     frame_ids,
     temperature_rules,
 )
+from .load import Loads
 from .messages import StrutBytes, StrutReader, period, read_message
 from .process import run
 from .rclpy_compat import Alarm
@@ -155,6 +156,7 @@ class CompensatorNode(MachineNode):
         self._journal.finish(time.monotonic())
         self._forget_commands()
         self.close_ends(*self._ends)
+        self._loads.close(self)
         for part in (self._requests, self._pacing, self._outputs, self._journal, self._instrument):
             if part is not None:
                 part.close()
@@ -168,6 +170,7 @@ class CompensatorNode(MachineNode):
         if self._compensator is not None:
             self._thermometers.follow(*temperature_rules(self._options))
             self._compensator.set_ramp_rate(self._options["ramp_rate"])
+            self._loads.apply()
         if self._instrument is not None:
             self._instrument.follow()
 
@@ -222,6 +225,7 @@ class CompensatorNode(MachineNode):
         )
         self._requests = Requests(self, status, self._files, self._forget_commands)
         self._journal = JournalTopics(self, compensator, self._files.sources, ids)
+        self._loads = Loads(self, compensator, status, ids, self._ignore)
         if options["fusion.enabled"]:
             frames = {ids[name]: pose for name, pose in compensator.geometry.work_frames.items()}
             self._instrument = PoseInstrument(self, compensator, status, frames)

@@ -28,12 +28,12 @@ from ..compensation.thermal import DEFAULT_TIME_CONSTANT, HUMIDITY_RATE, Plausib
 from ..core import ffi
 from ..core.batch import quaternion_of
 from ..errors import HexapodError
-from ..export.robot_description import joint_positions, urdf
 from ..formats.paths import confined_file, confined_opener, folder_of
 from ..machine.geometry import BASE, TOOL, WORK, HexapodGeometry
 from ..machine.kinematics import Structure, forward_error, solve_poses, strut_lengths
 from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL
+from ..machine.robot_description import joint_positions, urdf
 from ..pose import Pose
 from .base import ACKNOWLEDGED_WITHIN, EVENT_QOS, LATCHED_QOS, STATE_QOS, MachineNode
 from .messages import PoseBytes, StrutBytes, StrutReader, command_stamp, period, read_message, read_pose, stamp_of
@@ -105,6 +105,13 @@ temperature_timeout | 60.0 | 0 to 86400 s | always | a part without a temperatur
     its last one stays; the same of humidity; 0 = off
 humidity_rate_limit | {HUMIDITY_RATE} | 0 to 1 1/s | always | a humidity that jumps by more than 0.05 and this rate is
     refused; 0 = off
+gravity | [0.0, 0.0, 0.0] | -10.6 to 10.6 m/s² | always | gravity in `base_frame` while nobody publishes `gravity`;
+    zeros: the model's
+gravity_dead_band | 0.0 | 0 to 1 m/s² | always | a published gravity that differs by less from the one in use changes
+    nothing
+load_hold | false |  | always | hold the correction for gravity and wrench as it is, while an exposure or a cut lasts
+load_timeout | 60.0 | 0 to 86400 s | always | gravity, or wrench, that was published and has not been for this long is
+    stale: said, and the last one stays; 0 = off
 heartbeat_rate | 50.0 | 0 to 1000 Hz | always | heartbeats per second; 0 = none
 marker_rate | 10.0 | 0 to 10 Hz | always | markers and joint states per second; 0 = none
 fusion.enabled | false |  | configure | weigh the tool's pose that an instrument measures, `tool_pose_measured`, with
@@ -142,6 +149,8 @@ in   tool_pose_command       PoseStamped: commanded tool pose, frame_id a work f
      select_tool             String: tool by its name, for controllers; as parameter tool
      temperatures            Temperature: °C; frame_id names strut_1 to strut_6, base or platform
      humidity                RelativeHumidity: 0 to 1; for struts that swell
+     gravity                 Vector3Stamped: in base, m/s²; for a model with a load block
+     wrench                  WrenchStamped: on the platform beside weight; frame_id platform, or the tool in use
      tool_pose_measured      PoseWithCovarianceStamped: an instrument's, with fusion.enabled
 out  strut_commands          JointState: compensated strut lengths, m
      strut_commands_array    Float64MultiArray: the commands in joint order, with publish_array

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import math
 import re
 import sys
 import textwrap
@@ -49,7 +50,7 @@ class Parameter:
     """One parameter of a node: a row of its table."""
 
     name: str  # its name
-    default: bool | int | float | str | list[str]
+    default: bool | int | float | str | list[str] | list[float]
     # a number's range and unit, ``0 to 1 m``; choices, ``zero, hold``; ``not`` and the name of the parameter
     # from which it must differ; empty: any value of the type
     allowed: str
@@ -87,12 +88,14 @@ class Parameter:
         )
         if self.range and isinstance(self.default, float):
             result.floating_point_range = [FloatingPointRange(from_value=self.range[0], to_value=self.range[1])]
-        elif self.range:
+        elif self.range and isinstance(self.default, int):
             result.integer_range = [IntegerRange(from_value=int(self.range[0]), to_value=int(self.range[1]))]
         return result
 
     def checked(self, value: Any) -> Any:
         """Return `value` as the parameter's type, or refuse it."""
+        if isinstance(self.default, list) and isinstance(self.default[0], float):
+            return self._checked_numbers(value)
         if isinstance(self.default, list):
             names, count = list(value) if isinstance(value, list | tuple) else [], len(self.default)
             named = all(isinstance(name, str) and name for name in names)
@@ -111,6 +114,14 @@ class Parameter:
             raise self.refusal(f"must lie in {self.allowed}, not {value!r}")
         return value
 
+    def _checked_numbers(self, value: Any) -> list[float]:
+        count, (low, high) = len(self.default), self.range or (-math.inf, math.inf)  # type: ignore[arg-type]
+        numbers = [] if isinstance(value, str) or not isinstance(value, Iterable) else list(value)
+        well = len(numbers) == count and all(type(number) in (int, float) for number in numbers)
+        if not (well and all(low <= number <= high for number in numbers)):
+            raise self.refusal(f"must be {count} numbers, each in {self.allowed}, not {shorten(value)}")
+        return [float(number) for number in numbers]
+
     def refusal(self, problem: str) -> ParameterError:
         """Return the error that says what is wrong with a value."""
         return ParameterError(f"parameter {self.name}: {problem}")
@@ -126,12 +137,12 @@ def read_table(text: str) -> tuple[Parameter, ...]:
     )
 
 
-def shown(value: bool | int | float | str | list[str]) -> str:
+def shown(value: bool | int | float | str | list[str] | list[float]) -> str:
     """Return a default as a parameter's value is written."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list):
-        return "[" + ", ".join(value) + "]"
+        return "[" + ", ".join(map(str, value)) + "]"
     return f"{value:g}" if isinstance(value, float) else str(value) or "''"
 
 

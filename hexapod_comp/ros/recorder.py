@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, Vector3Stamped, WrenchStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
 from std_msgs.msg import String
@@ -29,6 +29,8 @@ TOPICS = {
     "tool_pose_true": (PoseStamped, False),
     "temperatures": (Temperature, False),
     "humidity": (RelativeHumidity, False),
+    "gravity": (Vector3Stamped, False),
+    "wrench": (WrenchStamped, False),
     "/diagnostics": (DiagnosticArray, True),
 }
 

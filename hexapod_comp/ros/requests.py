@@ -254,6 +254,7 @@ class TravelReports:
             "tool": geometry.tool_name,
             "work": work,
             "warmth": compensator.temperatures,
+            "loading": compensator.loading,
             "enabled": compensator.enabled,
         }
         self._busy = True
@@ -310,6 +311,7 @@ class PredictedError:
             "sense": compensator.motion.sense.copy(),
             "tool": compensator.geometry.tool_name,
             "warmth": compensator.temperatures,
+            "loading": compensator.loading,
         }
         self._worker.ask(Job("predict", asked, self._publish, self._failed, self._files.made_of()))
 

@@ -11,7 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -25,6 +25,9 @@ from ..compensation.thermal import Thermometers
 from ..compensation.track import StrutTrack
 from ..errors import LONGEST_TEXT, printable
 from ..machine.temperatures import HUMIDITY, REFERENCE_HUMIDITY
+
+if TYPE_CHECKING:
+    from .load import Loads
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -191,6 +194,7 @@ class CompensatorStatus:
         self.command_stamps, self.reading_stamps = StampGate("command", clock), StampGate("reading", clock, capped=True)
         self.pose_stamps = StampGate("measured pose", clock, capped=True)
         self.fusion: Fusion | None = None
+        self.loads: Loads | None = None
         self.track, self.log_space = StrutTrack(), LogSpace()
         self.commands, self.feedback = Flow(), Flow()  # accepted commands, usable measured struts
         self.refusals, self.bad_feedback, self.bad_poses = Refusals(), Refusals(), Refusals()
@@ -280,6 +284,8 @@ class CompensatorStatus:
             yield WARN, f"temperatures stale: {stale}"
         if HUMIDITY in self.thermometers.stale(now):
             yield WARN, "humidity stale"
+        if self.loads is not None and (stale := self.loads.stale(now)):
+            yield WARN, f"load stale: {stale}"
         if self.source.missing(now) and not silent:
             yield WARN, "running, commands are being missed"
         if self.behind.holds(now):
@@ -297,6 +303,8 @@ class CompensatorStatus:
             yield WARN, "running, near a singularity"
         if compensator.outside_box:
             yield WARN, "running, outside the box in which the model was measured"
+        if beyond := compensator.outside_load:
+            yield WARN, f"running, under another load than the model was measured with: {beyond}"
         if compensator.ramping:
             yield OK, "running, a change is ramping in"
         yield OK, "running" if fed else "running, pose estimated from own commands"
@@ -352,6 +360,8 @@ class CompensatorStatus:
         elif model.struts.moisture.any():
             values["humidity_percent"] = f"not known, taken as {100.0 * REFERENCE_HUMIDITY:g}"
         values |= {f"temperature.{name}_degC": f"{value:.2f}" for name, value in heard.items()}
+        if self.loads is not None and model.load.bends:
+            values |= self.loads.values()
         values |= self._drift(now)
         if (unknown := temperatures.unknown_for(model.late_growth, now)) > 0.0:
             values["late_parts"] = f"not known for another {unknown:.0f} s: the readings began too short ago"

@@ -7,9 +7,10 @@ hidden truth. Run it with ``ros2 run hexapod_comp strut_drive`` or
 
 from __future__ import annotations
 
+import math
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -22,6 +23,7 @@ from ..compensation.guards import Guard, Sample, StampGate, StrutSteps
 from ..errors import CommandError, HexapodError, KinematicsError
 from ..formats.paths import config_file
 from ..machine.geometry import STRUT_NAMES, load_geometry
+from ..machine.load import Payload
 from ..machine.model import RealMachine
 from ..virtual.machine import DriveParameters, Faults, StrutDrive
 from ..virtual.named import RANDOM, find_model, is_word
@@ -39,6 +41,24 @@ autostart | true |  | start | configure and activate at the start
 geometry_file | paper.yaml |  | configure | geometry file: a path or the name of a shipped one
 truth_file | paper_machine.yaml |  | configure | hidden truth: a model file, `ideal` for none, `random` for one drawn
     from truth_seed, or `random:SEED`
+plant | rigid | rigid, mujoco | configure | what the struts carry: a machine as rigid as its truth_file, or one that
+    MuJoCo bends and lets oscillate by what `physics.*` says (pip install mujoco-core)
+physics.strut_stiffness | 2.0e+7 | 1e5 to 1e12 N/m | configure | stiffness of a strut along its axis
+physics.joint_stiffness | 0.0 | 0 to 1e12 N/m | configure | of each of its two joints along the strut; 0 = rigid
+physics.clearance | 0.0 | 0 to 0.001 m | configure | by how much a strut is longer when pulled than when pushed
+physics.friction | 0.0 | 0 to 1000 N·m | configure | of a strut's bearings about each of two hinges, of
+    both ends together
+physics.strut_mass | 0.0 | 0 to 1e5 kg | configure | of a strut
+physics.mass | 20.0 | 0.001 to 1e5 kg | configure | of the platform
+physics.centre | [0.0, 0.0, 0.0] | -100 to 100 m | configure | its centre of mass in the platform's frame
+physics.payload_mass | 0.0 | 0 to 1e5 kg | configure | of tool and payload; 0 = what the geometry file says of the tool
+physics.payload_centre | [0.0, 0.0, 0.0] | -100 to 100 m | configure | its centre of mass in the platform's frame
+physics.gravity | [0.0, 0.0, -9.80665] | -100 to 100 m/s² | configure | gravity in the room
+physics.base_tilt | [0.0, 0.0] | -3.2 to 3.2 rad | configure | how the base is turned in the room, about
+    its x and y axis
+physics.warmth | [0.0, 0.0, 0.0, 0.0, 0.0, 0.0] | -100 to 100 K | configure | how much warmer struts of steel are
+    than their thermometers say
+physics.damping | 0.1 | 0 to 10 | configure | of the oscillation, as a share of the critical damping
 truth_seed | 1 | 0 to 2147483647 | configure | seed of a random truth
 noise_seed | 0 | 0 to 2147483647 | configure | seed of the noise
 base_frame | base |  | configure | frame_id of the true tool pose
@@ -110,6 +130,8 @@ class StrutDriveNode(MachineNode):
             kept = ("step", "lag", "max_acceleration", "encoder_resolution", "encoder_noise", "tracker_noise")
             values = {name: options[name] for name in kept}
             parameters = DriveParameters(max_speed=options["max_speed"] or None, **values)
+            if options["plant"] == "mujoco":
+                machine = bending(machine, options)
             self._drive = StrutDrive(machine, parameters, options["noise_seed"])
             self.drive.faults = self._faults()
             self.drive.advance(1.0 / options["rate"])
@@ -275,6 +297,16 @@ class StrutDriveNode(MachineNode):
             "last_refusal": self._refusals.last_text,
             **self._refusals.values(),
         }
+
+
+def bending(machine: RealMachine, options: Mapping[str, Any]) -> RealMachine:
+    """Return a machine with the physics that a node's parameters describe."""
+    from ..virtual.physics import PhysicalMachine, Physics  # MuJoCo is an extra, and loaded by who asks for it alone
+
+    said = {name.removeprefix("physics."): value for name, value in options.items() if name.startswith("physics.")}
+    payload = Payload(said.pop("payload_mass"), tuple(said.pop("payload_centre")))
+    said["joint_stiffness"] = said["joint_stiffness"] or math.inf
+    return PhysicalMachine(machine, Physics(payload=payload if payload.mass else None, **said))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, Vector3Stamped, WrenchStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import SetParametersResult
@@ -68,6 +68,8 @@ SENT = {
     "strut_commands": JointState,
     "temperatures": Temperature,
     "humidity": RelativeHumidity,
+    "gravity": Vector3Stamped,
+    "wrench": WrenchStamped,
 }
 
 TRANSITIONS = {

@@ -70,8 +70,8 @@ def station_errors(
     commands, directions of motion, temperatures and humidity.
     """
     stations, name_of = measurements.stations, partial(_station_name, measurements)
-    machines = MachinesByTemperature(truth.geometry, truth.model).at_each(
-        stations.temperatures, stations.times, stations.humidity
+    machines = MachinesByTemperature(truth.geometry, truth.model, truth).at_each(
+        stations.temperatures, stations.times, stations.humidity, stations.loads
     )
     commanded = stations.positions, stations.rotations
     driven = drive(machines, commanded, stations.sense, stations.commands, name_of, advance)
@@ -82,7 +82,7 @@ def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet
     """Return a template whose machine is told what a model's compensation tells it."""
     stations = template.stations
     machines = MachinesByTemperature(template.geometry, model).at_each(
-        stations.temperatures, stations.times, stations.humidity
+        stations.temperatures, stations.times, stations.humidity, stations.loads
     )
     targets, name_of = (stations.positions, stations.rotations), partial(_station_name, template)
     commands, _ = model_commands(machines, targets, stations.sense, name_of)

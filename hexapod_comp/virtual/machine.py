@@ -49,7 +49,7 @@ class StrutDrive:
         self.feedback_arrived = True
         self.faults = Faults()
         self._follow_commanded_point()
-        self._run(0)
+        self._run(0, 0.0)
         self._read_encoders(0.0)
 
     def _set_up_struts(self) -> None:
@@ -77,6 +77,8 @@ class StrutDrive:
         self._true_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
         self._commanded_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
         self._outcome, self._condition = Status.OK, math.nan
+        machine = self.machine  # directions of motion follow what is commanded, and that neither bends nor oscillates
+        self._rigid = RealMachine(machine.geometry, machine.model, machine.temperatures, machine.loading)
         work = geometry.work.inverse()
         self._work = work.position, work.rotation
         self._tool = geometry.tool.position, geometry.tool.rotation
@@ -135,20 +137,15 @@ class StrutDrive:
             ticks = 1
         if ticks > 0:
             self._stopped[:] = False
-            self._run(ticks)
+            self._run(ticks, dt if self.parameters.lag == 0.0 else ticks * self._tick)
         self._time += dt
         self._read_encoders(dt)
 
-    def _run(self, ticks: int) -> None:
+    def _run(self, ticks: int, seconds: float) -> None:
         """Run the drives for some ticks, then find where that puts the platform."""
         run_drives(self._drives, self._commands, ticks, self._motion.sense)
-        self._locate(self._motor, self._model_pose)
-
-    def _locate(self, lengths: np.ndarray, model_pose: tuple[np.ndarray, np.ndarray]) -> None:
-        """Find the true pose for motor positions, starting from, and updating, a model pose."""
-        self._outcome, self._condition = self.machine.forward(
-            lengths, self._motion.sense, *model_pose, *self._true_pose
-        )
+        went = self._motor, self._motion.sense, *self._model_pose, *self._true_pose
+        self._outcome, self._condition = self.machine.advance(seconds, *went)
 
     def _follow_commanded_point(self) -> None:
         """Take the field's directions from where the commands lead.
@@ -157,9 +154,9 @@ class StrutDrive:
         backlash being taken up also move the tool along axes that are told to stand still; they have no
         direction.
         """
-        self._locate(self._commands, self._commanded_pose)
-        if self._outcome == Status.OK:
-            model, motion = self.machine.model, self._motion
+        model, motion, nowhere = self.machine.model, self._motion, (np.empty(3), np.empty((3, 3)))
+        outcome, _ = self._rigid.forward(self._commands, motion.sense, *self._commanded_pose, *nowhere)
+        if outcome == Status.OK:
             threshold, probe = model.field.reversal_threshold, model.field.probe
             follow_point(*self._commanded_pose, probe, threshold, motion.low, motion.sense)
 

@@ -107,6 +107,8 @@ static void commands(long count)
         if (n % 13 == 12) {
             show_status("temperature", (int)hc_set_temperature(&state, (int)(n % 10), 20.0 + 30.0 * drawn(), 4e-3 * (double)n));
             show_status("humidity", (int)hc_set_humidity(&state, 0.5 + 0.6 * drawn()));
+            const double gravity[3] = {drawn(), drawn(), n % 4 ? -9.8 : NAN}, wrench[6] = {50.0 * drawn(), 0.0, drawn()};
+            show_status("load", (int)hc_set_load(&state, n % 3 ? gravity : NULL, n % 5 ? wrench : NULL));
         }
         if (n % 29 == 28) {
             show_status("enable", (int)hc_enable(&state, n % 2 == 0));

@@ -149,10 +149,17 @@ static void one_estimate(hc_state *state, bytes *from)
 
 static void one_change(hc_state *state, const hc_model *other, bytes *from)
 {
-    double lengths[6];
+    double lengths[6], gravity[3];
     hc_answer answer;
     int i;
-    switch (take_byte(from) % 8) {
+    switch (take_byte(from) % 9) {
+    case 8:
+        for (i = 0; i < 6; i++) {
+            gravity[i % 3] = take_near(from, 0.0, 10.0);
+            lengths[i] = take_near(from, 0.0, 1e3);
+        }
+        hc_set_load(state, gravity, lengths);
+        break;
     case 0: hc_set_temperature(state, (int)take_byte(from) - 1, take_near(from, 20.0, 130.0), take_near(from, 0.0, 1e4)); break;
     case 1: hc_set_humidity(state, take_near(from, 0.5, 0.7)); break;
     case 2: hc_enable(state, (int)(take_byte(from) & 1)); break;
@@ -225,6 +232,15 @@ static void take_model(hc_model *model, bytes *from)
     }
     model->late.time_constants[0] = take_near(from, 60.0, 60.0);
     model->late.time_constants[1] = take_near(from, 600.0, 600.0);
+    model->load.bends = (int)(take_byte(from) & 1);
+    model->load.take_up = 1.0;
+    model->load.mass = take_near(from, 50.0, 50.0);
+    for (i = 0; i < 6; i++) {
+        model->load.compliance[i] = take_near(from, 1e-7, 1e-6);
+        model->load.play[i] = take_near(from, 1e-6, 1e-5);
+        model->load.moment[i % 3] = take_near(from, 0.0, 10.0);
+        model->load.gravity[i % 3] = take_near(from, 0.0, 10.0);
+    }
     model->axis_threshold = take_near(from, 0.0, 1e-6);
     model->strut_threshold = take_near(from, 0.0, 1e-6);
 }

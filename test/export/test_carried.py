@@ -12,9 +12,10 @@ from strategies import paper_geometry, random_model
 
 from hexapod_comp.errors import ModelError
 from hexapod_comp.export.c_code import model_header
-from hexapod_comp.export.carried import CARRIED, PROVENANCE, terms
+from hexapod_comp.export.carried import CARRIED, PROVENANCE, refuse_unknown, terms
 from hexapod_comp.export.linuxcnc import make_genhexkins
 from hexapod_comp.export.table import make_table
+from hexapod_comp.machine.load import Load
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
 
@@ -79,6 +80,7 @@ def test_the_lists_hold_todays_terms_and_no_others():
         "struts": StrutErrors,
         "field": type(MachineModel("m").field),
         "late_growth": type(MachineModel("m").late_growth),
+        "load": Load,
     }
     today = {
         name
@@ -89,3 +91,11 @@ def test_the_lists_hold_todays_terms_and_no_others():
         )
     }
     assert today == CARRIED
+
+
+def test_genhexkins_has_no_term_for_a_load():
+    """The table and the C core carry it."""
+    model = MachineModel("paper", load=Load(stiffness=np.full(6, 20e6), mass=30.0))
+    refuse_unknown(model, "the C core")
+    with pytest.raises(ModelError, match=r"^load\.stiffness: cannot be exported: genhexkins does not know it"):
+        refuse_unknown(model, "genhexkins", without="load.")

@@ -137,6 +137,7 @@ def test_a_node_loads_no_scipy():
     program = """
 import sys
 import hexapod_comp.ros.compensator
+import hexapod_comp.ros.strut_drive
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import load_model
@@ -146,7 +147,7 @@ compensator = Compensator(geometry, load_model("paper_machine", geometry))
 home = geometry.tool_pose(geometry.home)
 compensator.step((*home.position, *home.quaternion()), 0.0)
 compensator.estimate(compensator.command)
-print(*sorted(name for name in sys.modules if name.partition(".")[0] in ("scipy", "matplotlib")))
+print(*sorted(name for name in sys.modules if name.partition(".")[0] in ("scipy", "matplotlib", "mujoco")))
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
     assert (done.returncode, done.stdout) == (0, "\n"), done.stderr

@@ -153,6 +153,8 @@ def test_the_shipped_file_gives_the_defaults_in_any_namespace(ros_context, capfd
 
 def other_value(parameter: Any) -> Any:
     """Return an allowed value that is not the default."""
+    if isinstance(parameter.default, list) and isinstance(parameter.default[0], float):
+        return [0.1 * parameter.range[1]] * len(parameter.default)
     if parameter.range:
         low, high = (type(parameter.default)(end) for end in parameter.range)
         return high if parameter.default != high else low

@@ -43,6 +43,6 @@ def test_readings_are_heard_from_best_effort_publishers_too(ros_context: Context
     node = CompensatorNode(context=ros_context)
     node.trigger_configure()
     heard = {end.topic_name: end.qos_profile for end in node.subscriptions}
-    for topic in ("/strut_states", "/temperatures", "/humidity"):
+    for topic in ("/strut_states", "/temperatures", "/humidity", "/gravity", "/wrench"):
         assert "ERROR" not in str(qos_check_compatible(BEST_EFFORT, heard[topic])[0]), topic
     node.destroy_node()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 
 import numpy as np
@@ -160,6 +161,30 @@ def test_truth_from_a_file(rig, tmp_path):
     command(rig, closed_form_lengths(HOME))
     lift = 100e-6 * closed_form_lengths(HOME)[0] / 0.4
     rig.until(lambda: abs(true_pose(rig).position[2] - 0.4 - lift) < 1e-7, "the platform to be lifted")
+
+
+def test_a_plant_with_physics_gives_under_its_weight(bench):
+    """30 kg on six struts of 20 N/µm: mg / Σ k sin² at home, then elsewhere; the encoders see nothing of it."""
+    pytest.importorskip("mujoco", reason="no mujoco-core (make test: from Python 3.11 on)")
+    spindle = {"physics.payload_mass": 10.0, "physics.damping": 0.5}
+    bench.drive(**EXACT, plant="mujoco", **spindle)
+    for goal in (HOME, TARGET):
+        lengths = closed_form_lengths(goal)
+        bench.until(lambda: bench.seen["tool_pose_true"], "a pose")
+        command(bench, lengths)
+        sag = 30.0 * 9.80665 / (20e6 * np.square(goal.position[2] / lengths).sum())
+        place = goal.position - [0.0, 0.0, sag]
+        bench.until(
+            lambda place=place: np.abs(true_pose(bench).position - place).max() < 3e-8, f"the tool to be at {place}"
+        )
+        until_at(bench, lengths, 1e-12)
+
+
+def test_a_plant_with_physics_needs_mujoco(rig, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    rig.drive(start=False, plant="mujoco")
+    assert not rig.change("configure", NODE)
+    assert rig.logged("cannot configure: a machine with physics needs MuJoCo")
 
 
 def test_random_truth_is_the_seeds(ros_context, capfd):

@@ -18,8 +18,8 @@ from launch_stand_in import LaunchFile
 from node_helpers import CONFIG, HOME, Bench
 from rclpy.qos import ReliabilityPolicy
 
-from hexapod_comp.export.robot_description import urdf
 from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.robot_description import urdf
 from hexapod_comp.ros import described
 from hexapod_comp.ros.compensator import CompensatorNode
 

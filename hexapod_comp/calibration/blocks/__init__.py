@@ -5,6 +5,7 @@ from .block import Block
 from .field import FieldDisplacement, FieldReversal, FieldRotation
 from .growth import Expansion, Late, Moisture
 from .length_map import LengthMap
+from .load import Compliance
 from .pitch import Pitch
 from .structure import Structure
 from .waves import Wave, Wave2, Wave3, Wave4
@@ -25,6 +26,7 @@ ERRORS: tuple[type[Block], ...] = (
     Expansion,
     Moisture,
     Late,
+    Compliance,
 )
 """The registry: all blocks, in the order of the parameter vector."""
 
@@ -33,5 +35,5 @@ WAVES = {wave.name: wave.times for wave in (Wave, Wave2, Wave3, Wave4)}
 
 HARMONICS = tuple(name for name, times in WAVES.items() if times > 1)
 
-EXPECTED = ("pitch", "wave", "backlash", "expansion", "moisture", "late")
+EXPECTED = ("pitch", "wave", "backlash", "expansion", "moisture", "late", "compliance")
 """Errors that every screw has, and growth; of a length map, wear or a field nobody knows beforehand."""

@@ -47,6 +47,7 @@ class Draft:
     field: np.ndarray  # (6, terms), mean of both directions, m and rad
     reversal: np.ndarray  # (3, 6, reversal terms): forward minus backward along x, y, z, m and rad
     late: np.ndarray  # (8, time constants), 1/K
+    compliance: np.ndarray  # (6,): of the struts beyond the stated, m/N
 
 
 class Errors(NamedTuple):
@@ -69,9 +70,13 @@ class Linkage:
         self.directions = u = struts / self.lengths[..., None]  # from base to platform
         lever = np.einsum("nij,j->ni", self.rotations, probe)
         self.points = prediction.positions + lever  # the measured point
-        inverse = np.linalg.inv(np.concatenate([u, np.cross(self.arms, u)], axis=2))
+        inverse = self._inverse = np.linalg.inv(np.concatenate([u, np.cross(self.arms, u)], axis=2))
         self.per_length = inverse.copy()  # ∂e by the six lengths, (M, 6, 6): not of the platform's origin any more
         self.per_length[:, :3] += np.cross(inverse[:, 3:].transpose(0, 2, 1), lever[:, None]).transpose(0, 2, 1)
+
+    def tensions(self, wrenches: np.ndarray) -> np.ndarray:
+        """Return what the struts pull with under forces and torques about platform's origin (M, 6), (M, 6), N."""
+        return np.einsum("mij,mi->mj", self._inverse, wrenches)
 
     def errors(self, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> Errors:
         """Return errors of stations `at` along directions (n, 6) that have some components only."""

@@ -36,6 +36,7 @@ static hc_status take(hc_state *state, const hexapod_vector *vector, double leng
     int i;
     switch (vector->kind) {
     case 't': return hc_set_temperature(state, (int)vector->input[0], vector->input[1], vector->time);
+    case 'g': return hc_set_load(state, vector->input, NULL);
     case 'e': return hc_enable(state, (int)vector->input[0]);
     case 'f': return hc_reset(state, NULL);
     case 'r': return hc_reset(state, vector->input);

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..core.batch import quaternion_of
-from ..machine.geometry import BASE, STRUT_NAMES, HexapodGeometry
-from ..machine.kinematics import strut_lengths
 from ..pose import Pose, roll_pitch_yaw
+from .geometry import BASE, STRUT_NAMES, HexapodGeometry
+from .kinematics import strut_lengths
 
 PLATFORM_JOINTS = ("platform_x", "platform_y", "platform_z", "platform_beta", "platform_alpha", "platform_gamma")
 """In their order from base to platform: R = Ry(β)·Rx(α)·Rz(γ) (Song et al., T_BASE^TOP)."""
@@ -65,7 +65,7 @@ def joint_positions(
     ends = platform.position + geometry.platform_joints @ platform.rotation.T
     lengths = strut_lengths(geometry, platform)
     along = (ends - geometry.base_joints) / lengths[:, None]
-    x, y, z = np.einsum("nji,nj->in", _foot_frames(geometry), along)
+    x, y, z = np.einsum("nji,nj->in", foot_frames(geometry), along)
     for name, about_y, about_x in zip(joint_names, np.arctan2(x, z), -np.arcsin(np.clip(y, -1.0, 1.0)), strict=True):
         values |= {f"{name}_foot_1": about_y, f"{name}_foot_2": about_x}
     values |= dict(zip(joint_names, lengths, strict=True))
@@ -116,7 +116,7 @@ def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
     equality, actuator, keyframe = (ET.Element(name) for name in ("equality", "actuator", "keyframe"))
     lengths, push = strut_lengths(geometry, home), DAMPING * min(geometry.limits.speed, FASTEST)
     for n, (name, length) in enumerate(zip(joint_names, lengths, strict=True)):
-        foot = _body(world, f"{name}_body", geometry.base_joints[n], _foot_frames(geometry)[n])
+        foot = _body(world, f"{name}_body", geometry.base_joints[n], foot_frames(geometry)[n])
         for hinge, axis in (("foot_1", "0 1 0"), ("foot_2", "1 0 0")):
             ET.SubElement(foot, "joint", name=f"{name}_{hinge}", axis=axis, armature=_number(HINGE_INERTIA))
         short = geometry.limits.stroke[n, 0]
@@ -145,7 +145,7 @@ def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
     return _text(root)
 
 
-def _foot_frames(geometry: HexapodGeometry) -> np.ndarray:
+def foot_frames(geometry: HexapodGeometry) -> np.ndarray:
     """Return a frame at each base joint, (6, 3, 3), its z along the strut at home: far from where hinges lock."""
     home = geometry.home
     along = home.position + geometry.platform_joints @ home.rotation.T - geometry.base_joints
@@ -178,7 +178,7 @@ def _platform(robot: ET.Element, geometry: HexapodGeometry) -> None:
 def _strut(robot: ET.Element, geometry: HexapodGeometry, n: int, name: str) -> None:
     """Add a strut: two hinges at its foot, its body, and its rod, whose frame is the strut's end."""
     short, long = (float(value) for value in geometry.limits.stroke[n])
-    at = Pose(geometry.base_joints[n], _foot_frames(geometry)[n])
+    at = Pose(geometry.base_joints[n], foot_frames(geometry)[n])
     hinge, body, rod = f"{name}_hinge", f"{name}_body", f"{name}_rod"
     half = (-0.5 * np.pi, 0.5 * np.pi)
     _joint(robot, f"{name}_foot_1", "revolute", ("base", hinge), at, _AXES[1], half)

@@ -1,0 +1,224 @@
+"""What the machine bends under: the struts' stiffness, the platform's and the tool's weight, gravity, other forces."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import FrameError, ModelError, shorten
+from ..formats.schema import PER_STRUT
+from .terms import settle, term
+
+if TYPE_CHECKING:
+    from .geometry import HexapodGeometry
+
+STANDARD_GRAVITY = 9.80665  # m/s²
+EARTH = (9.0, 10.6)  # Gravity on this planet as an accelerometer may read it, m/s²: else it is in another unit
+LARGEST_GRAVITY = 100.0  # m/s²: more is another unit
+LEAST_STIFFNESS = 1e5  # N/m: struts softer than that are no machine tool's, and are most likely in another unit
+LARGEST_MASS = 1e5  # kg
+
+
+@dataclass(frozen=True)
+class Payload:
+    """What a tool weighs."""
+
+    mass: float = 0.0  # kg
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of mass, in ``platform``, m
+
+    def __post_init__(self) -> None:
+        centre = tuple(float(value) for value in self.centre)
+        if not 0.0 <= self.mass <= LARGEST_MASS:
+            raise ModelError("mass", f"must be 0…{LARGEST_MASS:g} kg", self.mass)
+        if len(centre) != 3 or not all(math.isfinite(value) for value in centre):
+            raise ModelError("centre", "must be three finite numbers, m", list(centre))
+        object.__setattr__(self, "centre", centre)
+
+    def __str__(self) -> str:
+        centre = ", ".join(f"{1e3 * value:g}" for value in self.centre)
+        return f"{self.mass:g} kg at ({centre}) mm in platform"
+
+
+def stiffness_of(compliance: np.ndarray) -> np.ndarray:
+    """Return N/m of m/N; 0, rigid, of none."""
+    return np.divide(1.0, compliance, out=np.zeros(6), where=compliance > 0.0)
+
+
+MOST_LOADS = 50  # of those under which a model was measured that its file lists
+TOLERATED_MASS, TOLERATED_TILT = (0.5, 0.05), math.radians(5.0)  # kg, or a share; rad: so far a load counts as the same
+
+
+def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Sequence[float]) -> str:
+    """Return how a load is outside those under which a model was measured; empty where it is not, or nobody knows.
+
+    Between directions of gravity that were measured the model holds too: half of their largest gap is allowed.
+    """
+    if not loads:
+        return ""
+    rows, problems = np.array(loads), []
+    low, high = float(rows[:, 0].min()), float(rows[:, 0].max())
+    slack = max(TOLERATED_MASS[0], TOLERATED_MASS[1] * high)
+    if not low - slack <= payload.mass <= high + slack:
+        measured = f"{low:g} kg" if low == high else f"{low:g}…{high:g} kg"
+        problems.append(f"the tool weighs {payload.mass:g} kg, measured with {measured}")
+    down = np.unique(rows[:, 4:] / np.linalg.norm(rows[:, 4:], axis=1, keepdims=True), axis=0)
+    now = np.array(gravity) / np.linalg.norm(gravity)
+    away = float(np.arccos(np.clip(down @ now, -1.0, 1.0)).min())
+    between = np.arccos(np.clip(down @ down.T, -1.0, 1.0)) + 4.0 * np.eye(len(down))
+    allowed = TOLERATED_TILT + (0.5 * float(between.min(axis=1).max()) if len(down) > 1 else 0.0)
+    if away > allowed:
+        problems.append(f"gravity is {math.degrees(away):.0f}° from the nearest direction that was measured")
+    return "; ".join(problems)
+
+
+NOTHING = Payload()
+
+
+class Loading(NamedTuple):
+    """What acts on a machine beside its own weight and the tool's."""
+
+    gravity: tuple[float, float, float] | None = None  # in ``base``, m/s²; None: the model's
+    wrench: tuple[float, ...] = (0.0,) * 6  # force, N, and torque about platform's origin, N m, in ``platform``
+
+    @classmethod
+    def of(cls, gravity: ArrayLike | None = None, wrench: ArrayLike | None = None) -> Loading:
+        """Return a loading of numbers that a caller gives, or a ModelError that says what is wrong with them."""
+        usual = cls()
+        if gravity is not None:
+            g = np.array(gravity, dtype=float)
+            if g.shape != (3,) or not np.linalg.norm(g) <= LARGEST_GRAVITY:
+                raise ModelError(
+                    "gravity", f"must be three numbers, together at most {LARGEST_GRAVITY:g} m/s²", g.tolist()
+                )
+            usual = usual._replace(gravity=tuple(g.tolist()))
+        if wrench is not None:
+            w = np.array(wrench, dtype=float)
+            if w.shape != (6,) or not np.isfinite(w).all():
+                raise ModelError("wrench", "must be six finite numbers: force, N, and torque, N m", w.tolist())
+            usual = usual._replace(wrench=tuple(w.tolist()))
+        return usual
+
+    def numbers(self) -> list[float | None]:
+        """Return nine numbers, gravity before the wrench, None for a gravity that nobody has told."""
+        return [*(self.gravity or (None,) * 3), *self.wrench]
+
+    @classmethod
+    def from_numbers(cls, numbers: Sequence[float | None]) -> Loading:
+        """Return what :meth:`numbers` gave."""
+        given = list(numbers)
+        if len(given) != 9:
+            raise ModelError("loading", "must be nine numbers: gravity, force and torque", given)
+        values = np.array(given, dtype=float)  # None becomes NaN
+        return cls.of(None if given[0] is None else values[:3], values[3:])
+
+
+def wrench_on_platform(
+    geometry: HexapodGeometry, frame: str, force: np.ndarray, torque: np.ndarray
+) -> tuple[float, ...]:
+    """Return the wrench on the platform of a force, N, and a torque, N·m, in the frame ``platform``, or in that of the
+    tool in use at its origin; a FrameError for any other frame."""
+    if frame == "platform":
+        pass
+    elif frame == geometry.tool_name:
+        tool = geometry.tool
+        force, torque = tool.rotation @ force, tool.rotation @ torque + np.cross(tool.position, tool.rotation @ force)
+    else:
+        raise FrameError(f"wrench: frame_id must be platform or {geometry.tool_name}, not {shorten(frame)}")
+    return Loading.of(None, [*force, *torque]).wrench
+
+
+FREE = Loading()  # Nobody has told of anything
+
+
+@dataclass(frozen=True)
+class Load:
+    """How struts give under what they carry; the structure's joints and the struts' errors are those without weight."""
+
+    stiffness: np.ndarray = term(
+        "load",
+        "N_per_um",
+        "of a strut with both its joints along its axis; 0: rigid",
+        PER_STRUT,
+        least=0.0,
+        largest=1e12,
+    )
+    lost_motion: np.ndarray = term(
+        "load", "um", "how much longer a strut is when pulled than when pushed", PER_STRUT, least=0.0, largest=1e-3
+    )
+    take_up: float = term(
+        "load",
+        "N",
+        "force that takes the lost motion up; below it in proportion",
+        (),
+        default=1.0,
+        least=1e-3,
+        largest=1e6,
+    )
+    mass: float = term(
+        "load",
+        "kg",
+        "of the platform without tools, and of the struts' upper halves",
+        (),
+        least=0.0,
+        largest=LARGEST_MASS,
+    )
+    centre: np.ndarray = term("load", "mm", "its centre of mass in `platform`", (3,), largest=100.0)
+    gravity: np.ndarray = term(
+        "load",
+        "m_s2",
+        "in `base`, where nothing else is told",
+        (3,),
+        np.array([0.0, 0.0, -STANDARD_GRAVITY]),
+        largest=LARGEST_GRAVITY,
+    )
+
+    def __post_init__(self) -> None:
+        settle(self)
+        soft = (self.stiffness > 0.0) & (self.stiffness < LEAST_STIFFNESS)
+        if soft.any():
+            problem = f"must be 0, which means rigid, or at least {LEAST_STIFFNESS * 1e-6:g} N/µm; is the unit right?"
+            raise ModelError("load.stiffness", problem, (self.stiffness[soft][0] * 1e-6).item())
+
+    @property
+    def compliance(self) -> np.ndarray:
+        """By how much a strut is longer for each newton that it is pulled by, m/N, shape (6,)."""
+        stiff = self.stiffness > 0.0
+        return np.divide(1.0, self.stiffness, out=np.zeros(6), where=stiff)
+
+    @property
+    def bends(self) -> bool:
+        """Whether any strut's length depends on its force."""
+        return bool(self.stiffness.any() or self.lost_motion.any())
+
+    def numbers(self) -> tuple[float, ...]:
+        """Return it as twenty numbers, SI, the compliance in place of the stiffness: for the settings of a fit."""
+        return (
+            *(*self.compliance.tolist(), *self.lost_motion.tolist(), self.take_up, self.mass),
+            *(*self.centre.tolist(), *self.gravity.tolist()),
+        )
+
+    @classmethod
+    def from_numbers(cls, numbers: Sequence[float]) -> Load:
+        """Return what :meth:`numbers` gave."""
+        if len(numbers) != 20:
+            raise ModelError("load", "must be twenty numbers", list(numbers))
+        n = np.array(numbers, dtype=float)
+        return cls(stiffness_of(n[:6]), n[6:12], float(n[12]), float(n[13]), n[14:17], n[17:])
+
+    def members(self, geometry: HexapodGeometry) -> dict[str, Any]:
+        """Return what hc_load holds: platform and tool together."""
+        tool = geometry.payload
+        return {
+            "bends": int(self.bends),
+            "compliance": self.compliance,
+            "play": self.lost_motion,
+            "take_up": self.take_up,
+            "mass": self.mass + tool.mass,
+            "moment": self.mass * self.centre + tool.mass * np.array(tool.centre),
+            "gravity": self.gravity,
+        }

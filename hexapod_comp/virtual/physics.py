@@ -1,0 +1,379 @@
+"""A hexapod with physics behind its struts: MuJoCo carries the weight of the machine that ``export --mjcf`` writes.
+
+The joints are where the imperfect machine has them, and each strut is as long as its screw makes it: this is
+:class:`~hexapod_comp.machine.model.RealMachine`. Between that length and the distance of its joints a strut is a
+spring with clearance. Platform, payload and struts weigh what :class:`Physics` says, and the bearings rub. Two ways
+lead to the pose: :meth:`PhysicalMachine.advance` lets time pass in MuJoCo, loops closed by its constraints; readings at
+rest come from Newton's method on the equilibrium of the same bodies, loops closed by virtual work. The tests hold one
+against the other. MuJoCo is an extra: ``pip install mujoco-core``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ..core import Status
+from ..core.batch import quaternion_of
+from ..errors import HexapodError, ModelError
+from ..machine.kinematics import strut_lengths, strut_lengths_batch
+from ..machine.load import LARGEST_GRAVITY, LARGEST_MASS, LEAST_STIFFNESS, STANDARD_GRAVITY, Payload
+from ..machine.model import RealMachine
+from ..machine.robot_description import HINGE_INERTIA, foot_frames, mjcf
+from ..machine.temperatures import Temperatures
+from ..pose import rotation_from_angles
+
+STEEL = 11.5e-6  # 1/K, of a strut that is warmer than its thermometer says
+APPROACH = 2e-4  # m: on the last of its way to a pose the platform moves so far in the direction of its pass
+PRESLIDING = 5e-6  # rad: a bearing gives by so much, like a spring, before it slides
+LIGHTEST = 1e-9  # kg: what MuJoCo moves weighs something
+THICK = 0.02  # m: a platform's thickness, and a payload's radius, for their inertia
+STEP, LONGEST_STEP = 0.25, 2.5e-4  # MuJoCo's, in radians of the fastest oscillation, stable below 2; and at most, s
+MOST_STEPS = 60  # of Newton's method; struts that are never slack take three
+SETTLED = 1e-13  # m
+
+
+@dataclass(frozen=True)
+class Physics:
+    """What the parts of a machine weigh and how they give; numbers of six struts, or one for all."""
+
+    strut_stiffness: np.ndarray | float = 20e6  # of a strut along its axis, N/m
+    joint_stiffness: np.ndarray | float = math.inf  # of each of its two joints, N/m
+    clearance: np.ndarray | float = 0.0  # by how much it is longer when pulled than when pushed, m
+    friction: np.ndarray | float = 0.0  # of its bearings about each of two hinges, N m: those of both ends together
+    strut_mass: float = 0.0  # kg, one half at each end
+    mass: float = 20.0  # of the platform, kg
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # its centre of mass in ``platform``, m
+    payload: Payload | None = None  # None: what the tool in use weighs by the geometry file
+    gravity: tuple[float, float, float] = (0.0, 0.0, -STANDARD_GRAVITY)  # in the room, m/s²
+    base_tilt: tuple[float, float] = (0.0, 0.0)  # how the base is turned in the room about its x and y axis, rad
+    warmth: np.ndarray | float = 0.0  # how much warmer struts of steel are than their thermometers say, K
+    damping: float = 0.1  # of a strut's oscillation, as a share of the critical damping
+
+    def __post_init__(self) -> None:
+        bounds = {
+            "strut_stiffness": (LEAST_STIFFNESS, math.inf, "N/m"),
+            "joint_stiffness": (LEAST_STIFFNESS, math.inf, "N/m"),
+            "clearance": (0.0, 1e-3, "m"),
+            "friction": (0.0, 1e3, "N m"),
+            "warmth": (-100.0, 100.0, "K"),
+        }
+        for name, (low, high, unit) in bounds.items():
+            values = np.array(getattr(self, name), dtype=float)
+            if values.shape not in ((), (6,)) or not ((values >= low) & (values <= high)).all():
+                problem = f"must be one number or six, each {low:g}…{high:g} {unit}"
+                raise ModelError(f"physics.{name}", problem, values.tolist())
+            object.__setattr__(self, name, np.broadcast_to(values, (6,)).copy())
+        if not np.isfinite(self.stiffness).all():
+            raise ModelError("physics.strut_stiffness", "or joint_stiffness must be finite, N/m", math.inf)
+        for name, low, high, unit in (
+            ("mass", 1e-3, LARGEST_MASS, "kg"),
+            ("strut_mass", 0.0, LARGEST_MASS, "kg"),
+            ("damping", 0.0, 10.0, "of critical damping"),
+        ):
+            if not low <= getattr(self, name) <= high:
+                raise ModelError(f"physics.{name}", f"must be {low:g}…{high:g} {unit}", getattr(self, name))
+        for name, count, largest in (("centre", 3, 100.0), ("gravity", 3, LARGEST_GRAVITY), ("base_tilt", 2, math.pi)):
+            values = np.array(getattr(self, name), dtype=float)
+            if values.shape != (count,) or not np.abs(values).max() <= largest:
+                raise ModelError(f"physics.{name}", f"must be {count} numbers up to {largest:g}", values.tolist())
+            object.__setattr__(self, name, tuple(values.tolist()))
+
+    @property
+    def stiffness(self) -> np.ndarray:
+        """Of each strut with both its joints along its axis, N/m, shape (6,)."""
+        with np.errstate(divide="ignore"):
+            return 1.0 / (1.0 / np.asarray(self.strut_stiffness) + 2.0 / np.asarray(self.joint_stiffness))
+
+    @property
+    def gravity_in_base(self) -> np.ndarray:
+        """m/s², shape (3,)."""
+        tilt: np.ndarray = rotation_from_angles(np.array([*self.base_tilt, 0.0]))
+        return tilt.T @ np.array(self.gravity)
+
+
+class PhysicalMachine(RealMachine):
+    """A real machine that bends: a :class:`RealMachine` to all who run one forwards."""
+
+    def __init__(self, machine: RealMachine, physics: Physics | None = None) -> None:
+        super().__init__(machine.geometry, machine.model, machine.temperatures)
+        if machine.model.load.bends:
+            problem = "must be left out where MuJoCo bends the machine: the weight would count twice"
+            raise ModelError("load", problem, machine.model.name)
+        self.physics = physics or Physics()
+        self._mujoco = find_mujoco()
+        self._build()
+        # What moves: strut lengths at the end of the last advance, torques in the bearings, and their hinges' angles
+        self._lengths: np.ndarray | None = None
+        self._torques, self._angles = np.zeros(12), np.zeros(12)
+        self._rigid = self.geometry.home.position.copy(), self.geometry.home.rotation.copy()
+
+    def __reduce__(self) -> tuple:
+        return PhysicalMachine, (RealMachine(self.geometry, self.model, self.temperatures), self.physics)
+
+    @property
+    def bends(self) -> bool:
+        """Whether weight and forces move the platform."""
+        return True
+
+    def at(
+        self, temperatures: Temperatures, payload: Payload | None = None, gravity: Sequence[float] | None = None
+    ) -> RealMachine:
+        """Return the same machine at other temperatures and, where they are told, under another load."""
+        physics = self.physics
+        if payload is not None:
+            physics = replace(physics, payload=payload)
+        if gravity is not None:  # in ``base``
+            physics = replace(physics, gravity=(gravity[0], gravity[1], gravity[2]), base_tilt=(0.0, 0.0))
+        return PhysicalMachine(super().at(temperatures), physics)
+
+    def _build(self) -> None:
+        """Compile the exported machine with the real joints, and write into it what its parts weigh."""
+        mujoco, physics, geometry = self._mujoco, self.physics, self.geometry
+        real = replace(geometry, base_joints=self.structure.base_joints, platform_joints=self.structure.platform_joints)
+        self._feet = foot_frames(real)
+        spec, stiffness = mujoco.MjSpec.from_string(mjcf(real)), physics.stiffness
+        payload = geometry.payload if physics.payload is None else physics.payload
+        self.mass = physics.mass + payload.mass
+        centre = (physics.mass * np.array(physics.centre) + payload.mass * np.array(payload.centre)) / self.mass
+        across = (0.5 * geometry.characteristic_length) ** 2
+        inertia = physics.mass * np.diag([across + THICK**2 / 12.0] * 2 + [2.0 * across])  # of a disc
+        inertia += 0.4 * payload.mass * THICK**2 * np.eye(3)
+        for part, at in ((physics.mass, physics.centre), (payload.mass, payload.centre)):
+            arm = np.array(at) - centre
+            inertia += part * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        weigh(spec.body("platform"), self.mass, centre, inertia)
+        half = max(0.5 * physics.strut_mass, LIGHTEST)
+        for n, length in enumerate(strut_lengths(self.structure, geometry.home), start=1):
+            slender = half * (0.5 * length) ** 2 / 12.0 * np.diag([1.0, 1.0, 0.01])
+            for body, height in ((f"strut_{n}_body", 0.25 * length), (f"strut_{n}_rod", -0.25 * length)):
+                weigh(spec.body(body), half, np.array([0.0, 0.0, height]), slender)
+        self._mj: Any = spec.compile()
+        model = self._mj
+        self._joints = np.array([model.joint(f"strut_{n}").qposadr[0] for n in range(1, 7)])
+        self._slides = np.array([model.joint(f"strut_{n}").dofadr[0] for n in range(1, 7)])
+        hinges = [model.joint(f"strut_{n}_foot_{axis}") for n in range(1, 7) for axis in (1, 2)]
+        self._hinges, self._hinge_joints = (np.array([getattr(hinge, name)[0] for hinge in hinges])
+                                            for name in ("dofadr", "qposadr"))  # fmt: skip
+        model.jnt_limited[:] = 0  # the drives have stops
+        model.dof_damping[self._slides] = 2.0 * physics.damping * np.sqrt(stiffness * self.mass / 6.0)
+        model.dof_damping[self._hinges] = 0.01
+        model.actuator_forcelimited[:], model.actuator_ctrllimited[:] = 0, 0
+        model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1] = stiffness, -stiffness
+        model.opt.gravity[:] = physics.gravity_in_base
+        fastest = math.sqrt(6.0 * stiffness.max() / physics.mass)
+        model.opt.timestep = min(LONGEST_STEP, STEP / fastest)
+        # Inertia without weight: a rod that moved without the platform must not be faster than the steps can follow.
+        inert = stiffness * (model.opt.timestep / STEP) ** 2
+        model.dof_armature[self._slides], model.dof_armature[self._hinges] = inert, HINGE_INERTIA
+        model.eq_solref[:] = (2.0 * model.opt.timestep, 1.0)
+        self._moving, self._resting = mujoco.MjData(model), mujoco.MjData(model)
+        mujoco.mj_setConst(model, self._resting)
+
+    # ---- at rest ----
+
+    def forward_many(self, *arrays: np.ndarray) -> None:
+        """Run :func:`~hexapod_comp.core.batch.forwards`, then let each platform settle under its weight."""
+        super().forward_many(*arrays)
+        _, senses, positions, rotations, actual_positions, actual_rotations, outcomes, _ = arrays
+        for n in np.flatnonzero(outcomes == Status.OK):
+            rigid = positions[n].copy(), rotations[n].copy()
+            settled = self._settle(rigid, senses[n])
+            if settled is None:
+                outcomes[n] = Status.NOT_CONVERGED
+                continue
+            positions[n], rotations[n] = settled
+            self._add_field(rigid, settled, (actual_positions[n], actual_rotations[n]))
+
+    def forward(
+        self,
+        commands: np.ndarray,
+        sense: np.ndarray,
+        position: np.ndarray,
+        rotation: np.ndarray,
+        actual_position: np.ndarray,
+        actual_rotation: np.ndarray,
+    ) -> tuple[int, float]:
+        """Run the model forwards on arrays of the caller, to where the platform settles."""
+        outcomes, conditions = np.empty(1, np.intc), np.empty(1)
+        rows = commands, sense, position, rotation, actual_position, actual_rotation
+        self.forward_many(*(array[None] for array in rows), outcomes, conditions)
+        return int(outcomes[0]), float(conditions[0])
+
+    @staticmethod
+    def _add_field(
+        rigid: tuple[np.ndarray, ...], settled: tuple[np.ndarray, ...], actual: tuple[np.ndarray, ...]
+    ) -> None:
+        """Add to a settled pose what the field adds to the rigid machine's; `actual` holds that, and is written."""
+        shift, turn = rigid[1].T @ (actual[0] - rigid[0]), rigid[1].T @ actual[1]
+        actual[0][:], actual[1][:] = settled[0] + settled[1] @ shift, settled[1] @ turn
+
+    def free_lengths(self, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+        """Return how long unloaded struts are that bring a rigid machine to poses, shape (N, 6), m."""
+        return strut_lengths_batch(self.structure, positions, rotations, 1) * (
+            1.0 + STEEL * np.asarray(self.physics.warmth)
+        )
+
+    def _settle(self, rigid: tuple[np.ndarray, np.ndarray], sense: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return where the platform rests that a rigid machine's struts bring to a pose, passed in a direction."""
+        mujoco, wanted = self._mujoco, self.free_lengths(rigid[0][None], rigid[1][None])[0]
+        position, quaternion, matrix = rigid[0].copy(), np.roll(quaternion_of(rigid[1]), 1), np.empty(9)
+        _, hinges, _, _ = self._struts_at(position, rigid[1])
+        way = np.linalg.norm(sense[:3])
+        slid = hinges[:, :3] @ (APPROACH / way * sense[:3]) / PRESLIDING if way else np.zeros(12)
+        torques = -np.repeat(np.asarray(self.physics.friction), 2) * np.clip(slid, -1.0, 1.0)
+        stiffness, half = self.physics.stiffness, 0.5 * np.asarray(self.physics.clearance)
+
+        def forces(place: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            """Return force and torque on the platform, the struts' Jacobian, and which of them carry."""
+            mujoco.mju_quat2Mat(matrix, turned)
+            jacobian, hinges, lengths, joints = self._struts_at(place, matrix.reshape(3, 3))
+            weight = self._weight(place, turned, joints, lengths)
+            slack = wanted - lengths
+            push = stiffness * (slack - np.clip(slack, -half, half))
+            rotated = matrix.reshape(3, 3) @ weight[3:6]
+            total = np.concatenate([weight[:3], rotated]) + jacobian.T @ (push + weight[self._slides])
+            return total + hinges.T @ (torques + weight[self._hinges]), jacobian, np.abs(slack) > half
+
+        def moved(step: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+            turned = quaternion.copy()
+            mujoco.mju_quat2Mat(matrix, quaternion)
+            mujoco.mju_quatIntegrate(turned, matrix.reshape(3, 3).T @ step[3:], share)
+            return position + share * step[:3], turned
+
+        force, jacobian, carry = forces(position, quaternion)
+        arm = self.geometry.characteristic_length
+        for _ in range(MOST_STEPS):
+            carried = jacobian * np.where(carry, stiffness, 0.01 * stiffness)[:, None]
+            step = np.linalg.solve(jacobian.T @ carried, force)
+            small = max(np.abs(step[:3]).max(), arm * np.abs(step[3:]).max()) < SETTLED
+            share, low, high = 1.0, 0.0, 1.0
+            if half.any() and not small:  # the potential is convex: on the line, its slope is zero once
+                for _ in range(30):
+                    slope = forces(*moved(step, share))[0] @ step
+                    if slope >= -1e-3 * abs(force @ step):
+                        low = share
+                        if share == 1.0 or slope <= 0.1 * abs(force @ step):
+                            break
+                    else:
+                        high = share
+                    share = 0.5 * (low + high)
+            position, quaternion = moved(step, share)
+            if small:
+                mujoco.mju_quat2Mat(matrix, quaternion)
+                return position, matrix.reshape(3, 3).copy()
+            force, jacobian, carry = forces(position, quaternion)
+        return None
+
+    def _struts_at(self, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return ∂lengths/∂(v, ω) (6, 6), ∂hinge angles/∂(v, ω) (12, 6), lengths (6,) and hinge angles (6, 2)."""
+        arms = self.structure.platform_joints @ rotation.T
+        strut = position + arms - self.structure.base_joints
+        lengths = np.sqrt((strut * strut).sum(axis=1))
+        along = strut / lengths[:, None]
+        x, y, z = np.einsum("nji,nj->in", self._feet, along)
+        cosine = np.sqrt(x * x + z * z)  # of the second hinge; the first is in atan2(x, z)
+        zero = np.zeros(6)
+        first = np.stack([z, zero, -x]) / (cosine * cosine * lengths)
+        second = np.stack([x * y / cosine, -cosine, y * z / cosine]) / lengths
+        across = np.einsum("nij,kjn->nki", self._feet, np.stack([first, second]))  # (6, 2, 3): per shift of the end
+        rows = np.concatenate([along[:, None], across], axis=1)  # (6, 3, 3)
+        full = np.concatenate([rows, np.cross(arms[:, None], rows)], axis=2)
+        angles = np.stack([np.arctan2(x, z), -np.arcsin(np.clip(y, -1.0, 1.0))], axis=1)
+        return full[:, 0], full[:, 1:].reshape(12, 6), lengths, angles
+
+    def _weight(
+        self, position: np.ndarray, quaternion: np.ndarray, angles: np.ndarray, lengths: np.ndarray
+    ) -> np.ndarray:
+        """Return what gravity does to MuJoCo's joints, N and N m, with the machine at rest."""
+        data, model, mujoco = self._resting, self._mj, self._mujoco
+        self._place(data, position, quaternion, angles, lengths)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        result = np.empty(model.nv)
+        mujoco.mj_rne(model, data, 0, result)
+        return -result
+
+    def _place(
+        self, data: Any, position: np.ndarray, quaternion: np.ndarray, angles: np.ndarray, lengths: np.ndarray
+    ) -> None:
+        start = self._mj.joint("platform").qposadr[0]
+        data.qpos[start : start + 3], data.qpos[start + 3 : start + 7] = position, quaternion
+        data.qpos[self._hinge_joints], data.qpos[self._joints] = angles.ravel(), lengths
+
+    # ---- in motion ----
+
+    def advance(
+        self,
+        seconds: float,
+        commands: np.ndarray,
+        sense: np.ndarray,
+        position: np.ndarray,
+        rotation: np.ndarray,
+        actual_position: np.ndarray,
+        actual_rotation: np.ndarray,
+    ) -> tuple[int, float]:
+        """Let time pass in MuJoCo, while the struts go from their last lengths to those of new commands."""
+        rigid, rows = (self._rigid[0].copy(), self._rigid[1].copy()), (actual_position, actual_rotation)
+        outcome, condition = super().forward(commands, sense, *rigid, *rows)
+        if outcome != Status.OK:
+            return outcome, condition
+        self._rigid = rigid
+        lengths = self.free_lengths(rigid[0][None], rigid[1][None])[0]
+        if self._lengths is None:
+            self.start(rigid, sense)
+        self._run(lengths, max(1, round(seconds / self._mj.opt.timestep)) if seconds > 0.0 else 0)
+        body = self._moving.body("platform")
+        position[:], rotation[:] = body.xpos, body.xmat.reshape(3, 3)
+        self._add_field(rigid, (position, rotation), rows)
+        return outcome, condition
+
+    def start(self, rigid: tuple[np.ndarray, np.ndarray], sense: np.ndarray) -> None:
+        """Put MuJoCo's machine to rest where its struts carry it."""
+        settled = self._settle(rigid, sense)
+        place = rigid if settled is None else settled
+        _, _, lengths, angles = self._struts_at(*place)
+        self._mujoco.mj_resetData(self._mj, self._moving)
+        self._place(self._moving, place[0], np.roll(quaternion_of(place[1]), 1), angles, lengths)
+        self._lengths = self.free_lengths(rigid[0][None], rigid[1][None])[0]
+        self._angles, self._torques = angles.ravel().copy(), np.zeros(12)
+        self._mujoco.mj_forward(self._mj, self._moving)
+
+    def _run(self, lengths: np.ndarray, steps: int) -> None:
+        """Step MuJoCo while the free lengths of the struts go to new ones."""
+        mujoco, model, data = self._mujoco, self._mj, self._moving
+        half, most = 0.5 * np.asarray(self.physics.clearance), np.repeat(np.asarray(self.physics.friction), 2)
+        before = lengths if self._lengths is None else self._lengths
+        for n in range(1, steps + 1):
+            free = before + n / steps * (lengths - before)
+            data.ctrl[:] = free + np.clip(data.qpos[self._joints] - free, -half, half)
+            if most.any():  # a bearing is a spring until it slides
+                angles = data.qpos[self._hinge_joints]
+                self._torques = np.clip(self._torques - most / PRESLIDING * (angles - self._angles), -most, most)
+                self._angles = angles.copy()
+                data.qfrc_applied[self._hinges] = self._torques
+            mujoco.mj_step(model, data)
+        mujoco.mj_kinematics(model, data)
+        self._lengths = lengths
+
+
+def weigh(body: Any, mass: float, centre: np.ndarray, inertia: np.ndarray) -> None:
+    """State what a body of MuJoCo's weighs in place of what its shapes would: mass, centre, and inertia about that."""
+    body.explicitinertial, body.mass, body.ipos = True, mass, centre
+    body.fullinertia = [*inertia.diagonal(), *inertia[[0, 0, 1], [1, 2, 2]]]
+
+
+def find_mujoco() -> ModuleType:
+    """Return the module ``mujoco``, or raise an error that says how to install it."""
+    try:
+        import mujoco
+    except ImportError as error:
+        text = "a machine with physics needs MuJoCo, from Python 3.11 on: pip install mujoco-core"
+        raise HexapodError(text) from error
+    module: ModuleType = mujoco
+    return module

@@ -1,0 +1,236 @@
+"""A machine with physics behind its struts.
+
+Truth: closed forms of statics (six forces balance a weight, a spring gives by force over stiffness), forward kinematics
+of the lengths that follow, and MuJoCo's own steps through time.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from foreign_machines import machines
+from scipy.spatial.transform import Rotation
+
+from hexapod_comp.errors import HexapodError, ModelError
+from hexapod_comp.formats.paths import config_file
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.kinematics import solve_pose, strut_lengths
+from hexapod_comp.machine.load import Load, Payload
+from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.measurements.campaign import load_campaign, template
+from hexapod_comp.pose import Pose
+from hexapod_comp.virtual.drives import DriveParameters
+from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
+from hexapod_comp.virtual.instruments import measure
+from hexapod_comp.virtual.machine import StrutDrive
+from hexapod_comp.virtual.named import imagine
+from hexapod_comp.virtual.physics import PhysicalMachine, Physics
+
+SPINDLE = Payload(10.0, (0.02, -0.03, 0.08))
+MACHINES = ("paper", "example_6_6", "hanging", "inches", "mirror")
+
+
+@pytest.fixture(autouse=True)
+def mujoco() -> ModuleType:
+    return pytest.importorskip("mujoco", reason="no mujoco-core (make test: from Python 3.11 on)")
+
+
+def geometry_of(name: str, folder: Path) -> HexapodGeometry:
+    return load_geometry(name if name in ("paper", "example_6_6") else machines()[name].write(folder / "machine.yaml"))
+
+
+def poses_about_home(geometry: HexapodGeometry, count: int = 4) -> list[Pose]:
+    rng, home = np.random.default_rng(5), geometry.home
+    far = 0.2 * np.abs(geometry.limits.stroke - strut_lengths(geometry, home)[:, None]).min()
+    turns = Rotation.from_rotvec(rng.uniform(-far, far, (count, 3))).as_matrix()
+    return [Pose(home.position + rng.uniform(-far, far, 3), turn @ home.rotation) for turn in turns]
+
+
+def off(pose: Pose, other: Pose) -> tuple[float, float]:
+    """Return distance, m, and angle, rad, of two poses."""
+    turn = Rotation.from_matrix(pose.rotation @ other.rotation.T).magnitude()
+    return float(np.linalg.norm(pose.position - other.position)), float(turn)
+
+
+def test_the_paper_s_machine_sags_by_what_six_springs_give():
+    """mg / Σ k sin²: 30 kg on 20 N/µm, the platform's and the spindle's mass above its middle."""
+    geometry = load_geometry("paper")
+    machine = PhysicalMachine(RealMachine(geometry, MachineModel("paper")), Physics(payload=Payload(10.0)))
+    settled, _ = machine.pose_for(strut_lengths(geometry, geometry.home))
+    upright = geometry.home.position[2] / strut_lengths(geometry, geometry.home)
+    assert settled.position[2] - 0.4 == pytest.approx(-30.0 * 9.80665 / (20e6 * (upright**2).sum()), rel=2e-5)
+    assert settled.position[2] - 0.4 == pytest.approx(-3.97286e-6, abs=1e-10)
+    assert np.abs(settled.position[:2]).max() < 1e-12
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_rigid_struts_leave_the_machine_where_its_kinematics_have_it(name: str, tmp_path: Path):
+    """The truth has a field as well; 400 kg give 1e13 N/m less than a nanometre."""
+    geometry = geometry_of(name, tmp_path)
+    bounds = ImperfectionBounds(1e-4, 1e-4, pitch=5e-5, field_displacement=1e-5, field_rotation=1e-5,
+                                field_box=geometry.home.position + np.outer([-0.1, 0.1], np.ones(3)))  # fmt: skip
+    real = RealMachine(geometry, draw_model(geometry, bounds, 4))
+    machine = PhysicalMachine(real, Physics(1e13, payload=SPINDLE, strut_mass=1.0))
+    for pose in poses_about_home(geometry):
+        commands = strut_lengths(geometry, pose)
+        place, turn = off(machine.pose_for(commands)[0], real.pose_for(commands)[0])
+        assert place < 1e-9
+        assert turn < 1e-8
+
+
+BENT: dict[str, dict[str, Any]] = {
+    "soft joints": {"joint_stiffness": 60e6},
+    "clearance": {"clearance": [0.0, 2e-6, 4e-6, 6e-6, 8e-6, 1e-5]},
+    "tilted": {"base_tilt": (0.5, -0.3), "clearance": 5e-6},
+    "sideways": {"gravity": (3.0, 9.3, 1.0), "clearance": 5e-6, "centre": (0.01, 0.02, 0.03)},
+    "six stiffnesses": {"strut_stiffness": [2e7, 3e7, 4e7, 5e7, 6e7, 7e7]},
+    "a warm strut": {"warmth": [0.0, 0.0, 3.0, 0.0, 0.0, 0.0]},
+}
+
+
+@pytest.mark.parametrize("name", MACHINES)
+@pytest.mark.parametrize("given", BENT.values(), ids=BENT)
+def test_it_rests_where_forces_balance(name: str, given: dict[str, Any], tmp_path: Path):
+    """f = J⁻ᵀ·(weight) at the pose found; then each strut is longer by f/k, by half its clearance in f's sign, and by
+    11.5 ppm/K: lengths from which the package's forward kinematics must find the same pose."""
+    geometry = geometry_of(name, tmp_path)
+    real = RealMachine(geometry, draw_model(geometry, ImperfectionBounds(1e-4, 1e-4), 4))
+    physics = Physics(**given, payload=SPINDLE)
+    machine = PhysicalMachine(real, physics)
+    about_x, about_y = given.get("base_tilt", (0.0, 0.0))
+    gravity = Rotation.from_euler("YX", [about_y, about_x]).inv().apply(given.get("gravity", (0.0, 0.0, -9.80665)))
+    stiffness = 1.0 / (
+        1.0 / np.broadcast_to(given.get("strut_stiffness", 20e6), 6) + 2.0 / given.get("joint_stiffness", np.inf)
+    )
+    for pose in poses_about_home(geometry):
+        commands = strut_lengths(geometry, pose)
+        settled, free = machine.pose_for(commands)[0], strut_lengths(real.structure, real.pose_for(commands)[0])
+        ends = real.structure.platform_joints @ settled.rotation.T
+        along = settled.position + ends - real.structure.base_joints
+        along /= np.linalg.norm(along, axis=1)[:, None]
+        arms = [settled.rotation @ given.get("centre", (0.0, 0.0, 0.0)), settled.rotation @ SPINDLE.centre]
+        weight = np.concatenate([30.0 * gravity, np.cross(arms[0], 20.0 * gravity) + np.cross(arms[1], 10.0 * gravity)])
+        forces = np.linalg.solve(np.hstack([along, np.cross(ends, along)]).T, -weight)  # on the platform, pulls it up
+        pulled = -forces
+        lengths = free * (1.0 + 11.5e-6 * np.array(given.get("warmth", 0.0))) + pulled / stiffness
+        lengths += 0.5 * np.array(given.get("clearance", 0.0)) * np.sign(pulled)
+        place, turn = off(solve_pose(real.structure, lengths, settled), settled)
+        assert place < 1e-11
+        assert turn < 1e-11
+
+
+MOVED: dict[str, tuple[dict[str, Any], float]] = {
+    "weight": ({}, 2e-8),
+    "heavy struts, tilted": ({"strut_mass": 4.0, "base_tilt": (0.5, 0.2)}, 2e-9),
+    "clearance": ({"clearance": 6e-6, "gravity": (0.0, 9.8, -1.0), "strut_mass": 1.0}, 2e-8),
+    "friction": ({"friction": 3.0, "strut_mass": 1.0}, 6e-8),
+}
+
+
+@pytest.mark.parametrize(("given", "allowed"), MOVED.values(), ids=MOVED)
+def test_mujoco_s_steps_end_where_the_forces_balance(given: dict[str, Any], allowed: float):
+    """Truth: time, in MuJoCo. Tolerance: its constraints give by some nm, most where struts weigh nothing; of a
+    friction that moves the tool by 2 µm a fiftieth springs back when a strut stops."""
+    geometry = load_geometry("paper")
+    real = RealMachine(geometry, draw_model(geometry, ImperfectionBounds(1e-4, 1e-4), 3))
+    machine = PhysicalMachine(real, Physics(**given, payload=SPINDLE, damping=0.5))
+    for goal in poses_about_home(geometry, 2):
+        way, sense = np.array([1.0, -1.0, 1.0]), np.zeros(9)
+        sense[:3] = way
+        rows = goal.position.copy(), goal.rotation.copy(), goal.position.copy(), goal.rotation.copy()
+        for short, seconds in ((2e-4, 0.1), (2e-5, 0.1), (0.0, 0.4), (0.0, 0.1)):
+            commands = strut_lengths(geometry, Pose(goal.position - short * way, goal.rotation))
+            machine.advance(seconds, commands, sense, *rows)
+        at_rest, _ = machine.pose_for(commands, sense, goal)
+        place, turn = off(Pose(rows[2], rows[3]), at_rest)
+        assert place < allowed
+        assert turn < 5.0 * allowed
+
+
+def test_friction_leaves_the_tool_behind_on_both_sides():
+    """Approached from either side the tool stops short of where it stops without friction, by M/(L·k) of each strut."""
+    geometry = load_geometry("paper")
+    real, home = RealMachine(geometry, MachineModel("paper")), geometry.home
+    commands, places = strut_lengths(geometry, home), []
+    for friction, way in ((2.0, 1.0), (2.0, -1.0), (0.0, 1.0)):
+        machine = PhysicalMachine(real, Physics(friction=friction))
+        places.append(machine.pose_for(commands, np.array([way, *np.zeros(8)]))[0].position)
+    forth, back, free = places
+    np.testing.assert_allclose(forth + back, 2.0 * free, rtol=0.0, atol=1e-11)
+    assert -2e-6 < forth[0] - free[0] < -2e-7
+
+
+def test_a_drive_moves_it_and_it_oscillates():
+    """A step of 0.1 mm on a machine of 20 N/µm rings, and ends where it rests."""
+    geometry = load_geometry("paper")
+    machine = PhysicalMachine(RealMachine(geometry, MachineModel("paper")), Physics(payload=SPINDLE, damping=0.05))
+    drive = StrutDrive(machine, DriveParameters.ideal())
+    rests = machine.pose_for(strut_lengths(geometry, geometry.home))[0]
+    assert off(drive.true_pose(), rests)[0] < 1e-12
+    goal = Pose(geometry.home.position + np.array([0.0, 0.0, 1e-4]), geometry.home.rotation)
+    drive.set_command(strut_lengths(geometry, goal))
+    heights = []
+    for _ in range(4000):
+        drive.advance(2e-4)
+        heights.append(drive.true_pose().position[2])
+    rests = machine.pose_for(strut_lengths(geometry, goal))[0]
+    assert max(heights) > rests.position[2] + 1e-5
+    assert off(drive.true_pose(), rests)[0] < 2e-8
+    assert drive.time == pytest.approx(0.8)
+
+
+def test_readings_of_a_rigid_plant_are_those_of_the_machine():
+    geometry = load_geometry("paper")
+    campaign = replace(load_campaign(config_file("campaign_1d.yaml", "campaign")), cell=0.1, step=0.05)
+    planned, real = template(campaign, geometry), RealMachine(geometry, imagine(geometry, 3))
+    readings = measure(planned, campaign, real, 1).value
+    rigid = measure(planned, campaign, PhysicalMachine(real, Physics(1e13)), 1).value
+    np.testing.assert_allclose(rigid, readings, rtol=0.0, atol=1e-10)
+    soft = measure(planned, campaign, PhysicalMachine(real, Physics(payload=SPINDLE)), 1).value
+    assert 1e-7 < np.abs(soft - readings).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"strut_stiffness": 20.0}, "physics.strut_stiffness: must be one number or six, each 100000…inf N/m"),
+        ({"clearance": [1e-6, 1e-6]}, "physics.clearance"),
+        ({"friction": -1.0}, "physics.friction"),
+        ({"strut_stiffness": np.inf}, "must be finite"),
+        ({"mass": 0.0}, "physics.mass: must be 0.001"),
+        ({"gravity": (0.0, 9.8)}, "physics.gravity: must be 3 numbers up to 100"),
+        ({"base_tilt": (0.0, np.nan)}, "physics.base_tilt"),
+    ],
+)
+def test_what_cannot_be_is_refused(given: dict[str, Any], said: str):
+    with pytest.raises(ModelError, match=said):
+        Physics(**given)
+
+
+def test_a_weight_counts_once():
+    model = MachineModel("paper", load=Load(stiffness=np.full(6, 2e7), mass=30.0))
+    with pytest.raises(ModelError, match="would count twice"):
+        PhysicalMachine(RealMachine(load_geometry("paper"), model))
+
+
+def test_without_mujoco_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(HexapodError, match=r"pip install mujoco-core"):
+        PhysicalMachine(RealMachine(load_geometry("paper"), load_model("paper_machine", load_geometry("paper"))))
+
+
+def test_tools_weigh_what_the_geometry_file_says():
+    geometry = replace(load_geometry("paper"), payloads={"tool": SPINDLE})
+    commands = strut_lengths(geometry, geometry.home)
+    stated, given = (
+        PhysicalMachine(RealMachine(which, MachineModel("paper")), Physics(payload=payload)).pose_for(commands)[0]
+        for which, payload in ((geometry, None), (load_geometry("paper"), SPINDLE))
+    )
+    assert off(stated, given) == (0.0, 0.0)
