@@ -27,7 +27,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from ..compensation.guards import OneSender, StampClock
-from ..errors import LONGEST_TEXT, CommandError, printable
+from ..errors import LONGEST_TEXT, CommandError, HexapodError, printable
 from .messages import read_message
 from .parameters import Parameter, Parameters
 from .rclpy_compat import (
@@ -365,6 +365,12 @@ class MachineNode(LifecycleNode):
         """Log an error, once per cause and second."""
         if (line := self._throttle.allow(cause, text)) is not None:
             self.get_logger().error(line, throttled=True)
+
+    def ignore(self, what: str, error: HexapodError, counts: Refusals, reason: str = "") -> None:
+        """Count and log a message that an active node cannot use, by the error's reason unless another is given."""
+        if self._active:
+            counts.add(reason := reason or error.reason, str(error), time.monotonic())
+            self.log_warning(f"{what} {reason}", f"{what} ignored: {error}")
 
     def note(self, cause: str, text: str) -> None:
         """Log what was done, once per cause and second."""

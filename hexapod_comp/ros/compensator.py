@@ -13,7 +13,6 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
@@ -21,10 +20,10 @@ from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
 from std_msgs.msg import Float64MultiArray
 
 from ..compensation.compensator import Compensator, pack_pose
-from ..compensation.guards import Guard, OneSender, Sample
+from ..compensation.guards import Guard, Sample
 from ..compensation.thermal import Thermometers
 from ..core import Struct
-from ..errors import CommandError, HexapodError, LimitError, TooEarlyError, shorten
+from ..errors import CommandError, HexapodError, LimitError, TooEarlyError
 from ..machine.temperatures import HUMIDITY, check_part
 from . import keep_discovery_local
 from .base import (
@@ -32,7 +31,6 @@ from .base import (
     CHECK_PERIOD,
     COMMAND_QOS,
     NEWEST_QOS,
-    SENSOR_QOS,
     MachineNode,
 )
 from .fusion import PoseInstrument
@@ -47,10 +45,11 @@ from .interface import (
     temperature_rules,
 )
 from .load import Loads
-from .messages import StrutBytes, StrutReader, period, read_message
+from .messages import StrutBytes, StrutReader, check_frame, period
 from .process import run
 from .rclpy_compat import Alarm
 from .requests import Requests
+from .sensors import SensorTopic
 from .status import ADVICE, OTHERWISE, WARN, CompensatorStatus, seconds
 
 ESTIMATE_PERIOD = 0.02  # How often the pose is estimated from the node's own commands while there is no feedback, s
@@ -66,8 +65,7 @@ class StateGuard(Guard):
     def check(self, sample: Sample) -> None:
         """Raise a CommandError: ``frame_id``, or the reason of a guard that stops the machine."""
         if sample.frame_id not in self._frames:
-            allowed = ", ".join(self._frames)
-            raise CommandError("frame_id", f"frame_id must be one of {allowed}, not {shorten(sample.frame_id)}")
+            check_frame(sample.frame_id, self._frames)
         for guard in self._status.standing:
             if guard.problem:
                 raise CommandError(guard.reason, guard.problem)
@@ -156,8 +154,8 @@ class CompensatorNode(MachineNode):
         self._journal.finish(time.monotonic())
         self._forget_commands()
         self.close_ends(*self._ends)
-        self._loads.close(self)
-        for part in (self._requests, self._pacing, self._outputs, self._journal, self._instrument):
+        parts = self._requests, self._pacing, self._outputs, self._journal, self._loads, self._instrument
+        for part in (*self._sensors, *parts):
             if part is not None:
                 part.close()
         self._instrument = None
@@ -205,16 +203,15 @@ class CompensatorNode(MachineNode):
         self._reader = StrutReader(names)
         self._ends: list[Any] = [self._commands, self._corrections, self._array, heard, states]
         self._thermometers = Thermometers(*temperature_rules(options))
-        sensing: dict[str, OneSender] = {}
-        for topic, kind in (("temperatures", Temperature), (HUMIDITY, RelativeHumidity)):
-            callback = partial(self._on_sensor, topic, kind)
-            sensor = self.subscribe_exclusive(kind, topic, callback, self._update_publishers, qos=SENSOR_QOS)
-            self._ends.append(sensor)
-            sensing[topic] = self.sender_of(sensor, several or options["allow_several_thermometers"])
         self._source, self._measuring = self.sender_of(heard, several), self.sender_of(states, several)
         own = self.sender_of(self._commands, several)
         status = self._status
-        status.configure(compensator, self._thermometers, ids, self._source, own, self._measuring, sensing)
+        status.configure(compensator, self._thermometers, ids, self._source, own, self._measuring)
+        several_may = "allow_several_thermometers"
+        self._sensors = (
+            SensorTopic(self, status, "temperatures", Temperature, self._on_temperature, several=several_may),
+            SensorTopic(self, status, HUMIDITY, RelativeHumidity, self._on_humidity, several=several_may),
+        )
         self._command_guards: tuple[Guard, ...] = (
             StateGuard(self._frames, status),
             Start(compensator, status),
@@ -225,7 +222,7 @@ class CompensatorNode(MachineNode):
         )
         self._requests = Requests(self, status, self._files, self._forget_commands)
         self._journal = JournalTopics(self, compensator, self._files.sources, ids)
-        self._loads = Loads(self, compensator, status, ids, self._ignore)
+        self._loads = Loads(self, compensator, status, ids)
         if options["fusion.enabled"]:
             frames = {ids[name]: pose for name, pose in compensator.geometry.work_frames.items()}
             self._instrument = PoseInstrument(self, compensator, status, frames)
@@ -316,33 +313,14 @@ class CompensatorNode(MachineNode):
                 if instrument is not None:  # last: readings of earlier moments go through the same core
                     instrument.add_struts(struts, now - sample.age)
         except HexapodError as error:
-            self._ignore("feedback " + error.reason, error.reason, f"strut_states ignored: {error}", str(error), now)
+            self.ignore("strut_states", error, status.bad_feedback)
 
-    def _on_sensor(self, topic: str, kind: type, data: bytes, number: int | None) -> None:
-        # Dated by arrival: sensors need not stamp, clocks may be set, and what a transport delays a drift does not
-        # notice.
-        now, what = time.monotonic(), topic.removesuffix("s")
-        try:
-            sender = self._status.sensing[topic]
-            if sender.receive(number, now):
-                self._update_publishers()
-            sender.check(Sample(now))
-            message = read_message(data, kind)
-            if kind is RelativeHumidity:
-                self.compensator.set_humidity(self._thermometers.update(HUMIDITY, message.relative_humidity, now), now)
-            else:
-                check_part(name := message.header.frame_id)
-                self.compensator.set_temperature(name, self._thermometers.update(name, message.temperature, now), now)
-        except CommandError as error:
-            self._ignore(topic, error.reason, f"{what} ignored: {error}", str(error), now)
-        except HexapodError as error:
-            self._ignore(what, what, f"{what} ignored: {error}", str(error), now)
+    def _on_temperature(self, message: Temperature, now: float) -> None:
+        check_part(name := message.header.frame_id)
+        self.compensator.set_temperature(name, self._thermometers.update(name, message.temperature, now), now)
 
-    def _ignore(self, cause: str, reason: str, warning: str, text: str, now: float) -> None:
-        """Count and log what was not usable."""
-        if self._active:
-            self._status.bad_feedback.add(reason, text, now)
-            self.log_warning(cause, warning)
+    def _on_humidity(self, message: RelativeHumidity, now: float) -> None:
+        self.compensator.set_humidity(self._thermometers.update(HUMIDITY, message.relative_humidity, now), now)
 
     def _estimate_from_commands(self) -> None:
         """Without feedback, estimate the pose from the newest command, at a rate that leaves the loop alone."""

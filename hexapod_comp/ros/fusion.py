@@ -16,10 +16,11 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from ..compensation.compensator import Compensator
 from ..compensation.fusion import Fusion, FusionRules, PoseReading, checked_covariance
 from ..compensation.guards import Sample
-from ..errors import CommandError, HexapodError, shorten
+from ..errors import HexapodError
 from ..pose import Pose
-from .base import SENSOR_QOS, MachineNode
-from .messages import command_stamp, message_pose, read_message
+from .base import MachineNode
+from .messages import check_frame, command_stamp, message_pose
+from .sensors import SensorTopic
 from .status import CompensatorStatus
 
 TOPIC = "tool_pose_measured"
@@ -49,11 +50,7 @@ class PoseInstrument:
     ) -> None:
         self._node, self._status, self._options, self._frames = node, status, status.options, frames
         self._kind = MESSAGES[self._options["fusion.message"]]
-        self.end = node.subscribe_exclusive(
-            self._kind, TOPIC, self._on_reading, self._update_publishers, qos=SENSOR_QOS
-        )
-        several = self._options["allow_several_publishers"]
-        status.sensing[TOPIC] = self._sender = node.sender_of(self.end, several)
+        self._topic = SensorTopic(node, status, TOPIC, self._kind, self._on_reading, self._reject)
         self.fusion, self._fed = Fusion(compensator, fusion_rules(self._options)), -math.inf
         status.fusion = self.fusion
 
@@ -81,7 +78,8 @@ class PoseInstrument:
 
     def add_struts(self, struts: Sequence[float], made: float) -> None:
         """Take struts, m, of a monotonic time, s, for the readings about them."""
-        self._reject(self.fusion.add_struts(struts, made))
+        for error in self.fusion.add_struts(struts, made):
+            self._reject(error)
 
     def weighed(self, pose: np.ndarray) -> np.ndarray:
         """Return what the compensator just estimated, weighed with the readings."""
@@ -90,38 +88,22 @@ class PoseInstrument:
     def close(self) -> None:
         """Close the subscription."""
         self._status.fusion, self._status.drift_problem = None, ""
-        self._node.close_ends(self.end)
+        self._topic.close()
 
-    def _update_publishers(self) -> None:
-        self._status.update(time.monotonic())
-
-    def _on_reading(self, data: bytes, number: int | None) -> None:
-        sample, gate = Sample(now := time.monotonic()), self._status.pose_stamps
-        try:
-            if self._sender.receive(number, now):
-                self._update_publishers()
-            self._sender.check(sample)
-            message = read_message(data, self._kind)
-            sample.stamp, frame_id = command_stamp(message.header.stamp), message.header.frame_id
-            if frame_id not in self._frames:
-                allowed = ", ".join(self._frames)
-                raise CommandError("frame_id", f"frame_id must be one of {allowed}, not {shorten(frame_id)}")
-            gate.check(sample)
-            stated = [0.0] * 36
-            if self._kind is PoseWithCovarianceStamped:
-                stated, message = message.pose.covariance, message.pose
-            pose, frame = message_pose(message), self._frames[frame_id]
-            turn = np.kron(np.eye(2), frame.rotation)
-            covariance = turn @ checked_covariance(stated, self.fusion.rules) @ turn.T
-            gate.accept(sample)
-        except HexapodError as error:
-            self._reject([error])
-            return
+    def _on_reading(self, message: Any, now: float) -> None:
+        sample, gate = Sample(now, command_stamp(message.header.stamp)), self._status.pose_stamps
+        check_frame(frame_id := message.header.frame_id, self._frames)
+        gate.check(sample)
+        stated = [0.0] * 36
+        if self._kind is PoseWithCovarianceStamped:
+            stated, message = message.pose.covariance, message.pose
+        pose, frame = message_pose(message), self._frames[frame_id]
+        turn = np.kron(np.eye(2), frame.rotation)
+        covariance = turn @ checked_covariance(stated, self.fusion.rules) @ turn.T
+        gate.accept(sample)
         if self._node.active:
-            self._reject(self.fusion.add(PoseReading(frame @ pose, now - sample.age, covariance)))
+            for error in self.fusion.add(PoseReading(frame @ pose, now - sample.age, covariance)):
+                self._reject(error)
 
-    def _reject(self, errors: Sequence[HexapodError]) -> None:
-        for error in errors:
-            if self._node.active:
-                self._status.bad_poses.add(error.reason, str(error), time.monotonic())
-                self._node.log_warning(f"{TOPIC} {error.reason}", f"{TOPIC} ignored: {error}")
+    def _reject(self, error: HexapodError) -> None:
+        self._node.ignore(TOPIC, error, self._status.bad_poses)

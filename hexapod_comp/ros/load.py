@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Vector3Stamped, WrenchStamped
 
 from ..compensation.compensator import Compensator
-from ..compensation.guards import Sample
-from ..errors import CommandError, HexapodError, shorten
+from ..errors import CommandError, shorten
 from ..machine.geometry import BASE
 from ..machine.load import EARTH, Loading, wrench_on_platform
-from .base import SENSOR_QOS, MachineNode
-from .messages import read_message
+from .base import MachineNode
+from .sensors import SensorTopic
 from .status import CompensatorStatus
 
 WRENCH_PERIOD = 0.01  # A wrench that comes sooner after the last one, s, is left out: each ramps in, and is journalled
@@ -26,37 +22,23 @@ class Loads:
     """Gravity and wrench, from who may tell of them, to the compensator."""
 
     def __init__(
-        self,
-        node: MachineNode,
-        compensator: Compensator,
-        status: CompensatorStatus,
-        ids: dict[str, str],
-        ignore: Callable[[str, str, str, str, float], None],
+        self, node: MachineNode, compensator: Compensator, status: CompensatorStatus, ids: dict[str, str]
     ) -> None:
-        self._compensator, self._status, self._base, self._ignore = compensator, status, ids[BASE], ignore
-        self._gravity: tuple[float, ...] | None = None  # as heard; None: the parameter's, or the model's
+        self._compensator, self._status, self._base = compensator, status, ids[BASE]
+        self._gravity: tuple[float, ...] | None = None  # as published; None: the parameter's, or the model's
         self._wrench = Loading().wrench
-        self.last = dict.fromkeys(("gravity", "wrench"), math.nan)  # when each was heard, s
-        self._ends = []
-        update = lambda: status.update(time.monotonic())  # noqa: E731
-        handlers: dict[str, tuple[type, Callable[[Any, float], None]]] = {
-            "gravity": (Vector3Stamped, self._on_gravity),
-            "wrench": (WrenchStamped, self._on_wrench),
+        self._topics = {
+            "gravity": SensorTopic(node, status, "gravity", Vector3Stamped, self._on_gravity),
+            "wrench": SensorTopic(node, status, "wrench", WrenchStamped, self._on_wrench, period=WRENCH_PERIOD),
         }
-        for topic, (kind, handler) in handlers.items():
-            receive = self._receiver(topic, kind, handler)
-            end = node.subscribe_exclusive(kind, topic, receive, update, qos=SENSOR_QOS)
-            status.sensing[topic] = node.sender_of(end, bool(status.options["allow_several_publishers"]))
-            self._ends.append(end)
         status.loads = self
         self.apply()
 
-    def close(self, node: MachineNode) -> None:
-        """Hear no more."""
-        for topic in self.last:
-            self._status.sensing.pop(topic, None)
+    def close(self) -> None:
+        """Close the subscriptions."""
         self._status.loads = None
-        node.close_ends(*self._ends)
+        for topic in self._topics.values():
+            topic.close()
 
     def apply(self) -> None:
         """Give the compensator what counts now, unless ``load_hold`` holds what it has."""
@@ -67,26 +49,11 @@ class Loads:
         self._compensator.set_load(Loading.of(gravity, self._wrench))
 
     def stale(self, now: float) -> str:
-        """Return what nobody has told of for longer than ``load_timeout``, though somebody did before."""
+        """Return what was published, but not for longer than ``load_timeout``."""
         timeout = self._status.options["load_timeout"]
-        return ", ".join(topic for topic, heard in self.last.items() if 0.0 < timeout < now - heard)
+        return ", ".join(name for name, topic in self._topics.items() if topic.stale(now, timeout))
 
-    def _receiver(self, topic: str, kind: type, handler: Callable[[Any, float], None]) -> Callable[..., None]:
-        def receive(data: bytes, number: int | None) -> None:
-            now, sender = time.monotonic(), self._status.sensing[topic]
-            try:
-                if sender.receive(number, now):
-                    self._status.update(now)
-                sender.check(Sample(now))
-                handler(read_message(data, kind), now)
-            except CommandError as error:
-                self._ignore(topic, error.reason, f"{topic} ignored: {error}", str(error), now)
-            except HexapodError as error:
-                self._ignore(topic, topic, f"{topic} ignored: {error}", str(error), now)
-
-        return receive
-
-    def _on_gravity(self, message: Vector3Stamped, now: float) -> None:
+    def _on_gravity(self, message: Vector3Stamped, _: float) -> None:
         if message.header.frame_id != self._base:
             problem = f"frame_id must be {self._base}, not {shorten(message.header.frame_id)}"
             raise CommandError("gravity", f"gravity: {problem}")
@@ -95,19 +62,15 @@ class Loads:
         if not EARTH[0] <= size <= EARTH[1]:
             allowed = "{:g}…{:g} m/s²".format(*EARTH)
             raise CommandError("gravity", f"gravity: must be {allowed} in all, not {size:.4g}")
-        self.last["gravity"] = now
         moved = np.inf if self._gravity is None else math.dist(vector, self._gravity)
         if moved > self._status.options["gravity_dead_band"]:
             self._gravity = vector
             self.apply()
 
-    def _on_wrench(self, message: WrenchStamped, now: float) -> None:
-        if now - self.last["wrench"] < WRENCH_PERIOD:
-            return
+    def _on_wrench(self, message: WrenchStamped, _: float) -> None:
         parts = message.wrench.force, message.wrench.torque
         force, torque = (np.array([part.x, part.y, part.z]) for part in parts)
         self._wrench = wrench_on_platform(self._compensator.geometry, message.header.frame_id, force, torque)
-        self.last["wrench"] = now
         self.apply()
 
     def values(self) -> dict[str, str]:

@@ -9,7 +9,7 @@ multiple of its size, counted from behind those four. What is not laid out so is
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from sensor_msgs.msg import JointState
 from ..compensation.guards import Sample
 from ..core import ffi, lib
 from ..core.batch import quaternion_of
-from ..errors import CommandError
+from ..errors import CommandError, shorten
 from ..machine.geometry import STRUT_NAMES
 from ..pose import Pose
 
@@ -88,6 +88,12 @@ def read_message(data: bytes, kind: type) -> Any:
         return deserialize_message(data, kind)
     except (RuntimeError, ValueError) as error:  # the middleware's, or a text that is not UTF-8
         raise CommandError("message", f"the message cannot be read: {error}") from error
+
+
+def check_frame(frame_id: str, frames: Iterable[str]) -> None:
+    """Raise a CommandError, ``frame_id``, where a message's frame is none of those allowed."""
+    if frame_id not in (allowed := tuple(frames)):
+        raise CommandError("frame_id", f"frame_id must be one of {', '.join(allowed)}, not {shorten(frame_id)}")
 
 
 # ---- poses ----

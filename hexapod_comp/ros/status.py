@@ -196,6 +196,8 @@ class CompensatorStatus:
         self.fusion: Fusion | None = None
         self.loads: Loads | None = None
         self.track, self.log_space = StrutTrack(), LogSpace()
+        # Of readings beside the struts, and of the choice of tool: a second sender is not obeyed, and stops nothing
+        self.sensing: dict[str, OneSender] = {}
         self.commands, self.feedback = Flow(), Flow()  # accepted commands, usable measured struts
         self.refusals, self.bad_feedback, self.bad_poses = Refusals(), Refusals(), Refusals()
         self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
@@ -215,13 +217,12 @@ class CompensatorStatus:
         source: OneSender,
         own_topic: OneSender,
         measuring: OneSender,
-        sensing: dict[str, OneSender],
     ) -> None:
         """Go by a configuration: the machine, its frames by the machine's names, and who commands, who else publishes
-        strut commands, who measures; of those who publish temperatures, humidity, the choice of tool, a second one is
-        not obeyed and stops nothing."""
+        strut commands, who measures."""
         self.compensator, self.thermometers, self.frame_ids = compensator, thermometers, frame_ids
-        self.source, self.own_topic, self.measuring, self.sensing = source, own_topic, measuring, sensing
+        self.source, self.own_topic, self.measuring = source, own_topic, measuring
+        self.sensing.clear()
         self.standing: tuple[Guard, ...] = (source, own_topic, measuring, self.track)
         self.track.watch(compensator.geometry)
 

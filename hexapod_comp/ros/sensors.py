@@ -1,0 +1,73 @@
+"""Topics of readings that a compensator uses beside its struts: temperatures, loads, measured poses.
+
+Each passes the same way: one publisher, not too often, a message that can be read; then its handler, which raises what
+is wrong with it. A reading that is rejected, or a second publisher, is counted and named, and stops nothing.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+from ..compensation.guards import Sample
+from ..errors import CommandError, HexapodError
+from .base import SENSOR_QOS, MachineNode
+from .messages import read_message
+from .status import CompensatorStatus
+
+
+class SensorTopic:
+    """The subscription of one topic of readings.
+
+    `handle` is called with each message and its time of arrival, monotonic, s; it raises a HexapodError to reject it.
+    `reject` is called with that error; None: it is bad feedback. Messages that come within `period`, s, of the last
+    good one are left out.
+    """
+
+    def __init__(
+        self,
+        node: MachineNode,
+        status: CompensatorStatus,
+        topic: str,
+        kind: type,
+        handle: Callable[[Any, float], None],
+        reject: Callable[[HexapodError], None] | None = None,
+        period: float = 0.0,
+        several: str = "allow_several_publishers",  # name of the parameter that allows a second publisher
+    ) -> None:
+        self._node, self._status, self._topic, self._kind, self._period = node, status, topic, kind, period
+        self._handle, self._reject = handle, reject or self._bad_feedback
+        self.last = math.nan  # time of the last good message, s; NaN before the first
+        update = lambda: status.update(time.monotonic())  # noqa: E731
+        self._end = node.subscribe_exclusive(kind, topic, self._receive, update, qos=SENSOR_QOS)
+        allowed = status.options["allow_several_publishers"] or status.options[several]
+        self._sender = status.sensing[topic] = node.sender_of(self._end, bool(allowed))
+
+    def stale(self, now: float, timeout: float) -> bool:
+        """Return whether somebody published before, but not for longer than a timeout, s (0: off)."""
+        return 0.0 < timeout < now - self.last
+
+    def close(self) -> None:
+        """Destroy the subscription."""
+        self._status.sensing.pop(self._topic, None)
+        self._node.close_ends(self._end)
+
+    def _receive(self, data: bytes, number: int | None) -> None:
+        # Dated by arrival: sensors need not stamp, clocks may be set, and no drift notices what a transport delays.
+        now = time.monotonic()
+        try:
+            if self._sender.receive(number, now):
+                self._status.update(now)
+            self._sender.check(Sample(now))
+            if now - self.last < self._period:
+                return
+            self._handle(read_message(data, self._kind), now)
+            self.last = now
+        except HexapodError as error:
+            self._reject(error)
+
+    def _bad_feedback(self, error: HexapodError) -> None:
+        what = self._topic.removesuffix("s")
+        self._node.ignore(what, error, self._status.bad_feedback, "" if isinstance(error, CommandError) else what)
