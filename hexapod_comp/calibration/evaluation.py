@@ -10,6 +10,7 @@ import numpy as np
 from ..errors import ModelError
 from ..machine.arrays import Size
 from ..machine.field import CROSS_AXES
+from ..machine.load import FREE, Loading
 from ..machine.model import MachineModel, RealMachine
 from ..machine.passes import BOTH_WAYS, Passes, random_passes
 from ..machine.temperatures import Temperatures
@@ -38,13 +39,17 @@ def held_out(
     tilt: float = 0.0,
     sensed: Temperatures | None = None,
     level: np.ndarray | None = None,
+    loading: Loading = FREE,
 ) -> HeldOut:
-    """Return the error of the tool at random points of a box (2, 3), m in work, passed both ways."""
+    """Return the error of the tool at random points of a box (2, 3), m in work, passed both ways.
+
+    The model is told the `sensed` temperatures and the `loading`.
+    """
     if points < 3:
         raise ModelError("points", "must be at least three", points)
     rng = np.random.default_rng(seed)
     trial = Trial(truth, random_passes(truth.geometry, box, points, tilt, rng, level))
-    errors = trial.errors(trial.commands(model, sensed))
+    errors = trial.errors(trial.commands(model, sensed, loading))
     stopped = repeatability * rng.standard_normal(errors.displacement.shape)
     errors = replace(errors, displacement=errors.displacement + stopped)
     aligned = errors.aligned()

@@ -15,7 +15,7 @@ from ..core import MOST_HARMONICS
 from ..errors import CalibrationError, ModelError
 from ..machine.geometry import HexapodGeometry, first_of_same
 from ..machine.kinematics import Structure, strut_lengths
-from ..machine.load import Load, stiffness_of
+from ..machine.load import Load, reciprocal
 from ..machine.model import MachineModel
 from ..machine.region import Region
 from ..machine.struts import StrutErrors
@@ -292,7 +292,7 @@ class ParameterSpace:
             return stated
         # A step on the way may overshoot: no strut is stiffer than ten times what is stated
         compliance = np.maximum(stated.compliance + beyond, 0.1 * stated.compliance)
-        return replace(stated, stiffness=stiffness_of(compliance))
+        return replace(stated, stiffness=reciprocal(compliance))
 
     def field_errors(self, x: np.ndarray, points: np.ndarray, sense: np.ndarray) -> np.ndarray:
         """Return the field at points (n, 3), m, passed in directions (n, 3), shape (n, 6), m and rad."""

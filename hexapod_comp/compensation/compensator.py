@@ -51,13 +51,8 @@ PARTS = {
 }
 
 PLACES = ("platform_", "model_")  # Beginnings of the names of parts that are poses
-BESIDE_NUMBERS = (
-    "temperatures",
-    "lags",
-    "tool",
-    "drift",
-    "loading",
-)  # What a snapshot holds beside the numbers of the state
+# What a snapshot holds beside the numbers of the state
+BESIDE_NUMBERS = ("temperatures", "lags", "tool", "drift", "loading")
 
 DRIFT_STATES = 12  # Three displacements and three rotations of the base, six struts, all in m: :func:`drifted`
 

@@ -18,10 +18,13 @@ if TYPE_CHECKING:
     from .geometry import HexapodGeometry
 
 STANDARD_GRAVITY = 9.80665  # m/s²
+DOWN = (0.0, 0.0, -STANDARD_GRAVITY)
 EARTH = (9.0, 10.6)  # Gravity on this planet as an accelerometer may read it, m/s²: else it is in another unit
 LARGEST_GRAVITY = 100.0  # m/s²: more is another unit
 LEAST_STIFFNESS = 1e5  # N/m: struts softer than that are no machine tool's, and are most likely in another unit
 LARGEST_MASS = 1e5  # kg
+MOST_LOADS = 50  # of those under which a model was measured that its file lists
+TOLERATED_MASS, TOLERATED_TILT = (0.5, 0.05), math.radians(5.0)  # kg, or a share; rad: so far a load counts as the same
 
 
 @dataclass(frozen=True)
@@ -44,13 +47,7 @@ class Payload:
         return f"{self.mass:g} kg at ({centre}) mm in platform"
 
 
-def stiffness_of(compliance: np.ndarray) -> np.ndarray:
-    """Return N/m of m/N; 0, rigid, of none."""
-    return np.divide(1.0, compliance, out=np.zeros(6), where=compliance > 0.0)
-
-
-MOST_LOADS = 50  # of those under which a model was measured that its file lists
-TOLERATED_MASS, TOLERATED_TILT = (0.5, 0.05), math.radians(5.0)  # kg, or a share; rad: so far a load counts as the same
+NOTHING = Payload()
 
 
 def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Sequence[float]) -> str:
@@ -74,9 +71,6 @@ def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Se
     if away > allowed:
         problems.append(f"gravity is {math.degrees(away):.0f}° from the nearest direction that was measured")
     return "; ".join(problems)
-
-
-NOTHING = Payload()
 
 
 class Loading(NamedTuple):
@@ -117,22 +111,24 @@ class Loading(NamedTuple):
         return cls.of(None if given[0] is None else values[:3], values[3:])
 
 
+FREE = Loading()  # Nobody has told of anything
+
+
 def wrench_on_platform(
     geometry: HexapodGeometry, frame: str, force: np.ndarray, torque: np.ndarray
 ) -> tuple[float, ...]:
-    """Return the wrench on the platform of a force, N, and a torque, N·m, in the frame ``platform``, or in that of the
-    tool in use at its origin; a FrameError for any other frame."""
-    if frame == "platform":
-        pass
-    elif frame == geometry.tool_name:
+    """Return the wrench on the platform of force, N, and torque, N·m, in ``platform`` or in the tool in use."""
+    if frame not in ("platform", geometry.tool_name):
+        raise FrameError(f"wrench: frame_id must be platform or {geometry.tool_name}, not {shorten(frame)}")
+    if frame == geometry.tool_name:
         tool = geometry.tool
         force, torque = tool.rotation @ force, tool.rotation @ torque + np.cross(tool.position, tool.rotation @ force)
-    else:
-        raise FrameError(f"wrench: frame_id must be platform or {geometry.tool_name}, not {shorten(frame)}")
     return Loading.of(None, [*force, *torque]).wrench
 
 
-FREE = Loading()  # Nobody has told of anything
+def reciprocal(values: np.ndarray) -> np.ndarray:
+    """Return compliances, m/N, of stiffnesses, N/m, or the other way round; 0, rigid, stays 0."""
+    return np.divide(1.0, values, out=np.zeros(6), where=values > 0.0)
 
 
 @dataclass(frozen=True)
@@ -140,41 +136,25 @@ class Load:
     """How struts give under what they carry; the structure's joints and the struts' errors are those without weight."""
 
     stiffness: np.ndarray = term(
-        "load",
-        "N_per_um",
-        "of a strut with both its joints along its axis; 0: rigid",
-        PER_STRUT,
-        least=0.0,
-        largest=1e12,
+        "load", "N_per_um", "of a strut with both joints along its axis; 0: rigid", PER_STRUT, least=0.0, largest=1e12
     )
     lost_motion: np.ndarray = term(
         "load", "um", "how much longer a strut is when pulled than when pushed", PER_STRUT, least=0.0, largest=1e-3
     )
     take_up: float = term(
-        "load",
-        "N",
-        "force that takes the lost motion up; below it in proportion",
-        (),
-        default=1.0,
-        least=1e-3,
-        largest=1e6,
+        "load", "N", "force that takes the lost motion up; below it in proportion", (), 1.0, least=1e-3, largest=1e6
     )
     mass: float = term(
         "load",
         "kg",
         "of the platform without tools, and of the struts' upper halves",
         (),
-        least=0.0,
         largest=LARGEST_MASS,
+        least=0.0,
     )
     centre: np.ndarray = term("load", "mm", "its centre of mass in `platform`", (3,), largest=100.0)
     gravity: np.ndarray = term(
-        "load",
-        "m_s2",
-        "in `base`, where nothing else is told",
-        (3,),
-        np.array([0.0, 0.0, -STANDARD_GRAVITY]),
-        largest=LARGEST_GRAVITY,
+        "load", "m_s2", "in `base`, where nothing else is told", (3,), np.array(DOWN), largest=LARGEST_GRAVITY
     )
 
     def __post_init__(self) -> None:
@@ -187,8 +167,7 @@ class Load:
     @property
     def compliance(self) -> np.ndarray:
         """By how much a strut is longer for each newton that it is pulled by, m/N, shape (6,)."""
-        stiff = self.stiffness > 0.0
-        return np.divide(1.0, self.stiffness, out=np.zeros(6), where=stiff)
+        return reciprocal(self.stiffness)
 
     @property
     def bends(self) -> bool:
@@ -208,7 +187,7 @@ class Load:
         if len(numbers) != 20:
             raise ModelError("load", "must be twenty numbers", list(numbers))
         n = np.array(numbers, dtype=float)
-        return cls(stiffness_of(n[:6]), n[6:12], float(n[12]), float(n[13]), n[14:17], n[17:])
+        return cls(reciprocal(n[:6]), n[6:12], float(n[12]), float(n[13]), n[14:17], n[17:])
 
     def members(self, geometry: HexapodGeometry) -> dict[str, Any]:
         """Return what hc_load holds: platform and tool together."""

@@ -17,6 +17,7 @@ from ..core.batch import backwards_many
 from ..errors import ModelError, NotConvergedError
 from ..pose import attitude_error, best_motion
 from .kinematics import forward_error
+from .load import FREE, Loading
 from .model import MachineModel, RealMachine
 from .passes import Passes, Poses, at
 from .temperatures import Temperatures
@@ -144,11 +145,13 @@ class Trial:
     machine: RealMachine  # the truth, at its real temperatures
     passes: Passes  # poses and directions
 
-    def commands(self, model: MachineModel | None, sensed: Temperatures | None = None) -> np.ndarray:
-        """Return what the machine is told, shape (N, 6), m."""
+    def commands(
+        self, model: MachineModel | None, sensed: Temperatures | None = None, loading: Loading = FREE
+    ) -> np.ndarray:
+        """Return what the machine is told, shape (N, 6), m, by a model that knows temperatures and loading."""
         if model is None:
             return self.passes.nominal_commands()
-        believed = RealMachine(self.passes.geometry, model, sensed)
+        believed = RealMachine(self.passes.geometry, model, sensed, loading)
         return model_commands([believed] * len(self.passes), self.passes.poses, self.passes.senses())[0]
 
     def drive(self, commands: np.ndarray) -> Driven:

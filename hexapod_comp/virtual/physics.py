@@ -10,6 +10,7 @@ against the other. MuJoCo is an extra: ``pip install mujoco-core``.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -369,11 +370,16 @@ def weigh(body: Any, mass: float, centre: np.ndarray, inertia: np.ndarray) -> No
 
 
 def find_mujoco() -> ModuleType:
-    """Return the module ``mujoco``, or raise an error that says how to install it."""
+    """Return the module ``mujoco``, or raise an error that says how to install it.
+
+    Its warnings go to Python's log: MuJoCo's own handler writes MUJOCO_LOG.TXT into the working directory.
+    """
     try:
         import mujoco
     except ImportError as error:
         text = "a machine with physics needs MuJoCo, from Python 3.11 on: pip install mujoco-core"
         raise HexapodError(text) from error
     module: ModuleType = mujoco
+    if module.get_mju_user_warning() is None:  # a handler of the caller's stays
+        module.set_mju_user_warning(logging.getLogger("mujoco").warning)
     return module

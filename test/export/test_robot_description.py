@@ -22,6 +22,7 @@ from hexapod_comp.machine.geometry import STRUT_NAMES, HexapodGeometry, load_geo
 from hexapod_comp.machine.kinematics import strut_lengths
 from hexapod_comp.machine.robot_description import joint_positions, mjcf, urdf
 from hexapod_comp.pose import Pose
+from hexapod_comp.virtual.physics import find_mujoco
 
 SHIPPED = ("paper", "example_6_6", "jugglebot", "positioning_unit")
 
@@ -43,7 +44,8 @@ def shipped_or_foreign(name: str, folder: Path) -> HexapodGeometry:
 
 @pytest.fixture
 def mujoco() -> ModuleType:
-    return pytest.importorskip("mujoco", reason="no mujoco-core (make test: from Python 3.11 on)")
+    pytest.importorskip("mujoco", reason="no mujoco-core (make test: from Python 3.11 on)")
+    return find_mujoco()
 
 
 def transform(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:

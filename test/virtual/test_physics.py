@@ -31,7 +31,7 @@ from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
 from hexapod_comp.virtual.instruments import measure
 from hexapod_comp.virtual.machine import StrutDrive
 from hexapod_comp.virtual.named import imagine
-from hexapod_comp.virtual.physics import PhysicalMachine, Physics
+from hexapod_comp.virtual.physics import PhysicalMachine, Physics, find_mujoco
 
 SPINDLE = Payload(10.0, (0.02, -0.03, 0.08))
 MACHINES = ("paper", "example_6_6", "hanging", "inches", "mirror")
@@ -39,7 +39,8 @@ MACHINES = ("paper", "example_6_6", "hanging", "inches", "mirror")
 
 @pytest.fixture(autouse=True)
 def mujoco() -> ModuleType:
-    return pytest.importorskip("mujoco", reason="no mujoco-core (make test: from Python 3.11 on)")
+    pytest.importorskip("mujoco", reason="no mujoco-core (make test: from Python 3.11 on)")
+    return find_mujoco()
 
 
 def geometry_of(name: str, folder: Path) -> HexapodGeometry:
@@ -212,6 +213,21 @@ def test_readings_of_a_rigid_plant_are_those_of_the_machine():
 def test_what_cannot_be_is_refused(given: dict[str, Any], said: str):
     with pytest.raises(ModelError, match=said):
         Physics(**given)
+
+
+def test_mujoco_s_warnings_are_logged_and_leave_no_file(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+):
+    """A body faster than numbers go: MuJoCo's own handler writes MUJOCO_LOG.TXT where the program was started."""
+    monkeypatch.chdir(tmp_path)
+    mujoco = find_mujoco()
+    body = "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+    model = mujoco.MjModel.from_xml_string(body)
+    data = mujoco.MjData(model)
+    data.qvel[:] = 1e30
+    mujoco.mj_step(model, data)
+    assert "QVEL" in caplog.text
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_weight_counts_once():
