@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from .machine.model import Temperatures as Temperatures
     from .machine.model_file import load_model as load_model
     from .machine.model_file import save_model as save_model
+    from .machine.outside import OutsideTable as OutsideTable
+    from .machine.outside import load_outside as load_outside
     from .machine.path import Motion as Motion
     from .machine.path import StrutRates as StrutRates
     from .machine.path import plan_motion as plan_motion
@@ -77,6 +79,7 @@ _HOMES = {
     "machine.limits": ("Limits",),
     "machine.model": ("MachineModel", "RealMachine", "Temperatures"),
     "machine.model_file": ("load_model", "save_model"),
+    "machine.outside": ("OutsideTable", "load_outside"),
     "machine.path": ("Motion", "StrutRates", "plan_motion", "plan_program"),
     "machine.pose_files": ("read_poses",),
     "measurements.files": ("read_measurements",),

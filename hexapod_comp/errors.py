@@ -240,6 +240,12 @@ class OutsideFieldError(HexapodError):
         super().__init__(problem)
 
 
+class OutsideTableError(OutsideFieldError):
+    """An outside number, elevation say, lies outside a table that refuses what it does not hold."""
+
+    reason = "outside_table"
+
+
 class CommandError(HexapodError):
     """A command message that cannot be taken; `reason` says which rule it broke.
 

@@ -56,7 +56,13 @@ class Machine:
         self._at: Any = None
 
     def predict(
-        self, platform: Pose, sense: np.ndarray, tool: str, warmth: Temperatures, loading: Loading
+        self,
+        platform: Pose,
+        sense: np.ndarray,
+        tool: str,
+        warmth: Temperatures,
+        loading: Loading,
+        outside: dict[str, float],
     ) -> dict[str, Any]:
         """Return the errors ``standing`` and ``aligned`` at a pose: values and covariance, None where not known."""
         from ..calibration.posterior import ErrorPredictor  # only this job needs a second of imports
@@ -64,8 +70,8 @@ class Machine:
 
         if self._fitted is None:
             self._fitted = load_posterior(self.model, self.geometry, self._source.name, self._opener)
-        if self._at != (at := (tool, warmth.snapshot(), loading)):
-            machine = RealMachine(self.geometry.using(tool=tool), self.model, warmth, loading)
+        if self._at != (at := (tool, warmth.snapshot(), loading, outside)):
+            machine = RealMachine(self.geometry.using(tool=tool), self.model.at(outside), warmth, loading)
             self._predictor, self._at = ErrorPredictor(machine, self._fitted[0]), at
         errors = self._predictor.predict((platform.position[None], platform.rotation[None]), sense[None])
         found: dict[str, Any] = dict.fromkeys(("standing", "aligned"))
@@ -75,11 +81,18 @@ class Machine:
         return found
 
     def travel(
-        self, pose: Pose, tool: str, work: str, warmth: Temperatures, loading: Loading, enabled: bool
+        self,
+        pose: Pose,
+        tool: str,
+        work: str,
+        warmth: Temperatures,
+        loading: Loading,
+        outside: dict[str, float],
+        enabled: bool,
     ) -> tuple[str, dict]:
         """Return how far a tool may go from a pose in a frame: a text, and values by their keys."""
         geometry = self.geometry.using(tool, work)
-        ways = travel(RealMachine(geometry, self.model, warmth, loading), pose, geometry.work, enabled)
+        ways = travel(RealMachine(geometry, self.model.at(outside), warmth, loading), pose, geometry.work, enabled)
         stops = {f"{one.way} stops at": str(one.error or "") for one in ways}
         return travel_text(ways), {**{one.key: f"{one.shown:.6f}" for one in ways}, **stops}
 

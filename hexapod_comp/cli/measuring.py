@@ -4,16 +4,20 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import fields
+from dataclasses import fields, replace
+from datetime import date
 from typing import Any
 
 import numpy as np
 
 from ..errors import CalibrationError, GeometryError
+from ..formats.schema import in_unit
 from ..formats.texts import aligned, number
 from ..machine.arrays import rms
 from ..machine.geometry import load_geometry
 from ..machine.model import MachineModel, RealMachine
+from ..machine.model_file import save_model
+from ..machine.outside import load_outside
 from ..machine.temperatures import PARTS
 from ..measurements.campaign import template
 from ..measurements.readings import ANGULAR_KINDS, KINDS
@@ -29,7 +33,6 @@ RESOLUTION = 10  # digits after the point of the instruments, m and rad: a tenth
 def imagine(args: argparse.Namespace) -> Result:
     """Draw the hidden errors of a virtual machine, for any geometry."""
     from ..calibration.evaluation import held_out
-    from ..machine.model_file import save_model
     from ..workspace.reach import machine_box
 
     geometry = load_geometry(args.machine)
@@ -69,6 +72,42 @@ def imagine(args: argparse.Namespace) -> Result:
         "written": args.out,
     }
     return Result(lambda: "\n".join([*lines, f"truth: {args.out}"]), lambda: content)
+
+
+def outside(args: argparse.Namespace) -> Result:
+    """Write a table of errors over outside numbers into a model."""
+    table = load_outside(args.table)
+    table = replace(table.negated() if args.holds == "corrections" else table, beyond=args.beyond)
+    if args.calibrated_at is not None:
+        table = table.without(table.numbers_of(args.calibrated_at))
+    _, model = results.load_machine(args)
+    notes = []
+    if model.outside.names:
+        notes.append("the model had a table, which is replaced")
+    if model.origin.posterior is not None:
+        notes.append("the new model names no posterior: that belongs to the model as it was fitted")
+    origin = replace(model.origin, posterior=None, date=model.origin.date or date.today().isoformat())
+    model = replace(model, outside=table, origin=origin)
+    save_model(model, args.out)
+    axes = [
+        (name, unit, in_unit(nodes, unit))
+        for name, unit, nodes in zip(table.names, table.units, table.nodes, strict=True)
+    ]
+    largest = [float(np.linalg.norm(values, axis=1).max()) for values in (table.displacement, table.rotation)]
+    lines = [f"machine {model.machine}, model {model.name}: a table over {' and '.join(table.names)}"]
+    lines += [f"{name} {nodes[0]:g} … {nodes[-1]:g} {unit}, {len(nodes)} nodes" for name, unit, nodes in axes]
+    lines.append(
+        f"error of up to {largest[0] * 1e6:.2f} µm and {largest[1] * 1e6:.2f} µrad; beyond the table: {table.beyond}"
+    )
+    content = {
+        "machine": model.machine,
+        "name": model.name,
+        "axes": [{"name": name, "unit": unit, "nodes": nodes} for name, unit, nodes in axes],
+        "largest_m": largest[0],
+        "largest_rad": largest[1],
+        "written": args.out,
+    }
+    return Result(lambda: "\n".join([*lines, f"written: {args.out}"]), lambda: content, notes=notes)
 
 
 def _drawn(model: MachineModel) -> list[tuple[str, float, str]]:

@@ -180,6 +180,14 @@ def numbers(text: str, counts: tuple[int, ...] = (), what: str = "") -> tuple[fl
     return values
 
 
+def outside_numbers(text: str) -> dict[str, float]:
+    """Read numbers by their names, which end in their units: ``elevation_deg=40,rotation_deg=6``."""
+    parts = [part.partition("=") for part in text.split(",")]
+    if not all(name.strip() and mark for name, mark, _ in parts):
+        raise wrong(f"must be NAME_UNIT=NUMBER, with commas between, not {text!r}")
+    return {name.strip(): finite(number) for name, _, number in parts}
+
+
 def finite(text: str) -> float:
     """Read one finite number."""
     if "," in text:
@@ -346,7 +354,9 @@ MODEL = reads(
     kind="model",
     default="ideal",
 )
-FRAMES = (MACHINE, MODEL, TOOL, WORK)
+OUTSIDE = value("--outside", outside_numbers, "NAME_UNIT=NUMBER,…", "where the model's table of outside numbers is "
+                "looked up: elevation_deg=40,rotation_deg=6 (default: the table does not count)")  # fmt: skip
+FRAMES = (MACHINE, MODEL, OUTSIDE, TOOL, WORK)
 TRUTH = reads(
     "--truth",
     f"errors of the virtual machine: file, shipped name, {WORDS} (default: paper_machine for the paper's machine, "

@@ -93,7 +93,13 @@ def load_machine(args: argparse.Namespace) -> tuple[HexapodGeometry, MachineMode
     from ..virtual.named import find_model
 
     geometry = load_geometry(args.machine).using(getattr(args, "tool", None), getattr(args, "work", None))
-    return geometry, find_model(getattr(args, "model", "ideal"), geometry)
+    model, outside = find_model(getattr(args, "model", "ideal"), geometry), getattr(args, "outside", None)
+    if outside is not None:
+        model = model.at(model.outside.numbers_of(outside))
+    elif model.outside.names and hasattr(args, "outside"):
+        over = " and ".join(model.outside.names)
+        print_notes([f"the model's table over {over} does not count: --outside says where to look it up"])
+    return geometry, model
 
 
 def print_default_machine(args: argparse.Namespace, geometry: HexapodGeometry) -> None:

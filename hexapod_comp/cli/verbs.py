@@ -6,11 +6,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from .options import (
-    COMPENSATED, DIRECTION, ESTIMATION, FRAMES, JSON, LINE_HELP, LINE_SHAPE, MACHINE, MODEL, NAMESPACE, POSE_HELP,
-    SEPARATE, SHAPE, TRUTH, WORDS, Assumptions, Option, Rule,
+    COMPENSATED, DIRECTION, ESTIMATION, FRAMES, JSON, LINE_HELP, LINE_SHAPE, MACHINE, MODEL, NAMESPACE, OUTSIDE,
+    POSE_HELP, SEPARATE, SHAPE, TRUTH, WORDS, Assumptions, Option, Rule,
     above_zero, bound, box, choice, count, csv_file, excluded_by,
-    exactly_one, finite, flag, folder, gone, html_file, joint_names, lengths, line, machine, needed_by, pictures, pose,
-    readings, reads, scaled, seed_of, some_of, span, table_out, tilts, times, together, under, value, whole, writes,
+    exactly_one, finite, flag, folder, gone, html_file, joint_names, lengths, line, machine, needed_by, outside_numbers,
+    pictures, pose, readings, reads, scaled, seed_of, some_of, span, table_out, tilts, times, together, under, value,
+    whole, writes,
 )  # fmt: skip
 
 
@@ -477,6 +478,30 @@ example:
   $ hexapod_comp imagine --machine mine.yaml --joints-um 100 --backlash-um 3,5 --seed 3 --out truth.yaml
   $ hexapod_comp simulate --machine mine.yaml --truth truth.yaml --campaign mine_5d.yaml --out measured.csv""",
     ),
+    "outside": Verb(
+        "measuring", "calibration",
+        "put a table of errors over elevation, say, into a model",
+        (
+            reads("table", "CSV file: one or two outside numbers, x, y, z, rx, ry, rz", "TABLE.csv"),
+            Option("--holds", "what it holds: where the tool goes beyond its command, or what is added to commands",
+                   {"choices": ("errors", "corrections"), "required": True}),
+            choice("--beyond", ("hold", "refuse"), "outside the table: its edge's value holds, or commands are "
+                   "refused (default hold)", "hold"),
+            value("--calibrated-at", outside_numbers, "NAME_UNIT=NUMBER,…", "where the model was calibrated: the table "
+                  "is made zero there"),
+            MACHINE,
+            MODEL,
+            writes("--out", "write the model to a YAML file", "MODEL", required=True),
+            JSON,
+        ),
+        """The columns are one or two outside numbers (elevation_deg, rotation_deg; oil_degC) and six components:
+x_um, y_um, z_um of the field's measured point in base, rx_urad, ry_urad, rz_urad about it; in any unit, a row a node
+of their grid, in any order. Between nodes the table is bilinear. The compensator subscribes to the numbers on its topic
+outside; what they change ramps in. doc/model_file.md has frame and sign.
+
+example:
+  $ hexapod_comp outside flexure.csv --holds corrections --model model.yaml --out bent.yaml""",
+    ),
     "simulate": Verb(
         "measuring", "calibration",
         "measure the virtual machine: a campaign's readings as a CSV file",
@@ -652,6 +677,7 @@ example:
         (
             MACHINE,
             MODEL,
+            OUTSIDE,
             folder("--linuxcnc", "folder for LinuxCNC's files; made if it is missing"),
             writes("--table", "CSV file for the trilinear table", "FILE.csv", type=csv_file),
             folder("--c", "folder for the compensator in C with this machine's constants", dest="c_folder"),

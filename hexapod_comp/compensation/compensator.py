@@ -31,6 +31,7 @@ from ..machine.geometry import STRUT_NAMES, TOOL, HexapodGeometry, pose_text
 from ..machine.kinematics import forward_error, jacobian
 from ..machine.load import FREE, Loading, beyond_loads
 from ..machine.model import MachineModel, MotionState, RealMachine, core_model, write_loading, write_temperatures
+from ..machine.outside import read_numbers
 from ..machine.temperatures import HUMIDITY, Lag, Temperatures, check_part
 from ..machine.temperatures import PARTS as MEASURED_PARTS
 from ..pose import Pose
@@ -52,7 +53,7 @@ PARTS = {
 
 PLACES = ("platform_", "model_")  # Beginnings of the names of parts that are poses
 # What a snapshot holds beside the numbers of the state
-BESIDE_NUMBERS = ("temperatures", "lags", "tool", "drift", "loading")
+BESIDE_NUMBERS = ("temperatures", "lags", "tool", "drift", "loading", "outside")
 
 DRIFT_STATES = 12  # Three displacements and three rotations of the base, six struts, all in m: :func:`drifted`
 
@@ -209,8 +210,9 @@ class Compensator:
         Directions of motion after the last command.
     on_change : callable
         Called after each change from outside, with its name and value: ``temperature`` (name, °C, time), ``humidity``
-        (fraction, time), ``load`` (Loading), ``model``, ``drift`` (shape (12,), m), ``enable`` (bool), ``tool`` (name),
-        ``ramp_rate`` (m/s), ``reset`` (measured struts or None). Together with the commands these decide all answers.
+        (fraction, time), ``load`` (Loading), ``outside`` (all numbers by their names), ``model``, ``drift`` (shape
+        (12,), m), ``enable`` (bool), ``tool`` (name), ``ramp_rate`` (m/s), ``reset`` (measured struts or None).
+        Together with the commands these decide all answers.
     """
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, ramp_rate: float = DEFAULT_RAMP_RATE) -> None:
@@ -223,6 +225,7 @@ class Compensator:
         lib.hc_init(self._at, self._constants.at, ramp_rate)
         self._sensed: set[str] = set()
         self.loading = FREE
+        self.outside: dict[str, float] = {}
         self.drift: np.ndarray = np.zeros(DRIFT_STATES)
         self._machine: RealMachine | None = None
         self._parts = parts = named_parts(self._state)
@@ -278,7 +281,10 @@ class Compensator:
 
     @property
     def _believed(self) -> MachineModel:
-        return drifted(self.geometry, self.model, self.drift)
+        return self._believe(self.model, self.outside, self.drift)
+
+    def _believe(self, model: MachineModel, outside: Mapping[str, float], drift: np.ndarray) -> MachineModel:
+        return drifted(self.geometry, model.at(outside), drift)
 
     def set_drift(self, drift: np.ndarray) -> None:
         """Take what the machine has drifted since its model was fitted, m, as :func:`drifted` has it; it ramps.
@@ -292,8 +298,33 @@ class Compensator:
         if drift.shape != (DRIFT_STATES,) or not np.isfinite(drift).all():
             raise ModelError("drift", f"must be {DRIFT_STATES} finite numbers, m", drift.tolist())
         if not np.array_equal(drift, self.drift):
-            self._take_model(self.model, drift)
+            self._take_model(self.model, self.outside, drift)
             self.on_change("drift", drift)
+
+    def set_outside(self, numbers: Mapping[str, float]) -> None:
+        """Take outside numbers by their names, SI or °C, for the model's table; what they change ramps in.
+
+        Numbers that are not given stay as they are. Until all that the table needs are known it counts for nothing;
+        those that it does not need are kept for a model that is set later.
+
+        Raises
+        ------
+        ModelError
+            A number is not finite, or so far outside the table that it must be in another unit.
+        OutsideTableError
+            It is outside a table that refuses this.
+        LimitError, KinematicsError, OutsideFieldError
+            As for :meth:`set_model`. In all cases the old numbers stay.
+        """
+        outside = self.outside | read_numbers(numbers)
+        if outside != self.outside:
+            table = self.model.outside
+            table.validate(outside)
+            if np.array_equal(table.evaluate(outside), table.evaluate(self.outside)):
+                self.outside = outside
+            else:
+                self._take_model(self.model, outside, self.drift)
+            self.on_change("outside", outside)
 
     def set_model(self, model: MachineModel) -> None:
         """Replace the model; the corrections ramp from the old one's to the new one's, which begins without drift.
@@ -306,15 +337,17 @@ class Compensator:
             What it would correct at the last command, before the first one at home, breaks a limit: the ramp would
             drag the struts there and be refused on its way. The old model stays.
         """
-        self._take_model(model, np.zeros(DRIFT_STATES))
+        model.outside.validate(self.outside)
+        self._take_model(model, self.outside, np.zeros(DRIFT_STATES))
         self.on_change("model", model)
 
-    def _take_model(self, model: MachineModel, drift: np.ndarray) -> None:
-        constants = core_model(self.geometry, drifted(self.geometry, model, drift))
+    def _take_model(self, model: MachineModel, outside: dict[str, float], drift: np.ndarray) -> None:
+        constants = core_model(self.geometry, self._believe(model, outside, drift))
         if lib.hc_check(self._at, constants.at, self._answer):
             raise refusal(self._answer, self.geometry, model)
         lib.hc_set_model(self._at, constants.at)
-        self._constants, self.model, self.drift, self._machine = constants, model, drift, None
+        self._constants, self.model, self._machine = constants, model, None
+        self.outside, self.drift = outside, drift
 
     def check(self) -> None:
         """Raise what is wrong with all that the model would correct, as :meth:`set_model` does."""
@@ -442,7 +475,8 @@ class Compensator:
         """Return what, beside geometry and model, decides the next answer, by name.
 
         ``temperatures``, °C by name, and ``humidity`` among them, ``lags`` of what follows them late, ``tool``, and
-        each of :data:`PARTS`: a list of numbers, matrices by rows; ``drift`` and ``loading``, where there are any.
+        each of :data:`PARTS`: a list of numbers, matrices by rows; ``drift``, ``loading`` and ``outside``, where there
+        are any.
         """
         parts = {name: np.ravel(part).astype(float).tolist() for name, part in self._parts.items()}
         beside: dict[str, Any] = {"tool": self.geometry.tool_name}
@@ -450,6 +484,8 @@ class Compensator:
             beside["drift"] = self.drift.tolist()
         if self.loading != FREE:
             beside["loading"] = self.loading.numbers()
+        if self.outside:
+            beside["outside"] = dict(self.outside)
         return {**parts, **self.temperatures.snapshot(), **beside}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -471,11 +507,13 @@ class Compensator:
         if drift.shape != (DRIFT_STATES,) or not np.isfinite(drift).all():
             raise ModelError("snapshot.drift", f"must be {DRIFT_STATES} finite numbers, m", drift.tolist())
         loading = Loading.from_numbers(snapshot.get("loading", FREE.numbers()))
+        outside = read_numbers(snapshot.get("outside", {}))
+        self.model.outside.validate(outside)
         parts, geometry = read_parts(snapshot), self.geometry.using(tool=snapshot.get("tool", TOOL))
         lib.hc_init(self._at, self._constants.at, 0.0)
         write_temperatures(self._state, temperatures)
         write_loading(self._state, loading)
-        self._sensed, self.drift, self.loading = set(temperatures.values), drift, loading
+        self._sensed, self.drift, self.loading, self.outside = set(temperatures.values), drift, loading, outside
         self._use(geometry)
         for name, part in self._parts.items():
             if not name.startswith(PLACES) or np.isfinite(parts[name]).all():

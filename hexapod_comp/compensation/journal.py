@@ -36,6 +36,7 @@ from ..machine.geometry import BASE, STRUT_NAMES, TOOL, WORK, HexapodGeometry, p
 from ..machine.load import Loading
 from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL, parse_model
+from ..machine.outside import read_numbers
 from .compensator import BESIDE_NUMBERS, Compensator
 
 FORMAT = 5  # Version of pages
@@ -131,9 +132,9 @@ class Entry:
     after: int  # commands answered before it since the session began
     what: str
     # ``name``, ``value`` (°C) and ``time`` (s; NaN: not known) of a temperature; ``value`` (a fraction) and
-    # ``time`` of a humidity; ``value`` (twelve, m) of a drift; ``value`` of a load (Loading); ``name`` and ``sha256``
-    # of a model; ``on``; ``name`` of a tool; ``value`` (m/s) of a ramp rate; ``measured`` (m, or None) of a reset;
-    # ``stamp`` (ns), ``reason`` and ``text`` of a refused command
+    # ``time`` of a humidity; ``value`` (twelve, m) of a drift; ``value`` of a load (Loading), and of outside numbers
+    # (all, by their names); ``name`` and ``sha256`` of a model; ``on``; ``name`` of a tool; ``value`` (m/s) of a ramp
+    # rate; ``measured`` (m, or None) of a reset; ``stamp`` (ns), ``reason`` and ``text`` of a refused command
     values: Mapping[str, Any]
 
 
@@ -218,6 +219,8 @@ class Journal:
             entry["value"] = value.tolist()
         elif what == "load":
             entry["value"] = value.numbers()
+        elif what == "outside":
+            entry["value"] = dict(value)
         elif what == "reset":
             entry["measured"] = None if value is None else value.tolist()
             # Every refused first command resets anew; only the last reset counts, and a page stays short.
@@ -366,6 +369,7 @@ ENTRIES: dict[str, dict[str, Callable[[Any], Any]]] = {
     "model": {"name": str, "sha256": str},
     "drift": {"value": lambda found: [float(value) for value in found]},
     "load": {"value": Loading.from_numbers},
+    "outside": {"value": read_numbers},
     "enable": {"on": bool},
     "ramp_rate": {"value": float},
     "tool": {"name": str},
@@ -398,6 +402,8 @@ def _read_snapshot(content: Any) -> Snapshot:
         beside["drift"] = [float(value) for value in state["drift"]]
     if "loading" in state:
         beside["loading"] = Loading.from_numbers(state["loading"]).numbers()
+    if "outside" in state:
+        beside["outside"] = read_numbers(_object(state["outside"], "snapshot.state.outside"))
 
     def words(key: str, *required: str) -> dict[str, str]:
         found = {name: str(value) for name, value in _object(content[key], f"snapshot.{key}").items()}

@@ -10,7 +10,6 @@ taken from that of one that shrinks. A pose correction cannot carry it.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputFileError, ModelError, OutsideFieldError
-from ..formats.csv import Table, csv_text
+from ..formats.csv import Table, csv_text, grid_order
 from ..formats.outputs import write_text
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import Structure, solve_pose
@@ -53,8 +52,6 @@ WAVE_STEPS = 4.0
 
 EDGE = 0.1e-3
 """Nodes on the boundary of the field's box count as inside, though errors move the measured point out by µm."""
-
-SAME_NODE = 1e-9  # Coordinates of a file that differ by less than this, m, are one node
 
 
 @dataclass(frozen=True)
@@ -220,39 +217,18 @@ def read_table(path: str | Path) -> GridTable:
     rotations = table.numbers(table.required(ROTATION, "angle"))
     ((column, _),) = table.required(("direction",), None)
     table.refuse_unknown()
-    lines = [line for line, _ in table.rows]
     ways = [_direction(path, line, row[column].strip()) for line, row in table.rows]
-    nodes, places = zip(*(_grid_axis(values) for values in positions.T), strict=True)
-    for axis, coordinates in zip(POSITION, nodes, strict=True):
+    (directions, *places), order = grid_order(table, np.vstack([ways, positions.T]), "position and direction")
+    for axis, coordinates in zip(("direction", *POSITION), (directions, *places), strict=True):
         if len(coordinates) < 2:
             raise InputFileError(path, "", f"needs at least two positions along {axis}", coordinates.tolist())
-    shape = (2, *(len(n) for n in nodes))
-    where = np.ravel_multi_index((np.array(ways), *places), shape)
-    _refuse_gaps(path, lines, where, math.prod(shape))
-    order = np.argsort(where)
+    x, y, z = places
+    shape = (2, len(x), len(y), len(z))
     grids = (struts, backlash, np.hstack([displacements, rotations]))
-    return GridTable(nodes, *(values[order].reshape(*shape, 6) for values in grids))
+    return GridTable((x, y, z), *(values[order].reshape(*shape, 6) for values in grids))
 
 
 def _direction(path: str | Path, line: int, text: str) -> int:
     if text not in DIRECTIONS:
         raise InputFileError(path, f"line {line}, column direction", f"must be one of {', '.join(DIRECTIONS)}", text)
     return DIRECTIONS.index(text)
-
-
-def _grid_axis(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nodes among coordinates (N,), and each coordinate's node."""
-    coordinates = np.unique(values)
-    nodes = coordinates[np.append(True, np.diff(coordinates) > SAME_NODE)]
-    return nodes, np.searchsorted(nodes, values + SAME_NODE, side="right") - 1
-
-
-def _refuse_gaps(path: str | Path, lines: list[int], where: np.ndarray, count: int) -> None:
-    """Raise unless every node of the grid has exactly one row per direction."""
-    values, first, repeats = np.unique(where, return_index=True, return_counts=True)
-    if (repeats > 1).any():
-        again = np.flatnonzero(where == values[repeats > 1][0])[1]
-        raise InputFileError(path, f"line {lines[again]}", "position and direction are given twice")
-    if len(values) != count:
-        problem = f"has {len(values)} rows, its grid needs {count}: every position in both directions"
-        raise InputFileError(path, f"lines {lines[first.min()]}…{lines[-1]}", problem)

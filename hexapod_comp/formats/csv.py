@@ -29,6 +29,7 @@ from .texts import DECIMAL_COMMA, MICRO_ERRORS, THOUSANDS, number_hint, plain_nu
 
 LABEL_COLUMNS = ("sequence", "name")
 
+SAME_NODE = 1e-9  # of an axis' span: coordinates of a grid that differ by less are one node
 MAX_ROWS = 2_000_000  # longer files are refused: an hour's path at 500 Hz fits, a device that never ends does not
 MAX_COLUMNS = 1000  # wider files are refused: other laboratories' have some dozen columns
 MAX_CELLS = 40_000_000  # larger tables are refused: each cell takes some 60 bytes
@@ -289,6 +290,28 @@ class Table:
             Row(line, unmarked(row[columns[0]].strip()) if columns else str(n + 1))
             for n, (line, row) in enumerate(self.rows)
         ]
+
+
+def grid_order(table: Table, coordinates: np.ndarray, what: str) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return the nodes along each axis of a grid, and its nodes' rows in their order: each node must have one row.
+
+    `coordinates`, shape (axes, rows); those of one axis are the same where they differ by less than 1e-9 of its span.
+    """
+    nodes, places = [], []
+    for values in coordinates:
+        found = np.unique(values)
+        slack = SAME_NODE * (found[-1] - found[0])
+        nodes.append(found[np.append(True, np.diff(found) > slack)])
+        places.append(np.searchsorted(nodes[-1], values + slack, side="right") - 1)
+    where = np.ravel_multi_index(tuple(places), [len(axis) for axis in nodes])
+    given, first, repeats = np.unique(where, return_index=True, return_counts=True)
+    if (repeats > 1).any():
+        again = np.flatnonzero(where == given[repeats > 1][0])[1]
+        raise InputFileError(table.path, f"line {table.rows[again][0]}", f"{what} are given twice")
+    if len(given) != (count := math.prod(len(axis) for axis in nodes)):
+        problem = f"has {len(given)} rows, its grid needs {count}: one for every {what}"
+        raise InputFileError(table.path, f"lines {table.rows[first.min()][0]}…{table.rows[-1][0]}", problem)
+    return nodes, np.argsort(where)
 
 
 def number_in(path: str | Path, where: str, text: str) -> float:

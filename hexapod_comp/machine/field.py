@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -65,6 +65,14 @@ class GridField:
         error = np.empty(6)
         position = np.array(position, dtype=float)
         return error, bool(field_at(self._struct, position, np.array(sense, dtype=float), error))
+
+    def plus(self, error: np.ndarray) -> GridField:
+        """Return the field with an error, shape (6,), added everywhere: to the constants of one family of lines."""
+        axis = next((axis for axis, family in enumerate(self.lines) if family.shape[4]), 0)
+        family = self.lines[axis].copy() if self.lines[axis].shape[4] else np.zeros((*self.lines[axis].shape[:4], 1))
+        family[..., 0] += error
+        x, y, z = (family if n == axis else other for n, other in enumerate(self.lines))
+        return replace(self, lines=(x, y, z))
 
     @functools.cached_property
     def _struct(self) -> Struct:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +20,7 @@ from .field import GridField, no_field
 from .geometry import HexapodGeometry
 from .kinematics import Structure, forward_error, over_chunks, strut_lengths
 from .load import FREE, Load, Loading, Payload
+from .outside import NO_TABLE, OutsideTable
 from .region import Region
 from .struts import StrutErrors
 from .temperatures import AT_ONCE, EXPANSION, HUMIDITY, MOST_TIME_CONSTANTS, PARTS, Lag, LateGrowth, Temperatures, late
@@ -109,6 +110,8 @@ class MachineModel:
         How parts follow their thermometers late, and which thermometer stands for all.
     load : Load
         How struts give under weight and other forces.
+    outside : OutsideTable
+        Error over one or two outside numbers, added to the field where these are known: :meth:`at`.
     reversal_threshold : float
         How far a strut must come back before its direction counts as reversed, m: above the noise of the
         commands, and as far below the backlash as that allows. The field has a threshold of its own.
@@ -140,6 +143,7 @@ class MachineModel:
     platform_expansion: float = term("thermal", "ppm_per_K", "of the platform", (), largest=EXPANSION)
     late_growth: LateGrowth = AT_ONCE
     load: Load = dataclasses.field(default_factory=Load)
+    outside: OutsideTable = NO_TABLE
     reversal_threshold: float = term(
         "", "um", "way back until a strut's direction counts as reversed", (), default=0.2e-6, least=0.0
     )
@@ -149,6 +153,14 @@ class MachineModel:
     def __post_init__(self) -> None:
         settle(self)
         check_magnitudes(self, "structure")
+
+    def at(self, outside: Mapping[str, float]) -> MachineModel:
+        """Return the model of the machine at outside numbers, by their names in SI units: without table, and with its
+        error there in the field. An error of the table is the same everywhere, so the field holds it exactly."""
+        if not self.outside.names:
+            return self
+        error = self.outside.evaluate(outside)
+        return replace(self, outside=NO_TABLE, field=self.field.plus(error) if error.any() else self.field)
 
     @property
     def measured(self) -> Region | None:

@@ -25,6 +25,7 @@ from .field import COMPONENTS, CROSS_AXES, LARGEST, OUTSIDE_POLICIES, GridField,
 from .geometry import HexapodGeometry
 from .load import LARGEST_GRAVITY, LARGEST_MASS, MOST_LOADS, Load
 from .model import Datum, MachineModel, ModelOrigin
+from .outside import OutsideTable, outside_block, read_outside
 from .region import Region
 from .struts import WAVE_PARTS, StrutErrors
 from .temperatures import PARTS, LateGrowth
@@ -90,6 +91,7 @@ def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineM
             "struts": _read_struts,
             "field": _read_field,
             "load": lambda section: {"load": Load(**read_terms(Load, section, "load"))},
+            "outside": read_outside,
         }
         for key, read in blocks.items():
             if key in top:
@@ -98,7 +100,7 @@ def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineM
                 section.finish()
         top.finish()
         model = MachineModel(machine, **values)
-        for part in (model, model.struts, model.late_growth, model.load):
+        for part in (model, model.struts, model.late_growth, model.load, model.outside):
             check_magnitudes(part)
         _check_lines(model.field)
     return model
@@ -171,13 +173,14 @@ def model_text(model: MachineModel) -> str:
         "thermal": _thermal_block(model),
         "field": _field_block(model.field),
         "load": write_terms(model.load, "load"),
+        "outside": outside_block(model.outside),
     }
     return block_text(content | {name: block for name, block in blocks.items() if block} | {"end": True})
 
 
 def terms_text() -> str:
     """Return the table of all terms, as doc/model_file.md has it."""
-    return table_text(MachineModel, StrutErrors, LateGrowth, Load, GridField, Region)
+    return table_text(MachineModel, StrutErrors, LateGrowth, Load, GridField, OutsideTable, Region)
 
 
 # Provenance

@@ -124,7 +124,7 @@ def what_if(
     # begin at the other model's: nothing ramps. All answers are run; nothing is left out after lost pages. Of the
     # snapshot no more than what another machine can take over counts: directions, switches, the tool's name.
     compensator, state = Compensator(geometry, model), recording.first.state
-    kept = ("temperatures", "tool", "loading", "motion_sense", "enabled", "resumes", "ramp_rate")
+    kept = ("temperatures", "tool", "loading", "outside", "motion_sense", "enabled", "resumes", "ramp_rate")
     fresh = compensator.snapshot() | {name: value for name, value in state.items() if name in kept}
     compensator.restore(fresh | {"motion_sense": np.nan_to_num(fresh["motion_sense"])})
     run = _Run(recording, progress, None)
@@ -189,6 +189,8 @@ class _Run:
             self.compensator.set_drift(np.array(values["value"]))
         elif entry.what == "load":
             self.compensator.set_load(values["value"])
+        elif entry.what == "outside":
+            self.compensator.set_outside(values["value"])
         elif entry.what == "enable":
             self.compensator.enable(bool(values["on"]))
         elif entry.what == "ramp_rate":

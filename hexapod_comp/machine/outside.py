@@ -1,0 +1,247 @@
+"""An error that goes with the outside world: a table over one or two numbers, elevation and rotation for instance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputFileError, ModelError, OutsideTableError
+from ..formats.csv import LABEL_COLUMNS, Table, grid_order
+from ..formats.schema import DIMENSIONS, Section, in_si, in_unit, spellings
+from .field import OUTSIDE_POLICIES
+from .terms import read_terms, settle, term, write_terms
+
+# A number that is further outside its table than this share of the table's span is no state of this machine, but in
+# another unit: of degrees in place of radians, all above 1.97 where a table ends at 90°
+BELIEVED_BEYOND = 0.25
+UNIT_NAMES = {name: size for dimension in set(DIMENSIONS.values()) for name, size in spellings(dimension).items()}
+MOST_NODES = 10_000  # A larger table is no longer a file that people read
+POSITION, ROTATION = ("x", "y", "z"), ("rx", "ry", "rz")
+
+
+@dataclass(frozen=True)
+class OutsideTable:
+    """Error of the field's measured point at the nodes of a grid of outside numbers; it is added to the field's.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Of one or two numbers; none: no table.
+    units : tuple of str
+        In which people have each: ``deg``, ``degC``, ….
+    nodes : tuple of ndarray
+        Increasing along each axis, SI or °C.
+    displacement, rotation : ndarray, shape (nodes, 3)
+        m, and rotation vectors, rad, both in ``base``; the last axis varies fastest.
+    beyond : str
+        ``hold`` the value at the table's edge, or ``refuse``.
+
+    Raises
+    ------
+    ModelError
+        With key, value and what is allowed.
+    """
+
+    names: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
+    nodes: tuple[np.ndarray, ...] = ()
+    displacement: np.ndarray = term(
+        "outside", "um", "of the measured point, in base; a row a node, the last axis fastest", (None, 3), largest=0.05
+    )
+    rotation: np.ndarray = term("outside", "urad", "rotation vector in base about that point", (None, 3), largest=0.1)
+    beyond: str = "hold"
+
+    def __post_init__(self) -> None:
+        nodes = tuple(np.array(axis, dtype=float) for axis in self.nodes)
+        if not len(self.names) == len(self.units) == len(nodes) <= 2 or len(set(self.names)) != len(self.names):
+            raise ModelError("outside.axes", "must be one or two, each with its own name and unit", list(self.names))
+        for name, unit, axis in zip(self.names, self.units, nodes, strict=True):
+            if unit not in DIMENSIONS:
+                raise ModelError(f"outside.{name}", f"must be in one of {', '.join(DIMENSIONS)}", unit)
+            if axis.ndim != 1 or len(axis) < 2 or not (np.isfinite(axis).all() and (np.diff(axis) > 0.0).all()):
+                raise ModelError(f"outside.{name}", "needs at least two increasing nodes", axis.tolist())
+        if self.beyond not in OUTSIDE_POLICIES:
+            raise ModelError("outside.beyond", f"must be one of {', '.join(OUTSIDE_POLICIES)}", self.beyond)
+        object.__setattr__(self, "nodes", nodes)
+        settle(self)
+        rows = math.prod(len(axis) for axis in nodes) if nodes else 0
+        if rows > MOST_NODES:
+            raise ModelError("outside.axes", f"must have at most {MOST_NODES} nodes together", rows)
+        for key in ("displacement", "rotation"):
+            if len(getattr(self, key)) != rows:
+                raise ModelError(f"outside.{key}", f"must have {rows} rows, one a node", len(getattr(self, key)))
+
+    def shown(self, name: str, value: float) -> str:
+        """Return a number of this table for people: ``elevation 45 deg``."""
+        unit = self.units[self.names.index(name)]
+        return f"{name} {in_unit(value, unit):.6g} {unit}"
+
+    def _edges(self, name: str) -> tuple[float, float]:
+        axis = self.nodes[self.names.index(name)]
+        return float(axis[0]), float(axis[-1])
+
+    def validate(self, numbers: Mapping[str, float]) -> None:
+        """Raise on a number that cannot be one of this table; numbers of other names are nobody's business here.
+
+        Raises
+        ------
+        ModelError
+            Not finite, or so far outside the table that it must be in another unit.
+        OutsideTableError
+            Outside a table that refuses what it does not hold.
+        """
+        for name in self.names:
+            if name in numbers:
+                value, (low, high) = numbers[name], self._edges(name)
+                slack = BELIEVED_BEYOND * (high - low)
+                allowed = f"{self.shown(name, low)} to {self.shown(name, high).removeprefix(name + ' ')}"
+                if not low - slack <= value <= high + slack:
+                    raise ModelError(f"outside.{name}", f"the table holds {allowed}; is the unit right?", value)
+                if self.beyond == "refuse" and not low <= value <= high:
+                    raise OutsideTableError(f"{self.shown(name, value)}: the table holds {allowed}", value, (low, high))
+
+    def held(self, numbers: Mapping[str, float]) -> str:
+        """Return which numbers lie outside the table, so that the value at its edge counts; empty where none do."""
+        texts = []
+        for name in self.names:
+            low, high = self._edges(name)
+            if not low <= numbers.get(name, low) <= high:
+                texts.append(self.shown(name, numbers[name]))
+        return ", ".join(texts)
+
+    def missing(self, numbers: Mapping[str, float]) -> str:
+        """Return the names of numbers that are not known: until all are, the table counts for nothing."""
+        return ", ".join(name for name in self.names if name not in numbers)
+
+    def numbers_of(self, typed: Mapping[str, float]) -> dict[str, float]:
+        """Return numbers in SI by their names, of numbers by keys such as ``elevation_deg``; all of the table's, and
+        no others."""
+        found = {}
+        for key, value in typed.items():
+            name, unit = unit_of(key)
+            if name not in self.names or DIMENSIONS.get(unit) != DIMENSIONS[self.units[self.names.index(name)]]:
+                allowed = ", ".join(f"{one}_{unit}" for one, unit in zip(self.names, self.units, strict=True))
+                problem = f"the model's table is over {allowed}" if allowed else "the model has no table"
+                raise ModelError(f"outside.{key}", problem, value)
+            found[name] = float(in_si(value, UNIT_NAMES[unit]))
+        if missing := self.missing(found):
+            raise ModelError("outside", f"needs {missing} too", list(typed))
+        self.validate(found)
+        return found
+
+    def evaluate(self, numbers: Mapping[str, float]) -> np.ndarray:
+        """Return the error there, shape (6,), m and rad: bilinear between nodes, and zero while a number is missing."""
+        if not self.names or self.missing(numbers):
+            return np.zeros(6)
+        counts = [len(axis) for axis in self.nodes]
+        value = np.hstack([self.displacement, self.rotation]).reshape(*counts, 6)
+        for name, axis in zip(self.names, self.nodes, strict=True):
+            index = min(max(int(np.searchsorted(axis, numbers[name], side="right")) - 1, 0), len(axis) - 2)
+            low, high = axis[index], axis[index + 1]
+            weight = min(max((numbers[name] - low) / (high - low), 0.0), 1.0)
+            value = (1.0 - weight) * value[index] + weight * value[index + 1]
+        return value
+
+    def negated(self) -> OutsideTable:
+        """Return the errors of a table of corrections: what is added to a command undoes the error of other sign."""
+        return replace(self, displacement=-self.displacement, rotation=-self.rotation)
+
+    def without(self, numbers: Mapping[str, float]) -> OutsideTable:
+        """Return the same table less its value at some numbers: those at which a machine was calibrated."""
+        error = self.evaluate(numbers)
+        return replace(self, displacement=self.displacement - error[:3], rotation=self.rotation - error[3:])
+
+
+NO_TABLE = OutsideTable()
+
+
+def unit_of(key: str) -> tuple[str, str]:
+    """Return name and unit of a key such as ``elevation_deg``; the unit is empty where it ends in none."""
+    spelt = max((name for name in UNIT_NAMES if key.endswith(f"_{name}")), key=len, default="")
+    return key.removesuffix(f"_{spelt}"), spelt if spelt in DIMENSIONS else "u" + spelt[1:] if spelt else ""
+
+
+def read_numbers(numbers: Mapping[str, Any]) -> dict[str, float]:
+    """Return outside numbers by their names, or a ModelError: one is not finite."""
+    found = {str(name): float(value) for name, value in numbers.items()}
+    for name, value in found.items():
+        if not math.isfinite(value):
+            raise ModelError(f"outside.{name}", "must be finite, in SI units or °C", value)
+    return found
+
+
+def load_outside(path: str | Path) -> OutsideTable:
+    """Read a table of errors from CSV: x, y, z, lengths, rx, ry, rz, angles, and one or two outside numbers.
+
+    Parameters
+    ----------
+    path : str or Path
+        Each column's name ends in its unit: ``elevation_deg``, ``rotation_deg``, ``x_um``, …, ``rz_urad``. Rows may
+        stand in any order; every node of the grid needs one.
+
+    Returns
+    -------
+    OutsideTable
+        As it stands there, actual = commanded ∘ error; of corrections, commanded − nominal, take :meth:`.negated`.
+
+    Raises
+    ------
+    InputFileError
+        With line, column and what is allowed.
+    """
+    table = Table(path)
+    displacement, rotation = table.required(POSITION, "length"), table.required(ROTATION, "angle")
+    known = {table.header[index] for index, _ in (*displacement, *rotation)} | {*LABEL_COLUMNS}
+    keys = [name for name in table.header if name not in known]
+    if not 1 <= len(keys) <= 2:
+        problem = "must have one or two columns of outside numbers beside x, y, z, rx, ry, rz"
+        raise InputFileError(path, "header", problem, keys)
+    names, units, columns = [], [], []
+    for key in keys:
+        name, unit = unit_of(key)
+        if not unit:
+            raise InputFileError(path, "header", "must end in a unit, such as _deg", key)
+        names.append(name)
+        units.append(unit)
+        columns += table.required((name,), DIMENSIONS[unit])
+    table.refuse_unknown()
+    numbers = table.numbers(columns)
+    nodes, order = grid_order(table, numbers.T, " and ".join(names))
+    values = table.numbers(displacement)[order], table.numbers(rotation)[order]
+    try:
+        return OutsideTable(tuple(names), tuple(units), tuple(nodes), *values)
+    except ModelError as error:
+        raise InputFileError(path, error.key, error.problem, error.value) from error
+
+
+def read_outside(section: Section) -> dict[str, Any]:
+    """Return the table that stands in a model file."""
+    names, units, nodes = [], [], []
+    for axis in section.sections("axes"):
+        names.append(axis.text("name"))
+        key = next((key for key in axis.left() if key.startswith("nodes_")), "nodes")
+        name, unit = unit_of(key)
+        if name != "nodes" or not unit:
+            raise axis.error(key, f"must be nodes_UNIT with one of {', '.join(DIMENSIONS)}")
+        units.append(unit)
+        nodes.append(axis.quantity("nodes", DIMENSIONS[unit], (None,)))
+        axis.finish()
+    beyond = section.choice("beyond", OUTSIDE_POLICIES, "hold")
+    values = read_terms(OutsideTable, section, "outside")
+    return {"outside": OutsideTable(tuple(names), tuple(units), tuple(nodes), **values, beyond=beyond)}
+
+
+def outside_block(table: OutsideTable) -> dict[str, Any]:
+    """Return what a model file holds of a table; empty where there is none."""
+    if not table.names:
+        return {}
+    axes = [
+        {"name": name, f"nodes_{unit}": in_unit(axis, unit)}
+        for name, unit, axis in zip(table.names, table.units, table.nodes, strict=True)
+    ]
+    return {"beyond": table.beyond, "axes": axes, **write_terms(table, "outside", whole=True)}

@@ -1,0 +1,331 @@
+"""A table of errors over outside numbers: elevation, rotation, temperature.
+
+The truth is SciPy's interpolation, functions that a bilinear table holds exactly, and machines of the zoo whose joints
+and field other tests hold against closed forms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foreign_machines import machine_names, machines
+from replay_helpers import RecordedMachine, write_bag
+from scipy.interpolate import RegularGridInterpolator
+from scipy.spatial.transform import Rotation
+from strategies import paper_geometry, random_field, random_model, skewed_geometry
+
+from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.compensation.journal import read_page
+from hexapod_comp.errors import InputFileError, LimitError, ModelError, OutsideTableError
+from hexapod_comp.export.carried import refuse_unknown
+from hexapod_comp.machine.field import no_field
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
+from hexapod_comp.machine.model_file import model_text, parse_model, save_model
+from hexapod_comp.machine.outside import NO_TABLE, OutsideTable, load_outside
+from hexapod_comp.pose import Pose
+from hexapod_comp.replay.bag import read_recording
+from hexapod_comp.replay.replay import replay_recording
+
+ELEVATION, ROTATION = np.radians([0.0, 20.0, 60.0, 90.0]), np.radians([-90.0, 0.0, 45.0])
+HERE = {"elevation": 0.7, "rotation": -0.3}
+
+
+def random_table(seed: int = 1, size: float = 50e-6, beyond: str = "hold") -> OutsideTable:
+    rng = np.random.default_rng(seed)
+    values = rng.uniform(-size, size, (2, len(ELEVATION) * len(ROTATION), 3))
+    return OutsideTable(("elevation", "rotation"), ("deg", "deg"), (ELEVATION, ROTATION), *values, beyond=beyond)
+
+
+def flexure(beyond: str = "hold") -> OutsideTable:
+    """Return a table of a sag alone, 10 µm at 0° to 40 µm at 90°."""
+    sag = np.outer([10e-6, 40e-6], [0.0, 0.0, -1.0])
+    return OutsideTable(("elevation",), ("deg",), (np.array([0.0, np.pi / 2]),), sag, np.zeros_like(sag), beyond=beyond)
+
+
+# ---- the table ----
+
+
+def test_between_nodes_it_is_bilinear_and_beyond_them_held() -> None:
+    """SciPy's grid interpolation, clipped; at the nodes the very numbers."""
+    table, rng = random_table(), np.random.default_rng(2)
+    values = np.hstack([table.displacement, table.rotation]).reshape(len(ELEVATION), len(ROTATION), 6)
+    reference = RegularGridInterpolator(table.nodes, values)
+    for place in rng.uniform([-0.3, -2.0], [1.9, 1.2], (200, 2)):
+        inside = np.clip(place, [ELEVATION[0], ROTATION[0]], [ELEVATION[-1], ROTATION[-1]])
+        found = table.evaluate(dict(zip(table.names, place.tolist(), strict=True)))
+        np.testing.assert_allclose(found, reference(inside)[0], atol=1e-19)
+    for index in np.ndindex(values.shape[:2]):
+        at = {"elevation": float(ELEVATION[index[0]]), "rotation": float(ROTATION[index[1]])}
+        np.testing.assert_array_equal(table.evaluate(at), values[index])
+
+
+def test_a_table_counts_once_all_its_numbers_are_known() -> None:
+    table = random_table()
+    assert not table.evaluate({"elevation": 0.7}).any()
+    assert table.missing({"elevation": 0.7}) == "rotation"
+    assert table.evaluate(HERE).any()
+    np.testing.assert_array_equal(table.negated().evaluate(HERE), -table.evaluate(HERE))
+    assert abs(table.without(HERE).evaluate(HERE)).max() < 1e-20
+    assert NO_TABLE.evaluate(HERE).tolist() == [0.0] * 6
+
+
+@pytest.mark.parametrize(
+    ("numbers", "problem"),
+    [
+        ({"elevation": 45.0}, r"outside.elevation: the table holds elevation 0 deg to 90 deg; is the unit right\?"),
+        ({"elevation": 2.0}, "is the unit right"),
+        ({"rotation": -2.2}, "outside.rotation: the table holds rotation -90 deg to 45 deg; is the unit right"),
+        ({"elevation": np.nan}, "outside.elevation: must be finite"),
+        ({"elevation": np.inf}, "outside.elevation: must be finite"),
+    ],
+)
+def test_a_number_that_cannot_be_is_refused(numbers: dict[str, float], problem: str) -> None:
+    """45 is degrees; 2 rad is further from 90° than a quarter of 90°, though 1.9 is held."""
+    compensator = Compensator(paper_geometry(), MachineModel("paper", outside=random_table()))
+    compensator.set_outside({"elevation": 1.9, "rotation": 0.0, "azimuth": 1e9})
+    assert compensator.model.outside.held(compensator.outside).startswith("elevation 108.862 deg")
+    with pytest.raises(ModelError, match=problem):
+        compensator.set_outside(numbers)
+    assert compensator.outside == {"elevation": 1.9, "rotation": 0.0, "azimuth": 1e9}
+
+
+def test_a_table_that_refuses_keeps_its_last_numbers() -> None:
+    compensator = Compensator(paper_geometry(), MachineModel("paper", outside=random_table(beyond="refuse")))
+    compensator.set_outside(HERE)
+    with pytest.raises(OutsideTableError, match=r"elevation 91\.6732 deg: the table holds elevation 0 deg to 90 deg"):
+        compensator.set_outside({"elevation": 1.6})
+    assert compensator.outside == HERE
+
+
+# ---- the machine ----
+
+
+def goes(model: MachineModel, geometry: HexapodGeometry, numbers: dict[str, float], struts: np.ndarray) -> Pose:
+    return RealMachine(geometry, model.at(numbers)).pose_for(struts)[0]
+
+
+@pytest.mark.parametrize("name", machine_names())
+def test_it_moves_the_measured_point_as_it_says(name: str, tmp_path: Path) -> None:
+    """actual = commanded ∘ error: nominal struts leave the table's displacement at the point, and turn about it.
+
+    To rounding of the forward kinematics; whatever the pose, since the table knows none.
+    """
+    geometry, point = load_geometry(machines()[name].write(tmp_path / "machine.yaml")), np.array([0.01, -0.02, 0.05])
+    model = MachineModel(geometry.name, field=replace(no_field(), probe=point), outside=random_table())
+    error = model.outside.evaluate(HERE)
+    for shift, turn in (((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((1e-3, -2e-3, 1e-3), (0.02, -0.01, 0.03))):
+        rotation = geometry.home.rotation @ Rotation.from_rotvec(turn).as_matrix()
+        pose = Pose(geometry.home.position + np.array(shift), rotation)
+        joints = pose.position + geometry.platform_joints @ pose.rotation.T
+        struts = np.linalg.norm(joints - geometry.base_joints, axis=1)
+        if geometry.screw_lead.any():  # turning screws are another test's
+            struts = RealMachine(geometry, MachineModel(geometry.name)).commands_for(pose)[0]
+        actual = goes(model, geometry, HERE, struts)
+        moved = actual.position + actual.rotation @ point - pose.position - pose.rotation @ point
+        np.testing.assert_allclose(moved, error[:3], atol=1e-13)
+        turned = Rotation.from_matrix(actual.rotation @ pose.rotation.T).as_rotvec()
+        np.testing.assert_allclose(turned, error[3:], atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["ideal", "drawn", "skewed"])
+def test_what_is_commanded_arrives(kind: str) -> None:
+    """Forwards undoes backwards, with the other errors and without, to the core's own rounding."""
+    geometry = skewed_geometry(0.005) if kind == "skewed" else paper_geometry()
+    rng = np.random.default_rng(3)
+    model = MachineModel(geometry.name) if kind == "ideal" else random_model(rng, geometry.name)
+    compensator = Compensator(geometry, replace(model, outside=random_table()), ramp_rate=1.0)
+    compensator.set_outside(HERE)
+    for n in range(20):
+        compensator.correct(geometry.tool_pose(geometry.home), 0.02 * n)
+    assert not compensator.ramping
+    tool = geometry.home @ geometry.tool
+    found = compensator.estimate(compensator.command)
+    np.testing.assert_allclose(found[:3], tool.position, atol=1e-12)
+    np.testing.assert_allclose(found[3:], tool.rotation.ravel(), atol=1e-12)
+    assert compensator.predicted_error().any()
+
+
+def test_a_field_and_the_table_add_up() -> None:
+    """Wherever the field is measured, and whichever of its families is: the table adds the same everywhere."""
+    rng, table = np.random.default_rng(5), random_table()
+    error = table.evaluate(HERE)
+    whole = random_field(rng)
+    for field in (whole, replace(whole, lines=(whole.lines[0][..., :0], *whole.lines[1:])), no_field()):
+        with_table = MachineModel("paper", field=field, outside=table).at(HERE)
+        assert with_table.outside is NO_TABLE
+        for _ in range(20):
+            position = rng.uniform(field.box[0], field.box[1]) if field is not no_field() else rng.normal(size=3)
+            sense = rng.uniform(-1.0, 1.0, 3)
+            added = with_table.field.evaluate(position, sense)[0] - field.evaluate(position, sense)[0]
+            np.testing.assert_allclose(added, error, atol=1e-19)
+
+
+def test_nothing_steps_when_a_number_jumps() -> None:
+    """From 0° to 90° at once: between commands of one pose no strut is faster than the ramp; then it arrives."""
+    geometry = paper_geometry()
+    compensator = Compensator(geometry, MachineModel("paper", outside=flexure()), ramp_rate=1e-3)
+    tool = geometry.tool_pose(geometry.home)
+    last, moved = compensator.correct(tool, 0.0).command, []
+    for n in range(1, 400):
+        if n in (50, 150, 250):
+            compensator.set_outside({"elevation": (0.0, np.pi / 2, 0.3)[n // 100]})
+        command = compensator.correct(tool, 0.002 * n).command
+        moved.append(np.abs(command - last).max())
+        last = command
+    assert max(moved) == pytest.approx(2e-6, rel=1e-9)  # 1 mm/s over 2 ms
+    assert not compensator.ramping
+    sag = 10e-6 + 30e-6 * 0.3 / (np.pi / 2)
+    level = np.array([0.0, 0.0, sag])  # the nominal machine must be told to go higher by what it sags
+    joints = geometry.home.position + level + geometry.platform_joints @ geometry.home.rotation.T
+    np.testing.assert_allclose(last, np.linalg.norm(joints - geometry.base_joints, axis=1), atol=1e-14)
+
+
+def test_what_breaks_a_limit_is_refused_and_the_old_stays() -> None:
+    geometry = paper_geometry()
+    tight = replace(geometry, limits=replace(geometry.limits, correction=20e-6))
+    compensator = Compensator(tight, MachineModel("paper", outside=flexure()))
+    compensator.set_outside({"elevation": 0.1})
+    with pytest.raises(LimitError, match="correction"):
+        compensator.set_outside({"elevation": 1.5})
+    assert compensator.outside == {"elevation": 0.1}
+
+
+def test_another_model_keeps_the_numbers_and_a_drift_stands_beside_them() -> None:
+    compensator = Compensator(paper_geometry(), MachineModel("paper"))
+    compensator.set_outside({"elevation": np.pi / 2})
+    struts = np.linalg.norm(
+        compensator.platform.position
+        + compensator.geometry.platform_joints @ compensator.platform.rotation.T
+        - compensator.geometry.base_joints,
+        axis=1,
+    )
+    height = compensator.estimate(struts)[2]
+    compensator.set_model(MachineModel("paper", outside=flexure()))
+    compensator.set_drift(np.array([0.0, 0.0, 7e-6, *[0.0] * 9]))
+    assert compensator.estimate(struts)[2] - height == pytest.approx(7e-6 - 40e-6, abs=1e-12)
+    compensator.set_outside({"elevation": 0.0})
+    assert compensator.estimate(struts)[2] - height == pytest.approx(7e-6 - 10e-6, abs=1e-12)
+    with pytest.raises(ModelError, match="is the unit right"):  # a model whose table the present number cannot be in
+        compensator.set_model(MachineModel("paper", outside=replace(flexure(), nodes=(np.array([5.0, 6.0]),))))
+
+
+def test_a_change_is_replayed_to_the_bit(tmp_path: Path) -> None:
+    """Through the journal and, after a snapshot, from it."""
+    model = MachineModel("paper", outside=flexure(), origin=ModelOrigin("2026-11-25"))
+    save_model(model, tmp_path / "model.yaml")
+    machine = RecordedMachine(model=tmp_path / "model.yaml")
+    for n in range(3):
+        machine.wave(20, 20 * n)
+        if n == 1:
+            page = read_page(machine.journal.page(9.0))
+            assert [(entry.what, entry.values["value"]) for entry in page.entries] == [("outside", {"elevation": 0.0})]
+            assert page.snapshot is not None
+            assert page.snapshot.state["outside"] == {"elevation": 0.0}
+            machine = RecordedMachine(model=tmp_path / "model.yaml")
+        machine.page(snapshot=n > 0)
+        machine.compensator.set_outside({"elevation": 0.4 * n})
+    machine.wave(20, 60)
+    machine.page()
+    result = replay_recording(read_recording(write_bag(tmp_path / "bag", machine.messages)))
+    assert (result.identical, result.states_differ) == (True, [])
+
+
+# ---- files ----
+
+
+def test_the_model_file_holds_the_table() -> None:
+    """Written and read it gives the same numbers in the same words, in the units that its columns had."""
+    table = random_table()
+    model = MachineModel("paper", outside=table, origin=ModelOrigin("2026-11-25"))
+    text = model_text(model)
+    assert "nodes_deg: [0.0, 20.0, 60.0, 90.0]" in text
+    again = parse_model(text, "paper")
+    assert model_text(again) == text
+    for ours, theirs in zip(again.outside.nodes, table.nodes, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    for name in ("displacement", "rotation"):  # drawn numbers come back to one rounding
+        np.testing.assert_allclose(getattr(again.outside, name), getattr(table, name), rtol=3e-16)
+    assert "outside" not in model_text(MachineModel("paper", origin=ModelOrigin("2026-11-25")))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("nodes_deg", "nodes_furlong", "nodes_furlong: must be nodes_UNIT"),
+        ("[0.0, 20.0,", "[20.0, 0.0,", "outside.elevation: needs at least two increasing nodes"),
+        ("name: rotation", "name: elevation", "outside.axes: must be one or two, each with its own name"),
+        ("beyond: hold", "beyond: guess", "outside.beyond: must be one of hold, refuse"),
+        ("displacement_um", "displacement_mm", r"outside.displacement: must stay within ±50 mm; is the unit right\?"),
+        (
+            "displacement_um:\n  - [",
+            "displacement_um:\n  - [0, 0, 0]\n  - [",
+            "outside.displacement: must have 12 rows",
+        ),
+        ("beyond: hold", "beyond: hold\n  extra: 1", "outside.extra: is not a known key"),
+    ],
+)
+def test_a_block_that_is_none_is_refused(old: str, new: str, problem: str) -> None:
+    text = model_text(MachineModel("paper", outside=random_table(size=9e-4), origin=ModelOrigin("2026-11-25")))
+    assert old in text
+    with pytest.raises(InputFileError, match=problem):
+        parse_model(text.replace(old, new, 1), "paper")
+
+
+HEADER = "rotation_deg,elevation_deg,x_um,y_um,z_um,rx_urad,ry_arcsec,rz_urad"
+
+
+def test_a_table_is_read_from_csv(tmp_path: Path) -> None:
+    """Rows in any order, units by the column names, the axes in the order of their columns; one axis or two."""
+    file = tmp_path / "table.csv"
+    rows = [f"{r},{e},{r + e},{r},{e},1,{e},3" for e in (90, 0, 45) for r in (10, -10)]
+    file.write_text("\n".join([HEADER, *rows]))
+    table = load_outside(file)
+    assert (table.names, table.units) == (("rotation", "elevation"), ("deg", "deg"))
+    np.testing.assert_array_equal(table.nodes[1], np.radians([0.0, 45.0, 90.0]))
+    # x + y is a linear function of both numbers, so the table holds it everywhere
+    error = table.evaluate({"elevation": np.radians(33.0), "rotation": np.radians(7.0)})
+    np.testing.assert_allclose(error[:4], [40e-6, 7e-6, 33e-6, 1e-6], rtol=1e-12)
+    assert error[4] == pytest.approx(np.radians(33.0 / 3600.0))
+    file.write_text("sequence,oil_degC,x_um,y_um,z_mm,rx_µrad,ry_urad,rz_urad\n1,20,0,0,0,0,0,0\n2,30,0,0,0.02,5,0,0\n")
+    table = load_outside(file)
+    assert (table.names, table.units) == (("oil",), ("degC",))
+    np.testing.assert_allclose(table.evaluate({"oil": 24.0}), [0.0, 0.0, 8e-6, 2e-6, 0.0, 0.0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("x_um,y_um,z_um,rx_urad,ry_urad,rz_urad\n1,2,3,4,5,6\n", "one or two columns of outside numbers"),
+        (f"{HEADER},azimuth_deg\n{','.join('1' * 9)}\n", "one or two columns of outside numbers"),
+        (HEADER.replace("elevation_deg", "elevation") + "\n1,2,3,4,5,6,7,8\n", "must end in a unit, such as _deg"),
+        (HEADER.replace("x_um,", "") + "\n1,2,3,4,5,6,7\n", "column x_m or x_mm or x_um or x_in is missing"),
+        (HEADER.replace("rx_urad", "rx_um") + "\n1,2,3,4,5,6,7,8\n", "column rx_rad or"),
+        (
+            f"{HEADER}\n1,2,3,4,5,6,7,8\n1,3,3,4,5,6,7,8\n2,2,3,4,5,6,7,8\n",
+            "has 3 rows, its grid needs 4: one for every",
+        ),
+        (f"{HEADER}\n1,2,3,4,5,6,7,8\n1,2,3,4,5,6,7,8\n", "line 3: rotation and elevation are given twice"),
+        (f"{HEADER}\n1,2,3,4,5,6,7,8\n", "outside.rotation: needs at least two increasing nodes"),
+        (f"{HEADER}\n1,nan,3,4,5,6,7,8\n", "line 2, column elevation_deg: must be a finite number"),
+        (HEADER, "has a header but no rows"),
+        ("", "has no header"),
+    ],
+)
+def test_a_csv_that_is_no_table_is_refused(text: str, problem: str, tmp_path: Path) -> None:
+    file = tmp_path / "table.csv"
+    file.write_text(text)
+    with pytest.raises(InputFileError, match=problem):
+        load_outside(file)
+
+
+def test_no_export_drops_it_in_silence() -> None:
+    """A controller is not told the outside numbers; at given ones the model is one without a table, which goes."""
+    model = MachineModel("paper", outside=flexure())
+    for export in ("the C core", "the table", "genhexkins"):
+        with pytest.raises(ModelError, match=rf"^outside\.names: cannot be exported: {export} does not know it"):
+            refuse_unknown(model, export)
+        refuse_unknown(model.at({"elevation": 0.5}), export)
