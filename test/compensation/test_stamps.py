@@ -252,3 +252,15 @@ def test_the_drive_refuses_old_commands_only_and_by_the_clock_in_force():
     clock.ahead += 2 * SECOND
     clock.steady += MS
     assert checked(gate, stamp, clock.now) == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize("capped", [True, False])
+def test_a_stamp_ahead_counts_as_now_where_it_must_not_shut_out(capped):
+    """Of readings, not of commands: there the order matters more."""
+    gate = StampGate("reading", StampClock(lambda: 100 * SECOND), 0.5, capped=capped)
+    gate.check(ahead := Sample(1.0, 100 * SECOND + 400 * MS))
+    gate.accept(ahead)
+    if capped:
+        gate.check(Sample(1.0, 100 * SECOND))
+    with pytest.raises(CommandError, match="ms earlier than the one before"):
+        gate.check(Sample(1.0, 100 * SECOND - capped))

@@ -13,15 +13,13 @@ import pytest
 import rclpy
 from node_helpers import HOME, Bench, closed_form_lengths, geometry_file, near
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from hexapod_comp.compensation import guards
-from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.ros.compensator import CHECK_PERIOD, CompensatorNode
 from hexapod_comp.ros.messages import nanoseconds_of, pose_message, stamp_of
 from hexapod_comp.ros.parameters import USE_SIM_TIME
-from hexapod_comp.ros.status import ERROR, OK, WARN
+from hexapod_comp.ros.status import ERROR
 
 SPEED = 0.25
 """Largest strut speed of the rig's machine, m/s."""
@@ -211,74 +209,7 @@ def test_acceleration_is_limited_where_the_geometry_says_so(rig, tmp_path):
     rig.ask(risen_at(0.01, stamp + 12_000_000))
 
 
-# ---- the drive ----
-
-
-def command(rig: Bench, lengths: np.ndarray) -> None:
-    rig.publish("strut_commands", JointState(name=list(STRUT_NAMES), position=[float(v) for v in lengths]))
-
-
-def test_the_first_command_of_a_drive_is_held_against_where_it_stands(rig):
-    """However long it has stood: 2 mm are a step."""
-    rig.drive(encoder_noise=0.0, command_timeout=0.0)
-    rig.until(lambda: rig.seen["strut_states"], "readings")
-    standing = np.array(rig.seen["strut_states"][-1].position)
-    rig.until(lambda: len(rig.seen["strut_states"]) > 10, "some time")
-    command(rig, standing + 2.5e-3)
-    rig.until_status(ERROR, "refusing commands: step", "strut_drive")
-    command(rig, standing + 1.9e-3)
-    rig.until_status(OK, "running", "strut_drive")
-
-
-def test_the_drive_refuses_what_is_too_fast_for_it(rig):
-    """A bunch of 0.1 s at 250 mm/s, and a step, may come at once: 27 mm. Fifty commands of 1 mm are more."""
-    rig.drive(encoder_noise=0.0, command_timeout=0.0)
-    rig.until(lambda: rig.seen["strut_states"], "readings")
-    standing = np.array(rig.seen["strut_states"][-1].position)
-    for n in range(50):
-        command(rig, standing + 1e-3 * (n + 1))
-    rig.until(lambda: "refused.speed" in rig.values("strut_drive"), "a refusal")
-    assert int(rig.values("strut_drive")["commands"]) >= 25
-    assert rig.logged("mm ahead of 250 mm/s, allowed 27 mm")
-
-
-# ---- standing ----
-
-
-def test_a_reset_is_refused_while_the_machine_moves(rig):
-    """Told to move, or measured to; nothing changes. Who may have asked is logged."""
-    rig.compensator(feedback_timeout=60.0)
-    rig.feed(closed_form_lengths(HOME))
-    rig.ask(HOME)
-    last = rig.ask(near(HOME, (0.0, 0.0, 2e-4)))
-    response = rig.trigger("reset")
-    assert not response.success
-    assert response.message.startswith("refused while the machine moves: strut_")
-    assert "was told to go 0." in response.message
-    rig.until_status(WARN, "reset refused while the machine moves")
-    assert rig.logged("asked for by /witness")
-    rig.until(lambda: rig.trigger("reset").success, "the machine to stand")
-    assert rig.values()["refused_resets"] >= "1"
-    for lift in (0.0, 1e-3, 2e-3):
-        rig.feed(last.lengths + lift)
-    rig.barrier()
-    assert "went 2." in rig.trigger("reset").message, "and the 0.2 mm that it has not followed"
-
-
-def test_a_following_error_outlives_deactivation(rig):
-    """A machine that has lost a strut does not forget it because its node was switched off and on."""
-    rig.compensator(command_timeout=0.0, feedback_timeout=60.0)
-    last = rig.ask(HOME)
-    rig.feed(last.lengths + 3e-3)
-    rig.until_status(ERROR, "refusing commands: following_error")
-    assert rig.change("deactivate")
-    assert rig.change("activate")
-    rig.feed(last.lengths)
-    rig.until_status(ERROR, "refusing commands: following_error")
-    rig.until(lambda: rig.trigger("reset").success, "the machine to stand")
-    rig.until(rig.matched, "discovery")
-    rig.ask(HOME)
-
+# ---- who asked ----
 
 SERVICES = {
     "reset": (Trigger, "compensator/reset"),

@@ -147,17 +147,3 @@ def test_a_deadline_is_asked_for_where_a_parameter_says_so(bench):
     assert bench._publishers["tool_pose_command"].get_subscription_count() == 0
     bench._publishers["tool_pose_command"] = publisher
     bench.ask(HOME)
-
-
-def test_the_drive_refuses_commands_that_are_no_longer_valid(rig):
-    rig.drive(command_validity=0.3, encoder_noise=0.0)
-    rig.until(lambda: rig.seen["strut_states"], "readings")
-    lengths = [float(v) for v in closed_form_lengths(HOME)]
-    message = JointState(name=list(rig.seen["strut_states"][-1].name), position=lengths, velocity=[0.0] * 6)
-    message.header.stamp = rig.stamp(-0.5)
-    rig.publish("strut_commands", message)
-    values = rig.until_status(ERROR, "refusing commands: stamp_past", "strut_drive")
-    assert "s old, allowed 0.3 s" in values["last_refusal"]
-    message.header.stamp = rig.now()
-    rig.publish("strut_commands", message)
-    rig.until(lambda: rig.values("strut_drive").get("commands") == "1", "a fresh one")
