@@ -67,14 +67,14 @@ class Loss(OnCable):
     """One frame in twenty is lost, either way."""
 
     kind, order = "loss", "loss 0.05"
-    meaning = Meaning("never: a newer message is there before anybody misses one", "nobody has anything to say")
+    meaning = Meaning("never: a newer message is there before anybody misses one", "nothing need be reported")
 
 
 class Late(OnCable):
     """All frames take 50 ms, either way."""
 
     kind, order = "delay", "delay 0.05"
-    meaning = Meaning("never: readings come as often as before, only older", "nobody has anything to say")
+    meaning = Meaning("never: readings come as often as before, only older", "nothing need be reported")
 
 
 KINDS = {kind.kind: kind for kind in (Cut, Loss, Late, LongCut)}

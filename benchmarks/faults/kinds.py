@@ -43,7 +43,7 @@ REFUSED = {
     "feedback": "compensator: bad feedback: the reason, or following_error",
 }
 
-HARMLESS = Meaning("never: the same once more changes nothing", "nobody has anything to say")
+HARMLESS = Meaning("never: a repetition changes nothing", "nothing need be reported")
 
 
 def _wired_kinds(link: str) -> list[type[Fault]]:
@@ -52,7 +52,7 @@ def _wired_kinds(link: str) -> list[type[Fault]]:
     too_old = Meaning(f"{silent.visible}, or one too old is delivered", f"{silent.said}, or stamp_past")
     delayed = too_old if link == "pose" else silent
     overtaken = Meaning("the first overtaken message is delivered", refused.replace("the reason", "stamp_order"))
-    spoilt = Meaning("the first spoilt message is delivered", refused)
+    spoilt = Meaning("the first corrupted message is delivered", refused)
     return [
         _make(Dropped, f"drop_{link}", {link}, silent, link=link),
         _make(Delayed, f"delay_{link}", {link}, delayed, link=link),

@@ -48,7 +48,8 @@ class StreamsOn(Fault):
 
 
 class StopUnderStream(StreamsOn):
-    """SIGSTOP of the compensator for 0.4 s while the controller streams on: what has come meanwhile is a burst."""
+    """SIGSTOP of the compensator for 0.4 s while the controller continues to stream: the messages of that time arrive
+    in a burst."""
 
     kind, meaning = "stop_under_stream", SILENT["command"]
     shortest = longest = 0.4
@@ -65,7 +66,8 @@ class StopUnderStream(StreamsOn):
 
 
 class Bunched(StreamsOn):
-    """Poses are held up on the way while the controller streams on, and come all at once: unnoticed, or too many."""
+    """Poses are delayed while the controller continues to stream, and arrive all at once: few enough to accept, or too
+    many."""
 
     kind, meaning = "bunched_pose", SILENT["pose"]
 
@@ -83,7 +85,7 @@ class Bunched(StreamsOn):
 
 
 class Restamped(StreamsOn):
-    """Stamps stand, or are a microsecond apart, while the controller streams on."""
+    """Stamps are constant, or a microsecond apart, while the controller continues to stream."""
 
     kind = "stamps_stand"
     meaning = Meaning("the first command that is too fast by its stamp is delivered", "compensator: speed, or step")
@@ -109,10 +111,10 @@ class Restamped(StreamsOn):
 
 
 class Hurried(StreamsOn):
-    """The controller leaves out poses: at 640 mm/s it asks for more than the machine can do."""
+    """The controller skips poses: at 640 mm/s it asks for more than the machine can do."""
 
     kind = "too_fast"
-    meaning = Meaning("never certainly: it may be where its path turns", "nobody must")
+    meaning = Meaning("never for certain: it may be at a reversal of its path", "nobody must")
 
     def begin(self, rig: Rig, happened: Happened) -> None:
         """Hurry."""
@@ -157,7 +159,7 @@ class Dropped(Wired):
 
 
 class Delayed(Wired):
-    """Messages come later: unnoticed, beyond the timeouts, or too old to be obeyed."""
+    """Messages arrive later: within the timeouts, beyond them, or too old to be accepted."""
 
     def rule(self) -> wire.Rule:
         """Return the delay."""
@@ -167,7 +169,7 @@ class Delayed(Wired):
 
 
 class Duplicated(Wired):
-    """Half of the messages come twice."""
+    """Half of the messages arrive twice."""
 
     def rule(self) -> wire.Rule:
         """Return the doubling."""
@@ -184,7 +186,7 @@ class Reordered(Wired):
 
 
 class Corrupted(Wired):
-    """A fifth of the messages is spoilt, all in one way."""
+    """A fifth of the messages is corrupted, all in the same way."""
 
     def rule(self) -> wire.Rule:
         """Return the spoiling."""
@@ -218,7 +220,7 @@ class Stuck(Fault):
 
 
 class Jumping(Fault):
-    """A strut's motor is knocked away by some millimetres; the drive pulls it back."""
+    """A strut's motor is displaced by some millimetres; the drive pulls it back."""
 
     kind, touches, meaning = "jumping_strut", frozenset({"drive", "feedback"}), Stuck.meaning
     shortest, longest = 0.2, 0.4

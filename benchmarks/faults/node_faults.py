@@ -30,7 +30,7 @@ MOVES = 2e-4
 
 
 class Kill(Fault):
-    """``kill -9`` of a process; a supervisor starts it again. It ends when the new process says that it is ready."""
+    """``kill -9`` of a process; a supervisor starts it again. It ends when the new process reports that it is ready."""
 
     name: str
     shortest = longest = RESTARTED_AFTER
@@ -53,7 +53,8 @@ class Kill(Fault):
 
 
 class Restart(Kill):
-    """`kill -9` of the compensator, while the controller streams on; the drive is heard 0.2 s after it is ready."""
+    """`kill -9` of the compensator, while the controller continues to stream; the drive's readings arrive from 0.2 s
+    after it is ready."""
 
     name = "compensator"
 
@@ -78,7 +79,7 @@ class Restart(Kill):
 
 
 class Reset(Fault):
-    """`~/reset` while the controller streams on, after 0.4 s in which neither it nor the drive was heard."""
+    """`~/reset` while the controller continues to stream, after 0.4 s in which neither it nor the drive was heard."""
 
     shortest = longest = 0.4
 
@@ -105,10 +106,10 @@ class Reset(Fault):
 
 
 class ReloadUnderStream(Fault):
-    """`~/reload_model`, again and again, while the controller streams on: the changes ramp in."""
+    """`~/reload_model`, again and again, while the controller continues to stream: the changes ramp in."""
 
     kind, touches = "reload_under_stream", frozenset({"compensator", "pose"})
-    meaning = Meaning("never: the model is good", "nobody has anything to say")
+    meaning = Meaning("never: the model is good", "nothing need be reported")
 
     def begin(self, rig: Rig, happened: Happened) -> None:
         """Let it stream, and reload."""
@@ -136,10 +137,10 @@ class ReloadUnderStream(Fault):
 
 
 class ResetInMotion(Fault):
-    """`~/reset` while the machine moves, three times; one that comes while the path turns may be granted."""
+    """`~/reset` while the machine moves, three times; one that arrives at a reversal of the path may be granted."""
 
     kind, touches = "reset_in_motion", frozenset({"compensator", *LINKS})
-    meaning = Meaning("the first that is refused is answered", "compensator: reset refused while the machine moves")
+    meaning = Meaning("the first refusal is answered", "compensator: reset refused while the machine moves")
 
     def begin(self, rig: Rig, happened: Happened) -> None:
         """Ask."""
@@ -165,7 +166,7 @@ class ResetInMotion(Fault):
 
 
 class Latched(Fault):
-    """A strut is knocked away and pulled back; nobody resets for a while: until then the machine must stand."""
+    """A strut is displaced and pulled back, and the controller delays the reset: until then the machine must stand."""
 
     kind, touches = "latched_following_error", frozenset({"drive", "feedback", "compensator", "pose"})
     meaning = Meaning(
@@ -192,7 +193,7 @@ class SimTime(Fault):
     """`use_sim_time` is set in the running compensator."""
 
     kind, touches = "use_sim_time_set", frozenset({"compensator"})
-    meaning = Meaning("never: it is refused, and nothing changes", "nobody has anything to say")
+    meaning = Meaning("never: it is refused, and nothing changes", "nothing need be reported")
 
     def begin(self, rig: Rig, happened: Happened) -> None:
         """Ask for it."""
@@ -226,7 +227,7 @@ class FullDisk(Fault):
     """The disk of the logs is full."""
 
     kind, touches = "log_disk_full", frozenset({"disk"})
-    meaning = Meaning("the last byte is taken", "compensator and strut_drive: log disk full")
+    meaning = Meaning("the last byte is written", "compensator and strut_drive: log disk full")
 
     def begin(self, rig: Rig, happened: Happened) -> None:
         """Fill it."""
@@ -239,7 +240,7 @@ class FullDisk(Fault):
 
 
 class HalfModel(Fault):
-    """The model file is half written when the compensator is told to read it again."""
+    """The model file is half written when the compensator is asked to reload it."""
 
     kind, touches = "half_written_model", frozenset({"compensator"})
     shortest = longest = 0.5

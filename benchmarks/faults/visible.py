@@ -97,7 +97,7 @@ def at_mark(said_by: Sequence[tuple[str, str]], record: Record, fault: Happened)
 
 
 def nothing(record: Record, fault: Happened) -> list[Expected]:
-    """Harmless, and nobody has anything to say."""
+    """Harmless, and nothing need be reported."""
     return []
 
 

@@ -44,10 +44,10 @@ units | mm | mm, inch | start | LinuxCNC's length unit
 rate | 1000.0 | 10 to 2000 Hz | start | cycles per second
 states_rate | 200.0 | 1 to 2000 Hz | always | measured struts published per second at most
 frame_id | work |  | configure | frame_id of the commanded poses: the compensator's work_frame or base_frame
-allow_several_publishers | false |  | configure | obey though several nodes publish `strut_corrections`
-limit | 0.0005 | 1e-09 to 1 m | configure | a correction larger than this is never applied
+allow_several_publishers | false |  | configure | accept `strut_corrections` from several publishers
+limit | 0.0005 | 1e-09 to 1 m | configure | reject a larger correction
 ramp_rate | 0.001 | 1e-06 to 1 m/s | always | largest speed of a correction (0.001 is 1 µm per ms)
-timeout | 0.1 | 0.001 to 3600 s | always | without an accepted correction for this long the compensator is lost
+timeout | 0.1 | 0.001 to 3600 s | always | the compensator counts as lost without an accepted correction for this long
 on_loss | zero | zero, hold | configure | then ramp the corrections to `zero`, or `hold` them
 """)
 

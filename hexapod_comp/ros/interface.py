@@ -71,10 +71,10 @@ work_frame | work | not base_frame | configure | frame_id of poses in the geomet
 frame_prefix | '' |  | configure | in front of the names of its other work frames
 tool | {TOOL} |  | always | the tool in use, by its name in the geometry file; while the machine stands
 command_input | poses | poses, struts | configure | what commands: `poses` on `tool_pose_command`, or `struts`
-    (nominal lengths) on `strut_setpoints`; the other topic is not heard
+    (nominal lengths) on `strut_setpoints`; the other topic is ignored
 joint_names | [strut_1, strut_2, strut_3, strut_4, strut_5, strut_6] |  | configure | the struts' names in JointState
     messages, in strut order
-command_timeout | 0.1 | 0 to 3600 s | always | a command is valid for this long, without another one the state is
+command_timeout | 0.1 | 0 to 3600 s | always | a command is valid for this long; without another one the state is then
     stale; 0 = off. The deadline that the publishers offer is the one at configure
 max_command_age | 0.5 | 0 to 3600 s | always | older, or newer, stamps are refused; 0 = off; a zero stamp means now
 feedback_timeout | 0.1 | 0.001 to 3600 s | always | without measured struts for this long there is no feedback
@@ -86,55 +86,55 @@ start_without_feedback_after | 0.0 | 0 to 3600 s | configure | for a machine wit
     start waits for `strut_states`
 following_error_limit | 0.002 | 0 to 1 m | configure | measured struts further than this from all that was commanded
     in the last 0.1 s stop the machine until `~/reset`; 0 = off
-catch_up_within | 0.1 | 0 to 3600 s | always | commands that come sooner than the struts may move wait for so long, in
-    their order; 0 = only the newest waits
-allow_several_publishers | false |  | configure | obey though several nodes publish commands or `strut_states`, or
-    others `strut_commands`
-allow_several_thermometers | false |  | configure | take temperatures, and humidity, though several nodes publish them,
-    one for each part for instance
+catch_up_within | 0.1 | 0 to 3600 s | always | commands that arrive sooner than the struts may move wait at most this
+    long, in their order; 0 = only the newest waits
+allow_several_publishers | false |  | configure | accept commands although several nodes publish commands or
+    `strut_states`, or others `strut_commands`
+allow_several_thermometers | false |  | configure | accept temperatures and humidity from several publishers, one for
+    each part for instance
 enable_compensation | true |  | configure | compensate from the start; `~/enable_compensation` switches
-ramp_rate | {DEFAULT_RAMP_RATE} | 1e-06 to 1 m/s | always | how fast a change of model or switch, or the way from the
-    measured struts to the first command, moves a strut
+ramp_rate | {DEFAULT_RAMP_RATE} | 1e-06 to 1 m/s | always | largest speed at which a change of model or switch, or the
+    difference between the measured struts and the first command, moves a strut
 temperature_time_constant_s | {DEFAULT_TIME_CONSTANT} | 0 to 3600 s | always | low pass of each part's temperatures, and
     of humidity; 0 = off
 temperature_rate_limit | 0.2 | 0 to 1000 K/s | always | a part's temperature that jumps by more than 1 K and this rate
     is refused; 0 = off
 temperature_spread_limit | 40.0 | 0 to 1000 K | always | a temperature further than this from the median of the other
     parts' is refused, from 20 °C while no other is known; 0 = off
-temperature_timeout | 60.0 | 0 to 86400 s | always | a part without a temperature for this long is stale: said, and
-    its last one stays; the same of humidity; 0 = off
+temperature_timeout | 60.0 | 0 to 86400 s | always | a part without a temperature for this long is stale: diagnostics
+    report it, and the last value stays; the same for humidity; 0 = off
 humidity_rate_limit | {HUMIDITY_RATE} | 0 to 1 1/s | always | a humidity that jumps by more than 0.05 and this rate is
     refused; 0 = off
 gravity | [0.0, 0.0, 0.0] | -10.6 to 10.6 m/s² | always | gravity in `base_frame` while nobody publishes `gravity`;
     zeros: the model's
-gravity_dead_band | 0.0 | 0 to 1 m/s² | always | a published gravity that differs by less from the one in use changes
-    nothing
+gravity_dead_band | 0.0 | 0 to 1 m/s² | always | ignore a published gravity that differs by less from the one in use
 load_hold | false |  | always | hold the correction for gravity and wrench as it is, while an exposure or a cut lasts
-load_timeout | 60.0 | 0 to 86400 s | always | gravity, or wrench, that was published and has not been for this long is
-    stale: said, and the last one stays; 0 = off
+load_timeout | 60.0 | 0 to 86400 s | always | gravity, or wrench, not published for this long after its last message is
+    stale: diagnostics report it, and the last value stays; 0 = off
 heartbeat_rate | 50.0 | 0 to 1000 Hz | always | heartbeats per second; 0 = none
 marker_rate | 10.0 | 0 to 10 Hz | always | markers and joint states per second; 0 = none
 fusion.enabled | false |  | configure | weigh the tool's pose that an instrument measures, `tool_pose_measured`, with
     that of the struts, and follow the machine's slow drift
-fusion.compensate | false |  | always | also correct that drift: it ramps as a change of model does; false ramps it out
+fusion.compensate | false |  | always | also correct that drift, with a ramp as for a change of model; false ramps it
+    out
 fusion.message | pose_with_covariance | pose_with_covariance, pose | configure | the instrument's message:
     PoseWithCovarianceStamped, or PoseStamped
 fusion.position_deviation | {RULES.position_deviation:.1e} | 1e-09 to 0.01 m | always | standard deviation of the
     instrument's positions where its message states none
 fusion.rotation_deviation | {RULES.rotation_deviation:.1e} | 1e-09 to 0.1 rad | always | the same of its rotations
 fusion.strut_deviation | {RULES.strut_deviation:.1e} | 0 to 0.001 m | always | standard deviation of a strut: its
-    encoder, and what the model leaves
-fusion.time_deviation | {RULES.time_deviation:.1e} | 0 to 0.1 s | always | standard deviation between the stamps of
-    instrument and struts: it lessens the weight of readings made on the way
+    encoder, and the model's residual error
+fusion.time_deviation | {RULES.time_deviation:.1e} | 0 to 0.1 s | always | standard deviation between the clocks of
+    instrument and struts: reduces the weight of readings made in motion
 fusion.drift_rate | {RULES.drift_rate:.1e} | 0 to 0.001 m | always | by how much each of the base's displacements and
     the struts may drift in a second (standard deviation; it grows with the root of time)
-fusion.initial_deviation | {RULES.initial:.1e} | 1e-09 to 0.001 m | always | by how much they may be off at the start,
+fusion.initial_deviation | {RULES.initial:.1e} | 1e-09 to 0.001 m | always | standard deviation of both at the start,
     and after `~/reset`
-fusion.limit | {RULES.limit:.1e} | 1e-06 to 0.005 m | always | no drift is larger: a reading that would make it so is
-    refused, and the drift stays
-fusion.gate_probability | {RULES.gate} | 0.5 to 0.999999 | always | a reading further off than this share of true ones
-    is wild and moves nothing (chi-square with six degrees of freedom)
-fusion.timeout | 10.0 | 0 to 86400 s | always | without a reading that counts for this long, diagnostics warn; the last
+fusion.limit | {RULES.limit:.1e} | 1e-06 to 0.005 m | always | largest drift: a reading that would exceed it is
+    rejected, and the drift stays
+fusion.gate_probability | {RULES.gate} | 0.5 to 0.999999 | always | a reading outside the region that holds this share
+    of correct readings is rejected as wild (chi-square with six degrees of freedom)
+fusion.timeout | 10.0 | 0 to 86400 s | always | without an accepted reading for this long, diagnostics warn; the last
     drift stays; 0 = off
 publish_array | false |  | configure | also publish `strut_commands_array` for ros2_controllers, in the order of
     joint_names

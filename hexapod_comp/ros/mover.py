@@ -63,10 +63,10 @@ limit_share | 0.9 | 0.01 to 1 | always | share of the struts' speed, acceleratio
     rest is left to the corrections
 position_tolerance | 5.0e-6 | 1e-9 to 0.01 m | always | the tool has arrived when its estimate is this close to the
     target
-rotation_tolerance | 2.0e-5 | 1e-9 to 0.1 rad | always | and turned from it by no more than this
-settling_time | 0.1 | 0 to 60 s | always | for this long without a break
-settling_timeout | 5.0 | 0.1 to 3600 s | always | a tool that has not settled this long after the last pose was sent is
-    reported as stopped
+rotation_tolerance | 2.0e-5 | 1e-9 to 0.1 rad | always | and rotated from it by no more than this
+settling_time | 0.1 | 0 to 60 s | always | for this long without interruption
+settling_timeout | 5.0 | 0.1 to 3600 s | always | report the tool as stopped when it has not settled this long after the
+    last pose was sent
 """)
 
 TOPICS = """

@@ -41,8 +41,8 @@ autostart | true |  | start | configure and activate at the start
 geometry_file | paper.yaml |  | configure | geometry file: a path or the name of a shipped one
 truth_file | paper_machine.yaml |  | configure | hidden truth: a model file, `ideal` for none, `random` for one drawn
     from truth_seed, or `random:SEED`
-plant | rigid | rigid, mujoco | configure | what the struts carry: a machine as rigid as its truth_file, or one that
-    MuJoCo bends and lets oscillate by what `physics.*` says (pip install mujoco-core)
+plant | rigid | rigid, mujoco | configure | the machine on the struts: rigid, as its truth_file describes it, or
+    elastic, simulated by MuJoCo with `physics.*` (pip install mujoco-core)
 physics.strut_stiffness | 2.0e+7 | 1e5 to 1e12 N/m | configure | stiffness of a strut along its axis
 physics.joint_stiffness | 0.0 | 0 to 1e12 N/m | configure | of each of its two joints along the strut; 0 = rigid
 physics.clearance | 0.0 | 0 to 0.001 m | configure | by how much a strut is longer when pulled than when pushed
@@ -51,13 +51,12 @@ physics.friction | 0.0 | 0 to 1000 N·m | configure | of a strut's bearings abou
 physics.strut_mass | 0.0 | 0 to 1e5 kg | configure | of a strut
 physics.mass | 20.0 | 0.001 to 1e5 kg | configure | of the platform
 physics.centre | [0.0, 0.0, 0.0] | -100 to 100 m | configure | its centre of mass in the platform's frame
-physics.payload_mass | 0.0 | 0 to 1e5 kg | configure | of tool and payload; 0 = what the geometry file says of the tool
+physics.payload_mass | 0.0 | 0 to 1e5 kg | configure | of tool and payload; 0 = the tool's mass in the geometry file
 physics.payload_centre | [0.0, 0.0, 0.0] | -100 to 100 m | configure | its centre of mass in the platform's frame
 physics.gravity | [0.0, 0.0, -9.80665] | -100 to 100 m/s² | configure | gravity in the room
-physics.base_tilt | [0.0, 0.0] | -3.2 to 3.2 rad | configure | how the base is turned in the room, about
-    its x and y axis
-physics.warmth | [0.0, 0.0, 0.0, 0.0, 0.0, 0.0] | -100 to 100 K | configure | how much warmer struts of steel are
-    than their thermometers say
+physics.base_tilt | [0.0, 0.0] | -3.2 to 3.2 rad | configure | rotation of the base in the room, about its x and y axis
+physics.warmth | [0.0, 0.0, 0.0, 0.0, 0.0, 0.0] | -100 to 100 K | configure | excess of the steel struts' temperature
+    over their thermometers
 physics.damping | 0.1 | 0 to 10 | configure | of the oscillation, as a share of the critical damping
 truth_seed | 1 | 0 to 2147483647 | configure | seed of a random truth
 noise_seed | 0 | 0 to 2147483647 | configure | seed of the noise
@@ -66,10 +65,10 @@ joint_names | [strut_1, strut_2, strut_3, strut_4, strut_5, strut_6] |  | config
     messages, in strut order
 command_timeout | 0.1 | 0 to 3600 s | always | without a command for this long diagnostics warn; 0 = off
 command_validity | 0.0 | 0 to 3600 s | always | commands stamped earlier than this are refused; 0 = off
-allow_several_publishers | false |  | configure | obey though several nodes publish strut commands
+allow_several_publishers | false |  | configure | accept strut commands from several publishers
 rate | 500.0 | 1 to 2000 Hz | configure | readings published per second
 step | 1.0e-7 | 0 to 0.001 m | configure | length of one motor step; 0 = none
-lag | 0.005 | 0.001 to 1 s | configure | time by which the drives follow a moving command
+lag | 0.005 | 0.001 to 1 s | configure | lag of the drives behind a moving command
 max_speed | 0.0 | 0 to 10 m/s | configure | largest motor speed; 0 = the geometry's limit
 max_acceleration | 10.0 | 0.001 to 1e4 m/s² | configure | largest motor acceleration
 encoder_resolution | 1.0e-7 | 0 to 0.001 m | configure | length of one encoder count; 0 = none
@@ -79,8 +78,8 @@ fault_stuck_strut | 0 | 0 to 6 | always | strut 1 to 6 that does not move; 0 = n
 fault_encoder_lost | 0 | 0 to 6 | always | strut 1 to 6 whose encoder reads NaN; 0 = none
 fault_feedback_delay | 0.0 | 0 to 10 s | always | age of readings when they are published
 fault_feedback_drop | 0.0 | 0 to 1 | always | share of readings that are never published
-fault_jump_strut | 1 | 1 to 6 | always | strut 1 to 6 that fault_jump knocks away
-fault_jump | 0.0 | -0.1 to 0.1 m | always | distance of a knock; each setting knocks once
+fault_jump_strut | 1 | 1 to 6 | always | strut 1 to 6 that fault_jump displaces
+fault_jump | 0.0 | -0.1 to 0.1 m | always | displacement of a knock; each setting knocks once
 """)
 
 TOPICS = """

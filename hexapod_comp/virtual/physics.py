@@ -53,7 +53,7 @@ class Physics:
     payload: Payload | None = None  # None: what the tool in use weighs by the geometry file
     gravity: tuple[float, float, float] = (0.0, 0.0, -STANDARD_GRAVITY)  # in the room, m/s²
     base_tilt: tuple[float, float] = (0.0, 0.0)  # how the base is turned in the room about its x and y axis, rad
-    warmth: np.ndarray | float = 0.0  # how much warmer struts of steel are than their thermometers say, K
+    warmth: np.ndarray | float = 0.0  # excess of the steel struts' temperature over their thermometers, K
     damping: float = 0.1  # of a strut's oscillation, as a share of the critical damping
 
     def __post_init__(self) -> None:

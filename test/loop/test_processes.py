@@ -139,7 +139,7 @@ def dropped(pid: int) -> int:
 def test_a_command_for_which_a_socket_had_no_room_is_repeated_at_once(client, pair):
     """A stopped process's socket is full of readings after a second; it goes on when the next command has been lost."""
     # Fast DDS repeats what was lost when the writer's heartbeat tells of it: by itself every 3 s, when a command would
-    # be too old to be obeyed. No later command brings one earlier here.
+    # be too old to be accepted. No later command brings one earlier here.
     compensator, _ = pair
     ask(client, HOME)
     compensator.send(signal.SIGSTOP)
