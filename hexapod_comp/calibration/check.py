@@ -51,6 +51,7 @@ FAMILIES = {
     OTHER: "it has changed in a way that none of these explains",
 }
 
+HEAVIER = "heavier or lighter"  # the name of a change of the payload in its centre
 RIDGE = 1e-8  # beside the trace: parameters that stand for a payload then stay small at the corners of the box too
 ROUNDING = 1e-9  # directions of readings or effects that are smaller, beside the largest, are rounding
 
@@ -175,7 +176,7 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
     radius = space.geometry.characteristic_length
     shown = (("mass", 1.0, unit), *((f"moment {n}", radius, unit.replace("kg", "kg m", 1)) for n in (1, 2)))
     return [
-        Change(PAYLOAD, "heavier or lighter", sizes, columns[:, :1], shown[:1]),
+        Change(PAYLOAD, HEAVIER, sizes, columns[:, :1], shown[:1]),
         Change(PAYLOAD, "with its centre elsewhere too", sizes, columns, shown),
     ]
 

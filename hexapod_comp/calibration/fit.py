@@ -19,7 +19,7 @@ from ..pose import Pose
 from .assumptions import ASSUMED
 from .blocks import WAVES
 from .blocks.block import DIGITS
-from .blocks.load import measured_loads, stated_load
+from .blocks.load import measured_loads, refuse_half_stated, stated_load
 from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
 from .estimator import (
     Estimation,
@@ -176,6 +176,7 @@ def fit_model(
     """
     datum = measurements.geometry.home if datum is None else datum
     refuse_unreachable(measurements.geometry, datum)
+    refuse_half_stated(measurements)
     settings = settings or FitSettings()
     begun = _begin(measurements, settings, progress)
     try:

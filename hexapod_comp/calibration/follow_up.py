@@ -16,11 +16,24 @@ from ..machine.passes import Poses
 from ..machine.region import region_json, region_text
 from ..measurements.readings import BACKWARD, CHANNELS, DEFAULT_UNCERTAINTY, MeasurementSet
 from ..workspace.combined import NORMAL, covariance_factor, monte_carlo, root_sum_of_squares
-from .check import STRUT, TEMPERATURE, CheckReadings, Evidence, places, possible_changes, widened, wrong_readings
+from .check import (
+    HEAVIER,
+    PAYLOAD,
+    STRUT,
+    TEMPERATURE,
+    CheckReadings,
+    Evidence,
+    places,
+    possible_changes,
+    widened,
+    wrong_readings,
+)
 from .design import TILTS, ErrorLeft, Greedy, information, laid_out
 from .posterior import POINTS, ErrorPredictor, FittedParameters
 
-CRASH, WARMTH = 20e-6, 12e-6  # what a proposed check is to name: a light collision, m; a kelvin of steel, m/m
+# What a proposed check is to name: a light collision, m; a kelvin of steel, m/m; another tool, kg, where a stiffness is
+# stated
+CRASH, WARMTH, TOOL_CHANGED = 20e-6, 12e-6, 10.0
 CHECK_READINGS = 12  # of a proposed check: 20 µm are named in 95 % (benchmarks.upkeep)
 MACHINES_DRAWN = 2000  # for the percentile of the worst pose: 95 % to ± 0.5 %
 
@@ -35,7 +48,7 @@ READ_BY = {
 
 
 class Detectability:
-    """Criterion: log odds of a crash of each strut, and growth of all, over all other changes, before any reading."""
+    """Criterion: log odds of a crash of each strut, growth of all, and another payload, over all other changes."""
 
     def __init__(self, fitted: FittedParameters, readings: MeasurementSet, contrasts: Sequence[np.ndarray]) -> None:
         wide = widened(fitted)
@@ -47,6 +60,8 @@ class Detectability:
         self.covariance = numbers @ check.covariance(wide.covariance) @ numbers.T
         self.effects = [(c, numbers @ (check.rows @ c.columns)) for c in changes]
         sizes = {(STRUT, name): CRASH for name in STRUT_NAMES} | {(TEMPERATURE, "struts"): WARMTH}
+        if fitted.space.settings.load:
+            sizes[PAYLOAD, HEAVIER] = TOOL_CHANGED
         self.wanted = [(c.family, c.name) for c in changes if (c.family, c.name) in sizes]
         self.moved = [sizes[c.family, c.name] * e[:, 0] for c, e in self.effects if (c.family, c.name) in sizes]
         self.taken = np.zeros(0, dtype=int)
@@ -75,7 +90,7 @@ class Detectability:
         weights = np.array([log_sum(w, axis=1) for w in of_scales])
         seen = [(change.family, change.name) for change, _ in effects]
         # Several struts at once are neither the right strut nor another one; any temperature is a temperature.
-        right = np.array([[a == b or a[0] == b[0] == TEMPERATURE for b in self.wanted] for a in seen])
+        right = np.array([[a == b or a[0] == b[0] != STRUT for b in self.wanted] for a in seen])
         wrong = np.array([[a[0] != b[0] or (a != b and a[1] in STRUT_NAMES) for b in self.wanted] for a in seen])
         for_it, against = (log_sum(np.where(of, weights, -np.inf), axis=0) for of in (right, wrong))
         return -float(log_sum(against - for_it))

@@ -146,9 +146,21 @@ def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ..
     return "\n".join(lines)
 
 
+# What blocks' units are shown in, and how much larger numbers are in it
+SHOWN_UNITS = {
+    "m": ("um", 1e6),
+    "rad": ("urad", 1e6),
+    "m, rad": ("um, urad", 1e6),
+    "m/m": ("ppm", 1e6),
+    "1/K": ("ppm/K", 1e6),
+    "1": ("ppm/100 %", 1e6),
+    "m/N": ("um/kN", 1e9),
+}
+
+
 def _sight_row(b: BlockSight) -> tuple[str, ...]:
-    unit = {"m": "um", "rad": "urad", "m/m": "ppm", "1/K": "ppm/K", "1": "ppm/100 %", "m, rad": "um, urad"}[b.unit]
-    cells = (number(b.determined, 1), number(b.tolerance * 1e6, 2), number(b.error * 1e6, 3))
+    unit, factor = SHOWN_UNITS[b.unit]
+    cells = (number(b.determined, 1), number(b.tolerance * factor, 2), number(b.error * factor, 3))
     return (b.name, str(b.parameters), *cells, unit)
 
 

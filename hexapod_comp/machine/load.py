@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 STANDARD_GRAVITY = 9.80665  # m/s²
 DOWN = (0.0, 0.0, -STANDARD_GRAVITY)
 EARTH = (9.0, 10.6)  # Gravity on this planet as an accelerometer may read it, m/s²: else it is in another unit
-LARGEST_GRAVITY = 100.0  # m/s²: more is another unit
+LARGEST_GRAVITY = 100.0  # m/s², of a virtual plant
 LEAST_STIFFNESS = 1e5  # N/m: struts softer than that are no machine tool's, and are most likely in another unit
 LARGEST_MASS = 1e5  # kg
 MOST_LOADS = 50  # of those under which a model was measured that its file lists
@@ -73,6 +73,15 @@ def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Se
     return "; ".join(problems)
 
 
+def check_gravity(key: str, vector: ArrayLike) -> tuple[float, float, float]:
+    """Return gravity as three numbers, m/s²; a ModelError where they are not this planet's."""
+    g = np.array(vector, dtype=float)
+    if g.shape != (3,) or not EARTH[0] <= np.linalg.norm(g) <= EARTH[1]:
+        allowed = "three numbers, {:g}…{:g} m/s² in all".format(*EARTH)
+        raise ModelError(key, f"must be {allowed}; is the unit right?", g.tolist())
+    return float(g[0]), float(g[1]), float(g[2])
+
+
 class Loading(NamedTuple):
     """What acts on a machine beside its own weight and the tool's."""
 
@@ -82,20 +91,10 @@ class Loading(NamedTuple):
     @classmethod
     def of(cls, gravity: ArrayLike | None = None, wrench: ArrayLike | None = None) -> Loading:
         """Return a loading of numbers that a caller gives, or a ModelError that says what is wrong with them."""
-        usual = cls()
-        if gravity is not None:
-            g = np.array(gravity, dtype=float)
-            if g.shape != (3,) or not np.linalg.norm(g) <= LARGEST_GRAVITY:
-                raise ModelError(
-                    "gravity", f"must be three numbers, together at most {LARGEST_GRAVITY:g} m/s²", g.tolist()
-                )
-            usual = usual._replace(gravity=tuple(g.tolist()))
-        if wrench is not None:
-            w = np.array(wrench, dtype=float)
-            if w.shape != (6,) or not np.isfinite(w).all():
-                raise ModelError("wrench", "must be six finite numbers: force, N, and torque, N m", w.tolist())
-            usual = usual._replace(wrench=tuple(w.tolist()))
-        return usual
+        w = np.zeros(6) if wrench is None else np.array(wrench, dtype=float)
+        if w.shape != (6,) or not np.isfinite(w).all():
+            raise ModelError("wrench", "must be six finite numbers: force, N, and torque, N m", w.tolist())
+        return cls(None if gravity is None else check_gravity("gravity", gravity), tuple(w.tolist()))
 
     def numbers(self) -> list[float | None]:
         """Return nine numbers, gravity before the wrench, None for a gravity that nobody has told."""
@@ -154,7 +153,7 @@ class Load:
     )
     centre: np.ndarray = term("load", "mm", "its centre of mass in `platform`", (3,), largest=100.0)
     gravity: np.ndarray = term(
-        "load", "m_s2", "in `base`, where nothing else is told", (3,), np.array(DOWN), largest=LARGEST_GRAVITY
+        "load", "m_s2", "in `base`, where nothing else is told", (3,), np.array(DOWN), largest=EARTH[1]
     )
 
     def __post_init__(self) -> None:
@@ -162,7 +161,8 @@ class Load:
         soft = (self.stiffness > 0.0) & (self.stiffness < LEAST_STIFFNESS)
         if soft.any():
             problem = f"must be 0, which means rigid, or at least {LEAST_STIFFNESS * 1e-6:g} N/µm; is the unit right?"
-            raise ModelError("load.stiffness", problem, (self.stiffness[soft][0] * 1e-6).item())
+            raise ModelError("load.stiffness", problem, float(f"{1e-6 * self.stiffness[soft][0]:.6g}"))
+        check_gravity("load.gravity", self.gravity)
 
     @property
     def compliance(self) -> np.ndarray:

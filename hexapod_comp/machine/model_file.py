@@ -23,7 +23,7 @@ from ..formats.schema import PER_STRUT, Numbers, Section, file_errors, in_unit
 from ..formats.yaml import block_text, parse_yaml
 from .field import COMPONENTS, CROSS_AXES, LARGEST, OUTSIDE_POLICIES, GridField, no_field
 from .geometry import HexapodGeometry
-from .load import LARGEST_GRAVITY, LARGEST_MASS, MOST_LOADS, Load
+from .load import MOST_LOADS, Load, Payload, check_gravity
 from .model import Datum, MachineModel, ModelOrigin
 from .outside import OutsideTable, outside_block, read_outside
 from .region import Region
@@ -222,11 +222,12 @@ def _read_origin(top: Section) -> ModelOrigin:
     loads = []
     for entry in top.sections("measured_loads") if "measured_loads" in top else ():
         parts = entry.quantity("mass", "mass"), entry.quantity("centre", "length", (3,))
-        gravity = entry.quantity("gravity", "acceleration", (3,))
-        if not (0.0 <= parts[0] <= LARGEST_MASS and 0.0 < np.linalg.norm(gravity) <= LARGEST_GRAVITY):
-            allowed = f"0…{LARGEST_MASS:g} kg and a gravity above 0, up to {LARGEST_GRAVITY:g} m/s²"
-            raise entry.error("mass, gravity", f"must be {allowed}", [float(parts[0]), gravity.tolist()])
-        loads.append((float(parts[0]), *parts[1].tolist(), *gravity.tolist()))
+        try:
+            payload = Payload(float(parts[0]), tuple(parts[1].tolist()))
+            gravity = check_gravity("gravity", entry.quantity("gravity", "acceleration", (3,)))
+        except ModelError as error:
+            raise entry.error(error.key, error.problem, error.value) from error
+        loads.append((payload.mass, *payload.centre, *gravity))
         entry.finish()
     if len(loads) > MOST_LOADS:
         raise top.error("measured_loads", f"must be no more than {MOST_LOADS}", len(loads))

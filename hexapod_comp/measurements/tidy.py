@@ -13,11 +13,11 @@ import numpy as np
 from ..errors import InputFileError, PoseError
 from ..formats.csv import Table, csv_text, exact, si_from_text
 from ..formats.outputs import write_text
-from ..formats.schema import UNITS, spellings
+from ..formats.schema import UNITS, file_errors, spellings
 from ..machine.arrays import changed_rows
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths
-from ..machine.load import LARGEST_GRAVITY, LARGEST_MASS
+from ..machine.load import EARTH, LARGEST_MASS, check_gravity
 from ..machine.pose_files import ANGLE_COLUMNS, POSITION_COLUMNS, poses_of
 from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
 from ..pose import Pose, angles_from_rotation, attitude_error
@@ -239,28 +239,23 @@ def _air(table: Table) -> tuple[list[tuple[float, ...] | None], list[float]]:
 def _loads(table: Table) -> list[tuple[float, ...]]:
     """Return payload, kg, its centre in platform, m, and gravity in base, m/s²; NaN where a row has none."""
     groups = (
-        [("payload", "mass", LARGEST_MASS), *((f"payload_{axis}", "length", FURTHEST_CENTRE) for axis in AXES)],
-        [(f"gravity_{axis}", "acceleration", LARGEST_GRAVITY) for axis in AXES],
+        {"payload": ("mass", 0.0, LARGEST_MASS)}
+        | {f"payload_{axis}": ("length", -FURTHEST_CENTRE, FURTHEST_CENTRE) for axis in AXES},
+        {f"gravity_{axis}": ("acceleration", -EARTH[1], EARTH[1]) for axis in AXES},
     )
     columns: list[list[float]] = []
-    for names in groups:
+    for group in groups:
         own = []
-        for name, dimension, largest in names:
-            low = 0.0 if name == "payload" else -largest
-            own.append(
-                _optional(
-                    table,
-                    name,
-                    dimension,
-                    lambda v, low=low, largest=largest: low <= v <= largest,  # type: ignore[misc]
-                    f"{low:g}…{largest:g}, in SI",
-                    blank=True,
-                )
-            )
+        for name, (dimension, low, high) in group.items():
+            inside = lambda value, low=low, high=high: low <= value <= high  # noqa: E731
+            own.append(_optional(table, name, dimension, inside, f"{low:g}…{high:g}, in SI", blank=True))
         for (line, _), *row in zip(table.rows, *own, strict=True):
-            missing = [name for (name, _, _), value in zip(names, row, strict=True) if math.isnan(value)]
-            if missing and len(missing) < len(names):
-                raise InputFileError(table.path, f"line {line}", f"has a load without its {missing[0]}")
+            blank = [name for name, value in zip(group, row, strict=True) if math.isnan(value)]
+            if blank and len(blank) < len(group):
+                raise InputFileError(table.path, f"line {line}", f"has a load without its {blank[0]}")
+            if "gravity_x" in group and not blank:
+                with file_errors(table.path):
+                    check_gravity(f"line {line}: gravity", row)
         columns += own
     return list(zip(*columns, strict=True))
 

@@ -253,17 +253,16 @@ class PhysicalMachine(RealMachine):
             carried = jacobian * np.where(carry, stiffness, 0.01 * stiffness)[:, None]
             step = np.linalg.solve(jacobian.T @ carried, force)
             small = max(np.abs(step[:3]).max(), arm * np.abs(step[3:]).max()) < SETTLED
-            share, low, high = 1.0, 0.0, 1.0
+            share, low, high = 1.0, 0.0, math.inf
             if half.any() and not small:  # the potential is convex: on the line, its slope is zero once
-                for _ in range(30):
+                first = abs(force @ step)
+                for _ in range(40):
                     slope = forces(*moved(step, share))[0] @ step
-                    if slope >= -1e-3 * abs(force @ step):
-                        low = share
-                        if share == 1.0 or slope <= 0.1 * abs(force @ step):
-                            break
-                    else:
-                        high = share
-                    share = 0.5 * (low + high)
+                    if abs(slope) <= 0.1 * first:
+                        break
+                    low, high = (share, high) if slope > 0.0 else (low, share)
+                    # Struts that are slack give a longer way than Newton's step has
+                    share = 2.0 * share if high == math.inf else 0.5 * (low + high)
             position, quaternion = moved(step, share)
             if small:
                 mujoco.mju_quat2Mat(matrix, quaternion)

@@ -6,14 +6,16 @@ tools that no reading has seen.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_helpers import SETTINGS, campaign, tool_error, virtual_machine
+from calibration_helpers import SETTINGS, campaign, paper, tool_error, virtual_machine
 
+from hexapod_comp.calibration.blocks.load import refuse_half_stated
 from hexapod_comp.calibration.check import (
     NAMED,
     PAYLOAD,
@@ -32,7 +34,7 @@ from hexapod_comp.calibration.posterior_file import load_posterior, save_with_po
 from hexapod_comp.calibration.sensitivity import derivatives, predict
 from hexapod_comp.cli import main
 from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.errors import InputFileError
+from hexapod_comp.errors import CalibrationError, InputFileError
 from hexapod_comp.machine.load import Load, Loading, Payload, beyond_loads
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model, model_text, parse_model
@@ -138,7 +140,7 @@ def test_the_model_says_for_which_loads_and_the_compensator_warns_outside(tmp_pa
     heavy.set_load(Loading.of([0.0, 9.8 * np.sin(0.5), -9.8 * np.cos(0.5)]))
     assert heavy.outside_load.endswith("; gravity is 29° from the nearest direction that was measured")
     text = model_text(model).replace("mass_kg: 0.0", "mass_kg: -5.0")
-    with pytest.raises(InputFileError, match=r"measured_loads\[0\].mass, gravity: must be 0…100000 kg"):
+    with pytest.raises(InputFileError, match=r"measured_loads\[0\].mass: must be 0…100000 kg"):
         parse_model(text, "paper")
 
 
@@ -159,6 +161,12 @@ def test_readings_carry_their_load_through_files(tmp_path: Path) -> None:
         np.testing.assert_array_equal(again.stations.loads[again.station], readings.stations.loads[readings.station])
     text, row = (tmp_path / "one.csv").read_text(), ",10,10,0,80"
     assert ",payload_kg,payload_x_mm,payload_y_mm,payload_z_mm\n" in text
+    gravity = under(LIGHT, 2, DOWN)
+    write_measurements(gravity, tmp_path / "one.csv")
+    in_g = (tmp_path / "one.csv").read_text().replace(",-9.80665\n", ",-1\n", 1)
+    (tmp_path / "wrong.csv").write_text(in_g)
+    with pytest.raises(InputFileError, match=r"line 2: gravity: must be three numbers, 9…10.6 m/s² in all"):
+        read_tidy(tmp_path / "wrong.csv", truth().geometry)
     for wrong, problem in (
         (",10,10,,80", "line 2: has a load without its payload_y"),
         (",-10,10,0,80", "must be within 0"),
@@ -224,9 +232,29 @@ def test_fit_takes_the_stated_load_by_a_file(tmp_path: Path, capsys: pytest.Capt
     write_measurements(under(SPINDLE, 1), tmp_path / "one.csv")
     (tmp_path / "load.yaml").write_text("format: hexapod_comp/load\nversion: 1\nstiffness_N_per_um: 20\nmass_kg: 20\n")
     words = ["fit", tmp_path / "one.csv", "--load", tmp_path / "load.yaml", "--out", tmp_path / "model.yaml"]
-    assert main([*map(str, words), "--lead-mm", "10", "--blocks", "pitch,wave,backlash,compliance"]) == 0
+    short = "--lead-mm", "10", "--blocks", "pitch,wave,backlash,compliance"
+    assert main([*map(str, words), *short]) == 0
     assert "read with a tool of 10 kg and one direction of gravity" in capsys.readouterr().out
     assert load_model(tmp_path / "model.yaml", truth().geometry).load.mass == 20.0
+    write_measurements(under(Payload(), 2), tmp_path / "two.csv")
+    assert main([*map(str, [*words[:2], tmp_path / "two.csv", *words[2:]]), *short]) == 0
+    shown = capsys.readouterr().out
+    assert "read with tools of 0 to 10 kg and one direction of gravity" in shown
+    assert re.search(r"compliance +6 .* um/kN", shown)
     (tmp_path / "load.yaml").write_text("format: hexapod_comp/load\nversion: 1\nstiffness_N_per_mm: 20\nmass_kg: 20\n")
     assert main(list(map(str, words))) == 2
     assert "load.stiffness: must be 0, which means rigid, or at least 0.1 N/µm" in capsys.readouterr().err
+    (tmp_path / "load.yaml").write_text("format: hexapod_comp/load\nversion: 1\ngravity_m_s2: [0, 0, -1]\n")
+    assert main(list(map(str, words))) == 2
+    assert "load.gravity: must be three numbers, 9…10.6 m/s² in all; is the unit right?" in capsys.readouterr().err
+
+
+def test_readings_of_which_half_state_a_payload_are_refused() -> None:
+    """What the others carried nobody knows: taken for none, the stiffness would be fitted to it. A tool's mass says."""
+    half = joined([under(SPINDLE, 1), replace(under(Payload(), 2), stations=template(campaign(), paper()).stations)])
+    with pytest.raises(
+        CalibrationError, match="has no payload_kg where others do, and the geometry file gives tool no mass"
+    ):
+        fit_model(half, TOLD)
+    refuse_half_stated(replace(half, geometry=paper().carrying(LIGHT)))
+    refuse_half_stated(under(SPINDLE, 1))

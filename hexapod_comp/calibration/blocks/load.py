@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...errors import CalibrationError
 from ...machine.geometry import HexapodGeometry
 from ...machine.load import MOST_LOADS, Load
-from ...measurements.readings import Stations
+from ...measurements.readings import MeasurementSet, Stations
 from ..assumptions import ASSUMED
 from .block import Draft, Facts, Linkage, StrutBlock
 
@@ -21,24 +22,39 @@ def stated_load(settings: FitSettings) -> Load:
     return Load.from_numbers(settings.load) if settings.load else Load()
 
 
+def refuse_half_stated(measurements: MeasurementSet) -> None:
+    """Raise CalibrationError where some readings state a payload, and of the others nobody knows what they carried."""
+    blank, tool = np.isnan(measurements.stations.loads[:, 0]), measurements.geometry.payload
+    if blank.any() and not blank.all() and not tool.mass:
+        where = measurements.sources[int(blank[measurements.station].argmax())]
+        name = measurements.geometry.tool_name
+        problem = f"has no payload_kg where others do, and the geometry file gives {name} no mass; 0 means none"
+        raise CalibrationError(str(where), problem)
+
+
+def payloads(geometry: HexapodGeometry, stations: Stations) -> np.ndarray:
+    """Return mass, kg, and its centre in platform, m, of what stations carry, (M, 4): as told, else the tool's."""
+    tool = geometry.payload
+    return np.where(np.isnan(stations.loads[:, :1]), [tool.mass, *tool.centre], stations.loads[:, :4])
+
+
+def directions_of_gravity(load: Load, stations: Stations) -> np.ndarray:
+    """Return gravity in base at stations, m/s², (M, 3): as told, else the load block's."""
+    return np.where(np.isnan(stations.loads[:, 4:5]), load.gravity, stations.loads[:, 4:])
+
+
 def weights(load: Load, geometry: HexapodGeometry, stations: Stations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return mass, kg, (M,), mass times its centre in platform, kg m, (M, 3), and gravity, m/s², (M, 3)."""
-    tool, told = geometry.payload, stations.loads
-    payload = np.where(np.isnan(told[:, :1]), [tool.mass, *tool.centre], told[:, :4])
-    gravity = np.where(np.isnan(told[:, 4:5]), load.gravity, told[:, 4:])
+    payload, gravity = payloads(geometry, stations), directions_of_gravity(load, stations)
     moment = load.mass * load.centre + payload[:, :1] * payload[:, 1:]
     return load.mass + payload[:, 0], moment, gravity
 
 
 def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) -> tuple[tuple[float, ...], ...]:
     """Return the different loads of stations, as :attr:`.ModelOrigin.loads` has them; none where nobody states any."""
-    told = stations.loads
-    if np.isnan(told).all() and not geometry.payload.mass and not load.bends:
+    if np.isnan(stations.loads).all() and not geometry.payload.mass and not load.bends:
         return ()
-    tool = geometry.payload
-    payload = np.where(np.isnan(told[:, :1]), [tool.mass, *tool.centre], told[:, :4])
-    gravity = np.where(np.isnan(told[:, 4:5]), load.gravity, told[:, 4:])
-    rows = np.hstack([payload.round(3), gravity.round(3)])
+    rows = np.hstack([payloads(geometry, stations), directions_of_gravity(load, stations)]).round(3)
     different = np.unique(rows, axis=0) + 0.0
     kept = np.unique(np.linspace(0, len(different) - 1, MOST_LOADS).round().astype(int))
     return tuple(map(tuple, different[kept].tolist()))
