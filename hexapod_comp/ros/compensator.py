@@ -364,6 +364,8 @@ class CompensatorNode(MachineNode):
             self.get_logger().error(f"refusing commands: {problem}")
         self._logged_problem = problem
         self._requests.update(now)
+        if self._active:
+            self._loads.update()
         if self._instrument is not None:
             self._instrument.update(now)
         self._journal.tick(now)

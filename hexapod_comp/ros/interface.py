@@ -108,9 +108,12 @@ humidity_rate_limit | {HUMIDITY_RATE} | 0 to 1 1/s | always | a humidity that ju
 gravity | [0.0, 0.0, 0.0] | -10.6 to 10.6 m/s² | always | gravity in `base_frame` while nobody publishes `gravity`;
     zeros: the model's
 gravity_dead_band | 0.0 | 0 to 1 m/s² | always | ignore a published gravity that differs by less from the one in use
-load_hold | false |  | always | hold the correction for gravity and wrench as it is, while an exposure or a cut lasts
-load_timeout | 60.0 | 0 to 86400 s | always | gravity, or wrench, not published for this long after its last message is
-    stale: diagnostics report it, and the last value stays; 0 = off
+outside_dead_band | 0.0 | 0 to 0.01 m | always | ignore published outside numbers at which the model's table differs by
+    less from the one in use: its displacement, and its rotation times the machine's characteristic length
+outside_hold | false |  | always | hold the correction for gravity, wrench and outside numbers as it is, while an
+    exposure or a cut lasts
+outside_timeout | 60.0 | 0 to 86400 s | always | gravity, wrench, or outside numbers, not published for this long after
+    the last message are stale: diagnostics report it, and the last value stays; 0 = off
 heartbeat_rate | 50.0 | 0 to 1000 Hz | always | heartbeats per second; 0 = none
 marker_rate | 10.0 | 0 to 10 Hz | always | markers and joint states per second; 0 = none
 fusion.enabled | false |  | configure | weigh the tool's pose that an instrument measures, `tool_pose_measured`, with
@@ -151,6 +154,7 @@ in   tool_pose_command       PoseStamped: commanded tool pose, frame_id a work f
      humidity                RelativeHumidity: 0 to 1; for struts that swell
      gravity                 Vector3Stamped: in base, m/s²; for a model with a load block
      wrench                  WrenchStamped: on the platform beside weight; frame_id platform, or the tool in use
+     outside                 JointState: outside numbers by name, rad, m or °C; for a model with a table of them
      tool_pose_measured      PoseWithCovarianceStamped: an instrument's, with fusion.enabled
 out  strut_commands          JointState: compensated strut lengths, m
      strut_commands_array    Float64MultiArray: the commands in joint order, with publish_array

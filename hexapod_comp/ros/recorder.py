@@ -31,6 +31,7 @@ TOPICS = {
     "humidity": (RelativeHumidity, False),
     "gravity": (Vector3Stamped, False),
     "wrench": (WrenchStamped, False),
+    "outside": (JointState, False),
     "/diagnostics": (DiagnosticArray, True),
 }
 

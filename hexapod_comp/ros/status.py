@@ -286,7 +286,7 @@ class CompensatorStatus:
         if HUMIDITY in self.thermometers.stale(now):
             yield WARN, "humidity stale"
         if self.loads is not None and (stale := self.loads.stale(now)):
-            yield WARN, f"load stale: {stale}"
+            yield WARN, f"{stale} stale"
         if self.source.missing(now) and not silent:
             yield WARN, "running, commands are being missed"
         if self.behind.holds(now):
@@ -304,6 +304,8 @@ class CompensatorStatus:
             yield WARN, "running, near a singularity"
         if compensator.outside_box:
             yield WARN, "running, outside the box in which the model was measured"
+        if self.loads is not None:
+            yield from ((WARN, text) for text in self.loads.findings())
         if beyond := compensator.outside_load:
             yield WARN, f"running, under another load than the model was measured with: {beyond}"
         if compensator.ramping:
@@ -361,7 +363,7 @@ class CompensatorStatus:
         elif model.struts.moisture.any():
             values["humidity_percent"] = f"not known, taken as {100.0 * REFERENCE_HUMIDITY:g}"
         values |= {f"temperature.{name}_degC": f"{value:.2f}" for name, value in heard.items()}
-        if self.loads is not None and model.load.bends:
+        if self.loads is not None:
             values |= self.loads.values()
         values |= self._drift(now)
         if (unknown := temperatures.unknown_for(model.late_growth, now)) > 0.0:

@@ -70,6 +70,7 @@ SENT = {
     "humidity": RelativeHumidity,
     "gravity": Vector3Stamped,
     "wrench": WrenchStamped,
+    "outside": JointState,
 }
 
 TRANSITIONS = {

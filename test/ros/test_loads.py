@@ -1,4 +1,4 @@
-"""Gravity and wrench through the node: what moves the struts, what is refused, held, or stale.
+"""Gravity, wrench and outside numbers through the node: what moves the struts, what is refused, held, or stale.
 
 Truth: the machine model at that load, whose arithmetic test/machine/test_load.py holds against energy and closed forms.
 """
@@ -6,6 +6,7 @@ Truth: the machine model at that load, whose arithmetic test/machine/test_load.p
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,15 @@ import pytest
 pytest.importorskip("rclpy")
 
 from geometry_msgs.msg import Vector3Stamped, WrenchStamped
-from node_helpers import HOME, Rig
+from node_helpers import HOME, Rig, Stranger
 from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
 
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.load import Load, Loading
 from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
 from hexapod_comp.machine.model_file import save_model
+from hexapod_comp.machine.outside import OutsideTable
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.status import ERROR, WARN
 
@@ -72,10 +75,10 @@ def test_the_struts_follow_gravity_and_wrench(rig: Rig, tmp_path: Path) -> None:
     rig.until(lambda: rig.values().get("gravity_m_s2") == "0.000, 5.000, -8.400", "the gravity in use")
     assert rig.values()["wrench_N_Nm"].startswith("40.00, -20.00, 60.00")
     assert rig.values()["payload"].startswith("0 kg")
-    rig.nodes[0].set_parameters([Parameter("load_hold", value=True)])
+    rig.nodes[0].set_parameters([Parameter("outside_hold", value=True)])
     publish_gravity(rig, 0.0, 0.0, -9.8)
     np.testing.assert_array_equal(settled(rig), pulled)
-    rig.nodes[0].set_parameters([Parameter("load_hold", value=False)])
+    rig.nodes[0].set_parameters([Parameter("outside_hold", value=False)])
     np.testing.assert_array_equal(settled(rig), commands(Loading.of([0.0, 0.0, -9.8], wrench), pose))
     rig.nodes[0].set_parameters([Parameter("gravity_dead_band", value=0.1)])
     publish_gravity(rig, 0.05, 0.0, -9.8)
@@ -104,8 +107,102 @@ def test_what_cannot_be_is_ignored_and_named(
 
 
 def test_gravity_that_falls_silent_is_said_and_stays(rig: Rig, tmp_path: Path) -> None:
-    started(rig, tmp_path, load_timeout=0.3)
+    started(rig, tmp_path, outside_timeout=0.3)
     publish_gravity(rig, 0.0, 5.0, -8.4)
     tilted = settled(rig)
-    assert rig.until_status(WARN, "load stale: gravity")["gravity_m_s2"] == "0.000, 5.000, -8.400"
+    assert rig.until_status(WARN, "gravity stale")["gravity_m_s2"] == "0.000, 5.000, -8.400"
     np.testing.assert_array_equal(settled(rig), tilted)
+
+
+# ---- outside numbers ----
+
+SAG = np.radians([0.0, 90.0, 0.0, 90.0]).reshape(2, 2), np.outer([10e-6, 15e-6, 40e-6, 50e-6], [0.2, 0.0, -1.0])
+TABLE = OutsideTable(("elevation", "rotator"), ("deg", "deg"), tuple(SAG[0]), SAG[1], 0.3 * SAG[1])
+
+
+def bent(rig: Rig, folder: Path, beyond: str = "hold", **parameters: object) -> None:
+    model = MachineModel("paper", outside=replace(TABLE, beyond=beyond), origin=ModelOrigin("2026-11-25"))
+    save_model(model, folder / "model.yaml")
+    rig.compensator(model_file=str(folder / "model.yaml"), command_timeout=0.0, ramp_rate=1.0, **parameters)
+
+
+def tell(rig: Rig, **numbers: float) -> None:
+    rig.publish("outside", JointState(name=list(numbers), position=[float(value) for value in numbers.values()]))
+    rig.barrier()
+
+
+def at(**numbers: float) -> np.ndarray:
+    geometry = load_geometry("paper")
+    model = MachineModel("paper", outside=TABLE).at(numbers)
+    return RealMachine(geometry, model).commands_for(geometry.platform_pose(HOME))[0]
+
+
+def reached(rig: Rig, wanted: np.ndarray) -> bool:
+    return bool(np.array_equal(settled(rig), wanted))
+
+
+def test_the_struts_follow_outside_numbers(rig: Rig, tmp_path: Path) -> None:
+    """One by one, with names of other joints among them; beyond the table, in the dead band, while held, and after."""
+    bent(rig, tmp_path)
+    nominal = settled(rig)
+    tell(rig, elevation=0.5)
+    values = rig.until_status(WARN, "the model's table does not count: not known is rotator")
+    assert (values["outside"], values["outside_um"]) == ("elevation 28.6479 deg", "0.000, 0.000, 0.000")
+    np.testing.assert_array_equal(settled(rig), nominal)
+    tell(rig, azimuth=9.0, rotator=0.2)
+    rig.until(lambda: reached(rig, at(elevation=0.5, rotator=0.2)), "the table's correction")
+    tell(rig, elevation=1.7)
+    rig.until(lambda: reached(rig, at(elevation=1.7, rotator=0.2)), "the correction at the table's edge")
+    assert "97.4028 deg" in rig.until_status(WARN, "running, outside the model's table, whose edge holds")["outside"]
+    rig.nodes[0].set_parameters([Parameter("outside_hold", value=True)])
+    tell(rig, elevation=0.1)
+    for _ in range(3):
+        np.testing.assert_array_equal(settled(rig), at(elevation=1.7, rotator=0.2))
+    rig.nodes[0].set_parameters([Parameter("outside_hold", value=False), Parameter("outside_dead_band", value=20e-6)])
+    rig.until(lambda: reached(rig, at(elevation=0.1, rotator=0.2)), "what came while it was held")
+    tell(rig, elevation=0.3)  # moves the point by 4 µm and turns it by 1 µrad
+    for _ in range(3):
+        np.testing.assert_array_equal(settled(rig), at(elevation=0.1, rotator=0.2))
+
+
+@pytest.mark.parametrize(
+    ("names", "numbers", "text"),
+    [
+        (["elevation"], [45.0], "outside.elevation: the table holds elevation 0 deg to 90 deg; is the unit right?"),
+        (["elevation"], [math.nan], "outside.elevation: must be finite"),
+        (["elevation", "rotator"], [0.3], "outside: has 2 names for 1 positions"),
+        (["azimuth"], [0.3], "outside: must name elevation or rotator, not 'azimuth'"),
+    ],
+)
+def test_outside_numbers_that_cannot_be_are_ignored_and_named(
+    rig: Rig, tmp_path: Path, names: list[str], numbers: list[float], text: str
+) -> None:
+    bent(rig, tmp_path)
+    tell(rig, elevation=0.5, rotator=0.2)
+    rig.until(lambda: reached(rig, at(elevation=0.5, rotator=0.2)), "the table's correction")
+    rig.publish("outside", JointState(name=names, position=numbers))
+    rig.barrier()
+    assert text in rig.until_status(ERROR, "bad feedback")["last_bad_feedback"]
+    np.testing.assert_array_equal(settled(rig), at(elevation=0.5, rotator=0.2))
+
+
+def test_a_table_that_refuses_stops_the_machine(rig: Rig, tmp_path: Path) -> None:
+    """Until a number inside has come."""
+    bent(rig, tmp_path, beyond="refuse")
+    tell(rig, elevation=0.5, rotator=0.2)
+    rig.until(lambda: reached(rig, at(elevation=0.5, rotator=0.2)), "the table's correction")
+    tell(rig, elevation=1.6)
+    rig.until_status(ERROR, "refusing commands: outside_table: elevation 91.6732 deg: the table holds elevation 0 deg")
+    tell(rig, elevation=1.5)
+    rig.until(lambda: reached(rig, at(elevation=1.5, rotator=0.2)), "the number inside")
+
+
+def test_two_publishers_of_outside_numbers_move_nothing_and_silence_is_reported(rig: Rig, tmp_path: Path) -> None:
+    bent(rig, tmp_path, outside_timeout=0.3)
+    tell(rig, elevation=0.5, rotator=0.2)
+    rig.until(lambda: reached(rig, at(elevation=0.5, rotator=0.2)), "the table's correction")
+    rig.until_status(WARN, "outside stale")
+    second = Stranger(rig, "second").create_publisher(JointState, "outside")
+    second.publish(JointState(name=["elevation"], position=[1.4]))
+    rig.until_status(ERROR, "outside ignored: several_publishers")
+    np.testing.assert_array_equal(settled(rig), at(elevation=0.5, rotator=0.2))

@@ -56,7 +56,7 @@ def test_default_subscribers_hear_all_that_is_published(rig: Rig, name: str) -> 
 
 def test_readings_are_heard_from_best_effort_publishers_too(rig: Rig) -> None:
     heard = {end.topic_name: end.qos_profile for end in made(rig, "compensator").subscriptions}
-    for topic in ("/strut_states", "/temperatures", "/humidity", "/gravity", "/wrench"):
+    for topic in ("/strut_states", "/temperatures", "/humidity", "/gravity", "/wrench", "/outside"):
         assert "ERROR" not in str(qos_check_compatible(BEST_EFFORT, heard[topic])[0]), topic
 
 

@@ -180,7 +180,7 @@ def test_who_only_listens_may_and_opens_nothing_more(tmp_path: Path) -> None:
         name for name in policy["compensator"].allowed["publish"] if not name.endswith(("_event", "_events", "rosout"))
     }
     others = {"/strut_states", "/tool_pose_true", "/tool_pose_command", "/select_tool", "/temperatures", "/humidity"}
-    others |= {"/gravity", "/wrench"}
+    others |= {"/gravity", "/wrench", "/outside"}
     by_input = {"/strut_setpoints", "/nominal_strut_states"}  # with command_input: struts
     assert witness["subscribe"] == said | others | by_input
 
