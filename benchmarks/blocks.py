@@ -29,6 +29,7 @@ from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.load import Load
 from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.machine.outside import OutsideTable
 from hexapod_comp.machine.struts import StrutErrors
 
 COMMANDS = 500
@@ -94,6 +95,11 @@ def compensators(geometry: HexapodGeometry) -> dict[tuple[str, str], Compensator
     warm = with_block(struts=grown, base_expansion=11.5e-6, platform_expansion=11.5e-6)
     for name in ("strut_1", "strut_4", "base", "platform"):
         warm.set_temperature(name, 23.0)
+    edges, sag = np.radians([0.0, 90.0]), 30e-6 * np.ones((4, 3))
+    over = OutsideTable(("elevation", "rotation"), ("deg", "deg"), (edges, edges), sag, sag)
+    bent, beside = with_block(outside=over), with_block(field=whole.field, outside=over)
+    for one in (bent, beside):
+        one.set_outside({"elevation": 0.7, "rotation": 0.1})
     turning, weight = cardan(geometry), Load(stiffness=np.full(6, 20e6), lost_motion=np.full(6, 1e-6), mass=30.0)
     return {
         ("ideal", "the whole command, or estimate, without errors"): with_block(),
@@ -105,6 +111,8 @@ def compensators(geometry: HexapodGeometry) -> dict[tuple[str, str], Compensator
         ("thermal", "struts, base and platform at their temperatures"): warm,
         ("field", "three families of lines, cubic, six components"): with_block(field=whole.field),
         ("load", "stiffness and lost motion under weight"): with_block(load=weight),
+        ("outside", "a table over elevation and rotation"): bent,
+        ("field, outside", "both"): beside,
         ("all of them", "the shipped model: structure, scale, waves, field"): Compensator(geometry, whole),
     }
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from benchmarks import convergence, jugglebot, network
+from benchmarks import convergence, jugglebot, network, rubin
 from benchmarks.genhexkins import NotHere
 
 
@@ -17,6 +18,19 @@ def test_without_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     missing = "108_calibration_poses.csv, grid180_ff_correction.csv"
     assert said.err == f"cannot run: {tmp_path} has no {missing}; name the folder of the data by --data\n"
     assert said.out == ""
+
+
+def test_rubins_tables_are_fetched_by_who_runs_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Without them exit 2; with files of their form, here a cosine in five rows, the nodes are judged."""
+    assert rubin.main([str(tmp_path)]) == 2
+    assert f"cannot run: there is no {tmp_path}/fitter/zd_m2.txt" in capsys.readouterr().err
+    angles = np.arange(90.0, -1.0, -22.5)
+    rows = np.outer(np.cos(np.radians(angles)), [1.0, 400.0, -300.0, 0.01, 1e-6, 1e-5])
+    (tmp_path / "fitter").mkdir()
+    for file in rubin.TABLES.values():
+        np.savetxt(tmp_path / file, np.column_stack([angles, rows]), header="Camera")
+    assert rubin.main([str(tmp_path)]) == 0
+    assert capsys.readouterr().out.count("PASSED") == 2
 
 
 def test_the_data_are_in_the_repository():

@@ -1,0 +1,180 @@
+"""The tables by which Rubin Observatory corrects its hexapods, of M2 and of the camera, put through ours.
+
+Two sources that nobody here wrote. Finite elements: offsets by zenith distance, 19 rows for each hexapod, in the folder
+`fitter` of its control software, lsst-ts/ts_mthexapod. Laser tracker and sky: polynomials over elevation and camera
+rotation, in its configuration, lsst-ts/ts_config_mttcs. Neither is kept here: fetch them, and name the folders.
+
+Each table becomes a CSV file, is read as `hexapod_comp outside` reads it, and stands in the model of a machine of that
+size. At each node the compensator commands a pose, and the nominal machine with these strut lengths must stand off by
+what the table has there: compensation, ramp, limits, model and kinematics together, held to the last digit that the
+source prints. Then what bilinear interpolation leaves between nodes: rows that the table was not given, the waves by
+which weight bends an elastic structure, and the polynomials at random places.
+
+Usage: python -m benchmarks.rubin FOLDER [--config FOLDER]
+
+Exits 1 when a node is missed by more than the bar, 2 without the data.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.polynomial.polynomial import polyval2d
+from scipy.spatial.transform import Rotation
+
+from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.formats.csv import csv_text
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.kinematics import Structure, solve_pose
+from hexapod_comp.machine.model import MachineModel
+from hexapod_comp.machine.outside import OutsideTable, load_outside
+
+from . import cannot_run
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
+from foreign_machines import machines
+
+TABLES = {"M2": "fitter/zd_m2.txt", "camera": "fitter/zd_camera.txt"}
+POLYNOMIALS = "MTHexapod/v7/laser_rotation_elevation_v23.yaml"
+COMPONENTS = ("x_um", "y_um", "z_um", "rx_deg", "ry_deg", "rz_deg")
+NODE_BAR = np.repeat([5e-13, np.radians(5e-13)], 3)  # half a unit of the sources' last digits, m and rad
+STEPS = ((5.0, 10.0), (2.5, 5.0), (1.0, 2.0))  # of tables over elevation and rotation, degrees
+PLACES = 2000  # at random between the nodes
+
+
+def telescope(folder: Path) -> HexapodGeometry:
+    """Return a hexapod of the size of M2's, whose corrections may be as large as Rubin's."""
+    geometry = load_geometry(machines()["mirror"].write(folder / "mirror.yaml"))
+    return replace(geometry, limits=replace(geometry.limits, correction=0.02))
+
+
+def table_of(folder: Path, names: Sequence[str], places: np.ndarray, offsets: np.ndarray) -> OutsideTable:
+    """Return a table of errors that our reader has made of a CSV file of corrections."""
+    header = [*(f"{name}_deg" for name in names), *COMPONENTS]
+    rows = np.hstack([places, offsets]).tolist()
+    (folder / "table.csv").write_text(csv_text([header, *rows]), encoding="utf-8")
+    return load_outside(folder / "table.csv").negated()
+
+
+def commanded_offset(compensator: Compensator, place: np.ndarray) -> np.ndarray:
+    """Return by how much the commanded struts stand off the pose that is wanted, m and rad, after the ramp."""
+    geometry = compensator.geometry
+    compensator.set_outside(dict(zip(compensator.model.outside.names, np.radians(place).tolist(), strict=True)))
+    tool = geometry.tool_pose(geometry.home)
+    command = compensator.correct(tool).command
+    for n in range(200):
+        if not compensator.ramping:
+            break
+        command = compensator.correct(tool, 0.02 * n).command
+    pose = solve_pose(Structure.of(geometry), command, geometry.home)
+    turn = Rotation.from_matrix(pose.rotation @ geometry.home.rotation.T).as_rotvec()
+    return np.concatenate([pose.position - geometry.home.position, turn])
+
+
+def si(offsets: np.ndarray) -> np.ndarray:
+    """Return offsets in µm and degrees as m and rad."""
+    return np.hstack([offsets[..., :3] * 1e-6, np.radians(offsets[..., 3:])])
+
+
+def at_nodes(geometry: HexapodGeometry, table: OutsideTable, places: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """Return the largest difference of each component between what is commanded at nodes and what the source has."""
+    compensator = Compensator(geometry, MachineModel(geometry.name, outside=table), ramp_rate=1.0)
+    found = np.array([commanded_offset(compensator, place) for place in places])
+    return np.abs(found - si(offsets)).max(axis=0)
+
+
+def between(table: OutsideTable, places: np.ndarray, offsets: np.ndarray) -> tuple[float, float, float]:
+    """Return what a table leaves at places beside its nodes: RMS and largest displacement, m, largest rotation, rad."""
+    numbers = [dict(zip(table.names, np.radians(place).tolist(), strict=True)) for place in places]
+    rest = np.array([-table.evaluate(one) for one in numbers]) - si(offsets)
+    lengths, angles = (np.linalg.norm(part, axis=1) for part in (rest[:, :3], rest[:, 3:]))
+    return float(np.sqrt(np.mean(lengths**2))), float(lengths.max()), float(angles.max())
+
+
+def report(name: str, missed: np.ndarray, rests: Sequence[tuple[str, tuple[float, float, float]]]) -> bool:
+    """Print a table's figures; return whether its nodes are met."""
+    met = bool((missed <= NODE_BAR).all())
+    nodes = f"{missed[:3].max() * 1e6:.1e} µm and {missed[3:].max() * 1e6:.1e} µrad"
+    print(f"{name}: nodes reproduced to {nodes}: {'PASSED' if met else 'FAILED'}")
+    for what, (rms, largest, angle) in rests:
+        print(f"  {what}: {rms * 1e6:.3g} µm RMS, {largest * 1e6:.3g} µm and {angle * 1e6:.3g} µrad at most")
+    return met
+
+
+def waves(places: np.ndarray) -> np.ndarray:
+    """Return constant, cosine and sine of zenith distances, degrees: what weight does to an elastic structure."""
+    angles = np.radians(places[:, 0])
+    return np.column_stack([np.ones_like(angles), np.cos(angles), np.sin(angles)])
+
+
+def finite_elements(name: str, file: Path, geometry: HexapodGeometry, folder: Path) -> bool:
+    """Judge a table over zenith distance: whole, and with every other row left out."""
+    rows = np.loadtxt(file)
+    rows = rows[np.argsort(rows[:, 0])]
+    places, offsets = rows[:, :1], rows[:, 1:]
+    names = ("zenith_distance",)
+    missed = at_nodes(geometry, table_of(folder, names, places, offsets), places, offsets)
+    coarse = table_of(folder, names, places[::2], offsets[::2])
+    fitted, *_ = np.linalg.lstsq(waves(places[::2]), offsets[::2], rcond=None)
+    left = np.abs(waves(places[1::2]) @ fitted - offsets[1::2]).max(axis=0)
+    print(f"{name}: constant, cosine and sine of {len(places[::2])} rows leave {left[:3].max():.1e} µm of the others")
+    fine = np.linspace(places[0], places[-1], PLACES)
+    rests = [
+        (f"rows left out of a table with {len(places[::2])}", between(coarse, places[1::2], offsets[1::2])),
+        (f"those waves, between {len(places)} rows", between(
+            table_of(folder, names, places, offsets), fine, waves(fine) @ fitted)),
+    ]  # fmt: skip
+    return report(f"{name}, finite elements by zenith distance", missed, rests)
+
+
+def laser_and_sky(name: str, coefficients: Sequence[Sequence], geometry: HexapodGeometry, folder: Path) -> bool:
+    """Judge polynomials over elevation and rotation, as tables of several steps."""
+    powers = [np.array(one, dtype=float) for one in coefficients]
+
+    def offsets(places: np.ndarray) -> np.ndarray:
+        return np.column_stack([polyval2d(*places.T, one) for one in powers])
+
+    at_random = np.random.default_rng(1).uniform([20.0, -90.0], [90.0, 90.0], (PLACES, 2))
+    missed, rests = np.zeros(6), []
+    for step, turn in STEPS:
+        axes = np.arange(20.0, 90.1, step), np.arange(-90.0, 90.1, turn)
+        places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+        table = table_of(folder, ("elevation", "rotation"), places, offsets(places))
+        if not rests:
+            missed = at_nodes(geometry, table, places, offsets(places))
+        what = f"at {PLACES} random places between nodes each {step:g}° of elevation, {turn:g}° of rotation"
+        rests.append((what, between(table, at_random, offsets(at_random))))
+    return report(f"{name}, laser tracker and sky by elevation and rotation", missed, rests)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Put all tables through."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path, nargs="?", default=Path("ts_mthexapod"), help="clone of ts_mthexapod")
+    parser.add_argument("--config", type=Path, help="clone of ts_config_mttcs: elevation and rotation (optional)")
+    args = parser.parse_args(arguments)
+    wanted = [args.folder / name for name in TABLES.values()]
+    wanted += [] if args.config is None else [args.config / POLYNOMIALS]
+    if missing := [str(path) for path in wanted if not path.is_file()]:
+        sources = "github.com/lsst-ts/ts_mthexapod and github.com/lsst-ts/ts_config_mttcs"
+        return cannot_run(f"there is no {', '.join(missing)}; clone {sources}, and name the folders")
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        geometry = telescope(folder)
+        met = [finite_elements(name, args.folder / file, geometry, folder) for name, file in TABLES.items()]
+        if args.config is not None:
+            content = yaml.safe_load((args.config / POLYNOMIALS).read_text(encoding="utf-8"))
+            for name, key in (("M2", "m2_config"), ("camera", "camera_config")):
+                met.append(laser_and_sky(name, content[key]["elevation_rotation_coeffs"], geometry, folder))
+    return 0 if all(met) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
