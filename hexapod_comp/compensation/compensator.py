@@ -115,12 +115,12 @@ class Correction:
 
 
 class Phase(Enum):
-    """What the next command starts from; :data:`TRANSITIONS` says what leads from one to another."""
+    """Where the next command starts; :data:`TRANSITIONS` lists the events that lead from one phase to another."""
 
-    FIRST = "no command yet, or none since a reset: it may be one step from where the struts are known to be"
-    RESUMED = "at measured struts, of which it takes over what the machine may have corrected; then it ramps"
-    NEW_TOOL = "another tool was taken: it must be where the struts are"
-    RAMPING = "at the last command, while a change is taken up along the ramp"
+    FIRST = "no command yet, or none since a reset: it may be one step from the struts' known positions"
+    RESUMED = "at measured struts, including what the machine may have corrected there; then it ramps"
+    NEW_TOOL = "another tool was selected: it must be at the struts' present position"
+    RAMPING = "at the last command, while a change ramps"
     RUNNING = "at the last command"
 
 
