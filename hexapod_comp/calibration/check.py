@@ -659,6 +659,7 @@ def update_model(
     new = replace(
         known.space.model(x.round(DIGITS), model.name),
         reversal_threshold=model.reversal_threshold,
+        outside=model.outside,
         origin=origin,
     )
     if known.held is not None:  # the datum stays where neither old nor new readings show it

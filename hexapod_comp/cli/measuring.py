@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import fields, replace
 from datetime import date
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -84,9 +85,11 @@ def outside(args: argparse.Namespace) -> Result:
     notes = []
     if model.outside.names:
         notes.append("the model had a table, which is replaced")
-    if model.origin.posterior is not None:
-        notes.append("the new model names no posterior: that belongs to the model as it was fitted")
-    origin = replace(model.origin, posterior=None, date=model.origin.date or date.today().isoformat())
+    if model.origin.posterior is not None and Path(args.out).parent != Path(args.model).parent:
+        notes.append(
+            f"{model.origin.posterior[0]}, which says how well the fit knows its parameters, must lie beside it"
+        )
+    origin = replace(model.origin, date=model.origin.date or date.today().isoformat())
     model = replace(model, outside=table, origin=origin)
     save_model(model, args.out)
     axes = [

@@ -82,7 +82,7 @@ class ModelOrigin:
     # Under which loads it was measured, each payload, kg, its centre in platform, m, and gravity in base, m/s²; none
     # where nobody says
     loads: tuple[tuple[float, ...], ...] = ()
-    # Of the file that the model was read from, less the lines that name the posterior; empty when it was not read
+    # Of what a fit has made of the file that the model was read from; empty when it was not read
     text_sha256: str = dataclasses.field(default="", compare=False)
 
 

@@ -42,8 +42,9 @@ LOOKED_AT = 33  # Points along each line of a field at which its polynomials are
 # The extended forms that every supported Python reads alike
 ISO_8601 = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d(\.\d{3}(\d{3})?)?)?(Z|[+-]\d\d:\d\d)?)?")
 SHA_256 = re.compile(r"[0-9a-f]{64}")
-# The block that names a fit's posterior: that file names the hash of all the rest
-POSTERIOR_LINES = re.compile(r"^posterior:\n(?:[ \t]+.*\n)*", re.MULTILINE)
+# Blocks that a fit does not make: the name of its posterior, a file that names the hash of all the rest, and a table
+# over outside numbers, which is zero where the machine was calibrated
+NOT_FITTED = re.compile(r"^(?:posterior|outside):\n(?:[ \t]+.*\n)*", re.MULTILINE)
 
 # Key of a field line inside its family: direction, node index along each of the two cross axes
 Line = tuple[int, int, int]
@@ -107,8 +108,8 @@ def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineM
 
 
 def text_sha256(text: str) -> str:
-    """Return the hash of a model file's text less the block that names its posterior, which names this hash."""
-    return hashlib.sha256(POSTERIOR_LINES.sub("", text).encode()).hexdigest()
+    """Return the hash of what a fit has made of a model file's text."""
+    return hashlib.sha256(NOT_FITTED.sub("", text).encode()).hexdigest()
 
 
 def read_load(path: str | Path) -> Load:
