@@ -154,6 +154,7 @@ setup(
             f"compensator = {NAME}.ros:start_compensator",
             f"strut_drive = {NAME}.ros:start_strut_drive",
             f"mover = {NAME}.ros:start_mover",
+            f"instrument = {NAME}.ros:start_instrument",
             f"linuxcnc_bridge = {NAME}.linuxcnc:start_bridge",
             f"linuxcnc_machine = {NAME}.linuxcnc:start_machine",
             f"hal_sweep = {NAME}.linuxcnc.hal:main",

@@ -49,6 +49,12 @@ def generate_launch_description() -> LaunchDescription:
         ),
         argument("simulate", default_value="true", choices=FLAG, description="Start strut_drive too."),
         argument("mover", default_value="false", choices=FLAG, description="Start mover too: it commands the tool."),
+        argument(
+            "instrument",
+            default_value="",
+            choices=["", "tracker", "laser", "ball_bar"],
+            description="Start this virtual instrument too.",
+        ),
         argument("description", default_value="false", choices=FLAG, description="Start robot_state_publisher."),
         argument("rviz", default_value="false", choices=FLAG, description="Start RViz and robot_state_publisher."),
         argument("frame_prefix", default_value="", description="In front of all frames, as left/ of left/base."),
@@ -99,6 +105,8 @@ def _nodes(context: LaunchContext) -> list[Node]:
     if given("mover") == "true":
         frames = {key: value for key, value in (common | model).items() if key in MOVERS}
         nodes.append(_node("mover", given, [*files, frames]))
+    if given("instrument"):
+        nodes.append(_node("instrument", given, [*files, common | {"kind": given("instrument")}]))
     if "true" in (given("description"), given("rviz")):
         nodes.append(_helper("robot_state_publisher", given, [{"frame_prefix": prefix, **clock}], prefix=DESCRIBED))
     if given("rviz") == "true":

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import fields, replace
 from datetime import date
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import CalibrationError, GeometryError
+from ..errors import CalibrationError, CommandError, GeometryError
 from ..formats.schema import in_unit
 from ..formats.texts import aligned, number
 from ..machine.arrays import rms
@@ -21,6 +22,7 @@ from ..machine.model_file import save_model
 from ..machine.outside import load_outside
 from ..machine.temperatures import PARTS
 from ..measurements.campaign import template
+from ..measurements.collect import RunSetUp
 from ..measurements.readings import ANGULAR_KINDS, KINDS
 from ..virtual import named
 from ..virtual.imperfections import ImperfectionBounds, largest_errors
@@ -196,7 +198,12 @@ def collect(args: argparse.Namespace) -> Result:
     campaign = results.load_campaign(args, geometry)
     keep_discovery_local()
     signals = received_signals()
-    with WatchedMachine(args.topic, args.namespace, samples=args.samples) as machine, results.stage_line() as say:
+    instruments = {"readings": args.readings, "tracker_frame": args.tracker_frame, "samples": args.samples}
+    confirm = _confirmed if args.confirm else lambda run: None
+    with (
+        WatchedMachine(args.topic, args.namespace, **instruments, confirm=confirm) as machine,
+        results.stage_line() as say,
+    ):
         done = collect_readings(
             campaign,
             geometry,
@@ -205,6 +212,7 @@ def collect(args: argparse.Namespace) -> Result:
             args.seed,
             progress=lambda done, of, where: say(f"stop {done + 1} of {of}: {where}"),
             going_on=lambda: not signals,
+            tracker_frame=args.tracker_frame,
         )
     planned = len(template(campaign, geometry, args.seed, args.campaign))
     count, missing = len(done.measurements), list(done.missing)
@@ -215,6 +223,21 @@ def collect(args: argparse.Namespace) -> Result:
         code=0 if count == planned else 1,
         notes=[f"nothing was read at {where}; run it again to go on" for where in missing],
     )
+
+
+def _confirmed(run: RunSetUp) -> None:
+    """Wait until somebody has set an instrument up for a run."""
+    place = ", ".join(number(value * 1e3, 1) for value in run.place.position)
+    way = ", ".join(number(value, 3) for value in run.place.rotation[:, 0])
+    at = f"at ({place}) mm in base" if run.channels == ("length",) else f"from ({place}) mm in base along ({way})"
+    print(
+        f"\nset up {', '.join(run.channels)} for {run.name}, {at}, then press Enter ",
+        end="",
+        file=sys.stderr,
+        flush=True,
+    )
+    if not sys.stdin.readline():
+        raise CommandError("instrument", "nobody confirms that it is set up: the input has ended")
 
 
 def iso230(args: argparse.Namespace) -> Result:

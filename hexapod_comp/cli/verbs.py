@@ -538,9 +538,14 @@ example:
             MACHINE,
             reads("--campaign", "campaign file, or the name of a shipped one (default campaign_5d.yaml for the machine "
                   "paper, else campaign)", kind="campaign"),
-            value("--topic", None, "TOPIC", "poses of the tool in base (PoseStamped), from a tracker or motion capture "
+            value("--topic", None, "TOPIC", "poses of the tool (PoseStamped), from a tracker or motion capture "
                   "(default tool_pose_true, what strut_drive's tracker reads)", default="tool_pose_true"),
-            value("--samples", whole(3, 10_000), "N", "poses of which the median is taken at each stop (default 25)",
+            value("--readings", None, "TOPIC", "single readings (JointState: names are channels) of a laser or ball "
+                  "bar; lines, lengths and displacements then come from there", default=""),
+            choice("--tracker-frame", ("free", "known"), "known: poses are measured in base (default); free: in a "
+                   "frame that stands anywhere", "known"),
+            flag("--confirm", "wait for Enter before each run that --readings reads, while the instrument is set up"),
+            value("--samples", whole(3, 10_000), "N", "readings of which the median is taken at each stop (default 25)",
                   default=25),
             seed_of("the scattered poses"),
             writes("--out", "write the readings to a CSV file; one of this campaign is completed", type=csv_file,
@@ -549,16 +554,19 @@ example:
             JSON,
         ),
         """Has the mover visit a campaign's stations, each pass of a line from beside its first point, and reads the
-instrument there when the tool has settled; struts and temperatures are taken along. The file is what fit reads, and is
-whole at any time: Ctrl-C, or a mover that was stopped, ends the run, and the same command goes on with it. A stop at
-which the instrument reads nothing three times is left out, and visited by the next run. Ways and attitudes that no
-machine could err by (another unit, sign, frame or target) end the run after the first line. Exit code: 0 everything was
-read, 1 some is missing, 2 bad input.
+instruments there when the tool has settled; struts, temperatures and gravity are taken along. The file is what fit
+reads, and is whole at any time: Ctrl-C, or a mover that was stopped, ends the run, and the same command goes on with
+it. A stop at which an instrument reads nothing three times is left out, and visited by the next run; a run that counts
+from a zero begins anew where a broken beam (NaN) or an interruption lost that. Readings that no machine could err by
+(another unit, sign, channel, frame or target) end the run after the first line. Exit code: 0 everything was read, 1
+some is missing, 2 bad input.
 
 example:
   $ ros2 launch hexapod_comp machine.launch.py mover:=true     (compensator, mover and a simulated machine)
   $ hexapod_comp collect --campaign campaign_1d --out measured.csv
-  1670 of 1670 readings: measured.csv""",
+  1670 of 1670 readings: measured.csv
+  $ ros2 launch hexapod_comp machine.launch.py mover:=true instrument:=laser     (in place of the first)
+  $ hexapod_comp collect --campaign campaign_1d --readings instrument/readings --out laser.csv""",
     ),
     "fit": Verb(
         "fitting", "calibration",

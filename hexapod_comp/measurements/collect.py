@@ -1,58 +1,62 @@
 """Collecting a campaign's readings on a running machine, from station to station, into a file that is always whole.
 
-The machine is whatever can be sent to a pose and watched there by an instrument that reads poses of the tool, a tracker
-or motion capture. What it reads is written as the campaign's own channels, so that ``fit`` takes the file. A run that
-was interrupted goes on after the stations that its file has. While the first poses come in they are held against the
-commanded ones: a mistake in sign, unit or set-up is reported then, not when everything has been measured.
+The machine is whatever can be sent to a pose and watched there by an instrument: one that reads poses of the tool, a
+tracker or motion capture, or one that reads single channels, a laser on a line or a ball bar. What they read is written
+as the campaign's channels, so that ``fit`` takes the file. A run that was interrupted goes on after the stations that
+its file has; one whose unknown zero was lost with that begins anew. First readings are held against what was commanded:
+:mod:`.set_up` reports a mistake then, not when everything has been measured.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from ..core.batch import quaternion_of
 from ..errors import HexapodError, InputFileError
 from ..machine.geometry import HexapodGeometry
-from ..pose import Pose
+from ..pose import Pose, attitude_error
 from .campaign import Campaign, campaign_readings
-from .readings import LINE_KINDS, FileLine, MeasurementSet, Reading
+from .readings import ANGULAR_KINDS, LINE_KINDS, NO_LOAD, FileLine, MeasurementSet, Reading, Run
 from .runs import assemble
+from .set_up import FREE, KNOWN, PoseCheck, SetUpError, WayCheck, check_nudges, nudge
 from .tidy import tidy_readings, write_measurements
+
+__all__ = ["Collected", "InstrumentMachine", "MeasuredMachine", "Observation", "RunSetUp", "SetUpError", "collect"]
 
 SAVE_EVERY = 5.0  # The file is written anew after this long, s, and at the end of each run: no more is lost than that
 OVERRUN = 2e-3  # A pass over a line begins this far before it, m, so that every strut arrives in the pass's direction
-
-# Where no machine is: how far the measured ways may differ from the commanded ones before a mistake is reported
-LEAST_WAY = 0.02  # Root of the summed squared ways from which they are compared, m
-LARGEST_SCALE_ERROR = 0.01  # Ways longer or shorter by this share: another unit
-LARGEST_TURN = math.radians(2.0)  # Ways turned by this: another frame
-LARGEST_OFFSET = 0.01  # Poses beside the commanded ones by this, m: another origin or target
-
-UNITS = {1e3: "mm read as m", 1e-3: "m read as mm", 25.4: "inches read as mm", 1.0 / 25.4: "mm read as inches"}
-
-
-class SetUpError(HexapodError):
-    """The first readings show a mistake in sign, unit, frame or target."""
-
-    reason = "set_up"
+FRAME_REMARK = "tracker frame in base, mm and quaternion: "  # of a file whose poses came from a tracker anywhere
+OPEN = "open"  # in place of the frame while too little was measured to know it
 
 
 class Observation(NamedTuple):
     """What was seen of a machine at rest."""
 
-    pose: Pose  # ``pose_tool_in_base``, averaged
+    pose: Pose | None  # ``pose_tool_in_base``, or in the tracker's frame, averaged; None: no instrument of poses
     uncertainty: np.ndarray  # (6,) its standard deviation along and about the axes of ``base``, m and rad; NaN: unknown
     struts: tuple[float, ...] | None = None  # measured lengths, m
     temperatures: tuple[float, ...] | None = None  # struts 1–6, base, platform, °C
     time: float = math.nan  # s
+    channels: Mapping[str, tuple[float, float]] = {}  # what is read itself, from any zero, and its deviation, m or rad
+    zero_lost: bool = False  # the zeros of these are others than at the observation before: a beam was broken
+    gravity: tuple[float, ...] | None = None  # in ``base``, m/s²
+
+
+class RunSetUp(NamedTuple):
+    """What an instrument is set up for: one run of a campaign."""
+
+    name: str
+    channels: tuple[str, ...]
+    # In base: of a line its first point, and x along it, forward; of lengths the first centre; else the first pose
+    place: Pose
 
 
 class MeasuredMachine(Protocol):
@@ -65,6 +69,14 @@ class MeasuredMachine(Protocol):
         """Return what the instrument reads; None while it reads nothing, as with a broken beam."""
 
 
+@runtime_checkable
+class InstrumentMachine(MeasuredMachine, Protocol):
+    """A machine whose instrument is set up for each run."""
+
+    def set_up(self, run: RunSetUp) -> Collection[str]:
+        """Return, when it is set up, which of the run's channels it reads itself; the others come from poses."""
+
+
 class Visit(NamedTuple):
     """One stop: all channels that are read at a station in one pass of a run."""
 
@@ -75,6 +87,11 @@ class Visit(NamedTuple):
     readings: tuple[int, ...]  # indices among the campaign's
     first_of_pass: bool
     approach: Pose | None  # from where it is reached in the direction of its pass
+
+    @property
+    def where(self) -> str:
+        """Where it is, for people."""
+        return f"{self.run}, cycle {self.cycle}, at {(self.pose.position * 1e3).round(3).tolist()} mm"
 
 
 @dataclass(frozen=True)
@@ -95,6 +112,7 @@ def collect(
     attempts: int = 3,
     progress: Callable[[int, int, str], object] = lambda done, of, text: None,
     going_on: Callable[[], bool] = lambda: True,
+    tracker_frame: str = KNOWN,
 ) -> Collected:
     """Visit a campaign's stations in its order and write what is read there as tidy CSV.
 
@@ -109,73 +127,289 @@ def collect(
     path : path
         The file; where it is there already it must hold readings of this campaign, and is completed.
     attempts : int, optional
-        How often an instrument that reads nothing is asked at a station before the station is left out.
+        How often an instrument that reads nothing is asked at a station before the station is left out, and how often
+        a run is begun whose zero is lost on the way.
     progress : callable, optional
         Called at each stop with the number of those done, of all, and where it is.
     going_on : callable, optional
         Asked before each stop; false ends the run, with what was collected in the file.
+    tracker_frame : str, optional
+        ``known``: poses are measured in the base; ``free``: in a frame that stands anywhere, which is estimated from
+        the first stations, and which the file says.
 
     Raises
     ------
     SetUpError
-        A mistake in sign, unit, frame or target; what was read is in the file.
+        A mistake in sign, unit, channel, frame or target; what was read is in the file.
     InputFileError
         A file of another campaign.
     HexapodError
         As ``machine.move`` raises it; what was read is in the file.
     """
-    listed = list(campaign_readings(campaign, seed))
-    plan = assemble(geometry, [reading._replace(source=FileLine("campaign", 0)) for reading in listed])
-    weights, visits = plan.directions(), list(_visits(listed))
-    found: dict[int, Reading] = _resumed(path, geometry, listed) if Path(path).exists() else {}
-    resumed = sum(all(n in found for n in visit.readings) for visit in visits)
-    watch, missing, saved = _SetUp(geometry), list[str](), time.monotonic()
-    here = -1  # the stop at which the machine stands
+    work = _Collecting(geometry, machine, list(campaign_readings(campaign, seed)), path, attempts, tracker_frame)
+    work.progress, work.going_on = progress, going_on
     try:
-        for done, visit in enumerate(visits):
-            if all(n in found for n in visit.readings):
-                continue
+        for _, stops in groupby(range(len(work.visits)), lambda k: work.visits[k].run):
             if not going_on():
                 break
-            where = f"{visit.run}, cycle {visit.cycle}, at {(visit.pose.position * 1e3).round(3).tolist()} mm"
-            progress(done, len(visits), where)
-            if visit.approach is not None and (visit.first_of_pass or here != done - 1):
-                _approach(machine, visit.approach)
-            machine.move(visit.pose)
-            here = done
-            seen = next((o for o in (machine.observe() for _ in range(attempts)) if o is not None), None)
-            if seen is None:
-                missing.append(where)
-                continue
-            if not watch.plausible(visit.pose, seen.pose):
-                continue  # of no use, and the next stops tell why
-            for n in visit.readings:
-                found[n] = _read(listed[n], seen, geometry, weights[n])
-            if time.monotonic() - saved > SAVE_EVERY or done + 1 == len(visits) or visits[done + 1].run != visit.run:
-                if whole := _in_order(geometry, found):
-                    write_measurements(whole, path)
-                saved = time.monotonic()
-        watch.end()
+            work.run(list(stops))
+        work.poses.end()
     finally:
-        if whole := _in_order(geometry, found):
-            write_measurements(whole, path)
+        whole = work.save()
     if whole is None:
-        read = "one point of a line only, which is too little for a file" if found else "nothing, so there is no file"
+        read = (
+            "one point of a line only, which is too little for a file" if work.found else "nothing, so there is no file"
+        )
         raise InputFileError(path, "", f"the instrument read {read}")
-    return Collected(whole, resumed, tuple(missing))
+    return Collected(whole, work.resumed, tuple(work.missing))
 
 
-def _in_order(geometry: HexapodGeometry, found: dict[int, Reading]) -> MeasurementSet | None:
-    """Return what was found as a set, without lines of which only one point was; None where nothing is left."""
-    places: dict[str, set[bytes]] = {}
-    for reading in found.values():
-        places.setdefault(reading.run, set()).add(reading.pose.position.tobytes())
-    kept = [
-        found[n]
-        for n in sorted(found)
-        if len(places[found[n].run]) > 1 or found[n].channel.partition("_")[0] not in (*LINE_KINDS, "rotation")
-    ]
-    return assemble(geometry, kept) if kept else None
+class _Collecting:
+    """A campaign that is being measured: what was found so far, and how the instruments stand."""
+
+    def __init__(
+        self,
+        geometry: HexapodGeometry,
+        machine: MeasuredMachine,
+        listed: list[Reading],
+        path: str | Path,
+        attempts: int,
+        tracker_frame: str,
+    ) -> None:
+        self._geometry, self._machine, self._listed, self._path = geometry, machine, listed, path
+        self._attempts = attempts
+        self._plan = assemble(geometry, [reading._replace(source=FileLine("campaign", 0)) for reading in listed])
+        self._directions, self._along = self._plan.directions(), self._plan.along()
+        self.visits, self.missing, self.resumed = list(_visits(listed)), list[str](), 0
+        angular = any(reading.channel.partition("_")[0] in ANGULAR_KINDS for reading in listed)
+        self.poses = PoseCheck(geometry.characteristic_length, tracker_frame, angular)
+        self._frame: Pose | None = Pose.identity() if tracker_frame == KNOWN else None
+        self.found: dict[int, Reading] = {}
+        if Path(path).exists():
+            self.found = _resumed(path, geometry, listed)
+            self._frame = _stated_frame(path, tracker_frame)
+        self._unplaced: list[tuple[Visit, Observation, Pose]] = []  # in a frame that does not show yet
+        self._nudged: set[tuple[str, ...]] = set()  # channels that were checked
+        self._saved, self._here = time.monotonic(), -1  # when, and the stop at which the machine stands
+        self.progress: Callable[[int, int, str], object]
+        self.going_on: Callable[[], bool]
+
+    # ---- runs and stops ----
+
+    def run(self, stops: Sequence[int]) -> None:
+        """Visit what is not found yet of a run's stops; anew where the zero of its readings is lost on the way."""
+        if self._all_found(stops):
+            self.resumed += len(stops)
+            return
+        readings = [n for k in stops for n in self.visits[k].readings]
+        channels = tuple(dict.fromkeys(self._listed[n].channel for n in readings))
+        run = self._plan.runs[self._plan.run[readings[0]]]
+        own: Collection[str] = ()
+        if isinstance(self._machine, InstrumentMachine):
+            place = self._place(run, self.visits[stops[0]])
+            own = [c for c in channels if c in self._machine.set_up(RunSetUp(run.name, channels, place))]
+        counting = bool(own) and not run.known_zero
+        missing = list(self.missing)
+        for _ in range(self._attempts if counting else 1):
+            self.missing = list(missing)
+            if counting:  # whoever was away does not know whether the zero is still the same
+                for n in readings:
+                    self.found.pop(n, None)
+            if self._pass_over(stops, own, counting):
+                break
+        else:
+            self.missing.append(f"{run.name}, whose zero was lost {self._attempts} times")
+        self.save()
+
+    def _all_found(self, stops: Sequence[int]) -> bool:
+        return all(n in self.found for k in stops for n in self.visits[k].readings)
+
+    def _place(self, run: Run, first: Visit) -> Pose:
+        """Return where an instrument stands: see :class:`RunSetUp`."""
+        n = first.readings[0]
+        if run.is_line:
+            across = np.linalg.svd(run.axis[None])[2][1]
+            return Pose(run.origin, np.column_stack([run.axis, across, np.cross(run.axis, across)]))
+        pose = self._geometry.work @ first.pose
+        return pose if self._listed[n].centre is None else Pose(self._plan.centre[n], np.eye(3))
+
+    def _pass_over(self, stops: Sequence[int], own: Collection[str], counting: bool) -> bool:
+        """Visit a run's stops that are not found yet; return False where the zero is lost."""
+        zeros: dict[str, float] = {}
+        checked = not own or tuple(own) in self._nudged
+        ways = {channel: WayCheck(channel, checked) for channel in own}
+        for k in stops:
+            visit = self.visits[k]
+            if self._all_found([k]):
+                self.resumed += 1
+                continue
+            if not self.going_on():
+                return True
+            self.progress(k, len(self.visits), visit.where)
+            self._go(k)
+            if not checked:
+                if not self._check_channels(visit, own):
+                    return False
+                checked = True
+                self._go(k)
+            seen = self._observe()
+            if seen is None:
+                self.missing.append(visit.where)
+                continue
+            if seen.zero_lost and counting and zeros:
+                return False
+            if not self._take_channels(visit, seen, ways, zeros):
+                if counting:
+                    return False
+                self.missing.append(visit.where)
+                continue
+            self._take_pose(visit, seen, own)
+            if time.monotonic() - self._saved > SAVE_EVERY:
+                self.save()
+        return True
+
+    def _go(self, k: int) -> None:
+        """Move to a stop, in the direction of its pass."""
+        visit = self.visits[k]
+        if visit.approach is not None and (visit.first_of_pass or self._here != k - 1):
+            self._move(visit.approach)
+        self._machine.move(visit.pose)
+        self._here = k
+
+    def _move(self, pose: Pose) -> bool:
+        """Move somewhere that need not be reached; return False where a limit forbids it."""
+        try:
+            self._machine.move(pose)
+        except HexapodError as error:
+            if error.reason != "limit":
+                raise
+            return False
+        return True
+
+    def _observe(self) -> Observation | None:
+        """Return what is seen, asking again where it is nothing."""
+        return next((o for o in (self._machine.observe() for _ in range(self._attempts)) if o is not None), None)
+
+    def _check_channels(self, visit: Visit, own: Collection[str]) -> bool:
+        """Move the tool a little along each channel's direction and hold what they read against it; False: their zero
+        was lost meanwhile."""
+        chosen = [n for n in visit.readings if self._listed[n].channel in own]
+        directions, before = self._directions[chosen], self._observe()
+        names = [self._listed[n].channel for n in chosen]
+        seen, tool = np.eye(len(chosen)) * 0.0, self._geometry.work @ visit.pose
+        for j, (direction, name) in enumerate(zip(directions, names, strict=True)):
+            for sign in (1.0, -1.0):
+                if self._move(self._geometry.work.inverse() @ nudge(tool, direction, name, sign)):
+                    after = self._observe()
+                    self._machine.move(visit.pose)
+                    if before is None or after is None or after.zero_lost:
+                        return False
+                    seen[:, j] = [sign * (after.channels[c][0] - before.channels[c][0]) for c in names]
+                    break
+            else:
+                raise SetUpError(f"the limits leave no room to move along {name} at {visit.where}")
+        check_nudges(names, directions, seen)
+        self._nudged.add(tuple(own))
+        return True
+
+    # ---- readings ----
+
+    def _take_channels(
+        self, visit: Visit, seen: Observation, ways: Mapping[str, WayCheck], zeros: dict[str, float]
+    ) -> bool:
+        """Add what an instrument read itself; False where no machine errs so."""
+        added, plausible = {}, True
+        for n in visit.readings:
+            reading = self._listed[n]
+            if reading.channel in ways:
+                (read, deviation), way = seen.channels[reading.channel], self._way(n)
+                follows = reading.channel in ("linear", "length")
+                plausible &= ways[reading.channel].plausible(way, read)
+                value = read - (way if follows else 0.0)
+                if not reading.known_zero:
+                    value -= zeros.setdefault(reading.channel, value)
+                added[n] = self._reading(reading, value, deviation, seen)
+        if plausible:
+            self.found |= added
+        return plausible
+
+    def _way(self, n: int) -> float:
+        """Return the commanded way along a line, or the distance from a length's centre, m."""
+        if self._listed[n].centre is None:
+            return float(self._along[n])
+        return float(np.linalg.norm(self._plan.points()[self._plan.station[n]] - self._plan.centre[n]))
+
+    def _take_pose(self, visit: Visit, seen: Observation, own: Collection[str]) -> None:
+        """Add what a measured pose shows of the channels that no instrument read itself."""
+        if all(self._listed[n].channel in own for n in visit.readings):
+            return
+        if seen.pose is None:
+            self.missing.append(visit.where)
+            return
+        if not self.poses.plausible(self._geometry.work @ visit.pose, seen.pose):
+            return  # of no use, and the next stops tell why
+        self._unplaced.append((visit, seen, seen.pose))
+        if self._frame is None:
+            self._frame = self.poses.frame()
+        if self._frame is None:
+            return
+        for there, then, pose in self._unplaced:
+            for n in there.readings:
+                if self._listed[n].channel not in own:
+                    self.found[n] = self._of_pose(n, then, self._frame, pose)
+        self._unplaced.clear()
+
+    def _of_pose(self, n: int, seen: Observation, frame: Pose, pose: Pose) -> Reading:
+        """Return a reading from a measured pose in an instrument's frame."""
+        reading, w = self._listed[n], self._directions[n]
+        commanded, measured = self._geometry.work @ reading.pose, frame @ pose
+        off = measured.position - commanded.position
+        if reading.channel == "length":
+            centre = self._plan.centre[n]
+            value = float(np.linalg.norm(measured.position - centre) - np.linalg.norm(commanded.position - centre))
+        else:
+            value = float(w @ np.concatenate([off, attitude_error(measured.rotation, commanded.rotation)]))
+        along = np.concatenate([w[:3] @ frame.rotation, w[3:] @ frame.rotation])  # as the instrument's axes see it
+        return self._reading(reading, value, float(np.sqrt(along**2 @ seen.uncertainty**2)), seen)
+
+    def _reading(self, reading: Reading, value: float, deviation: float, seen: Observation) -> Reading:
+        """Return a campaign's reading with its value and what was felt then."""
+        payload = self._geometry.payload
+        load = (payload.mass, *payload.centre) if payload.mass else NO_LOAD[:4]
+        return reading._replace(
+            value=value,
+            uncertainty=deviation if deviation > 0.0 else math.nan,
+            commands=seen.struts,
+            temperatures=seen.temperatures or reading.temperatures,
+            time=seen.time,
+            load=(*load, *(seen.gravity or NO_LOAD[4:])),
+        )
+
+    def save(self) -> MeasurementSet | None:
+        """Write what was found, without lines of which only one point was; return it, None where nothing is left."""
+        places: dict[str, set[bytes]] = {}
+        for reading in self.found.values():
+            places.setdefault(reading.run, set()).add(reading.pose.position.tobytes())
+        kept = [
+            self.found[n]
+            for n in sorted(self.found)
+            if len(places[self.found[n].run]) > 1 or self.found[n].channel.partition("_")[0] not in LINE_KINDS
+        ]
+        self._saved = time.monotonic()
+        if not kept:
+            return None
+        whole = assemble(self._geometry, kept)
+        write_measurements(whole, self._path, self._frame_remark())
+        return whole
+
+    def _frame_remark(self) -> str:
+        """Return what the file says of a tracker that stands anywhere."""
+        if not self.poses.free:
+            return ""
+        if self._frame is None:
+            return FRAME_REMARK + OPEN
+        numbers = *(self._frame.position * 1e3).tolist(), *quaternion_of(self._frame.rotation)
+        return FRAME_REMARK + ", ".join(map(repr, numbers))
 
 
 def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
@@ -201,34 +435,6 @@ def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
         before = this
 
 
-def _approach(machine: MeasuredMachine, pose: Pose) -> None:
-    """Begin a pass, or what is left of it, before its first point; where a limit forbids it, at the point itself."""
-    try:
-        machine.move(pose)
-    except HexapodError as error:
-        if error.reason != "limit":
-            raise
-
-
-def _read(reading: Reading, seen: Observation, geometry: HexapodGeometry, w: np.ndarray) -> Reading:
-    """Return a campaign's reading with what was seen: `w` as :meth:`MeasurementSet.directions` has it."""
-    commanded = geometry.work @ reading.pose
-    turned = Rotation.from_matrix(seen.pose.rotation @ commanded.rotation.T).as_rotvec()
-    if reading.channel == "length" and reading.centre is not None:
-        centre = geometry.work.position + geometry.work.rotation @ np.array(reading.centre)
-        value = float(np.linalg.norm(seen.pose.position - centre) - np.linalg.norm(commanded.position - centre))
-    else:
-        value = float(w @ np.concatenate([seen.pose.position - commanded.position, turned]))
-    sigma = float(np.sqrt(w**2 @ seen.uncertainty**2))
-    return reading._replace(
-        value=value,
-        uncertainty=sigma if sigma > 0.0 else math.nan,
-        commands=seen.struts,
-        temperatures=seen.temperatures or reading.temperatures,
-        time=seen.time,
-    )
-
-
 def _resumed(path: str | Path, geometry: HexapodGeometry, listed: Sequence[Reading]) -> dict[int, Reading]:
     """Return the campaign's readings that a file has already, by their number."""
 
@@ -247,51 +453,17 @@ def _resumed(path: str | Path, geometry: HexapodGeometry, listed: Sequence[Readi
     return found
 
 
-class _SetUp:
-    """Holds measured ways between stops against the commanded ones."""
-
-    def __init__(self, geometry: HexapodGeometry) -> None:
-        self._geometry = geometry
-        self._commanded, self._measured = list[np.ndarray](), list[np.ndarray]()
-
-    def plausible(self, commanded: Pose, measured: Pose) -> bool:
-        """Take a stop's poses, in the work frame and in the base, and return whether a machine may err so; a SetUpError
-        as soon as the ways between the stops tell why it cannot."""
-        meant = self._geometry.work @ commanded
-        self._commanded.append(meant.position)
-        self._measured.append(measured.position)
-        turned = Rotation.from_matrix(measured.rotation @ meant.rotation.T).as_rotvec()
-        if (angle := float(np.linalg.norm(turned))) > LARGEST_TURN:
-            about = ", ".join(f"{value:.1f}" for value in np.degrees(turned))
-            text = f"the tool reads turned by {math.degrees(angle):.1f}° ({about}° about x, y, z of the base)"
-            raise SetUpError(f"{text}: is the target mounted turned, or are the axes of the instrument's frame others?")
-        ways = [np.array(places) - np.mean(places, axis=0) for places in (self._commanded, self._measured)]
-        gone, seen = (float(np.sqrt((way**2).sum())) for way in ways)
-        if gone > LEAST_WAY:
-            scale, cosine = seen / gone, float((ways[0] * ways[1]).sum() / max(gone * seen, 1e-300))
-            if abs(scale - 1.0) > LARGEST_SCALE_ERROR:
-                near = min(UNITS, key=lambda size: abs(math.log(max(scale, 1e-12) / size)))
-                hint = f": {UNITS[near]}?" if abs(scale / near - 1.0) < LARGEST_SCALE_ERROR else ""
-                raise SetUpError(f"ways read {scale:.4g} times as long as commanded{hint}")
-            if cosine < -math.cos(LARGEST_TURN):
-                raise SetUpError(
-                    "ways read reversed: the sign of the readings, or of an axis of the instrument's frame"
-                )
-            if (angle := math.acos(min(cosine, 1.0))) > LARGEST_TURN:
-                text = f"ways read turned by about {math.degrees(angle):.1f}° against the commanded ones"
-                raise SetUpError(f"{text}: are the axes of the instrument's frame those of the base, none exchanged?")
-            self.end()
-        return bool(np.linalg.norm(self._offset()) < LARGEST_OFFSET)
-
-    def end(self) -> None:
-        """Raise a SetUpError where the tool reads beside where it was sent."""
-        offset = self._offset()
-        if np.linalg.norm(offset) > LARGEST_OFFSET:
-            away = ", ".join(f"{value * 1e3:.1f}" for value in offset)
-            text = f"the tool reads {away} mm beside where it was sent"
-            raise SetUpError(f"{text}: is the target's place the tool's, and the instrument's origin the base's?")
-
-    def _offset(self) -> np.ndarray:
-        if not self._measured:
-            return np.zeros(3)
-        return np.asarray(np.mean(self._measured, axis=0) - np.mean(self._commanded, axis=0))
+def _stated_frame(path: str | Path, tracker_frame: str) -> Pose | None:
+    """Return the tracker's frame that a file states, or the base; None where it is yet to be found."""
+    with Path(path).open(encoding="utf-8") as file:
+        remarks = [line[2:] for line in file if line.startswith(f"# {FRAME_REMARK}")]
+    if bool(remarks) != (tracker_frame == FREE):
+        other = FREE if remarks else KNOWN
+        raise InputFileError(path, "", f"was measured with --tracker-frame {other}: go on so, or give another file")
+    if not remarks:
+        return Pose.identity()
+    text = remarks[0].removeprefix(FRAME_REMARK).strip()
+    if text == OPEN:
+        return None
+    numbers = np.array(text.split(","), dtype=float)
+    return Pose.from_quaternion(numbers[:3] * 1e-3, numbers[3:])

@@ -528,12 +528,12 @@ def _minus(row: TidyRow, commanded: float) -> float:
     return float(exact(row.text, float(row.text)).scaleb(power) - Decimal(repr(commanded)))
 
 
-def write_measurements(measurements: MeasurementSet, path: str | Path) -> None:
-    """Write a set as the file that :func:`~.tidy.read_tidy` reads back, to the last bit."""
-    comment = ""
+def write_measurements(measurements: MeasurementSet, path: str | Path, remark: str = "") -> None:
+    """Write a set as the file that :func:`~.tidy.read_tidy` reads back, to the last bit, with a remark on top."""
+    comment = f"# {remark}\n" if remark else ""
     if not np.array_equal(measurements.probe, measurements.geometry.tool.position):
         point = ", ".join(_scaled(float(value), 3) for value in measurements.probe)
-        comment = f"# measured point in the platform frame, mm: {point}\n"
+        comment += f"# measured point in the platform frame, mm: {point}\n"
     write_text(path, comment + csv_text(_csv_rows(measurements)))
 
 

@@ -104,3 +104,8 @@ def start_strut_drive() -> int:
 def start_mover() -> int:
     """Run the executable ``mover``."""
     return start("hexapod_comp.ros.mover")
+
+
+def start_instrument() -> int:
+    """Run the executable ``instrument``."""
+    return start("hexapod_comp.ros.instrument")

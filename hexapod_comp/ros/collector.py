@@ -1,58 +1,108 @@
 """A running machine that :func:`~hexapod_comp.measurements.collect.collect` measures: moved by the mover, watched on a
-topic of poses."""
+topic of poses, a topic of single readings, or both."""
 
 from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable, Collection
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, Vector3Stamped
+from rclpy.duration import Duration
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState, Temperature
 
 from ..errors import CommandError, HexapodError, NoAnswerError, shorten
 from ..machine.geometry import STRUT_NAMES
+from ..machine.load import EARTH
 from ..machine.temperatures import TEMPERATURE_RANGE, Temperatures
-from ..measurements.collect import Observation
-from ..measurements.readings import LEAST_NOISE
+from ..measurements.collect import Observation, RunSetUp
+from ..measurements.readings import ABSOLUTE_KINDS, LEAST_NOISE
+from ..measurements.set_up import KNOWN
 from ..pose import Pose
-from .base import NEWEST_QOS, SENSOR_QOS
+from .base import LATCHED_QOS, NEWEST_QOS, SENSOR_QOS
 from .client import Machine
-from .messages import message_pose, nanoseconds_of
+from .instrument import SET_UP_TOPIC
+from .messages import message_pose, nanoseconds_of, pose_message, stamp_of
 
 MEDIAN_TO_SIGMA = 1.4826  # Standard deviation of a normal distribution over the median of its absolute values
 OF_A_MEDIAN = math.sqrt(math.pi / 2.0)  # Its standard deviation, times √n, over that of a reading
+LEAST_SAMPLES = 3  # of which a median is taken
+SET_UP_WITHIN = Duration(seconds=2)  # Who sets instruments up by topic hears of a run within this time
 
 
 class WatchedMachine(Machine):
-    """A machine with a mover, and an instrument that publishes poses of its tool in ``base``.
+    """A machine with a mover, and instruments that are heard on topics.
 
-    At each stop the median of `samples` poses that came after the tool had settled is taken, so that single wild ones
-    count for nothing; fewer than half within `patience`, s, count as a broken beam.
+    At each stop the median of `samples` readings that came after the tool had settled is taken, so that single wild
+    ones count for nothing; fewer than half within `patience`, s, count as a broken beam.
+
+    Parameters
+    ----------
+    topic : str
+        Poses of the tool, PoseStamped, in ``base``; in any frame where ``tracker_frame`` is ``free``.
+    readings : str, optional
+        Topic of single readings, JointState: a name is a channel, its position what is read of it, m or rad. Lines,
+        lengths and displacements then come from there; NaN says that a beam is broken and its zero lost.
+    confirm : callable, optional
+        Called with each run that an instrument of single readings is set up for; returns when it is.
     """
 
     def __init__(
-        self, topic: str, namespace: str = "", mover: str = "mover", samples: int = 25, patience: float = 2.0
+        self,
+        topic: str,
+        namespace: str = "",
+        mover: str = "mover",
+        samples: int = 25,
+        patience: float = 2.0,
+        readings: str = "",
+        tracker_frame: str = KNOWN,
+        confirm: Callable[[RunSetUp], object] = lambda run: None,
     ) -> None:
         self._samples, self._patience, self._problem = samples, patience, ""
+        self._frame_id, self._confirm = "base" if tracker_frame == KNOWN else "", confirm
         self._poses, self._struts = list[tuple[Pose, float]](), list[np.ndarray]()
+        self._read, self._zero_lost = list[tuple[list[float], float]](), False
+        self._own, self._wants_pose = tuple[str, ...](), True  # channels that are read themselves in this run
         self._warmth: dict[str, float] = {}
+        self._gravity: tuple[float, ...] | None = None
         super().__init__(namespace, mover)
         node = self._session.node
         node.create_subscription(PoseStamped, topic, self._on_pose, SENSOR_QOS)
         node.create_subscription(JointState, "strut_states", self._on_struts, NEWEST_QOS)
         node.create_subscription(Temperature, "temperatures", self._on_temperature, SENSOR_QOS)
-        self._topic = node.resolve_topic_name(topic)
+        node.create_subscription(Vector3Stamped, "gravity", self._on_gravity, SENSOR_QOS)
+        self._topic, self._readings = node.resolve_topic_name(topic), ""
+        if readings:
+            self._readings = node.resolve_topic_name(readings)
+            node.create_subscription(JointState, readings, self._on_readings, SENSOR_QOS)
+            self._set_up = node.create_publisher(PoseStamped, SET_UP_TOPIC, LATCHED_QOS)
+
+    # ---- what comes in ----
 
     def _on_pose(self, message: PoseStamped) -> None:
-        if message.header.frame_id != "base":
-            self._problem = f"frame_id must be base, not {shorten(message.header.frame_id)}"
+        frame_id = message.header.frame_id
+        self._frame_id = self._frame_id or frame_id
+        if frame_id != self._frame_id:
+            self._problem = f"{self._topic}: frame_id must be {self._frame_id}, not {shorten(frame_id)}"
             return
         try:
             self._poses.append((message_pose(message), nanoseconds_of(message.header.stamp) * 1e-9))
         except HexapodError as error:
-            self._problem = str(error)
+            self._problem = f"{self._topic}: {error}"
+
+    def _on_readings(self, message: JointState) -> None:
+        values = dict(zip(message.name, message.position, strict=False))
+        if missing := [channel for channel in self._own if channel not in values]:
+            self._problem = f"{self._readings}: {missing[0]} is missing, there are {shorten(', '.join(message.name))}"
+            return
+        read = [values[channel] for channel in self._own]
+        if all(map(math.isfinite, read)):
+            self._read.append((read, nanoseconds_of(message.header.stamp) * 1e-9))
+        else:
+            self._zero_lost = True
+            self._read.clear()
 
     def _on_struts(self, message: JointState) -> None:
         lengths = dict(zip(message.name, message.position, strict=False))
@@ -64,20 +114,75 @@ class WatchedMachine(Machine):
         if message.header.frame_id in Temperatures.NAMES and low <= message.temperature <= high:
             self._warmth[message.header.frame_id] = message.temperature
 
+    def _on_gravity(self, message: Vector3Stamped) -> None:
+        vector = message.vector.x, message.vector.y, message.vector.z
+        if message.header.frame_id == "base" and EARTH[0] <= math.hypot(*vector) <= EARTH[1]:
+            self._gravity = vector
+
+    # ---- what collect asks ----
+
+    def set_up(self, run: RunSetUp) -> Collection[str]:
+        """Tell who sets instruments up where a run is, and wait for whoever confirms it."""
+        self._own = () if not self._readings else tuple(
+            channel for channel in run.channels if channel.partition("_")[0] not in ABSOLUTE_KINDS
+        )  # fmt: skip
+        self._wants_pose = len(self._own) < len(run.channels)
+        if self._own:
+            message = pose_message(run.place, "base")
+            message.header.stamp = stamp_of(self._session.node.get_clock().now().nanoseconds)
+            self._set_up.publish(message)
+            self._set_up.wait_for_all_acked(SET_UP_WITHIN)
+            self._confirm(run)
+            self._spin(0.1)  # what is still on the way is of the run before
+        self._zero_lost = False
+        return self._own
+
+    def _spin(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self._session.spin_once(0.02)
+
     def observe(self) -> Observation | None:
-        """Return the median of the next poses; None where too few come."""
-        self._poses.clear()
-        self._struts.clear()
+        """Return the medians of what comes next; None where too little comes."""
+        for heard in (self._poses, self._struts, self._read):
+            heard.clear()
         self._problem = ""
         end = time.monotonic() + self._patience
-        while len(self._poses) < self._samples and time.monotonic() < end:
+        while time.monotonic() < end and not self._problem:
             self._session.spin_once(0.02)
+            if self._enough(self._samples):
+                break
         if self._problem:
-            raise CommandError("instrument", f"{self._topic}: {self._problem}")
-        if len(self._poses) < max(3, self._samples // 2):
-            if self._session.node.count_publishers(self._topic) == 0:
-                raise NoAnswerError(f"nobody publishes {self._topic}")
+            raise CommandError("instrument", self._problem)
+        if not self._enough(max(LEAST_SAMPLES, self._samples // 2)):
+            wanted = [self._topic] * self._wants_pose + [self._readings] * bool(self._own)
+            if silent := [topic for topic in wanted if self._session.node.count_publishers(topic) == 0]:
+                raise NoAnswerError(f"nobody publishes {silent[0]}")
             return None
+        pose, uncertainty, channels = None, np.full(6, math.nan), {}
+        if self._wants_pose:
+            pose, uncertainty = self._middle_pose()
+        if self._own:
+            middle, deviation = _median(np.array([read for read, _ in self._read]))
+            channels = dict(zip(self._own, zip(middle.tolist(), deviation.tolist(), strict=True), strict=True))
+        lost, self._zero_lost = self._zero_lost, False
+        return Observation(
+            pose,
+            uncertainty,
+            tuple(np.mean(self._struts, axis=0).tolist()) if self._struts else None,
+            tuple(self._warmth[name] for name in Temperatures.NAMES) if len(self._warmth) == 8 else None,
+            (self._read if self._own else self._poses)[-1][1],
+            channels,
+            lost,
+            self._gravity,
+        )
+
+    def _enough(self, count: int) -> bool:
+        """Return whether everything that this run needs has been read so often."""
+        return (not self._wants_pose or len(self._poses) >= count) and (not self._own or len(self._read) >= count)
+
+    def _middle_pose(self) -> tuple[Pose, np.ndarray]:
+        """Return the median of the poses, and its standard deviation (6,)."""
         first = self._poses[0][0]
         numbers = np.array(
             [
@@ -85,12 +190,12 @@ class WatchedMachine(Machine):
                 for p, _ in self._poses
             ]
         )
-        middle = np.median(numbers, axis=0)
-        spread = MEDIAN_TO_SIGMA * np.median(np.abs(numbers - middle), axis=0)
-        return Observation(
-            Pose(middle[:3], Rotation.from_rotvec(middle[3:]).as_matrix() @ first.rotation),
-            np.maximum(spread * OF_A_MEDIAN / math.sqrt(len(numbers)), LEAST_NOISE),
-            tuple(np.mean(self._struts, axis=0).tolist()) if self._struts else None,
-            tuple(self._warmth[name] for name in Temperatures.NAMES) if len(self._warmth) == 8 else None,
-            self._poses[-1][1],
-        )
+        middle, deviation = _median(numbers)
+        return Pose(middle[:3], Rotation.from_rotvec(middle[3:]).as_matrix() @ first.rotation), deviation
+
+
+def _median(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the median of samples (n, k), and its standard deviation (k,)."""
+    middle = np.median(numbers, axis=0)
+    spread = MEDIAN_TO_SIGMA * np.median(np.abs(numbers - middle), axis=0)
+    return middle, np.maximum(spread * OF_A_MEDIAN / math.sqrt(len(numbers)), LEAST_NOISE)

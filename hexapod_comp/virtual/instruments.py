@@ -7,18 +7,21 @@ measuring to compensating can be tried, and judged, without a laser.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..errors import CommandError
 from ..machine.arrays import different_rows
+from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel, MachinesByTemperature, RealMachine
 from ..machine.trial import drive, model_commands
-from ..measurements.campaign import Campaign
+from ..measurements.campaign import INSTRUMENTS, Campaign, line_channels, line_readings
 from ..measurements.readings import (
     ABSOLUTE_KINDS,
+    ANGULAR_KINDS,
     AXES,
     CHANNELS,
     KINDS,
@@ -26,6 +29,8 @@ from ..measurements.readings import (
     LENGTH,
     MeasurementSet,
 )
+from ..measurements.runs import assemble
+from ..pose import Pose, attitude_error
 
 VISITS, SLOPES, NOISE, CENTRES = range(4)
 """Streams of random numbers, one per cause: changing one leaves the others' draws alone."""
@@ -152,3 +157,100 @@ def _beams(template: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
     chosen = straightness[shared]
     result[chosen] = drawn[first[run[shared]], about[chosen]] * levers[chosen]
     return result
+
+
+TRACKER, LASER, BALL_BAR = LIVE = ("tracker", "laser", "ball_bar")
+PARALLEL = 1.0 - 1e-9  # cosine from which a line is parallel to an axis of the work frame
+
+
+@dataclass(frozen=True)
+class LiveFlaws:
+    """How a live instrument errs."""
+
+    length_noise: float = 1e-6  # standard deviation of what it reads, m
+    angle_noise: float = 1e-6  # rad
+    beam_slope: float = Campaign.beam_slope  # 1 σ of a straightness beam's unknown slope, rad
+    centre_off: float = Campaign.centre_off  # 1 σ of a centre of lengths beside its place, each axis, m
+    wild_share: float = 0.0  # share of readings that are wild
+    wild_size: float = 1e-3  # by so much, m or rad
+    scale: float = 1.0  # of what it reads: −1 reverses its sign, 1000 has it read mm
+    exchanged: bool = False  # its first two channels are
+
+
+class LiveInstrument:
+    """What an instrument reads of a tool that is seen moment by moment, with the signs and zeros of :func:`measure`.
+
+    A laser and a ball bar are set up for each run and count from where they are then; a tracker stands at a place.
+    """
+
+    def __init__(
+        self,
+        geometry: HexapodGeometry,
+        kind: str,
+        components: str = "5-D",
+        flaws: LiveFlaws = LiveFlaws(),
+        stands: Pose | None = None,
+        seed: int = 0,
+    ) -> None:
+        if kind not in LIVE or components not in INSTRUMENTS:
+            raise CommandError("instrument", f"must be one of {', '.join(LIVE)}, of {', '.join(INSTRUMENTS)}")
+        self._geometry, self.kind, self._components, self.flaws = geometry, kind, components, flaws
+        self._to_own = (stands or Pose.identity()).inverse()
+        self._rng = np.random.default_rng(seed)
+        self._place: Pose | None = None
+        self.channels: tuple[str, ...] = ()
+
+    def set_up(self, place: Pose) -> None:
+        """Set up for a run: a line that begins at a place in ``base`` and goes along its x, or a centre there."""
+        self._place = place
+        self._centre = place.position + self.flaws.centre_off * self._rng.standard_normal(3)
+        self.channels, axis = ("length",), self._geometry.work.rotation.T @ place.rotation[:, 0]
+        if self.kind == LASER:
+            along = int(np.abs(axis).argmax())
+            self.channels = line_channels(self._components, along if abs(axis[along]) > PARALLEL else None)
+            ends = [self._geometry.work.inverse() @ Pose(place.position + way * place.rotation[:, 0], place.rotation)
+                    for way in (0.0, 1.0)]  # fmt: skip
+            line = assemble(self._geometry, list(line_readings("line", ends, self.channels, 1)), in_reach=False)
+            self._directions = line.directions()[: len(self.channels)]
+            straight = np.array([channel.startswith("straightness") for channel in self.channels])
+            slopes = np.where(straight, self.flaws.beam_slope * self._rng.standard_normal(len(straight)), 0.0)
+            self._directions[:, :3] += slopes[:, None] * place.rotation[:, 0]
+        self.zero()
+
+    def zero(self) -> None:
+        """Count from where the tool is seen next."""
+        self._start: Pose | None = None
+
+    def read(self, tool: Pose) -> dict[str, float]:
+        """Return what is read of the tool's pose in ``base`` by a laser or ball bar; nothing before it is set up."""
+        if self._place is None or self.kind == TRACKER:
+            return {}
+        self._start = start = self._start or tool
+        if self.kind == LASER:
+            turned = attitude_error(tool.rotation, start.rotation)
+            values = self._directions @ np.concatenate([tool.position - start.position, turned])
+        else:
+            ends = np.array([tool.position, start.position]) - self._centre
+            values = -np.diff(np.linalg.norm(ends, axis=1))
+        noise = [self._noise(channel) for channel in self.channels]
+        values = self.flaws.scale * (values + noise)
+        if self.flaws.exchanged and len(values) > 1:
+            values[[0, 1]] = values[[1, 0]]
+        return dict(zip(self.channels, values.tolist(), strict=True))
+
+    def pose(self, tool: Pose) -> Pose:
+        """Return where a tracker sees the tool, in its own frame."""
+        own = self._to_own @ tool
+        away = np.array([self._noise("position") for _ in AXES])
+        turn = np.array([self._noise("attitude") for _ in AXES])
+        position = self.flaws.scale * (own.position + away)
+        if self.flaws.exchanged:
+            position[[0, 1]] = position[[1, 0]]
+        return Pose(position, Rotation.from_rotvec(turn).as_matrix() @ own.rotation)
+
+    def _noise(self, channel: str) -> float:
+        """Return by how much a reading is off."""
+        angular = channel.partition("_")[0] in ANGULAR_KINDS
+        noise = (self.flaws.angle_noise if angular else self.flaws.length_noise) * self._rng.standard_normal()
+        wild = self._rng.random() < self.flaws.wild_share
+        return float(noise + wild * self.flaws.wild_size * self._rng.choice([-1.0, 1.0]))

@@ -15,13 +15,19 @@ from rcl_interfaces.srv import DescribeParameters
 from std_msgs.msg import UInt64
 
 from hexapod_comp.ros.compensator import CompensatorNode
+from hexapod_comp.ros.instrument import InstrumentNode
 from hexapod_comp.ros.mover import MoverNode
 from hexapod_comp.ros.parameters import Taken
 from hexapod_comp.ros.strut_drive import StrutDriveNode
 
 MAKER = runpy.run_path(str(CONFIG.parent / "tools" / "make_parameter_files.py"))
 TABLES = MAKER["TABLES"]
-KINDS = {"compensator": CompensatorNode, "strut_drive": StrutDriveNode, "mover": MoverNode}
+KINDS = {
+    "compensator": CompensatorNode,
+    "strut_drive": StrutDriveNode,
+    "mover": MoverNode,
+    "instrument": InstrumentNode,
+}
 
 COMPENSATOR = "compensator"
 
@@ -118,6 +124,7 @@ def test_descriptors_say_range_and_when(rig):
     rig.compensator(start=False)
     rig.drive(start=False)
     rig.add(MoverNode, False, {})
+    rig.add(InstrumentNode, False, {})
     for name in KINDS:
         table = TABLES[name]
         request = DescribeParameters.Request(names=[p.name for p in table])
@@ -173,7 +180,8 @@ def test_a_file_of_other_values_is_loaded_also_through_the_launch_file(rig, monk
     path.write_text(yaml.safe_dump({f"/**/{name}": {"ros__parameters": others}}))
     node = rig.add(KINDS[name], False, {}, cli_args=["--ros-args", "--params-file", str(path)])
     assert {key: value for key, value in in_force(node).items() if key in others} == others
-    given = LaunchFile(monkeypatch).start(f"params_file:={path}", "model:=table.yaml", "mover:=true")[name]
+    arguments = f"params_file:={path}", "model:=table.yaml", "mover:=true", "instrument:=laser"
+    given = LaunchFile(monkeypatch).start(*arguments)[name]
     arguments, given = ["--ros-args"], given["parameters"]
     for number, part in enumerate(given):
         if isinstance(part, dict):

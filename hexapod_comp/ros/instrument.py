@@ -1,0 +1,222 @@
+"""The virtual instrument node: what a tracker, a laser or a ball bar would read of the simulated drive's machine.
+
+It watches ``tool_pose_true`` and publishes as a real instrument's driver does, with noise, wild readings, a broken
+beam and silence by parameter: :class:`~hexapod_comp.virtual.instruments.LiveInstrument`. Run it with ``ros2 run
+hexapod_comp instrument`` or ``python -m hexapod_comp.ros.instrument``.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from sensor_msgs.msg import JointState
+
+from ..errors import HexapodError, shorten
+from ..formats.paths import config_file
+from ..machine.geometry import load_geometry
+from ..pose import Pose
+from ..virtual.instruments import LIVE, TRACKER, LiveFlaws, LiveInstrument
+from . import keep_discovery_local
+from .base import CHECK_PERIOD, LATCHED_QOS, NEWEST_QOS, STATE_QOS, MachineNode
+from .messages import message_pose, stamp_of, write_pose
+from .parameters import Program, read_table
+from .process import run
+from .status import OK, WARN
+
+SET_UP_TOPIC = "instrument_set_up"
+SEEN_WITHIN = 0.5  # A true pose that is older says no more where the tool is, s
+
+PARAMETERS = read_table(f"""
+autostart | true |  | start | configure and activate at the start
+geometry_file | paper.yaml |  | configure | geometry file: a path or the name of a shipped one
+kind | laser | {", ".join(LIVE)} | configure | what it is: a tracker publishes ~/pose, a laser and a ball bar ~/readings
+components | 5-D | 1-D, 5-D, 6-D | configure | what a laser reads of a line: its length; straightness, pitch and yaw
+    too; roll as well
+base_frame | base |  | configure | frame_id of the true tool pose
+frame_id | base |  | configure | frame_id of a tracker's poses
+stands_at | [0.0, 0.0, 0.0] | -100 to 100 m | configure | where a tracker stands in base
+stands_turned | [0.0, 0.0, 0.0] | -7 to 7 rad | configure | and how it is turned, the angles α, β, γ
+noise_seed | 0 | 0 to 2147483647 | configure | seed of all that is drawn
+rate | 100.0 | 1 to 1000 Hz | configure | readings published per second
+length_noise | 1.0e-6 | 0 to 0.01 m | always | standard deviation of a length or coordinate that is read
+angle_noise | 1.0e-6 | 0 to 0.01 rad | always | of an angle
+beam_slope | 1.0e-4 | 0 to 0.1 rad | always | 1 σ of how a laser's beam lies off its line, from the next run on
+centre_off | 3.0e-4 | 0 to 0.1 m | always | 1 σ of a ball bar's centre beside its place, from the next run on
+wild_share | 0.0 | 0 to 1 | always | share of readings that are wild
+wild_size | 0.001 | 0 to 1 | always | by so much, m or rad
+fault_break | 0.0 | 0 to 3600 s | always | each setting breaks the beam for this long: NaN is read, and what follows
+    is counted anew
+fault_silent | false |  | always | publishes nothing, and keeps its zero
+fault_scale | 1.0 | -1e9 to 1e9 | always | of all that it reads: -1 reverses the sign, 1000 has it read mm
+fault_exchanged | false |  | always | its first two channels, or coordinates, are exchanged
+""")
+
+TOPICS = f"""
+in   tool_pose_true      PoseStamped: where the tool really is, in base
+     {SET_UP_TOPIC}   PoseStamped, latched: a run's line begins there and goes along its x; or its centre
+out  ~/readings          JointState of a laser or ball bar: name is the channel, position what is read, m or rad
+     ~/pose              PoseStamped of a tracker: the tool in the tracker's frame
+     /diagnostics
+"""
+
+PROGRAM = Program(
+    "instrument",
+    "Reads a simulated machine as a tracker, a laser or a ball bar would.",
+    PARAMETERS,
+    TOPICS,
+    "-p kind:=tracker -p length_noise:=1.0e-5",
+)
+
+
+class InstrumentNode(MachineNode):
+    """Lifecycle node around one :class:`LiveInstrument`; arguments are those of ``rclpy`` nodes."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("instrument", PARAMETERS, **options)
+        self._instrument: LiveInstrument | None = None
+
+    # ---- lifecycle ----
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Make the instrument and open topics."""
+        options = self._options
+        stands = Pose.from_angles(np.array(options["stands_at"]), np.array(options["stands_turned"]))
+        try:
+            geometry = load_geometry(config_file(options["geometry_file"], "geometry"))
+            what = options["kind"], options["components"]
+            self._instrument = LiveInstrument(geometry, *what, self._flaws(), stands, options["noise_seed"])
+        except HexapodError as error:
+            self.get_logger().error(f"cannot configure: {error}")
+            return TransitionCallbackReturn.FAILURE
+        self.set_hardware_id(geometry.name)
+        self._seen: tuple[Pose, float] | None = None  # the tool, and when it was heard, monotonic
+        self._broken_until, self._published, self._problem = -math.inf, 0, ""
+        with self.rolled_back_on_error():
+            tracker = options["kind"] == TRACKER
+            self._out = self.publish_on(
+                PoseStamped if tracker else JointState, "~/pose" if tracker else "~/readings", STATE_QOS
+            )
+            self._ends: list[Any] = [
+                self._out,
+                self.subscribe(PoseStamped, "tool_pose_true", self._on_tool, NEWEST_QOS),
+                self.subscribe(PoseStamped, SET_UP_TOPIC, self._on_set_up, LATCHED_QOS),
+                self.every(1.0 / options["rate"], self._publish),
+                self.every(CHECK_PERIOD, self._check_state),
+            ]
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Read."""
+        self._active = True
+        self.get_logger().info("ready")
+        return super().on_activate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close topics and forget the instrument."""
+        self._active, self._instrument = False, None
+        self.close_ends(*self._ends)
+        return super().on_cleanup(state)
+
+    # ---- parameters ----
+
+    def on_parameters(self, names: set[str]) -> None:
+        """Err by what has been set while the node runs; a beam breaks where it is asked for anew."""
+        if self._instrument is not None:
+            self._instrument.flaws = self._flaws()
+            if "fault_break" in names:
+                self._broken_until = time.monotonic() + self._options["fault_break"]
+
+    def _flaws(self) -> LiveFlaws:
+        options = self._options
+        kept = ("length_noise", "angle_noise", "beam_slope", "centre_off", "wild_share", "wild_size")
+        values = {name: options[name] for name in kept}
+        return LiveFlaws(**values, scale=options["fault_scale"], exchanged=options["fault_exchanged"])
+
+    # ---- what it sees and reads ----
+
+    def _on_tool(self, message: PoseStamped) -> None:
+        if pose := self._pose_in_base(message, "tool_pose_true"):
+            self._seen = pose, time.monotonic()
+
+    def _on_set_up(self, message: PoseStamped) -> None:
+        if (pose := self._pose_in_base(message, SET_UP_TOPIC)) and self._instrument is not None:
+            self._instrument.set_up(pose)
+            self.note("set up", f"set up for {', '.join(self._instrument.channels)}")
+
+    def _pose_in_base(self, message: PoseStamped, topic: str) -> Pose | None:
+        """Return a message's pose; None, and a warning, where it is none in the base."""
+        try:
+            pose = message_pose(message)
+        except HexapodError as error:
+            self._problem = f"{topic} ignored: {error}"
+        else:
+            if message.header.frame_id == self._options["base_frame"]:
+                self._problem = ""
+                return pose
+            allowed = f"frame_id must be {self._options['base_frame']}"
+            self._problem = f"{topic} ignored: {allowed}, not {shorten(message.header.frame_id)}"
+        self.log_warning(topic, self._problem)
+        return None
+
+    def _publish(self) -> None:
+        now = time.monotonic()
+        if not self._active or self._instrument is None or self._options["fault_silent"]:
+            return
+        if self._seen is None or now - self._seen[1] > SEEN_WITHIN:
+            return
+        broken, stamp = now < self._broken_until, stamp_of(self.get_clock().now().nanoseconds)
+        if self._options["kind"] == TRACKER:
+            if not broken:
+                pose, message = self._instrument.pose(self._seen[0]), PoseStamped()
+                message.header.frame_id = self._options["frame_id"]
+                write_pose(message, pose.position, pose.rotation)
+                message.header.stamp = stamp
+                self._out.publish(message)
+                self._published += 1
+            return
+        if broken:
+            self._instrument.zero()
+        readings = dict.fromkeys(self._instrument.channels, math.nan)
+        if not broken:
+            readings = self._instrument.read(self._seen[0])
+        if readings:
+            message = JointState(name=list(readings), position=list(readings.values()))
+            message.header.stamp = stamp
+            self._out.publish(message)
+            self._published += 1
+
+    # ---- state ----
+
+    def _check_state(self) -> None:
+        now = time.monotonic()
+        level, text = OK, "reading"
+        if not self._active:
+            level, text = WARN, "not active"
+        elif self._problem:
+            level, text = WARN, self._problem
+        elif self._seen is None or now - self._seen[1] > SEEN_WITHIN:
+            level, text = WARN, "nobody publishes tool_pose_true"
+        elif now < self._broken_until:
+            level, text = WARN, "the beam is broken"
+        elif self._instrument and self._options["kind"] != TRACKER and not self._instrument.channels:
+            text = f"waiting for {SET_UP_TOPIC}"
+        channels = self._instrument.channels if self._instrument else ()
+        values = {"channels": ", ".join(channels), "readings": str(self._published)}
+        self.publish_status(level, text, lambda: values)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node; the entry of the executable ``instrument``."""
+    keep_discovery_local()
+    return run(InstrumentNode, PROGRAM, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
