@@ -40,7 +40,7 @@ NOT_DRAWN = {"pictures.py", "page.py", "shell_page.py", "__main__.py", "stable_a
 """Files and folders of what is judged by eye, or not ours."""
 
 TESTS = {
-    "pose.py": ["test_pose.py", "ros/test_conversions.py", "machine"],
+    "pose.py": ["test_pose.py", "ros/test_wire.py", "machine"],
     "errors.py": ["test_errors.py", "formats"],
     "core": ["core", "machine", "compensation", "export/test_c_core.py", "workspace"],
     "machine": ["machine", "compensation", "calibration/test_sensitivity.py", "workspace", "fuzz/test_fuzz_files.py"],

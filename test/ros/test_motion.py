@@ -211,21 +211,17 @@ def test_acceleration_is_limited_where_the_geometry_says_so(rig, tmp_path):
 
 # ---- who asked ----
 
-SERVICES = {
-    "reset": (Trigger, "compensator/reset"),
-    "reload_model": (Trigger, "compensator/reload_model"),
-    "enable_compensation": (SetBool, "compensator/enable_compensation"),
-}
 
-
-@pytest.mark.parametrize("service", SERVICES)
-def test_who_asked_is_logged(bench, service):
+@pytest.mark.parametrize(
+    ("service", "kind"), [("reset", Trigger), ("reload_model", Trigger), ("enable_compensation", SetBool)]
+)
+def test_who_asked_is_logged(bench, service, kind):
     """rclpy does not tell who has called; the nodes that have a client of the service are logged."""
     bench.compensator()
     other = rclpy.create_node("operator", context=bench.context)
-    client = other.create_client(*SERVICES[service])
+    client = other.create_client(kind, f"compensator/{service}")
     bench.until(client.service_is_ready, "the other's client")
-    bench.call(*SERVICES[service])
+    bench.call(kind, f"compensator/{service}")
     bench.until(lambda: bench.logged("asked for by /operator or /witness"), "the log")
     other.destroy_node()
 
