@@ -374,9 +374,7 @@ class LinuxcncBridgeNode(MachineNode):
         self._pose_pub = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS, self._options["timeout"])
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
         self.set_hardware_id(self._options["component"])
-        self._subscription = self.subscribe_exclusive(
-            JointState, "strut_corrections", self._on_correction, self._update_publishers
-        )
+        self._subscription = self.subscribe_exclusive(JointState, "strut_corrections", self._on_correction)
         self._source = self.sender_of(self._subscription, self._options["allow_several_publishers"])
         self._check = self.every(CHECK_PERIOD, self._check_state)
         self._reset = CompensatorReset(self, self._status, self._options)
@@ -498,7 +496,8 @@ class LinuxcncBridgeNode(MachineNode):
         self.log_warning(which, text)
         return False
 
-    def _update_publishers(self) -> None:
+    def update_publishers(self) -> None:
+        """Look who publishes what only one node may."""
         self._source.update(time.monotonic())
 
     def _on_correction(self, data: bytes, number: int | None) -> None:

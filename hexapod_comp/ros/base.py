@@ -316,14 +316,12 @@ class MachineNode(LifecycleNode):
         message_type: type,
         topic: str,
         callback: Callable[[bytes, int | None], None],
-        matched: Callable[[], None],
         qos: QoSProfile = COMMAND_QOS,
     ) -> Subscription:
         """Return a subscription of what only one node may say: see :meth:`sender_of`.
 
-        Its callback gets the message's bytes, so that it need not read what is too long, and its sequence number;
-        `matched` is called when a publisher comes or goes, where the middleware tells (who wants to be sure also looks
-        now and then).
+        Its callback gets the message's bytes, so that it need not read what is too long, and its sequence number.
+        Where the middleware tells that a publisher comes or goes, :meth:`update_publishers` is called at once.
         """
         make = functools.partial(
             super().create_subscription,
@@ -337,7 +335,7 @@ class MachineNode(LifecycleNode):
 
         def on_matched(_: Any) -> None:
             if subscription in self.subscriptions:  # told of a subscription that has been closed meanwhile
-                matched()
+                self.update_publishers()
 
         try:
             guarded = self.guard.around(f"matching of {topic}", on_matched)
@@ -345,6 +343,9 @@ class MachineNode(LifecycleNode):
         except UnsupportedEventTypeError:
             subscription = make()
         return subscription
+
+    def update_publishers(self) -> None:
+        """Look who publishes what only one node may; called when one comes or goes, and now and then."""
 
     def sender_of(self, end: Subscription | Publisher, allowed: bool) -> OneSender:
         """Return the guard of a topic that one node may publish: of what this node hears, or says itself."""

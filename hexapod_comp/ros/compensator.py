@@ -196,10 +196,8 @@ class CompensatorNode(MachineNode):
             self._array = self.publish_on(Float64MultiArray, "strut_commands_array", COMMAND_QOS, deadline)
         self._outputs = Outputs(self, compensator, options, self._commands.topic_name)
         self._input = asked = command_input(compensator, options)
-        heard = self.subscribe_exclusive(asked.kind, asked.topic, self._on_command, self._update_publishers)
-        states = self.subscribe_exclusive(
-            JointState, "strut_states", self._on_states, self._update_publishers, qos=NEWEST_QOS
-        )
+        heard = self.subscribe_exclusive(asked.kind, asked.topic, self._on_command)
+        states = self.subscribe_exclusive(JointState, "strut_states", self._on_states, qos=NEWEST_QOS)
         self._reader = StrutReader(names)
         self._ends: list[Any] = [self._commands, self._corrections, self._array, heard, states]
         self._thermometers = Thermometers(*temperature_rules(options))
@@ -291,7 +289,7 @@ class CompensatorNode(MachineNode):
         now = sample.now
         try:
             if self._measuring.receive(number, now):
-                self._update_publishers()
+                self.update_publishers()
             self._measuring.check(sample)
             self._reader.sample(data, sample)
             status.reading_stamps.check(sample)
@@ -350,8 +348,8 @@ class CompensatorNode(MachineNode):
         self._unestimated = self._outputs.answered = 0  # the velocity of the next command is zero
         self._status.fresh_start = True
 
-    def _update_publishers(self) -> None:
-        """Look who publishes what only one may: now and then, and when somebody comes or goes."""
+    def update_publishers(self) -> None:
+        """Look who publishes what only one node may."""
         self._status.update(time.monotonic())
 
     def _check_state(self) -> None:

@@ -143,8 +143,7 @@ class ToolChoice:
 
     def __init__(self, node: MachineNode, status: CompensatorStatus) -> None:
         self._node, self._compensator, self._status = node, status.compensator, status
-        update = lambda: status.update(time.monotonic())  # noqa: E731
-        self._selected = node.subscribe_exclusive(String, "select_tool", self._on_message, update)
+        self._selected = node.subscribe_exclusive(String, "select_tool", self._on_message)
         several = bool(status.options["allow_several_publishers"])
         self._sender = status.sensing["select_tool"] = node.sender_of(self._selected, several)
         self._publisher = node.create_publisher(String, "~/tool", LATCHED_QOS)

@@ -40,8 +40,7 @@ class SensorTopic:
         self._node, self._status, self._topic, self._kind, self._period = node, status, topic, kind, period
         self._handle, self._reject = handle, reject or self._bad_feedback
         self.last = math.nan  # time of the last good message, s; NaN before the first
-        update = lambda: status.update(time.monotonic())  # noqa: E731
-        self._end = node.subscribe_exclusive(kind, topic, self._receive, update, qos=SENSOR_QOS)
+        self._end = node.subscribe_exclusive(kind, topic, self._receive, SENSOR_QOS)
         allowed = status.options["allow_several_publishers"] or status.options[several]
         self._sender = status.sensing[topic] = node.sender_of(self._end, bool(allowed))
 
@@ -59,7 +58,7 @@ class SensorTopic:
         now = time.monotonic()
         try:
             if self._sender.receive(number, now):
-                self._status.update(now)
+                self._node.update_publishers()
             self._sender.check(Sample(now))
             if now - self.last < self._period:
                 return

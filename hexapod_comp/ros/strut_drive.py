@@ -178,9 +178,7 @@ class StrutDriveNode(MachineNode):
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
         self._true_pub = self.publish_on(PoseStamped, "tool_pose_true", STATE_QOS)
         self.set_hardware_id(self.drive.machine.geometry.name)
-        self._subscription = self.subscribe_exclusive(
-            JointState, "strut_commands", self._on_commands, self._update_publishers
-        )
+        self._subscription = self.subscribe_exclusive(JointState, "strut_commands", self._on_commands)
         self._source = self.sender_of(self._subscription, self._options["allow_several_publishers"])
         self._own_timers = [
             self.every(1.0 / self._options["rate"], self._run),
@@ -210,7 +208,8 @@ class StrutDriveNode(MachineNode):
 
     # ---- the machine ----
 
-    def _update_publishers(self) -> None:
+    def update_publishers(self) -> None:
+        """Look who publishes what only one node may."""
         self._source.update(time.monotonic())
 
     def _on_commands(self, data: bytes, number: int | None) -> None:
@@ -277,7 +276,7 @@ class StrutDriveNode(MachineNode):
         yield OK, "running" if self._commands.count else "waiting for the first command"
 
     def _check_state(self) -> None:
-        self._update_publishers()
+        self.update_publishers()
         self._log_space.check()
         now = time.monotonic()
         level, text = joined(self._findings(now)) if self._active else (WARN, "not active")
