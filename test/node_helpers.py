@@ -7,6 +7,7 @@ import pickle
 import sys
 import time
 from collections import defaultdict, deque
+from collections.abc import Iterator
 from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
@@ -129,6 +130,24 @@ class Stranger:
         return sum(end.topic_name == f"/{topic}" for node in self._rig.nodes for end in node.subscriptions)
 
 
+class Messages(list[Any]):
+    """What was published on a topic, oldest first; a message is read from its bytes when it is looked at."""
+
+    def add(self, data: bytes, kind: type) -> None:
+        self.append((data, kind))
+
+    def __getitem__(self, which: Any) -> Any:
+        if isinstance(which, slice):
+            return [self[n] for n in range(*which.indices(len(self)))]
+        found = super().__getitem__(which)
+        if isinstance(found, tuple):
+            self[which] = found = deserialize_message(*found)
+        return found
+
+    def __iter__(self) -> Iterator[Any]:
+        return (self[n] for n in range(len(self)))
+
+
 class Rig(Bench):
     """A bench without DDS, threads and waiting: nodes are called with messages directly, on a clock of the rig's own.
 
@@ -142,8 +161,8 @@ class Rig(Bench):
     def __init__(self, context: Any, capture: Any, patch: pytest.MonkeyPatch) -> None:
         self.context, self.namespace, self._capture, self._log = context, "", capture, ""
         self.clock, self.nodes, self.voices, self._alarms = FakeTime(), [], [], []
-        self.seen = defaultdict(list)
-        self.listeners = [("/" + topic.lstrip("/"), self.seen[topic].append) for topic in WATCHED]
+        self.seen: dict[str, Any] = defaultdict(Messages)
+        self.listeners: list[tuple[str, Any]] = [("/" + topic.lstrip("/"), self.seen[topic]) for topic in WATCHED]
         self._waiting: deque[tuple[Any, Any]] = deque()
         self._due: dict[Any, float] = {}
         self._handling, self._publishers, self._numbers = False, {}, dict[Any, int]()
@@ -236,12 +255,14 @@ class Rig(Bench):
     # ---- messages ----
 
     def _published(self, publisher: Publisher, message: Any) -> None:
-        data = message if isinstance(message, bytes) else bytes(serialize_message(message))
+        data, name = message if isinstance(message, bytes) else bytes(serialize_message(message)), publisher.topic_name
         for topic, callback in list(self.listeners):
-            if topic == publisher.topic_name:
+            if topic == name and isinstance(callback, Messages):
+                callback.add(data, publisher.msg_type)
+            elif topic == name:
                 callback(deserialize_message(data, publisher.msg_type))
         self._numbers[publisher] = self._numbers.get(publisher, 0) + 1
-        self.route(publisher.topic_name, data, self._numbers[publisher])
+        self.route(name, data, self._numbers[publisher])
 
     def route(self, topic: str, data: bytes, number: int | None) -> None:
         """Hand a message to the nodes that hear it, after those that came before."""
