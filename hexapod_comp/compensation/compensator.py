@@ -210,9 +210,9 @@ class Compensator:
         Directions of motion after the last command.
     on_change : callable
         Called after each change from outside, with its name and value: ``temperature`` (name, °C, time), ``humidity``
-        (fraction, time), ``load`` (Loading), ``outside`` (all numbers by their names), ``model``, ``drift`` (shape
-        (12,), m), ``enable`` (bool), ``tool`` (name), ``ramp_rate`` (m/s), ``reset`` (measured struts or None).
-        Together with the commands these decide all answers.
+        (fraction, time), ``load`` (:meth:`.Loading.numbers`), ``outside`` (all numbers by their names), ``model``,
+        ``drift`` (twelve, m), ``enable`` (bool), ``tool`` (name), ``ramp_rate`` (m/s), ``reset`` (measured struts or
+        None). Together with the commands these decide all answers.
     """
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, ramp_rate: float = DEFAULT_RAMP_RATE) -> None:
@@ -299,7 +299,7 @@ class Compensator:
             raise ModelError("drift", f"must be {DRIFT_STATES} finite numbers, m", drift.tolist())
         if not np.array_equal(drift, self.drift):
             self._take_model(self.model, self.outside, drift)
-            self.on_change("drift", drift)
+            self.on_change("drift", drift.tolist())
 
     def set_outside(self, numbers: Mapping[str, float]) -> None:
         """Take outside numbers by their names, SI or °C, for the model's table; what they change ramps in.
@@ -401,7 +401,7 @@ class Compensator:
         if loading != self.loading:
             lib.hc_set_load(self._at, loading.gravity or (math.nan,) * 3, loading.wrench)
             self.loading, self._machine = loading, None
-            self.on_change("load", loading)
+            self.on_change("load", loading.numbers())
 
     def set_tool(self, name: str) -> None:
         """Take another tool by its name; nothing moves. What a tool weighs otherwise ramps in with the next command.
@@ -469,7 +469,7 @@ class Compensator:
             measured = np.array(measured, dtype=float)
             if measured.shape != (6,) or lib.hc_reset(self._at, given("measured", measured, 6)):
                 raise NotFiniteError("measured strut lengths must be six finite numbers, m", measured.tolist())
-        self.on_change("reset", measured)
+        self.on_change("reset", None if measured is None else measured.tolist())
 
     def snapshot(self) -> dict[str, Any]:
         """Return what, beside geometry and model, decides the next answer, by name.

@@ -206,30 +206,20 @@ class Journal:
     def note(self, what: str, value: Any) -> None:
         """Write down a change that has just been made."""
         entry = {"after": self._count, "what": what}
-        if what in ("temperature", "humidity"):
-            *name, number, time = value
-            entry |= {
-                "value": number,
-                "time": None if math.isnan(time) else time,
-                **({"name": name[0]} if name else {}),
-            }
-        elif what == "model":
+        if what == "model":
             entry |= {"name": value.name, "sha256": self._sources["model"].sha256}
-        elif what == "drift":
-            entry["value"] = value.tolist()
-        elif what == "load":
-            entry["value"] = value.numbers()
-        elif what == "outside":
-            entry["value"] = dict(value)
-        elif what == "reset":
-            entry["measured"] = None if value is None else value.tolist()
-            # Every refused first command resets anew; only the last reset counts, and a page stays short.
-            if self._entries and (self._entries[-1]["what"], self._entries[-1]["after"]) == (what, self._count):
-                self._entries.pop()
-        elif what in ("enable", "ramp_rate", "tool"):
-            entry |= {key: read(value) for key, read in ENTRIES[what].items()}
+        elif what in SETTERS:
+            told = value if isinstance(value, tuple) else (value,)
+            entry |= {key: None if v != v else v for key, v in zip(ENTRIES[what], told, strict=True)}
         else:
             raise JournalError(f"the journal knows no change called {what!r}")
+        # Every refused first command resets anew; only the last reset counts, and a page stays short.
+        if (
+            what == "reset"
+            and self._entries
+            and (self._entries[-1]["what"], self._entries[-1]["after"]) == (what, self._count)
+        ):
+            self._entries.pop()
         self._entries.append(entry)
 
     def refused(self, stamp: int, reason: str, text: str) -> None:
@@ -362,20 +352,31 @@ def _object(content: Any, where: str) -> dict[str, Any]:
     return content
 
 
+def _number(found: float | None) -> float:
+    return math.nan if found is None else float(found)
+
+
+def _numbers(found: Sequence[float] | None) -> list[float] | None:
+    return None if found is None else [float(value) for value in found]
+
+
 # What each kind of entry says, and how it is read
 ENTRIES: dict[str, dict[str, Callable[[Any], Any]]] = {
-    "temperature": {"name": str, "value": float, "time": lambda found: math.nan if found is None else float(found)},
-    "humidity": {"value": float, "time": lambda found: math.nan if found is None else float(found)},
+    "temperature": {"name": str, "value": float, "time": _number},
+    "humidity": {"value": float, "time": _number},
     "model": {"name": str, "sha256": str},
-    "drift": {"value": lambda found: [float(value) for value in found]},
+    "drift": {"value": _numbers},
     "load": {"value": Loading.from_numbers},
     "outside": {"value": read_numbers},
     "enable": {"on": bool},
     "ramp_rate": {"value": float},
     "tool": {"name": str},
-    "reset": {"measured": lambda found: None if found is None else [float(value) for value in found]},
+    "reset": {"measured": _numbers},
     "refused": {"stamp": int, "reason": str, "text": str},
 }
+# Which method of the compensator makes a change again, with what its entry says in that order
+SETTERS = {what: f"set_{what}" for what in ("temperature", "humidity", "drift", "load", "outside", "ramp_rate", "tool")}
+SETTERS |= {"enable": "enable", "reset": "reset"}
 
 
 def _read_entry(content: Any) -> Entry:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..compensation.compensator import BESIDE_NUMBERS, PLACES, Compensator, pack_pose
-from ..compensation.journal import Entry, Snapshot, time_of
+from ..compensation.journal import SETTERS, Entry, Snapshot, time_of
 from ..errors import FrameError, HexapodError
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
@@ -177,29 +177,12 @@ class _Run:
 
     def _change(self, entry: Entry) -> None:
         """Make a change that the journal holds."""
-        values = entry.values
-        if entry.what == "model" and self._files is not None:
-            self.compensator.set_model(self._files.model(values, self.compensator.geometry))
-            self._in_use = self._in_use[0], values["sha256"]
-        elif entry.what == "temperature":
-            self.compensator.set_temperature(values["name"], float(values["value"]), float(values["time"]))
-        elif entry.what == "humidity":
-            self.compensator.set_humidity(float(values["value"]), float(values["time"]))
-        elif entry.what == "drift" and self._files is not None:
-            self.compensator.set_drift(np.array(values["value"]))
-        elif entry.what == "load":
-            self.compensator.set_load(values["value"])
-        elif entry.what == "outside":
-            self.compensator.set_outside(values["value"])
-        elif entry.what == "enable":
-            self.compensator.enable(bool(values["on"]))
-        elif entry.what == "ramp_rate":
-            self.compensator.set_ramp_rate(values["value"])
-        elif entry.what == "tool":
-            self.compensator.set_tool(values["name"])
-        elif entry.what == "reset":
-            measured = values["measured"]
-            self.compensator.reset(None if measured is None else np.array(measured, dtype=float))
+        if entry.what == "model":
+            if self._files is not None:
+                self.compensator.set_model(self._files.model(entry.values, self.compensator.geometry))
+                self._in_use = self._in_use[0], entry.values["sha256"]
+        elif entry.what != "drift" or self._files is not None:
+            getattr(self.compensator, SETTERS[entry.what])(*entry.values.values())
 
     def _step(self, row: int) -> int:
         """Give the command that was answered, as the node did; return what comes of it."""
