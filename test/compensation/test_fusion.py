@@ -25,7 +25,6 @@ from hexapod_comp.compensation.fusion import (
     checked_covariance,
     observation,
 )
-from hexapod_comp.compensation.journal import Journal, Source, read_page
 from hexapod_comp.errors import CommandError, ModelError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel
@@ -239,46 +238,6 @@ def test_another_model_and_a_reset_begin_without_drift(paper):
     assert not compensator.drift.any()
     fusion.feed(compensate=True)
     assert (fusion.drift.any(), compensator.drift.any(), fusion.count) == (False, False, 0)
-
-
-def test_a_snapshot_and_the_journal_hold_the_drift(paper):
-    compensator = Compensator(paper, MachineModel(paper.name))
-    assert "drift" not in compensator.snapshot()
-    sources = {name: Source.of(name, "") for name in ("geometry", "model")}
-    journal = Journal(compensator, sources, {"base": "base", "work": "work"})
-    drift = 1e-6 * np.arange(12.0)
-    compensator.set_drift(drift)
-    page = read_page(journal.page(0.0))
-    assert [(entry.what, entry.values["value"]) for entry in page.entries] == [("drift", drift.tolist())]
-    again = Compensator(paper, MachineModel(paper.name))
-    assert page.snapshot is not None
-    again.restore(page.snapshot.state)
-    np.testing.assert_array_equal(again.drift, drift)
-    struts = lengths(paper, paper.home)
-    np.testing.assert_array_equal(again.estimate(struts), compensator.estimate(struts))
-
-
-def test_a_drift_is_replayed_to_the_bit(paper):
-    """From a snapshot before it, and from one after it, as a replay goes on after a lost page."""
-    compensator, again, later = (Compensator(paper, MachineModel(paper.name)) for _ in range(3))
-    drift = 1e-6 * np.arange(12.0)
-
-    def asked(one: Compensator, n: int) -> bytes:
-        shifted = Pose(paper.home.position + np.array([1e-4 * n, 0.0, 0.0]), paper.home.rotation)
-        return one.correct(paper.tool_pose(shifted), 0.01 * n).command.tobytes()
-
-    asked(compensator, 0)
-    again.restore(compensator.snapshot())
-    for one in (compensator, again):
-        one.set_drift(drift)
-    answers = []
-    for n in range(1, 20):
-        if n == 5:
-            later.restore(compensator.snapshot())
-        answers.append(asked(compensator, n))
-        assert answers[-1] == asked(again, n)
-        assert n < 5 or answers[-1] == asked(later, n)
-    assert len(set(answers)) == len(answers)
 
 
 @pytest.mark.parametrize("wrong", [np.zeros(6), np.full(12, np.nan)])

@@ -12,11 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foreign_machines import machines
-from replay_helpers import RecordedMachine
 from strategies import paper_geometry
 
 from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.compensation.journal import read_page
 from hexapod_comp.compensation.thermal import Plausibility, Thermometers
 from hexapod_comp.errors import InputFileError, ModelError
 from hexapod_comp.export.c_code import write_c
@@ -90,18 +88,6 @@ def test_humidity_is_smoothed_goes_stale_and_judges_no_temperature() -> None:
     assert sensors.update("humidity", 0.6, 0.0) == pytest.approx(0.5, abs=1e-15)
     assert sensors.update("base", 60.0, 0.0) == 60.0
     assert sensors.stale(60.5) == ("base", "humidity")
-
-
-def test_the_journal_tells_and_a_snapshot_brings_it_back() -> None:
-    machine = RecordedMachine()
-    machine.compensator.set_humidity(0.61, 12.5)
-    machine.wave(3)
-    page = read_page(machine.journal.page(9.0))
-    assert (page.entries[0].what, page.entries[0].values) == ("humidity", {"value": 0.61, "time": 12.5})
-    assert page.snapshot is not None
-    other = Compensator(machine.geometry, machine.compensator.model)
-    other.restore(page.snapshot.state)
-    assert other.temperatures.values == {"humidity": 0.61}
 
 
 def test_models_carry_it_and_absurd_ones_are_refused() -> None:

@@ -14,22 +14,18 @@ import pytest
 from foreign_machines import machines
 from helpers import three_two_one_machine
 from hypothesis import given
-from replay_helpers import RecordedMachine, write_bag
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from strategies import fixed, paper_geometry, random_model, random_pose, seeds, skewed_geometry
 
 from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.compensation.journal import read_page
 from hexapod_comp.core import Status, lib
 from hexapod_comp.errors import InputFileError, ModelError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.load import STANDARD_GRAVITY, Load, Loading, Payload
 from hexapod_comp.machine.model import MachineModel, ModelOrigin, MotionState, RealMachine
-from hexapod_comp.machine.model_file import model_text, parse_model, save_model
+from hexapod_comp.machine.model_file import model_text, parse_model
 from hexapod_comp.pose import Pose
-from hexapod_comp.replay.bag import read_recording
-from hexapod_comp.replay.replay import replay_recording
 
 SOFT = np.full(6, 20e6)  # N/m
 G = STANDARD_GRAVITY
@@ -217,30 +213,6 @@ def test_the_core_refuses_what_is_not_finite() -> None:
     state, infinite = compensator._at, float("inf")
     assert lib.hc_set_load(state, [0.0, 0.0, infinite], [0.0] * 6) == Status.LOAD
     assert lib.hc_set_load(state, [0.0] * 3, [0.0, infinite, 0.0, 0.0, 0.0, 0.0]) == Status.LOAD
-
-
-def test_a_change_of_load_is_replayed(tmp_path: Path) -> None:
-    """The journal has the change; a replay gives the same bits across it, and from a snapshot taken after it."""
-    model = MachineModel("paper", load=Load(stiffness=SOFT, mass=30.0), origin=ModelOrigin("2026-11-24"))
-    save_model(model, tmp_path / "model.yaml")
-    machine, tilted = RecordedMachine(model=tmp_path / "model.yaml"), Loading.of([1.0, 0.0, -9.7], [5.0] * 6)
-    machine.wave(20)
-    machine.compensator.set_load(tilted)
-    machine.wave(20, 20)
-    page = read_page(machine.journal.page(9.0))
-    assert [(entry.what, entry.values["value"]) for entry in page.entries] == [("load", tilted)]
-    assert page.snapshot is not None
-    assert page.snapshot.state["loading"] == tilted.numbers()
-
-    machine = RecordedMachine(model=tmp_path / "model.yaml")
-    for n in range(3):
-        machine.wave(20, 20 * n)
-        machine.page(snapshot=n > 0)
-        machine.compensator.set_load((tilted, Loading(), tilted)[n])
-    result = replay_recording(read_recording(write_bag(tmp_path / "bag", machine.messages)))
-    assert result.identical
-    assert result.compared == 60
-    assert not result.states_differ
 
 
 # ---- files ----

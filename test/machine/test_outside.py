@@ -12,23 +12,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foreign_machines import machine_names, machines
-from replay_helpers import RecordedMachine, write_bag
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 from strategies import paper_geometry, random_field, random_model, skewed_geometry
 
 from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.compensation.journal import read_page
 from hexapod_comp.errors import InputFileError, LimitError, ModelError, OutsideTableError
 from hexapod_comp.export.carried import refuse_unknown
 from hexapod_comp.machine.field import no_field
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
-from hexapod_comp.machine.model_file import model_text, parse_model, save_model
+from hexapod_comp.machine.model_file import model_text, parse_model
 from hexapod_comp.machine.outside import NO_TABLE, OutsideTable, load_outside
 from hexapod_comp.pose import Pose
-from hexapod_comp.replay.bag import read_recording
-from hexapod_comp.replay.replay import replay_recording
 
 ELEVATION, ROTATION = np.radians([0.0, 20.0, 60.0, 90.0]), np.radians([-90.0, 0.0, 45.0])
 HERE = {"elevation": 0.7, "rotation": -0.3}
@@ -211,27 +207,6 @@ def test_another_model_keeps_the_numbers_and_a_drift_stands_beside_them() -> Non
     assert compensator.estimate(struts)[2] - height == pytest.approx(7e-6 - 10e-6, abs=1e-12)
     with pytest.raises(ModelError, match="is the unit right"):  # a model whose table the present number cannot be in
         compensator.set_model(MachineModel("paper", outside=replace(flexure(), nodes=(np.array([5.0, 6.0]),))))
-
-
-def test_a_change_is_replayed_to_the_bit(tmp_path: Path) -> None:
-    """Through the journal and, after a snapshot, from it."""
-    model = MachineModel("paper", outside=flexure(), origin=ModelOrigin("2026-11-25"))
-    save_model(model, tmp_path / "model.yaml")
-    machine = RecordedMachine(model=tmp_path / "model.yaml")
-    for n in range(3):
-        machine.wave(20, 20 * n)
-        if n == 1:
-            page = read_page(machine.journal.page(9.0))
-            assert [(entry.what, entry.values["value"]) for entry in page.entries] == [("outside", {"elevation": 0.0})]
-            assert page.snapshot is not None
-            assert page.snapshot.state["outside"] == {"elevation": 0.0}
-            machine = RecordedMachine(model=tmp_path / "model.yaml")
-        machine.page(snapshot=n > 0)
-        machine.compensator.set_outside({"elevation": 0.4 * n})
-    machine.wave(20, 60)
-    machine.page()
-    result = replay_recording(read_recording(write_bag(tmp_path / "bag", machine.messages)))
-    assert (result.identical, result.states_differ) == (True, [])
 
 
 # ---- files ----
