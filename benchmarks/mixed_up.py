@@ -29,7 +29,7 @@ from benchmarks import drawn
 from benchmarks.calibration import LEAD
 from benchmarks.promise import FOREIGN, KNOWN, OWN, setting
 from hexapod_comp.calibration.fit import mixed_up
-from hexapod_comp.calibration.mixups import FAMILIES, family_of_run
+from hexapod_comp.calibration.mistakes import FAMILIES, family_of_run
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.measurements.readings import CHANNELS, MeasurementSet
 

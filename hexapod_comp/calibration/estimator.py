@@ -19,8 +19,8 @@ from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs
 from ..errors import CalibrationError, KinematicsError, ModelError
 from ..measurements.readings import KINDS, LEAST_NOISE, MeasurementSet, refuse_absurd
 from .assumptions import ASSUMED
-from .observations import Cells, Nuisance, of_square, of_zero
-from .parameters import ParameterSpace
+from .observations import Cells, Nuisance, of_square
+from .parameters import Components, ParameterSpace
 from .sensitivity import Prediction, Slopes, predict
 
 Given = TypeVar("Given")
@@ -205,7 +205,7 @@ class Posterior:
 
 
 def solve(
-    space: ParameterSpace,
+    space: ParameterSpace | Components,
     problem: LinearProblem,
     tolerances: np.ndarray,
     noise: np.ndarray,
@@ -278,14 +278,14 @@ def _noise(
     return np.maximum(result, problem.least_noise)
 
 
-def _tolerances(space: ParameterSpace, posterior: Posterior, z: np.ndarray) -> np.ndarray:
+def _tolerances(space: ParameterSpace | Components, posterior: Posterior, z: np.ndarray) -> np.ndarray:
     """Return new tolerances: MacKay's fixed point, squared parameters over how many are determined.
 
     The first guess counts as a tenth of a parameter, which keeps an empty block from collapsing.
     """
     result, start = posterior.tolerances.copy(), space.start_tolerances()
-    for n, block in enumerate(space.blocks):
-        members = (posterior.used >= block.part.start) & (posterior.used < block.part.stop)
+    for n, part in enumerate(space.parts):
+        members = (posterior.used >= part.start) & (posterior.used < part.stop)
         if members.any():
             first = ASSUMED.hyperprior * (start[n] / result[n]) ** 2
             factor = np.sqrt(
@@ -362,7 +362,7 @@ class Estimation:
             self._components[lengths.members, :3] = True  # their directions change with the answer
         self._groups = self._group_alike()
         needed = len(space.blocks[0].labels)
-        free = len(self.cells.station) - len(self._zeros) - sum(along is not None for _, along in self._zeros)
+        free = len(self.cells.station) - len(self._zeros.groups) - int(self._zeros.sloping.sum())
         free -= len(self._squares) + sum(lengths.count for lengths in self._lengths) + 6 * len(self._frames)
         if alone and free < needed:
             problem = f"{len(measurements)} readings at {len(self.cells.station)} distinct places leave {free} "
@@ -378,7 +378,7 @@ class Estimation:
         scale = np.sqrt(total)
         values = np.bincount(c.of_reading, weights * m.value) / total
         prediction, directions = prediction or self._predicted(x), c.directions.copy()
-        expected, unknowns = self._unknowns(directions, prediction.errors[c.station], values, scale)
+        expected, unknowns = self.unknowns(directions, prediction.errors[c.station], values, scale)
         misfit = m.value - expected[c.of_reading]
         mean = np.bincount(c.of_reading, weights * misfit) / total
         rows, moved = self._rows(x, prediction, scale[:, None] * directions)
@@ -437,7 +437,7 @@ class Estimation:
         """Return one over the cells' stated noise, (C,), and what instruments do not know, at the nominal machine."""
         scale = np.sqrt(np.bincount(self.cells.of_reading, self.uncertainty**-2))
         values = np.zeros(len(scale))
-        return scale, self._unknowns(self.cells.directions.copy(), np.zeros((len(scale), 6)), values, scale)[1]
+        return scale, self.unknowns(self.cells.directions.copy(), np.zeros((len(scale), 6)), values, scale)[1]
 
     def _predicted(self, x: np.ndarray) -> Prediction:
         """Return what the machine of a parameter vector does."""
@@ -448,12 +448,12 @@ class Estimation:
             problem = f"left the machines that can be ({error}); {hint}"
             raise CalibrationError("fit", problem) from error
 
-    def _unknowns(
+    def unknowns(
         self, directions: np.ndarray, errors: np.ndarray, values: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, list[Nuisance]]:
         """Return what cells with errors (C, 6) should read, and what is unknown; renews `directions` that change."""
         expected = np.einsum("ci,ci->c", directions, errors)
-        unknowns = [of_zero(members, scale[members], along) for members, along in self._zeros]
+        unknowns = self._zeros.unknowns(scale)
         unknowns += [of_square(n, scale[n], self.cells.lever[n], self.cells.group[n]) for n in self._squares]
         for lengths in self._lengths:
             n = lengths.members
@@ -485,9 +485,7 @@ class Estimation:
     def _group_alike(self) -> list[_Group]:
         """Return the cells in groups of one kind whose errors have the same components."""
         c = self.cells
-        for members in (
-            [members for members, _ in self._zeros] + self._squares + [lengths.members for lengths in self._lengths]
-        ):
+        for members in (*self._zeros.groups, *self._squares, *(lengths.members for lengths in self._lengths)):
             self._components[members] |= self._components[members].any(axis=0)
         key = c.kind * 64 + self._components @ (1 << np.arange(6))
         order = np.lexsort((c.group, self.measurements.run[c.first], key))

@@ -186,7 +186,7 @@ def fit_model(
             return _drop_outlier_runs(measurements, begun, error, progress, datum)
     except HexapodError as error:
         blocks = [block.name for block in begun.everything.space.blocks]
-        named = mixups(begun.everything, begun.problem, blocks, progress)
+        named = mixups(begun.everything, blocks, progress)
         if swapped_directions(begun.everything, begun.problem, blocks):
             named.append(SWAPPED)
         if named:
@@ -227,7 +227,7 @@ def mixed_up(measurements: MeasurementSet, settings: FitSettings) -> list[str]:
     """Return how readings must have been taken to be more probable, by name, the best first; nothing is fitted."""
     begun = _begin(measurements, settings, lambda text: None)
     decisions = select(begun.everything.space, begun.problem, np.ones(len(KINDS)), lambda text: None)[0]
-    return mixups(begun.everything, begun.problem, [d.block for d in decisions if d.kept])
+    return mixups(begun.everything, [d.block for d in decisions if d.kept])
 
 
 class _Begun(NamedTuple):
@@ -263,7 +263,7 @@ def _fit(
     notes += _check_noise(channels)
     progress("what is it worth?")
     noise = {KINDS.index(c.kind): c.estimated for c in channels}
-    mixed = mixups(everything, nominal, [d.block for d in decisions if d.kept], progress)
+    mixed = mixups(everything, [d.block for d in decisions if d.kept], progress)
     left_out = _averaged(space, solution, everything.space, possible, decisions)
     verdict = judge(residuals, settings, noise, mixed, left_out)
     no_trace = unseen_errors(measurements, settings)

@@ -9,6 +9,7 @@ need not be small beside the length.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -63,14 +64,38 @@ def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: 
     return Nuisance(members, (slope / np.linalg.norm(slope))[:, None], np.ones(1))
 
 
-def of_zero(members: np.ndarray, scale: np.ndarray, along: np.ndarray | None = None) -> Nuisance:
-    """Return an unknown zero, and the slope along a line."""
-    columns = [scale / np.linalg.norm(scale)]
-    if along is not None:
-        slope = scale * (along - along.mean())
-        slope -= columns[0] * (columns[0] @ slope)
-        columns.append(slope / np.linalg.norm(slope))
-    return Nuisance(members, np.stack(columns, axis=1), np.ones(len(columns)))
+class Zeros:
+    """Groups of cells with an unknown zero each, and the slope along a line where `along`, (C,), is not NaN."""
+
+    def __init__(self, groups: Sequence[np.ndarray], along: np.ndarray) -> None:
+        self._order = np.concatenate(groups) if groups else np.zeros(0, dtype=int)
+        self._count = np.array([len(members) for members in groups], dtype=int)
+        self._start = np.cumsum(self._count) - self._count
+        self._away = along[self._order]
+        if groups:
+            self._away = self._away - self._each(self._sums(self._away) / self._count)
+        self.groups, self.sloping = groups, np.isfinite(self._away[self._start])
+
+    def _sums(self, values: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(values, self._start)
+
+    def _each(self, of_group: np.ndarray) -> np.ndarray:
+        return np.repeat(of_group, self._count)
+
+    def unknowns(self, scale: np.ndarray) -> list[Nuisance]:
+        """Return them for cells whose values have one over these standard deviations, (C,)."""
+        if not self.groups:
+            return []
+        zero = scale[self._order]
+        slope = zero * self._away
+        zero = zero / self._each(np.sqrt(self._sums(zero**2)))
+        slope -= zero * self._each(self._sums(zero * slope))
+        basis = np.column_stack([zero, slope / self._each(np.sqrt(self._sums(slope**2)))])
+        both, ends = np.ones(2), self._start + self._count
+        return [
+            Nuisance(members, basis[start:stop, : 1 + sloping], both[: 1 + sloping])
+            for members, start, stop, sloping in zip(self.groups, self._start, ends, self.sloping, strict=True)
+        ]
 
 
 @dataclass(frozen=True)
@@ -103,9 +128,8 @@ class Lengths:
         What is left of the lengths counts as their noise where it is more: far from the answer a circle's centre would
         otherwise leave its plane, where it hardly matters, to explain what the machine does.
         """
-        zero = of_zero(self.members, scale)
-        if self.known_zero:
-            zero = zero._replace(basis=zero.basis[:, :0], share=zero.share[:0])
+        known = 0 if self.known_zero else 1
+        zero = Nuisance(self.members, (scale / np.linalg.norm(scale))[:, None][:, :known], np.ones(known))
         arms = self._arms()
         size = float(np.linalg.norm(arms, axis=1).max()) or 1.0  # m; turns are counted by how far they move a centre
         nominal = np.linalg.norm(self.points - self.centres, axis=1)
@@ -241,26 +265,24 @@ class Cells:
             fold=np.unique(fold_key, return_inverse=True)[1].ravel(),
         )
 
-    def groups(self, measurements: MeasurementSet) -> tuple[list[tuple[np.ndarray, np.ndarray | None]], list[Lengths]]:
-        """Return the cells of each channel of each run: those with a zero, and their slope's lever; and lengths."""
+    def groups(self, measurements: MeasurementSet) -> tuple[Zeros, list[Lengths]]:
+        """Return the channels of runs that have a zero, and their slopes along lines; and lengths."""
         c, m = self, measurements
         points = m.points()
-        zeros: list[tuple[np.ndarray, np.ndarray | None]] = []
-        lengths = []
-        for group in np.unique(c.group[c.group >= 0]):
-            members = np.flatnonzero(c.group == group)
+        zeros, lengths = list[np.ndarray](), list[Lengths]()
+        along = np.where((c.square < 0) & (c.kind == KINDS.index("straightness")), c.along, np.nan)
+        for members in _members(c.group):
+            if c.group[members[0]] < 0:
+                continue
             if c.channel[members[0]] == LENGTH:
                 run = m.runs[m.run[c.first[members[0]]]]
                 places = points[c.station[members]], m.centre[c.first[members]]
                 lengths.append(Lengths(run.name, members, *places, run.known_zero))
                 continue
-            sloping = (
-                (c.square[members] < 0).all()
-                and KINDS[c.kind[members[0]]] == "straightness"
-                and np.ptp(c.along[members]) > 0.0
-            )
-            zeros.append((members, c.along[members] if sloping else None))
-        return zeros, lengths
+            if not np.ptp(along[members]) > 0.0:
+                along[members] = np.nan
+            zeros.append(members)
+        return Zeros(zeros, along), lengths
 
     def squares(self) -> list[np.ndarray]:
         """Return the cells that turn with each square about each axis: all of their groups."""
@@ -275,6 +297,12 @@ class Cells:
             if len(np.unique(self.station[absolute[run == n]])) < FRAME_STATIONS:
                 run[run == n] = -1
         return [Frame(own, points[self.station[own]]) for n in np.unique(run) for own in [absolute[run == n]]]
+
+
+def _members(group: np.ndarray) -> list[np.ndarray]:
+    """Return the cells of each group, by its number."""
+    order = np.argsort(group, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
 
 
 def _left_out_whole(measurements: MeasurementSet) -> np.ndarray:

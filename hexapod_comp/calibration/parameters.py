@@ -8,6 +8,7 @@ keeps smooth blocks smooth; where the data determine a parameter it hardly count
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -148,6 +149,21 @@ class Extent:
         )
 
 
+class Components(NamedTuple):
+    """Independent parameters with one prior a block: what :func:`~.estimator.solve` needs of a parameter space."""
+
+    parts: tuple[slice, ...]  # of each block
+    first: np.ndarray  # (blocks,): tolerances to start from
+
+    def start_tolerances(self) -> np.ndarray:
+        """Return the blocks' first tolerances, shape (blocks,)."""
+        return self.first
+
+    def spread(self, tolerances: np.ndarray) -> np.ndarray:
+        """Return each parameter's tolerance from its block's, shape (size,)."""
+        return np.repeat(tolerances, [part.stop - part.start for part in self.parts])
+
+
 class ParameterSpace:
     """All parameters of a joint fit, in SI, block by block, and the machine that a vector of them makes.
 
@@ -183,6 +199,11 @@ class ParameterSpace:
         """Return points (n, 3) of the work frame in ``base``, m."""
         work = self.geometry.work
         return work.position + in_work @ work.rotation.T
+
+    @property
+    def parts(self) -> tuple[slice, ...]:
+        """Where each block stands in the parameter vector."""
+        return tuple(block.part for block in self.blocks)
 
     @property
     def measured(self) -> Region | None:

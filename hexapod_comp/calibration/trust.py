@@ -41,7 +41,7 @@ from .estimator import (
     physical_covariance,
     whitened_precision,
 )
-from .mixups import FAMILIES, family_of_run
+from .mistakes import FAMILIES, family_of_run
 from .parameters import FitSettings, ParameterSpace
 from .posterior import ToolError, box_errors, expected_error
 from .promise import Scatter, Unexplained

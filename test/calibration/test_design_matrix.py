@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hexapod_comp.calibration.estimator import Alike, DesignMatrix
-from hexapod_comp.calibration.observations import of_zero
+from hexapod_comp.calibration.observations import Zeros
 
 SHAPE = (40, 12)
 
@@ -57,6 +57,6 @@ def test_further_columns(rows: DesignMatrix):
 def test_a_zero_is_taken_off_the_cells_of_its_part_alone(rows: DesignMatrix):
     """What is left of cells of equal noise is what their mean leaves."""
     wanted, members = rows.dense(), np.sort(rows.parts[1].cells[3:9])
-    rows.project_out([of_zero(members, np.ones(6))])
+    rows.project_out(Zeros([members], np.full(40, np.nan)).unknowns(np.ones(40)))
     wanted[members] -= wanted[members].mean(axis=0)
     close(rows.dense(), wanted)

@@ -16,7 +16,7 @@ from scipy.stats import f as f_distribution
 from hexapod_comp.calibration.estimator import Estimation, NotSettled, influence, iterate
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
-from hexapod_comp.calibration.mixups import family_of_run
+from hexapod_comp.calibration.mistakes import family_of_run
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import expected_error, stations_of
 from hexapod_comp.calibration.promise import Scatter, Unexplained

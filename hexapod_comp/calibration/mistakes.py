@@ -1,0 +1,228 @@
+"""Mistakes in how readings are taken: what may have been mixed up, and what readings are if it was.
+
+One table: a row is a mistake's name and the readings without it. Signs, units and labels of channels leave the machine
+where it stood; other frames, orders of angles and machines put it elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache, partial
+from itertools import combinations, permutations, product
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..formats.paths import config_file
+from ..machine.geometry import HexapodGeometry, load_geometry
+from ..machine.kinematics import Structure, strut_lengths_batch
+from ..machine.model import MachineModel
+from ..machine.passes import Passes
+from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_KINDS, MeasurementSet, Run
+from ..measurements.runs import GEOMETRIES
+from ..pose import angles_from_rotation
+from ..virtual.instruments import compensated
+
+PARALLEL = 0.999  # cosine from which a line is parallel to an axis
+
+FAMILIES = ("x lines", "y lines", "z lines", "other lines", "other runs")
+"""Families of runs, by direction in the work frame."""
+
+UNITS = {
+    "length": (("µinch", 0.0254), ("0.1 µm", 0.1), ("0.01 mm", 10.0), ("mm", 1e3), ("nm", 1e-3)),
+    "angle": (("arcsec", np.pi / 0.648), ("mrad", 1e3), ("mdeg", np.pi / 0.18)),
+}
+"""Units in which readings may stand that are said to be µm or µrad."""
+
+TURNS = ((1, "by 90°"), (2, "by 180°"), (3, "by -90°"))
+
+
+class Mistake(NamedTuple):
+    """One way in which readings may have been mixed up."""
+
+    name: str  # "x lines, linear: sign reversed"
+    undone: Callable[[], MeasurementSet | None]  # the readings without it; None: these cannot have it
+    factor: np.ndarray = np.ones(len(KINDS))  # (kinds,): by which it changes the unit of each kind of channel
+    choices: float = 0.0  # logarithm of how many equally probable mistakes this one was chosen from
+
+
+def family_of_run(measurements: MeasurementSet) -> np.ndarray:
+    """Return the index into :data:`FAMILIES` of each run."""
+    axes = np.array([run.axis for run in measurements.runs]).reshape(-1, 3) @ measurements.geometry.work.rotation
+    parallel = np.abs(axes) > PARALLEL
+    family = np.where(parallel.any(axis=1), parallel.argmax(axis=1), 3)
+    return np.where(axes.any(axis=1), family, 4)
+
+
+def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
+    """Yield what leaves the machine where it stood: signs, units and channels exchanged."""
+    for name, members in _parts(m):
+        yield Mistake(f"{name}: sign reversed", partial(sign_reversed, m, members))
+    for name, kinds, factor in _in_other_units(m):
+        factors = np.where(np.isin(np.arange(len(KINDS)), kinds), factor, 1.0)
+        yield Mistake(name, partial(m.with_values, factors[m.kind] * m.value), factors)
+    for name, channel in _exchanged(m):
+        yield Mistake(f"{name}: exchanged", partial(replace, m, channel=channel))
+
+
+def mistakes_of_check(m: MeasurementSet, model: MachineModel) -> Iterator[Mistake]:
+    """Yield what may be wrong with readings that check a model."""
+    if has_nominal_commands(m):
+        yield Mistake("taken with this model running (--compensated)", partial(compensated, m, model))
+        yield from (mistake for mistake in mistakes_of_place(m) if mistake.name.endswith(": exchanged"))
+    else:
+        off = replace(m.stations, commands=_nominal(m.geometry, m))
+        yield Mistake("taken with the compensation off", partial(replace, m, stations=off))
+    yield Mistake("all readings: sign reversed", partial(m.with_values, -m.value))
+    yield from mistakes(m)
+
+
+def mistakes_of_place(m: MeasurementSet) -> Iterator[Mistake]:
+    """Yield where else the machine may have stood: frames exchanged, mirrored and turned, angles, other machines."""
+    for a, b in combinations(range(3), 2):
+        order = np.eye(3)
+        order[[a, b]] = order[[b, a]]
+        yield Mistake(f"{AXES[a]} and {AXES[b]}: exchanged", partial(in_frame, m, order))
+    for a, axis in enumerate(AXES):
+        mirror = np.diag(1.0 - 2.0 * np.eye(3)[a])
+        yield Mistake(f"{axis}: mirrored", partial(in_frame, m, mirror))
+        yield Mistake(f"{axis}: mirrored, rotations as well", partial(in_frame, m, mirror, axial=True))
+        for quarters, name in TURNS:
+            turn = Rotation.from_rotvec(0.5 * np.pi * quarters * np.eye(3)[a]).as_matrix().round()
+            yield Mistake(f"the work frame: turned about {axis} {name}", partial(in_frame, m, turn))
+    for axes in permutations(AXES):
+        if axes != ("y", "x", "z"):  # R = Ry(β)·Rx(α)·Rz(γ)
+            title = f"angles: turned about {', '.join(axes)} in turn"
+            yield Mistake(title, partial(_in_order, m, "".join(axes).upper()))
+    for geometry in _shipped():
+        yield Mistake(f"the geometry of {geometry.name}", partial(_of_machine, m, geometry))
+
+
+@cache
+def _shipped() -> tuple[HexapodGeometry, ...]:
+    """Return the machines whose files come with the package."""
+    return tuple(load_geometry(config_file(name)) for name in GEOMETRIES)
+
+
+def sign_reversed(m: MeasurementSet, members: np.ndarray) -> MeasurementSet:
+    """Return a set in which some readings, (N,), have the other sign."""
+    return m.with_values(np.where(members, -m.value, m.value))
+
+
+def has_nominal_commands(m: MeasurementSet) -> bool:
+    """Return whether the struts' lengths are those of the nominal machine at the poses: nobody measured them."""
+    return np.allclose(m.stations.commands, _nominal(m.geometry, m), rtol=0.0, atol=1e-9)
+
+
+def _nominal(geometry: HexapodGeometry, m: MeasurementSet) -> np.ndarray:
+    return strut_lengths_batch(Structure.of(geometry), m.stations.positions, m.stations.rotations)
+
+
+def _parts(m: MeasurementSet) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield name and mask of parts whose sign somebody may have reversed: families, their kinds, and channels."""
+    family = family_of_run(m)[m.run]
+    for number, name in enumerate(FAMILIES):
+        members = family == number
+        kinds = np.unique(m.kind[members])
+        if members.any() and not members.all():
+            yield name, members
+        if len(kinds) > 1:
+            for k in kinds:
+                yield f"{name}, {KINDS[k]}", members & (m.kind == k)
+    for channel in np.unique(m.channel):
+        members = m.channel == channel
+        if not members.all():
+            yield CHANNELS[channel], members
+        for number in np.unique(family[members]):
+            if KINDS[m.kind[members][0]] != "linear":
+                yield f"{FAMILIES[number]}, {CHANNELS[channel]}", members & (family == number)
+
+
+def _in_other_units(m: MeasurementSet) -> Iterator[tuple[str, np.ndarray, float]]:
+    """Yield name, kinds and factor of each kind in each other unit, those of lines together, and all."""
+    present = np.unique(m.kind)
+    angular = np.array([KINDS[k] in ANGULAR_KINDS for k in present])
+    for which, meant, kinds in (("length", "µm", present[~angular]), ("angle", "µrad", present[angular])):
+        together = [(f"all {which}s", kinds)] if len(kinds) > 1 else []
+        of_lines = [k for k in kinds if KINDS[k] in LINE_KINDS]
+        if 1 < len(of_lines) < len(kinds):
+            together.append((" and ".join(KINDS[k] for k in of_lines), np.array(of_lines)))
+        for (name, members), (unit, factor) in product([*together, *((KINDS[k], [k]) for k in kinds)], UNITS[which]):
+            yield f"{name}: {unit} in place of {meant}", np.asarray(members), factor
+
+
+def _exchanged(m: MeasurementSet) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield two channels of a kind exchanged, everywhere and in one family of runs: names, channels of readings."""
+    family, present = family_of_run(m)[m.run], np.unique(m.channel)
+    for a, b in combinations(present, 2):
+        if CHANNELS[a].partition("_")[0] != CHANNELS[b].partition("_")[0]:
+            continue
+        both = (m.channel == a) | (m.channel == b)
+        common = [n for n in np.unique(family[both]) if {a, b} <= set(m.channel[family == n].tolist())]
+        for name, where in [("", both), *((f"{FAMILIES[n]}, ", both & (family == n)) for n in common)]:
+            if where is both and CHANNELS[a].startswith("straightness") and (family[both] < 3).any():
+                continue  # along its own line it is none
+            yield f"{name}{CHANNELS[a]} and {CHANNELS[b]}", np.where(where, a + b - m.channel, m.channel)
+
+
+def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> MeasurementSet:
+    """Return a set whose poses, lines and channels stand in axes that are columns of a signed permutation.
+
+    A mirrored file has the signs of its columns reversed, rotations among them, unless these are `axial` vectors.
+    """
+    tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
+    handed = round(float(np.linalg.det(frame)))
+    turned = frame @ tools @ frame.T
+    if handed < 0 and not axial:
+        turned = np.swapaxes(turned, 1, 2)
+    work = m.geometry.work
+    in_base = work.rotation @ frame @ work.rotation.T
+    to, sign = np.abs(frame).argmax(axis=0), frame.sum(axis=0)
+    channel, factor = np.arange(len(CHANNELS)), np.ones(len(CHANNELS))
+    for index, name in enumerate(CHANNELS):
+        kind, _, axis = name.partition("_")
+        if axis:
+            a = AXES.index(axis)
+            channel[index] = CHANNELS.index(f"{kind}_{AXES[to[a]]}")
+            factor[index] = sign[a] * (handed if axial and kind in ANGULAR_KINDS else 1)
+    centre = work.position + (m.centre - work.position) @ in_base.T
+    value = factor[m.channel] * m.value
+    renamed = replace(m, channel=channel[m.channel], value=value, centre=centre, runs=_turned_runs(m, in_base))
+    return _sent(renamed, m.geometry, *m.geometry.platform_poses(tips @ frame.T, turned), in_base)
+
+
+def _in_order(m: MeasurementSet, order: str) -> MeasurementSet | None:
+    """Return a set whose angles were applied in another order; None where the tool was level."""
+    tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
+    angles = angles_from_rotation(tools)
+    if (np.abs(angles) > 1e-6).sum(axis=1).max() < 2:
+        return None
+    by_axis = angles[:, ["XYZ".index(axis) for axis in order]]
+    turned = Rotation.from_euler(order, by_axis).as_matrix()
+    return _sent(m, m.geometry, *m.geometry.platform_poses(tips, turned), np.eye(3))
+
+
+def _of_machine(m: MeasurementSet, geometry: HexapodGeometry) -> MeasurementSet | None:
+    """Return a set as if another machine's tool had gone the same way in its work frame."""
+    if geometry.name == m.geometry.name:
+        return None
+    tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
+    turn = geometry.work.rotation @ m.geometry.work.rotation.T
+    sent = _sent(replace(m, runs=_turned_runs(m, turn)), geometry, *geometry.platform_poses(tips, tools), turn)
+    return replace(sent, geometry=geometry, probe=geometry.tool.position)
+
+
+def _turned_runs(m: MeasurementSet, turn: np.ndarray) -> tuple[Run, ...]:
+    return tuple(replace(run, axis=turn @ run.axis) for run in m.runs)
+
+
+def _sent(
+    m: MeasurementSet, geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, turn: np.ndarray
+) -> MeasurementSet:
+    """Return a set with other poses and directions turned alike; lengths of struts that were measured stay."""
+    moving = Passes(geometry, positions, rotations, m.stations.sense[:, :3] @ turn.T)
+    commands = moving.nominal_commands() if has_nominal_commands(m) else m.stations.commands
+    stations = replace(m.stations, positions=positions, rotations=rotations, commands=commands, sense=moving.senses())
+    return replace(m, stations=stations)
