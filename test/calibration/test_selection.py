@@ -20,6 +20,7 @@ def two_blocks() -> SimpleNamespace:
     blocks = [SimpleNamespace(name=name, part=slice(a, b)) for name, (a, b) in zip(SIZES, pairwise(ends), strict=True)]
     return SimpleNamespace(
         blocks=blocks,
+        parts=[block.part for block in blocks],
         spread=lambda tolerances: np.repeat(tolerances, list(SIZES.values())),
         start_tolerances=lambda: np.ones(len(SIZES)),
     )
