@@ -363,7 +363,7 @@ def test_switching_off_and_on_ramps(rig):
 
 def test_a_pause_does_not_become_a_step(rig):
     """After a pause, a strut may go 20 ms × 1 mm/s = 20 µm at once, not the whole 164 µm; so after a reset too."""
-    rig.compensator(ramp_rate=1e-3, command_timeout=0.05)
+    rig.compensator(ramp_rate=1e-3, command_timeout=0.2)
     before = rig.ask(HOME)
     rig.enable(False)
     rig.until_status(WARN, "no new command")

@@ -1,4 +1,5 @@
-"""How a program of a node ends: by a signal, at any time; and what it loads."""
+"""How a program of a node begins and ends: signals at any time, closed streams, topics that cannot be opened, a log
+that nobody reads; and what it loads."""
 
 from __future__ import annotations
 
@@ -11,8 +12,16 @@ import time
 from pathlib import Path
 
 import pytest
+from hal_stand_in import StandInHal
+from rclpy.context import Context
 
+from hexapod_comp.linuxcnc import bridge as bridge_module
+from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
+from hexapod_comp.ros import base, received_signals
+from hexapod_comp.ros import compensator as compensator_module
+from hexapod_comp.ros.compensator import CompensatorNode
 from hexapod_comp.ros.process import ENDED_WITHIN
+from hexapod_comp.ros.strut_drive import StrutDriveNode
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -151,3 +160,139 @@ print(*sorted(name for name in sys.modules if name.partition(".")[0] in ("scipy"
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
     assert (done.returncode, done.stdout) == (0, "\n"), done.stderr
+
+
+# ---- streams and topics that cannot be had ----
+
+
+@pytest.mark.parametrize("closed", [(2,), (1, 2), (0, 1, 2)])
+def test_closed_streams_are_opened_again(closed: tuple[int, ...]) -> None:
+    """rclpy's executor switches faulthandler on, which raises without a stderr: the node ended after "ready"."""
+    program = (
+        "import os, sys\n"
+        "from hexapod_comp.ros import open_streams\n"
+        "open_streams()\n"
+        "import faulthandler\n"
+        "faulthandler.enable()\n"
+        "print('lost', file=sys.stderr)\n"
+        "pipe = os.pipe()\n"
+        "sys.exit(7 if min(pipe) > 2 else 1)\n"
+    )
+    shell = " ".join(f"{number}>&-" for number in closed)
+    done = subprocess.run(["sh", "-c", f'exec "$0" -c "$1" {shell}', sys.executable, program], check=False)
+    assert done.returncode == 7
+
+
+def test_a_hang_up_ends_a_node_as_other_signals_do_unless_it_is_ignored() -> None:
+    """As nohup has it."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        heard = received_signals()
+        signal.raise_signal(signal.SIGHUP)
+        assert heard == [signal.SIGHUP]
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        heard = received_signals()
+        signal.raise_signal(signal.SIGHUP)
+        signal.raise_signal(signal.SIGTERM)
+        assert heard == [signal.SIGTERM]
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+NO_MORE = {
+    "requests": (CompensatorNode, compensator_module, "Requests"),
+    "journal": (CompensatorNode, compensator_module, "JournalTopics"),
+    "a drive's sender": (StrutDriveNode, base.MachineNode, "sender_of"),
+    "a bridge's reset": (LinuxcncBridgeNode, bridge_module, "CompensatorReset"),
+}
+
+
+@pytest.mark.parametrize("part", NO_MORE)
+def test_a_topic_that_cannot_be_opened_is_said_and_leaves_nothing_open(
+    part: str, ros_context: Context, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The node's goodbye had hidden the reason behind an AttributeError. It may be configured once more."""
+    kind, module, name = NO_MORE[part]
+    node = kind(context=ros_context, **({"hal": StandInHal()} if kind is LinuxcncBridgeNode else {}))
+
+    def ends() -> list[int]:
+        return [len(list(all_of)) for all_of in (node.publishers, node.subscriptions, node.services, node.timers)]
+
+    def fails(*_: object) -> None:
+        raise RuntimeError("no more topics")
+
+    before = ends()
+    with monkeypatch.context() as patch:
+        patch.setattr(module, name, fails)
+        node.trigger_configure()
+    assert "RuntimeError: no more topics" in capfd.readouterr().err
+    assert ends() == before
+    node.publish_last_status()
+    assert node.unconfigured
+    node.trigger_configure()
+    assert not node.unconfigured
+    node.publish_last_status()
+    node.destroy_node()
+
+
+# ---- a log that nobody reads ----
+
+RELAYED = """
+import os, sys, time
+from hexapod_comp.ros.process import LogRelay
+
+def write(stream, text):
+    try:
+        return os.write(stream, text.encode())
+    except BlockingIOError:
+        return 0
+
+with LogRelay():
+    {body}
+"""
+
+
+def relayed(body: str, **streams: object) -> subprocess.Popen[bytes]:
+    """Run a few lines within a LogRelay in a process of its own."""
+    return subprocess.Popen([sys.executable, "-c", RELAYED.format(body=body)], **streams)
+
+
+def test_all_lines_arrive_in_order() -> None:
+    child = relayed("for i in range(20000): write(2, f'{i}\\n')", stderr=subprocess.PIPE)
+    _, said = child.communicate(timeout=60)
+    assert child.returncode == 0
+    assert said.split() == [b"%d" % i for i in range(20000)]
+
+
+def test_a_reader_that_does_not_read_stops_nobody() -> None:
+    """16 MB into a pipe that takes 64 kB: without the relay the process would wait for ever."""
+    reading, writing = os.pipe()
+    body = "for i in range(16384): write(2, 'x' * 1023 + '\\n')"
+    try:
+        child = relayed(body, stderr=writing)
+        assert child.wait(60) == 0
+    finally:
+        os.close(reading)
+        os.close(writing)
+
+
+def test_a_reader_that_has_gone_stops_nobody() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    child = relayed("for i in range(4096): write(2, 'x' * 1023 + '\\n')", stderr=writing)
+    os.close(writing)
+    assert child.wait(60) == 0
+
+
+def test_a_closed_stream_and_a_file_are_left_alone(tmp_path) -> None:
+    path = tmp_path / "log"
+    with path.open("wb") as log:
+        child = relayed("os.write(2, b'straight')", stderr=log, preexec_fn=lambda: os.close(1))
+        assert child.wait(60) == 0
+    assert path.read_bytes() == b"straight"
+
+
+def test_stdout_is_relayed_too() -> None:
+    said = relayed("os.write(1, b'out'); os.write(2, b'err')", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert said.communicate(timeout=60) == (b"out", b"err")

@@ -59,23 +59,19 @@ def test_a_model_that_breaks_a_limit_at_the_last_command_moves_nothing(rig, tmp_
     assert rig.trigger("reload_model").success
 
 
-def test_before_the_first_command_the_model_is_looked_at_at_home(rig, tmp_path):
-    path = model_file(tmp_path)
-    rig.compensator(model_file=path)
-    model_file(tmp_path, field=field(5000.0))
-    assert "is larger than ±2000 µm" in rig.trigger("reload_model").message
-
-
-def test_a_field_that_refuses_extrapolation_is_refused_outside_its_box(rig, tmp_path):
-    """Home is at z = 400 mm; where the machine stands is below the box, which begins at 350 mm."""
-    path = model_file(tmp_path)
-    rig.compensator(model_file=path, command_timeout=0.0)
-    for step in range(1, 55):
+@pytest.mark.parametrize(
+    ("steps", "shape", "said"),
+    [(0, field(5000.0), "is larger than ±2000 µm"), (54, field(10.0, "refuse"), "is outside the field's box")],
+    ids=["at home before the first command", "below the box, which begins 50 mm under home"],
+)
+def test_a_model_is_judged_where_the_machine_stands(rig, tmp_path, steps, shape, said):
+    rig.compensator(model_file=model_file(tmp_path), command_timeout=0.0)
+    for step in range(1, steps + 1):
         rig.ask(near(HOME, (0.0, 0.0, -1e-3 * step)))
-    model_file(tmp_path, field=field(10.0, "refuse"))
+    model_file(tmp_path, field=shape)
     response = rig.trigger("reload_model")
     assert not response.success
-    assert "is outside the field's box" in response.message
+    assert said in response.message
 
 
 def test_compensation_is_not_switched_on_where_it_breaks_a_limit(rig, tmp_path):
@@ -148,23 +144,18 @@ def test_a_file_that_is_never_read_is_given_up_in_time(tmp_path, monkeypatch):
         os.kill(process, 0)
 
 
-def test_what_becomes_a_pipe_after_the_look_at_its_name_is_refused(tmp_path):
-    """Nobody writes into it: to open it, as files are opened, would take until somebody does."""
-    path = tmp_path / "model.yaml"
-    os.mkfifo(path)
-    with pytest.raises(InputFileError, match="is not a regular file"):
-        read_text(path, confined_opener(tmp_path))
-
-
-def test_what_becomes_a_link_after_the_look_at_its_name_is_refused(tmp_path):
+def test_what_takes_the_files_place_after_the_look_at_its_name_is_refused(tmp_path):
+    """A pipe, which nobody writes into: to open it would take until somebody does. A link that leads out."""
     (tmp_path / "mine").mkdir()
-    outside = tmp_path / "outside.yaml"
+    outside, pipe, link = tmp_path / "outside.yaml", tmp_path / "pipe", tmp_path / "mine" / "model.yaml"
     outside.write_text("a: 1")
-    path = tmp_path / "mine" / "model.yaml"
-    path.symlink_to(outside)
+    os.mkfifo(pipe)
+    link.symlink_to(outside)
+    with pytest.raises(InputFileError, match="is not a regular file"):
+        read_text(pipe, confined_opener(tmp_path))
     with pytest.raises(InputFileError, match=f"leads to {outside}, but files are only read from"):
-        read_text(path, confined_opener(tmp_path / "mine"))
-    assert read_text(path, confined_opener(tmp_path)) == "a: 1"
+        read_text(link, confined_opener(tmp_path / "mine"))
+    assert read_text(link, confined_opener(tmp_path)) == "a: 1"
 
 
 @pytest.mark.parametrize("padding", [0, LARGEST_SOURCE])
