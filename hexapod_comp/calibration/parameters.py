@@ -274,6 +274,7 @@ class ParameterSpace:
             growth=self.stated_expansion,
             late=np.zeros((len(PARTS), 0)),
             compliance=np.zeros(6),
+            lost_motion=np.zeros(6),
             field=np.zeros((6, len(self.field.terms))),
             reversal=np.zeros((3, 6, len(self.field.reversal_terms))),
         )
@@ -302,18 +303,18 @@ class ParameterSpace:
             platform_expansion=float(draft.growth[7]),
             late_growth=LateGrowth(tuple(constants), draft.late, thermometer),
             region=self.measured,
-            load=self._load(draft.compliance),
+            load=self._load(draft),
             **machine,
         )
 
-    def _load(self, beyond: np.ndarray) -> Load:
-        """Return the load block as stated, with compliances that differ from it by some, m/N."""
+    def _load(self, draft: Draft) -> Load:
+        """Return the load block as stated, with compliances and lost motions that differ from it by a draft's."""
         stated = stated_load(self.settings)
-        if not beyond.any():
-            return stated
-        # A step on the way may overshoot: no strut is stiffer than ten times what is stated
-        compliance = np.maximum(stated.compliance + beyond, 0.1 * stated.compliance)
-        return replace(stated, stiffness=reciprocal(compliance))
+        if draft.compliance.any():
+            # A step on the way may overshoot: no strut is stiffer than ten times what is stated
+            compliance = np.maximum(stated.compliance + draft.compliance, 0.1 * stated.compliance)
+            stated = replace(stated, stiffness=reciprocal(compliance))
+        return replace(stated, lost_motion=stated.lost_motion + draft.lost_motion)
 
     def field_errors(self, x: np.ndarray, points: np.ndarray, sense: np.ndarray) -> np.ndarray:
         """Return the field at points (n, 3), m, passed in directions (n, 3), shape (n, 6), m and rad."""

@@ -2,33 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ..machine.model import MachinesByTemperature, RealMachine
 from ..machine.trial import drive
 from ..measurements.readings import Stations
 from .blocks.backlash import without_negative
-from .blocks.block import Linkage
+from .blocks.block import Linkage, Prediction
 from .parameters import ParameterSpace
 
 JOINTS = ("base_joints", "platform_joints")
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """The machine at some stations."""
-
-    errors: np.ndarray  # (M, 6): e of each station, m and rad
-    positions: np.ndarray  # (M, 3): actual pose_platform_in_base without the field, m
-    rotations: np.ndarray  # (M, 3, 3)
-    base_joints: np.ndarray  # (M, 6, 3): real joints at each station's temperatures, m
-    platform_joints: np.ndarray
-
-    def select(self, chosen: np.ndarray | slice) -> Prediction:
-        """Return the machine at some of the stations."""
-        return Prediction(**{name: array[chosen] for name, array in vars(self).items()})
 
 
 def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Prediction:

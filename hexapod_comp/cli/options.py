@@ -397,7 +397,7 @@ ESTIMATION = under(
     value("--lead-mm", scaled(bound, 1e-3), "MM", "period of the screws' errors (default: the geometry's; else what "
           "the readings show)", dest="lead"),
     value("--blocks", None, "A,B,…", "what may be fitted: pitch, wave, harmonics, backlash, map, field, expansion, "
-          "moisture, late, compliance (default all)"),
+          "moisture, late, compliance, lost motion (default all)"),
     SEPARATE,
     value("--tolerance-um", bound, "UM", "how well joints are built, to start from, µm (default 100)"),
     choice("--tracker-frame", ("free", "known"), "free: a tracker stands anywhere, six unknowns a run (default); "

@@ -138,7 +138,7 @@ class Load:
         "load", "N_per_um", "of a strut with both joints along its axis; 0: rigid", PER_STRUT, least=0.0, largest=1e12
     )
     lost_motion: np.ndarray = term(
-        "load", "um", "how much longer a strut is when pulled than when pushed", PER_STRUT, least=0.0, largest=1e-3
+        "load", "um", "how much longer a strut is when pulled than when pushed", PER_STRUT, largest=1e-3
     )
     take_up: float = term(
         "load", "N", "force that takes the lost motion up; below it in proportion", (), 1.0, least=1e-3, largest=1e6

@@ -120,6 +120,8 @@ def read_load(path: str | Path) -> Load:
     with file_errors(file):
         load = Load(**read_terms(Load, top, "load"))
         check_magnitudes(load)
+        if (load.lost_motion < 0.0).any():  # a fit's noise may be negative, what is stated may not
+            raise ModelError("load.lost_motion", "must not be negative", load.lost_motion.tolist())
     top.finish()
     return load
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from calibration_helpers import SETTINGS, campaign, paper, tool_error, virtual_machine
 
-from hexapod_comp.calibration.blocks.load import refuse_half_stated
+from hexapod_comp.calibration.blocks.load import as_loaded, refuse_half_stated
 from hexapod_comp.calibration.check import (
     NAMED,
     PAYLOAD,
@@ -38,7 +38,7 @@ from hexapod_comp.errors import CalibrationError, InputFileError
 from hexapod_comp.machine.load import Load, Loading, Payload, beyond_loads
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model, model_text, parse_model
-from hexapod_comp.measurements.campaign import template
+from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import FORWARD, MeasurementSet
 from hexapod_comp.measurements.runs import joined
 from hexapod_comp.measurements.tidy import read_tidy, write_measurements
@@ -258,3 +258,29 @@ def test_readings_of_which_half_state_a_payload_are_refused() -> None:
         fit_model(half, TOLD)
     refuse_half_stated(replace(half, geometry=paper().carrying(LIGHT)))
     refuse_half_stated(under(SPINDLE, 1))
+
+
+def test_lost_motion_by_the_force_s_sign_is_fitted_where_forces_change_their_sign() -> None:
+    """Truth: six clearances that no reading's direction shows. At the box's sides struts pull that push in its middle.
+
+    Without the block they look like a field; where all struts push nothing shows it, and it is left out.
+    """
+    clearance = 1e-6 * np.array([3.0, 5.0, 2.0, 6.0, 4.0, 1.0])
+    loose = RealMachine(paper(), replace(truth().model, load=replace(TRUE, lost_motion=clearance)))
+    plan, laid = campaign(), under(SPINDLE, 1)
+    readings = measure(laid, plan, loose, 4)
+    told = replace(TOLD, blocks=(*BLOCKS, "lost motion"))
+    fitted, without = fit_model(readings, told), fit_model(readings, replace(told, blocks=BLOCKS))
+    block = fitted.space.block("lost motion")
+    assert block is not None
+    error = fitted.model.load.lost_motion - clearance
+    assert (np.abs(error) < 4.0 * fitted.standard_errors[block.part]).all()
+    assert np.abs(error).max() < 1e-6
+    before, after = (
+        tool_error(RealMachine(loose.geometry.carrying(SPINDLE), loose.model), each.model)[0]
+        for each in (without, fitted)
+    )
+    assert after < 0.5 * before
+    high = Campaign(np.array([[-0.05, -0.05, 0.45], [0.05, 0.05, 0.55]]), 0.1, 0.05)
+    assert "lost motion" in as_loaded(told, paper(), template(high, paper()).stations)
+    assert "lost motion" not in as_loaded(told, paper(), readings.stations)

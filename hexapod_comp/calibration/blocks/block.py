@@ -19,7 +19,6 @@ from ...measurements.readings import Stations
 
 if TYPE_CHECKING:
     from ..parameters import Extent, FitSettings
-    from ..sensitivity import Prediction
     from .field import SmoothField
 
 DIGITS = 11  # after the point in a model file: a hundredth of a nanometre
@@ -48,6 +47,7 @@ class Draft:
     reversal: np.ndarray  # (3, 6, reversal terms): forward minus backward along x, y, z, m and rad
     late: np.ndarray  # (8, time constants), 1/K
     compliance: np.ndarray  # (6,): of the struts beyond the stated, m/N
+    lost_motion: np.ndarray  # (6,): by the sign of the struts' forces, beyond the stated, m
 
 
 class Errors(NamedTuple):
@@ -57,6 +57,21 @@ class Errors(NamedTuple):
     directions: np.ndarray  # (n, 6): w of each
     components: np.ndarray  # which of the six components they have
     gains: np.ndarray  # (n, 6): by what each strut's length moves them
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The machine at some stations."""
+
+    errors: np.ndarray  # (M, 6): e of each station, m and rad
+    positions: np.ndarray  # (M, 3): actual pose_platform_in_base without the field, m
+    rotations: np.ndarray  # (M, 3, 3)
+    base_joints: np.ndarray  # (M, 6, 3): real joints at each station's temperatures, m
+    platform_joints: np.ndarray
+
+    def select(self, chosen: np.ndarray | slice) -> Prediction:
+        """Return the machine at some of the stations."""
+        return Prediction(**{name: array[chosen] for name, array in vars(self).items()})
 
 
 class Linkage:

@@ -11,7 +11,7 @@ from ...machine.geometry import HexapodGeometry
 from ...machine.load import MOST_LOADS, Load
 from ...measurements.readings import MeasurementSet, Stations
 from ..assumptions import ASSUMED
-from .block import Draft, Facts, Linkage, StrutBlock
+from .block import Draft, Facts, Linkage, Prediction, StrutBlock
 
 if TYPE_CHECKING:
     from ..parameters import FitSettings
@@ -60,13 +60,31 @@ def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) ->
     return tuple(map(tuple, different[kept].tolist()))
 
 
+def tensions(load: Load, geometry: HexapodGeometry, linkage: Linkage) -> np.ndarray:
+    """Return what the struts pull with under the weight at a linkage's stations, (M, 6), N."""
+    mass, moment, gravity = weights(load, geometry, linkage.stations)
+    torque = np.cross(np.einsum("mij,mj->mi", linkage.rotations, moment), gravity)
+    return linkage.tensions(np.concatenate([mass[:, None] * gravity, torque], axis=1))
+
+
 def as_loaded(settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> set[str]:
-    """Return the blocks of load that stations cannot show: one load is a change of the struts' lengths."""
-    load = stated_load(settings)
+    """Return the blocks of load that stations cannot show: at one load, or with forces of one sign, struts look longer.
+
+    Forces are those of the nominal machine.
+    """
+    load, hidden = stated_load(settings), {"compliance", "lost motion"}
+    if not settings.load or not len(stations):
+        return hidden
     mass, _, gravity = weights(load, geometry, stations)
     forces = mass[:, None] * gravity
-    several = bool(np.linalg.norm(np.ptp(forces, axis=0)) >= ASSUMED.least_load) if len(forces) else False
-    return set() if several and load.stiffness.all() else {"compliance"}
+    if load.stiffness.all() and np.linalg.norm(np.ptp(forces, axis=0)) >= ASSUMED.least_load:
+        hidden.remove("compliance")
+    joints = (np.tile(each, (len(stations), 1, 1)) for each in (geometry.base_joints, geometry.platform_joints))
+    nominal = Prediction(np.zeros((len(stations), 6)), stations.positions, stations.rotations, *joints)
+    pulled = tensions(load, geometry, Linkage(nominal, np.zeros(3), stations))
+    if ((pulled.min(axis=0) < -load.take_up) & (pulled.max(axis=0) > load.take_up)).any():
+        hidden.remove("lost motion")
+    return hidden
 
 
 class Compliance(StrutBlock):
@@ -86,9 +104,7 @@ class Compliance(StrutBlock):
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
         """The struts' tensions."""
-        mass, moment, gravity = weights(self._load, self._geometry, linkage.stations)
-        torque = np.cross(np.einsum("mij,mj->mi", linkage.rotations, moment), gravity)
-        return linkage.tensions(np.concatenate([mass[:, None] * gravity, torque], axis=1))[..., None]
+        return tensions(self._load, self._geometry, linkage)[..., None]
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
         """It adds to what is stated."""
