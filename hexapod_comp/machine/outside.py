@@ -19,6 +19,7 @@ from .terms import read_terms, settle, term, write_terms
 # A number that is further outside its table than this share of the table's span is no state of this machine, but in
 # another unit: of degrees in place of radians, all above 1.97 where a table ends at 90°
 BELIEVED_BEYOND = 0.25
+ON_THE_EDGE = 1e-6  # A number that is outside by less than this share of the span is at the edge: senders round
 UNIT_NAMES = {name: size for dimension in set(DIMENSIONS.values()) for name, size in spellings(dimension).items()}
 MOST_NODES = 10_000  # A larger table is no longer a file that people read
 POSITION, ROTATION = ("x", "y", "z"), ("rx", "ry", "rz")
@@ -81,12 +82,13 @@ class OutsideTable:
         unit = self.units[self.names.index(name)]
         return f"{name} {in_unit(value, unit):.6g} {unit}"
 
-    def _edges(self, name: str) -> tuple[float, float]:
+    def _beyond(self, name: str, value: float) -> float:
+        """Return how far a number is outside, as a share of the table's span; 0 inside."""
         axis = self.nodes[self.names.index(name)]
-        return float(axis[0]), float(axis[-1])
+        return max(float(axis[0]) - value, value - float(axis[-1]), 0.0) / float(axis[-1] - axis[0])
 
     def validate(self, numbers: Mapping[str, float]) -> None:
-        """Raise on a number that cannot be one of this table; numbers of other names are nobody's business here.
+        """Raise on a number that cannot be one of this table; numbers of other names are ignored.
 
         Raises
         ------
@@ -95,24 +97,20 @@ class OutsideTable:
         OutsideTableError
             Outside a table that refuses what it does not hold.
         """
-        for name in self.names:
+        for name, axis in zip(self.names, self.nodes, strict=True):
             if name in numbers:
-                value, (low, high) = numbers[name], self._edges(name)
-                slack = BELIEVED_BEYOND * (high - low)
-                allowed = f"{self.shown(name, low)} to {self.shown(name, high).removeprefix(name + ' ')}"
-                if not low - slack <= value <= high + slack:
-                    raise ModelError(f"outside.{name}", f"the table holds {allowed}; is the unit right?", value)
-                if self.beyond == "refuse" and not low <= value <= high:
-                    raise OutsideTableError(f"{self.shown(name, value)}: the table holds {allowed}", value, (low, high))
+                value, unit = numbers[name], self.units[self.names.index(name)]
+                low, high = in_unit([axis[0], axis[-1]], unit)
+                holds = f"the table holds {name} {low:.6g} to {high:.6g} {unit}"
+                if not self._beyond(name, value) <= BELIEVED_BEYOND:
+                    raise ModelError(f"outside.{name}", f"{holds}; is the unit right?", value)
+                if self.beyond == "refuse" and self._beyond(name, value) > ON_THE_EDGE:
+                    raise OutsideTableError(f"{self.shown(name, value)}: {holds}", value, (axis[0], axis[-1]))
 
     def held(self, numbers: Mapping[str, float]) -> str:
         """Return which numbers lie outside the table, so that the value at its edge counts; empty where none do."""
-        texts = []
-        for name in self.names:
-            low, high = self._edges(name)
-            if not low <= numbers.get(name, low) <= high:
-                texts.append(self.shown(name, numbers[name]))
-        return ", ".join(texts)
+        known = [name for name in self.names if name in numbers]
+        return ", ".join(self.shown(n, numbers[n]) for n in known if self._beyond(n, numbers[n]) > ON_THE_EDGE)
 
     def missing(self, numbers: Mapping[str, float]) -> str:
         """Return the names of numbers that are not known: until all are, the table counts for nothing."""

@@ -55,7 +55,7 @@ def test_corrections_have_the_other_sign_and_a_calibration_has_seen_some(bent: P
     assert "error of up to 40.00 µm and 0.00 µrad; beyond the table: refuse" in capsys.readouterr().out
     assert raised_um(bent, capsys, "--outside", "elevation_deg=90") == pytest.approx(-40.0, abs=1e-6)
     assert main(["ik", "--pose", "0,0,400", "--model", str(bent), "--outside", "elevation_deg=91"]) == 2
-    assert "elevation 91 deg: the table holds elevation 0 deg to 90 deg" in capsys.readouterr().err
+    assert "elevation 91 deg: the table holds elevation 0 to 90 deg" in capsys.readouterr().err
     assert main([*table, "--holds", "errors", "--calibrated-at", "elevation_deg=60"]) == 0
     assert raised_um(bent, capsys, "--outside", "elevation_deg=60") == pytest.approx(0.0, abs=1e-6)
     assert raised_um(bent, capsys, "--outside", "elevation_deg=0") == pytest.approx(-20.0, abs=1e-6)
@@ -76,7 +76,7 @@ def test_a_table_leaves_what_a_fit_knows_of_a_model(bent: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "problem"),
     [
-        ("elevation_deg=90000", "the table holds elevation 0 deg to 90 deg; is the unit right?"),
+        ("elevation_deg=90000", "the table holds elevation 0 to 90 deg; is the unit right?"),
         ("elevation_mm=3", "outside.elevation_mm: the model's table is over elevation_deg"),
         ("azimuth_deg=3", "outside.azimuth_deg: the model's table is over elevation_deg"),
     ],

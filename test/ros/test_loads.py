@@ -168,7 +168,7 @@ def test_the_struts_follow_outside_numbers(rig: Rig, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("names", "numbers", "text"),
     [
-        (["elevation"], [45.0], "outside.elevation: the table holds elevation 0 deg to 90 deg; is the unit right?"),
+        (["elevation"], [45.0], "outside.elevation: the table holds elevation 0 to 90 deg; is the unit right?"),
         (["elevation"], [math.nan], "outside.elevation: must be finite"),
         (["elevation", "rotator"], [0.3], "outside: has 2 names for 1 positions"),
         (["azimuth"], [0.3], "outside: must name elevation or rotator, not 'azimuth'"),
@@ -192,7 +192,7 @@ def test_a_table_that_refuses_stops_the_machine(rig: Rig, tmp_path: Path) -> Non
     tell(rig, elevation=0.5, rotator=0.2)
     rig.until(lambda: reached(rig, at(elevation=0.5, rotator=0.2)), "the table's correction")
     tell(rig, elevation=1.6)
-    rig.until_status(ERROR, "refusing commands: outside_table: elevation 91.6732 deg: the table holds elevation 0 deg")
+    rig.until_status(ERROR, "refusing commands: outside_table: elevation 91.6732 deg: the table holds elevation 0 to")
     tell(rig, elevation=1.5)
     rig.until(lambda: reached(rig, at(elevation=1.5, rotator=0.2)), "the number inside")
 
