@@ -294,6 +294,58 @@ example:
   $ hexapod_comp move --pose 0,0,2 --relative --frame tool""",
         (exactly_one("--pose", "--stop"),),
     ),
+    "adapt": Verb(
+        "adapting", "loop",
+        "a machine calibrates itself, checks its model and repairs it",
+        (
+            MACHINE,
+            folder("--folder", "folder of the journal, readings and models; what it has begun goes on", required=True),
+            value("--goal-um", above_zero, "UM", "RMS tool error that may be left, with 95 %%, the datum aligned: "
+                  "campaigns are planned for it"),
+            reads("--campaign", "campaign file to measure instead; its box is checked", kind="campaign"),
+            flag("--reload", "have the compensator run each model that its checks bear out; else models are proposed"),
+            flag("--verify", "check the model of the folder once, now; calibrate nothing"),
+            flag("--anew", "calibrate, whatever the folder has"),
+            value("--checks", whole(0), "N", "then check the model N times (default 0; with --every-min until Ctrl-C)"),
+            value("--every-min", bound, "MIN", "time from one check to the next (default 10)"),
+            value("--box", box, CORNERS, "lowest and highest tool position that counts, mm (default: the campaign's, "
+                  "else the largest that the machine reaches)"),
+            value("--instruments", None, "A,B,…", "what to plan for, read from the poses (default 6-D: lines)"),
+            value("--hours", above_zero, "H", "how long a planned campaign may take (default 4)"),
+            value("--topic", None, "TOPIC", "poses of the tool in base (PoseStamped), from a tracker or motion capture "
+                  "(default tool_pose_true, what strut_drive's tracker reads)", default="tool_pose_true"),
+            value("--samples", whole(3, 10_000), "N", "poses of which the median is taken, three times at each stop "
+                  "(default 25)", default=25),
+            NAMESPACE,
+            JSON,
+            *ESTIMATION,
+        ),
+        """Plans a campaign for the goal, has the mover visit it, fits a model, and takes check readings elsewhere,
+which the fit has not seen. Only a model that they bear out becomes FOLDER/model.yaml; with --reload the compensator
+then runs it, by its ramp. Where the fit promises less than the goal a further campaign is planned, up to three in all.
+Then, or where two checks contradict the model, it is refused with the reason.
+
+With --checks or --every-min the model is then checked every so often: a line along x, y and z through places drawn at
+random, and the box's diagonals. A check that contradicts it is repeated at other places. If that one does too, the
+machine has changed: a strut, a temperature or a payload is named, the model is renewed from the checks, checked itself
+and reloaded. What few readings cannot repair is calibrated anew with --reload, else its campaign is proposed.
+
+Every step stands in FOLDER/journal.jsonl. Ctrl-C brakes the machine and ends; the same command goes on from there, also
+after a kill. At each stop the instrument is asked three times and the median counts; a stop at which it reads nothing
+is visited again. Exit code: 0 a model is in use, or proposed; 1 refused, or the machine has changed; 2 bad input, or
+the machine does not answer; 130 stopped.
+
+example:
+  $ ros2 launch hexapod_comp machine.launch.py mover:=true     (compensator, mover and a simulated machine)
+  $ hexapod_comp adapt --goal-um 3 --folder adapted --reload
+  $ hexapod_comp adapt --goal-um 3 --folder adapted --reload --every-min 30
+  $ hexapod_comp adapt --goal-um 3 --folder adapted --verify""",
+        (
+            exactly_one("--goal-um", "--campaign"),
+            excluded_by("--campaign", "--box", "--instruments", "--hours"),
+            excluded_by("--verify", "--anew", "--checks", "--every-min"),
+        ),
+    ),
     "demo": Verb(
         "running", "loop",
         "measure, fit and compensate a machine: what is left of its errors",

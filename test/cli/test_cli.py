@@ -83,7 +83,7 @@ def test_help_is_fast_and_needs_no_compiler() -> None:
     assert done.returncode == 0, done.stderr
     listed = re.findall(r"^ +(\w+):$|^    (\w+)  ", done.stdout, re.MULTILINE)
     assert " ".join(group + ":" if group else verb for group, verb in listed) == (
-        "kinematics: show ik fk check travel loop: run move demo watch echo record replay "
+        "kinematics: show ik fk check travel loop: run move adapt demo watch echo record replay "
         "calibration: plan imagine outside simulate collect fit verify iso230 export analysis: assess classify"
     )
     assert all(len(line) <= 80 for line in done.stdout.splitlines() if line.startswith("    ")), "one line a verb"

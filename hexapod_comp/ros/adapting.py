@@ -1,0 +1,78 @@
+"""A running machine that calibrates itself: measured, braked when a person stops it, its model reloaded."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import GetParameters, SetParameters
+from std_srvs.srv import Trigger
+
+from ..errors import CommandError, NoAnswerError
+from ..pose import Pose
+from .client import MoveState
+from .collector import WatchedMachine
+
+ANSWERED_WITHIN = 60.0  # A model is read within 30 s, or refused
+
+
+class AdaptedMachine(WatchedMachine):
+    """A machine with mover, compensator and an instrument that publishes poses of its tool; `going_on` false brakes."""
+
+    def __init__(
+        self,
+        topic: str,
+        namespace: str = "",
+        mover: str = "mover",
+        compensator: str = "compensator",
+        samples: int = 25,
+        going_on: Callable[[], bool] = lambda: True,
+    ) -> None:
+        super().__init__(topic, namespace, mover, samples)
+        self._going_on, self._compensator = going_on, compensator
+        node = self._session.node
+        self._reload_model = node.create_client(Trigger, f"{compensator}/reload_model")
+        self._set = node.create_client(SetParameters, f"{compensator}/set_parameters")
+        self._get = node.create_client(GetParameters, f"{compensator}/get_parameters")
+
+    def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
+        """Move the tool and return when it has arrived; brake when it shall not go on: a MoveError, ``person``."""
+        braked = False
+
+        def watch(state: MoveState) -> None:
+            nonlocal braked
+            if not braked and not self._going_on():
+                braked = True
+                self._stop.call_async(Trigger.Request())
+
+        return super().move(pose, *arguments, **{"progress": watch, **options})
+
+    def reload(self, path: Path) -> None:
+        """Have the compensator run a model file, by its ramp; where it refuses, the old model and its name stay."""
+        for client in (self._reload_model, self._set, self._get):
+            self._wait(client.service_is_ready, 10.0, f"the services of {self._compensator}")
+        before = self._call(self._get, GetParameters.Request(names=["model_file"])).values[0].string_value
+        wanted = str(path.resolve())
+        self._name_model(wanted)
+        answer = self._call(self._reload_model, Trigger.Request())
+        if not answer.success:
+            self._name_model(before)
+            raise CommandError("reload", f"{self._compensator} did not take {wanted}: {answer.message}")
+
+    def _name_model(self, name: str) -> None:
+        value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=name)
+        request = SetParameters.Request(parameters=[Parameter(name="model_file", value=value)])
+        (result,) = self._call(self._set, request).results
+        if not result.successful:
+            raise CommandError("reload", f"{self._compensator} keeps its model_file: {result.reason}")
+
+    def _call(self, client: Any, request: Any) -> Any:
+        future, end = client.call_async(request), time.monotonic() + ANSWERED_WITHIN
+        while not future.done():
+            if time.monotonic() > end:
+                raise NoAnswerError(f"{client.srv_name} did not answer within {ANSWERED_WITHIN:g} s")
+            self._session.spin_once(0.02)
+        return future.result()

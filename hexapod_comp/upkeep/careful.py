@@ -1,0 +1,40 @@
+"""A machine observed with care: the median of three observations at each stop, so that a single wild one is nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..measurements.collect import MeasuredMachine, Observation
+from ..pose import Pose
+
+LOOKS = 3  # at each stop; one of them may be wild
+LEAST = 2  # of them that must read something
+FINEST = 1e-7  # No stop is stated to be read better, m and rad: struts are counted to a tenth of a micrometre
+
+
+class Careful:
+    """Passes moves on, and observes with care."""
+
+    def __init__(self, machine: MeasuredMachine) -> None:
+        self._machine = machine
+
+    def move(self, pose: Pose) -> object:
+        """Have the machine move."""
+        return self._machine.move(pose)
+
+    def observe(self) -> Observation | None:
+        """Return the median of some observations; None where too few read anything."""
+        seen = [o for o in (self._machine.observe() for _ in range(LOOKS)) if o is not None]
+        if len(seen) < LEAST:
+            return None
+        first = seen[0].pose
+        turns = [Rotation.from_matrix(o.pose.rotation @ first.rotation.T).as_rotvec() for o in seen]
+        numbers = np.array([np.concatenate([o.pose.position, turn]) for o, turn in zip(seen, turns, strict=True)])
+        if len(seen) == LEAST:  # of two that differ nobody knows which is wild: their mean, as uncertain as they differ
+            middle, apart = numbers.mean(axis=0), np.abs(numbers[1] - numbers[0])
+        else:
+            middle, apart = np.median(numbers, axis=0), np.zeros(6)
+        stated = np.nanmax([np.median([o.uncertainty for o in seen], axis=0), np.full(6, FINEST)], axis=0)
+        turned = Rotation.from_rotvec(middle[3:]).as_matrix() @ first.rotation
+        return seen[-1]._replace(pose=Pose(middle[:3], turned), uncertainty=np.maximum(stated, apart))

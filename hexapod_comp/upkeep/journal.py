@@ -1,0 +1,60 @@
+"""What was done, a line of JSON each: the memory of a loop that may be killed at any time."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputFileError
+from ..formats.json import json_content, json_text
+
+Event = dict[str, Any]
+
+
+class Journal:
+    """A file of events; each is on the disk before the next step begins.
+
+    A last line that a killed process left unfinished is dropped: its step is done again.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.events: list[Event] = []
+        if not self.path.exists():
+            return
+        try:
+            text = self.path.read_bytes().decode("utf-8", errors="replace")
+        except OSError as error:
+            raise InputFileError(path, "", f"cannot be read: {error.strerror}") from error
+        whole, _, rest = text.rpartition("\n")
+        self.events = list(self._parsed(whole))
+        if rest:
+            with self.path.open("r+b") as file:
+                file.truncate(len((whole + "\n").encode()) if whole else 0)
+
+    def _parsed(self, text: str) -> Iterator[Event]:
+        for number, line in enumerate(text.splitlines(), start=1):
+            try:
+                event = json_content(line)
+            except ValueError as error:
+                raise InputFileError(self.path, f"line {number}", f"is no event: {error}") from error
+            if not isinstance(event, dict) or not isinstance(event.get("event"), str):
+                raise InputFileError(self.path, f"line {number}", "must be an object with an event")
+            yield event
+
+    def add(self, event: str, **content: Any) -> Event:
+        """Write an event, with the time."""
+        entry = {"time": datetime.now(timezone.utc).isoformat(timespec="seconds"), "event": event, **content}
+        line = json_text(entry, indent=None)
+        try:
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(line)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise InputFileError(self.path, "", f"cannot be written: {error.strerror}") from error
+        self.events.append(json_content(line))
+        return self.events[-1]

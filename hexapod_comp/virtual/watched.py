@@ -1,0 +1,116 @@
+"""A virtual machine that is measured while it moves: it goes to poses, and a virtual tracker watches its tool.
+
+What :func:`~hexapod_comp.measurements.collect.collect` asks of a machine, without ROS: the compensator's core sends the
+struts of a :class:`~.machine.StrutDrive` along straight moves, and each stop is read with noise, wild readings and
+broken beams, as drawn from a seed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..compensation.compensator import Compensator
+from ..errors import LimitError
+from ..machine.geometry import HexapodGeometry
+from ..machine.model import MachineModel, RealMachine
+from ..machine.temperatures import Temperatures
+from ..machine.trajectory import commanded_in_base
+from ..measurements.collect import Observation
+from ..pose import Pose
+from .machine import DriveParameters, StrutDrive
+
+PLACES = (0.5, 0.75, 0.875, 0.94, 0.97, 0.99, 1.0)  # of a move, as shares of it: struts turn back where they would
+FARTHEST = 1.0  # A move is a few commands, each further than a step of a stream may be, m
+REST = 0.05  # the drives come to rest within this, s: ten of their lags
+SAMPLES = 25  # poses of which an observation is the mean
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """A tracker, and what goes wrong with it."""
+
+    position: float = 1e-6  # standard deviation of a pose's coordinates, m
+    rotation: float = 1e-6  # of its rotation about each axis, rad
+    wild: float = 0.0  # share of observations that are off by some ten times what a machine errs by
+    broken: float = 0.0  # share of observations at which the beam is broken
+
+
+class VirtualMachine:
+    """A machine with hidden errors, compensated by a model, watched by an instrument."""
+
+    def __init__(
+        self,
+        geometry: HexapodGeometry,
+        truth: MachineModel,
+        instrument: Instrument | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.geometry, self.truth, self.instrument = geometry, truth, instrument or Instrument()
+        self.stops = 0
+        self._rng, self._in_base = np.random.default_rng([seed, 30]), commanded_in_base(geometry)
+        far = replace(self._in_base.limits, step=FARTHEST)
+        self._in_base = replace(self._in_base, limits=far)
+        self._core = Compensator(self._in_base, MachineModel(geometry.name))
+        self._at = geometry.home @ geometry.tool
+        self._drive = StrutDrive(RealMachine(self._in_base, truth), DriveParameters(), seed)
+
+    def move(self, pose: Pose) -> None:
+        """Go straight to a tool pose in work, and come to rest; a LimitError, ``limit``, where a limit forbids it."""
+        target, start = self.geometry.work @ pose, self._at
+        way = target.position - start.position
+        turn = Rotation.from_matrix(target.rotation @ start.rotation.T).as_rotvec()
+        for share in PLACES:
+            place = start.position + share * way
+            before = Pose(place, Rotation.from_rotvec(share * turn).as_matrix() @ start.rotation)
+            try:
+                self._send(target if share == 1.0 else before)
+            except LimitError as error:
+                error.reason = "limit"  # as the mover names it
+                raise
+            self._at = target if share == 1.0 else before
+        self.stops += 1
+
+    def _send(self, tool_in_base: Pose) -> None:
+        """Command a pose, and let the drives get there."""
+        command = self._core.correct(tool_in_base).command
+        longest = float(np.abs(command - self._drive.motor_lengths()).max())
+        self._drive.set_command(command)
+        self._drive.advance(longest / self._drive.parameters.max_speed + REST)  # type: ignore[operator]
+
+    def observe(self) -> Observation | None:
+        """Return what the instrument reads; None while its beam is broken."""
+        draws, instrument = self._rng.uniform(size=2), self.instrument
+        noise = self._rng.standard_normal((2, 3)) / np.sqrt(SAMPLES)
+        jump = self._rng.standard_normal((2, 3)) * 200e-6
+        if draws[0] < instrument.broken:
+            return None
+        true, sigma = self._drive.true_tool_pose(), np.array([instrument.position, instrument.rotation])
+        off = noise * sigma[:, None] + (draws[1] < instrument.wild) * jump
+        seen = Pose(true.position + off[0], Rotation.from_rotvec(off[1]).as_matrix() @ true.rotation)
+        temperatures = tuple(self._drive.machine.temperatures.at(name) for name in Temperatures.NAMES)
+        struts = tuple(self._drive.motor_lengths().tolist())
+        return Observation(seen, np.repeat(sigma, 3) / np.sqrt(SAMPLES), struts, temperatures, float(self.stops))
+
+    def reload(self, model: MachineModel) -> None:
+        """Have the compensation run another model."""
+        self._core.set_model(model)
+
+    def knock(self, strut: int, distance: float) -> None:
+        """Make a strut longer for good, m, behind the compensation's back."""
+        offset = self.truth.struts.offset.copy()
+        offset[strut] += distance
+        self.become(replace(self.truth, struts=replace(self.truth.struts, offset=offset)))
+
+    def become(self, truth: MachineModel) -> None:
+        """Have other errors from now on, standing where it stands."""
+        parameters = DriveParameters(initial_lengths=self._drive.commands)
+        self.truth = truth
+        self._drive = StrutDrive(RealMachine(self._in_base, truth, self._drive.machine.temperatures), parameters)
+
+    def error(self, pose: Pose) -> np.ndarray:
+        """Return what the tool does beside a commanded pose in work, m, along the axes of base."""
+        self.move(pose)
+        return np.asarray(self._drive.true_tool_pose().position - (self.geometry.work @ pose).position)
