@@ -45,7 +45,7 @@ SPEAKERS_WITHIN = 1.0
 
 SPEAKERS_HELD = 2.0  # Two that sent in turn count as two for this long after the last turn, s
 
-# What rmw calls a publisher whose node it has not heard of: found a moment ago, or not a ROS node
+# What rmw calls a publisher whose node is not known yet: found a moment ago, or not a ROS node
 UNKNOWN_NAME = "_NODE_NAME_UNKNOWN_"
 
 
@@ -179,7 +179,7 @@ class StrutSteps(Guard):
         raise LimitError(reason, text, excess.moved, allowed, excess.which, "commanded")
 
     def accept(self, sample: Sample) -> None:
-        """The struts are told to go there."""
+        """Remember a command that the struts now follow."""
         self._limit.accept(tuple(sample.values or ()), sample.now)
 
     def reset(self, standing: Sequence[float] | None = None) -> None:
@@ -257,7 +257,7 @@ class StampGate(Guard):
 
     `max_age`, s, is the allowed difference to the clock, 0: any; with `future` stamps from the future are refused as
     old ones are; `capped`: a stamp from the future counts as now in the order of stamps, so that it does not shut out
-    those that follow. A zero stamp tells nothing and passes, unless `required`.
+    those that follow. A zero stamp passes: its message is not dated.
     """
 
     def __init__(

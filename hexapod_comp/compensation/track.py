@@ -1,4 +1,4 @@
-"""Where the struts are: one record of what they were told and what was measured, which every question is put to."""
+"""Where the struts are: one record of commanded and measured lengths, which answers every question about them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .guards import Guard, RateLimit, Sample
 
 KEPT = 512  # Commands and readings remembered: half a second at 1 kHz
 
-# A drive follows and tells within this time, s: a strut is right where any command of that time wants it
+# A drive follows and its reading arrives within this time, s: a strut may be where any command of that time put it
 FOLLOWED_WITHIN = 0.1
 
 # A strut that moves by no more than this in that time stands, m: encoders and servos are never quite still
@@ -41,10 +41,10 @@ class StrutTrack(Guard):
 
     Drives lag, and readings are on their way for a while, so a reading is compared with all that was commanded since
     :data:`FOLLOWED_WITHIN` before it was made: it must lie between the least and the most of it, or within `limit`, m
-    (0: any). Once it does not, the machine is stopped until somebody has looked, as on servo drives and in LinuxCNC: a
-    strut that comes back by itself has all the same been where nobody told it to be.
+    (0: any). Once it does not, the machine is stopped until a person resets it, as on servo drives and in LinuxCNC: a
+    strut that comes back by itself has all the same been where it was not commanded to be.
 
-    A controller streams on while a compensator restarts, and DDS may let it be heard before the drive is. So "no
+    A controller streams on while a compensator restarts, and DDS may discover it before the drive. So "no
     reading yet" does not mean that the struts may be sent anywhere: a start waits for one, unless nothing has become
     known for `anywhere_after`, s, since the activation (0: for ever), on a machine without feedback.
     """

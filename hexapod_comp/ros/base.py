@@ -48,10 +48,10 @@ _LAST, _RELIABLE, _BEST_EFFORT = HistoryPolicy.KEEP_LAST, ReliabilityPolicy.RELI
 # Commands: each must arrive. A hundred wait while a busy processor pauses for 0.1 s at 1 kHz, or a cable repeats.
 COMMAND_QOS = QoSProfile(depth=100, history=_LAST, reliability=_RELIABLE)
 
-# Publishers of states: the newest only, to reliable listeners too. Who subscribes without a thought is one.
+# Publishers of states: the newest only, to reliable subscribers too, as those with rclpy's defaults are
 STATE_QOS = QoSProfile(depth=1, history=_LAST, reliability=_RELIABLE)
 
-# Subscriptions of states, however published: only the newest counts, and an old one is not worth repeating
+# Subscriptions of states, however published: only the newest counts, an old one need not be repeated
 NEWEST_QOS = QoSProfile(depth=1, history=_LAST, reliability=_BEST_EFFORT)
 
 # Subscriptions of sensors, however they publish
@@ -60,7 +60,7 @@ SENSOR_QOS = QoSProfile(depth=10, history=_LAST, reliability=_BEST_EFFORT)
 # Rare messages, each of which counts: diagnostics, markers
 EVENT_QOS = QoSProfile(depth=10, history=_LAST, reliability=_RELIABLE)
 
-# A state that who comes late must know too
+# A state that late subscribers must receive too
 LATCHED_QOS = QoSProfile(depth=1, history=_LAST, reliability=_RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 # What of a topic's QoS a user may override by parameters; subscriptions have no lifespan
@@ -76,7 +76,7 @@ OVERRIDES = QoSOverridingOptions(
 
 TRANSITIONS = ("on_configure", "on_activate", "on_deactivate", "on_cleanup", "on_shutdown")
 
-CHECK_PERIOD = 0.05  # How often a node looks whether its state has changed, s
+CHECK_PERIOD = 0.05  # Period at which a node evaluates its state, s
 
 # How long the last message waits to be acknowledged: that may take DDS 3 s, and the dead never do it
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.4)
@@ -203,7 +203,7 @@ class MachineNode(LifecycleNode):
         return super().on_shutdown(state)
 
     def publish_last_status(self) -> None:
-        """Publish what must still be said before the node ends."""
+        """Publish the last status before the node ends."""
 
     def destroy_node(self) -> None:
         """Leave ROS at once, lifecycle services included."""
@@ -248,7 +248,7 @@ class MachineNode(LifecycleNode):
         self.on_parameters(names)
 
     def on_parameters(self, names: set[str]) -> None:
-        """Take what has been set while the node runs; called at other times too, with no names."""
+        """Apply parameters that have been set while the node runs; called at other times too, with no names."""
 
     def simulated_time(self) -> Callable[[], int] | None:
         """Return what reads the simulated time, ns; None where the time is the system's."""
@@ -299,7 +299,7 @@ class MachineNode(LifecycleNode):
     def subscribe(
         self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
     ) -> Subscription:
-        """Return a subscription of what anybody may say; what cannot be read, or is too long, is left aside."""
+        """Return a subscription of what any node may publish; what cannot be read, or is too long, is ignored."""
 
         def receive(data: bytes) -> None:
             try:
@@ -318,7 +318,7 @@ class MachineNode(LifecycleNode):
         callback: Callable[[bytes, int | None], None],
         qos: QoSProfile = COMMAND_QOS,
     ) -> Subscription:
-        """Return a subscription of what only one node may say: see :meth:`sender_of`.
+        """Return a subscription of what only one node may publish: see :meth:`sender_of`.
 
         Its callback gets the message's bytes, so that it need not read what is too long, and its sequence number.
         Where the middleware tells that a publisher comes or goes, :meth:`update_publishers` is called at once.
@@ -334,7 +334,7 @@ class MachineNode(LifecycleNode):
         )
 
         def on_matched(_: Any) -> None:
-            if subscription in self.subscriptions:  # told of a subscription that has been closed meanwhile
+            if subscription in self.subscriptions:  # the event of one that has been closed meanwhile
                 self.update_publishers()
 
         try:
@@ -345,10 +345,10 @@ class MachineNode(LifecycleNode):
         return subscription
 
     def update_publishers(self) -> None:
-        """Look who publishes what only one node may; called when one comes or goes, and now and then."""
+        """Update who publishes what only one node may; called when a publisher comes or goes, and periodically."""
 
     def sender_of(self, end: Subscription | Publisher, allowed: bool) -> OneSender:
-        """Return the guard of a topic that one node may publish: of what this node hears, or says itself."""
+        """Return the guard of a topic that only one node may publish: one that this node subscribes to or publishes."""
         topic, names = end.topic_name, functools.partial(publishers, self, end.topic_name)
         if isinstance(end, Subscription):
             return OneSender(topic, end.get_publisher_count, names, allowed)

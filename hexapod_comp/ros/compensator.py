@@ -53,7 +53,7 @@ from .sensors import SensorTopic
 from .status import ADVICE, OTHERWISE, WARN, CompensatorStatus, seconds
 
 ESTIMATE_PERIOD = 0.02  # How often the pose is estimated from the node's own commands while there is no feedback, s
-JITTER = 0.02  # A wait of a command up to this, s, is nothing to speak of, nor is an alarm that rings so late
+JITTER = 0.02  # A command that waits no longer than this, s, is not late, nor is an alarm
 
 
 class StateGuard(Guard):
@@ -132,7 +132,7 @@ class CompensatorNode(MachineNode):
             with self.rolled_back_on_error():
                 self._open_topics(ids)
         except Exception:
-            self._compensator = None  # else the end would say goodbye on topics that there are not
+            self._compensator = None  # else publish_last_status would publish on topics that were never opened
             raise
         what = "the ideal model, which corrects nothing (parameter model_file)"
         what = what if self._files.ideal else f"model {self.compensator.model.name!r}"
@@ -141,7 +141,7 @@ class CompensatorNode(MachineNode):
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Start to take commands; of those that came before none is replayed."""
+        """Start to answer commands; none that came before is replayed."""
         self._forget_commands()
         self._track.begin(time.monotonic())
         self._active = True
@@ -163,7 +163,7 @@ class CompensatorNode(MachineNode):
         return super().on_cleanup(state)
 
     def on_parameters(self, names: set[str]) -> None:
-        """Take what has been set while the node runs; the rest is looked up where it is needed."""
+        """Apply what has been set while the node runs; other parameters are read where they are used."""
         self._status.apply_parameters()
         if self._compensator is not None:
             self._thermometers.follow(*temperature_rules(self._options))
@@ -196,12 +196,12 @@ class CompensatorNode(MachineNode):
             self._array = self.publish_on(Float64MultiArray, "strut_commands_array", COMMAND_QOS, deadline)
         self._outputs = Outputs(self, compensator, options, self._commands.topic_name)
         self._input = asked = command_input(compensator, options)
-        heard = self.subscribe_exclusive(asked.kind, asked.topic, self._on_command)
+        commands = self.subscribe_exclusive(asked.kind, asked.topic, self._on_command)
         states = self.subscribe_exclusive(JointState, "strut_states", self._on_states, qos=NEWEST_QOS)
         self._reader = StrutReader(names)
-        self._ends: list[Any] = [self._commands, self._corrections, self._array, heard, states]
+        self._ends: list[Any] = [self._commands, self._corrections, self._array, commands, states]
         self._thermometers = Thermometers(*temperature_rules(options))
-        self._source, self._measuring = self.sender_of(heard, several), self.sender_of(states, several)
+        self._source, self._measuring = self.sender_of(commands, several), self.sender_of(states, several)
         own = self.sender_of(self._commands, several)
         status = self._status
         status.configure(compensator, self._thermometers, ids, self._source, own, self._measuring)
@@ -240,7 +240,7 @@ class CompensatorNode(MachineNode):
             self._pacing.begin(data, now, wait)
 
     def _process_command(self, data: bytes, now: float) -> float:
-        """Answer or refuse a command that came, or whose turn it is, now; return how long it must wait instead, s."""
+        """Answer or refuse a command; return the time that it must wait first, s: the struts cannot be there yet."""
         sample, compensator, status = Sample(now), self.compensator, self._status
         try:
             self._input.read(data, sample)
@@ -284,7 +284,7 @@ class CompensatorNode(MachineNode):
     # ---- a reading ----
 
     def _on_states(self, data: bytes, number: int | None) -> None:
-        """Use measured struts, also while the node is inactive: a start must begin where they are."""
+        """Use measured struts, also while the node is inactive: a start begins where they stand."""
         sample, track, status = Sample(time.monotonic()), self._track, self._status
         now = sample.now
         try:
@@ -415,7 +415,7 @@ class Pacing:
         self.waiting.clear()
 
     def close(self) -> None:
-        """Forget what waits, and take nothing any more."""
+        """Forget what waits, and stop the alarm."""
         self.reset()
         self._alarm.close()
 
@@ -431,7 +431,7 @@ class Pacing:
         return now - self._stood_still - came
 
     def _process_next(self) -> None:
-        """Take what waits, as far as the struts may go by now."""
+        """Answer the waiting commands that the struts can follow by now."""
         if (late := time.monotonic() - self._due) > JITTER:
             self._stood_still += late
         if not self._node.active:
@@ -447,7 +447,7 @@ class Pacing:
                 return
             if self._age(came, now) > JITTER:
                 self._status.behind.note(now)
-            if self.waiting:  # else what was taken has cleared it
+            if self.waiting:  # else the command was refused and a reset has cleared the queue
                 self.waiting.popleft()
 
     def _refuse_all(self, now: float) -> None:

@@ -1,4 +1,4 @@
-"""What a compensator looks like from outside: its parameters, the files they name, what it hears and what it publishes.
+"""The compensator's interface: its parameters, the files they name, its inputs and what it publishes.
 
 The answers to commands alone are published by the loop itself, in :mod:`.compensator`.
 """
@@ -41,8 +41,8 @@ from .parameters import ParameterError, Program, read_table
 
 POSES, STRUTS = "poses", "struts"  # Values of the parameter ``command_input``
 
-# Whether the node stops the machine is said again after this long, s: who comes late is given what is latched, but on
-# a busy computer the middleware loses that now and then
+# Whether the node stops the machine is published again after this time, s: late subscribers receive what is latched,
+# but on a busy computer the middleware loses that now and then
 REPEATED_AFTER = 1.0
 
 # The largest time that a message can hold, ns: what is valid until later is valid until then
@@ -232,7 +232,7 @@ class MachineFiles:
 
     def model_place(self) -> tuple[str, str, str | None]:
         """Return name, the folder that relative paths start from (where it was deleted, only absolute ones are found),
-        and the folder in which it must be: nothing of it is looked at here."""
+        and the folder in which it must be: the file is not opened here."""
         try:
             place = os.getcwd()
         except FileNotFoundError:
@@ -278,11 +278,11 @@ class PoseInput:
 
 
 class StrutInput(PoseInput):
-    """Nominal strut lengths on ``strut_setpoints``, m, by name: what a controller that plans struts itself would tell a
+    """Nominal strut lengths on ``strut_setpoints``, m, by name: what a controller that plans struts itself commands a
     machine without errors.
 
     They become the tool pose of that machine at once: what comes after, limits, stamps, journal and replay, knows poses
-    alone. What such a controller hears of the struts is nominal too.
+    alone. The strut readings that such a controller receives are nominal too.
     """
 
     topic, kind = "strut_setpoints", JointState
@@ -339,7 +339,7 @@ def nominal_lengths(compensator: Compensator, measured: np.ndarray) -> np.ndarra
 
 
 class Outputs:
-    """What a configured compensator publishes beside its answers: estimates, the machine to look at, its description,
+    """What a configured compensator publishes beside its answers: estimates, markers of the machine, its description,
     and what a machine's own safety watches: a heartbeat, how long a command holds, whether commands are refused."""
 
     def __init__(
@@ -382,7 +382,7 @@ class Outputs:
             self._nominal.publish(out.made(at, stamp, period(out.stamp, stamp), fastest))
 
     def stop(self, stopped: bool) -> None:
-        """Say whether the node stops the machine, where that has changed or has not been said for a while."""
+        """Publish whether the node stops the machine, when that has changed and every :data:`REPEATED_AFTER`."""
         now = time.monotonic()
         if stopped != self._stopped or now - self._stop_said > REPEATED_AFTER:
             self._stopped, self._stop_said = stopped, now
@@ -393,7 +393,7 @@ class Outputs:
         self._stops.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
     def close(self) -> None:
-        """Beat no more, and destroy the publishers."""
+        """Stop the heartbeat, and destroy the publishers."""
         for ticker in self._tickers:
             ticker.close()
         always = self._estimates, self._markers, self._heartbeats, self._validities, self._stops
@@ -409,8 +409,8 @@ class Outputs:
             self._validities.publish(self._validity)
 
     def _show(self) -> None:
-        """Publish the machine as it stands to who looks: as markers, before the first command without corrections, and
-        as the joints of its URDF."""
+        """Publish the machine as markers and as the joints of its URDF, where somebody subscribes; before the first
+        command its struts have no corrections."""
         if not self._node.active:
             return
         now, pose = self._node.get_clock().now().to_msg(), self._compensator.platform_estimate
@@ -462,7 +462,7 @@ class JournalTopics:
         self._node.close_ends(self._pages, self._files)
 
 
-# ---- the machine to look at ----
+# ---- markers ----
 
 STRUT_DIAMETER = 0.02
 JOINT_DIAMETER = 0.035

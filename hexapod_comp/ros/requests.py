@@ -184,7 +184,7 @@ class ToolChoice:
         """Set the parameter. Where the commander's choice is refused, its next command must be where the struts are:
         commands for the tool that it did not get may follow. Whoever else asks in vain stops nothing."""
         now, status = time.monotonic(), self._status
-        status.update(now)  # who has just come may have sent already, and who commands may not have been looked up yet
+        status.update(now)  # a new publisher may have sent already, and the commander's name may be outdated
         self._sender.receive(number, now)
         try:
             self._sender.check(Sample(now))

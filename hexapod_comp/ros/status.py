@@ -63,7 +63,7 @@ def seconds(value: float) -> str:
 
 
 class Flow:
-    """Counts events and tells their rate and the age of the last one."""
+    """Counts events; returns their rate and the age of the last one."""
 
     def __init__(self) -> None:
         self.count, self.last = 0, -math.inf
@@ -122,14 +122,14 @@ class Refusals:
 
 
 class LogSpace:
-    """Whether there is room for ROS's log: nobody but the nodes can tell that nothing is written any more."""
+    """Whether there is room for ROS's log: only the nodes can report that nothing is written any more."""
 
     def __init__(self, folder: Path | None = None) -> None:
         self._folder = Path(get_logging_directory()) if folder is None else folder
         self.problem = ""
 
     def check(self) -> None:
-        """Look again; takes a few microseconds on a local file system."""
+        """Measure the room; takes a few microseconds on a local file system."""
         self.problem = ""
         try:
             usage = os.statvfs(self._folder)
@@ -196,7 +196,7 @@ class CompensatorStatus:
         self.fusion: Fusion | None = None
         self.loads: Loads | None = None
         self.track, self.log_space = StrutTrack(), LogSpace()
-        # Of readings beside the struts, and of the choice of tool: a second sender is not obeyed, and stops nothing
+        # Senders of sensor readings and of the tool's choice: a second one is ignored, and stops nothing
         self.sensing: dict[str, OneSender] = {}
         self.commands, self.feedback = Flow(), Flow()  # accepted commands, usable measured struts
         self.refusals, self.bad_feedback, self.bad_poses = Refusals(), Refusals(), Refusals()
@@ -227,14 +227,14 @@ class CompensatorStatus:
         self.track.watch(compensator.geometry)
 
     def apply_parameters(self) -> None:
-        """Go by the parameters as they are now; others are looked up where they are needed."""
+        """Apply the parameters as they are now; others are read where they are used."""
         self.command_stamps.max_age = self.options["max_command_age"]
         self.reading_stamps.max_age = self.pose_stamps.max_age = self.options["max_reading_age"]
         self.track.limit = self.options["following_error_limit"]
         self.track.anywhere_after = self.options["start_without_feedback_after"]
 
     def update(self, now: float) -> None:
-        """Look who publishes."""
+        """Update who publishes."""
         for sender in (self.source, self.own_topic, self.measuring, *self.sensing.values()):
             sender.update(now)
 
@@ -357,12 +357,12 @@ class CompensatorStatus:
             "refused_tools": str(self.refused_tools.total),
         }
         values |= {f"{topic}_by": ", ".join(sender.names) for topic, sender in self.sensing.items()}
-        heard = dict(temperatures.values)
-        if (humidity := heard.pop(HUMIDITY, None)) is not None:
+        known = dict(temperatures.values)
+        if (humidity := known.pop(HUMIDITY, None)) is not None:
             values["humidity_percent"] = f"{100.0 * humidity:.1f}"
         elif model.struts.moisture.any():
             values["humidity_percent"] = f"not known, taken as {100.0 * REFERENCE_HUMIDITY:g}"
-        values |= {f"temperature.{name}_degC": f"{value:.2f}" for name, value in heard.items()}
+        values |= {f"temperature.{name}_degC": f"{value:.2f}" for name, value in known.items()}
         if self.loads is not None:
             values |= self.loads.values()
         values |= self._drift(now)

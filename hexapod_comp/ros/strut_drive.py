@@ -143,7 +143,7 @@ class StrutDriveNode(MachineNode):
             with self.rolled_back_on_error():
                 self._open_topics()
         except Exception:
-            self._drive = None  # else the end would say goodbye on topics that there are not
+            self._drive = None  # else publish_last_status would publish on topics that were never opened
             raise
         self._stamps = StampGate("command", self.clock, options["command_validity"], future=False)
         self._steps, self._log_space = StrutSteps(geometry.limits.step, geometry.limits.speed), LogSpace()
@@ -258,7 +258,7 @@ class StrutDriveNode(MachineNode):
     # ---- state ----
 
     def _findings(self, now: float) -> Iterator[tuple[bytes, str]]:
-        """Yield what there is to say, worst first."""
+        """Yield level and text of each finding, worst first."""
         stopped = [name for name, at_stop in zip(STRUT_NAMES, self.drive.stopped, strict=True) if at_stop]
         if stopped:
             yield ERROR, f"at the travel stop: {', '.join(stopped)}"
