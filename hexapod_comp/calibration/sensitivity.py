@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..machine.model import MachinesByTemperature, RealMachine
+from ..machine.model import RealMachine
 from ..machine.trial import drive
 from ..measurements.readings import Stations
 from .blocks.backlash import without_negative
@@ -18,8 +18,7 @@ def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Predict
     """Return where the machine of a parameter vector goes at each station."""
     positive, sense = without_negative(space.blocks, x, stations.sense)
     model = space.model(positive, with_field=False)
-    air = stations.temperatures, stations.times, stations.humidity, stations.loads
-    machines = MachinesByTemperature(space.geometry, model).at_each(*air)
+    machines = stations.surroundings.machines(RealMachine(space.geometry, model))
     commanded = stations.positions, stations.rotations
     driven = drive(machines, commanded, sense, stations.commands)
     errors = driven.errors(commanded, space.probe).as_array()

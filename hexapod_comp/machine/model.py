@@ -15,7 +15,6 @@ from ..core import Status, Struct, batch, lib
 from ..core.batch import backwards, rotate
 from ..errors import ModelError, NotConvergedError
 from ..pose import Pose
-from .arrays import changed_rows
 from .field import GridField, no_field
 from .geometry import HexapodGeometry
 from .kinematics import Structure, forward_error, over_chunks, strut_lengths
@@ -23,7 +22,7 @@ from .load import FREE, Load, Loading, Payload
 from .outside import NO_TABLE, OutsideTable
 from .region import Region
 from .struts import StrutErrors
-from .temperatures import AT_ONCE, EXPANSION, HUMIDITY, MOST_TIME_CONSTANTS, PARTS, Lag, LateGrowth, Temperatures, late
+from .temperatures import AT_ONCE, EXPANSION, HUMIDITY, MOST_TIME_CONSTANTS, PARTS, LateGrowth, Temperatures
 from .terms import check_magnitudes, settle, term
 
 
@@ -450,55 +449,6 @@ def _late(model: MachineModel) -> dict[str, Any]:
     constants[:count], expansion[:, :count] = late.time_constants, late.expansion
     sensors = [late.sensor_of(part) for part in range(len(PARTS))]
     return {"count": count, "time_constants": constants, "expansion": expansion, "sensors": sensors}
-
-
-class MachinesByTemperature:
-    """Real machines at temperatures that come again and again, each made once."""
-
-    def __init__(self, geometry: HexapodGeometry, model: MachineModel, machine: RealMachine | None = None) -> None:
-        self._machine = RealMachine(geometry, model) if machine is None else machine
-        self._model = model
-        self._known: dict[tuple[Any, ...], RealMachine] = {}
-
-    def at(
-        self,
-        values: np.ndarray,
-        behind: np.ndarray | None = None,
-        humidity: float = math.nan,
-        load: Sequence[float] = (),
-    ) -> RealMachine:
-        """Return the machine at the temperatures of struts 1–6, base and platform, °C, shape (8,), a humidity, and a
-        load: payload, kg, its centre, m, and gravity, m/s²; NaN or empty: the tool's and the model's."""
-        swells = math.isfinite(humidity) and bool(self._model.struts.moisture.any())
-        air = {HUMIDITY: humidity} if swells else {}
-        told = tuple(load) if self._machine.bends else ()
-        key = (*values.tolist(), *air.values(), *(() if behind is None else behind.ravel().tolist()), repr(told))
-        if key not in self._known:
-            late_parts = {} if behind is None else dict(zip(PARTS, behind.tolist(), strict=True))
-            lags = {name: Lag(math.nan, math.nan, row) for name, row in late_parts.items()}
-            readings = dict(zip(PARTS, values.tolist(), strict=True)) | air
-            payload = Payload(told[0], (told[1], told[2], told[3])) if told and not math.isnan(told[0]) else None
-            gravity = told[4:] if told and not math.isnan(told[4]) else None
-            self._known[key] = self._machine.at(Temperatures(readings, lags), payload, gravity)
-        return self._known[key]
-
-    def at_each(
-        self, temperatures: np.ndarray, times: np.ndarray, humidities: np.ndarray, loads: np.ndarray | None = None
-    ) -> list[RealMachine]:
-        """Return the machine at rows of temperatures, °C, shape (N, 8), read at some times, s, humidities, (N,), and
-        loads, (N, 7), as :meth:`at` has them."""
-        constants = self._model.late_growth.time_constants
-        loads = np.full((len(temperatures), 7), np.nan) if loads is None else loads
-        air = np.column_stack([temperatures, np.nan_to_num(humidities, nan=-1.0), np.nan_to_num(loads, nan=-1e9)])
-        behind = None
-        if constants and np.isfinite(times).all():
-            behind = late(times, temperatures, constants)
-            air = np.hstack([air, behind.reshape(len(air), -1)])
-        rows, number = changed_rows(air)
-        lags = [None] * len(rows) if behind is None else behind[rows]
-        told = zip(temperatures[rows], lags, humidities[rows].tolist(), loads[rows].tolist(), strict=True)
-        machines = [self.at(*row) for row in told]
-        return [machines[n] for n in number.tolist()]
 
 
 def commanded_box(geometry: HexapodGeometry, model: MachineModel) -> np.ndarray:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import CalibrationError
 from ..machine.arrays import rms
 from ..machine.geometry import HexapodGeometry
+from ..machine.surroundings import NO_LOAD, Surroundings
 from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
 from ..pose import Pose, attitude_error
 
@@ -49,10 +50,6 @@ LEAST_NOISE = 1e-9
 COARSEST = 300.0
 LARGEST_READING = 1.0  # no machine errs by more, m or rad
 LEAST_TRAVEL = 1e-6  # components of a line shorter than this, m, are no travel along that axis
-
-
-# What a reading's load is where nobody tells: NaN, the mass and centre of the tool in use, and the model's gravity
-NO_LOAD = (np.nan,) * 7
 
 
 class FileLine(NamedTuple):
@@ -135,6 +132,11 @@ class Stations:
     def select(self, chosen: np.ndarray | slice) -> Stations:
         """Return those in a mask, at indices or of a slice."""
         return Stations(**{entry.name: getattr(self, entry.name)[chosen] for entry in fields(self)})
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """What acted on the machine there."""
+        return Surroundings(**{name: getattr(self, name) for name in Surroundings._fields})
 
     def pose(self, index: int) -> Pose:
         """Return a commanded ``pose_platform_in_base``."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields
 from itertools import combinations
@@ -298,15 +299,14 @@ def _collect_stations(
         # A station belongs to a run: lines that cross at a point pass it in different ways.
         came_from = before if r.direction == FROM_PREVIOUS else None
         time = r.time if warming else math.nan
-        air = (None if math.isnan(time) else time, None if math.isnan(r.humidity) else r.humidity)
-        load = tuple(None if math.isnan(value) else value for value in r.load)
-        key = (place, r.direction, came_from, r.temperatures, air, load)
+        around = r.temperatures, time, r.humidity, r.load  # as in Surroundings
+        key = (place, r.direction, came_from, struct.pack("17d", *r.temperatures, time, r.humidity, *r.load))
         if key not in known:
             own = poses[0][pose], poses[1][pose], lengths[pose]
             commands = own[2] if r.commands is None else np.array(r.commands, dtype=float)
             known[key] = len(rows)
             sense = _sense(own[0], commands, None if came_from is None else rows[came_from])
-            rows.append((*own[:2], commands, sense, r.temperatures, time, r.humidity, r.load))
+            rows.append((*own[:2], commands, sense, *around))
             ways.append(r.direction * run.axis if r.direction in (FORWARD, BACKWARD) else np.zeros(3))
         index.append(known[key])
     columns = [np.array(column, dtype=float) for column in zip(*rows, strict=True)]

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import CommandError
 from ..machine.arrays import different_rows
 from ..machine.geometry import HexapodGeometry
-from ..machine.model import MachineModel, MachinesByTemperature, RealMachine
+from ..machine.model import MachineModel, RealMachine
 from ..machine.trial import drive, model_commands
 from ..measurements.campaign import INSTRUMENTS, Campaign, line_channels, line_readings
 from ..measurements.readings import (
@@ -75,9 +75,7 @@ def station_errors(
     commands, directions of motion, temperatures and humidity.
     """
     stations, name_of = measurements.stations, partial(_station_name, measurements)
-    machines = MachinesByTemperature(truth.geometry, truth.model, truth).at_each(
-        stations.temperatures, stations.times, stations.humidity, stations.loads
-    )
+    machines = stations.surroundings.machines(truth)
     commanded = stations.positions, stations.rotations
     driven = drive(machines, commanded, stations.sense, stations.commands, name_of, advance)
     return driven.errors(commanded, measurements.probe).as_array()
@@ -86,9 +84,7 @@ def station_errors(
 def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet:
     """Return a template whose machine is told what a model's compensation tells it."""
     stations = template.stations
-    machines = MachinesByTemperature(template.geometry, model).at_each(
-        stations.temperatures, stations.times, stations.humidity, stations.loads
-    )
+    machines = stations.surroundings.machines(RealMachine(template.geometry, model))
     targets, name_of = (stations.positions, stations.rotations), partial(_station_name, template)
     commands, _ = model_commands(machines, targets, stations.sense, name_of)
     return replace(template, stations=replace(stations, commands=commands))

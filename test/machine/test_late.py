@@ -11,10 +11,12 @@ from scipy.integrate import solve_ivp
 
 from hexapod_comp.errors import InputFileError, KinematicsError, ModelError
 from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
-from hexapod_comp.machine.model import MachineModel, MachinesByTemperature, ModelOrigin, RealMachine
+from hexapod_comp.machine.load import Load
+from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
 from hexapod_comp.machine.model_file import load_model, save_model
 from hexapod_comp.machine.struts import StrutErrors
-from hexapod_comp.machine.temperatures import PARTS, LateGrowth, Temperatures, late
+from hexapod_comp.machine.surroundings import NO_LOAD, Surroundings
+from hexapod_comp.machine.temperatures import PARTS, Lag, LateGrowth, Temperatures, late
 from hexapod_comp.machine.trial import drive
 from hexapod_comp.pose import Pose
 
@@ -74,10 +76,9 @@ def warming_model(**changes) -> MachineModel:
 
 def test_a_machine_grows_by_one_thermometer_and_what_is_behind_it():
     """Growth of strut 3: 11 ppm/K of 2 K, less 4 and 5 ppm/K of 1 and 1.5 K: 10.5 ppm; the base: 20 − 12 − 19.5."""
-    machines = MachinesByTemperature(paper(), warming_model())
-    behind = np.zeros((8, 2))
-    behind[6] = -1.0, -1.5
-    warm = machines.at(np.array([99.0] * 6 + [22.0, 50.0]), behind)
+    read = dict(zip(PARTS, [99.0] * 6 + [22.0, 50.0], strict=True))
+    behind = {part: Lag(np.nan, np.nan, [-1.0, -1.5] if part == "base" else [0.0, 0.0]) for part in PARTS}
+    warm = RealMachine(paper(), warming_model(), Temperatures(read, behind))
     assert warm.growth[2] == pytest.approx(10.5e-6)
     nominal = paper().kernel_joints[0]
     np.testing.assert_allclose(warm.structure.base_joints - nominal, -11.5e-6 * nominal, atol=1e-15)
@@ -89,7 +90,8 @@ def test_stations_driven_together_go_where_each_goes_alone():
     """Four in a row, the middle two alike: to the bit. The third is then told a length that no pose has, and named."""
     temperatures, humidity = np.full((4, 8), 20.0), np.full(4, np.nan)
     temperatures[1:3, 6], temperatures[3, 2] = 23.0, 25.0
-    machines = MachinesByTemperature(paper(), warming_model()).at_each(temperatures, np.full(4, np.nan), humidity)
+    around = Surroundings(temperatures, np.full(4, np.nan), humidity, np.tile(NO_LOAD, (4, 1)))
+    machines = around.machines(RealMachine(paper(), warming_model()))
     assert machines[1] is machines[2]
     assert len(set(machines)) == 3
     home = paper().home
@@ -156,3 +158,20 @@ def test_a_restart_does_not_know_what_was_before_and_says_for_how_long():
     temperatures.follow("base", 25.0, 1000.0, late_growth.time_constants)
     assert temperatures.unknown_for(late_growth, 2000.0) == 3 * 7200.0 - 1000.0
     assert temperatures.unknown_for(late_growth, 50_000.0) == 0.0
+
+
+def test_whatever_acts_on_the_machine_tells_places_apart():
+    """One number of a place at a time is another; only what leaves the machine as it is may be merged."""
+    swelling = StrutErrors(expansion=np.full(6, 11e-6), moisture=np.full(6, 1e-4))
+    load = Load(stiffness=np.full(6, 2e7), mass=20.0)
+    bending = RealMachine(paper(), replace(warming_model(), struts=swelling, load=load))
+    rigid = RealMachine(paper(), MachineModel("paper", "rigid"))
+    usual = [20.0] * 8 + [0.5] + [3.0, 0.0, 0.0, 0.1] + [0.0, 0.0, -9.81]
+    rows = np.tile(usual, (1 + len(usual), 1))
+    rows[1 + np.arange(len(usual)), np.arange(len(usual))] += 0.25
+    around = Surroundings(rows[:, :8], np.full(len(rows), np.nan), rows[:, 8], rows[:, 9:])
+    assert len(set(around.machines(bending))) == len(rows)
+    assert len(set(around.machines(rigid))) == 9  # no strut gives or swells: temperatures alone
+    again = Surroundings(*(np.concatenate([part, part]) for part in around))
+    machines = again.machines(bending)
+    assert all(a is b for a, b in zip(machines, machines[len(rows) :], strict=False))

@@ -1,0 +1,57 @@
+"""What acts on a machine from outside, place by place: temperatures, humidity and load, with one key."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from .arrays import different_rows
+from .load import Payload
+from .model import RealMachine
+from .temperatures import HUMIDITY, PARTS, Lag, Temperatures, late
+
+# What a load is where nobody tells: NaN, the mass and centre of the tool in use, and the model's gravity
+NO_LOAD = (math.nan,) * 7
+
+
+class Surroundings(NamedTuple):
+    """What acted on the machine at N places. Whatever is added here tells places apart by itself."""
+
+    temperatures: np.ndarray  # (N, 8): struts 1–6, base, platform, °C
+    times: np.ndarray  # (N,): when these were read, s; NaN where that is not known
+    humidity: np.ndarray  # (N,): relative humidity of the air, a fraction; NaN where that is not known
+    loads: np.ndarray  # (N, 7): mass, kg, its centre in platform, m, and gravity in base, m/s²; NaN: as usual
+
+    def numbers(self) -> np.ndarray:
+        """Return all of them but the times as the bits of a row a place: NaN is equal to NaN."""
+        rows = np.column_stack([value for name, value in self._asdict().items() if name != "times"])
+        return np.ascontiguousarray(rows, dtype=float).view(np.int64)
+
+    def machines(self, machine: RealMachine) -> list[RealMachine]:
+        """Return the machine at each place; places at which the same acts on it share one."""
+        model, count = machine.model, len(self.times)
+        around = self
+        if not model.struts.moisture.any():
+            around = around._replace(humidity=np.full(count, np.nan))
+        if not machine.bends:
+            around = around._replace(loads=np.full((count, 7), np.nan))
+        constants, lags = model.late_growth.time_constants, np.zeros((count, len(PARTS), 0))
+        if constants and np.isfinite(self.times).all():
+            lags = late(self.times, self.temperatures, constants)
+        bits = np.hstack([around.numbers(), np.ascontiguousarray(lags.reshape(count, -1)).view(np.int64)])
+        first, number = different_rows(bits)
+        different = [around._machine(machine, n, lags[n]) for n in first.tolist()]
+        return [different[n] for n in number.tolist()]
+
+    def _machine(self, machine: RealMachine, n: int, lags: np.ndarray) -> RealMachine:
+        """Return the machine at a place; its parts lag behind their thermometers by `lags`, (8, time constants)."""
+        readings = dict(zip(PARTS, self.temperatures[n].tolist(), strict=True))
+        if math.isfinite(self.humidity[n]):
+            readings[HUMIDITY] = float(self.humidity[n])
+        late_parts = dict(zip(PARTS, lags.tolist(), strict=True)) if lags.size else {}
+        behind = {name: Lag(math.nan, math.nan, row) for name, row in late_parts.items()}
+        mass, x, y, z, *gravity = self.loads[n].tolist()
+        payload = None if math.isnan(mass) else Payload(mass, (x, y, z))
+        return machine.at(Temperatures(readings, behind), payload, None if math.isnan(gravity[0]) else gravity)
