@@ -25,16 +25,17 @@ class Careful:
 
     def observe(self) -> Observation | None:
         """Return the median of some observations; None where too few read anything."""
-        seen = [o for o in (self._machine.observe() for _ in range(LOOKS)) if o is not None]
+        looks = (self._machine.observe() for _ in range(LOOKS))
+        seen = [(o, o.pose) for o in looks if o is not None and o.pose is not None]
         if len(seen) < LEAST:
             return None
-        first = seen[0].pose
-        turns = [Rotation.from_matrix(o.pose.rotation @ first.rotation.T).as_rotvec() for o in seen]
-        numbers = np.array([np.concatenate([o.pose.position, turn]) for o, turn in zip(seen, turns, strict=True)])
+        first = seen[0][1]
+        turns = [Rotation.from_matrix(pose.rotation @ first.rotation.T).as_rotvec() for _, pose in seen]
+        numbers = np.array([np.concatenate([pose.position, turn]) for (_, pose), turn in zip(seen, turns, strict=True)])
         if len(seen) == LEAST:  # of two that differ nobody knows which is wild: their mean, as uncertain as they differ
             middle, apart = numbers.mean(axis=0), np.abs(numbers[1] - numbers[0])
         else:
             middle, apart = np.median(numbers, axis=0), np.zeros(6)
-        stated = np.nanmax([np.median([o.uncertainty for o in seen], axis=0), np.full(6, FINEST)], axis=0)
+        stated = np.nanmax([np.median([o.uncertainty for o, _ in seen], axis=0), np.full(6, FINEST)], axis=0)
         turned = Rotation.from_rotvec(middle[3:]).as_matrix() @ first.rotation
-        return seen[-1]._replace(pose=Pose(middle[:3], turned), uncertainty=np.maximum(stated, apart))
+        return seen[-1][0]._replace(pose=Pose(middle[:3], turned), uncertainty=np.maximum(stated, apart))
