@@ -7,9 +7,9 @@
 >>> pose = hc.Pose.from_angles([0.0, 0.0, 0.4], np.radians([0.0, 0.0, 5.0]))
 >>> microns = compensator.correct(pose).correction * 1e6
 
-These names are the public ones; they are imported when they are first used. Everything is in SI units (m, rad, s; °C);
-a pose is the tool's in the work frame unless a parameter says ``pose_platform_in_base``. Whatever is wrong with an
-input is a :class:`HexapodError`.
+These names are the public ones; each is imported at its first use. Everything is in SI units (m, rad, s; °C);
+a pose is the tool's in the work frame unless a parameter says ``pose_platform_in_base``. Every error about an input is
+a :class:`HexapodError`.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ __all__ = ["__version__", *sorted(_HOME_OF)]
 
 
 def __getattr__(name: str) -> object:
-    """Import a public name when it is first used; ``hexapod_comp --help`` then need not wait for NumPy."""
+    """Import a public name at its first use; ``hexapod_comp --help`` then does not import NumPy."""
     if name == "__version__":
         from .formats.paths import version
 

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 LONGEST_TEXT = 2000
-"""No message, log line or value in diagnostics is longer than this, whatever a stranger has sent."""
+"""Longest message, log line or value in diagnostics, whatever was received."""
 
 
 class HexapodError(Exception):
-    """Root of all errors that this package raises on purpose.
+    """Root of all errors that this package raises deliberately.
 
-    Its text may quote what came from outside, so it is made :func:`printable` here, for all of them at once.
+    Its text may quote foreign text, so all are made :func:`printable` here.
 
     Parameters
     ----------
@@ -34,28 +34,28 @@ class HexapodError(Exception):
         return str(self.args[0])  # also where a parent class has a text of its own, as ImportError
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return what pickle needs: text and attributes, whatever the class wants to be made of."""
+        """Return what pickle needs: text and attributes, independent of the class's constructor."""
         return _remade, (type(self), self.args), self.__dict__
 
     def with_lines(self, lines: str) -> HexapodError:
-        """Return the error with lines below its text that are shown as they are: what our own process has logged."""
+        """Return the error with lines appended unchanged: the log of our own process."""
         self.args = (f"{self}\n{lines}",)
         return self
 
 
 def _remade(kind: type[HexapodError], args: tuple[Any, ...]) -> HexapodError:
-    """Return an error with its text; pickle puts the attributes in."""
+    """Return an error with its text; pickle adds the attributes."""
     error = kind.__new__(kind)
     error.args = args
     return error
 
 
 LONGEST_PATH = 500
-"""A file's name is shown up to this length: what is wrong with it must still fit into the message."""
+"""A file's name is shown up to this length, so that the problem still fits into the message."""
 
 
 class InputFileError(HexapodError):
-    """A file cannot be used: what is wrong, at which key, with which value.
+    """A file cannot be used: problem, key and value.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class InputFileError(HexapodError):
 
 
 class GeometryError(HexapodError):
-    """A geometry that no hexapod can have: which quantity, which value, what is allowed."""
+    """A geometry that no hexapod can have: quantity, value, and what is allowed."""
 
     reason = "bad_geometry"
 
@@ -91,7 +91,7 @@ class GeometryError(HexapodError):
 
 
 class FrameError(HexapodError):
-    """A machine has no tool or work frame of that name; lists those that there are."""
+    """A machine has no tool or work frame of that name; lists the valid names."""
 
     reason = "unknown_frame"
 
@@ -103,7 +103,7 @@ class ModelError(GeometryError):
 
 
 class CalibrationError(HexapodError):
-    """Measurements from which no model can be made.
+    """Measurements from which no model can be fitted.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ class CalibrationError(HexapodError):
 
 
 class PoseError(HexapodError):
-    """A pose that is not one: not finite, or its rotation is not a rotation.
+    """A pose that is invalid: not finite, or its rotation is not a rotation.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ class NotFiniteError(KinematicsError):
 
 
 class NotConvergedError(KinematicsError):
-    """Newton did not settle within the allowed number of iterations."""
+    """Newton did not converge within the allowed number of iterations."""
 
     reason = "not_converged"
 
@@ -211,18 +211,10 @@ class LimitError(HexapodError):
 
 
 class TooEarlyError(LimitError):
-    """A command may not come yet: the struts would have to be faster than they may. Later it may.
+    """A command is too early: the struts would exceed their largest speed. Later it may.
 
-    Parameters
-    ----------
-    problem : str
-        Sentence with value, limit and units.
-    wait : float
-        After which time, s.
-    limit : float
-        Largest strut speed, m/s.
-    strut : int
-        Index 0..5 of the strut concerned.
+    Parameters ---------- problem : str Sentence with value, limit and units. wait : float Time until it is allowed, s.
+    limit : float Largest strut speed, m/s. strut : int Index 0..5 of the strut concerned.
     """
 
     def __init__(self, problem: str, wait: float, limit: float, strut: int):
@@ -247,7 +239,7 @@ class OutsideTableError(OutsideFieldError):
 
 
 class CommandError(HexapodError):
-    """A command message that cannot be taken; `reason` says which rule it broke.
+    """A command message that is rejected; `reason` names the rule that it broke.
 
     Parameters
     ----------
@@ -273,8 +265,8 @@ def shorten(value: Any, limit: int = 80) -> str:
 def printable(text: str, limit: int = 200) -> str:
     """Return a text on one line, of at most `limit` characters, without codes for the terminal.
 
-    What comes from outside (a file, a message, the network's names) passes here before it is shown: a line break
-    would forge lines of the log, an escape code moves the cursor, and ten megabytes are no message.
+    Text from outside (a file, a message, the network's names) passes here before it is shown: a line break would forge
+    lines of the log, an escape code moves the cursor, and ten megabytes are too long.
     """
     if len(text) <= limit and text.isprintable():
         return text
@@ -283,6 +275,6 @@ def printable(text: str, limit: int = 200) -> str:
 
 
 class NoAnswerError(HexapodError):
-    """Something that must happen has not happened in time."""
+    """An expected event has not happened in time."""
 
     reason = "timeout"

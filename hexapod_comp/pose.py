@@ -1,4 +1,4 @@
-"""Poses: a position and a rotation that is known to be one, and the conversions at the edges.
+"""Poses: a position and a validated rotation, and the conversions at the edges.
 
 Inside, a pose is a position of shape (3,) in metres and a rotation matrix of shape (3, 3) whose columns
 are the moving frame's axes. The paper's angles (degrees or radians) and quaternions appear only here.
@@ -18,11 +18,11 @@ from .core.batch import quaternion_of, read_pose, rotation_flaw
 from .errors import PoseError
 
 LARGEST_ANGLE = 1000.0
-"""Larger angles, rad, are refused: nobody turns a tool 159 times, and at 1e16 rounding turns it anywhere."""
+"""Larger angles, rad, are refused: no tool turns 159 times, and at 1e16 rounding makes the angle arbitrary."""
 
 
 ROTATION_TOLERANCE = 1e-9
-"""Largest deviation of RᵀR from the identity that passes as rounding."""
+"""Largest deviation of RᵀR from the identity that is accepted as rounding."""
 
 
 IN_A_LINE = 1e-6
@@ -102,13 +102,13 @@ class Pose:
         return quaternion if quaternion[3] >= 0.0 else -quaternion
 
     def as_columns(self) -> dict[str, float]:
-        """Return it as files and JSON have it, mm and degrees: ``x_mm``, ``y_mm``, ``z_mm``, ``alpha_deg``, …"""
+        """Return it as in files and JSON, mm and degrees: ``x_mm``, ``y_mm``, ``z_mm``, ``alpha_deg``, …"""
         names = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
         values = [*(self.position * 1e3).tolist(), *np.degrees(self.angles()).tolist()]
         return dict(zip(names, values, strict=True))
 
     def inverse(self) -> Pose:
-        """Return the pose of the outer frame seen from this one."""
+        """Return the pose of the outer frame relative to this one."""
         return Pose(-self.rotation.T @ self.position, self.rotation.T)
 
     def __matmul__(self, other: Pose) -> Pose:
@@ -116,7 +116,8 @@ class Pose:
 
 
 def stacked(poses: Sequence[Pose] | tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions, shape (N, 3), and the rotations, shape (N, 3, 3), of N poses; arrays as they are.
+    """Return the positions, shape (N, 3), and the rotations, shape (N, 3, 3), of N poses; arrays are returned
+    unchanged.
 
     Raises
     ------
@@ -166,7 +167,7 @@ def rotation_from_angles(angles: np.ndarray) -> np.ndarray:
 def angles_from_rotation(rotation: np.ndarray) -> np.ndarray:
     """Return α, β, γ of R = Ry(β)·Rx(α)·Rz(γ); radians, shape (..., 3).
 
-    At α = ±90° only β ± γ is determined; β is then whatever rounding leaves, and γ fits it.
+    At α = ±90° only β ± γ is determined; β then depends on rounding, and γ agrees with it.
     """
     r = np.asarray(rotation, dtype=float)
     alpha = np.arctan2(-r[..., 1, 2], np.hypot(r[..., 1, 0], r[..., 1, 1]))
@@ -180,7 +181,7 @@ def angles_from_rotation(rotation: np.ndarray) -> np.ndarray:
 def roll_pitch_yaw(rotation: np.ndarray) -> np.ndarray:
     """Return URDF's angles about fixed axes, R = Rz(yaw)·Ry(pitch)·Rx(roll); radians, shape (3,).
 
-    At a pitch of ±90° only yaw ± roll is determined; yaw is then whatever rounding leaves, and roll fits it.
+    At a pitch of ±90° only yaw ± roll is determined; yaw then depends on rounding, and roll agrees with it.
     """
     r = np.asarray(rotation, dtype=float)
     yaw = math.atan2(r[1, 0], r[0, 0])
@@ -198,24 +199,21 @@ def rotation_angle(rotation: np.ndarray) -> float:
 
 def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:
     """Return the rotation vector(s) that turn commanded into actual rotations, rad in their common frame."""
-    from scipy.spatial.transform import Rotation  # 27 MB with all that it needs, which a node does without
+    from scipy.spatial.transform import Rotation  # 27 MB with its dependencies, which a node avoids
 
     return Rotation.from_matrix(actual @ np.swapaxes(commanded, -1, -2)).as_rotvec()
 
 
 def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
-    """Return the rigid motion that brings points as close as it can to others: the datum aligned (Kabsch).
+    """Return the rigid motion that brings points closest to others: the datum aligned (Kabsch).
 
     Parameters
     ----------
     points, onto : ndarray, shape (N, 3)
         Pairs of places, m.
 
-    Returns
-    -------
-    Pose or None
-        T with T·points ≈ onto, least squares; None for fewer than three points or points in a line, which leave a
-        turn open.
+    Returns ------- Pose or None T with T·points ≈ onto, least squares; None for fewer than three points or points in a
+    line, which do not determine a turn.
     """
     from scipy.spatial.transform import Rotation  # As in attitude_error
 

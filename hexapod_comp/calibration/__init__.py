@@ -1,1 +1,1 @@
-"""From readings to a machine model, and what that model is worth."""
+"""From readings to a machine model, and how accurate that model is."""

@@ -1,6 +1,7 @@
-"""What calibration assumes about machines, instruments and numbers: every constant of this room, with unit and source.
+"""Assumptions of calibration about machines, instruments and numbers: every constant of this package, with unit and
+source.
 
-Use ``ASSUMED.name``. A number that the readings or textbooks give does not belong here; one that tunes a bar needs an
+Use ``ASSUMED.name``. Numbers given by the readings or textbooks do not belong here; a number that tunes a bar needs an
 ablation in benchmarks/ on machines that were not used to find it. ``fit --assumptions`` prints the table.
 """
 
@@ -25,44 +26,52 @@ class Assumptions:
     hyperprior: float = assumed(0.1, "", "parameters that a first tolerance counts as", "or empty blocks collapse")
 
     # Observations (observations.py)
-    centre: float = assumed(5e-3, "m", "where a centre of lengths is beside its place, 1 σ of each axis", "by a rule")
+    centre: float = assumed(5e-3, "m", "error of a centre's stated place, 1 σ of each axis", "by a rule")
     across: float = assumed(
-        0.3e-3, "m", "the same where lengths hardly show it", "it acts with the machine's error alone"
+        0.3e-3, "m", "the same where lengths hardly depend on it", "it acts with the machine's error alone"
     )
 
     # Selection (selection.py)
-    least_evidence: float = assumed(2.0, "", "log Bayes factor that keeps a block", "one number 2 σ from zero")
+    least_evidence: float = assumed(2.0, "", "log Bayes factor above which a block is kept", "one number 2 σ from zero")
 
     # Blocks (blocks/)
     knot_distance: float = assumed(17e-3, "m", "largest distance of a length map's knots", "a wave of 60 mm has 3.5")
-    map_correlation: float = assumed(40e-3, "m", "how far a length map's errors are alike", "Matérn 5/2; ground screws")
-    field_decay: float = assumed(0.6, "", "share of the prior that each degree of the field keeps", "fields are smooth")
+    map_correlation: float = assumed(
+        40e-3, "m", "correlation length of a length map's errors", "Matérn 5/2; ground screws"
+    )
+    field_decay: float = assumed(
+        0.6, "", "ratio of the priors of one degree of the field and the next", "fields are smooth"
+    )
     reversal_degree: int = assumed(2, "", "degree of the field's part that depends on direction", "few reversals read")
     struts_alike: float = assumed(0.998, "", "correlation of the struts' expansions", "one material: 5 % apart")
     struts_warmed_alike: float = assumed(0.9, "", "the same by another part's thermometer", "loaded, cooled unlike")
-    least_warming: float = assumed(0.5, "K", "change that shows an expansion", "3 µm on 0.5 m of steel")
-    least_damping: float = assumed(0.1, "", "change of humidity that shows swelling", "5 µm on 0.5 m of carbon fibre")
-    least_load: float = assumed(10.0, "N", "change of weight that shows a stiffness", "0.5 µm on 20 N/µm")
+    least_warming: float = assumed(0.5, "K", "change that determines an expansion", "3 µm on 0.5 m of steel")
+    least_damping: float = assumed(
+        0.1, "", "change of humidity that determines swelling", "5 µm on 0.5 m of carbon fibre"
+    )
+    least_load: float = assumed(10.0, "N", "change of weight that determines a stiffness", "0.5 µm on 20 N/µm")
 
     # Posterior (posterior.py, datum.py)
-    seen: float = assumed(1.0, "σ", "change of all readings from which on a direction is observable", "one σ of noise")
+    seen: float = assumed(1.0, "σ", "change of all readings above which a direction is observable", "one σ of noise")
     weak: float = assumed(5.0, "σ", "observable directions below are listed as weak", "known to a fifth")
 
     # Lead (lead.py)
-    lead_odds: float = assumed(25.0, "", "log odds that show a period, against none and any other", "look-elsewhere")
+    lead_odds: float = assumed(
+        25.0, "", "log odds that establish a period, against none and any other", "look-elsewhere"
+    )
 
     # Thermal (thermal.py)
     rate_persistence: float = assumed(3600.0, "s", "how long the rate of a temperature persists", "machines and rooms")
-    clear_evidence: float = assumed(10.0, "", "log evidence that shows a time constant", "odds of 22,000 : 1")
-    known_expansion: float = assumed(20e-6, "1/K", "expansion that surprises in no material", "aluminium: 23e-6")
-    known_moisture: float = assumed(5e-4, "m/m", "swelling that surprises in no material", "polymers, dry to damp")
+    clear_evidence: float = assumed(10.0, "", "log evidence that establishes a time constant", "odds of 22,000 : 1")
+    known_expansion: float = assumed(20e-6, "1/K", "expansion that is plausible for any material", "aluminium: 23e-6")
+    known_moisture: float = assumed(5e-4, "m/m", "swelling that is plausible for any material", "polymers, dry to damp")
 
-    # Changes of a machine since its fit (changes.py, check.py); each has some standard deviations, equally likely
+    # Changes of a machine since its fit (changes.py, check.py); each has several standard deviations, equally likely
     prior_odds: tuple[float, ...] = assumed(
         (1.0, 1.0, 1.0, 1.0, 0.125, 0.25, 0.5),
         "",
-        "of datum, strut, temperature, payload, ageing, a wrong reading and all else",
-        "ageing as likely as each of the last one's four groups: each can stand for the other",
+        "of datum, strut, temperature, payload, ageing, a wrong reading and all others",
+        "ageing as likely as each of the last one's four groups: each can represent the other",
     )
     moved: tuple[float, ...] = assumed(
         (3e-6, 1e-5, 3e-5, 1e-4, 3e-4), "m", "how far joints, struts or the datum may have moved", "wear to crash"
@@ -85,27 +94,31 @@ class Assumptions:
         (1e-6, 3e-6, 1e-5, 3e-5), "m", "wear of one screw's backlash", "preload lost"
     )
     wrong_reading: tuple[float, ...] = assumed(
-        (5.0, 20.0, 100.0, 1000.0), "σ", "how far off one wrong reading may be", "a slip of a digit"
+        (5.0, 20.0, 100.0, 1000.0), "σ", "size of one wrong reading", "a slip of a digit"
     )
     scattered: tuple[float, ...] = assumed(
         (2.0, 5.0, 20.0, 100.0), "σ", "additional scatter of all readings", "air, vibration"
     )
-    false_alarms: float = assumed(0.01, "", "share of unchanged machines that may be called changed", "usual level")
+    false_alarms: float = assumed(
+        0.01, "", "share of unchanged machines that may be reported as changed", "usual level"
+    )
     sure: float = assumed(
         0.9, "", "share of the probability at which one kind of change is stated", "chosen: 10 % wrong"
     )
-    surely: float = assumed(4.0, "σ", "changes, or a negative backlash, of this size are surely there", "1 in 16,000")
+    surely: float = assumed(4.0, "σ", "size beyond which changes, or a negative backlash, are certain", "1 in 16,000")
     # Trust (trust.py, promise.py)
     misfit: tuple[float, float, float] = assumed(
-        (1.5, 3.0, 10.0), "", "noise found over noise stated: remarked on, in doubt, refused", "χ² of 2.25, 9, 100"
+        (1.5, 3.0, 10.0), "", "noise found over noise stated: noted, in doubt, refused", "χ² of 2.25, 9, 100"
     )
     jackknife_prior: float = assumed(
-        3.0, "", "freedom with which a covariance is believed", "most likely by benchmarks.promise --ablate"
+        3.0, "", "degrees of freedom assigned to a covariance", "most likely by benchmarks.promise --ablate"
     )
     drift: float = assumed(11.5e-6, "m/m", "prior of the scale's change over a campaign", "steel by 1 K")
-    clear: float = assumed(3.0, "σ", "a drift, a discrepancy or runs that differ by no chance", "1 in 370")
-    lack_margin: float = assumed(1.5, "", "a discrepancy elsewhere, at most, over that of the readings", "chosen")
-    fine_terms: float = assumed(0.3, "", "how well coarse terms of a field tell the fine ones, log", "factor of 1.35")
+    clear: float = assumed(3.0, "σ", "significance of a drift, a discrepancy or a difference between runs", "1 in 370")
+    lack_margin: float = assumed(1.5, "", "largest ratio of a discrepancy elsewhere to that at the readings", "chosen")
+    fine_terms: float = assumed(
+        0.3, "", "uncertainty of a field's fine terms given the coarse ones, log", "factor of 1.35"
+    )
     scales: tuple = assumed(
         (("linear", 0.5e-6), ("length", 0.5e-6), ("position", 10e-6)), "m/m", "scale of an instrument, 1 σ", "classes"
     )
@@ -113,7 +126,9 @@ class Assumptions:
 
     # Mix-ups (mixups.py)
     mixup_odds: float = assumed(1e4, "", "prior odds against any one mix-up", "1 campaign in 100, some 100 ways")
-    mistaken: float = assumed(10.0, "", "a mistake that all readings share, over what is usual", "1 mm; 200 ppm")
+    mistaken: float = assumed(
+        10.0, "", "ratio of a mistake common to all readings to the usual deviation", "1 mm; 200 ppm"
+    )
     usual_scale: float = assumed(20e-6, "m/m", "scale that screws and instruments may share, 1 σ", "steel by 2 K")
 
     # Design of measurements (design.py, candidates.py)

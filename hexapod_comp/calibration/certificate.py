@@ -1,4 +1,4 @@
-"""A calibration certificate: one page to be filed, whose figures are those of the fit's report."""
+"""A calibration certificate: one page to file, with the figures of the fit's report."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 
 FORMAT, VERSION = "hexapod_comp/certificate", 1
 COVERAGE = 2.0  # coverage factor k of expanded uncertainties: about 95 %
-# What no readings tell: keys of a details file, and what they are called. What is not given is left to be written by
-# hand.
+# Information that readings do not contain: keys of a details file, and their titles. Missing entries are left to be
+# written by hand.
 DETAILS = {
     "number": "certificate number",
     "customer": "customer",
@@ -53,7 +53,7 @@ DETAILS = {
     "environment": "environment",
 }
 
-# What reads each kind of channel
+# Instrument of each kind of channel
 INSTRUMENTS = {
     "linear": "linear laser",
     "straightness": "straightness optics",
@@ -69,7 +69,7 @@ MOST_RUNS = 200  # runs beyond these are counted, not listed
 
 @dataclass(frozen=True)
 class Details:
-    """What the readings do not tell."""
+    """Information that the readings do not contain."""
 
     texts: dict[str, str]  # by the keys of DETAILS
     instruments: tuple[str, ...] = ()  # type, serial number and calibration of each
@@ -95,11 +95,11 @@ def load_details(path: str | Path) -> Details:
 
 @dataclass(frozen=True)
 class Filed:
-    """What was written with the certificate."""
+    """Files written with the certificate."""
 
     model: str  # name of the model
     files: tuple[Path, ...]  # the model's file, and those beside it
-    report: str  # the fit's, as printed; with what it opens, before it names the machine, the certificate opens
+    report: str  # the fit's report as printed; the certificate opens with the warnings before its first machine line
 
 
 def certificate_text(fit: ModelFit, filed: Filed, details: Details | None = None) -> str:
@@ -150,7 +150,7 @@ def _identity(fit: ModelFit, filed: Filed, details: Details) -> Rows:
 
 
 def _result(fit: ModelFit) -> Rows:
-    """Return the machine's error before and after compensation, µm and µrad; none where nothing is promised."""
+    """Return the machine's error before and after compensation, µm and µrad; none without a predicted interval."""
     if fit.level is None:
         return []
     rows: Rows = []
@@ -199,7 +199,7 @@ def _humidity(fit: ModelFit) -> Rows:
 
 
 def _measured(fit: ModelFit) -> Rows:
-    """Return what was measured: how many readings on which runs."""
+    """Return the number of readings on each kind of run."""
     m = fit.measurements
     lines = sum(run.is_line for run in m.runs)
     counts = {"lines": lines, "other runs": len(m.runs) - lines}
@@ -232,7 +232,7 @@ def _tests(before: Judged, after: Judged) -> Iterator[dict[str, object]]:
 
 
 def _circles(before: dict[str, CircularTest], after: dict[str, CircularTest]) -> dict[str, object]:
-    """Return the tests of circles: each figure before → after, µm, a dash where a test cannot tell."""
+    """Return the tests of circles: each figure before → after, µm, a dash where a test is not possible."""
     rows = []
     for name, test in before.items():
         cells = figure_cells(CIRCLE_COLUMNS, 2, test.figures, after[name].figures)
@@ -259,7 +259,7 @@ def _figures(fit: ModelFit) -> list[tuple[str, Figure]]:
     if fit.model.region is not None:
         text = "Error in space before compensation, and what is expected after it, at three heights of the measured box"
         figures.append((text, before_after_figure(fit)))
-    text = "What the fit leaves of each reading, over its stated standard uncertainty; the band is ± U (k = 2)"
+    text = "Residual of each reading, over its stated standard uncertainty; the band is ± U (k = 2)"
     return [*figures, (text, residuals_by_run_figure(fit))]
 
 

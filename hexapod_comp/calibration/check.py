@@ -1,4 +1,4 @@
-"""Is a model still valid? A few check readings, weighed by the Bayes factor of each change that may have happened.
+"""Is a model still valid? Check readings are weighed by the Bayes factor of each possible change.
 
 The readings of an unchanged machine scatter about its model by N(0, S), S = J·Σ·Jᵀ + noise. A change moves parameters
 by A·θ, θ ~ N(0, s²), with several scales s, equally likely: under it they are N(0, S + s²·J·A·Aᵀ·Jᵀ).
@@ -40,7 +40,7 @@ UNCHANGED_DRAWS = 4000  # machines drawn to find the false alarms: 1 % to ± 0.1
 
 DATUM, STRUT, TEMPERATURE, PAYLOAD = "datum", "strut", "temperature", "payload"
 AGEING, READING, OTHER = "ageing", "reading", "other"
-# Kinds of change, and what each is called. All but payload and the last two few readings can repair.
+# Kinds of change with their names. Few readings can repair all but payload and the last two.
 FAMILIES = {
     DATUM: "the datum has moved",
     STRUT: "a strut's offset has changed",
@@ -52,24 +52,26 @@ FAMILIES = {
 }
 
 HEAVIER = "heavier or lighter"  # the name of a change of the payload in its centre
-RIDGE = 1e-8  # beside the trace: parameters that stand for a payload then stay small at the corners of the box too
-ROUNDING = 1e-9  # directions of readings or effects that are smaller, beside the largest, are rounding
+# weight relative to the trace: parameters that represent a payload then stay small at the corners of the box too
+RIDGE = 1e-8
+ROUNDING = 1e-9  # directions of readings or effects that are smaller, relative to the largest, are rounding
 
 
 @dataclass(frozen=True)
 class Change:
-    """One thing that may have happened: parameters move by `columns`·θ, θ ~ N(0, scale²)."""
+    """One possible change: parameters move by `columns`·θ, θ ~ N(0, scale²)."""
 
     family: str  # of FAMILIES
     name: str
     scales: np.ndarray  # (m,): standard deviations of θ
     columns: np.ndarray | None = None  # (size, k), SI; None: readings have changed, not the machine
-    shown: tuple[tuple[str, float, str], ...] = ()  # label, factor, unit of each θ; empty: they mean nothing one by one
-    group: str = ""  # changes of a kind that are alike; all groups of a kind are equally likely beforehand
+    # label, factor, unit of each θ; empty: they have no meaning one by one
+    shown: tuple[tuple[str, float, str], ...] = ()
+    group: str = ""  # similar changes of a kind; all groups of a kind are equally likely beforehand
 
 
 def widened(fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS) -> FittedParameters:
-    """Return what a fit knows, in a space that has more blocks; these are zero and, so far, certain."""
+    """Return a fit's result in a space with more blocks; these are zero and, so far, certain."""
     old = fitted.space
     kept = {block.name for block in old.blocks}
     settings = replace(old.settings, blocks=tuple(name for name in BLOCKS if name in kept or name in blocks))
@@ -84,7 +86,7 @@ def widened(fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS) -> Fitte
 
 
 def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Change]:
-    """Return what may have happened to a machine, in a space that has all blocks; those of its fit, `modelled`, age."""
+    """Return the possible changes of a machine, in a space that has all blocks; those of its fit, `modelled`, age."""
     geometry, unit = space.geometry, np.eye(space.size)
     start, count = space.blocks[0].part.start, int(space.platform_groups.max()) + 1
     base = start + np.arange(18).reshape(6, 3)
@@ -122,7 +124,7 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 
     changes += payload_changes(space)
 
-    # Ageing and a bend can stand for each other: were one's scales coarser, the other would win, whichever is true.
+    # Ageing and a bend can represent each other: if one's scales were coarser, the other would win, whichever is true.
     prior = space.physical(np.diag(space.spread(space.start_tolerances())))
     owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
     aged, bend = prior[:, np.isin(owner, modelled)], prior[:, np.isin(owner, ("field displacement", "field rotation"))]
@@ -141,11 +143,11 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 
 
 def payload_changes(space: ParameterSpace) -> list[Change]:
-    """Return that the machine carries more or less, in its centre or beside it, as parameters that move it alike.
+    """Return a change of the payload, in the machine's centre or beside it, as parameters with the same effect.
 
     The stretch of struts under a weight is a smooth function of the pose; over the measured box, level and tilted, the
-    parameters that do the same and surprise least stand for it. Where no stiffness is stated, all struts have an
-    assumed one, and masses are so many kg at that.
+    most probable parameters with that effect represent it. Where no stiffness is stated, all struts have an assumed
+    one, and masses are so many kg at that.
     """
     stations = [box_stations(space, tilt) for tilt in (0.0, TILT)]
     if stations[0] is None or stations[1] is None:
@@ -165,7 +167,8 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
     rows, errors = (np.concatenate(each) for each in zip(*parts, strict=True))
     rows[:, 3:] *= space.geometry.characteristic_length
     errors[:, 3:] *= space.geometry.characteristic_length
-    smooth = ("structure", "pitch", "map", "field displacement", "field rotation")  # none that hangs on load or warmth
+    # none that depends on load or warmth
+    smooth = ("structure", "pitch", "map", "field displacement", "field rotation")
     owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
     prior = space.physical(np.diag(space.spread(space.start_tolerances())))[:, np.isin(owner, smooth)]
     design = rows.reshape(-1, space.size) @ prior
@@ -183,18 +186,18 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
 
 @dataclass(frozen=True)
 class CheckReadings:
-    """Check readings beside what a model and its fit expect, as n numbers free of what the instruments do not know."""
+    """Check readings with the prediction of a model and its fit, as n numbers free of the instruments' unknowns."""
 
-    residuals: np.ndarray  # (n,): what the fit does not expect of them, in standard deviations
-    rows: np.ndarray  # (n, size): how the parameters move them
-    noise: np.ndarray  # (n, n): their covariance where the machine is known
-    single: np.ndarray  # (n, places): the effect of one reading that is wrong by one of its standard deviations
+    residuals: np.ndarray  # (n,): deviations from the fit's prediction, in standard deviations
+    rows: np.ndarray  # (n, size): derivatives by the parameters
+    noise: np.ndarray  # (n, n): their covariance if the machine is known
+    single: np.ndarray  # (n, places): effect of one reading that is wrong by one of its standard deviations
     names: tuple[str, ...]  # of the places
     seen: np.ndarray = field(repr=False)  # (n, places): the numbers, as orthonormal combinations of the places
 
     @staticmethod
     def of(fitted: FittedParameters, measurements: MeasurementSet, x: np.ndarray | None = None) -> CheckReadings:
-        """Return readings beside a fit in a space that has all blocks; linearised at `x` where that is given."""
+        """Return readings with a fit in a space that has all blocks; linearised at `x` if given."""
         space = fitted.space
         away = float(np.abs(measurements.probe - space.probe).max())
         if away > ROUNDING:
@@ -209,7 +212,7 @@ class CheckReadings:
         free, sizes, _ = np.linalg.svd(estimation.free_of_nuisance(np.eye(len(cells.kind))))
         seen = free[:, sizes > ROUNDING * sizes.max(initial=0.0)].T
         if not len(seen):
-            problem = "tell nothing: the unknown zeros of their runs take all of them; read more places of each run"
+            problem = "determine nothing: the zeros of their runs account for all of them; read more places of each run"
             raise CalibrationError("measurements", problem)
         rows, sigma = seen @ space.unwhitened(linear.rows.dense()), fitted.noise[cells.kind]
         m = measurements
@@ -218,16 +221,17 @@ class CheckReadings:
         return CheckReadings(residuals, rows, (seen * sigma**2) @ seen.T, seen * sigma, names, seen)
 
     def covariance(self, of_parameters: np.ndarray) -> np.ndarray:
-        """Return the readings' covariance when the parameters have one, shape (n, n)."""
+        """Return the readings' covariance for a covariance of the parameters, shape (n, n)."""
         return self.noise + self.rows @ of_parameters @ self.rows.T
 
     def chi_square(self, of_parameters: np.ndarray | float = 0.0) -> float:
-        """Return the squared differences over those to expect when the parameters have a covariance, per number."""
+        """Return the squared deviations over the expected ones for a covariance of the parameters, per number."""
         covariance = self.noise if np.isscalar(of_parameters) else self.covariance(np.asarray(of_parameters))
         return float(self.residuals @ np.linalg.solve(covariance, self.residuals)) / len(self.residuals)
 
     def effects(self, changes: Sequence[Change]) -> Iterator[tuple[Change, np.ndarray]]:
-        """Yield what may have happened with its effect (n, k): changes, one wrong reading, or more scatter in all."""
+        """Yield the possible explanations with their effects (n, k): changes, one wrong reading, or more scatter in
+        all."""
         for change in changes:
             yield change, self.rows @ change.columns
         yield from wrong_readings(self.single, self.names)
@@ -242,11 +246,11 @@ def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[C
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A change as readings see it, in coordinates in which those of an unchanged machine are N(0, 1)."""
+    """A change in coordinates in which the readings of an unchanged machine are N(0, 1)."""
 
     change: Change
     directions: np.ndarray  # (n, k), orthonormal
-    gains: np.ndarray  # (k,): how large the effect of θ = 1 is along them
+    gains: np.ndarray  # (k,): effect of θ = 1 along them
     least_gain: float  # of all θ; 0 where one moves no reading
     log_prior: float = 0.0  # of each of its scales
 
@@ -270,7 +274,7 @@ class Hypothesis:
 
 
 class Evidence:
-    """Changes, given with their effects (n, k) on readings that have a covariance where nothing has changed."""
+    """Changes with their effects (n, k) on readings whose covariance is known for an unchanged machine."""
 
     def __init__(self, covariance: np.ndarray, effects: Iterable[tuple[Change, np.ndarray]]) -> None:
         self._whitening = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -291,7 +295,7 @@ class Evidence:
         return [h.log_bayes_factors(z) + h.log_prior for h in self.hypotheses]
 
     def probability_unchanged(self, readings: np.ndarray) -> float:
-        """Return in which share of checks a machine that has not changed reads as strangely as this, or more so."""
+        """Return the share of checks in which an unchanged machine's readings deviate as much as these, or more."""
         z = np.random.default_rng(11).standard_normal((UNCHANGED_DRAWS, len(readings)))
         z = np.vstack([self._whitening @ readings, z])
         changed = np.logaddexp.reduce(np.concatenate(self._of_whitened(z), axis=1), axis=1)
@@ -300,14 +304,14 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Explanation:
-    """Mean and covariance of the parameters' difference from the fit's if one explanation of readings is right."""
+    """Mean and covariance of the parameters' difference from the fit's under one explanation of the readings."""
 
     mean: np.ndarray  # (size,), SI
     covariance: np.ndarray  # (size, size)
 
     @staticmethod
     def of(check: CheckReadings, fitted: FittedParameters, change: Change | None, scale: float = 0.0) -> Explanation:
-        """Return what readings make of the parameters if a change of one scale has happened; None: no change."""
+        """Return the parameters' posterior given the readings and a change of one scale; None: no change."""
         prior = fitted.covariance
         if change is not None and change.columns is not None:
             prior = prior + scale**2 * change.columns @ change.columns.T
@@ -316,11 +320,11 @@ class Explanation:
         return Explanation(gain @ check.residuals, prior - gain @ reached)
 
 
-# Which readings tell two explanations apart
+# Readings that distinguish two explanations
 
 
 def places(readings: MeasurementSet) -> Iterator[tuple[str, tuple[str, ...], np.ndarray]]:
-    """Yield each line and each scattered pose of readings: where, which channels, and the readings' numbers."""
+    """Yield each line and each scattered pose of readings: place, channels, and the readings' numbers."""
     on_line = np.array([run.is_line for run in readings.runs])[readings.run]
     key = np.where(on_line, -1 - readings.run, readings.station)
     tips, _ = readings.geometry.tool_poses(readings.stations.positions, readings.stations.rotations)
@@ -334,18 +338,18 @@ def places(readings: MeasurementSet) -> Iterator[tuple[str, tuple[str, ...], np.
 
 @dataclass(frozen=True)
 class Settling:
-    """Readings that would tell two explanations apart."""
+    """Readings that would distinguish two explanations."""
 
     name: str  # a line with its ends, or a pose
     channels: tuple[str, ...]  # what to read there
     readings: int
-    odds: float  # log of the odds to expect for the right explanation over the wrong one, whichever is right
+    odds: float  # expected log odds for the true explanation over the wrong one, for the worse case
 
 
 def settle(
     fitted: FittedParameters, measured: MeasurementSet, explanations: tuple[Explanation, Explanation]
 ) -> list[Settling]:
-    """Return the three readings that would tell two explanations of `measured` apart best, with its instruments."""
+    """Return the three readings that would best distinguish two explanations of `measured`, with its instruments."""
     space, kinds = fitted.space, np.unique(measured.kind)
     by_pose = np.isin(np.array(KINDS)[kinds], ABSOLUTE_KINDS)
     sets = [laid_out(space, lines=2)] if not by_pose.all() else []
@@ -381,13 +385,13 @@ VALID, NAMED, UNDECIDED, UNEXPLAINED = "valid", "named", "undecided", "unexplain
 
 @dataclass(frozen=True)
 class Candidate:
-    """What may have happened, and how well the readings bear it out."""
+    """A possible change, and its probability given the readings."""
 
     change: Change
     probability: float  # among all changes, given that there is one
     scale: float  # the most probable of its scales
-    coefficients: np.ndarray  # (k,): how large each θ of Change.shown is, SI; empty where they mean nothing one by one
-    deviations: np.ndarray  # (k,): how well that is known
+    coefficients: np.ndarray  # (k,): size of each θ of Change.shown, SI; empty where they have no meaning one by one
+    deviations: np.ndarray  # (k,): their standard errors
 
     @property
     def family(self) -> str:
@@ -401,7 +405,7 @@ class Candidate:
 
     @property
     def sizes(self) -> list[dict[str, Any]]:
-        """Each θ that is shown: name, value, standard_error and unit, as JSON lists it and the text prints it."""
+        """Each displayed θ: name, value, standard_error and unit, for JSON and text."""
         return [
             {"name": label, "value": value * factor, "standard_error": deviation * factor, "unit": unit}
             for (label, factor, unit), value, deviation in zip(
@@ -412,7 +416,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Verification:
-    """What check readings say of a model.
+    """Result of check readings for a model.
 
     Attributes
     ----------
@@ -474,7 +478,7 @@ def verify_model(
     measurements: MeasurementSet,
     false_alarms: float = ASSUMED.false_alarms,
 ) -> Verification:
-    """Return whether a model still holds, and if not, what has probably happened.
+    """Return whether a model still holds, and if not, the most probable change.
 
     Parameters
     ----------
@@ -525,7 +529,7 @@ def verify_model(
 
 
 def _beyond_loads(model: MachineModel, readings: MeasurementSet) -> list[str]:
-    """Return remarks on readings taken under loads for which the model promises nothing."""
+    """Return notes on readings taken under loads outside the model's."""
     loads = measured_loads(model.load, readings.geometry, readings.stations)
     said = (beyond_loads(model.origin.loads, Payload(row[0], (row[1], row[2], row[3])), row[4:]) for row in loads)
     return [f"read under another load than the model: {text}" for text in dict.fromkeys(said) if text]
@@ -556,7 +560,7 @@ def _candidates(
 
 
 def _visible(evidence: Evidence) -> dict[str, float]:
-    """Return the smallest change of a kind that is surely seen, whichever strut, body or direction it is of."""
+    """Return the smallest change of a kind that is certainly detected, for any strut, body or direction."""
     sizes: dict[str, float] = {}
     for hypothesis in evidence.hypotheses:
         family = hypothesis.change.family
@@ -567,7 +571,8 @@ def _visible(evidence: Evidence) -> dict[str, float]:
 
 
 def _tool(model: MachineModel, fitted: FittedParameters, change: Explanation) -> tuple[float, float] | None:
-    """Return how far a change moves the tool in the measured box, RMS, as it stands and with the datum aligned, m."""
+    """Return the tool's displacement in the measured box by a change, RMS, as it stands and with the datum aligned,
+    m."""
     space, region = fitted.space, model.measured
     if region is None:  # no box in which a datum could be aligned
         return None
@@ -576,7 +581,7 @@ def _tool(model: MachineModel, fitted: FittedParameters, change: Explanation) ->
         _, *slopes, _ = ErrorPredictor(RealMachine(space.geometry, model), fitted).slopes(
             region.poses(places, space.level)
         )
-    except CalibrationError:  # hardly a pose of the box can be reached
+    except CalibrationError:  # hardly any pose of the box can be reached
         return None
     standing, aligned = (np.linalg.norm(part[:, :3] @ change.mean, axis=1) for part in slopes)
     return rms(standing[np.isfinite(standing)]), rms(aligned[np.isfinite(aligned)])
@@ -587,12 +592,12 @@ class Update:
     """A renewed model."""
 
     model: MachineModel
-    fitted: FittedParameters  # what is known of its parameters now
-    chi_square: float  # squared differences of the readings from it over their noise, per independent number
+    fitted: FittedParameters  # the new posterior of its parameters
+    chi_square: float  # squared residuals over their noise, per independent number
 
 
 def refusal(verification: Verification) -> str:
-    """Return why few readings cannot renew a model; empty where they can."""
+    """Return why few readings cannot renew a model; empty if they can."""
     best = verification.candidates[0].change
     if verification.doubts:
         return f"the readings may be others than they are taken for: {verification.doubts[0]}"
@@ -697,7 +702,7 @@ def _mixture(check: CheckReadings, prior: FittedParameters, changes: list[Change
 
 
 def verification_report(result: Verification) -> str:
-    """Return what check readings say of a model, for people."""
+    """Return the result of a check as text."""
     m, region = result.measurements, result.model.measured
     parts = [
         f"machine {m.geometry.name}, model {result.model.name!r}: {len(m)} check readings of {len(np.unique(m.run))} "
@@ -731,7 +736,7 @@ def verification_report(result: Verification) -> str:
 
 
 def _verdict(result: Verification) -> Iterator[str]:
-    """Yield whether the model is valid, and what has happened."""
+    """Yield whether the model is valid, and the most probable change."""
     best, percent = result.candidates[0], f"{100.0 * result.usual:.2g} %"
     if result.verdict == VALID:
         yield f"VALID: a machine that has not changed reads as strangely as this in {percent} of checks"
@@ -753,7 +758,7 @@ def _verdict(result: Verification) -> Iterator[str]:
 
 
 def _described(candidate: Candidate) -> str:
-    """Return what a candidate is, with sizes where they mean something."""
+    """Return a candidate's name, with sizes where they have a meaning."""
     sizes = {s["name"]: f"{s['value']:+.3g} ± {s['standard_error']:.2g} {s['unit']}" for s in candidate.sizes}
     if len(sizes) < 2:
         return " by ".join((candidate.name, *sizes.values()))
@@ -766,8 +771,8 @@ def _odds(logarithm: float) -> str:
 
 
 def _visible_text(result: Verification) -> Iterator[str]:
-    """Yield the smallest changes that these readings surely show."""
-    most = 1e-3  # m or m/m: larger ones are not worth naming
+    """Yield the smallest changes that these readings certainly show."""
+    most = 1e-3  # m or m/m: larger ones are not worth listing
     for family, name, unit in ((STRUT, "any strut's offset", "µm"), (TEMPERATURE, "growth by temperature", "ppm")):
         size = result.visible.get(family, math.inf)
         if size > most:
@@ -779,7 +784,7 @@ def _visible_text(result: Verification) -> Iterator[str]:
 
 
 def update_report(update: Update, written: str) -> str:
-    """Return what renewing a model did, for people."""
+    """Return the result of a renewal as text."""
     head = (
         f"renewed; χ² of the readings against the new model: {update.chi_square:.3g} per number, by their noise alone"
     )
@@ -788,7 +793,7 @@ def update_report(update: Update, written: str) -> str:
 
 
 def verification_json(result: Verification) -> dict:
-    """Return a check as plain numbers; SI units are in the keys, or stand beside numbers as ``unit``."""
+    """Return a check as plain numbers; units are in the keys, or beside numbers as ``unit``."""
     return {
         "machine": result.measurements.geometry.name,
         "model": result.model.name,

@@ -1,8 +1,8 @@
-"""Where a machine stands as a whole: which part of it readings do not show, and the pose at which that part is held.
+"""Where a machine stands as a whole: the part that readings do not show, and the pose at which it is held.
 
-Shift and turn the whole machine, and a laser line reads the same: its zero, and where its beam lies, are unknown. What
-readings do not show, only the priors would decide. So it is held where a shop needs it: at a datum pose the model moves
-the tool by nothing, and a workpiece zero set there stays.
+If the whole machine is shifted and turned, a laser line reads the same: its zero and its beam's place are unknown.
+Otherwise only the priors would decide the part that readings do not show. So it is held where a workshop needs it: at a
+datum pose the model does not move the tool, and a workpiece zero set there stays valid.
 """
 
 from __future__ import annotations
@@ -25,24 +25,26 @@ from .sensitivity import carried
 
 @dataclass(frozen=True)
 class HeldDatum:
-    """A datum, and which part of the tool's displacement, m, and rotation, rad, in ``base``, is held at zero there."""
+    """A datum, and the part of the tool's displacement, m, and rotation, rad, in ``base``, that is held at zero
+    there."""
 
     pose: Pose  # pose_platform_in_base
     part: np.ndarray  # (6, 6), a projection
-    given_up: np.ndarray  # (6,), by how much the priors alone would move the tool: the held part is not in the model
+    # (6,), the tool's displacement and rotation by the priors alone: the model does not contain the held part
+    given_up: np.ndarray
 
     @property
     def held(self) -> int:
-        """In how many of the six ways to shift and turn the whole machine the tool is held."""
+        """The number of the six ways to shift and turn the whole machine in which the tool is held."""
         return round(float(np.trace(self.part)))
 
     @property
     def datum(self) -> Datum:
-        """What a model file says of it."""
+        """Its text in a model file."""
         return Datum.at(self.pose, self.held)
 
     def moved(self, arms: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """Return by how much holding moved the machine at places that are arms (N, 3), m, beside the tool there.
+        """Return the machine's motion by holding, at places that are arms (N, 3), m, from the tool at the datum.
 
         Shape (N, 6), m and rad, along and about the columns of `axes`, (3, 3) in ``base``.
         """
@@ -50,7 +52,7 @@ class HeldDatum:
         return carried(np.tile(there[:, None], (len(arms), 1, 1)), arms)[:, :, 0]
 
     def report(self) -> str:
-        """Return what is held and why, for people."""
+        """Return the held ways and the reason, as text."""
         lengths = np.linalg.norm(self.given_up[:3]) * 1e6, np.linalg.norm(self.given_up[3:]) * 1e6
         moved = "{:.2f} µm and {:.2f} µrad".format(*lengths)
         of_six = f"Of six ways to shift and turn the whole machine the readings do not show {self.held}; in these the"
@@ -82,7 +84,7 @@ def refuse_unreachable(geometry: HexapodGeometry, pose: Pose) -> None:
 def hold(
     geometry: HexapodGeometry, model: MachineModel, pose: Pose, part: np.ndarray
 ) -> tuple[MachineModel, HeldDatum]:
-    """Return a model that holds a part of the tool's error at a pose, in a model file's digits, and what is held.
+    """Return a model that holds a part of the tool's error at a pose, in a model file's digits, and that part.
 
     A pose that a limit of the machine forbids is refused.
     """
@@ -97,12 +99,12 @@ def hold(
 def unseen_part(
     estimation: Estimation, tolerance: float, noise: np.ndarray, pose: Pose, before: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return which part of the tool's error at a pose is a motion of the whole machine that readings do not show.
+    """Return the part of the tool's error at a pose that is a motion of the whole machine that readings do not show.
 
-    A motion is seen when one of the structure's `tolerance`, m, changes the readings, free of what their instruments do
-    not know (zeros, a beam's direction, a tracker's frame), by more than their `noise`, factors on what is stated.
-    `before` is the part that earlier readings did not show either. The result, (6, 6), projects displacement, m, and
-    rotation, rad, in ``base``; rotations weigh as displacements at the machine's characteristic length.
+    A motion is seen when one of the structure's `tolerance`, m, changes the readings, free of their instruments'
+    unknowns (zeros, a beam's direction, a tracker's frame), by more than their `noise`, factors on the stated. `before`
+    is the part that earlier readings did not show either. The result, (6, 6), projects displacement, m, and rotation,
+    rad, in ``base``; rotations weigh as displacements at the machine's characteristic length.
     """
     measurements, cells = estimation.measurements, estimation.cells
     geometry = measurements.geometry
@@ -119,6 +121,6 @@ def unseen_part(
 
 
 def _range(projection: np.ndarray) -> np.ndarray:
-    """Return orthonormal columns that span what an orthogonal projection leaves, shape (n, k)."""
+    """Return orthonormal columns that span the null space of an orthogonal projection, shape (n, k)."""
     shares, directions = np.linalg.eigh(0.5 * (projection + projection.T))
     return directions[:, shares > 0.5]

@@ -1,8 +1,8 @@
-"""What to measure: candidates, what each would show, and the best of them by a criterion.
+"""What to measure: candidates, the information of each, and the best of them by a criterion.
 
-In parameters z of unit variance so far, readings A of unit noise, free of nuisances, turn their covariance C into
-C − CAᵀ(I + ACAᵀ)⁻¹AC, whatever they will read. So :class:`Greedy` chooses, before anyone measures, the candidate that
-gains most for what it costs.
+In parameters z of unit prior variance, readings A of unit noise, free of nuisances, turn their covariance C into C −
+CAᵀ(I + ACAᵀ)⁻¹AC, independent of the values read. So :class:`Greedy` chooses in advance the candidate with the largest
+gain per cost.
 """
 
 from __future__ import annotations
@@ -43,12 +43,13 @@ from .posterior import POINTS, Observability, ToolError, UnseenError, box_errors
 from .promise import Scatter, Unexplained
 from .trust import TILT
 
-FAINT = 0.05  # directions that readings see by less are left out, σ
-LEAST_REACHED = 0.3  # share of the box in which the tool must tilt as wanted
+FAINT = 0.05  # directions with a smaller effect on readings are omitted, σ
+LEAST_REACHED = 0.3  # share of the box in which the tool must reach the wanted tilt
 
 
 def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) -> tuple[np.ndarray, Cells]:
-    """Return how the parameters y move readings, (cells, size), over their stated noise and free of nuisances."""
+    """Return the derivatives of readings by the parameters y, (cells, size), over their stated noise and free of
+    nuisances."""
     estimation = Estimation(readings, space, alone=False)
     problem, _ = estimation.linearise(x, np.ones(len(readings)))
     return problem.rows.dense(), estimation.cells
@@ -60,10 +61,10 @@ TILTS = (10.0, 5.0, 2.0)  # of scattered poses, °: the first within reach
 
 
 class Criterion(Protocol):
-    """What candidates are chosen by; it knows which have been taken."""
+    """A criterion for choosing candidates; it stores those already chosen."""
 
     def gains(self, allowed: np.ndarray) -> np.ndarray:
-        """Return by how much each allowed candidate would improve it."""
+        """Return the improvement by each allowed candidate."""
 
     def add(self, n: int) -> None:
         """Take a candidate."""
@@ -73,15 +74,16 @@ C = TypeVar("C", bound=Criterion)
 
 
 class Greedy(Generic[C]):
-    """Candidates taken one by one, each time the one that gains most for its cost, as long as a budget lasts."""
+    """Candidates chosen one by one, each time the one with the largest gain per cost, within a budget."""
 
     def __init__(
         self,
         criterion: C,
         costs: np.ndarray,  # of each candidate
-        needs: Sequence[str] = (),  # what must be put up for it; nothing by default
-        putting_up: Mapping[str, float] | None = None,  # what that costs, once
-        after: np.ndarray | None = None,  # the candidate that must be taken before it, or -1: then each is taken once
+        needs: Sequence[str] = (),  # instrument to set up for it; none by default
+        putting_up: Mapping[str, float] | None = None,  # cost of that set-up
+        # index of the candidate that must be chosen before it, or -1: then each is chosen once
+        after: np.ndarray | None = None,
     ) -> None:
         self.criterion, self.costs, self.putting_up = criterion, costs, putting_up or {}
         self.needs = list(needs) or [""] * len(costs)
@@ -90,12 +92,12 @@ class Greedy(Generic[C]):
         self.spent = 0.0
 
     def totals(self) -> np.ndarray:
-        """Return what would have been spent after each candidate."""
+        """Return the total cost after each candidate."""
         up = {self.needs[n] for n in self.picks}
         return self.spent + self.costs + [0.0 if name in up else self.putting_up.get(name, 0.0) for name in self.needs]
 
     def extend(self, budget: float, enough: Callable[[], bool] = lambda: False, most: int = 400) -> None:
-        """Take candidates until there is enough, none gains or is affordable, or `most` have been taken."""
+        """Choose candidates until the goal is met, none gains or is affordable, or `most` have been chosen."""
         most += len(self.picks)
         while len(self.picks) < most and not enough():
             totals = self.totals()
@@ -117,7 +119,7 @@ class ErrorLeft:
 
     def __init__(self, seen: Sequence[np.ndarray], square: np.ndarray) -> None:
         values, vectors = np.linalg.eigh(square)
-        kept = values > 1e-9 * values[-1]  # the others add next to nothing to the tool's error
+        kept = values > 1e-9 * values[-1]  # the others contribute almost nothing to the tool's error
         root = vectors[:, kept] * np.sqrt(values[kept])
         self.parts = [slice(*pair) for pair in pairwise(np.cumsum([0, *(len(rows) for rows in seen)]))]
         rows = np.concatenate(seen)
@@ -159,7 +161,7 @@ class ErrorLeft:
             gram -= along[part] @ along[part].T
 
     def after_all(self, times: float = 1.0) -> np.ndarray:
-        """Return C after all candidates, each so many times."""
+        """Return C after all candidates, each repeated."""
         size = np.eye(self.basis.shape[1])
         return self._whole(cho_solve(cho_factor(size + times * self.rows.T @ self.rows), size))
 
@@ -172,7 +174,7 @@ def laid_out(
     tilts: Sequence[float] = (0.0,),
     instrument: str = "6-D",
 ) -> tuple[MeasurementSet, float]:
-    """Return what could be read in a fit's box: `lines` across each direction with diagonals, and scattered poses."""
+    """Return possible readings in a fit's box: `lines` across each direction with diagonals, and scattered poses."""
     box, side, geometry = space.work_box, float(np.ptp(space.work_box, axis=0).min()), space.geometry
     if side <= 0.0:
         raise CalibrationError("fit", "has measured no box in which readings could be laid out")
@@ -194,13 +196,13 @@ def laid_out(
 
 @dataclass(frozen=True)
 class Plan:
-    """What may be expected of a campaign."""
+    """Prediction for a campaign."""
 
     measurements: MeasurementSet  # its readings, without values
     space: ParameterSpace
     observability: Observability
     unseen_errors: tuple[UnseenError, ...]  # machine errors that the readings will not show
-    level: ToolError | None  # to expect after a fit, repeatability included; `before`: machines within the tolerances
+    level: ToolError | None  # after a fit, repeatability included; `before`: machines within the tolerances
     tilted: ToolError | None
     stops: float  # the machine's repeatability as stated, RMS over all three axes, m; 0 where none is
 
@@ -227,21 +229,21 @@ def noise_factors(campaign: Campaign) -> np.ndarray:
     return np.maximum(np.hypot(campaign.noise, stops), 1e-3 * default) / default
 
 
-# What could be measured in a box: lines along and across it, circles, poses; level and tilted
+# Possible measurements in a box: lines along and across it, circles, poses; level and tilted
 
 FEW_POINTS, USUAL_POINTS = (5, 13), (13,)
-# Points of a line, by instrument: few at little cost, or enough to see the screws' waves
+# Points of a line, by instrument: few at little cost, or enough to resolve the screws' waves
 LINE_POINTS = {"linear": (8, 21), "5-D": FEW_POINTS, "6-D": FEW_POINTS}
-# The same where each is read once, on the way there or back: more places for as many readings
+# The same with each point read once, in alternating directions: more places for as many readings
 ALTERNATE_POINTS = {"linear": (4, 6, 10), "5-D": (4, 8), "6-D": (4, 8)}
 
 
 @dataclass(frozen=True)
 class MeasuringBox:
-    """Where a machine is to be measured."""
+    """The box and the attitudes of a measurement."""
 
     geometry: HexapodGeometry  # the machine as designed
-    box: np.ndarray  # (2, 3): lowest and highest corner of the tool's way, m in the work frame
+    box: np.ndarray  # (2, 3): lowest and highest corner of the tool's positions, m in the work frame
     level: np.ndarray  # (3, 3): attitude of the level tool in the work frame
     tilt: float  # largest tilt of the tool from there, rad
 
@@ -264,7 +266,7 @@ class MeasuringBox:
 
 
 def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[CampaignRun]:
-    """Return the runs to choose from, all within the limits of the nominal machine; without any a GeometryError."""
+    """Return the candidate runs, all within the limits of the nominal machine; a GeometryError if there are none."""
     runs: list[CampaignRun] = []
     lines = list(_lines(place)) if any(name in LINE_INSTRUMENTS for name in instruments) else []
     for instrument in instruments:
@@ -287,7 +289,7 @@ def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[Campaign
 
 
 def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield name, ends (2, 3), m, and attitude of each line, as far as the limits let it go."""
+    """Yield name, ends (2, 3), m, and attitude of each line, cut at the limits."""
     low, size = place.box[0], np.ptp(place.box, axis=0)
     level, tilted = [], []
     for axis, (a, b) in enumerate(CROSS_AXES):
@@ -308,8 +310,8 @@ def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     level += diagonals
     tilted += diagonals[:4]
 
-    share = np.linspace(0.0, 1.0, 41)  # points that are examined
-    least = 0.4  # lines of which the limits leave a smaller share are left out
+    share = np.linspace(0.0, 1.0, 41)  # points that are checked
+    least = 0.4  # lines of which a smaller share is within the limits are omitted
     for attitude, rotation in place.attitudes():
         for name, ends in level if attitude == "level" else tilted:
             points = ends[0] + share[:, None] * (ends[1] - ends[0])
@@ -319,7 +321,7 @@ def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
 
 
 def _longest(within: np.ndarray) -> tuple[int, int]:
-    """Return first and last index of the longest stretch; one less at an end where a limit cuts it."""
+    """Return first and last index of the longest stretch; one less at an end that a limit cuts."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], within, [False]]).astype(int)))
     if not len(edges):
         return 0, -1
@@ -356,7 +358,7 @@ def _circles(place: MeasuringBox) -> Iterator[CampaignRun]:
 
 
 def _shares(corners: bool) -> Iterator[np.ndarray]:
-    """Yield where in a box, in shares of its sides: its middle, the middles of its faces, and its corners."""
+    """Yield places of a box, in shares of its sides: its middle, the middles of its faces, and its corners."""
     for index in np.ndindex(3, 3, 3):
         off = sum(i != 1 for i in index)
         if off in (0, 1) or (corners and off == 3):
@@ -407,7 +409,7 @@ class Times:
         return self.run + self.stop * run.count(cycles) / len(run.channels)
 
 
-# What a practised machinist needs, by instrument: those for which there are runs to choose from
+# Times of an experienced machinist, by instrument; for these there are candidate runs
 TIMES = {
     "linear": Times(1200.0, 480.0, 4.0),
     "straightness": Times(1200.0, 900.0, 4.0),
@@ -424,12 +426,12 @@ TIMES = {
 
 @dataclass(frozen=True)
 class Goal:
-    """What is wanted; a :class:`CalibrationError` names values that no goal can have."""
+    """A goal; a :class:`CalibrationError` reports impossible values."""
 
-    error: float  # RMS tool error, the datum aligned, that may be left, m
-    tilt: float = 0.0  # of the tool, up to which it holds, rad
-    instruments: tuple[str, ...] = ("linear",)  # which there are, of TIMES
-    seconds: float = 4.0 * 3600.0  # how long measuring may take
+    error: float  # allowed RMS tool error, the datum aligned, m
+    tilt: float = 0.0  # of the tool, up to which the goal holds, rad
+    instruments: tuple[str, ...] = ("linear",)  # available instruments, of TIMES
+    seconds: float = 4.0 * 3600.0  # available time
     times: Mapping[str, Times] = field(default_factory=lambda: TIMES)
 
     def __post_init__(self) -> None:
@@ -460,11 +462,11 @@ class Proposal:
     space: ParameterSpace  # the parameters to be fitted
     before: dict[str, float]  # the error before, `level` and, where the goal tilts, `tilted`
     expected: dict[str, float]  # and after
-    seconds: float  # how long measuring takes
+    seconds: float  # duration of the measurement
     all_of_them: float  # the worse error after all candidates,
-    unseen: float  # and after so many repeats of them that noise no longer counts
-    shares: dict[str, float]  # of blocks, and of the repeatability, in the mean square error left
-    needed: float | None  # seconds in which the goal would be met; None where these candidates do not meet it
+    unseen: float  # and after enough repeats of them that noise no longer counts
+    shares: dict[str, float]  # of blocks, and of the repeatability, in the remaining mean square error
+    needed: float | None  # seconds in which the goal would be met; None if these candidates do not meet it
 
     @property
     def worst(self) -> float:
@@ -483,7 +485,7 @@ class Proposal:
 
     @property
     def each(self) -> list[float]:
-        """How long each run takes, the instrument's putting up with its first, s."""
+        """Duration of each run, the instrument's set-up included in its first, s."""
         runs = self.campaign.runs
         first = [n == 0 or run.instrument != runs[n - 1].instrument for n, run in enumerate(runs)]
         times = [self.goal.times[run.instrument] for run in runs]
@@ -491,10 +493,10 @@ class Proposal:
 
 
 class Aim:
-    """The tool error that a goal is judged by, of parameters z of unit prior."""
+    """The tool error of the goal, by parameters z of unit prior."""
 
     def __init__(self, space: ParameterSpace, tilt: float, stops: float = 0.0) -> None:
-        self.stops = stops  # repeatability, RMS over all three axes, m: no model takes that away
+        self.stops = stops  # repeatability, RMS over all three axes, m: no model reduces it
         tilts = {"level": 0.0} | ({"tilted": tilt} if tilt > 0.0 else {})
         self.parts = {name: self._square(space, angle) for name, angle in tilts.items()}
         self.square = np.mean(list(self.parts.values()), axis=0)
@@ -511,13 +513,13 @@ class Aim:
         return np.asarray(spread[:, None] * space.whitened(space.whitened(errors.mean_squares()[0]).T) * spread)
 
     def errors(self, covariance: np.ndarray) -> dict[str, float]:
-        """Return the RMS tool error that a covariance leaves, level and tilted, m."""
+        """Return the RMS tool error for a covariance, level and tilted, m."""
         squares = {name: (square * covariance).sum() + self.stops**2 for name, square in self.parts.items()}
         return {name: float(np.sqrt(square)) for name, square in squares.items()}
 
 
 def seen_by(space: ParameterSpace, campaign: Campaign, measured: MeasurementSet) -> list[np.ndarray]:
-    """Return how each run of a campaign's template (or part of it) moves with z, (k, size), over its noise."""
+    """Return the derivatives of each run of a campaign's template (or part of it) by z, (k, size), over its noise."""
     rows, cells = information(space, measured, np.zeros(space.size))
     rows *= space.spread(space.start_tolerances()) / noise_factors(campaign)[cells.kind][:, None]
     run_of_station = np.empty(len(measured.stations), dtype=int)
@@ -553,7 +555,7 @@ def propose(
     base: Campaign | None = None,
     progress: Callable[[str], object] = lambda text: None,
 ) -> Proposal:
-    """Return the runs to measure for a goal, in measuring order; `base` tells noise, beam slope, stops and cycles."""
+    """Return the runs to measure for a goal, in measuring order; `base` gives noise, beam slope, stops and cycles."""
     progress("what could be measured")
     runs = candidates(place, goal.instruments)
     space = ParameterSpace((place.geometry, region(place, runs)), settings)
@@ -585,7 +587,7 @@ def propose(
         choice.extend(goal.seconds, lambda: left(choice) <= goal.error)
         return choice
 
-    # All instruments, or one of them alone, which saves putting up the others.
+    # All instruments, or one of them alone, which saves setting up the others.
     alone = [(name,) for name in goal.instruments] if len(goal.instruments) > 1 and any(putting_up.values()) else []
     tries = [chosen(names) for names in dict.fromkeys([tuple(goal.instruments), *alone])]
     best = min(tries, key=lambda t: (left(t) > goal.error, t.spent if left(t) <= goal.error else left(t)))
@@ -593,11 +595,11 @@ def propose(
         raise CalibrationError("hours", f"are too few: the shortest run takes {best.totals().min() / 3600.0:.2g} h")
     progress("what limits it")
     covariance, seconds, picks = best.criterion.covariance, best.spent, best.picks
-    repeated = 1e4  # so often measured, candidates leave only what their instruments do not see
+    repeated = 1e4  # repeats after which only errors that the instruments do not see remain
     all_of_them, unseen = (max(aim.errors(tries[0].criterion.after_all(n)).values()) for n in (1.0, repeated))
     needed = seconds if left(best) <= goal.error else None
     expected = aim.errors(covariance)
-    if needed is None and all_of_them <= goal.error:  # continued, to say what the goal would take
+    if needed is None and all_of_them <= goal.error:  # continued, to report the time that the goal would take
         tries[0].extend(np.inf, lambda: left(tries[0]) <= goal.error, most=25)
         needed = tries[0].spent if left(tries[0]) <= goal.error else None
     picks = sorted(picks, key=lambda n: (goal.instruments.index(needs[n]), n))
@@ -623,14 +625,14 @@ def propose(
 
 
 def stops_text(stops: float) -> str:
-    """Return how much of a planned tool error is the machine's repeatability: RMS over all three axes, m."""
+    """Return the part of a planned tool error that is the machine's repeatability: RMS over all three axes, m."""
     if stops:
         return f"counted in: the machine's repeatability, {stops * 1e6:.3g} µm RMS over all three axes"
     return "not counted: the machine's repeatability, for none is stated (--repeatability-um)"
 
 
 def proposal_report(plan: Proposal) -> str:
-    """Return the report of a proposed plan: the goal, what may be expected, what limits it, the runs in their order."""
+    """Return the report of a proposed plan: goal, prediction, limiting factor, runs in their order."""
     expected = ["expected tool error at random points of the box, both directions, the datum aligned:"]
     for name, after in plan.expected.items():
         shown = "level tool: " if name == "level" else f"tilted {np.degrees(plan.goal.tilt):g}°:"
@@ -679,7 +681,7 @@ def proposal_json(plan: Proposal) -> dict[str, Any]:
 
 
 def remarks(plan: Proposal) -> list[str]:
-    """Return what stands on top of the campaign's file."""
+    """Return the comment at the top of the campaign's file."""
     return [
         f"Proposed for machine {plan.space.geometry.name}: {_goal(plan)}.",
         f"Expected: {', '.join(f'{name} {um(value)}' for name, value in plan.expected.items())} RMS, datum aligned.",
@@ -688,7 +690,7 @@ def remarks(plan: Proposal) -> list[str]:
 
 
 def verdict(plan: Proposal) -> str:
-    """Say whether the goal is met and, where it is not, what limits it."""
+    """Report whether the goal is met and, if not, the limiting factor."""
     if plan.met:
         return f"the goal is met: {um(plan.worst)} in {plan.seconds / 3600.0:.1f} h"
     goal, named, stops = um(plan.goal.error), ", ".join(plan.goal.instruments), plan.campaign.stops
@@ -704,7 +706,7 @@ def verdict(plan: Proposal) -> str:
         limit = f"the instruments' noise: all runs considered, once each, leave {um(plan.all_of_them)}"
     else:
         limit = f"time: many more runs would do; all considered leave {um(plan.all_of_them)}"
-    least = 0.1  # blocks that make up less of what is left are not named
+    least = 0.1  # smaller shares of blocks in the remaining error are not listed
     blocks = [f"{name} {100.0 * share:.0f} %" for name, share in plan.shares.items() if share >= least]
     return "\n".join(
         [

@@ -1,8 +1,8 @@
-"""The estimator: readings against parameters, by a whitened, chunked, robust Gauss–Newton with evidence.
+"""The estimator: a whitened, chunked, robust Gauss–Newton with evidence for the parameters given the readings.
 
 Each linear problem is Bayesian: every block of parameters has a prior whose size (a hyperparameter) is estimated from
 the readings, as is the noise of every kind of channel: empirical Bayes, by MacKay's fixed point. Nuisance parameters of
-the instruments are projected out of the design matrix beforehand, so they cost nothing.
+the instruments are projected out of the design matrix beforehand, so they add no unknowns.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Given = TypeVar("Given")
 Result = TypeVar("Result")
 
 STEPS, SETTLED = 20, 1e-2  # most Gauss-Newton steps; largest change of a parameter in the last one, σ
-ROUNDS, FEW_ROUNDS = 12, 2  # of hyperparameters at one step, and where they start at an answer
+ROUNDS, FEW_ROUNDS = 12, 2  # rounds of hyperparameters at one step, and at the start from an answer
 ROUNDS_SETTLED = 1e-3  # relative change after which rounds stop: hyperparameters are known to 1/√(2n)
 LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # longest extrapolation, in rounds, and largest change by it, logarithm
 LEAST_FREEDOM = 10.0  # fewest readings beyond the parameters for a noise: its own error is then 22 %
@@ -35,9 +35,9 @@ CHUNK, THREADED = 512, 500  # cells of a processor's cache; rows from which on t
 
 
 def at_once(work: Callable[[Given], Result], items: Iterable[Given], rows: int) -> list[Result]:
-    """Return the results of independent work with matrices of so many rows together.
+    """Return the results of independent work with matrices of this number of rows together.
 
-    NumPy lets as many threads work as there are processors; few rows are done sooner than a thread is started.
+    NumPy uses as many threads as there are processors; few rows are done sooner than a thread is started.
     """
     if rows < THREADED:
         return list(map(work, items))
@@ -64,7 +64,7 @@ class DesignMatrix:
 
     @staticmethod
     def of(matrix: np.ndarray) -> DesignMatrix:
-        """Return a dense matrix as such rows."""
+        """Return a dense matrix in this form."""
         return DesignMatrix(matrix.shape, [Alike(np.arange(len(matrix)), np.arange(matrix.shape[1]), matrix)])
 
     def dense(self) -> np.ndarray:
@@ -98,7 +98,7 @@ class DesignMatrix:
         return result
 
     def select(self, cells: np.ndarray) -> DesignMatrix:
-        """Return the rows of some cells, in their order; without copying where they stand in a row."""
+        """Return the rows of some cells, in their order; without copying if they are consecutive."""
         owner, parts = self._part[cells], []
         for n in np.unique(owner):
             at = np.flatnonzero(owner == n)
@@ -130,9 +130,9 @@ class DesignMatrix:
         return DesignMatrix((self.shape[0], size + len(further)), parts)
 
     def project_out(self, unknowns: Sequence[Nuisance]) -> None:
-        """Take off, in place, what unknowns of instruments may explain.
+        """Project out, in place, the components that unknowns of instruments may explain.
 
-        The cells of each stand in one part, or in parts of the same parameters, as a tracker's positions and attitudes.
+        The cells of each are in one part, or in parts of the same parameters, as a tracker's positions and attitudes.
         """
         owner = np.array([self._part[unknown.members[0]] for unknown in unknowns])
         for n, unknown in enumerate(unknowns):
@@ -173,7 +173,7 @@ def _alike(first: np.ndarray, second: np.ndarray) -> Iterator[tuple[tuple[int, i
 
 @dataclass(frozen=True)
 class LinearProblem:
-    """The fit linearised at one parameter vector x = root·y, free of what instruments do not know."""
+    """The fit linearised at one parameter vector x = root·y, free of the instruments' unknowns."""
 
     # (C,): Cells' values that the parameters explain, over their standard deviation at unit noise factors
     target: np.ndarray
@@ -185,14 +185,14 @@ class LinearProblem:
     square: np.ndarray  # (kinds,): Sum of squared targets, the scatter of readings about their cell's mean included
     freedom: np.ndarray  # (kinds,): Readings minus unknowns projected out
     least_noise: np.ndarray  # (kinds,): Smallest noise factors that an instrument can have
-    # (C, 6): Derivatives by the struts' lengths, scaled as the rows, with what instruments do not know still in them
+    # (C, 6): Derivatives by the struts' lengths, scaled as the rows, with the instruments' unknowns still in them
     per_length: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
     unknowns: tuple[Nuisance, ...] = ()  # What that is
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """What a linear problem says about the parameters y that it uses."""
+    """The posterior of a linear problem for the parameters y in use."""
 
     used: np.ndarray  # (n,): Which parameters; the others' blocks are out
     y: np.ndarray  # (n,): The most probable ones
@@ -237,7 +237,7 @@ def solve(
 
 
 def _extrapolated(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> np.ndarray:
-    """Return where three rounds of a fixed point that converge slowly lead, in logarithms (SQUAREM).
+    """Return the extrapolation of three rounds of a fixed point that converges slowly, in logarithms (SQUAREM).
 
     Varadhan, Roland (2008), Scandinavian Journal of Statistics 35, 335: first − 2·a·r + a²·v, with r and v first and
     second differences and a = −|r|/|v|, no shorter than a round and at most ``longest_stride`` of them.
@@ -268,7 +268,7 @@ def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
 def _noise(
     problem: LinearProblem, kinds: np.ndarray, normal: np.ndarray, moment: np.ndarray, posterior: Posterior
 ) -> np.ndarray:
-    """Return new noise factors: squared residuals over what freedom the parameters leave; sums of some kinds."""
+    """Return new noise factors: squared residuals over the remaining degrees of freedom; sums of some kinds."""
     result, y = posterior.noise.copy(), posterior.y
     for k, information, sums in zip(kinds, normal, moment, strict=True):
         rest = problem.square[k] - 2.0 * y @ sums + y @ information @ y
@@ -296,10 +296,10 @@ def _tolerances(space: ParameterSpace | Components, posterior: Posterior, z: np.
 
 
 def log_evidence(problem: LinearProblem, posterior: Posterior) -> float:
-    """Return the logarithm of the readings' probability under a posterior's tolerances and noise, but for a constant.
+    """Return the logarithm of the readings' probability under a posterior's tolerances and noise, up to a constant.
 
-    MacKay (1992), Neural Computation 4, 415: how well the readings are met, less what it takes to single the parameters
-    out of their priors.
+    MacKay (1992), Neural Computation 4, 415: the likelihood of the best parameters, times the Occam factor of their
+    priors.
     """
     kinds = np.unique(problem.kind)
     weights, moment = posterior.noise[kinds] ** -2, problem.moment[np.ix_(kinds, posterior.used)]
@@ -331,11 +331,11 @@ MEDIAN_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over the median of its absolute values."""
 
 ROUNDING = 1e-12
-"""A direction whose component is below this does not have it: frames turned by right angles are right to rounding."""
+"""A smaller component of a direction counts as zero: frames turned by right angles are exact to rounding."""
 
 
 class _Group(NamedTuple):
-    """Cells of one kind whose errors have the same components; those of a run, and of an unknown, stand together."""
+    """Cells of one kind whose errors have the same components; those of a run, and of an unknown, are consecutive."""
 
     kind: int
     components: np.ndarray
@@ -391,13 +391,14 @@ class Estimation:
         rows.project_out(unknowns)
         residuals = misfit - unknown[c.of_reading]
         scatter = np.bincount(m.kind, weights * (misfit - mean[c.of_reading]) ** 2, len(KINDS))
-        # Huber's proposal 2: noise comes from the residuals cut off, weight² · residual², or outliers blow it up.
+        # Huber's proposal 2: noise is estimated from clipped residuals, weight² · residual², since outliers would
+        # enlarge it.
         beyond = np.bincount(m.kind, weights * (1.0 - reading_weights) * residuals**2, len(KINDS))
         problem = self._problem(target + moved, rows, scatter - beyond, unknowns)
         return replace(problem, per_length=per_length, unknowns=tuple(unknowns)), residuals
 
     def _rows(self, x: np.ndarray, prediction: Prediction, directions: np.ndarray) -> tuple[DesignMatrix, np.ndarray]:
-        """Return each cell's derivatives by y, and what all parameters do together, (C,).
+        """Return each cell's derivatives by y, and the effect of all parameters together, (C,).
 
         Along directions (C, 6), over the standard deviations of the cells' values.
         """
@@ -416,7 +417,7 @@ class Estimation:
         return DesignMatrix((len(moved), space.size), at_once(rows_of, self._groups, len(moved))), moved
 
     def free_of_nuisance(self, rows: np.ndarray) -> np.ndarray:
-        """Return what is left of cells' derivatives (C, K) beside all that instruments do not know, over their noise.
+        """Return cells' derivatives (C, K) free of the instruments' unknowns, over their noise.
 
         The noise is the stated one.
         """
@@ -427,20 +428,20 @@ class Estimation:
         return rows
 
     def shares_of_nuisance(self) -> np.ndarray:
-        """Return how much of each cell's value what instruments do not know takes up, shape (C,), 0…1."""
+        """Return the share of each cell's value that the instruments' unknowns explain, shape (C,), 0…1."""
         shares = np.zeros(len(self.cells.station))
         for part in self._stated_unknowns()[1]:
             shares[part.members] += part.basis**2 @ part.share
         return shares
 
     def _stated_unknowns(self) -> tuple[np.ndarray, list[Nuisance]]:
-        """Return one over the cells' stated noise, (C,), and what instruments do not know, at the nominal machine."""
+        """Return one over the cells' stated noise, (C,), and the instruments' unknowns, at the nominal machine."""
         scale = np.sqrt(np.bincount(self.cells.of_reading, self.uncertainty**-2))
         values = np.zeros(len(scale))
         return scale, self.unknowns(self.cells.directions.copy(), np.zeros((len(scale), 6)), values, scale)[1]
 
     def _predicted(self, x: np.ndarray) -> Prediction:
-        """Return what the machine of a parameter vector does."""
+        """Return the machine of a parameter vector at the stations."""
         try:
             return predict(self.space, x, self.measurements.stations)
         except (ModelError, KinematicsError) as error:
@@ -451,7 +452,8 @@ class Estimation:
     def unknowns(
         self, directions: np.ndarray, errors: np.ndarray, values: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, list[Nuisance]]:
-        """Return what cells with errors (C, 6) should read, and what is unknown; renews `directions` that change."""
+        """Return the predicted values of cells with errors (C, 6), and the unknowns; renews `directions` that
+        change."""
         expected = np.einsum("ci,ci->c", directions, errors)
         unknowns = self._zeros.unknowns(scale)
         unknowns += [of_square(n, scale[n], self.cells.lever[n], self.cells.group[n]) for n in self._squares]
@@ -468,7 +470,7 @@ class Estimation:
     def _problem(
         self, target: np.ndarray, rows: DesignMatrix, scatter: np.ndarray, unknowns: list[Nuisance]
     ) -> LinearProblem:
-        """Gather the sums that everything later needs."""
+        """Compute the sums that later steps need."""
         kind, size, kinds = self.cells.kind, self.space.size, len(KINDS)
         normal, moment, square = np.zeros((kinds, size, size)), np.zeros((kinds, size)), scatter.copy()
         freedom = np.bincount(self.measurements.kind, minlength=kinds).astype(float)
@@ -495,9 +497,9 @@ class Estimation:
         ]
 
     def robust_weights(self, residuals: np.ndarray) -> np.ndarray:
-        """Return Huber's weights of residuals (N,), 1 for all that are no surprise.
+        """Return Huber's weights of residuals (N,), 1 for all below the threshold.
 
-        What is a surprise is measured by the median of each kind's residuals, which gross errors do not move.
+        The threshold is in units of the median of each kind's residuals, which gross errors do not move.
         """
         size = np.abs(residuals) / self.uncertainty
         weights = np.ones(len(size))
@@ -510,7 +512,7 @@ class Estimation:
 
 
 class NotSettled(CalibrationError):
-    """A fit whose parameters still change after the last step, with where it stood then."""
+    """A fit whose parameters still change after the last step, with its state then."""
 
     def __init__(self, problem: str, solution: Solution) -> None:
         super().__init__("fit", problem)
@@ -524,8 +526,8 @@ class Solution:
     problem: LinearProblem  # Linearised at the answer
     posterior: Posterior  # The answer
     x: np.ndarray  # (size,): Its parameters, SI
-    residuals: np.ndarray  # (N,): Of each reading, m or rad; and the trust it got, 0…1
-    weights: np.ndarray  # (N,): Of each reading, m or rad; and the trust it got, 0…1
+    residuals: np.ndarray  # (N,): Of each reading, m or rad; and its robust weight, 0…1
+    weights: np.ndarray  # (N,): Of each reading, m or rad; and its robust weight, 0…1
     steps: int  # Gauss–Newton steps
     change: float  # Largest change of a parameter in the last one, in its standard deviation
 
@@ -537,10 +539,10 @@ def iterate(
     noise: np.ndarray,
     progress: Callable[[str], object],
 ) -> Solution:
-    """Run Gauss–Newton steps until the parameters settle, from the nominal machine or from an answer."""
+    """Run Gauss–Newton steps until the parameters converge, from the nominal machine or from an answer."""
     space, weights = estimation.space, np.ones(len(estimation.measurements))
     robust = space.settings.robust
-    all_alike = 0 if x.any() else 1  # steps whose residuals are the machine's errors: they weigh no reading
+    all_alike = 0 if x.any() else 1  # steps whose residuals are the machine's errors: no reading is downweighted
     for step in range(1, STEPS + 1):
         problem, residuals = estimation.linearise(x, weights)
         posterior = solve(space, problem, tolerances, noise)
@@ -562,22 +564,23 @@ def iterate(
 
 
 class Omitted(NamedTuple):
-    """What leaving one group of cells out of a fit does."""
+    """Effect of leaving one group of cells out of a fit."""
 
     cells: np.ndarray  # (n,): the group
-    errors: np.ndarray  # (n,): leave-one-out residuals, in standard deviations: of fits that did not see the group
-    moved: np.ndarray  # (k,): by how much effects of the parameters change
-    covariance: np.ndarray  # (k, k): of that change, if the model is right
+    errors: np.ndarray  # (n,): leave-one-out residuals, in standard deviations
+    moved: np.ndarray  # (k,): change of the effects of the parameters
+    covariance: np.ndarray  # (k, k): covariance of that change, if the model is right
 
 
 def jackknife(
     rows: DesignMatrix, residual: np.ndarray, precision: np.ndarray, groups: np.ndarray, effects: np.ndarray
 ) -> list[Omitted]:
-    """Return what leaving out each group of cells does, by the linear problem: exact, and no fit is repeated.
+    """Return the effect of leaving out each group of cells, in the linear problem: exact, and no fit is repeated.
 
     Without a group's rows R and residuals r, parameters z whose precision is P = C⁻¹ change by
     (P − Rᵀ·R)⁻¹·Rᵀ·r = C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r, a matrix of the parameters' size or of the group's; the covariance of
-    that is (P − Rᵀ·R)⁻¹ − C if the model is right. `effects`, (n, k), are those of the parameters to look at.
+    that is (P − Rᵀ·R)⁻¹ − C if the model is right. `effects`, (n, k), are the functions of the parameters whose change
+    is computed.
     """
     covariance = np.linalg.inv(precision)
     reached = covariance @ effects
@@ -601,7 +604,7 @@ def jackknife(
 
 
 def influence(run: np.ndarray, solution: Solution) -> np.ndarray:
-    """Return how far the parameters move, leaving out each run, in their standard deviations: Cook's distance, (runs,).
+    """Return the change of the parameters without each run, in their standard deviations: Cook's distance, (runs,).
 
     `run` (C,) is that of each cell.
     """

@@ -1,4 +1,4 @@
-"""Tool errors of a virtual machine without and with a model, at points to which nothing was fitted."""
+"""Tool errors of a virtual machine without and with a model, at points that were not used in the fit."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ INCH = 0.0254
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Error of the tool at points that nothing was fitted to, both ways through each."""
+    """Error of the tool at points that were not used in the fit, in both directions through each."""
 
     points: int
-    raw: Size  # the error vector as it is, m
+    raw: Size  # the error vector as the machine stands, m
     aligned: Size  # the same after one rotation and one shift of everything
-    rotation: Size  # the rotation less the common one, rad
+    rotation: Size  # the rotation minus the common one, rad
 
 
 def held_out(
@@ -41,9 +41,9 @@ def held_out(
     level: np.ndarray | None = None,
     loading: Loading = FREE,
 ) -> HeldOut:
-    """Return the error of the tool at random points of a box (2, 3), m in work, passed both ways.
+    """Return the error of the tool at random points of a box (2, 3), m in work, passed in both directions.
 
-    The model is told the `sensed` temperatures and the `loading`.
+    The model receives the `sensed` temperatures and the `loading`.
     """
     if points < 3:
         raise ModelError("points", "must be at least three", points)
@@ -58,7 +58,7 @@ def held_out(
 
 @dataclass(frozen=True)
 class PaperMetric:
-    """Mou & King's own measure, without and with a model."""
+    """Mou & King's own metric, without and with a model."""
 
     before: float  # mean absolute displacement error along lines, m
     after: float
@@ -108,11 +108,11 @@ class ModelEvaluation:
     before: HeldOut  # the tool's error in space without and with the model
     after: HeldOut
     paper: PaperMetric
-    promised: tuple[float, float] | None = None  # where a fit expects the RMS error with the model, datum aligned, m
+    promised: tuple[float, float] | None = None  # predicted interval of the RMS error with the model, datum aligned, m
 
     @property
     def kept(self) -> bool | None:
-        """Whether what a fit promised is so; None where it promised nothing."""
+        """Whether the error is within the predicted interval; None if there is none."""
         return None if self.promised is None else self.promised[0] <= self.after.aligned.rms <= self.promised[1]
 
 

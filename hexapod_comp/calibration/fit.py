@@ -1,4 +1,4 @@
-"""Fit a machine model to measurements with scheme ``joint``, and say what the fit is worth."""
+"""Fit a machine model to measurements with scheme ``joint``, and judge the result."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ from .selection import Decision, select
 from .thermal import ThermalEvidence, TimeConstants, estimate_time_constants, with_courses
 from .trust import LeftOut, Residuals, Verdict, judge, with_drift
 
-LARGEST_NOISE = 0.02  # A machine that leaves more than this of its readings, m or rad, is not the one that was measured
-# Readings taken further than this from the reference temperature, K, need an expansion: 1 µm on half a metre
+LARGEST_NOISE = 0.02  # Residual above which the fitted machine is not the measured one, m or rad
+# Readings further than this from the reference temperature, K, need an expansion: 1 µm on half a metre
 WARM = 0.2
-MOST_LEFT_OUT = 3  # runs left out of a fit that does not settle; more are a bad campaign
+MOST_LEFT_OUT = 3  # runs left out of a fit that does not converge; more are a bad campaign
 
 
 @dataclass(frozen=True)
 class ChannelFit:
-    """How one kind of channel was met."""
+    """Result for one kind of channel."""
 
     kind: str  # of KINDS
     readings: int
@@ -72,38 +72,16 @@ class Outlier:
 class ModelFit:
     """A model with everything that is known about it.
 
-    Attributes
-    ----------
-    model : MachineModel
-        The machine as fitted.
-    measurements : MeasurementSet
-        What it was fitted to.
-    space : ParameterSpace
-        Names, blocks and priors of the parameters.
-    solution : Solution
-        Parameters, covariance, residuals.
-    decisions : tuple of Decision
-        Which blocks stay, and why.
-    channels : tuple of ChannelFit
-        χ² and held-out error of each kind of channel.
-    observability : Observability
-        What the data determine.
-    unseen_errors : tuple of UnseenError
-        Machine errors that the readings do not show (:data:`~.posterior.MACHINE_ERRORS`).
-    verdict : Verdict
-        What the model promises, and what is wrong.
-    outliers : tuple of Outlier
-        Largest first.
-    notes : tuple of str
-        What a reader must know.
-    held : HeldDatum
-        Where the tool is held: the model is the solution's machine, shifted and turned as a whole.
-    warming : ThermalEvidence
-        What they tell of heat.
-    lead : ScrewLead or None
-        What is known of the screws' lead; None where it was not looked for.
-    held_out : ndarray, shape (C,)
-        Leave-one-out errors of the cells, whose line or pose a fit did not see, over their stated standard deviation.
+    Attributes ---------- model : MachineModel The machine as fitted. measurements : MeasurementSet Its readings. space
+    : ParameterSpace Names, blocks and priors of the parameters. solution : Solution Parameters, covariance, residuals.
+    decisions : tuple of Decision Which blocks stay, and why. channels : tuple of ChannelFit χ² and held-out error of
+    each kind of channel. observability : Observability What the data determine. unseen_errors : tuple of UnseenError
+    Machine errors that the readings do not show (:data:`~.posterior.MACHINE_ERRORS`). verdict : Verdict Predicted tool
+    error, and doubts. outliers : tuple of Outlier Largest first. notes : tuple of str Notes for the reader. held :
+    HeldDatum Where the tool is held: the model is the solution's machine, shifted and turned as a whole. warming :
+    ThermalEvidence Evidence on heat. lead : ScrewLead or None The screws' lead; None if it was not searched for.
+    held_out : ndarray, shape (C,) Leave-one-out errors of the cells, whose line or pose a fit did not use, over their
+    stated standard deviation.
     """
 
     model: MachineModel
@@ -129,12 +107,12 @@ class ModelFit:
 
     @property
     def level(self) -> ToolError | None:
-        """The tool error to expect with this model, for a level tool."""
+        """The expected tool error with this model, for a level tool."""
         return self.verdict.level
 
     @property
     def tilted(self) -> ToolError | None:
-        """The same for a tool tilted by :data:`~.trust.TILT`; None too where nothing can be promised."""
+        """The same for a tool tilted by :data:`~.trust.TILT`; None if nothing can be predicted."""
         return self.verdict.tilted
 
     @property
@@ -201,7 +179,8 @@ def _drop_outlier_runs(
     progress: Callable[[str], object],
     datum: Pose,
 ) -> ModelFit:
-    """Return the fit without the runs that pull it most, one by one, until it settles; else as it stands, refused."""
+    """Return the fit without the most influential runs, left out one by one, until it converges; else the last step,
+    refused."""
     kept, names, error = measurements, list[str](), unsettled
     while len(names) < MOST_LEFT_OUT and len(np.unique(kept.run)) > 1:
         of_cell = kept.run[Estimation(kept, begun.everything.space, alone=False).cells.first]
@@ -224,14 +203,14 @@ def _drop_outlier_runs(
 
 
 def mixed_up(measurements: MeasurementSet, settings: FitSettings) -> list[str]:
-    """Return how readings must have been taken to be more probable, by name, the best first; nothing is fitted."""
+    """Return the mix-ups that would make the readings more probable, by name, the best first; nothing is fitted."""
     begun = _begin(measurements, settings, lambda text: None)
     decisions = select(begun.everything.space, begun.problem, np.ones(len(KINDS)), lambda text: None)[0]
     return mixups(begun.everything, [d.block for d in decisions if d.kept])
 
 
 class _Begun(NamedTuple):
-    """All parameters that may be used, the problem at the nominal machine, the screws' lead, and time constants."""
+    """All parameters in use, the problem at the nominal machine, the screws' lead, and time constants."""
 
     everything: Estimation
     problem: LinearProblem
@@ -246,7 +225,7 @@ def _fit(
     datum: Pose,
     settles: bool = True,
 ) -> ModelFit:
-    """Choose blocks, fit them, and judge what comes of it."""
+    """Select blocks, fit them, and judge the result."""
     everything, nominal, lead, constants = begun
     settings = everything.space.settings
     decisions, possible, estimation, solution = _choose(everything, nominal, progress, settles)
@@ -261,7 +240,7 @@ def _fit(
         *_check_backlash(space, solution),
     ]
     notes += _check_noise(channels)
-    progress("what is it worth?")
+    progress("judging the result")
     noise = {KINDS.index(c.kind): c.estimated for c in channels}
     mixed = mixups(everything, [d.block for d in decisions if d.kept], progress)
     left_out = _averaged(space, solution, everything.space, possible, decisions)
@@ -292,7 +271,7 @@ def _fit(
 
 
 def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object]) -> _Begun:
-    """Return what a fit starts from; the lead is left alone where no screw wave is fitted or screws differ."""
+    """Return the starting point of a fit; the lead is not searched for if no screw wave is fitted or screws differ."""
     measurements = with_courses(measurements)
     constants = estimate_time_constants(measurements, ParameterSpace(measurements, settings), progress)
     if constants.values:
@@ -319,13 +298,13 @@ Start = tuple[ParameterSpace, np.ndarray, np.ndarray, np.ndarray]
 def _choose(
     everything: Estimation, problem: LinearProblem, progress: Callable[[str], object], settles: bool
 ) -> tuple[list[Decision], Posterior, Estimation, Solution]:
-    """Return what became of blocks, what the readings allow with all of them in, and the fit with those kept."""
+    """Return the decisions on blocks, the posterior with all blocks, and the fit with those kept."""
     space = everything.space
     decisions, possible, kept = select(space, problem, np.ones(len(KINDS)), progress)
     y = np.zeros(space.size)
     y[kept.used] = kept.y
     start = space, space.physical(y), kept.tolerances, kept.noise
-    if not any(d.kept for d in decisions):  # too few runs to leave one out, or none that shows anything: from the start
+    if not any(d.kept for d in decisions):  # too few runs to leave one out, or none with information: from the start
         start = space, 0.0 * y, space.start_tolerances(), np.ones(len(KINDS))
     estimation, solution = _solve(everything, decisions, start, progress, settles)
     if solution.weights.min() < ASSUMED.huber / ASSUMED.outlier:  # it was made with readings that are wrong
@@ -346,7 +325,7 @@ def _solve(
     progress: Callable[[str], object],
     settles: bool,
 ) -> tuple[Estimation, Solution]:
-    """Return a settled fit with the blocks decided on; where none `settles`, what the last step gives."""
+    """Return a converged fit with the selected blocks; if none `settles`, the result of the last step."""
     settings = replace(everything.space.settings, blocks=tuple(d.block for d in decisions if d.kept))
     estimation = Estimation(everything.measurements, ParameterSpace(everything.measurements, settings))
     try:
@@ -358,7 +337,8 @@ def _solve(
 
 
 def _carried_over(start: Start, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return parameters, tolerances and noise of a start in another space; what it lacks is zero, and as at first."""
+    """Return parameters, tolerances and noise of a start in another space; missing ones are zero, and the first
+    guess."""
     old, given, sizes, noise = start
     x, tolerances = np.zeros(space.size), space.start_tolerances()
     for n, block in enumerate(space.blocks):
@@ -375,9 +355,9 @@ def _averaged(
     possible: Posterior,
     decisions: Sequence[Decision],
 ) -> LeftOut:
-    """Return how probable it is that a block was left out that is there, and the tool's error if all blocks are.
+    """Return the probability that a block was left out although present, and the tool's error with all blocks.
 
-    By the blocks' Bayes factors, with even odds beforehand; seen from the answer.
+    By the blocks' Bayes factors, with even prior odds; at the same answer.
     """
     absent = np.prod([expit(-d.evidence) for d in decisions if not d.kept])
     way, x = np.zeros(everything.size), np.zeros(everything.size)
@@ -397,13 +377,13 @@ def _averaged(
 
 
 def unseen_errors(measurements: MeasurementSet, settings: FitSettings) -> tuple[UnseenError, ...]:
-    """Return the machine errors that the readings do not show, whatever blocks are allowed in a fit."""
+    """Return the machine errors that the readings do not show, for any allowed blocks."""
     space = ParameterSpace(measurements, replace(settings, blocks=("field displacement", "field rotation")))
     return without_trace(Estimation(measurements, space))
 
 
 def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
-    """Return remarks on negative backlash; refuse the fit when most struts have it."""
+    """Return notes on negative backlash; refuse the fit if most struts have it."""
     block = space.block("backlash")
     if block is None:
         return []
@@ -418,7 +398,7 @@ def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
 
 
 def _about_lead(lead: ScrewLead | None) -> list[str]:
-    """Return remarks on a lead that is not known, or not the one that was given."""
+    """Return notes on a lead that is not known, or differs from the given one."""
     if lead is None:
         return []
     if not lead.agrees:
@@ -431,7 +411,7 @@ def _about_lead(lead: ScrewLead | None) -> list[str]:
 
 
 def _about_loads(measurements: MeasurementSet, space: ParameterSpace) -> list[str]:
-    """Return for which loads the promise holds, where any is stated."""
+    """Return the loads for which the predicted error holds, if any is stated."""
     load = stated_load(space.settings)
     loads = np.array(measured_loads(load, space.geometry, measurements.stations))
     if not len(loads):
@@ -449,7 +429,7 @@ def _about_loads(measurements: MeasurementSet, space: ParameterSpace) -> list[st
 
 
 def _ignored(measurements: MeasurementSet, space: ParameterSpace) -> list[str]:
-    """Return remarks on what the fit was not told and therefore takes for something else."""
+    """Return notes on missing inputs, whose effects the fit attributes to other errors."""
     notes = []
     warmth = np.abs(measurements.stations.temperatures - REFERENCE_TEMPERATURE).max()
     if warmth > WARM and space.block("expansion") is None and not space.stated_expansion.any():
@@ -460,7 +440,7 @@ def _ignored(measurements: MeasurementSet, space: ParameterSpace) -> list[str]:
 
 
 def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:
-    """Return remarks on readings that scatter more than they should; refuse those that no machine explains."""
+    """Return notes on readings that scatter more than stated; refuse those that no machine explains."""
     for c in channels:
         if c.estimated > LARGEST_NOISE:
             unit = "rad" if c.kind in ANGULAR_KINDS else "m"
@@ -478,7 +458,7 @@ def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:
 
 
 def _channels(residuals: Residuals) -> list[ChannelFit]:
-    """Return how each kind of channel was met."""
+    """Return the residuals of each kind of channel."""
     estimation, problem, posterior = residuals.estimation, residuals.solution.problem, residuals.solution.posterior
     kinds, errors = estimation.measurements.kind, residuals.held_out
     readings_of_cell = np.bincount(estimation.cells.of_reading, minlength=len(problem.kind))
@@ -521,7 +501,7 @@ def _named(
     tried: int,
     level: ToolError | None,
 ) -> MachineModel:
-    """Return the fitted model with its origin, and what it promises."""
+    """Return the fitted model with its origin, and its predicted error."""
     kept = ", ".join(block.name for block in space.blocks)
     lengths = [c.held_out for c in channels if c.kind not in ANGULAR_KINDS]
     note = f"scheme joint, {len(measurements)} readings, blocks {kept} (of {tried + 1} tried)"

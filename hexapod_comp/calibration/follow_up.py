@@ -1,4 +1,4 @@
-"""What to read once there is a fit: readings for a check, and what remains unknown."""
+"""Which readings to take after a fit: for a check, and to reduce the remaining uncertainty."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from .check import (
 from .design import TILTS, ErrorLeft, Greedy, information, laid_out
 from .posterior import POINTS, ErrorPredictor, FittedParameters
 
-# What a proposed check is to name: a light collision, m; a kelvin of steel, m/m; another tool, kg, where a stiffness is
-# stated
+# What a proposed check must detect: a light collision, m; a kelvin of steel, m/m; another tool, kg, where a stiffness
+# is stated
 CRASH, WARMTH, TOOL_CHANGED = 20e-6, 12e-6, 10.0
 CHECK_READINGS = 12  # of a proposed check: 20 µm are named in 95 % (benchmarks.upkeep)
 MACHINES_DRAWN = 2000  # for the percentile of the worst pose: 95 % to ± 0.5 %
 
-# What each instrument of a check reads: on diagonals the displacement alone; of rotations pitch and yaw, no roll
+# Channels of each instrument of a check: on diagonals the displacement alone; of rotations pitch and yaw, no roll
 READ_BY = {
     "linear": ("linear",),
     "straightness": ("straightness_x", "straightness_y", "straightness_z"),
@@ -68,7 +68,7 @@ class Detectability:
         self.now = self._value(self.taken)
 
     def gains(self, allowed: np.ndarray) -> np.ndarray:
-        """Return by how much the log odds rise with each allowed candidate."""
+        """Return the gain in log odds by each allowed candidate."""
         tries = [
             self._value(np.concatenate([self.taken, numbers])) if ok else self.now
             for numbers, ok in zip(self.of_candidate, allowed, strict=True)
@@ -101,11 +101,11 @@ def propose_check(
     readings: int = CHECK_READINGS,
     instruments: Sequence[str] = ("linear", "rotation"),
 ) -> MeasurementSet:
-    """Return the check readings to take with some instruments of :data:`READ_BY`; values are not a number."""
+    """Return the check readings to take with some instruments of :data:`READ_BY`; values are NaN."""
     for name in instruments:
         if name not in READ_BY:
             raise CalibrationError("instruments", f"must be of {', '.join(READ_BY)}, not {name!r}")
-    least, most = 6, 60  # as few tell next to nothing; as many are better laid out as a campaign
+    least, most = 6, 60  # fewer determine next to nothing; more are better planned as a campaign
     if not least <= readings <= most:
         raise CalibrationError("readings", f"must be {least}…{most}, not {readings}")
     channels = [CHANNELS.index(name) for instrument in instruments for name in READ_BY[instrument]]
@@ -155,20 +155,20 @@ def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]
 
 @dataclass(frozen=True)
 class ErrorOverPoses:
-    """What is left over some poses, the datum aligned."""
+    """Remaining error over some poses, the datum aligned."""
 
     where: str
     poses: int
     rms: np.ndarray  # (2,): displacement, m, and standard deviation of the rotation about the worst axis, rad
     worst: float  # the same displacement at the worst pose, m
     at: np.ndarray  # (3,): the tool there, in `work`, m
-    most: float  # nineteen of twenty machines that the readings allow stay below this everywhere, m
+    most: float  # stays below this everywhere for nineteen of twenty machines that agree with the readings, m
     standing: float  # RMS displacement with the datum as the machine stands, m
 
 
 @dataclass(frozen=True)
 class Share:
-    """What would be left if a block of parameters were known exactly, or one more measurement were made."""
+    """The remaining error if a block of parameters were known exactly, or with one more measurement."""
 
     name: str
     count: int  # its parameters, or readings
@@ -177,13 +177,13 @@ class Share:
 
 @dataclass(frozen=True)
 class Remaining:
-    """What a calibration leaves."""
+    """The remaining error of a calibration."""
 
     machine: RealMachine  # as calibrated
-    parameters: int  # how many the fit has
+    parameters: int  # number of the fit's parameters
     left: tuple[ErrorOverPoses, ...]  # in the measured box with a level tool, and in the workspace
     blocks: tuple[Share, ...]
-    measurements: tuple[Share, ...]  # the one that removes most from the workspace first
+    measurements: tuple[Share, ...]  # the one that reduces the error in the workspace most is first
 
 
 def remaining(
@@ -193,7 +193,7 @@ def remaining(
     name: str = "workspace",
     progress: Callable[[str], object] = lambda text: None,
 ) -> Remaining:
-    """Return what is left of the tool's error after a calibration: in its box, and over platform poses in ``base``."""
+    """Return the remaining tool error after a calibration: in its box, and over platform poses in ``base``."""
     space, predictor, rng = fitted.space, ErrorPredictor(machine, fitted), np.random.default_rng(7)
     box = measured_region(machine.model)
     in_box = box.poses(rng.uniform(box.box[0], box.box[1], (POINTS, 3)), space.level)
@@ -206,12 +206,12 @@ def remaining(
         squares.append(square)
 
     def shares(tried: list[tuple[str, int, np.ndarray]]) -> list[Share]:
-        """Return what is left after each of some measurements, (name, count, rows by x), by itself."""
+        """Return the remaining error after each of some measurements, (name, count, rows by x), by itself."""
         gains = [ErrorLeft([rows @ factor for *_, rows in tried], square).gains() for square in squares]
         after = np.sqrt(np.maximum([[np.trace(square)] for square in squares] - np.array(gains), 0.0))
         return [Share(what, count, column) for (what, count, _), column in zip(tried, after.T, strict=True)]
 
-    # To know a block is to measure its parameters, far better than they are known.
+    # Knowing a block is measuring its parameters, far better than they are known.
     deviations = np.linalg.norm(factor, axis=1)
     known = np.diag(1e4 / np.where(deviations > 0.0, deviations, 1.0))
     blocks = shares([(block.name, len(block.labels), known[block.part]) for block in space.blocks])
@@ -222,7 +222,7 @@ def remaining(
 
 
 def _left(predictor: ErrorPredictor, poses: Poses, factor: np.ndarray, where: str) -> tuple[ErrorOverPoses, np.ndarray]:
-    """Return what is left over some poses, and M, (p, p): its mean square is tr(M) of independent effects."""
+    """Return the remaining error over some poses, and M, (p, p): its mean square is tr(M) of independent effects."""
     tips, standing, slopes, given_up = predictor.slopes(poses)
     reached = np.isfinite(slopes).all(axis=(1, 2))
     tips, effects = tips[reached], np.swapaxes(slopes[reached] @ factor, 1, 2)
@@ -272,7 +272,7 @@ def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]
 
 
 def remaining_text(result: Remaining) -> str:
-    """Return what a calibration leaves, for people."""
+    """Return the remaining error of a calibration as text."""
     geometry, model = result.machine.geometry, result.machine.model
     head = (
         f"machine {geometry.name}, model {model.name!r}: what is left of the tool's error after compensation, by the "
@@ -317,7 +317,7 @@ def measurement_rows(result: Remaining) -> list[dict[str, Any]]:
 
 
 def remaining_json(result: Remaining) -> dict[str, Any]:
-    """Return what a calibration leaves as plain numbers; units are in the keys."""
+    """Return the remaining error of a calibration as plain numbers; units are in the keys."""
 
     def shares(given: Iterable[Share], counted: str) -> list[dict[str, Any]]:
         return [

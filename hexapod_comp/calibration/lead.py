@@ -1,8 +1,8 @@
-"""The lead of the screws, looked for in the readings: at which period do the struts' errors repeat?
+"""The lead of the screws, estimated from the readings: the period of the struts' errors.
 
-What a fit without screw waves leaves is looked through for periods: first strut by strut with Fourier transforms over
-the commands, then, about the strongest lines, with all other parameters free. A period counts as shown when the
-readings speak for it, and against every other one, by far more than noise would.
+The residuals of a fit without screw waves are searched for periods: first strut by strut with Fourier transforms over
+the commands, then, about the strongest lines, with all other parameters free. A period is reported when the readings
+prefer it to every other one by far more than noise would.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from .assumptions import ASSUMED
 from .blocks import WAVES
 from .estimator import MEDIAN_TO_SIGMA, Estimation, LinearProblem, Posterior, at_once, solve
 
-LEAST_FREEDOM = 200.0  # fewest readings beyond the parameters that show a period
-MOST_READINGS = 5000  # in which a period is looked for first
+LEAST_FREEDOM = 200.0  # fewest readings beyond the parameters that determine a period
+MOST_READINGS = 5000  # first range of the search
 WAVE_AMPLITUDE = 10e-6  # prior of amplitudes while periods are compared, m: loose
 AGREES, CLOSE = 6.0, 5e-3  # a given or a round lead agrees within, σ, and as a share
 
-SHORTEST, LONGEST = 1e-3, 30e-3  # periods that are looked for, m: beyond, a wave is as smooth as a length map
+SHORTEST, LONGEST = 1e-3, 30e-3  # range of the search, m: longer waves are as smooth as a length map
 
 GRID_STEP = SHORTEST / 32.0
 """Of the transforms, m: 0.3 % of a wave of the shortest period is lost."""
@@ -33,16 +33,16 @@ ROUND = (0.5e-3, 0.025 * 0.0254)
 
 @dataclass(frozen=True)
 class ScrewLead:
-    """What is known of the screws' lead."""
+    """The screws' lead by settings, geometry and readings."""
 
     given: float | None  # by the settings or the geometry, m
-    shown: float | None  # the period that the readings show, m; None: they show none
+    shown: float | None  # the period that the readings show, m; None: none
     error: float  # its standard error, m
     odds: float  # log odds by which they prefer it to any other period and to none
 
     @property
     def used(self) -> float | None:
-        """The period to be fitted, m: the given one; else the one shown, or the round number that it stands for."""
+        """The period to be fitted, m: the given one; else the one shown, or the round number near it."""
         if self.given is not None or self.shown is None:
             return self.given
         within = AGREES * self.error
@@ -52,7 +52,8 @@ class ScrewLead:
 
     @property
     def agrees(self) -> bool:
-        """Whether the given lead explains what is shown, as one of its harmonics; True where there is no question."""
+        """Whether the given lead explains the shown one, as one of its harmonics; True if there is nothing to
+        compare."""
         if self.given is None or self.shown is None:
             return True
         misses = [abs(self.given / n - self.shown) for n in range(1, MOST_HARMONICS + 1)]
@@ -69,9 +70,9 @@ class ScrewLead:
 
 
 def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
-    """Return what readings show of the screws' lead, beside what is given; `problem` is at the nominal machine.
+    """Return the lead that readings show, with the given one; `problem` is at the nominal machine.
 
-    Where readings are plenty a random part is tried first.
+    With many readings a random part is tried first.
     """
     space, measurements = estimation.space, estimation.measurements
     given = float(space.periods[0]) if np.isfinite(space.periods).all() else None
@@ -85,10 +86,10 @@ def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
         odds, best, posterior = _strongest(estimation, problem)
     if best is None or odds < ASSUMED.lead_odds:
         return ScrewLead(given, None, np.inf, odds)
-    # So far the waves counted as noise, which let the priors weigh too much.
+    # Until here the waves counted as noise, which gave the priors too much weight.
     quiet = solve(space, problem, posterior.tolerances, posterior.noise * best.noise, rounds=0)
     rest = _Rest(estimation, problem, quiet)
-    if rest.freedom >= LEAST_FREEDOM:  # few readings leave a quiet fit nothing to tell its noise by
+    if rest.freedom >= LEAST_FREEDOM:  # a quiet fit of few readings has no information on its noise
         best = rest.line(best.frequency)
     if not np.isfinite(best.error):
         return ScrewLead(given, None, np.inf, odds)
@@ -96,7 +97,7 @@ def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
 
 
 def _strongest(estimation: Estimation, problem: LinearProblem) -> tuple[float, Line | None, Posterior]:
-    """Return the odds of the period that readings speak for most, that period, and the fit without waves."""
+    """Return the odds of the most probable period, that period, and the fit without waves."""
     space = estimation.space
     tolerances = np.where([b.name in WAVES for b in space.blocks], 0.0, space.start_tolerances())
     posterior = solve(space, problem, tolerances, np.ones(problem.normal.shape[0]), 5)
@@ -116,11 +117,11 @@ class Line(NamedTuple):
     frequency: float  # 1/m
     error: float  # its standard error
     odds: float  # log odds against no such errors
-    noise: float  # what it leaves, over what all else had left
+    noise: float  # its residual, over the residual without it
 
 
 class _Rest:
-    """What a fit without screw waves leaves of the readings, and how the six lengths move them, over the noise."""
+    """The residuals of a fit without screw waves, and their derivatives by the six lengths, over the noise."""
 
     def __init__(self, estimation: Estimation, problem: LinearProblem, posterior: Posterior) -> None:
         over_noise = 1.0 / posterior.noise[problem.kind]
@@ -141,7 +142,8 @@ class _Rest:
         self.frequencies = every[self._searched]
 
     def spectrum(self) -> np.ndarray:
-        """Return by how much a wave of each frequency lowers the squares, were struts and readings independent."""
+        """Return the reduction of the sum of squares by a wave of each frequency, as if struts and readings were
+        independent."""
         power = np.zeros(len(self.frequencies))
         for gain, commands in zip(self.gains.T, self.commands.T, strict=True):
             bins = ((commands - commands.min()) / GRID_STEP).round().astype(int)
@@ -150,7 +152,7 @@ class _Rest:
         return power
 
     def line(self, frequency: float, harmonics: int = MOST_HARMONICS) -> Line:
-        """Return the best frequency near one, with at most so many harmonics, all other parameters free."""
+        """Return the best frequency near one, with at most this number of harmonics, all other parameters free."""
         harmonics = int(np.clip(1.0 / (SHORTEST * frequency), 1, harmonics))
         parameters = 12 * harmonics + 1
         half_width, start = 0.5 / self.span, frequency
@@ -162,19 +164,21 @@ class _Rest:
             if abs(frequency + step - start) > half_width:
                 break
             frequency += step
-            if abs(step) < 0.1 * error:  # a Newton step squares that
+            if abs(step) < 0.1 * error:  # a Newton step squares the error
                 break
         return Line(frequency, error, self._odds(less, parameters), noise)
 
     def _odds(self, less: float, parameters: int) -> float:
-        """Return the log odds of an explanation that lowers the squares, at the noise that it leaves."""
+        """Return the log odds of an explanation that lowers the sum of squares, at the noise of its residuals."""
         left = max(self.square - less, 1e-6 * self.square)
         return 0.5 * self.freedom * float(np.log(self.square / left)) - parameters
 
     def _step_to(self, frequency: float, harmonics: int) -> tuple[float, float, float]:
-        """Return by how much waves of a frequency lower the squares, the step to a better one, its error at noise 1.
+        """Return the reduction of the sum of squares by waves of a frequency, the step to a better one, its error at
+        noise 1.
 
-        Readings that cannot tell a frequency from all else, to rounding, ask for no step, with an infinite error.
+        If readings cannot distinguish a frequency from all others, to rounding, the step is zero, with an infinite
+        error.
         """
         orders = np.arange(1, harmonics + 1)
         first = np.exp(2.0j * np.pi * frequency * self.commands)[:, None]
@@ -194,7 +198,7 @@ class _Rest:
         return less, float(together[-1]), float(np.sqrt(covariance[-1, -1]))
 
     def _free(self, columns: np.ndarray) -> np.ndarray:
-        """Return columns free of what the instruments do not know."""
+        """Return columns free of the instruments' unknowns."""
         for part in self._problem.unknowns:
             part.project_out(columns)
         return columns
@@ -204,7 +208,7 @@ class _Rest:
         return self._problem.rows.transposed_times(self._over_noise[:, None] * columns)[self._posterior.used]
 
     def _solved(self, columns: np.ndarray, shared: np.ndarray, loose: int = 0) -> tuple[np.ndarray, float, np.ndarray]:
-        """Return factors of columns (C, n), by how much they lower the squares, and their covariance.
+        """Return factors of columns (C, n), their reduction of the sum of squares, and their covariance.
 
         `shared` are theirs of :meth:`_shared`; the other parameters are free within their priors, and the last `loose`
         columns have none.
@@ -219,9 +223,9 @@ class _Rest:
 
 
 def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return amplitudes (2, harmonics, 6) without what noise makes of them, harmonic by harmonic (James & Stein).
+    """Return amplitudes (2, harmonics, 6) shrunk by the share of noise, harmonic by harmonic (James & Stein).
 
-    A harmonic that is none turns fastest: what noise makes of it would pass for knowledge of the frequency.
+    An absent harmonic turns fastest: its noise would count as information about the frequency.
     """
     result, numbers = amplitudes.copy(), np.arange(amplitudes.size).reshape(amplitudes.shape)
     for n in range(amplitudes.shape[1]):

@@ -1,14 +1,15 @@
-"""Scheme ``lines``, Mou & King's: a polynomial along each measured grid line, forward and backward apart.
+"""Scheme ``lines``, Mou & King's: a polynomial along each measured grid line, separate for forward and backward.
 
-A laser's zero is not known against the next line's, nor the slope of a straightness beam. So displacement along a line
-and rotations are zero, in the mean of both directions, where the line passes home's coordinate along it (backlash stays
-in, half to each direction), and a straightness is taken without its least-squares line. How the planes through home
-stand and bend (1-D data), or the squareness of the axes and the twists of the planes (5-D data) remain in the machine.
+A laser's zero relative to the next line's is not known, nor the slope of a straightness beam. So displacement along a
+line and rotations are set to zero, in the mean of both directions, where the line passes home's coordinate along it
+(backlash stays, half in each direction), and the least-squares line of a straightness is subtracted. The position and
+bending of the planes through home (1-D data), or the squareness of the axes and the twists of the planes (5-D data)
+remain in the machine.
 
 The three families of a field add up, but all cross in the grid's nodes and see the same errors there. So each component
 belongs first to one family (a displacement to the lines along it; a rotation to the first of x, y, z that reads it as
-pitch or yaw); the others share one polynomial for what it leaves over, averaged over lines that differ only in the
-first family's coordinate. On twenty virtual machines that left 18.1 µm of 27.9; 18.3 where all was added as read.
+pitch or yaw); the others share one polynomial for its residual, averaged over lines that differ only in the first
+family's coordinate. On twenty virtual machines the residual was 18.1 µm of 27.9; 18.3 where all readings were added.
 """
 
 from __future__ import annotations
@@ -37,28 +38,28 @@ from .datum import HeldDatum, hold
 
 OrderRule = Literal["adjusted-r2", "aicc"] | int  # how the order of a polynomial is chosen, or the order itself
 
-# Commands further off the nominal lengths than this, m, are a compensation's; than that, worth a remark
+# Commands further off the nominal lengths than this, m, are a compensation's; than that, worth a note
 COMPENSATED, FOLLOWED = 10e-6, 0.1e-6
 # A line of 17 points gets at most 5 coefficients, one of 9 gets 3: no more than the readings can carry
 POINTS_PER_COEFFICIENT = 3
-FEWEST_POINTS = 2 * POINTS_PER_COEFFICIENT  # below this not even a straight line is left
-# Repeated readings may scatter so many times as much as stated, and so far may readings lie off their polynomial, which
-# leaves out the screws' waves (on the shipped machine 15 times a rotation's noise)
+FEWEST_POINTS = 2 * POINTS_PER_COEFFICIENT  # below this not even a straight line is possible
+# Repeated readings may scatter by this factor more than stated, and readings may lie this far off their polynomial,
+# which leaves out the screws' waves (on the shipped machine 15 times a rotation's noise)
 MISFIT, LINES_MISFIT = 10.0, 100.0
 DIRECTIONS = (1, -1)  # forward, backward: the order of a field's polynomials
 
 
 @dataclass(frozen=True)
 class LineFit:
-    """One polynomial and how well it fits."""
+    """One polynomial and the quality of its fit."""
 
     name: str  # of the line, or of the lines that share the polynomial
     axis: int  # along which it runs
-    nodes: tuple[tuple[int, int], ...]  # indices across, in the order of CROSS_AXES, of each line that it stands for
+    nodes: tuple[tuple[int, int], ...]  # indices across, in the order of CROSS_AXES, of each line that it represents
     component: int  # index into machine.field.COMPONENTS
-    direction: int  # 1, -1, or 0 for a line that was read in one direction, or in none, and stands for both
+    direction: int  # 1, -1, or 0 for a line that was read in one direction, or in none, and represents both
     coordinates: np.ndarray  # (n,), along the axis, m in base
-    values: np.ndarray  # (n,), mean readings less the datum and what other families say, m or rad
+    values: np.ndarray  # (n,), mean readings minus the datum and the other families' part, m or rad
     coefficients: np.ndarray  # (order + 1,), powers of u, which runs from -1 to 1 over the box
     r2: float
     adjusted_r2: float
@@ -73,11 +74,11 @@ class LineFit:
 
 @dataclass(frozen=True)
 class LinesFit:
-    """What scheme ``lines`` makes of a machine's readings."""
+    """Result of scheme ``lines`` for a machine's readings."""
 
-    model: MachineModel  # the field; the rest is nominal, but for the base where holding the datum moves it
+    model: MachineModel  # the field; the rest is nominal, except the base if holding the datum moves it
     lines: tuple[LineFit, ...]
-    notes: tuple[str, ...]  # what was odd, left out or assumed
+    notes: tuple[str, ...]  # notes on odd, omitted or assumed inputs
     held: HeldDatum
     misfit: str = ""  # why the model is not to be trusted: repeats that scatter, or readings far off their polynomials
 
@@ -103,7 +104,7 @@ def fit_lines(
     groups = np.unique(np.stack([measurements.run, measurements.channel]), axis=1, return_inverse=True)[1].ravel()
     means = np.bincount(groups, measurements.value) / np.bincount(groups)
     left = measurements.value - means[groups]
-    if np.abs(left).max() <= LEAST_NOISE:  # one silent kind among others does this scheme no harm
+    if np.abs(left).max() <= LEAST_NOISE:  # one kind without noise among others does not harm this scheme
         refuse_unmoved(measurements, left)
     chosen = f"of order {order}" if isinstance(order, int) else f"of an order chosen by {order}"
     note = (
@@ -124,7 +125,7 @@ def fit_lines(
 
 
 def _misfit(measurements: MeasurementSet, fits: Sequence[LineFit]) -> str:
-    """Return what :attr:`LinesFit.misfit` says."""
+    """Return :attr:`LinesFit.misfit`."""
     repeated: dict[int, float] = {}
     left: dict[int, float] = {}
     for kind in np.unique(measurements.kind):
@@ -167,7 +168,7 @@ class Readings(NamedTuple):
 
 
 def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
-    """Return the readings on lines parallel to an axis, and remarks on all that was left out."""
+    """Return the readings on lines parallel to an axis, and notes on omitted ones."""
     m = measurements
     axis_of_run = np.array([-1 if run.base_axis is None else run.base_axis for run in m.runs])
     axis = axis_of_run[m.run]
@@ -200,7 +201,7 @@ def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
 
 
 def _of_the_model(measurements: MeasurementSet) -> np.ndarray:
-    """Return readings without what the turning of the screws does to them, shape (N,), m or rad."""
+    """Return readings without the effect of the screws' turning, shape (N,), m or rad."""
     m = measurements
     if not m.geometry.screw_lead.any():
         return m.value
@@ -209,7 +210,7 @@ def _of_the_model(measurements: MeasurementSet) -> np.ndarray:
 
 
 def _components(measurements: MeasurementSet, wanted: np.ndarray) -> np.ndarray:
-    """Return which of the six components each reading is of, shape (N,), −1 where a mask does not want it."""
+    """Return the index of each reading's component of six, shape (N,), −1 where a mask excludes it."""
     weights = np.abs(measurements.directions())
     turned = wanted & (weights.max(axis=1) < 1.0 - 1e-9)
     if turned.any():
@@ -223,7 +224,7 @@ def _components(measurements: MeasurementSet, wanted: np.ndarray) -> np.ndarray:
 
 
 def _command_note(measurements: MeasurementSet, stations: np.ndarray) -> list[str]:
-    """Return a remark on commands that were not quite nominal; refuse a machine that was compensated."""
+    """Return a note on commands that were not quite nominal; refuse a machine that was compensated."""
     there, nominal = measurements.stations, Structure.of(measurements.geometry)
     lengths = strut_lengths_batch(nominal, there.positions[stations], there.rotations[stations])
     most = float(np.abs(there.commands[stations] - lengths).max())
@@ -236,13 +237,13 @@ def _command_note(measurements: MeasurementSet, stations: np.ndarray) -> list[st
 
 
 def _distinct(values: np.ndarray) -> np.ndarray:
-    """Return values, in order, of which no two are the same place."""
+    """Return distinct values, sorted; equal ones are the same place."""
     ordered = np.unique(values)
     return ordered[np.append(True, np.diff(ordered) > LEAST_TRAVEL)]
 
 
 def _grid_of(readings: Readings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the nodes along x, y, z, m: where the lines stand, or how far they go where none crosses."""
+    """Return the nodes along x, y, z, m: the places of the lines, or their ends where none crosses."""
     grid = []
     for axis, name in enumerate(AXES):
         along = readings.point[readings.axis == axis, axis]
@@ -282,7 +283,7 @@ def _check_complete(readings: Readings, grid: Sequence[np.ndarray]) -> None:
 
 
 def _check_ends(family: Readings, axis: int, grid: Sequence[np.ndarray]) -> None:
-    """Refuse a line that ends within the grid: a polynomial says nothing beyond its readings."""
+    """Refuse a line that ends within the grid: a polynomial is not valid beyond its readings."""
     low, high = grid[axis][0], grid[axis][-1]
     for node in sorted({(int(i), int(j)) for i, j in family.node[:, CROSS_AXES[axis]]}):
         on_line = (family.node[:, CROSS_AXES[axis]] == node).all(axis=1)
@@ -294,7 +295,7 @@ def _check_ends(family: Readings, axis: int, grid: Sequence[np.ndarray]) -> None
 
 
 def _datum_of(measurements: MeasurementSet, grid: Sequence[np.ndarray]) -> tuple[np.ndarray, list[str]]:
-    """Return where each line is zero, shape (3,), m in ``base``: home's place of the measured point."""
+    """Return the point where each line is zero, shape (3,), m in ``base``: home's place of the measured point."""
     home = measurements.geometry.home
     point = home.position + home.rotation @ measurements.probe
     datum = np.array([min(max(p, nodes[0]), nodes[-1]) for p, nodes in zip(point, grid, strict=True)])
@@ -335,7 +336,7 @@ def _fit_family(
     """Return the polynomials of the lines along an axis for one component; `field` has the families before this one."""
     family = readings.select(readings.axis == axis)
     first = _priority(component, readings)[0]
-    # Lines of which the first family has predicted everything that differs between them share what is left.
+    # Lines whose differences the first family has predicted share the residual.
     shared = None if axis == first else first
     family = family._replace(value=family.value - _predicted(field, family, component))
     fits = []
@@ -348,7 +349,7 @@ def _fit_family(
 
 
 def _fit_notes(fits: Sequence[LineFit], order: OrderRule) -> list[str]:
-    """Return remarks on lines that were read in one direction only, or did not carry the order asked for."""
+    """Return notes on lines that were read in one direction only, or with too few points for the requested order."""
     notes = []
     one_way = list(dict.fromkeys(fit.name for fit in fits if fit.direction == 0))
     if one_way:
@@ -362,7 +363,7 @@ def _fit_notes(fits: Sequence[LineFit], order: OrderRule) -> list[str]:
 
 
 def _predicted(field: GridField, readings: Readings, component: int) -> np.ndarray:
-    """Return the errors that a field predicts for readings, shape (N,); an axis that stands still has no direction."""
+    """Return the errors that a field predicts for readings, shape (N,); an axis at rest has no direction."""
     predicted = np.zeros(len(readings.value))
     if not any(family[:, :, :, component].any() for family in field.lines):
         return predicted
@@ -394,7 +395,7 @@ def _fit_line(
     """Return the polynomials of a line's directions: two, or one when it was read in one direction only."""
     axis, component = int(group.axis[0]), int(group.component[0])
     ways = sorted(set(group.direction.tolist()) - {0}, reverse=True) or [0]
-    group = group.select(np.isin(group.direction, ways))  # readings without direction tell nothing beside others
+    group = group.select(np.isin(group.direction, ways))  # readings without direction are not used beside others
     u = _parameter(group.point[:, axis], along)
     values = _without_run_zeros(group, u, ways)
     place, number = _places(group.point[:, axis])

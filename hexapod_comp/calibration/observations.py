@@ -1,10 +1,10 @@
-"""What was observed: cells of repeated readings, and the nuisance parameters of the instruments that read them.
+"""Observations: cells of repeated readings, and the nuisance parameters of the instruments that read them.
 
-Nuisance are zeros, the slopes of beams, and where a length starts from. A length is read from a centre c to the
+Nuisance are zeros, the slopes of beams, and the start of a length. A length is read from a centre c to the
 measured point p + e: it is |p + e − c| − |p − c₀| + zero longer than commanded, with c₀ the centre's place in the file.
 The centres of a run belong to one body, c = m + R·(c₀ − m) + δ, with m their mean. δ and R are fitted to the readings
-wherever the machine's parameters stand (variable projection): a centre may be millimetres off its place, and errors
-need not be small beside the length.
+for every parameter vector (variable projection): a centre may be millimetres off its place, and errors need not be
+small compared with the length.
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ from ..machine.arrays import different_rows, rms
 from ..measurements.readings import ABSOLUTE_KINDS, KINDS, LEAST_TRAVEL, LENGTH, MeasurementSet
 from .assumptions import ASSUMED
 
-FAR = 5.0  # a centre further off its place is refused, σ of its prior
+FAR = 5.0  # a centre further off its stated place is refused, σ of its prior
 UNMOVED = 1e-3  # change of lengths by a body's motion that hardly shows it: a circle's centre
 FRAME_STATIONS = 4  # tracker runs with fewer stations share a frame: six unknowns need three
-FRAME_RANK = 1e-9  # what moves readings less, in proportion, is rounding
+FRAME_RANK = 1e-9  # smaller relative motions of readings are rounding
 
 ROUNDS, SETTLED = 20, 1e-10
-"""Most Gauss–Newton steps to a body's place, and the step, m, after which it has settled."""
+"""Most Gauss–Newton steps to a body's place, and the step, m, at which it has converged."""
 
 
 class Nuisance(NamedTuple):
-    """What one channel of one run does not know, in units of the standard deviation of its cells."""
+    """The unknowns of one channel of one run, in units of the standard deviation of its cells."""
 
     members: np.ndarray  # (n,): Its cells
     basis: np.ndarray  # (n, k): Orthonormal directions of the cells' values that the unknown moves
-    # (k,): How much of each is explained by the unknown, 0…1; the rest is left for the machine. 1: nothing else is
+    # (k,): Share of each that the unknown explains, 0…1; the rest remains for the machine. 1: all of it
     # known of it
     share: np.ndarray
 
     def explained(self, values: np.ndarray) -> np.ndarray:
-        """Return what the unknown most probably adds to its cells' values, shape (n,)."""
+        """Return the most probable contribution of the unknown to its cells' values, shape (n,)."""
         return self.basis @ (self.share * (self.basis.T @ values[self.members]))
 
     def project_out(self, values: np.ndarray, where: np.ndarray | slice | None = None) -> None:
-        """Take off the cells' values, (C,) or (C, n), in place, what the unknown may explain.
+        """Subtract from the cells' values, (C,) or (C, n), in place, the part that the unknown may explain.
 
         Values with the covariance I + B·Bᵀ, B the unknown's columns in its standard deviations, become values with the
-        covariance I. `where` the cells' values stand if that is not at their numbers.
+        covariance I. `where` gives the positions of the cells' values if they are not at their numbers.
         """
         where = self.members if where is None else where
         weight = 1.0 - np.sqrt(1.0 - self.share)
@@ -104,15 +104,15 @@ class Lengths:
 
     name: str  # Of the run
     members: np.ndarray  # (n,): Cells
-    # (n, 3): Commanded place of the measured point, and from where its length is read, as far as known, m in ``base``
+    # (n, 3): Commanded place of the measured point, and stated place from which its length is read, m in ``base``
     points: np.ndarray
-    # (n, 3): Commanded place of the measured point, and from where its length is read, as far as known, m in ``base``
+    # (n, 3): Commanded place of the measured point, and stated place from which its length is read, m in ``base``
     centres: np.ndarray
-    known_zero: bool  # Whether the lengths are known as a whole
+    known_zero: bool  # Whether the lengths are calibrated
 
     @property
     def count(self) -> int:
-        """How many numbers are unknown."""
+        """Number of the unknowns."""
         return (not self.known_zero) + (6 if self._arms().any() else 3)
 
     def _arms(self) -> np.ndarray:
@@ -123,10 +123,10 @@ class Lengths:
     def seen(
         self, displacement: np.ndarray, value: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
-        """Return what these lengths show, once their body has been put where it explains them best.
+        """Return the information in these lengths, once their body is at its most probable place.
 
-        What is left of the lengths counts as their noise where it is more: far from the answer a circle's centre would
-        otherwise leave its plane, where it hardly matters, to explain what the machine does.
+        A residual of the lengths larger than their noise counts as noise: far from the answer a circle's centre would
+        otherwise leave its plane, where it hardly matters, to explain the machine's errors.
         """
         known = 0 if self.known_zero else 1
         zero = Nuisance(self.members, (scale / np.linalg.norm(scale))[:, None][:, :known], np.ones(known))
@@ -153,7 +153,7 @@ class Lengths:
             body = np.concatenate([body[:3] + step[:3], size * turn.as_rotvec()])
         self._refuse_far(body[:3])
         u, s, _ = np.linalg.svd(columns / noise, full_matrices=False)
-        # As seen from the file's place, where the prior's mean is: else being off it would cost nothing.
+        # Relative to the file's place, the prior's mean: otherwise an offset from it would cost nothing.
         seen = distance - nominal - columns @ off / scale
         return seen, n, [zero, Nuisance(self.members, u, s**2 / (1.0 + s**2))]
 
@@ -168,7 +168,7 @@ class Lengths:
         return directions * np.where(squares > UNMOVED**2, ASSUMED.centre, ASSUMED.across)
 
     def _refuse_far(self, place: np.ndarray) -> None:
-        """Raise when the body is at another place, m, than the file's."""
+        """Raise when the body is at another place, m, than in the file."""
         if np.abs(place).max() > FAR * ASSUMED.centre:
             shown = ", ".join(f"{v * 1e3:.1f}" for v in place)
             problem = f"the lengths of run {self.name} put their centre {shown} mm (in base) off its place in the file"
@@ -179,11 +179,11 @@ class Lengths:
 
 @dataclass(frozen=True)
 class Frame:
-    """Where a tracker stands: readings of one set-up, in a frame that is only roughly the work frame.
+    """The place of a tracker: readings of one set-up, in a frame that is only roughly the work frame.
 
     A frame off by the rotation R and the shift d about c shows the point p + e at c + Rᵀ·(p + e − c − d), and the
-    attitude error r as that of Rᵀ·exp(r). R and d are fitted wherever the machine's parameters stand; nothing is known
-    of them beforehand, however far they are from the nominal ones.
+    attitude error r as that of Rᵀ·exp(r). R and d are fitted for every parameter vector; no prior holds them near the
+    nominal ones.
     """
 
     members: np.ndarray  # (n,): cells
@@ -192,7 +192,8 @@ class Frame:
     def seen(
         self, directions: np.ndarray, errors: np.ndarray, value: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, Nuisance]:
-        """Return what these cells should read, along which directions (n, 6) errors move it, and the six unknowns.
+        """Return the predicted values of these cells, the directions (n, 6) of errors that change them, and the six
+        unknowns.
 
         `directions` (n, 6) are those of a right frame, `errors` (n, 6) those of the machine, `value` and `scale` (n,)
         what was read and one over its standard deviation.
@@ -230,9 +231,9 @@ class Cells:
     group: np.ndarray  # (C,): Of each cell; a group is one channel of one run, whose unknowns its cells share
     directions: np.ndarray  # (C, 6): w of each cell; of a length, from its centre's place in the file
     along: np.ndarray  # (C,): Commanded coordinate along the line, m
-    lever: np.ndarray  # (C,): By how much a square that turns moves it, m per rad
+    lever: np.ndarray  # (C,): Its change by a square's rotation, m per rad
     square: np.ndarray  # (C,): Number of the square and its axis whose slope it has; -1: its group has its own, or none
-    # (C,): What is left out together in cross-validation: a line's run, a ball bar's circle, or a scattered pose
+    # (C,): Fold of cross-validation: a line's run, a ball bar's circle, or a scattered pose
     fold: np.ndarray
 
     @staticmethod

@@ -1,8 +1,8 @@
-"""The parameters of a joint calibration: an ordered collection of blocks, and what a fit is told.
+"""The parameters of a joint calibration: an ordered collection of blocks, and the settings of a fit.
 
 Each block has a prior: zero mean and a covariance of known shape whose size, the block's *tolerance*, is a
-hyperparameter estimated with the rest. The prior fixes what the data cannot see (the gauge) at the nominal machine and
-keeps smooth blocks smooth; where the data determine a parameter it hardly counts.
+hyperparameter estimated with the rest. The prior fixes unobservable directions (the gauge) at the nominal machine and
+keeps smooth blocks smooth; it hardly affects parameters that the data determine.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from .blocks.load import as_loaded, stated_load
 
 LEADS = 0.1e-3, 1.0  # shortest and longest of a screw, m
 LARGEST_EXPANSION, LARGEST_MOISTURE = 100e-6, 1e-2  # 1/K: three times zinc's; m/m from dry to damp: more than wood's
-BEYOND_STROKE = 50e-3  # encoders may read so far beyond the stroke, m: zeros of their own
+BEYOND_STROKE = 50e-3  # largest reading of encoders beyond the stroke, m: they have their own zeros
 
 TOLERANCES = {block.name: block.tolerance for block in ERRORS}
-"""First guess of the blocks' standard deviations, m, m/m, rad or 1/K; the fit goes on from there."""
+"""First guess of the blocks' standard deviations, m, m/m, rad or 1/K; the fit estimates them."""
 
 BLOCKS = tuple(TOLERANCES)
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """What a joint fit is told besides the measurements.
+    """Inputs of a joint fit besides the measurements.
 
     Parameters
     ----------
@@ -112,9 +112,10 @@ class FitSettings:
             if not 0.0 <= value <= largest:
                 raise ModelError(name.replace("_", " "), f"must be 0…{largest * factor:g} {unit}", value * factor)
         if self.load:
-            Load.from_numbers(self.load)  # refuses what cannot be
+            Load.from_numbers(self.load)  # refuses invalid numbers
         constants = self.time_constants or ()
-        LateGrowth(tuple(constants), np.zeros((len(PARTS), len(constants))), self.thermometer)  # refuses what cannot be
+        # refuses invalid numbers
+        LateGrowth(tuple(constants), np.zeros((len(PARTS), len(constants))), self.thermometer)
         for name, given, most, unit in (("scale", self.scale, 1e-2, "m/m"), ("alignment", self.alignment, 0.1, "rad")):
             if given is not None and not 0.0 <= given <= most:
                 raise ModelError(name, f"must be 0…{most:g} {unit}", given)
@@ -126,11 +127,11 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class Extent:
-    """What was measured, as far as parameters depend on it: all that is left of readings once they are fitted."""
+    """The region of a measurement, as far as parameters depend on it; it remains after the readings are fitted."""
 
     commands: np.ndarray  # (2,): lowest and highest strut command, m
-    box: np.ndarray  # (2, 3): lowest and highest commanded place of the measured point, m in base: where the field is
-    work_box: np.ndarray  # (2, 3): the same in the work frame, in which campaigns are boxes: where the model holds
+    box: np.ndarray  # (2, 3): lowest and highest commanded place of the measured point, m in base: the field's region
+    work_box: np.ndarray  # (2, 3): the same in the work frame, in which campaigns are boxes: the model's region
     level: np.ndarray  # (3, 3): attitude of the platform, in base, with a level tool (MeasurementSet.level)
     probe: np.ndarray  # (3,): the measured point in platform, m
 
@@ -165,9 +166,9 @@ class Components(NamedTuple):
 
 
 class ParameterSpace:
-    """All parameters of a joint fit, in SI, block by block, and the machine that a vector of them makes.
+    """All parameters of a joint fit, in SI, block by block, and the machine of a vector of them.
 
-    `blocks` stand in the order of the vector, `size` is its length; `region` is what was measured.
+    `blocks` are in the order of the vector, `size` is its length; `region` is the measured one.
     """
 
     def __init__(self, measurements: MeasurementSet | tuple[HexapodGeometry, Extent], settings: FitSettings) -> None:
@@ -207,12 +208,12 @@ class ParameterSpace:
 
     @property
     def measured(self) -> Region | None:
-        """Where a model of these parameters holds; None where no box was measured."""
+        """The region of models with these parameters; None if no box was measured."""
         return Region.of(self.work_box, self.probe, self.geometry.work) if spans(self.work_box) else None
 
     @property
     def offsets(self) -> slice:
-        """Where the struts' offsets stand; they move the tool as any error of length does."""
+        """The slice of the struts' offsets, which move the tool like any error of length."""
         end = self.blocks[0].part.stop
         return slice(end - 6, end)
 
@@ -251,7 +252,7 @@ class ParameterSpace:
 
     @property
     def swells(self) -> bool:
-        """Whether humidity acts on the struts."""
+        """Whether humidity changes the struts."""
         return self.settings.strut_moisture is not None
 
     @property
@@ -261,7 +262,7 @@ class ParameterSpace:
         return np.array([*[s.strut_expansion] * 6, s.base_expansion, s.platform_expansion])
 
     def _draft(self, x: np.ndarray) -> Draft:
-        """Return what a parameter vector means, written by its blocks."""
+        """Return the machine model of a parameter vector, written by its blocks."""
         waves = {part: np.zeros((6, MOST_HARMONICS)) for part in ("cosine", "sine")}
         struts = {
             "reference_length": self.home_lengths,
@@ -283,7 +284,7 @@ class ParameterSpace:
         return draft
 
     def model(self, x: np.ndarray, name: str = "joint calibration", with_field: bool = True) -> MachineModel:
-        """Return the machine that a parameter vector (size,), SI, means.
+        """Return the machine of a parameter vector (size,), SI.
 
         `with_field` false leaves the field out: the fit adds it from its own basis.
         """
@@ -311,7 +312,7 @@ class ParameterSpace:
         """Return the load block as stated, with compliances and lost motions that differ from it by a draft's."""
         stated = stated_load(self.settings)
         if draft.compliance.any():
-            # A step on the way may overshoot: no strut is stiffer than ten times what is stated
+            # A step on the way may overshoot: no strut is stiffer than ten times the stated value
             compliance = np.maximum(stated.compliance + draft.compliance, 0.1 * stated.compliance)
             stated = replace(stated, stiffness=reciprocal(compliance))
         return replace(stated, lost_motion=stated.lost_motion + draft.lost_motion)
@@ -323,7 +324,7 @@ class ParameterSpace:
 
 
 def _check_commands(geometry: HexapodGeometry, commands: np.ndarray) -> None:
-    """Refuse strut readings that are no lengths of this machine's struts."""
+    """Refuse strut readings that cannot be lengths of this machine's struts."""
     stroke, beyond = geometry.limits.stroke, BEYOND_STROKE
     low, high = stroke.min() - beyond, stroke.max() + beyond
     if not (low <= commands.min() and commands.max() <= high):

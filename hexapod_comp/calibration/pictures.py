@@ -1,4 +1,4 @@
-"""Pictures of calibrations: what a model says of the struts, and how polynomials lie among their readings."""
+"""Pictures of calibrations: a model's strut errors, and polynomials with their readings."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def strut_error_figure(
 
 
 def fitted_lines_figure(fit: LinesFit, axis: int = 0, component: int | None = None) -> Figure:
-    """Show the polynomials of one family and component among the readings that they were fitted to."""
+    """Show the polynomials of one family and component with their readings."""
     component = axis if component is None else component
     lines = [line for line in fit.lines if (line.axis, line.component) == (axis, component)]
     if not lines:
@@ -105,7 +105,7 @@ def _line_panel(axes: Axes, line: LineFit, grid: Sequence[np.ndarray]) -> None:
 
 
 def fit_figure(fit: ModelFit) -> Figure:
-    """Show a joint fit: its residuals, the struts' errors, what the data determine, and what error to expect."""
+    """Show a joint fit: its residuals, the struts' errors, what the data determine, and the expected tool error."""
     figure = Figure(figsize=(11, 7.6), layout="constrained")
     panels = figure.subplots(2, 2)
     _residual_panel(panels[0, 0], fit)
@@ -128,7 +128,7 @@ def _sight_panel(axes: Axes, fit: ModelFit) -> None:
 
 
 def _residual_panel(axes: Axes, fit: ModelFit) -> None:
-    """Show the residuals of each kind of channel against what noise alone would look like."""
+    """Show the residuals of each kind of channel compared with pure noise."""
     kinds = fit.measurements.kind
     edges = np.linspace(-5.0, 5.0, 51)
     for channel in fit.channels:
@@ -141,7 +141,7 @@ def _residual_panel(axes: Axes, fit: ModelFit) -> None:
 
 
 def _strut_panel(axes: Axes, fit: ModelFit) -> None:
-    """Show what each strut does with its commands, offset and backlash aside."""
+    """Show each strut's error over its commands, without offset and backlash."""
     struts = fit.model.struts
     even = replace(struts, cosine=np.zeros_like(struts.cosine), sine=np.zeros_like(struts.sine))
     machine = RealMachine(fit.measurements.geometry, replace(fit.model, struts=even))
@@ -157,7 +157,7 @@ def _strut_panel(axes: Axes, fit: ModelFit) -> None:
 
 
 def _tool_error_panel(axes: Axes, fit: ModelFit) -> None:
-    """Show the tool error to expect, before and after, for a level and for a tilted tool."""
+    """Show the expected tool error, before and after, for a level and for a tilted tool."""
     cases = {"level": fit.level, "tilted 10°": fit.tilted}
     known = {name: error for name, error in cases.items() if error is not None}
     places = np.arange(len(known))
@@ -183,13 +183,13 @@ def _maps(fit: ModelFit) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     points = np.stack(np.meshgrid(heights, y, x, indexing="ij"), axis=-1)[..., ::-1].reshape(-1, 3)
     errors = errors_in_space(fit.space, fit.solution.x, fit.covariance, fit.space.places(points))
     before, left = (part.reshape(3, MAP_NODES, MAP_NODES) * 1e6 for part in errors)
-    # What the promise allows for beside the parameters is nowhere in particular, so it is everywhere.
+    # The allowance for errors without a parameter has no place, so it is added everywhere.
     beside = 0.0 if fit.level is None else (fit.level.after * 1e6) ** 2 - np.nanmean(left**2)
     return x, y, heights, before, np.sqrt(left**2 + max(beside, 0.0))
 
 
 def left_error_figure(fit: ModelFit) -> Figure:
-    """Show where in the measured box what error is left after compensation: the RMS to expect, at three heights."""
+    """Show the expected residual error (RMS) in the measured box at three heights."""
     x, y, heights, _, left = _maps(fit)
     figure = Figure(figsize=(11, 3.9), layout="constrained")
     panels = figure.subplots(1, 3, sharex=True, sharey=True)

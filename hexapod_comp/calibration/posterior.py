@@ -1,9 +1,9 @@
-"""The posterior: what a fit knows of its parameters and how well, and what that says of the tool's error.
+"""The posterior: the parameters of a fit with their covariance, and the resulting tool error.
 
-The only place that turns a covariance of parameters into tool error. To first order the error is e(x) = e₀ + J·δx at
+The only place that computes tool error from a covariance of parameters. To first order the error is e(x) = e₀ + J·δx at
 every place; with Σ the parameters' covariance its own is J·Σ·Jᵀ, and with M the mean of JᵀJ over the places of a box
 its mean square is tr(M·Σ). As a rule the *datum is aligned*: the shift and the turn that best explain the
-displacements, and the mean rotation, are taken off e and J, as a shop does that sets its zero and squares its work.
+displacements, and the mean rotation, are subtracted from e and J, as setting up a workpiece does.
 
 Mou & King (1998): "predict the linear displacement errors of any point within designated machine workspace".
 """
@@ -55,11 +55,12 @@ class FittedParameters:
     covariance: np.ndarray  # (size, size)
     tolerances: np.ndarray  # (blocks,), size of each block's prior
     noise: np.ndarray  # (kinds,), factor on the stated standard deviation of each kind's readings
-    held: HeldDatum | None = None  # where the model holds the tool; x and covariance are as before; None in old files
+    # where the model holds the tool; x and covariance are not changed by it; None in old files
+    held: HeldDatum | None = None
 
     @staticmethod
     def of(fit: ModelFit) -> FittedParameters:
-        """Return what a fit knows."""
+        """Return the posterior of a fit."""
         estimate = fit.solution.posterior
         return FittedParameters(
             fit.space, fit.solution.x, fit.covariance, estimate.tolerances, estimate.noise, fit.held
@@ -70,7 +71,7 @@ class FittedParameters:
 
 
 class Datum(NamedTuple):
-    """A small motion of everything about a centre, and the tool's mean rotation: what aligning takes off."""
+    """A small motion of everything about a centre, and the tool's mean rotation: the part that alignment subtracts."""
 
     centre: np.ndarray  # (3,), m
     motion: np.ndarray  # (6, 1 + size), shift, m, and turn, rad
@@ -78,7 +79,8 @@ class Datum(NamedTuple):
 
 
 class FirstOrder(NamedTuple):
-    """The tool's errors at N places and how parameters move them, along and about the same axes, m and rad."""
+    """The tool's errors at N places and their derivatives by the parameters, along and about the same axes, m and
+    rad."""
 
     places: np.ndarray  # (N, 3)
     columns: np.ndarray  # (N, 6, 1 + size): displacement and rotation vector, then their derivatives
@@ -105,7 +107,7 @@ class FirstOrder(NamedTuple):
         return FirstOrder(self.places[chosen], self.columns[chosen])
 
     def datum(self) -> Datum:
-        """Return what explains the displacements best, by least squares, and the mean rotation."""
+        """Return the motion that explains the displacements best, by least squares, and the mean rotation."""
         centre = self.places.mean(axis=0)
         unit = np.tile(np.eye(6), (len(self.places), 1, 1))
         explain = np.linalg.pinv(carried(unit, self.places - centre)[:, :3].reshape(-1, 6))
@@ -113,20 +115,21 @@ class FirstOrder(NamedTuple):
         return Datum(centre, motion, self.columns[:, 3:].mean(axis=0))
 
     def aligned(self, datum: Datum | None = None) -> FirstOrder:
-        """Return the same with a datum taken off, by default that of these places."""
+        """Return the same minus a datum, by default that of these places."""
         datum = self.datum() if datum is None else datum
         whole = carried(datum.motion[None], self.places - datum.centre)
         whole[:, 3:] = datum.rotation
         return FirstOrder(self.places, self.columns - whole)
 
     def mean_squares(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return M of displacement and of rotation, (size, size): δxᵀ·M·δx is the mean square that δx makes."""
+        """Return M of displacement and of rotation, (size, size): δxᵀ·M·δx is the mean square for a change δx."""
         count, size = len(self.places), self.slopes.shape[2]
         parts = (self.slopes[:, rows].reshape(-1, size) for rows in (slice(3), slice(3, 6)))
         return tuple(part.T @ part / count for part in parts)  # type: ignore[return-value]
 
     def known(self, covariance: np.ndarray | None, moved: np.ndarray | float = 0.0) -> PredictedError:
-        """Return the errors with their mean squares about the truth; `moved`, (N, 6), is by how much a model was."""
+        """Return the errors with their mean squares about the truth; `moved`, (N, 6), is the motion by holding the
+        datum."""
         if covariance is None:
             return PredictedError(self.values, None)
         moves = np.broadcast_to(moved, self.values.shape)
@@ -136,10 +139,10 @@ class FirstOrder(NamedTuple):
 
 @dataclass(frozen=True)
 class PredictedError:
-    """What the tool's tip does at N poses when the struts are told nominal lengths, in ``work``, m and rad."""
+    """The error of the tool's tip at N poses with the struts commanded to nominal lengths, in ``work``, m and rad."""
 
     values: np.ndarray  # (N, 6), displacement and rotation vector, actual minus commanded; NaN where there is no pose
-    covariance: np.ndarray | None  # (N, 6, 6); None: nobody knows
+    covariance: np.ndarray | None  # (N, 6, 6); None: not known
 
     @property
     def deviations(self) -> np.ndarray | None:
@@ -152,9 +155,10 @@ class PredictedError:
 class ErrorPredictor:
     """Predicts the tool's error without compensation, by a model at its temperatures, at any pose.
 
-    Σ has the prior of what no reading showed, so that the uncertainty of an error as the machine stands includes where
-    it stands as a whole. A model whose datum is held has been moved away from the most probable machine by h: about
-    what it predicts the truth then scatters by J·Σ·Jᵀ + h·hᵀ. Without fitted parameters no covariance is known.
+    Σ has the prior of motions that no reading showed, so that the uncertainty of an error as the machine stands
+    includes where it stands as a whole. A model whose datum is held has been moved away from the most probable machine
+    by h: the truth then scatters about its prediction by J·Σ·Jᵀ + h·hᵀ. Without fitted parameters no covariance is
+    known.
     """
 
     def __init__(self, machine: RealMachine, fitted: FittedParameters | None) -> None:
@@ -178,9 +182,10 @@ class ErrorPredictor:
         return _joined(standing), _joined(aligned) if aligned else None
 
     def slopes(self, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the tips in ``work``, (N, 3), m, and how the fit's parameters move the tool there, (N, 6, size).
+        """Return the tips in ``work``, (N, 3), m, and the tool's derivatives by the fit's parameters, (N, 6, size).
 
-        As the machine stands and with the datum aligned; and what holding the datum took off the former, (N, 6).
+        As the machine stands and with the datum aligned; and the part of the former removed by holding the datum, (N,
+        6).
         """
         if self._fitted is None or self._datum is None:
             raise CalibrationError("model", "tells neither how well it is known, nor where it was measured")
@@ -253,22 +258,22 @@ def _joined(parts: list[PredictedError]) -> PredictedError:
 class ToolError:
     """The tool error of a machine before and after compensation, RMS in a box, the datum aligned."""
 
-    before: float  # 3-D error of the machine as fitted, told nominal lengths, m
-    after: float  # 3-D error to expect with the model, m
+    before: float  # 3-D error of the fitted machine commanded with nominal lengths, m
+    after: float  # expected 3-D error with the model, m
     low: float  # it lies above this with 97.5 %, m,
-    high: float  # and below this, which allows for errors of which the readings do not tell whether they are there
+    high: float  # and below this, which allows for errors that the readings neither show nor exclude
     rotation_before: float  # rad, as above
     rotation_after: float
-    rotation_low: float | None  # None where the readings do not show how the tool rolls: only priors would say it
+    rotation_low: float | None  # None if the readings do not show the tool's roll: only priors would determine it
     rotation_high: float | None
     rotation_unknown: str = ""  # why they are None
 
 
 def box_stations(space: ParameterSpace, tilt: float = 0.0) -> Stations | None:
-    """Return random reachable stations in the measured box, in the work frame, each passed there and back.
+    """Return random reachable stations in the measured box, in the work frame, each passed in both directions.
 
-    First all there, then all back. The tool is tilted by `tilt`, rad, from level, each time about another horizontal
-    axis of the work frame.
+    First all forward, then all backward. The tool is tilted by `tilt`, rad, from level, each time about another
+    horizontal axis of the work frame.
     """
     rng = np.random.default_rng(SEED)
     points = space.places(rng.uniform(space.work_box[0], space.work_box[1], (POINTS, 3)))
@@ -283,7 +288,7 @@ def box_stations(space: ParameterSpace, tilt: float = 0.0) -> Stations | None:
 
 
 def stations_of(passes: Passes) -> Stations:
-    """Return the stations of some passes, told nominal lengths, at 20 °C."""
+    """Return the stations of some passes, commanded with nominal lengths, at 20 °C."""
     count = len(passes)
     return Stations(
         positions=passes.positions,
@@ -312,8 +317,8 @@ def expected_error(
 ) -> ToolError | None:
     """Return the tool error that drawn machines of a covariance leave over the measured box, both directions.
 
-    The error before is that of x, or of machines of a `prior` covariance. What is `beyond` all parameters
-    widens the interval upwards. None where no pose is within reach.
+    The error before is that of x, or of machines of a `prior` covariance. The part `beyond` all parameters widens the
+    interval upwards. None if no pose is within reach.
     """
     stations = box_stations(space, tilt)
     if stations is None:
@@ -338,14 +343,15 @@ def expected_error(
 def left_errors(
     space: ParameterSpace, prediction: Prediction, stations: Stations, covariance: np.ndarray
 ) -> np.ndarray:
-    """Return errors that a model may leave at stations, by drawn machines, (M, 6, D), m and rad; datum not aligned."""
+    """Return possible errors of a model at stations, by drawn machines, (M, 6, D), m and rad; datum not aligned."""
     return derivatives(space, prediction, stations) @ _drawn(covariance)
 
 
 def errors_in_space(
     space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the error in space without compensation, and the RMS error left with it, at points (n, 3), m in ``base``.
+    """Return the error in space without compensation, and the RMS residual error with it, at points (n, 3), m in
+    ``base``.
 
     Level tool, there and back, the datum aligned over these points; shape (n,), m, NaN out of reach.
     """
@@ -364,7 +370,7 @@ def errors_in_space(
 
 
 def _sizes(square: np.ndarray, drawn: np.ndarray) -> np.ndarray:
-    """Return the RMS that drawn parameters (size, D) make, by their mean-square matrix, shape (D,)."""
+    """Return the RMS for drawn parameters (size, D), by their mean-square matrix, shape (D,)."""
     return np.sqrt(np.maximum(np.einsum("id,id->d", drawn, square @ drawn), 0.0))
 
 
@@ -380,12 +386,12 @@ def _drawn(covariance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class BlockSight:
-    """How well the data see one block."""
+    """How well the data determine one block."""
 
     name: str
     unit: str
     parameters: int  # how many
-    determined: float  # how many of them the data determine; the prior the rest
+    determined: float  # number of them that the data determine; the prior determines the rest
     tolerance: float  # standard deviation of the block's prior
     error: float  # median standard error of its parameters
 
@@ -399,11 +405,11 @@ class Observability:
     structure_size: int
     rank: int  # the same of all parameters
     size: int
-    condition: float  # largest over smallest singular value of what is seen, each parameter in its tolerance
+    condition: float  # largest over smallest singular value of the observable part, each parameter in its tolerance
     indices: dict[str, float]  # O1 … O4, of the seen directions
-    weak: tuple[tuple[float, str], ...]  # strength, in σ, and main parameters of directions that are only just seen
+    weak: tuple[tuple[float, str], ...]  # strength, in σ, and main parameters of barely observable directions
     unseen: tuple[str, ...]  # structure parameters that the data do not see
-    tilt: float  # furthest that the tool was tilted from level in the readings, rad
+    tilt: float  # largest tilt of the tool from level in the readings, rad
 
 
 def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, tilt: float = 0.0) -> Observability:
@@ -471,25 +477,25 @@ MACHINE_ERRORS: dict[str, tuple[tuple[str, str], ...]] = {
     "roll of y": (("ry", "y1"),),
     "roll of z": (("rz", "z1"),),
 }
-"""Machine errors in the field's terms (component, term), by the names under which machinists know them."""
+"""Machine errors in the field's terms (component, term), by their names in machine metrology."""
 
 
 class UnseenError(NamedTuple):
     """An error of a machine that its readings do not show."""
 
     name: str
-    trace: float  # by how much one of the field's tolerance changes all readings, root sum of squares, σ as stated
+    trace: float  # change of all readings by one of the field's tolerance, root sum of squares, σ as stated
 
     @property
     def reason(self) -> str:
-        """Why it is not seen."""
+        """Why it is not observable."""
         if self.trace <= 1e-6:  # rounding
             return "no reading shows it"
         return f"below the noise: it changes all readings together by {self.trace:.2g} σ, seen from {ASSUMED.seen:g} on"
 
 
 def listed(errors: Iterable[UnseenError]) -> str:
-    """Return errors in words, those together that are not seen for the same reason."""
+    """Return errors as text, grouped by the reason why they are not observable."""
     by_reason: dict[str, list[str]] = {}
     for error in errors:
         by_reason.setdefault(error.reason, []).append(error.name)

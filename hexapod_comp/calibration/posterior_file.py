@@ -1,6 +1,7 @@
-"""The file of a posterior, beside the model file, which names it with its hash: no model gets the figures of another.
+"""The file of a posterior, beside the model file, which holds its hash, so that no model is used with another's
+figures.
 
-It holds all that the readings left behind: parameters, covariance, tolerances and noise, and what they mean. New
+It holds all results of a fit: parameters, covariance, tolerances and noise, and their meaning. New
 readings can be added to it without the old ones.
 """
 
@@ -42,13 +43,14 @@ REGION_SHAPES = {
 }  # fmt: skip
 
 LARGEST, MOST_LISTED = 1e6, 100
-"""No number of a fit is larger, SI: what is would overflow where it is squared; no list of its settings is longer."""
+"""Bound of the numbers of a fit, SI: larger ones would overflow when squared; and of the length of its settings'
+lists."""
 
 NOT_ONE = "is no file of a fit's posterior"
 
 
 def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, path: str | Path) -> list[Path]:
-    """Write a model file, and beside it what its fit knows; return what was written beside.
+    """Write a model file, and beside it its fit's posterior; return the other file's name.
 
     Parameters
     ----------
@@ -70,7 +72,7 @@ def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, pa
         return []
     unnamed = model_text(replace(model, origin=replace(model.origin, posterior=None)))
     beside, content = file.with_name(file.stem + SUFFIX), _content(fitted, text_sha256(unnamed))
-    with new_file(beside, "wb") as stream:  # first: a model file never names what is not there yet
+    with new_file(beside, "wb") as stream:  # first: a model file never names a missing file
         stream.write(content)
     posterior = beside.name, hashlib.sha256(content).hexdigest()
     save_model(replace(model, origin=replace(model.origin, posterior=posterior)), path)
@@ -97,7 +99,7 @@ def load_posterior(
     path: str | Path,
     opener: Opener | None = None,
 ) -> tuple[FittedParameters | None, str]:
-    """Return what a model's fit knows of its parameters, or why that is not known.
+    """Return the posterior of a model's fit, or why it is not known.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a fit promises of the tool's error: an interval by its covariance, widened by what is unexplained."""
+"""The predicted interval of a fit's tool error, by its covariance, widened by unexplained errors."""
 
 from __future__ import annotations
 
@@ -12,22 +12,18 @@ from ..machine.arrays import rms
 from .assumptions import ASSUMED
 
 TWICE = 2.0
-"""An end of an interval stands so many standard deviations out."""
+"""The ends of an interval, in standard deviations."""
 
 STEEL = 11.5e-6
 """Expansion of steel, 1/K."""
 
 
 class Scatter(NamedTuple):
-    """What the tool does that no parameter describes, RMS over all three axes: displacement, m, or rotation, rad.
+    """Tool error that no parameter describes, RMS over all three axes: displacement, m, or rotation, rad.
 
-    Attributes
-    ----------
-    lack : float
-        Of an error that no parameter describes: the discrepancy.
-    stops, most_stops : float
-        Of where the machine stops from visit to visit, by repeated readings, if the instruments scatter as stated; and
-        what it is at most.
+    Attributes ---------- lack : float Of an error that no parameter describes: the discrepancy. stops, most_stops :
+    float Of the machine's stops from visit to visit, by repeated readings, if the instruments scatter as stated; and
+    its upper bound.
     """
 
     lack: float = 0.0
@@ -39,7 +35,7 @@ NO_SCATTER = Scatter()
 
 
 class Promise(NamedTuple):
-    """RMS error of the tool to expect, and between what it lies with 95 %: m, or rad."""
+    """Expected RMS error of the tool, and its interval of 95 %: m, or rad."""
 
     after: float
     low: float
@@ -48,23 +44,23 @@ class Promise(NamedTuple):
 
 @dataclass(frozen=True)
 class Unexplained:
-    """What widens a promise."""
+    """Contributions that widen an interval."""
 
-    factor: float = 1.0  # on the standard deviations of all parameters: what runs left out in turn show clearly
-    believed: float = np.inf  # degrees of freedom with which the covariance's scale is believed to be 1
-    prior: float = 0.0  # standard deviation of the logarithm of the tool error to expect: priors' sizes are estimates
+    factor: float = 1.0  # factor on the standard deviations of all parameters, shown by leaving out runs in turn
+    believed: float = np.inf  # degrees of freedom of the covariance's scale
+    prior: float = 0.0  # standard deviation of the logarithm of the expected tool error: priors' sizes are estimates
     prior_rotation: float = 0.0  # the same of the tool's rotation
-    displacement: Scatter = NO_SCATTER  # what the tool does that no parameter describes
+    displacement: Scatter = NO_SCATTER  # tool error that no parameter describes
     rotation: Scatter = NO_SCATTER
     drift: float = 0.0  # change of the scale from the first to the last reading, m/m; 0 where none is in the fit
     drift_error: float = 0.0  # its standard deviation
     scale: float = 0.0  # stated standard deviation of the scale of all readings, m/m
-    ratio: float = 1.0  # of the tool's squared changes to those expected, as runs are left out in turn
+    ratio: float = 1.0  # ratio of the tool's squared changes to the expected ones, as runs are left out in turn
     freedom: float = 0.0  # degrees of freedom of that
-    averaged: float = 1.0  # on the tool's error, by averaging over which blocks are there
+    averaged: float = 1.0  # factor on the tool's error, by averaging over the presence of blocks
 
     def promised(self, left: np.ndarray, points: np.ndarray) -> Promise:
-        """Return what is promised of the tool's displacement; what is unexplained raises the upper end.
+        """Return the predicted interval of the tool's displacement; unexplained errors raise the upper end.
 
         Parameters
         ----------
@@ -79,13 +75,13 @@ class Unexplained:
         return Promise(float(np.sqrt(after**2 + off)), low, float(np.sqrt(high**2 + TWICE**2 * off)))
 
     def promised_rotation(self, left: np.ndarray) -> Promise:
-        """Return what is promised of the tool's rotation, from draws as for :meth:`promised`, rad."""
+        """Return the predicted interval of the tool's rotation, from draws as for :meth:`promised`, rad."""
         return self._interval(left, self.prior_rotation, self.rotation)
 
     def _interval(self, left: np.ndarray, prior: float, scatter: Scatter) -> Promise:
-        """Return what is promised without any error of scale.
+        """Return the predicted interval without any error of scale.
 
-        Whether the machine or its instrument scatters more than stated nobody can say: the lower end is without it.
+        Whether the machine or its instrument scatters more than stated is unknown: the lower end omits the scatter.
         """
         size, (low, high) = rms(left), np.percentile(left, [2.5, 97.5])
         high = max(self.averaged * high, float(np.percentile(left * self._scales(len(left)), 97.5)))
@@ -97,11 +93,11 @@ class Unexplained:
         return Promise(float(after), float(low), float(high))
 
     def _scales(self, count: int) -> np.ndarray:
-        """Return draws of what standard deviations may have to be multiplied by, (count,): draws are multivariate t's.
+        """Return factors on the standard deviations of draws, (count,): draws are multivariate t's.
 
-        The variance's scale has an inverse χ² prior about 1 of so many degrees of freedom as it is `believed` with,
-        which the runs' own freedom outvotes. A ratio below 1 does not make it smaller: lines cross others, which
-        foretell them better than what lies between lines.
+        The variance's scale has an inverse χ² prior about 1 with `believed` degrees of freedom, which the runs' own
+        degrees of freedom can outweigh. A ratio below 1 does not reduce it: crossing lines predict a line better than
+        the space between lines.
         """
         if not np.isfinite(self.believed):
             return np.ones(count)
@@ -110,7 +106,7 @@ class Unexplained:
         return np.sqrt(sums / (2.0 * gammaincinv(0.5 * (self.believed + self.freedom), places / count)))
 
     def doubts(self) -> list[str]:
-        """Return what puts a fit in doubt."""
+        """Return the causes of doubt about a fit."""
         listed = []
         if self.factor > ASSUMED.misfit[1]:
             listed.append(f"{self._outcome()}: lines, or what they were read with, disagree with each other")
@@ -121,7 +117,7 @@ class Unexplained:
         return listed
 
     def remarks(self) -> list[str]:
-        """Return what a reader must know of how the promise came about."""
+        """Return notes on how the interval was computed."""
         listed = []
         if 1.0 < self.factor <= ASSUMED.misfit[1]:
             listed.append(f"{self._outcome()}; the expected tool error allows for it")
@@ -158,7 +154,7 @@ class Unexplained:
 
 
 def _sizes(displacement: float, rotation: float) -> str:
-    """Return sizes of what the tool does in words; empty where it does nothing."""
+    """Return sizes of a tool error as text; empty if it is zero."""
     shown = [f"{displacement * 1e6:.2f} µm RMS of the tool's displacement"] if displacement else []
     shown += [f"{rotation * 1e6:.2f} µrad RMS of its rotation"] if rotation else []
     return " and ".join(shown)

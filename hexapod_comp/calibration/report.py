@@ -1,4 +1,4 @@
-"""What fits print, for people and as JSON: scheme ``joint``, or a plan for one, and scheme ``lines``."""
+"""Reports of fits, as text and as JSON: scheme ``joint``, or a plan for one, and scheme ``lines``."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ from .thermal import warming_json, warming_text
 from .trust import TILT
 
 MOST_LISTED, MOST_OF_RUN = 10, 3  # runs with outliers, and outliers of a run, beyond these are counted, not listed
-# Standard deviations beyond which a reading is taken for mistyped: no instrument's own errors are as large
+# Standard deviations beyond which a reading looks mistyped: no instrument's own errors are as large
 GROSS = 50.0
-MOST_RUNS = 5  # runs that are listed as met worst
-TRUST = 0.1  # A tilted tool that keeps more than this share of its error is warned of, when parameters are not seen
+MOST_RUNS = 5  # number of runs listed with the largest residuals
+# A share of the error of a tilted tool above which a warning is printed, when parameters are not observable
+TRUST = 0.1
 
 
 def fit_report(fit: ModelFit) -> str:
-    """Return the report of a fit, for people: what is left, what was found, what the readings could not show."""
+    """Return the report of a fit: residual error, parameters, and what the readings could not show."""
     doubts = (*fit.verdict.refusals, *fit.verdict.doubts)
     parts = [
         *_gross_errors(fit),
@@ -59,7 +60,7 @@ def _headline(fit: ModelFit) -> str:
 
 
 def _expected(level: ToolError | None, tilted: ToolError | None, seen: Observability) -> Iterator[str]:
-    """Yield what tool error the model leaves, and whether it can be trusted with a tilted tool."""
+    """Yield the tool error with the model, and whether it can be trusted with a tilted tool."""
     if level is None:
         return
     lines = ["expected tool error at random points of the measured box, both directions, the datum aligned:"]
@@ -111,7 +112,7 @@ def _channel_table(fit: ModelFit) -> str:
 
 
 def _chi_square_tables(fit: ModelFit) -> Iterator[str]:
-    """Yield χ² by channel, family of lines and direction; and the runs that were met worst."""
+    """Yield χ² by channel, family of lines and direction; and the runs with the largest residuals."""
     parts = list(dict.fromkeys(c.part for c in fit.verdict.chi_squares))
     known = {(c.kind, c.part): number(c.value, 3) for c in fit.verdict.chi_squares}
     rows = [(c.kind, *(known.get((c.kind, part), "") for part in parts)) for c in fit.channels]
@@ -146,7 +147,7 @@ def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ..
     return "\n".join(lines)
 
 
-# What blocks' units are shown in, and how much larger numbers are in it
+# Units in which blocks are displayed, and the factor of the numbers
 SHOWN_UNITS = {
     "m": ("um", 1e6),
     "rad": ("urad", 1e6),
@@ -182,7 +183,7 @@ def _outliers(fit: ModelFit) -> Iterator[str]:
 
 
 def _gross_errors(fit: ModelFit) -> Iterator[str]:
-    """Yield the reading that is worst, before anything else, where it looks mistyped."""
+    """Yield the worst reading, before anything else, if it looks mistyped."""
     gross = sorted((o for o in fit.outliers if abs(o.sigmas) >= GROSS), key=lambda o: -abs(o.sigmas))
     if gross:
         more = f"; {len(gross) - 1} more beyond {GROSS:g} σ below" if len(gross) > 1 else ""
@@ -248,7 +249,7 @@ def _unit(kind: str) -> str:
 def _expected_json(
     level: ToolError | None, tilted: ToolError | None, seen: Observability, unseen_errors: tuple[UnseenError, ...]
 ) -> dict:
-    """Return what a fit and a plan for one both say."""
+    """Return the keys that a fit and a plan for one share."""
 
     def error(tool: ToolError | None) -> dict | None:
         if tool is None:

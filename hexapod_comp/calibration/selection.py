@@ -1,9 +1,9 @@
-"""Which blocks of parameters a fit keeps: those that the evidence speaks for.
+"""Which blocks of parameters a fit keeps: those with enough evidence.
 
-All blocks start in, so that a field cannot explain what a length map does better only because it was tried first. The
-evidence for each is the logarithm of the Bayes factor with against without it: by the Savage–Dickey density ratio, the
-prior's density of "all its parameters are zero" over the posterior's. The one with the least goes, and the fit is
-solved again, until all that are left have enough.
+All blocks are in at first, so that a field cannot explain an error that a length map describes better only because it
+was tried first. The evidence for each is the logarithm of the Bayes factor with against without it: by the
+Savage–Dickey density ratio, the prior's density of "all its parameters are zero" over the posterior's. The block with
+the least evidence is dropped, and the fit is solved again, until all remaining ones have enough.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from .estimator import FEW_ROUNDS, ROUNDS, LinearProblem, Posterior, solve
 from .parameters import ParameterSpace
 
 SILENT = 1e-9
-"""Parameters of which readings determine a smaller share with all blocks in are left out: they move nothing."""
+"""Parameters with a smaller share determined by readings are omitted: they change nothing."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What became of one block."""
+    """The decision on one block."""
 
     block: str
     kept: bool
@@ -55,12 +55,12 @@ def log_bayes_factor(space: ParameterSpace, posterior: Posterior, name: str) -> 
     """Return log p(readings | with a block) − log p(without) (Savage–Dickey), all hyperparameters alike."""
     part = next(block.part for block in space.blocks if block.name == name)
     members = np.flatnonzero((posterior.used >= part.start) & (posterior.used < part.stop))
-    if not len(members):  # the readings say nothing of it
+    if not len(members):  # the readings have no information on it
         return 0.0
     spread = posterior.spread[members]
     relative = posterior.covariance[np.ix_(members, members)] / (spread[:, None] * spread)
     factor, failed = dpotrf(relative, lower=1)
-    if failed:  # to rounding, some parameters are known without any error
+    if failed:  # to rounding, some parameters are known exactly
         return np.inf
     met = dtrtrs(factor, posterior.y[members] / spread, lower=1)[0]
     return float(0.5 * met @ met + np.log(np.diag(factor)).sum())

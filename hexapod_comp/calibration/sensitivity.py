@@ -1,4 +1,5 @@
-"""What a parametrised machine does at measured stations, and the design matrix: how every parameter moves it."""
+"""The errors of a parametrised machine at measured stations, and the design matrix: the derivatives by every
+parameter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command ``hexapod_comp <verb>``: parsers made from the table of verbs, and the module of the verb that is run."""
+"""The command ``hexapod_comp <verb>``: makes parsers from the table of verbs and runs the verb's function."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from .verbs import DESCRIPTION, EPILOG, GONE, VERBS, Verb
 PROGRAM = "hexapod_comp"
 
 ALIASES = {verb.alias: name for name, verb in VERBS.items() if verb.alias}  # old names of verbs, which still work
-NEGATIVE = re.compile(r"-[.\d]")  # what follows an option and looks like this is its value, not another option
+NEGATIVE = re.compile(r"-[.\d]")  # a value after an option may begin like this; it is not another option
 
-NUMBERS = re.compile(r"[-+.\d]+(,[-+.\d]+)+")  # what was meant to be read as it stands, not a file's name
-TYPED = {"poses": "--pose", "lengths": "--lengths"}  # options that take what files of a kind hold
+NUMBERS = re.compile(r"[-+.\d]+(,[-+.\d]+)+")  # numbers typed in place of a file's name
+TYPED = {"poses": "--pose", "lengths": "--lengths"}  # options that take directly what files of a kind contain
 
-# Verbs whose matrices are too small for the threads of NumPy's BLAS, which on busy cores wait for each other
+# Verbs with matrices too small for the threads of NumPy's BLAS, which wait for each other on busy cores
 ONE_THREAD = ("fit", "verify", "demo")
 
 USAGE_ERROR, INTERRUPTED = 2, 130  # exit codes: bad input; Ctrl-C as shells count it, 128 + signal
@@ -34,11 +34,8 @@ USAGE_ERROR, INTERRUPTED = 2, 130  # exit codes: bad input; Ctrl-C as shells cou
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line, by default with the arguments of this process.
 
-    Returns
-    -------
-    int
-        Exit code: 0 fine, 1 the verb's own "no", 2 bad input or no room for the output, 130 interrupted, 141 nobody
-        reads the output any more.
+    Returns ------- int Exit code: 0 success, 1 the verb's negative result, 2 bad input or output that cannot be
+    written, 130 interrupted, 141 the reader of the output has closed it.
     """
     arguments = sys.argv[1:] if argv is None else argv
     return run_with_plain_streams(lambda: _run(arguments)) or 0
@@ -55,7 +52,7 @@ def _run(arguments: Sequence[str]) -> int:
         complete(parser)
     try:
         args = parser.parse_args(_with_negative_values(arguments))
-    except SystemExit as leaving:  # argparse has printed help or what is wrong
+    except SystemExit as leaving:  # argparse has printed help or the error
         return leaving.code if isinstance(leaving.code, int) else USAGE_ERROR
     if args.called != args.verb:
         print(f"{PROGRAM}: note: {args.called} is now called {args.verb}", file=sys.stderr)
@@ -65,7 +62,7 @@ def _run(arguments: Sequence[str]) -> int:
         _check_conflicts(verb, args)
         _refuse_numbers_as_files(verb, args)
         with protected(*named.values()):
-            if args.verb in ONE_THREAD:  # NumPy reads this when it is loaded, and nothing has loaded it yet
+            if args.verb in ONE_THREAD:  # NumPy reads this variable when it is loaded, and nothing has loaded it yet
                 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
             run = getattr(importlib.import_module(f".{verb.module}", __package__), args.verb)
             result = run(args)
@@ -75,7 +72,7 @@ def _run(arguments: Sequence[str]) -> int:
             raise
         return _fail(str(error))
     except MemoryError as error:
-        return _fail(f"this needs more memory than there is: {error}")
+        return _fail(f"not enough memory: {error}")
     except KeyboardInterrupt:
         return INTERRUPTED
 
@@ -89,13 +86,13 @@ def _fail(problem: str) -> int:
 
 
 def _meant(name: str, names: Iterable[str]) -> str:
-    """Return which name may have been meant, to follow a complaint."""
+    """Return the name that was probably meant, to append to a message."""
     near = difflib.get_close_matches(name, list(names), 1)
     return f"; did you mean {near[0]}?" if near else ""
 
 
 def _with_negative_values(arguments: Sequence[str]) -> list[str]:
-    """Join ``--pose -5,0,400`` to ``--pose=-5,0,400``: argparse takes -5,0,400 for an option."""
+    """Join ``--pose -5,0,400`` to ``--pose=-5,0,400``, since argparse reads -5,0,400 as an option."""
     joined: list[str] = []
     for argument in arguments:
         after_option = joined and joined[-1].startswith("--") and "=" not in joined[-1]
@@ -124,16 +121,16 @@ def _check_conflicts(verb: Verb, args: argparse.Namespace) -> None:
 
 
 def _refuse_numbers_as_files(verb: Verb, args: argparse.Namespace) -> None:
-    """Raise where numbers stand in the place of a file that holds such, and say which option takes them."""
+    """Raise if numbers are given in place of a file of numbers, and name the option for numbers."""
     names = {option.name for option in verb.options}
     for option in verb.options:
         typed, name = TYPED.get(option.kind), getattr(args, option.dest)
         if typed in names and name and NUMBERS.fullmatch(name) and not os.path.exists(name):
-            raise InputFileError(name, "", f"there is no such file; numbers go with an option: {typed} {name}")
+            raise InputFileError(name, "", f"there is no such file; give numbers by an option: {typed} {name}")
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says which option was meant."""
+    """A parser that suggests the option that was meant."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         options = [option for option in self._option_string_actions if option.startswith("--")]
@@ -147,7 +144,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 class _Version(argparse.Action):
-    """Print the version of the code that runs."""
+    """Print the version of the running code."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         from ..formats.paths import version
@@ -157,10 +154,10 @@ class _Version(argparse.Action):
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser; it leaves the verb as ``verb``, and the name under which it was called as ``called``."""
+    """Return the parser; it stores the verb as ``verb``, and the typed name as ``called``."""
     raw = argparse.RawDescriptionHelpFormatter
     parser = _Parser(PROGRAM, description=DESCRIPTION, epilog=EPILOG, formatter_class=raw)
-    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and leave")
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     listed = []
     for group, verbs in groupby(VERBS.items(), lambda item: item[1].group):
         listed += [f"{group}:", *(f"  {name:<9} {verb.summary}" for name, verb in verbs)]
@@ -185,7 +182,8 @@ def make_parser() -> argparse.ArgumentParser:
             if option.heading not in groups:
                 groups[option.heading] = own.add_argument_group(option.heading)
             action = groups[option.heading].add_argument(option.name, help=option.help, **option.keywords)
-            if option.keywords.get("default") == []:  # nargs "*" would take none where an option stands before them
+            # with nargs "*" argparse would require one where an option stands before
+            if option.keywords.get("default") == []:
                 action.required = False
             action.declared = option
         own.set_defaults(verb=name)
@@ -193,17 +191,17 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def complete(parser: argparse.ArgumentParser) -> None:
-    """Answer the shell, which waits for completions, and leave; without argcomplete this does nothing."""
+    """Answer the shell's request for completions and exit; without argcomplete do nothing."""
     try:
         import argcomplete
-    except ImportError:  # an extra; nobody reads what is printed now
+    except ImportError:  # an extra; output would be ignored now
         return
     from ..formats.paths import shipped_names
 
     files = argcomplete.FilesCompleter()
 
     def names(prefix: str, parsed_args: Any = None, action: Any = None, **_: object) -> list[str]:
-        """Complete with files, and with the shipped ones that the option takes."""
+        """Complete with files, and with the shipped ones that the option accepts."""
         kind = action.declared.kind
         shipped = ["ideal", "random"] * (kind == "model") + (
             shipped_names(kind) if kind not in ("", "readings") else []

@@ -38,7 +38,7 @@ Meshes = tuple[np.ndarray, np.ndarray]  # points of nested shells, and every err
 
 
 def classify(args: argparse.Namespace) -> int | Result:
-    """Rank the errors of a budget, or those that a model's fit leaves, by what they do to the tool."""
+    """Rank the errors of a budget, or those that a model's fit leaves, by their effect on the tool."""
     geometry = load_geometry(args.machine)
     if args.clearance_mm is not None:
         geometry = replace(geometry, limits=replace(geometry.limits, clearance=args.clearance_mm * 1e-3))
@@ -47,7 +47,7 @@ def classify(args: argparse.Namespace) -> int | Result:
         return _after_calibration(args, geometry, turned)
     path = input_file(args.budget, "error_budget")
     budget = load_budget(path)
-    with file_errors(path):  # what does not fit the machine is refused before the work starts
+    with file_errors(path):  # refuse errors that do not fit the machine before the work starts
         budget.single_errors(geometry)
     reached = reaches(geometry, turned, args.cells)
     names = tuple(f"α {math.degrees(a):g}°, β {math.degrees(b):g}°" for a, b in product(args.tilt_deg, args.tilt_deg))
@@ -79,7 +79,7 @@ def classify(args: argparse.Namespace) -> int | Result:
             results.mention(args, f"page: {page}")
         except InputFileError:
             raise
-        except HexapodError as error:  # plotly is an extra: the rest is there without it
+        except HexapodError as error:  # plotly is an extra: without it the other outputs are written
             results.mention(args, f"no page: {error}")
     if args.publish:  # on a latched topic, for RViz and Foxglove
         from ..viewer.shells import TOPIC, show_shells
@@ -93,7 +93,7 @@ def classify(args: argparse.Namespace) -> int | Result:
 
 
 def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry, turned: np.ndarray) -> Result:
-    """Show what a model's calibration leaves, and which measurement would remove most of it."""
+    """Show the residual error of a model's calibration, and the measurement that would reduce it most."""
     from ..calibration.follow_up import measurement_rows, remaining, remaining_json, remaining_text
     from ..calibration.pictures import predicted_error_figure
     from ..calibration.posterior_file import load_posterior
@@ -101,7 +101,7 @@ def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry, turn
     model = load_model(args.model, geometry)
     fitted, unknown = load_posterior(model, geometry, args.model)
     if fitted is None:
-        raise CommandError("model", f"it is not known what {args.model} leaves: {unknown}")
+        raise CommandError("model", f"what the calibration of {args.model} leaves is not known: {unknown}")
     reached = reaches(geometry, turned, args.cells)
     poses, machine = random_poses(reached, COMBINED_POSES, args.seed), RealMachine(geometry, model)
     name = f"workspace, α and β of {', '.join(f'{math.degrees(tilt):g}' for tilt in args.tilt_deg)}°"
@@ -116,7 +116,7 @@ def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry, turn
 
 
 def _layers(study: Study, meshes: Meshes, names: tuple[str, ...], error: int) -> tuple[list[Layer], str]:
-    """Return one error's shells in the orientation in the middle of the list, and their title."""
+    """Return one error's shells for the middle orientation of the list, and their title."""
     points, values = meshes
     kind = study.errors.kinds[study.errors.kind[error]]
     layers = [Layer(p, v) for p, v in zip(points, values[error, 0], strict=True)]
@@ -124,7 +124,7 @@ def _layers(study: Study, meshes: Meshes, names: tuple[str, ...], error: int) ->
 
 
 def _figures(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...]) -> dict[str, Figure]:
-    """Draw the pictures: of the orientation in the middle of the list."""
+    """Draw the pictures for the middle orientation of the list."""
     from ..workspace.pictures import RankedRow, causes_figure, ranking_figure, shells_figure
 
     middle, machine = len(bodies) // 2, study.geometry.name

@@ -20,24 +20,25 @@ from ..virtual.named import is_random
 from . import results
 from .results import Result
 
-# An error that grows by less than this, m, has not grown: the files' digits and LinuxCNC's floats count for more
+# An increase of an error by less than this, m, is rounding: the files' digits and LinuxCNC's floats
 HARMLESS = 10e-9
 
 
 class ExportMethod(NamedTuple):
-    """One way to use an export, driven through the machine that the model describes."""
+    """One use of an export, checked by driving the machine of the model through it."""
 
     name: str
     check: ExportCheck  # what it leaves
-    notes: list[str]  # what it does not carry
+    notes: list[str]  # errors that it does not contain
 
 
 def export(args: argparse.Namespace) -> Result:
-    """Write a model in other forms, and show what they leave; 1 when one would make the error larger."""
+    """Write a model in other formats, and show the residual errors; 1 if one would increase the error."""
     geometry, model = results.load_machine(args)
     written, tried = _exact(args, geometry, model), list[ExportMethod]()
     title, known = f"machine {model.machine}, model {model.name}", {"machine": model.machine, "model": model.name}
-    if args.linuxcnc is None and args.table is None:  # what was written has the very numbers: nothing is to be judged
+    # the written file has the same numbers: there is nothing to compare
+    if args.linuxcnc is None and args.table is None:
         text = f"{title}\nwritten: {', '.join(written)}"
         if args.c_folder is not None:
             text += "\nbuild the self-test and run it on the target: see hexapod_selftest.c"
@@ -51,12 +52,12 @@ def export(args: argparse.Namespace) -> Result:
         say("the tool's error as the machine is")
         trial = ExportTrial(geometry, model, box, args.poses, args.seed, math.radians(args.tilt_deg))
         if args.linuxcnc is not None:
-            say("LinuxCNC's files, and what they leave")
+            say("LinuxCNC's files, and the error that they leave")
             files, one = _linuxcnc(args, trial, box, titles)
             written += files
             tried.append(one)
         if args.table is not None:
-            say("the table, and what it leaves")
+            say("the table, and the error that it leaves")
             written.append(args.table)
             tried += _table(args, trial, box, titles)
     lines = [
@@ -79,7 +80,7 @@ def export(args: argparse.Namespace) -> Result:
 
 
 def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
-    """Write what robot programs want to know, and the C core with this machine's constants; return the files."""
+    """Write files for robot programs, and the C core with this machine's constants; return the files."""
     from ..machine.robot_description import mjcf, urdf
 
     joints = args.joint_names or STRUT_NAMES
@@ -134,7 +135,7 @@ def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles
 
     geometry, model = trial.machine.geometry, trial.machine.model
     table, left_out = make_table(geometry, model, box, args.step_mm * 1e-3)
-    left_out.append("tilt: the table holds for a level tool; above stands what a tilted one keeps")
+    left_out.append("tilt: the table is for a level tool; the error of a tilted one is listed above")
     write_table(table, args.table, titles)
     back = read_table(args.table)
     lost = model.struts.largest_backlash.max() * 1e6
@@ -146,10 +147,10 @@ def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles
 
 
 def _shown(tried: ExportMethod, tilt_deg: float) -> tuple[list[str], dict[str, Any]]:
-    """Return lines about one way to use an export, and the same for programs."""
+    """Return lines about one use of an export, and the same for programs."""
     name, check, notes = tried
     heat, damp = check.per_kelvin, check.per_humidity
-    tilted = "no such pose is within the machine's limits" if check.tilted is None else _change(check.tilted)
+    tilted = "no pose of this kind is within the machine's limits" if check.tilted is None else _change(check.tilted)
     if heat is None:
         carried = "thermal growth (the model has none)"
     else:
@@ -187,7 +188,7 @@ def _change(comparison: Comparison) -> str:
 
 
 def _sizes(name: str, size: Size | None, unit: str = "um") -> dict[str, float | None]:
-    """Return RMS and largest of an error in millionths of its unit, by names that end in it."""
+    """Return RMS and largest value of an error in millionths of its unit; these names are the keys' ends."""
     sizes = (None, None) if size is None else (size.rms * 1e6, size.largest * 1e6)
     return dict(zip((f"{name}_rms_{unit}", f"{name}_max_{unit}"), sizes, strict=True))
 

@@ -53,17 +53,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 REFUSED = "NOT WRITTEN: this model is not to be trusted"
-# Top of the report where readings do not bear the model out
+# First line of the report where the readings contradict the model
 FORCED = "WRITTEN BY FORCE: this model is not to be trusted"
 
-ADVICE = "Do units, lead, geometry and the instrument's uncertainty fit?"
+ADVICE = "Check units, lead, geometry and the instrument's uncertainty."
 
-# Limits that a model breaks by itself; others, such as the stroke's end, a measured pose may be next to
+# Limits that a model breaks by its size; a measured pose may be close to others, such as the end of the stroke
 OF_THE_MODEL = ("correction", "assembly", "not_converged")
 
 
 def fit_settings(args: argparse.Namespace) -> FitSettings:
-    """Return what the options say about a fit of scheme joint; raises ModelError on an unknown block."""
+    """Return the settings of a fit of scheme joint from the options; raises ModelError on an unknown block."""
     known = {one.name for one in fields(FitSettings)} & vars(args).keys()
     given: dict[str, Any] = {name: value for name in known if (value := getattr(args, name)) is not None}
     if args.blocks is not None:
@@ -84,7 +84,7 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
 
 
 def plan(args: argparse.Namespace) -> Result:
-    """Say what a campaign determines, or propose one for a goal; 1 when the goal cannot be met."""
+    """Predict what a campaign determines, or propose one for a goal; 1 when the goal cannot be met."""
     from ..calibration.design import (
         TIMES,
         Goal,
@@ -111,7 +111,7 @@ def plan(args: argparse.Namespace) -> Result:
     times = dict(TIMES)
     for name, numbers in args.time or ():
         if name not in times:
-            raise CalibrationError("--time", f"is of one of {', '.join(times)}, not {name}")
+            raise CalibrationError("--time", f"must be of one of {', '.join(times)}, not {name}")
         times[name] = Times(*numbers)
     given: dict[str, Any] = {"instruments": tuple(args.instruments.split(","))} if args.instruments is not None else {}
     given |= {"seconds": args.hours * 3600.0} if args.hours is not None else {}
@@ -130,7 +130,7 @@ def plan(args: argparse.Namespace) -> Result:
 
 
 def _detours(geometry: HexapodGeometry, campaign: Campaign) -> Iterator[str]:
-    """Yield between which runs the machine cannot move straight, as ``check`` sees it."""
+    """Yield the pairs of runs between which the machine cannot move straight, by ``check``."""
     ends = [
         (run, slice(None, None, max(1, len(run.positions) - 1)) if run.is_line else slice(None))
         for run in campaign.runs
@@ -142,20 +142,20 @@ def _detours(geometry: HexapodGeometry, campaign: Campaign) -> Iterator[str]:
     result = check(geometry, MachineModel(geometry.name), (positions, rotations))
     for row in sorted({breach.row for breach in result.breaches}):
         error = next(breach.error for breach in result.breaches if breach.row == row)
-        yield f"no straight way from {names[max(row - 1, 0)]} to {names[row]}: go by home ({error})"
+        yield f"no straight move from {names[max(row - 1, 0)]} to {names[row]}: move by home ({error})"
 
 
 # ---- fit ----
 
 
 def fit(args: argparse.Namespace) -> int | Result:
-    """Fit a model to measurements and write it; 1 when the readings do not bear it out."""
+    """Fit a model to measurements and write it; 1 when the readings contradict it."""
     if args.update is not None:
         return _renew(args)
     if args.details is not None:
         from ..calibration.certificate import load_details
 
-        load_details(args.details)  # what is wrong there is better said before a long fit
+        load_details(args.details)  # report errors here before a long fit
     geometry = load_geometry(args.machine)
     truth = None if args.truth is None else RealMachine(geometry, find_model(args.truth, geometry))
     settings = fit_settings(args)
@@ -183,14 +183,14 @@ def fit(args: argparse.Namespace) -> int | Result:
 
 @dataclass(frozen=True)
 class Fitted:
-    """What a scheme gives."""
+    """Result of a scheme."""
 
     model: MachineModel
     text: str  # its report
     content: Callable[[], dict[str, Any]]  # the same for JSON
     pictures: Callable[[], dict[str, Figure]]
     misfit: str
-    fitted: FittedParameters | None = None  # how well parameters are known, and the fit, of scheme joint
+    fitted: FittedParameters | None = None  # covariance of the parameters, and the fit, for scheme joint
     fit: ModelFit | None = None
 
 
@@ -231,7 +231,7 @@ def _lines(args: argparse.Namespace, measured: MeasurementSet, datum: Pose | Non
 
 
 def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
-    """Return which poses, of those measured, the compensator would refuse with a model; empty if none."""
+    """Return the measured poses that the compensator would refuse with a model, as text; empty if none."""
     geometry, stations = measured.geometry, measured.stations
     places = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(12)
     chosen = np.unique(places, axis=0, return_index=True)[1]
@@ -241,15 +241,15 @@ def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
         return ""
     at = ", ".join(number(1e3 * v, 1) for v in poses[0][breaches[0].row])
     count = len({breach.row for breach in breaches})
-    problem = f"with it the compensator would refuse {count} of the {len(chosen)} poses that were measured"
+    problem = f"with it the compensator would refuse {count} of the {len(chosen)} measured poses"
     return f"{problem}, first at {at} mm, tool in work: {breaches[0].error}"
 
 
 def _worth(truth: RealMachine, result: Fitted, measured: MeasurementSet) -> ModelEvaluation:
-    """Return what the model is worth on the virtual machine that was measured."""
+    """Return the error of the model on the virtual machine that was measured."""
     box, geometry = measured.tool_box(), measured.geometry
     if not spans(box):
-        raise CalibrationError("--truth", "the readings span no box in which the model could be judged")
+        raise CalibrationError("--truth", "the readings do not span a box, so the model cannot be judged")
     level = geometry.work.rotation.T @ measured.level() @ geometry.tool.rotation
     tool = None if result.fit is None else result.fit.level
     promised = None if tool is None else (tool.low, tool.high)
@@ -257,7 +257,7 @@ def _worth(truth: RealMachine, result: Fitted, measured: MeasurementSet) -> Mode
 
 
 def _write(args: argparse.Namespace, result: Fitted, measured: MeasurementSet, tried: ModelEvaluation | None) -> int:
-    """Write the model and what else was asked for, and show it."""
+    """Write the model and the other requested files, and show the result."""
     judged = judge(measured)
     parts = [result.text, region_text(result.model.measured, measured.geometry) + "\n"]
     parts += [standards_text(judged) + "\n"] if judged else []
@@ -273,7 +273,7 @@ def _write(args: argparse.Namespace, result: Fitted, measured: MeasurementSet, t
         files = {"misfit": result.misfit, "written": args.out, "written_beside": beside}
         return {**result.content(), **more, **files}
 
-    # The model is there: what follows may fail, and pictures come last.
+    # The model is written first, since the rest may fail; pictures come last.
     Result(lambda: f"{text}\nmodel: {args.out}\n{_listed(beside)}", content).finish(args)
     if args.report is not None:
         write_text(args.report, text)
@@ -297,19 +297,19 @@ def _forced(model: MachineModel, reason: str) -> MachineModel:
 
 
 def _listed(beside: list[Path]) -> str:
-    return "".join(f"its parameters' covariance, to be kept beside it: {path}\n" for path in beside)
+    return "".join(f"covariance of its parameters, keep it beside the model: {path}\n" for path in beside)
 
 
 def _renew(args: argparse.Namespace) -> Result:
-    """Write a model renewed from few readings; 1 when they cannot renew it."""
+    """Write a model renewed from few readings; 1 when they do not allow it."""
     old, new = input_file(args.update), Path(args.out)
     if new.resolve().with_name(new.stem + SUFFIX) == old.resolve().with_name(old.stem + SUFFIX):
-        raise CommandError("--out", f"{new} would replace what the fit of {old} knows; write to another name")
+        raise CommandError("--out", f"{new} would replace the fit's result for {old}; write to another name")
     model, fitted, measured, verification = checked(args, args.update)
     text, content = verification_report(verification), verification_json(verification)
     reason = refusal(verification)
     if reason and not args.force:
-        print(f"hexapod_comp: error: nothing was written: {reason} (--force renews all the same)", file=sys.stderr)
+        print(f"hexapod_comp: error: nothing was written: {reason} (--force renews nevertheless)", file=sys.stderr)
         return Result(lambda: text, lambda: {**content, "refused": reason, "written": None}, code=1)
     update = update_model(model, fitted, measured, verification)
     model = _forced(update.model, reason)
@@ -327,7 +327,7 @@ def _renew(args: argparse.Namespace) -> Result:
 
 
 def verify(args: argparse.Namespace) -> Result:
-    """Say whether a model still holds, 1 when the machine has changed; or write the check readings to take."""
+    """Check whether a model still holds, 1 when the machine has changed; or propose check readings."""
     if args.propose is None:
         result = checked(args, args.model).verification
         code = 0 if result.verdict == VALID else 1
@@ -345,13 +345,13 @@ def verify(args: argparse.Namespace) -> Result:
     runs = [{"where": where, "channels": channels} for where, channels, _ in places(readings)]
     lines = [f"{len(readings)} check readings:", *(f"  {run['where']}: {', '.join(run['channels'])}" for run in runs)]
     return Result(
-        lambda: "\n".join([*lines, f"to be filled in: {args.propose}"]),
+        lambda: "\n".join([*lines, f"fill in the values: {args.propose}"]),
         lambda: {"runs": runs, "written": args.propose},
     )
 
 
 class Checked(NamedTuple):
-    """A model with what its fit knows, and readings that check it."""
+    """A model with its fit's result, and readings that check it."""
 
     model: MachineModel
     fitted: FittedParameters
@@ -360,7 +360,7 @@ class Checked(NamedTuple):
 
 
 def checked(args: argparse.Namespace, path: str) -> Checked:
-    """Return a model beside the check readings that the options name."""
+    """Return a model with the check readings that the options name."""
     model, fitted = _known(args, path)
     geometry, probe = fitted.space.geometry, args.probe_mm
     if probe is None and not np.allclose(fitted.space.probe, geometry.tool.position, rtol=0.0, atol=1e-12):
@@ -369,12 +369,12 @@ def checked(args: argparse.Namespace, path: str) -> Checked:
         measured = read_measurements(args.files, geometry, args.columns, probe)
     if args.compensated:
         measured = compensated(measured, model)
-    with results.stage("weighing what may have happened"):
+    with results.stage("comparing possible changes"):
         return Checked(model, fitted, measured, verify_model(model, fitted, measured))
 
 
 def _known(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedParameters]:
-    """Return a model and what its fit knows."""
+    """Return a model and its fit's result."""
     geometry = load_geometry(args.machine)
     model = load_model(path, geometry)
     fitted, unknown = load_posterior(model, geometry, path)

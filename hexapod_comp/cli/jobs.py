@@ -1,6 +1,6 @@
-"""The process beside a node, ``python -m hexapod_comp.cli.jobs FD``: does jobs that would stop the node's loop.
+"""The process beside a node, ``python -m hexapod_comp.cli.jobs FD``: runs jobs that would stop the node's loop.
 
-:mod:`hexapod_comp.ros.worker` starts it and gives it its end of a socket; jobs come, and results go, pickled.
+:mod:`hexapod_comp.ros.worker` starts it with one end of a socket; jobs and results are pickled.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ def load_model(name: str, place: str, folder: str | None, machine: str) -> tuple
 
 
 class Machine:
-    """A machine and its model, made of the texts in use: what else is needed of them is made when it is."""
+    """A machine and its model, made from the texts in use; other objects are made from them at first use."""
 
     def __init__(self, geometry: Source, model: Source, folder: str | None) -> None:
         self._opener = confined_opener(None if folder is None else Path(folder))
         self._source = model
-        if model.text is None:  # it was too long to be kept
+        if model.text is None:  # it was too long to store
             self._source = Source.read(model.name, self._opener)
             if self._source.sha256 != model.sha256:
                 raise InputFileError(model.name, "", "has changed since it was loaded")
@@ -64,8 +64,8 @@ class Machine:
         loading: Loading,
         outside: dict[str, float],
     ) -> dict[str, Any]:
-        """Return the errors ``standing`` and ``aligned`` at a pose: values and covariance, None where not known."""
-        from ..calibration.posterior import ErrorPredictor  # only this job needs a second of imports
+        """Return the errors ``standing`` and ``aligned`` at a pose: values and covariance, None if not known."""
+        from ..calibration.posterior import ErrorPredictor  # an import of one second that only this job needs
         from ..calibration.posterior_file import load_posterior
 
         if self._fitted is None:
@@ -90,7 +90,7 @@ class Machine:
         outside: dict[str, float],
         enabled: bool,
     ) -> tuple[str, dict]:
-        """Return how far a tool may go from a pose in a frame: a text, and values by their keys."""
+        """Return the travel of a tool from a pose in a frame: a text, and values by their keys."""
         geometry = self.geometry.using(tool, work)
         ways = travel(RealMachine(geometry, self.model.at(outside), warmth, loading), pose, geometry.work, enabled)
         stops = {f"{one.way} stops at": str(one.error or "") for one in ways}
@@ -99,9 +99,9 @@ class Machine:
     def plan_move(
         self, poses: list[Pose], times: list[float], pivot: np.ndarray, tool: str, rate: float, share: float
     ) -> list[Motion]:
-        """Return the motions from the first pose to the others, in ``base``; a program where there are times.
+        """Return the motions from the first pose to the others, in ``base``; with times they are a program.
 
-        Raises the first limit that is broken on the way.
+        Raise the first limit that is broken on the way.
         """
         geometry = self.geometry.using(tool, BASE)
         rates = StrutRates.of(geometry, rate, share)
@@ -129,14 +129,14 @@ class PlanError(HexapodError):
 
 
 class Jobs:
-    """Does one job after another; the machine that they are about stays until another is given."""
+    """Runs one job after another; keeps the machine of a job until another is given."""
 
     def __init__(self) -> None:
         self._made_of: dict[str, Any] = {}
         self._machine: Machine | None = None
 
     def do(self, task: str, machine: dict[str, Any] | None, arguments: dict[str, Any]) -> tuple[str, Any]:
-        """Return the problem, empty where there is none, and the result."""
+        """Return the problem, empty if there is none, and the result."""
         if machine is not None:
             self._made_of, self._machine = machine, None
         try:
@@ -151,14 +151,14 @@ class Jobs:
             return "", tasks[task](**arguments)
         except (HexapodError, OSError) as error:
             return str(error), None
-        except Exception as error:  # else the process would end, and nobody know why
+        except Exception as error:  # otherwise the process would end without a message
             return f"{task}: {type(error).__name__}: {error}", None
 
 
 def main() -> int:
-    """Answer until the node's end closes."""
+    """Answer until the node closes its end."""
     os.nice(NICENESS)
-    os.dup2(2, 1)  # what a library prints goes to the log
+    os.dup2(2, 1)  # prints of libraries go to the log
     jobs = Jobs()
     with Connection(int(sys.argv[1])) as connection:
         while True:

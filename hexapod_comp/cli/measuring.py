@@ -1,5 +1,5 @@
 """Measuring: ``imagine`` draws a virtual machine, ``simulate`` measures it, ``collect`` measures a running one,
-``iso230`` judges readings."""
+``iso230`` evaluates readings."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def imagine(args: argparse.Namespace) -> Result:
     lines = [f"machine {model.machine}, seed {args.seed}: model {model.name}"]
     drawn = _drawn(model)
     rows = [[name, number(value, 3), UNITS.get(unit, unit)] for name, value, unit in drawn]
-    lines.append(aligned(["error", "largest", ""], rows) if rows else "no errors at all")
+    lines.append(aligned(["error", "largest", ""], rows) if rows else "no errors")
     tool: dict[str, Any] | None = None
     try:
         box, attitude, _ = machine_box(geometry)
@@ -65,7 +65,7 @@ def imagine(args: argparse.Namespace) -> Result:
         )
         tool = {"frame": "work", "box_m": box, "rms_m": error.raw.rms, "aligned_rms_m": error.aligned.rms}
     except GeometryError as problem:
-        results.print_notes([f"what the tool does is not shown: {problem}"])
+        results.print_notes([f"the tool's error is not shown: {problem}"])
     content = {
         "machine": model.machine,
         "name": model.name,
@@ -116,7 +116,7 @@ def outside(args: argparse.Namespace) -> Result:
 
 
 def _drawn(model: MachineModel) -> list[tuple[str, float, str]]:
-    """Return name, largest value and unit of each error that the machine has."""
+    """Return name, largest value and unit of each of the machine's errors."""
     struts, size = model.struts, np.abs
     bodies = np.array([model.base_expansion, model.platform_expansion])
     of_field = largest_errors(model.field) if any(family.size for family in model.field.lines) else np.zeros(6)
@@ -170,10 +170,10 @@ def simulate(args: argparse.Namespace) -> Result:
     if args.warm_up is not None:
         went = (stations.temperatures.max(axis=0) - stations.temperatures.min(axis=0)).tolist()
         rises = dict(zip(PARTS, went, strict=True))
-        damp = stations.humidity.max() - stations.humidity.min()  # NaN where nobody measures it
+        damp = stations.humidity.max() - stations.humidity.min()  # NaN where it is not measured
         listed = ", ".join(f"{name} {number(rise, 2)} K" for name, rise in rises.items() if rise)
         air = f", humidity {number(100.0 * damp, 1)} %" if damp > 0.0 else ""
-        lines.append(f"warms while it is measured: {listed}{air}, as {args.warm_up} has it")
+        lines.append(f"warms while it is measured: {listed}{air}, by {args.warm_up}")
         content |= {"warm_up": args.warm_up, "warmed_K": rises}
     counts = {"readings": len(measured), "runs": len(measured.runs), "stations": len(stations)}
     channels = []
@@ -221,7 +221,7 @@ def collect(args: argparse.Namespace) -> Result:
         lambda: f"{count} of {planned} readings: {args.out}",
         lambda: {**content, "resumed_stops": done.resumed},
         code=0 if count == planned else 1,
-        notes=[f"nothing was read at {where}; run it again to go on" for where in missing],
+        notes=[f"nothing was read at {where}; run it again to complete the file" for where in missing],
     )
 
 

@@ -1,7 +1,7 @@
-"""What options are: declared once, with what is read of them, and which of them go together.
+"""Options: each declared once, with its reader, and rules for their combination.
 
-A verb's options stand in :data:`.verbs.VERBS`. From there come its parser, its help, what its shell completes, which
-files it reads and writes, and every complaint about options that do not go together. Nothing heavy is loaded here.
+A verb's options stand in :data:`.verbs.VERBS`. From the table are made the parser, its help, the shell's completions,
+the lists of files read and written, and every message about options that exclude each other. Imports nothing slow.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from ..formats.texts import number_hint
 POSE_HELP = "mm and degrees: x,y,z or x,y,z,alpha,beta,gamma"
 LINE_HELP = "mm and degrees: x,y,z of its start, x,y,z of its end, and the tool's alpha,beta,gamma (default 0,0,0)"
 SHAPE, LINE_SHAPE = "X,Y,Z[,A,B,C]", "X,Y,Z,X,Y,Z[,A,B,C]"
-WORDS = "ideal, random or random:SEED"  # models that are no files
+WORDS = "ideal, random or random:SEED"  # models that are not files
 
 
 @dataclass(frozen=True)
 class Option:
-    """An option (``--name``), or an argument that is known by its place."""
+    """An option (``--name``), or a positional argument."""
 
     name: str
     help: str
     keywords: dict[str, Any] = field(default_factory=dict)  # of argparse: type, metavar, default, nargs, …
-    role: str = ""  # "reads", "writes", "folder": what it names, a file that is read or written, or a folder to make
-    kind: str = ""  # of the shipped files that it takes, as formats.paths.shipped_names knows them
-    heading: str = ""  # under which it is listed; empty: with all others
+    role: str = ""  # "reads", "writes", "folder": it is a file to read or to write, or a folder to make
+    kind: str = ""  # kind of the shipped files that it accepts, as in formats.paths.shipped_names
+    heading: str = ""  # heading in the help; empty: the common one
 
     @property
     def dest(self) -> str:
@@ -40,11 +40,11 @@ class Option:
 
     @property
     def label(self) -> str:
-        """What it is called in messages."""
+        """Name in messages."""
         return self.name if self.name.startswith("-") else str(self.keywords.get("metavar", self.name))
 
     def given(self, args: argparse.Namespace) -> bool:
-        """Return whether it was given, as something else than its default."""
+        """Return whether it was given a value other than its default."""
         given = getattr(args, self.dest)
         return given is not None and given is not False and given != [] and given != self.keywords.get("default")
 
@@ -55,37 +55,37 @@ def flag(name: str, text: str) -> Option:
 
 
 def value(name: str, read: Callable[[str], Any] | None, metavar: str, text: str, **more: Any) -> Option:
-    """Return an option with a value, which `read` makes of what was typed."""
+    """Return an option with a value, which `read` parses."""
     return Option(name, text, {"metavar": metavar, **({} if read is None else {"type": read}), **more})
 
 
 def choice(name: str, words: Sequence[str], text: str, default: str | None = None) -> Option:
-    """Return an option that takes one of some words."""
+    """Return an option with a fixed list of words."""
     return Option(name, text, {"choices": words, "default": default})
 
 
 def reads(name: str, text: str, metavar: str = "FILE", kind: str = "", **more: Any) -> Option:
-    """Return an option that names what is read: files, shipped files, or a bag's folder."""
+    """Return an option for something to read: files, shipped files, or a bag's folder."""
     return Option(name, text, {"metavar": metavar, **more}, "reads", kind)
 
 
 def writes(name: str, text: str, metavar: str = "FILE", **more: Any) -> Option:
-    """Return an option that names a file to write."""
+    """Return an option for a file to write."""
     return Option(name, text, {"metavar": metavar, **more}, "writes")
 
 
 def folder(name: str, text: str, **more: Any) -> Option:
-    """Return an option that names a folder to write into; it is made."""
+    """Return an option for a folder to write into; the verb makes it."""
     return Option(name, text, {"metavar": "FOLDER", **more}, "folder")
 
 
 def gone(name: str, now: str) -> Option:
-    """Return an option of an older version that is refused, with what it is called now."""
+    """Return an option of an older version, which is refused with its new name."""
     return Option(name, argparse.SUPPRESS, {"action": Renamed, "const": now, "metavar": "X"})
 
 
 def under(heading: str, *options: Option) -> tuple[Option, ...]:
-    """Return options that help lists under a heading."""
+    """Return options under a heading of the help."""
     return tuple(replace(option, heading=heading) for option in options)
 
 
@@ -99,12 +99,12 @@ class Assumptions(argparse.Action):
         for name, value, what, source in ASSUMED.rows():
             print(f"{name} = {value}: {what} ({source})")
         for block, tolerance in TOLERANCES.items():
-            print(f"tolerance of {block} = {tolerance:g}: first guess of its size (the fit goes on from there)")
+            print(f"tolerance of {block} = {tolerance:g}: first guess of its size (the fit estimates it)")
         parser.exit()
 
 
 class Renamed(argparse.Action):
-    """Refuse an option of an older version, and say what it is called now."""
+    """Refuse an option of an older version, and give its new name."""
 
     def __call__(self, parser: argparse.ArgumentParser, _: object, __: object, option: str | None = None) -> None:
         parser.error(f"argument {option}: is now {self.const}")
@@ -117,17 +117,18 @@ class StoreMachine(argparse.Action):
         namespace.machine, namespace.machine_given = given, True
 
 
-# Which options go together. In a rule an option stands by its name, or with its value: "--scheme lines".
+# Rules for combining options. A rule names an option, or an option with its value: "--scheme lines".
 
 
 class Rule(NamedTuple):
-    """What must hold for the options of a verb that are given."""
+    """A condition on the given options of a verb."""
 
     kind: str
-    options: tuple[str, ...]  # of EXACTLY_ONE also several with spaces between them, which stand for one way
+    # with EXACTLY_ONE an entry may be several options with spaces between, which together are one alternative
+    options: tuple[str, ...]
 
     def problem(self, given: Callable[[str], bool], label: Callable[[str], str]) -> str:
-        """Return what is wrong, empty if nothing is."""
+        """Return the problem, empty if there is none."""
         by, others = self.options[0], self.options[1:]
         here = [name for name in self.options if any(given(part) for part in re.split(" (?=--)", name))]
         first = next((label(name) for name in others if given(name)), "") if self.kind in (NEEDS, EXCLUDES) else ""
@@ -139,9 +140,9 @@ class Rule(NamedTuple):
             missing = next(name for name in self.options if name not in here)
             return f"{missing} is missing: {', '.join(self.options)} go together"
         if self.kind == NEEDS and first and not given(by):
-            return f"{first} has no meaning without {label(by)}"
+            return f"{first} needs {label(by)}"
         if self.kind == EXCLUDES and first and given(by):
-            return f"{first} has no meaning with {label(by)}"
+            return f"{first} cannot be combined with {label(by)}"
         return ""
 
 
@@ -152,23 +153,23 @@ def _rule(kind: str, *options: str) -> Rule:
     return Rule(kind, options)
 
 
-exactly_one = partial(_rule, EXACTLY_ONE)  # of the options, and one alone
+exactly_one = partial(_rule, EXACTLY_ONE)  # exactly one of the options
 some_of = partial(_rule, SOME)  # one or more of them
 together = partial(_rule, TOGETHER)  # all of them, or none
-needed_by = partial(_rule, NEEDS)  # those that follow mean nothing without the first
-excluded_by = partial(_rule, EXCLUDES)  # those that follow mean nothing with the first
+needed_by = partial(_rule, NEEDS)  # the first is needed by the others
+excluded_by = partial(_rule, EXCLUDES)  # the first excludes the others
 
 
-# What is typed becomes numbers in SI; argparse says which option was wrong.
+# Readers of typed values, into numbers in SI; argparse names the wrong option.
 
 
 def wrong(text: str) -> argparse.ArgumentTypeError:
-    """Return (not raise) an error about what was typed."""
+    """Return (not raise) an error about a typed value."""
     return argparse.ArgumentTypeError(text)
 
 
 def numbers(text: str, counts: tuple[int, ...] = (), what: str = "") -> tuple[float, ...]:
-    """Read finite numbers with commas between them; only so many, where counts are given."""
+    """Read finite numbers separated by commas; where counts are given, one of these counts."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -210,7 +211,7 @@ def above_zero(text: str) -> float:
 
 
 def scaled(read: Callable[[str], Any], size: float) -> Callable[[str], Any]:
-    """Return what reads as another does, and multiplies by the size of the option's unit in SI."""
+    """Return a reader that multiplies another's result by the size of the option's unit in SI."""
 
     def in_si(text: str) -> Any:
         value = read(text)
@@ -220,7 +221,7 @@ def scaled(read: Callable[[str], Any], size: float) -> Callable[[str], Any]:
 
 
 def span(text: str) -> tuple[float, float]:
-    """Read ``LOW,HIGH``, or one number that stands for 0 to it; both not negative."""
+    """Read ``LOW,HIGH``, or one number for 0 to it; neither negative."""
     values = numbers(text)
     low, high = (0.0, *values) if len(values) == 1 else values if len(values) == 2 else (1.0, 0.0)
     if not 0.0 <= low <= high:
@@ -229,7 +230,7 @@ def span(text: str) -> tuple[float, float]:
 
 
 def whole(low: int, high: int = 10_000_000) -> Callable[[str], int]:
-    """Return what reads a whole number within bounds."""
+    """Return a reader of a whole number within bounds."""
 
     def count(text: str) -> int:
         if not text.isdecimal() or len(text) > 12 or not low <= int(text) <= high:
@@ -260,7 +261,7 @@ lengths = scaled(partial(numbers, counts=(6,), what="six lengths in mm"), 1e-3) 
 
 
 def line(text: str) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Read two points in mm and, perhaps, the tool's angles in degrees; return the points, m, and the angles, rad."""
+    """Read two points in mm and optionally the tool's angles in degrees; return the points, m, and the angles, rad."""
     values = numbers(text, (6, 9), f"six or nine numbers ({LINE_HELP})")
     start, end = (tuple(v * 1e-3 for v in values[n : n + 3]) for n in (0, 3))
     if start == end:
@@ -277,7 +278,7 @@ def box(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 def tilts(text: str) -> tuple[float, ...]:
-    """Read tilts in degrees; return them in rad, rising, each once."""
+    """Read tilts in degrees; return them in rad, sorted, each once."""
     return tuple(math.radians(v) for v in sorted(set(numbers(text))))
 
 
@@ -288,7 +289,7 @@ def expansions(text: str) -> tuple[float, float, float]:
 
 
 def time_constants(text: str) -> tuple[float, ...]:
-    """Read time constants in s; return them rising."""
+    """Read time constants in s; return them sorted."""
     return tuple(sorted(numbers(text)))
 
 
@@ -313,32 +314,32 @@ def joint_names(text: str) -> tuple[str, ...]:
 
 
 def csv_file(text: str) -> str:
-    """Read the name of a CSV file to write; JSON is printed, so a name that ends so was meant for that."""
+    """Read the name of a CSV file to write; refuse JSON's suffix, since --json prints JSON."""
     if text.lower().endswith(".json"):
         raise wrong(f"writes CSV; for JSON: --json > {text}")
     return text
 
 
 def html_file(text: str) -> str:
-    """Read the name of an HTML file to write; a browser makes a PDF of it."""
+    """Read the name of an HTML file to write; a browser converts it to PDF."""
     if not text.lower().endswith((".html", ".htm")):
         raise wrong(f"writes HTML, which any browser prints to PDF: name it .html (not {text!r})")
     return text
 
 
-# Options that mean the same wherever they stand.
+# Options with the same meaning in every verb.
 
-JSON = flag("--json", "print JSON, for programs, in place of text; units are in the keys")
+JSON = flag("--json", "print the result as JSON instead of text; units are in the keys")
 TOOL = value("--tool", None, "NAME", "one of the geometry file's `tools` (default: its `tool`)")
 WORK = value("--work", None, "NAME", "the poses' frame: one of its `work_frames`, or base (default: its `work`)")
 DIRECTION = choice(
     "--direction",
     ("forward", "backward"),
-    "the direction in which every axis and every strut last moved (default: not known, midway between both)",
+    "the direction in which every axis and every strut last moved (default: not known, the mean of both)",
 )
-NAMESPACE = value("--namespace", None, "NAME", "where the machine's nodes are (default: none)", default="")
-SEPARATE = flag("--separate-joints", "platform joints at the same place are two joints, not one")
-COMPENSATED = flag("--compensated", "check readings: taken with the compensation running, by the model that is checked")
+NAMESPACE = value("--namespace", None, "NAME", "namespace of the machine's nodes (default: none)", default="")
+SEPARATE = flag("--separate-joints", "platform joints at the same place are separate joints")
+COMPENSATED = flag("--compensated", "check readings: taken with the compensation running, with the checked model")
 
 
 def machine(default: str = "paper.yaml") -> Option:
@@ -372,7 +373,7 @@ def table_out(what: str) -> Option:
 
 def pictures(default: str | None = None) -> Option:
     """Return the option for the folder of pictures."""
-    return folder("--pictures", "folder for pictures; made if it is missing" + f" (default {default})" * bool(default),
+    return folder("--pictures", "folder for pictures; made if missing" + f" (default {default})" * bool(default),
                   default=default)  # fmt: skip
 
 
@@ -386,30 +387,30 @@ def readings(required: bool = True) -> tuple[Option, ...]:
     return (
         reads("files", "measured files", kind="readings", nargs="+", default=None if required else []),
         MACHINE,
-        reads("--columns", "columns file that explains wide CSV files", kind="columns"),
+        reads("--columns", "columns file that describes wide CSV files", kind="columns"),
         value("--probe-mm", point, "X,Y,Z", "measured point in platform (default: the tool's tip)"),
     )
 
 
-# What a fit of scheme joint, or a plan for one, can be given; most by the name that FitSettings has for it, in SI
+# Options of a fit of scheme joint and of a plan for one; most have the name and the SI value of a field of FitSettings
 ESTIMATION = under(
     "scheme joint",
-    value("--lead-mm", scaled(bound, 1e-3), "MM", "period of the screws' errors (default: the geometry's; else what "
-          "the readings show)", dest="lead"),
+    value("--lead-mm", scaled(bound, 1e-3), "MM", "period of the screws' errors (default: the geometry's; else "
+                                                  "estimated from the readings)", dest="lead"),
     value("--blocks", None, "A,B,…", "what may be fitted: pitch, wave, harmonics, backlash, map, field, expansion, "
           "moisture, late, compliance, lost motion (default all)"),
     SEPARATE,
-    value("--tolerance-um", bound, "UM", "how well joints are built, to start from, µm (default 100)"),
-    choice("--tracker-frame", ("free", "known"), "free: a tracker stands anywhere, six unknowns a run (default); "
-           "known: its frame is the work frame"),
+    value("--tolerance-um", bound, "UM", "initial tolerance of the joints, µm (default 100)"),
+    choice("--tracker-frame", ("free", "known"), "free: the tracker's frame is unknown, six unknowns a run (default); "
+                                                 "known: it is the work frame"),
     value("--field-degree", count, "N", "degree of the field (default 6)"),
     value("--expansion-ppm", expansions, "S[,B,P]", "thermal expansion of struts, or of struts, base and platform, "
-          "ppm/K; a warm-up starts there (default 0)"),
+                                                    "ppm/K; the initial value for a warm-up (default 0)"),
     value("--moisture-ppm", scaled(bound, 1e-4), "PPM", "growth of struts by humidity, ppm per %% (1 to 5)",
           dest="strut_moisture"),
     reads("--load", "file that states stiffness and weight, as a model's block load (default: the struts are rigid)",
           kind="load"),
-    value("--thermometer", None, "PART", "part whose sensor stands for all (default: the one that alone was read)"),
-    value("--time-constants-s", time_constants, "S[,S]", "how late parts follow their sensors (default: sought from "
-          "the readings)"),
+    value("--thermometer", None, "PART", "part whose sensor represents all (default: the only one that was read)"),
+    value("--time-constants-s", time_constants, "S[,S]", "delays of the parts behind their sensors (default: estimated "
+                                                         "from the readings)"),
 )  # fmt: skip

@@ -26,7 +26,7 @@ from . import results
 from .results import Result, Table
 from .verbs import POSE_OPTIONS
 
-MOST_NOTES = 10  # limits that ik breaks, named on stderr
+MOST_NOTES = 10  # limits broken in ik that are named on stderr
 MOST_STEPS = 100_000  # poses on a line, each way
 MOST_ROWS = 100  # rows of margins that check prints; --out writes all
 MOST_BREACHES = 20  # broken limits that it prints; --json prints all
@@ -34,7 +34,7 @@ MOST_RESULTS = 10_000_000  # of assess, machines times poses: more results are r
 
 
 def show(args: argparse.Namespace) -> Result:
-    """Show a machine at a glance, and what looks wrong in its file."""
+    """Show a machine at a glance, and suspicious entries of its file."""
     from ..workspace.overview import as_json, overview, report
     from ..workspace.pictures import overview_figure
 
@@ -45,7 +45,7 @@ def show(args: argparse.Namespace) -> Result:
 
 
 def travel(args: argparse.Namespace) -> Result:
-    """Show how far the tool may go from a pose."""
+    """Show the travel of the tool from a pose."""
     from ..compensation.travel import travel, travel_text
 
     geometry, model = results.load_machine(args)
@@ -69,16 +69,16 @@ def travel(args: argparse.Namespace) -> Result:
 class Targets:
     """Tool poses, each with its directions of motion."""
 
-    rows: list[Row]  # where each comes from
+    rows: list[Row]  # row of the file
     positions: np.ndarray  # (N, 3) and (N, 3, 3): pose_tool_in_work, m
     rotations: np.ndarray
     senses: np.ndarray  # (N, 9), of axes and struts
-    directions: list[str]  # what they are called
-    along: np.ndarray | None = None  # way from the start of a line, (N,), m
+    directions: list[str]  # names of the directions
+    along: np.ndarray | None = None  # distance from the start of a line, (N,), m
 
     @staticmethod
     def given(args: argparse.Namespace) -> Targets:
-        """Return the poses of the file, or the one that the options give, in one direction."""
+        """Return the poses of the file, or the one given by options, in one direction."""
         if args.poses is not None:
             with results.stage(f"reading {args.poses}"):
                 rows, positions, rotations = read_pose_arrays(args.poses)
@@ -93,7 +93,7 @@ class Targets:
     @staticmethod
     def on_line(args: argparse.Namespace, geometry: HexapodGeometry) -> Targets:
         """Return the poses along a straight line of the tool, forward and then, in the same order, backward."""
-        # Each axis and each strut has the direction of its own motion; one that stands still has none.
+        # Each axis and each strut has the direction of its own motion; at rest it has none.
         start, end, angles = args.line
         way, step = np.array(end) - np.array(start), args.step_mm * 1e-3
         length = float(np.linalg.norm(way))
@@ -111,7 +111,7 @@ class Targets:
         return Targets(rows, *both, directions, np.tile(along, 2))
 
     def where(self, n: int) -> str:
-        """Say which pose one is, for messages."""
+        """Identify a pose in messages."""
         if self.along is None:
             return results.where(self.rows[n])
         return f"{texts.number(float(self.along[n]) * 1e3, 3)} mm along the line, {self.directions[n]}"
@@ -133,14 +133,14 @@ class Targets:
 
 
 def ik(args: argparse.Namespace) -> Result:
-    """Give strut lengths for tool poses: CSV, or a table of one pose, and no text where a file is written."""
+    """Compute strut lengths for tool poses: CSV, or a table of one pose, and no text where a file is written."""
     geometry, model = results.load_machine(args)
     targets = Targets.given(args) if args.line is None else Targets.on_line(args, geometry)
     poses, count = (targets.positions, targets.rotations), len(targets.rows)
     with results.progress_bar(count, " poses") as bar:
         found = check_limits(geometry, model, poses, "poses", progress=bar.update, senses=targets.senses)
     lengths = found.lengths
-    if not np.isfinite(lengths).all():  # the model cannot be undone at a pose: there are no commands to give
+    if not np.isfinite(lengths).all():  # the model cannot be undone at a pose: there is no command
         row = int((~np.isfinite(lengths)).any(axis=(1, 2)).argmax())
         for breach in found.breaches:
             if breach.row == row and isinstance(breach.error, NotConvergedError):
@@ -153,7 +153,7 @@ def ik(args: argparse.Namespace) -> Result:
             lie = "the pose lies" if count == 1 else f"{outside} of {count} poses lie"
             note = f"{lie} outside the box in which the model was measured; the predicted error there is extrapolated"
             results.print_notes([f"{note} ({region_text(model.measured, geometry)})"])
-    # Also an ideal machine's commands are not its lengths where screws turn with the joints.
+    # Also an ideal machine's commands differ from its lengths where screws turn with the joints.
     corrected = predicted is not None or bool(geometry.screw_lead.any())
     rows = [targets.row(n, lengths[n], corrected or args.line is not None) for n in range(count)]
     content: dict[str, Any] = results.about(geometry, model)
@@ -186,7 +186,7 @@ def _moved(direction: str) -> str:
 
 
 class Predicted:
-    """What the tool would do without compensation: as the machine stands, and with the datum aligned."""
+    """The tool's error without compensation: as the machine stands, and with the datum aligned."""
 
     def __init__(self, machine: RealMachine, file: str, poses: Any, senses: np.ndarray) -> None:
         from ..calibration.posterior import COMPONENTS, ErrorPredictor
@@ -209,7 +209,7 @@ class Predicted:
         return columns
 
     def text(self, direction: str) -> str:
-        """Return the first pose's errors as a table for people."""
+        """Return the first pose's errors as a table of text."""
         cells = ["not known" if value is None else texts.number(value, 2) for value in self.columns(0).values()]
         rows = zip(*(cells[start : start + 6] for start in range(0, 24, 6)), strict=True)
         named = zip(self._components, rows, strict=True)
@@ -229,7 +229,7 @@ class Predicted:
 
 
 def fk(args: argparse.Namespace) -> Result:
-    """Give tool poses for strut lengths: CSV, or a table of one pose, and no text where a file is written."""
+    """Compute tool poses for strut lengths: CSV, or a table of one pose, and no text where a file is written."""
     if args.lengths is None:
         with results.stage(f"reading {args.lengths_file}"):
             rows, lengths = read_lengths(args.lengths_file)
@@ -262,7 +262,7 @@ def fk(args: argparse.Namespace) -> Result:
 def _solved(
     args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel, rows: list[Row], lengths: np.ndarray
 ) -> list[Pose]:
-    """Return the platform pose of every row; the first row without one is named."""
+    """Return the platform pose of every row; if a row has none, name the first such row."""
     machine = RealMachine(geometry, model)
     commands = args.model != "ideal" or bool(geometry.screw_lead.any())  # rather than lengths
     structure = machine.structure if commands else Structure.of(geometry)
@@ -280,7 +280,7 @@ def _solved(
                     pose = Pose(batch.positions[n], batch.rotations[n])
                 else:
                     pose = solve_pose(structure, lengths[n], guess)
-                if commands:  # struts and field come on top
+                if commands:  # struts and field are applied after it
                     pose = machine.pose_for(lengths[n], senses, pose)[0]
             except KinematicsError as error:
                 problem = f"{results.where(row)}: {error}" if row.line else str(error)
@@ -290,7 +290,7 @@ def _solved(
 
 
 def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.ndarray) -> Result:
-    """Show every assembly mode, and say for each why it is, or is not, the working one."""
+    """Show every assembly mode, and for each whether and why it is the working one."""
     structure = Structure.of(geometry)
     modes = assembly_modes(structure, lengths)
     if not modes:
@@ -328,15 +328,15 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
 
 
 class LimitFormat(NamedTuple):
-    """How a limit is shown."""
+    """How a limit is displayed."""
 
     column: str
     unit: str
     factor: float  # from SI
     digits: int  # for people
     margin: bool = False  # its margin rather than its value
-    unsigned: bool = False  # only its size is of interest
-    stages: tuple[int, ...] = (0, 1)  # of nominal and compensated; a correction has but one value
+    unsigned: bool = False  # only its magnitude matters
+    stages: tuple[int, ...] = (0, 1)  # separate for nominal and compensated; a correction has one value
 
     def name(self, stage: int) -> str:
         """Return the name of its column in CSV and JSON."""
@@ -386,10 +386,10 @@ def check(args: argparse.Namespace) -> Result:
         lines += ["", "smallest margin per limit:", _smallest_table(smallest), ""]
         if skipped := int(result.unchecked_moves.sum()):
             first = results.where(rows[int(result.unchecked_moves.argmax())])
-            lines.append(f"not checked: {skipped} moves of which an end breaks a limit by itself, the first to {first}")
+            lines.append(f"not checked: {skipped} moves with an end that breaks a limit itself, the first to {first}")
         for outside, problem in (
             (result.outside_box, "outside the box in which the model was measured"),
-            (result.outside_field, "outside the error field, whose value at the boundary is held there"),
+            (result.outside_field, "outside the error field, whose boundary value is used there"),
         ):
             if outside.any():
                 first = results.where(rows[int(outside.argmax())])
@@ -428,7 +428,7 @@ def check(args: argparse.Namespace) -> Result:
 
 
 def _margins(row: Row, n: int, result: CheckResult) -> dict[str, Any]:
-    """Return one row's margins, or values, whichever are shown, in the units shown."""
+    """Return one row's displayed margins or values, in the displayed units."""
     values: dict[str, Any] = {"sequence": row.label, "line": row.line}
     for name, summary in result.limits.items():
         shown = LIMITS_SHOWN[name]
@@ -439,7 +439,7 @@ def _margins(row: Row, n: int, result: CheckResult) -> dict[str, Any]:
 
 
 def _margin_table(margins: list[dict[str, Any]], result: CheckResult, ideal: bool) -> str:
-    """Return the table of margins; with a model, nominal and compensated stand side by side."""
+    """Return the table of margins; with a model, nominal and compensated side by side."""
 
     def cell(row: dict[str, Any], shown: LimitFormat) -> str:
         values = [row[shown.name(stage)] for stage in (shown.stages[:1] if ideal else shown.stages)]
@@ -456,7 +456,7 @@ def _margin_table(margins: list[dict[str, Any]], result: CheckResult, ideal: boo
 
 
 def _smallest(limits: Limits, rows: list[Row], result: CheckResult) -> list[dict[str, Any]]:
-    """Return, for each limit, the smallest margin and where it is; units as shown."""
+    """Return, for each limit, the smallest margin and its place; displayed units."""
     listed = []
     for name, summary in result.limits.items():
         shown, place = LIMITS_SHOWN[name], summary.smallest()
@@ -501,14 +501,14 @@ def _smallest_table(smallest: list[dict[str, Any]]) -> str:
 
 POSE_COLUMNS = ("alpha_deg", "beta_deg", "gamma_deg", "x_mm", "y_mm", "z_mm")
 PERCENTILES = {"median": 50.0, "95 %": 95.0, "max": 100.0}
-# Of what percentiles over the machines are shown: title, unit and its size
+# Quantities with percentiles over the machines: title, unit and its size
 STATISTICS = {"strut_change": ("|dL|", "um", 1e6), "displacement": ("|dp|", "um", 1e6),
               "rotation": ("angle", "deg", 180.0 / math.pi)}  # fmt: skip
 ERRORS = ("x_um", "y_um", "z_um", "rx_urad", "ry_urad", "rz_urad")
 
 
 def assess(args: argparse.Namespace) -> Result:
-    """Assess machines drawn at random, as Song, Mou & King do: their tables of the first, percentiles over all."""
+    """Assess machines drawn at random, as Song, Mou & King do: their tables for the first, percentiles over all."""
     from ..virtual.assessment import assess
     from ..virtual.imperfections import ImperfectionBounds
 

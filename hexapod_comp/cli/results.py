@@ -1,4 +1,4 @@
-"""What the verbs share: the one table and the one result that all print, and how machines are found."""
+"""Shared by the verbs: the table and the result that all print, and loading of machines."""
 
 from __future__ import annotations
 
@@ -28,23 +28,24 @@ if TYPE_CHECKING:
 
     from ..measurements.campaign import Campaign
 
-# Digits after the point in CSV files, by unit: a picometre, and less than that at the platform's edge
+# Digits after the point in CSV files, by unit: a picometre, and the corresponding rotation at the platform's edge
 DECIMALS = {"mm": 9, "deg": 9, "um": 6, "urad": 6}
-SHOWN = {"mm": 6, "deg": 6}  # the same for people, who otherwise get three
+SHOWN = {"mm": 6, "deg": 6}  # the same in text; other units have three
 
 
 class Table:
-    """Rows with the same columns, named with their units; a value is text, a whole number, a number, or missing."""
+    """Rows with the same columns, whose names contain the units; a value is text, a whole number, a number, or
+    missing."""
 
     def __init__(self, rows: Sequence[Mapping[str, Any]]) -> None:
         self.rows = rows
 
     def csv(self) -> str:
-        """Return the rows as CSV; what is missing or not finite stays empty."""
+        """Return the rows as CSV; missing or not finite values stay empty."""
         return csv_text([list(self.rows[0]), *self._cells(list(self.rows[0]), DECIMALS, 6, "", lambda value: value)])
 
     def text(self, names: Sequence[str] = (), digits: Mapping[str, int] | None = None) -> str:
-        """Return some columns, or all, aligned; with other digits after the point where they are given by name."""
+        """Return some columns, or all, aligned; `digits` overrides the digits after the point by column or unit."""
         names, digits = names or list(self.rows[0]), {**SHOWN, **(digits or {})}
         return aligned(names, self._cells(names, digits, 3, "–", lambda v: "–" if v is None else str(v)))
 
@@ -66,7 +67,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Result:
-    """What a verb gives back: the same as text and as JSON, the rows of its CSV file, its pictures, its exit code."""
+    """Result of a verb: its text, its JSON, the rows of its CSV file, its pictures, its exit code."""
 
     text: Callable[[], str]
     content: Callable[[], Any]  # of --json
@@ -76,7 +77,7 @@ class Result:
     notes: Iterable[str] = ()  # for stderr, below the result
 
     def finish(self, args: argparse.Namespace) -> int:
-        """Write the CSV file and print, as the options say; draw; return the exit code."""
+        """Write the CSV file, print text or JSON, draw the pictures; return the exit code."""
         text = json_text(self.content()) if args.json else self.text()
         if self.rows and args.out is not None:
             write_text(args.out, Table(list(self.rows)).csv())
@@ -89,7 +90,7 @@ class Result:
 
 
 def load_machine(args: argparse.Namespace) -> tuple[HexapodGeometry, MachineModel]:
-    """Return the geometry, with the tool and the work frame, and the model that the options name."""
+    """Return the geometry, with tool and work frame, and the model that the options name."""
     from ..virtual.named import find_model
 
     geometry = load_geometry(args.machine).using(getattr(args, "tool", None), getattr(args, "work", None))
@@ -103,7 +104,7 @@ def load_machine(args: argparse.Namespace) -> tuple[HexapodGeometry, MachineMode
 
 
 def print_default_machine(args: argparse.Namespace, geometry: HexapodGeometry) -> None:
-    """Say on stderr that the default machine was taken, where nobody named one."""
+    """Report on stderr that the default machine is used, unless --machine was given."""
     if not getattr(args, "machine_given", False):
         print_notes([f"no --machine was given: this is machine {geometry.name}, the default"])
 
@@ -126,39 +127,39 @@ def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campai
 
 
 def about(geometry: HexapodGeometry, model: MachineModel | None = None) -> dict[str, str]:
-    """Return what JSON begins with: machine, model, and whose poses it has in which frame."""
+    """Return the first keys of a JSON result: machine, model, tool and frame of its poses."""
     named = {"machine": geometry.name} | ({} if model is None else {"model": model.name})
     return named | {"tool": geometry.tool_name, "frame": geometry.work_name}
 
 
 def whose(geometry: HexapodGeometry) -> str:
-    """Return whose poses a report has: ``the tool in work``."""
+    """Return tool and frame of a report's poses: ``the tool in work``."""
     return f"the {geometry.tool_name} in {geometry.work_name}"
 
 
 def machine_title(geometry: HexapodGeometry, model: MachineModel) -> str:
-    """Return what a report begins with: the machine and, where there is one, the model."""
+    """Return the beginning of a report's title: the machine and, if there is one, the model."""
     return f"machine {geometry.name}" + (f", model {model.name}" if model.name != "ideal" else "")
 
 
 def where(row: Row) -> str:
-    """Say where a row stands, for messages."""
+    """Identify a row in messages."""
     return f"line {row.line} (row {row.label})" if row.line else "the pose"
 
 
 def mention(args: argparse.Namespace, text: str) -> None:
-    """Print what was written where; beside JSON that is no part of the result."""
+    """Print which file was written; with --json on stderr, since it is not part of the result."""
     print(text, file=sys.stderr if args.json else sys.stdout)
 
 
 def print_notes(notes: Iterable[str]) -> None:
-    """Say on stderr what a reader of files found odd."""
+    """Print notes of a reader of files on stderr."""
     for note in notes:
         print(f"hexapod_comp: note: {note}", file=sys.stderr)
 
 
 def save_pictures(args: argparse.Namespace, pictures: Callable[[], Mapping[str, Figure]]) -> None:
-    """Draw pictures and write them into the folder of ``--pictures``, and say where they are."""
+    """Draw pictures, write them into the folder of ``--pictures`` and print their names."""
     from ..formats.figures import save
 
     with stage("drawing pictures"):
@@ -172,14 +173,14 @@ def save_pictures(args: argparse.Namespace, pictures: Callable[[], Mapping[str, 
 
 @contextlib.contextmanager
 def ended_in_order() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end this context as Ctrl-C does, so that what was started is ended, with 128 + signal."""
-    # A second one ends the process at once. A hang-up that nohup ignores stays ignored.
+    """Let SIGTERM and SIGHUP end this context like Ctrl-C, so that started processes are ended, with 128 + signal."""
+    # A second signal ends the process at once. A hang-up that nohup ignores stays ignored.
 
     def leave(caught: int, frame: object) -> None:
         signal.signal(caught, signal.SIG_DFL)
         raise SystemExit(128 + caught)
 
-    in_main = threading.current_thread() is threading.main_thread()  # elsewhere Python sets no handlers
+    in_main = threading.current_thread() is threading.main_thread()  # in other threads Python sets no handlers
     usual = [one for one in (signal.SIGTERM, signal.SIGHUP) if in_main and signal.getsignal(one) == signal.SIG_DFL]
     for one in usual:
         signal.signal(one, leave)
@@ -199,7 +200,7 @@ def progress_bar(total: int, unit: str) -> Any:
 
 @contextlib.contextmanager
 def stage(text: str) -> Iterator[None]:
-    """Show on stderr, on terminals only, what is done as long as this context is open."""
+    """Show on stderr, on terminals only, the present step while this context is open."""
     with stage_line() as say:
         say(text)
         yield
@@ -207,14 +208,14 @@ def stage(text: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stage_line() -> Iterator[Callable[[str], None]]:
-    """Give a function that shows on stderr, on terminals only, what a long calculation is at and since when."""
+    """Give a function that shows on stderr, on terminals only, the present step of a long calculation and its time."""
     if not sys.stderr.isatty():
         yield lambda text: None
         return
     began = time.monotonic()
 
     def say(text: str) -> None:
-        width = (os.get_terminal_size(sys.stderr.fileno()).columns or 80) - 1  # some say 0 where they do not know
+        width = (os.get_terminal_size(sys.stderr.fileno()).columns or 80) - 1  # some terminals report 0 columns
         line = CODES.sub("", f"{time.monotonic() - began:5.1f} s  {text}")[:width]
         print(f"\r\033[K{line}", end="", file=own_terminal(), flush=True)
 

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from ..loop.story import Calibration
     from ..ros.echo import EchoedMessage
 
-TRUE = "truth"  # the model that is no file: the machine's own errors
-FITTED = "fit"  # the model of demo that is yet to be made, of readings
+TRUE = "truth"  # the model that is not a file: the machine's own errors
+FITTED = "fit"  # the model of demo that is fitted to readings
 HZ_PERIOD = 1.0  # how often echo --hz prints a line, s
 
 
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> Result:
     rows, poses = read_poses(args.poses)
     session.refuse_broken_limits(args.poses, geometry, model, rows, poses)
     started = nullcontext(()) if args.attach else session.simulated(args.machine, model, truth)
-    compare = not (args.attach or args.no_compare)  # nobody switches a real machine's compensation off in passing
+    compare = not (args.attach or args.no_compare)  # a real machine's compensation is not switched off as a side effect
     with results.ended_in_order(), started as nodes:
         result = session.run_poses(geometry, nodes, poses, None, rate, compare, args.namespace)
     errors, unanswered = report.error_rows(result), result.lost + result.refused
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> Result:
 
 
 def _hidden_errors(args: argparse.Namespace, geometry: HexapodGeometry) -> MachineModel:
-    """Return the machine's hidden errors, and leave the name that they go by in the options."""
+    """Return the machine's hidden errors, and store their name in the options."""
     args.truth = truth_name(args.truth, geometry)
     return find_model(args.truth, geometry)
 
@@ -84,7 +84,7 @@ def _drawn(
 
 
 def demo(args: argparse.Namespace) -> Result:
-    """Measure, fit and run a machine with hidden errors; 0 when the loop kept what the fit promised."""
+    """Measure, fit and run a machine with hidden errors; 0 when the loop's error is within the fit's interval."""
     from ..loop import report, session, story
 
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as for fit: its matrices are small
@@ -121,7 +121,7 @@ def demo(args: argparse.Namespace) -> Result:
 
 
 def move(args: argparse.Namespace) -> Result:
-    """Have the mover move the tool, or stop it; 0 when it has arrived, or stands."""
+    """Have the mover move the tool, or stop it; 0 when the tool has arrived, or stands."""
     from ..pose import Pose
     from ..ros import keep_discovery_local, received_signals
     from ..ros.client import Machine, MoveState
@@ -161,7 +161,7 @@ def watch(args: argparse.Namespace) -> int:
 
 
 def echo(args: argparse.Namespace) -> int | Result:
-    """Print a topic's messages until Ctrl-C, --count or --seconds; 0 when one has come."""
+    """Print a topic's messages until Ctrl-C, --count or --seconds; 0 if one arrived."""
     from ..ros import keep_discovery_local, received_signals
     from ..ros.echo import DISCOVERY_TIME, Echo, published_topics
     from ..ros.process import QUIET, SPIN_PERIOD, RosSession
@@ -202,7 +202,7 @@ def echo(args: argparse.Namespace) -> int | Result:
 
 
 def record(args: argparse.Namespace) -> int:
-    """Write a machine's topics into a bag; 0 when there is something to be replayed."""
+    """Write a machine's topics into a bag; 0 if it can be replayed."""
     from ..ros import received_signals
     from ..ros.recorder import BagRecorder
 
@@ -217,7 +217,7 @@ def record(args: argparse.Namespace) -> int:
         lambda: "\n".join(lines),
         lambda: {"bag": args.folder, "messages": recorder.counts},
         code=0 if recorder.journal else 1,
-        notes=["no compensator was heard: there is nothing to replay"] if nothing else (),
+        notes=["no compensator published: there is nothing to replay"] if nothing else (),
     )
     code = shown.finish(args)
     if recorder.problem:
@@ -226,7 +226,7 @@ def record(args: argparse.Namespace) -> int:
 
 
 def replay(args: argparse.Namespace) -> Result:
-    """Run a recording again with what was in use, and with what the options name, where that is another."""
+    """Replay a recording with its own model and geometry, and with others where the options name them."""
     from ..compensation.journal import Source
     from ..replay.bag import Files, read_recording
     from ..replay.replay import replay_recording, what_if

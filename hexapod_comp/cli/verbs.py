@@ -1,4 +1,4 @@
-"""The verbs: each with its group, one line on what it does, its options, its help, and which options go together."""
+"""The verbs: each with its group, a summary, its options, its help, and rules for its options."""
 
 # ruff: noqa: I001 (one name a line would be fifty)
 from __future__ import annotations
@@ -16,13 +16,13 @@ from .options import (
 
 
 class Verb(NamedTuple):
-    """A verb: a function of its name, of the parsed options, that returns an exit code or a Result."""
+    """A verb: a function of this name, of the parsed options, that returns an exit code or a Result."""
 
     module: str  # in which it is
     group: str  # under which heading it is listed
     summary: str  # one line
     options: tuple[Option, ...]
-    text: str  # what stands below its options
+    text: str  # help below the options
     rules: tuple[Rule, ...] = ()
     alias: str = ""  # an old name, which still works
 
@@ -36,21 +36,22 @@ shipped one (paper, paper_machine, …)."""
 EPILOG = """Verbs, options and files complete in the shell: pip install argcomplete, then
 eval "$(register-python-argcomplete hexapod_comp)"."""
 
-GONE = {"paper": "is `make papers` in the source tree now (python -m examples.papers)"}  # verbs that went, and where to
+# removed verbs, and their replacements
+GONE = {"paper": "is `make papers` in the source tree now (python -m examples.papers)"}
 
-# A pose number by number: the options of ik, and their units
+# The options of ik that give a pose number by number, and their units
 POSE_OPTIONS = {f"--{axis}-mm": "mm" for axis in "xyz"} | {
     f"--{axis}-deg": "degrees" for axis in ("alpha", "beta", "gamma")
 }
 
 CORNERS = "X0,Y0,Z0,X1,Y1,Z1"
 
-# What plan can propose runs for; a test holds it to the planner's own list, which is slow to import
+# Instruments for which plan can propose runs; a test compares them with the planner's own list, which is slow to import
 INSTRUMENTS = (
     "linear", "straightness", "rotation", "5-D", "6-D", "tracker", "tracker_6d", "ball_bar", "station", "r_test",
 )  # fmt: skip
 
-# What run and demo share
+# Shared by run and demo
 LOOP = (
     MACHINE,
     TRUTH,
@@ -59,7 +60,7 @@ LOOP = (
     JSON,
 )
 
-# Bounds that assess draws machines within, and what they are by default
+# Default bounds of the machines that assess draws
 DRAWN = {
     "--joint-um": (10.0, "every coordinate of every joint, µm"),
     "--strut-um": (10.0, "every strut's length offset, µm"),
@@ -67,7 +68,7 @@ DRAWN = {
     "--wave-um": (0.0, "every screw's periodic error (its amplitude, drawn from 0 up), µm"),
 }
 
-# How imperfect an imagined machine may be, by the names that ImperfectionBounds has; defaults are those of `random`
+# Bounds of an imagined machine, by the names of ImperfectionBounds; defaults are those of `random`
 BOUNDED = (
     ("--joints-um", bound, 1e-6, "joint", "every coordinate of every joint, ± µm (default 50)"),
     ("--struts-um", bound, 1e-6, "strut_offset", "every strut's length, ± µm (default 50)"),
@@ -77,7 +78,7 @@ BOUNDED = (
     ("--wave-period-mm", above_zero, 1e-3, "wave_period", "its period, mm (default: the geometry's lead, else 10)"),
     ("--map-um", bound, 1e-6, "length_map", "smooth length error of every strut, RMS µm (default 1)"),
     ("--backlash-um", span, 1e-6, "backlash", "backlash of every strut, µm (default 2,4)"),
-    ("--wear-um", bound, 1e-6, "wear", "how much more of it a screw has where it is worn most, µm (default 0)"),
+    ("--wear-um", bound, 1e-6, "wear", "largest additional backlash where a screw is worn, µm (default 0)"),
     ("--strut-expansion-ppm-per-k", span, 1e-6, "strut_expansion", "thermal expansion of the struts (default 0)"),
     ("--body-expansion-ppm-per-k", span, 1e-6, "body_expansion", "the same of base and platform (default 0)"),
     ("--field-um", bound, 1e-6, "field_displacement", "largest displacement by a field in space, µm (default 0)"),
@@ -87,9 +88,9 @@ BOUNDED = (
 BOUNDS = (
     *(value(name, scaled(read, size), "LOW,HIGH" if read is span else "NUMBER", text, dest=bound)
       for name, read, size, bound, text in BOUNDED),
-    value("--box", box, CORNERS, "where the field is: lowest and highest tool position, mm (default: what a level tool "
-          "reaches about home)"),
-    flag("--separate-joints", "struts that share a platform joint each get one of their own"),
+    value("--box", box, CORNERS, "region of the field: lowest and highest tool position, mm (default: the reach of a "
+                                 "level tool about home)"),
+    flag("--separate-joints", "struts that share a platform joint get separate ones"),
 )  # fmt: skip
 
 # fmt: off
@@ -102,10 +103,10 @@ VERBS = {
             pictures("out"),
             JSON,
         ),
-        """Prints where joints and frames are (mm, degrees), how far the tool tilts at home, what the machine reaches
-and which limit stops it, and the largest box that fits into the reach. Campaigns without a box take that one. What
-looks wrong in the file is said at the end: a mirrored or turned home, swapped joints, a wrong unit, missing
-joint_axes. The folder of --pictures gets machine.png.
+        """Prints the places of joints and frames (mm, degrees), the tool's largest tilt at home, the reach and the
+limits that end it, and the largest box within the reach. Campaigns without a box use that one. Suspicious entries of
+the file are listed at the end: a mirrored or turned home, swapped joints, a wrong unit, missing joint_axes. With
+--pictures, machine.png is written into the folder.
 
 example:
   $ hexapod_comp show mine.yaml
@@ -130,15 +131,15 @@ example:
             table_out("the lengths"),
             JSON,
         ),
-        """A file's columns are x_mm, y_mm, z_mm, optionally alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw)
-and sequence or name; other units by their suffix (_m, _um, _in, _rad). CSV in gives CSV out, L1_mm … L6_mm,
-which fk reads. With --model, L1_mm … L6_mm are the lengths to command, nominal_L1_mm … and
-correction_L1_um … (command − nominal) follow. By default no direction of motion is known: commands are midway
-between both, and a backlash adds nothing. With --direction forward every axis and every strut is taken to have moved
-in its positive direction last (struts: longer), with backward in its negative one; the output says which.
-With --line the tool passes a straight line both ways, and each strut moves as that line has it: a row for every
---step-mm and for the end, from start to end, all forward (towards the end), then all backward. Lengths are given for
-any pose; limits that it breaks are named on stderr (see check).
+        """A file's columns are x_mm, y_mm, z_mm, optionally alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw) and
+sequence or name; other units by their suffix (_m, _um, _in, _rad). CSV input gives CSV output, L1_mm … L6_mm, which fk
+reads. With --model, L1_mm … L6_mm are the lengths to command, nominal_L1_mm … and correction_L1_um … (command −
+nominal) follow. By default no direction of motion is assumed: commands are the mean of both directions, without
+backlash. With --direction forward every axis and every strut is assumed to have moved in its positive direction last
+(struts: longer), with backward in its negative one; the output states which. With --line the tool passes a straight
+line both ways, and each strut moves as the line requires: a row for every --step-mm and for the end, from start to
+end, all forward (towards the end), then all backward. Lengths are computed for any pose; broken limits are reported on
+stderr (see check).
 
 example:
   $ hexapod_comp ik --pose 0,0,400,5,0,0
@@ -173,12 +174,12 @@ example:
             table_out("the poses"),
             JSON,
         ),
-        """A file's columns are L1_mm … L6_mm (or _m, _um, _in), optionally sequence or name; CSV in gives CSV
-out, which ik and check read. With --model the lengths are commands, and the pose is where the real machine
-goes, midway between both directions of motion or, with --direction, in the one in which axes and struts moved last
-(see ik). Newton starts at home, or at --guess; --cold needs no guess: it finds every pose with these lengths
-and picks the one in which the machine can work. Of a 6-3 machine these are all; of others those that Newton
-finds from 4000 starts all around.
+        """A file's columns are L1_mm … L6_mm (or _m, _um, _in), optionally sequence or name; CSV input gives CSV
+output, which ik and check read. With --model the lengths are commands, and the pose is that of the real machine, the
+mean of both directions of motion or, with --direction, the one in which axes and struts moved last (see ik). Newton
+starts at home, or at --guess; --cold needs no guess: it finds every pose with these lengths and selects the one in
+which the machine can work. For a 6-3 machine these are all; for others those that Newton finds from 4000 starts all
+around.
 
 example:
   $ hexapod_comp fk --lengths 519.494,519.808,509.192,509.192,499.282,498.955
@@ -205,12 +206,12 @@ example:
             table_out("all margins"),
             JSON,
         ),
-        """By default the rows are targets: the tool moves from one to the next with a rest at each, as `run`
-does, and the whole way is checked. With --stream the rows are consecutive commands at --rate-hz, and their steps
-and strut speeds are checked as they are. Limits hold for nominal and for compensated values (--model).
-Margins: stroke in mm to the nearer end, joint cones in degrees, distance of the struts' axes in mm if the machine
-limits it; condition number, correction (µm), step (mm) and speed (mm/s) are shown as values. Exit code: 0 all
-within, 1 a limit is broken, 2 bad input.
+        """By default the rows are targets: the tool moves from one to the next with a rest at each, as in `run`, and
+the whole path is checked. With --stream the rows are consecutive commands at --rate-hz, and the steps and strut speeds
+between them are checked. Limits hold for nominal and for compensated values (--model). Margins: stroke in mm to the
+nearer end, joint cones in degrees, distance of the struts' axes in mm if the machine limits it; condition number,
+correction (µm), step (mm) and speed (mm/s) are shown as values. Exit code: 0 all within, 1 a limit is broken, 2 bad
+input.
 
 example:
   $ hexapod_comp check config/table1.csv
@@ -230,16 +231,16 @@ example:
     ),
     "travel": Verb(
         "poses", "kinematics",
-        "how far the tool may go from a pose, each way, and what stops it",
+        "how far the tool may move from a pose in each direction, and which limit ends it",
         (
-            value("--pose", pose, SHAPE, f"where the tool is, {POSE_HELP} (default: home)"),
+            value("--pose", pose, SHAPE, f"pose of the tool, {POSE_HELP} (default: home)"),
             *FRAMES,
             JSON,
         ),
-        """Goes from the pose along x, y and z of the work frame, mm, and by each of its angles, degrees, the others
-as they are, forward and backward, until a limit stands: stroke, joint cones, clearance of the struts, condition number,
-correction, the field's box. Limits hold for nominal and for compensated values (--model); turns end at 180°.
-What is narrower than a five-hundredth of the longest strut, or half a degree, may be stepped over.
+        """Moves from the pose along x, y and z of the work frame, mm, and by each of its angles, degrees, with the
+others fixed, forward and backward, up to a limit: stroke, joint cones, clearance of the struts, condition number,
+correction, the field's box. Limits hold for nominal and for compensated values (--model); turns end at 180°. A
+forbidden region narrower than a five-hundredth of the longest strut, or half a degree, may be missed.
 
 example:
   $ hexapod_comp travel --pose 0,0,400,0,0,5 --model paper_machine.yaml""",
@@ -254,14 +255,14 @@ example:
                   "own errors "
                   "(default)", kind="model", default="truth"),
             pictures(),
-            flag("--attach", "use nodes that already run; one pass, as they are"),
+            flag("--attach", "use nodes that already run; one pass, without changing them"),
             value("--namespace", None, "NAME", "namespace of those nodes", default=""),
             flag("--no-compare", "leave out the simulated pass without compensation"),
         ),
         """The tool moves from pose to pose within the machine's limits and rests at each. Its error is read from
-tool_pose_true. Columns of the file: x_mm, y_mm, z_mm, alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw). Poses in
-the file and in the report are the tool's in the work frame, in mm and degrees. Errors are in µm and µrad. From six
-poses on the report also has the error with the datum aligned: less the one rigid motion that a workpiece zero takes up.
+tool_pose_true. Columns of the file: x_mm, y_mm, z_mm, alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw). Poses in the
+file and in the report are the tool's in the work frame, in mm and degrees. Errors are in µm and µrad. From six poses
+on the report also has the error with the datum aligned: minus the rigid motion that setting a workpiece zero removes.
 The simulated machine has the errors of --truth; by default the compensator knows them. Exit code: 0 all commands were
 answered, 1 some were lost or refused, 2 bad input.
 
@@ -277,16 +278,16 @@ example:
             value("--pose", pose, SHAPE, f"where to, {POSE_HELP}"),
             value("--frame", None, "NAME", "frame of the pose: work (default), base or a named one; with --relative "
                   "also tool", default="work"),
-            flag("--relative", "go on from where the tool stands, along and about the frame's axes"),
-            flag("--stop", "brake the move that is under way, within the struts' limits"),
+            flag("--relative", "move relative to the tool's present pose, along and about the frame's axes"),
+            flag("--stop", "brake the present move, within the struts' limits"),
             value("--timeout-s", above_zero, "S", "stop a move that takes longer (default 3600)", default=3600.0),
             NAMESPACE,
             JSON,
         ),
-        """Asks the node mover, which plans a straight line and the shortest turn in the least time that the struts'
-speed, acceleration and jerk allow, checks every limit along it first, and holds the tool at its end. The tool has
-arrived when its estimate has settled within the mover's tolerances. Ctrl-C brakes. Exit code: 0 arrived, or stopped by
---stop; 2 refused, or stopped on the way, with the reason.
+        """Sends the target to the node mover, which plans a straight line and the shortest turn in the least time that
+the struts' speed, acceleration and jerk allow, checks every limit along it first, and holds the tool at its end. The
+tool has arrived when its estimate has settled within the mover's tolerances. Ctrl-C brakes. Exit code: 0 arrived, or
+stopped by --stop; 2 refused, or stopped on the way, with the reason.
 
 example:
   $ ros2 run hexapod_comp mover     (beside the compensator)
@@ -330,10 +331,10 @@ random, and the box's diagonals. A check that contradicts it is repeated at othe
 machine has changed: a strut, a temperature or a payload is named, the model is renewed from the checks, checked itself
 and reloaded. What few readings cannot repair is calibrated anew with --reload, else its campaign is proposed.
 
-Every step stands in FOLDER/journal.jsonl. Ctrl-C brakes the machine and ends; the same command goes on from there, also
-after a kill. At each stop the instrument is asked three times and the median counts; a stop at which it reads nothing
-is visited again. Exit code: 0 a model is in use, or proposed; 1 refused, or the machine has changed; 2 bad input, or
-the machine does not answer; 130 stopped.
+Every step stands in FOLDER/journal.jsonl. Ctrl-C brakes the machine and ends; the same command goes on from there,
+also after a kill. At each stop the instrument is asked three times and the median counts; a stop at which it reads
+nothing is visited again. Exit code: 0 a model is in use, or proposed; 1 refused, or the machine has changed; 2 bad
+input, or the machine does not answer; 130 stopped.
 
 example:
   $ ros2 launch hexapod_comp machine.launch.py mover:=true     (compensator, mover and a simulated machine)
@@ -348,26 +349,26 @@ example:
     ),
     "demo": Verb(
         "running", "loop",
-        "measure, fit and compensate a machine: what is left of its errors",
+        "measure, fit and compensate a machine, and show its residual error",
         (
             *LOOP,
-            reads("--model", "model that the compensator runs: fit, made of laser readings (default); truth; file, "
-                  "shipped name, "
-                  f"{WORDS}", kind="model", default="fit"),
+            reads("--model", "model that the compensator runs: fit, from laser readings (default); truth; file, "
+                             f"shipped name, {WORDS}", kind="model", default="fit"),
             seed_of("noise and poses"),
             pictures("out"),
         ),
         """A machine with hidden errors is measured with virtual lasers, noise included, in a box about its home. fit
 makes a model of the readings. Then both nodes run over DDS, through random poses of that box and along a milled path,
-without and with the model. The report lays what the tool really did beside what the fit promised, and beside it the
-1-D scheme of Mou & King in their own measure. Errors are in µm and µrad, poses in the work frame, in mm and degrees.
+without and with the model. The report compares the tool's true error with the fit's prediction, and with the 1-D
+scheme of Mou & King in their own metric. Errors are in µm and µrad, poses in the work frame, in mm and degrees.
 
-Laser lines do not show where the machine stands as a whole, so errors are given as they are and with the datum
-aligned: less the one rigid motion that a workpiece zero takes up. The verdict is by the latter. --model runs another
-model: truth, the machine's own errors, shows what the drives alone leave.
+Laser lines do not show where the machine stands as a whole, so errors are given as the machine stands and with the
+datum aligned: minus the rigid motion that setting a workpiece zero removes. The verdict uses the latter. --model runs
+another model: truth, the machine's own errors, shows the residual due to the drives.
 
-Exit code: 0 only when no command was lost or refused, both nodes ended well, and the RMS error at rest and along the
-path, datum aligned, is no larger than promised (95 %) and what the drives add. A busy computer is named as the cause.
+Exit code: 0 only when no command was lost or refused, both nodes exited normally, and the RMS error at rest and along
+the path, datum aligned, is no larger than the predicted upper end (95 %) with the drives' share. If the computer was
+busy, the report says so.
 
 example:
   $ hexapod_comp demo
@@ -381,12 +382,12 @@ example:
             MACHINE,
             NAMESPACE,
             value("--host", None, "ADDRESS", "address to serve on (default 127.0.0.1: this computer alone; 0.0.0.0: "
-                  "all that reach it)", default="127.0.0.1"),
+                                             "all that can reach it)", default="127.0.0.1"),
             value("--port", whole(1, 65535), "N", "port to serve on (default 8080)", default=8080),
         ),
-        """Serves a page on this computer alone, unless --host says otherwise: the machine in 3-D, its struts coloured
-by correction, the tool's error (µm, µrad) as predicted and as left, what compensator and drive say of themselves,
-refusals, strut lengths (mm), and latencies (ms). It only listens in this ROS domain: nothing on the page moves or
+        """Serves a page to this computer alone, unless --host gives another address: the machine in 3-D, its struts
+coloured by correction, the tool's predicted and residual error (µm, µrad), the diagnostics of compensator and drive,
+refusals, strut lengths (mm), and latencies (ms). It only subscribes in this ROS domain: nothing on the page moves or
 changes anything. It ends at Ctrl-C. It needs viser: pip install viser.
 
 example:
@@ -401,14 +402,15 @@ example:
             NAMESPACE,
             value("--count", count, "N", "end after N messages"),
             value("--seconds", above_zero, "S", "end after S seconds (default: at Ctrl-C)"),
-            flag("--hz", "print the rate once a second in place of the messages"),
+            flag("--hz", "print the rate once a second instead of the messages"),
             JSON,
         ),
-        """Prints each message of TOPIC, whatever its type: struts in mm, corrections in µm, poses in mm and degrees,
-predicted errors in µm and µrad with their standard deviations, diagnostics by name. Its rate over the last 2 s and its
-age, from its stamp to its receipt, stand above it. --hz prints the rate alone, as `ros2 topic hz` does. Without TOPIC
-it lists the topics that are published. With --json each message is one line. It needs no ROS 2 installation, and it
-publishes nothing. Exit code: 0 a message came, 1 none came, 2 bad input, or nobody publishes the topic.
+        """Prints each message of TOPIC, of any type: struts in mm, corrections in µm, poses in mm and degrees,
+predicted errors in µm and µrad with their standard deviations, diagnostics by name. Above each message are its rate
+over the last 2 s and its age, from its stamp to its receipt. --hz prints the rate alone, as `ros2 topic hz` does.
+Without TOPIC it lists the topics that are published. With --json each message is one line. It needs no ROS 2
+installation, and it publishes nothing. Exit code: 0 a message arrived, 1 none arrived, 2 bad input, or the topic has
+no publisher.
 
 example:
   $ hexapod_comp echo strut_corrections --count 1
@@ -421,14 +423,14 @@ example:
         "running", "loop",
         "record a running machine's topics, for replay",
         (
-            folder("--out", "folder for the bag (MCAP); must not be there yet", dest="folder", required=True),
+            folder("--out", "folder for the bag (MCAP); must not exist", dest="folder", required=True),
             NAMESPACE,
-            value("--seconds", above_zero, "S", "end after so long (default: at Ctrl-C)"),
+            value("--seconds", above_zero, "S", "end after this time (default: at Ctrl-C)"),
             JSON,
         ),
-        """Hears commands, readings, estimates, diagnostics and the compensator's journal in this ROS domain, and writes
-them as ros2 bag does, into a folder with an MCAP file. It ends at Ctrl-C, or after --seconds. It may begin in the
-middle of a motion. Exit code: 0 there is something to replay, 1 no compensator was heard, 2 bad input.
+        """Subscribes to commands, readings, estimates, diagnostics and the compensator's journal in this ROS domain,
+and writes them as ros2 bag does, into a folder with an MCAP file. It ends at Ctrl-C, or after --seconds. It may begin
+during a motion. Exit code: 0 the bag can be replayed, 1 no compensator published, 2 bad input.
 
 example:
   $ hexapod_comp record --out run
@@ -439,10 +441,10 @@ example:
         "run a recorded bag through the compensator again: the same bits?",
         (
             reads("bag", "folder of a bag, .mcap or .db3 file", "BAG"),
-            value("--namespace", None, "NAME", "the machine meant, when the bag holds several"),
-            reads("--machine", "geometry file, or the name of a shipped one (default: what the recording carries)",
+            value("--namespace", None, "NAME", "namespace of the machine, when the bag holds several"),
+            reads("--machine", "geometry file, or the name of a shipped one (default: the recording's)",
                   kind="geometry"),
-            reads("--model", f"model file, the name of a shipped one, {WORDS} (default: what the recording carries)",
+            reads("--model", f"model file, the name of a shipped one, {WORDS} (default: the recording's)",
                   kind="model"),
             value("--tolerance-um", bound, "UM", "accept differences up to this, µm (default 0: the same bits)",
                   default=0.0),
@@ -451,12 +453,12 @@ example:
             JSON,
         ),
         """BAG is a folder that `ros2 bag record` has written (MCAP or sqlite3), or one of its files. It must hold
-compensator/journal; with compensator/files the geometry and the model that were in use come along. strut_states and
-tool_pose_estimate are shown in the pictures. How far the tool was off its path, by tool_pose_estimate and
-tool_pose_true, is told in µm: as it is, and with the datum aligned.
+compensator/journal; with compensator/files it contains the geometry and the model in use. The pictures show
+strut_states and tool_pose_estimate. The tool's distance from its path, by tool_pose_estimate and tool_pose_true, is
+given in µm: as the machine stands, and with the datum aligned.
 
-With --model (or --machine) of another file than was in use, the report also says what that would have corrected.
-Exit code 0: the same bits, or within --tolerance-um; 1: not the same; 2: the bag cannot be used.
+With another --model (or --machine) the report also shows the corrections that it would have made. Exit code 0: the
+same bits, or within --tolerance-um; 1: not the same; 2: the bag cannot be used.
 
 example:
   $ ros2 bag record --storage mcap --output run --all
@@ -470,35 +472,35 @@ example:
         "fitting", "calibration",
         "what a campaign will determine; or which one a goal needs",
         (
-            reads("campaign", "campaign file, or the name of a shipped one; with --goal-um optional: whose box and "
-                  "noise count", "CAMPAIGN", "campaign", nargs="?"),
+            reads("campaign", "campaign file, or the name of a shipped one; with --goal-um optional: only its box and "
+                              "noise are used", "CAMPAIGN", "campaign", nargs="?"),
             MACHINE,
-            value("--repeatability-um", bound, "UM", "standard deviation of where the machine stops, along each axis "
-                  "(default: the campaign's)"),
+            value("--repeatability-um", bound, "UM", "standard deviation of the machine's stops, along each axis "
+                                                     "(default: the campaign's)"),
             *under(
                 "proposing a campaign",
-                value("--goal-um", above_zero, "UM", "RMS tool error that may be left, the datum aligned: propose a "
-                      "campaign for it"),
-                value("--tilt-deg", bound, "DEG", "tilt of the tool at which it must hold too (default 0)"),
-                value("--instruments", None, "A,B,…", f"what there is to measure with: {', '.join(INSTRUMENTS)} "
-                      "(default linear)"),
-                value("--hours", above_zero, "H", "how long measuring may take (default 4)"),
-                value("--time", times, "NAME=MIN,MIN,S", "how long an instrument takes: minutes to put it up, minutes "
-                      "a run, seconds a stop; may be repeated", action="append"),
+                value("--goal-um", above_zero, "UM", "allowed RMS tool error, the datum aligned: propose a campaign "
+                                                     "that reaches it"),
+                value("--tilt-deg", bound, "DEG", "tilt of the tool at which the goal must also hold (default 0)"),
+                value("--instruments", None, "A,B,…", f"available instruments: {', '.join(INSTRUMENTS)} (default "
+                                                      "linear)"),
+                value("--hours", above_zero, "H", "time available for measuring (default 4)"),
+                value("--time", times, "NAME=MIN,MIN,S", "times of an instrument: minutes to set up, minutes a run, "
+                                                         "seconds a stop; may be repeated", action="append"),
                 writes("--out", "write the proposed campaign to a file (YAML)", "CAMPAIGN"),
             ),
             *ESTIMATION,
             seed_of("scattered poses"),
             JSON,
         ),
-        """Takes a campaign file and says without a single reading which parameters the campaign would determine, which
-it leaves open, and what tool error (µm) a fit of --scheme joint will leave on a machine within the tolerances. How far
-the machine stops beside its usual place is in it, where the campaign or --repeatability-um states it.
+        """Predicts from a campaign file, without readings, which parameters the campaign would determine, which it
+would not, and which tool error (µm) a fit of --scheme joint will leave on a machine within the tolerances. The scatter
+of the machine's stops is included, where the campaign or --repeatability-um states it.
 
-With --goal-um it proposes a campaign: lines and poses in measuring order, within the limits, that bring the tool error
-(µm, RMS, the datum aligned) down to the goal in the time there is. The box and the noise are those of CAMPAIGN, by
-default the machine's own box. Where the goal cannot be met it says what can be had, and what limits it. simulate and
-fit read the file. Exit code: 0 fine, 1 the goal is not met, 2 bad input.
+With --goal-um it proposes a campaign: lines and poses in measuring order, within the limits, that reduce the tool
+error (µm, RMS, the datum aligned) to the goal in the available time. The box and the noise are those of CAMPAIGN, by
+default the machine's own box. Where the goal cannot be met it gives the reachable error, and the limiting factor.
+simulate and fit read the file. Exit code: 0 success, 1 the goal is not met, 2 bad input.
 
 example:
   $ hexapod_comp plan campaign_1d --lead-mm 10 --blocks pitch,wave,backlash
@@ -519,12 +521,12 @@ example:
             writes("--out", "write the errors to a model file (YAML)", "MODEL", required=True),
             JSON,
         ),
-        """Draws the errors of a virtual machine at random, evenly within the bounds, and writes them as a model file.
-simulate, run, demo and fit take it as --truth. The same seed gives the same machine, and a bound that is changed leaves
-the other errors alone. A bound of 0 leaves that error out.
+        """Draws the errors of a virtual machine at random, uniformly within the bounds, and writes them as a model
+file. simulate, run, demo and fit read it with --truth. The same seed gives the same machine; changing one bound does
+not change the other errors. A bound of 0 leaves that error out.
 
-Wherever a truth or a model is taken, `random` is the machine that this verb draws without any option, and `random:7`
-the one of --seed 7.
+Wherever an option accepts a truth or a model, `random` is the machine that this verb draws without any option, and
+`random:7` the one of --seed 7.
 
 example:
   $ hexapod_comp imagine --machine mine.yaml --joints-um 100 --backlash-um 3,5 --seed 3 --out truth.yaml
@@ -546,9 +548,9 @@ example:
             writes("--out", "write the model to a YAML file", "MODEL", required=True),
             JSON,
         ),
-        """The columns are one or two outside numbers (elevation_deg, rotation_deg; oil_degC) and six components:
-x_um, y_um, z_um of the field's measured point in base, rx_urad, ry_urad, rz_urad about it; in any unit, a row a node
-of their grid, in any order. Between nodes the table is bilinear. The compensator subscribes to the numbers on its topic
+        """The columns are one or two outside numbers (elevation_deg, rotation_deg; oil_degC) and six components: x_um,
+y_um, z_um of the field's measured point in base, rx_urad, ry_urad, rz_urad about it; in any unit, a row a node of
+their grid, in any order. Between nodes the table is bilinear. The compensator subscribes to the numbers on its topic
 outside; what they change ramps in. doc/model_file.md has frame and sign.
 
 example:
@@ -563,17 +565,17 @@ example:
             TRUTH,
             reads("--campaign", "campaign file, or the name of a shipped one (default campaign_5d.yaml for the machine "
                   "paper, else campaign)", kind="campaign"),
-            reads("--warm-up", "file of how the machine warms meanwhile, warm_up for the shipped one: then x, y and z "
-                  "lines again and again", kind="warm_up"),
-            seed_of("all that is random"),
+            reads("--warm-up", "file that describes a warm-up during the measurement, warm_up for the shipped one: "
+                               "then x, y and z lines are repeated", kind="warm_up"),
+            seed_of("all random draws"),
             writes("--out", "write the readings to a CSV file", type=csv_file, required=True),
             JSON,
         ),
-        """Moves the virtual machine through a campaign (lines, diagonals, scattered poses) and writes what its
-instruments read, noise and unknown zeros included. The CSV file is the one that fit reads: one reading a row, errors
-as measured minus commanded, in um and urad. --model measures the machine with that model's compensation: then the file
-also holds the strut lengths that were commanded. --warm-up warm_up warms the machine after the campaign, reads three
-lines again every ten minutes, and writes times and what its sensors tell. The same seed gives the same file.
+        """Moves the virtual machine through a campaign (lines, diagonals, scattered poses) and writes its instruments'
+readings, with noise and unknown zeros. fit reads this CSV file: one reading a row, errors as measured minus commanded,
+in um and urad. --model measures the machine with that model's compensation: then the file also holds the commanded
+strut lengths. --warm-up warm_up warms the machine after the campaign, reads three lines again every ten minutes, and
+writes times and sensor readings. The same seed gives the same file.
 
 example:
   $ hexapod_comp simulate --campaign campaign_1d --seed 1 --out measured.csv
@@ -591,27 +593,28 @@ example:
             reads("--campaign", "campaign file, or the name of a shipped one (default campaign_5d.yaml for the machine "
                   "paper, else campaign)", kind="campaign"),
             value("--topic", None, "TOPIC", "poses of the tool (PoseStamped), from a tracker or motion capture "
-                  "(default tool_pose_true, what strut_drive's tracker reads)", default="tool_pose_true"),
+                  "(default tool_pose_true, strut_drive's simulated tracker)", default="tool_pose_true"),
             value("--readings", None, "TOPIC", "single readings (JointState: names are channels) of a laser or ball "
-                  "bar; lines, lengths and displacements then come from there", default=""),
-            choice("--tracker-frame", ("free", "known"), "known: poses are measured in base (default); free: in a "
-                   "frame that stands anywhere", "known"),
+                  "bar; lines, lengths and displacements are then read from it", default=""),
+            choice("--tracker-frame", ("free", "known"), "known: poses are measured in base (default); free: in an "
+                   "unknown frame", "known"),
             flag("--confirm", "wait for Enter before each run that --readings reads, while the instrument is set up"),
-            value("--samples", whole(3, 10_000), "N", "readings of which the median is taken at each stop (default 25)",
+            value("--samples", whole(3, 10_000), "N", "readings at each stop, of which the median is taken (default 25)",
                   default=25),
             seed_of("the scattered poses"),
-            writes("--out", "write the readings to a CSV file; one of this campaign is completed", type=csv_file,
+            writes("--out", "write the readings to a CSV file; an incomplete one of this campaign is "
+                            "completed", type=csv_file,
                    required=True),
             NAMESPACE,
             JSON,
         ),
-        """Has the mover visit a campaign's stations, each pass of a line from beside its first point, and reads the
-instruments there when the tool has settled; struts, temperatures and gravity are taken along. The file is what fit
-reads, and is whole at any time: Ctrl-C, or a mover that was stopped, ends the run, and the same command goes on with
-it. A stop at which an instrument reads nothing three times is left out, and visited by the next run; a run that counts
-from a zero begins anew where a broken beam (NaN) or an interruption lost that. Readings that no machine could err by
-(another unit, sign, channel, frame or target) end the run after the first line. Exit code: 0 everything was read, 1
-some is missing, 2 bad input.
+        """Has the mover visit a campaign's stations, each pass of a line from a point before its first one, and reads
+the instruments there when the tool has settled; struts, temperatures and gravity are recorded. fit reads the file,
+which is complete at any time: Ctrl-C, or a mover that was stopped, ends the run, and the same command resumes it. A
+stop at which an instrument reads nothing three times is skipped, and visited by the next run; a run that counts from a
+zero begins anew after a broken beam (NaN) or an interruption. Readings beyond any machine's errors (another unit,
+sign, channel, frame or target) end the run after the first line. Exit code: 0 everything was read, 1 some is missing,
+2 bad input.
 
 example:
   $ ros2 launch hexapod_comp machine.launch.py mover:=true     (compensator, mover and a simulated machine)
@@ -628,20 +631,21 @@ example:
             choice("--scheme", ("joint", "lines"), "how to fit (default joint)", "joint"),
             writes("--out", "write the model to a YAML file", "MODEL", required=True),
             value("--name", None, "TEXT", "name of the model"),
-            value("--datum", pose, "POSE", f"tool pose in work that stays where it is, {POSE_HELP} (default: home)"),
+            value("--datum", pose, "POSE", f"tool pose in work that the model does not move, {POSE_HELP} (default: "
+                                           "home)"),
             writes("--report", "write the report to a file too"),
-            writes("--certificate", "write a calibration certificate, a page to be filed or printed (scheme joint)",
+            writes("--certificate", "write a calibration certificate, an HTML page to file or print (scheme joint)",
                    "FILE.html", type=html_file),
-            reads("--details", "what the certificate says of instruments, place and people (YAML)"),
+            reads("--details", "the certificate's information on instruments, place and people (YAML)"),
             gone("--covariance", "always written, beside the model, as MODEL.posterior.npz"),
             pictures(),
             JSON,
             reads("--truth", f"errors of the virtual machine that was measured: file, shipped name, {WORDS}",
                   kind="model"),
-            flag("--force", "write a model that the readings do not bear out"),
-            Option("--assumptions", "print what all fits assume, with units and sources",
+            flag("--force", "write a model that the readings contradict"),
+            Option("--assumptions", "print the assumptions of all fits, with units and sources",
                    {"action": Assumptions, "nargs": 0}),
-            reads("--update", "renew this model from few readings, what its fit knows as the prior", "MODEL"),
+            reads("--update", "renew this model from few readings, with its fit's result as the prior", "MODEL"),
             COMPENSATED,
             *ESTIMATION,
             *under(
@@ -650,22 +654,22 @@ example:
                       "joint; default by its class: laser 0.5, tracker 10)", dest="scale"),
                 value("--alignment-mrad", scaled(bound, 1e-3), "MRAD", "angle between a laser's beam and its line, "
                       "1 σ, mrad (scheme joint; default 0.5)", dest="alignment"),
-                flag("--not-robust", "trust readings that disagree with the rest (scheme joint)"),
+                flag("--not-robust", "give full weight to readings that disagree with the rest (scheme joint)"),
             ),
-            choice("--order", ("adjusted-r2", "aicc"), "what picks the polynomials' order (scheme lines; default "
-                   "adjusted-r2)"),
+            choice("--order", ("adjusted-r2", "aicc"), "criterion for the polynomials' order (scheme lines; default "
+                                                       "adjusted-r2)"),
             flag("--every-line", "report order, R² and residual of each line (scheme lines)"),
         ),
-        """Reads tidy CSV (one reading a row, what simulate writes), or with --columns the wide CSV files of other labs.
+        """Reads tidy CSV (one reading a row, as simulate writes it), or with --columns the wide CSV files of other
+laboratories.
 
---scheme joint fits structure, struts and field to all readings at once. It keeps only what helps on readings that
-the fit did not see. --scheme lines is that of Mou & King 1998: a polynomial per grid line, direction and channel.
---certificate writes a page to be filed: machine, instruments, environment, errors before and after, figures of
-ISO 230, pictures, hashes of model and readings; any browser prints it to PDF.
---truth names the errors of the virtual machine that simulate moved: the report then says what the model is worth.
---update renews a model from the few readings of a check, and writes another one (see verify).
-Errors are reported in µm and µrad. Exit code: 0 written, 1 the readings do not bear the model out (nothing is
-written without --force), 2 bad input.
+--scheme joint fits structure, struts and field to all readings at once. It keeps only blocks that improve the
+prediction of readings left out of the fit. --scheme lines is that of Mou & King 1998: a polynomial per grid line,
+direction and channel. --certificate writes a page to file: machine, instruments, environment, errors before and after,
+figures of ISO 230, pictures, hashes of model and readings; any browser prints it to PDF. --truth names the errors of
+the virtual machine that simulate moved: the report then compares the model with them. --update renews a model from the
+few readings of a check, and writes another one (see verify). Errors are reported in µm and µrad. Exit code: 0 written,
+1 the readings contradict the model (nothing is written without --force), 2 bad input.
 
 example:
   $ hexapod_comp simulate --campaign campaign_5d --seed 1 --out measured.csv
@@ -683,27 +687,27 @@ example:
     ),
     "verify": Verb(
         "fitting", "calibration",
-        "does a model still hold, by a few readings; what has changed",
+        "check by a few readings whether a model still holds, and what has changed",
         (
             reads("model", "model file that fit has written, MODEL.posterior.npz beside it", "MODEL"),
             *readings(required=False),
             COMPENSATED,
             writes("--propose", "instead: write which readings to take, a tidy CSV file without values"),
-            value("--readings", int, "N", "how many of them (default 12)"),
-            value("--instruments", None, "A,B", "what takes them: linear, straightness, rotation, tracker, tracker_6d "
-                  "(default linear,rotation)"),
+            value("--readings", int, "N", "number of readings (default 12)"),
+            value("--instruments", None, "A,B", "instruments: linear, straightness, rotation, tracker, tracker_6d "
+                                                "(default linear,rotation)"),
             JSON,
         ),
-        """Weighs 6 to 20 check readings, spread over the box, against the model and what its fit knows of its
-parameters. If the machine has changed it says what has probably happened: the datum has moved, a strut's offset has
-changed (which, by how much), a temperature acts, the whole has aged, a single reading is wrong, or none of these. One
-machine in eighty that has not changed is called changed. Where two explanations stay close it says which further
-readings would tell them apart. Readings that are far off are tried in other units, with other signs, axes
-exchanged, and with the compensation on or off: the report opens with what fits.
+        """Compares 6 to 20 check readings, spread over the box, with the model and the uncertainty of its parameters.
+If the machine has changed it gives the most probable change: the datum has moved, a strut's offset has changed (which,
+by how much), a temperature acts, the whole has aged, a single reading is wrong, or none of these. One unchanged
+machine in eighty is reported as changed. If two explanations are similarly probable it lists readings that would
+distinguish them. Readings that are far off are tested in other units, with other signs, axes exchanged, and with the
+compensation on or off: the report opens with the version that fits.
 
-The readings are taken as for fit: compensation off, or with the struts' commands in the file, or with this model
-running and --compensated. fit --update renews the model from them. Errors are in µm and µrad. Exit code: 0 valid,
-1 changed, 2 bad input.
+Take the readings as for fit: compensation off, or with the struts' commands in the file, or with this model running
+and --compensated. fit --update renews the model from them. Errors are in µm and µrad. Exit code: 0 valid, 1 changed, 2
+bad input.
 
 example:
   $ hexapod_comp verify model.yaml check.csv
@@ -722,18 +726,19 @@ example:
             flag("--targets", "each run target by target, with notes"),
             JSON,
         ),
-        """Judges every linear run with two cycles or more, all targets read from both sides in each (the standards ask
-for five cycles; a campaign says how many it makes). Lines along an axis of the work frame come under ISO 230-2:2014,
-all others, as body and face diagonals, under ISO 230-6:2002: A, E, R, M, B. Lengths read around a circle from its
-middle, as by a ball bar, come under ISO 230-4:2005: G, G(b), and F and D where the length is known. Figures are in µm.
---targets prints each line target by target. Targets that the machine of --machine does not reach are judged too.
+        """Evaluates every linear run with two cycles or more and all targets read from both sides in each (the
+standards require five cycles; a campaign states its number). Lines along an axis of the work frame are evaluated by
+ISO 230-2:2014, all others, as body and face diagonals, by ISO 230-6:2002: A, E, R, M, B. Lengths read around a circle
+from its middle, as by a ball bar, are evaluated by ISO 230-4:2005: G, G(b), and F and D where the length is known.
+Figures are in µm. --targets prints each line target by target. Targets that the machine of --machine does not reach
+are evaluated too.
 
 example:
   $ hexapod_comp iso230 measured.csv""",
     ),
     "export": Verb(
         "export", "calibration",
-        "write a model for LinuxCNC or as a table; check what it leaves",
+        "write a model for LinuxCNC or as a table; check its residual error",
         (
             MACHINE,
             MODEL,
@@ -759,13 +764,13 @@ example:
             JSON,
         ),
         """--linuxcnc writes into a folder: genhexkins.hal (setp lines with the real joints), strut_1.comp …
-strut_6.comp (offset, pitch, screw wave, length map and backlash of each strut, at most 256 points) and comp.ini
-(lines to copy into the ini file). --table writes corrections of struts and of poses on a grid of positions of a level
-tool, forward and backward, as CSV. Files of the same names are replaced.
+strut_6.comp (offset, pitch, screw wave, length map and backlash of each strut, at most 256 points) and comp.ini (lines
+to copy into the ini file). --table writes corrections of struts and of poses on a grid of positions of a level tool,
+forward and backward, as CSV. Files of the same names are replaced.
 
-Every file is then read back, and the machine that the model describes is driven through it along random poses, level
-and tilted, forward and backward: the report gives the tool's 3-D error before and after, and the size of what
-the export cannot carry. The exit code is 1 when it would make the error larger.
+Every file is then read back, and drives the machine of the model along random poses, level and tilted, forward and
+backward: the report gives the tool's 3-D error before and after, and the size of the errors that the export does not
+contain. The exit code is 1 if it would increase the error.
 
 example:
   $ hexapod_comp export --machine paper.yaml --model paper_machine.yaml --linuxcnc linuxcnc --table table.csv""",
@@ -773,15 +778,14 @@ example:
     ),
     "assess": Verb(
         "poses", "analysis",
-        "what random imperfections within bounds do to lengths and poses",
+        "effect of random imperfections within bounds on lengths and poses",
         (
             reads("poses", "CSV file of poses (mm, degrees; default: Table 1 of Song, Mou & King); - for standard "
                   "input", "POSES.csv", "poses", nargs="?", default="table1.csv"),
             *(value(n, bound, "BOUND", f"bound of {what} (default {usual:g})", default=usual)
               for n, (usual, what) in DRAWN.items()),
             value("--wave-period-mm", bound, "MM", "period of that error (default 10)", default=10.0),
-            flag("--separate-platform-joints", "struts that share a platform joint nominally each get one of their "
-                 "own"),
+            flag("--separate-platform-joints", "struts that nominally share a platform joint get separate ones"),
             value("--machines", count, "N", "how many to draw (default 1)", default=1),
             seed_of("the first machine"),
             MACHINE,
@@ -790,8 +794,8 @@ example:
         ),
         """Draws machines within the bounds (uniform, ±). For the first one it prints the tables of Song, Mou & King:
 the ideal strut lengths (mm), the lengths that the real machine needs for the same poses, their difference (µm), and
-the pose (mm, degrees) that the real machine takes under ideal lengths. With --machines N it also prints percentiles
-over N machines with consecutive seeds. --out writes every machine and pose to a CSV file.
+the pose (mm, degrees) of the real machine with ideal lengths. With --machines N it also prints percentiles over N
+machines with consecutive seeds. --out writes every machine and pose to a CSV file.
 
 example:
   $ hexapod_comp assess config/table1.csv --joint-um 10 --strut-um 10 --machines 200 --seed 1
@@ -805,13 +809,13 @@ example:
     ),
     "classify": Verb(
         "classify", "analysis",
-        "rank a machine's errors by what they do to the tool",
+        "rank a machine's errors by their effect on the tool",
         (
             machine("positioning_unit.yaml"),
             reads("--budget", "error budget, or the name of a shipped one (default error_budget.yaml)",
                   kind="error_budget", default="error_budget.yaml"),
-            reads("--model", "in place of a budget: what the fit of this model leaves, and which measurement would "
-                  "remove most of it", kind="model"),
+            reads("--model", "instead of a budget: rank the uncertainties of this model's fit, and the measurements "
+                             "that would reduce them most", kind="model"),
             table_out("the ranking"),
             pictures(),
             JSON,
@@ -822,25 +826,25 @@ example:
             value("--tilt-deg", tilts, "A,B,…", "tilts about the tool's x and y, from its attitude at home (default "
                   "-4,0,4)", default=tilts("-4,0,4")),
             choice("--method", ("exact", "linear", "iteration"), "of the ranking: exact (default), linear, or "
-                   "iteration, which is v. Daake et al.'s own", "exact"),
+                                                                 "iteration, which is v. Daake et al.'s own", "exact"),
             value("--compare", count, "N", "compare exact, linear and the iteration of v. Daake et al. at N poses"),
-            value("--allow-um", above_zero, "UM", "allowed error of the tool: says what the errors may be"),
+            value("--allow-um", above_zero, "UM", "allowed error of the tool: gives the allowed size of each error"),
             value("--workers", whole(1, 256), "N", "processes (default 1, with all threads)", default=1),
-            value("--scheduler", None, "tcp://…", "Dask scheduler that does the work instead"),
+            value("--scheduler", None, "tcp://…", "Dask scheduler that runs the work instead"),
             seed_of("random poses and draws"),
-            flag("--no-page", "leave the interactive page out of --pictures"),
+            flag("--no-page", "omit the interactive page from --pictures"),
             flag("--publish", "then keep the worst type's shells on workspace/shells until Ctrl-C"),
         ),
-        """Finds what the machine reaches (stroke, joint cones, strut clearance, condition number), and the effect of
-every single error of the budget at every grid point of it, by forward kinematics of the machine with that error.
-Prints the ranked table of v. Daake et al. with their figures beside it (µm, mdeg), what the budget adds up to, and
-with --allow-um what each error may be. --out writes the ranking as CSV. --pictures writes pictures (ranking, causes,
-one of shells for each error type) and, with plotly installed, page.html, which shows every error from all sides.
+        """Computes the reach of the machine (stroke, joint cones, strut clearance, condition number), and the effect
+of every single error of the budget at every grid point of it, by forward kinematics of the machine with that error.
+Prints the ranked table of v. Daake et al. with their figures (µm, mdeg), the sum of the budget, and with --allow-um
+the allowed size of each error. --out writes the ranking as CSV. --pictures writes pictures (ranking, causes, one of
+shells for each error type) and, with plotly installed, page.html, which shows every error from all sides.
 
---tilt-deg says which orientations: every combination of tilts about the tool's x and y, from its attitude at home.
+--tilt-deg gives the orientations: every combination of tilts about the tool's x and y, from its attitude at home.
 
---model takes the covariance of a fit in place of a budget: what is left of the tool's error in the measured box and in
-the workspace (µm; places in work), which parameters make it up, and which measurement would remove most of it.
+--model uses the covariance of a fit instead of a budget: the remaining tool error in the measured box and in the
+workspace (µm; places in work), the parameters that cause it, and the measurement that would reduce it most.
 
 example:
   $ hexapod_comp classify --pictures out

@@ -1,1 +1,1 @@
-"""How files and reports are read and written, whatever is in them."""
+"""Reading and writing of files and reports, independent of their content."""

@@ -1,7 +1,7 @@
 """CSV files: units in the column names, errors that name row and column.
 
-What separates the columns shows in the header: commas or else semicolons or else tabs. Where it is not commas, numbers
-may have decimal commas, as spreadsheets of many countries write them.
+The header determines the separator of columns: commas, else semicolons, else tabs. With other separators numbers may
+have decimal commas, as spreadsheets of many countries write them.
 """
 
 from __future__ import annotations
@@ -30,29 +30,29 @@ from .texts import DECIMAL_COMMA, MICRO_ERRORS, THOUSANDS, number_hint, plain_nu
 LABEL_COLUMNS = ("sequence", "name")
 
 SAME_NODE = 1e-9  # of an axis' span: coordinates of a grid that differ by less are one node
-MAX_ROWS = 2_000_000  # longer files are refused: an hour's path at 500 Hz fits, a device that never ends does not
+MAX_ROWS = 2_000_000  # longer files are refused: an hour's path at 500 Hz fits, an endless device does not
 MAX_COLUMNS = 1000  # wider files are refused: other laboratories' have some dozen columns
 MAX_CELLS = 40_000_000  # larger tables are refused: each cell takes some 60 bytes
 
-# Longer lines are refused, in characters: a file without line ends would be read into memory whole
+# Longer lines are refused, in characters: a file without line ends would be read into memory completely
 MAX_LINE = 1_000_000
 
-# What a file may be written in. Without a word it is UTF-16 where its mark says so, else UTF-8; what is neither is read
-# as Windows-1252, of which Latin-1 is a part: only letters of names differ.
+# Encodings of a file. If none is given it is UTF-16 if its byte order mark says so, else UTF-8; a file that is neither
+# is read as Windows-1252, of which Latin-1 is a part: only letters of names differ.
 ENCODINGS = ("utf-8", "utf-16", "windows-1252", "latin-1")
 
 MOST_SKIPPED = 1000  # rows above or below the header that may be skipped
 
-# What may stand between columns; the first of them that is in the header does
+# Separators of columns; the first of them that is in the header is used
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 
-QUOTED = re.compile(r'"[^"]*"')  # what stands in quotes separates nothing
-FORMULA = ("=", "+", "-", "@", "\t", "\r")  # a spreadsheet takes a cell that begins so for a formula, and runs it
-MARK = "'"  # set before such a cell when it is written: spreadsheets show the text, and unmarked takes it off again
+QUOTED = re.compile(r'"[^"]*"')  # separators in quotes do not count
+FORMULA = ("=", "+", "-", "@", "\t", "\r")  # a spreadsheet runs a cell that begins so as a formula
+MARK = "'"  # set before such a cell when it is written: spreadsheets show the text, and `unmarked` removes it
 
 
 def csv_text(rows: Iterable[Sequence[Any]]) -> str:
-    """Return rows of numbers and texts as CSV, with line feeds; a text that a spreadsheet would run gets a mark."""
+    """Return rows of numbers and texts as CSV, with line feeds; mark texts that a spreadsheet would run."""
     stream = io.StringIO()
     csv.writer(stream, lineterminator="\n").writerows([_marked(cell) for cell in row] for row in rows)
     return stream.getvalue()
@@ -70,7 +70,7 @@ def unmarked(cell: str) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """Where a value comes from."""
+    """Place of a value in a file."""
 
     line: int  # line in the file, the header being line 1
     label: str  # the row's ``sequence`` or ``name``, or its number
@@ -78,7 +78,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Layout:
-    """How a CSV file is written, where its header does not show it."""
+    """Format of a CSV file, where its header does not show it."""
 
     encoding: str = ""  # one of :data:`ENCODINGS`; empty: detected
     above: int = 0  # rows to skip above the header, empty ones and comments too, and below it: titles, a row of units
@@ -89,7 +89,7 @@ AS_USUAL = Layout()
 
 
 class Table:
-    """A CSV file with its header understood: less empty rows and comments."""
+    """A CSV file with a parsed header, without empty rows and comments."""
 
     def __init__(self, path: str | Path, layout: Layout = AS_USUAL) -> None:
         self.path = path
@@ -107,7 +107,7 @@ class Table:
     # ---- reading ----
 
     def _read(self, layout: Layout) -> None:
-        """Read the file; again as Windows-1252 where it is not UTF-8 and nothing else was said."""
+        """Read the file; again as Windows-1252 where it is not UTF-8 and no encoding was given."""
         with open_input(self.path, MAX_CSV_BYTES) as file:
             again = not layout.encoding and file.seekable()
             start = file.read(2) if again else b""
@@ -126,7 +126,7 @@ class Table:
                         raise InputFileError(self.path, "", problem) from error
 
     def _decode(self, file: io.FileIO, layout: Layout, encoding: str) -> None:
-        """Take header and rows of a file of a given encoding."""
+        """Read header and rows of a file in a given encoding."""
         source, self.rows = _Hashed(file, self.path, MAX_CSV_BYTES), []
         options = {"utf-8": ("utf-8-sig", MICRO_ERRORS), "windows-1252": ("cp1252", "replace")}
         codec, errors = options.get(encoding, (encoding, "strict"))
@@ -194,7 +194,7 @@ class Table:
         self.rows.append((line, cells))
 
     def _point_decimals(self) -> None:
-        """Give numbers with decimal commas points; refuse a file in which a comma may mean two things."""
+        """Replace decimal commas by points; refuse a file in which a comma is ambiguous."""
         commas = [
             (line, row, k)
             for line, row in self.rows
@@ -218,7 +218,7 @@ class Table:
     # ---- columns ----
 
     def column(self, name: str, dimension: str | None) -> tuple[int, float] | None:
-        """Return index and unit of a column, or None when there is none of that name."""
+        """Return index and unit of a column, or None if it is absent."""
         wanted = {name: 1.0} if dimension is None else {f"{name}_{u}": s for u, s in spellings(dimension).items()}
         keys = [key for key in wanted if key in self.header]
         if len(keys) > 1:
@@ -239,14 +239,14 @@ class Table:
         return [entry for entry in columns if entry is not None]
 
     def required(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]]:
-        """Return all columns of a group that must be there."""
+        """Return all columns of a required group."""
         columns = self.columns(names, dimension)
         if columns is None:
             raise self._missing(names[0], dimension)
         return columns
 
     def _missing(self, name: str, dimension: str | None) -> InputFileError:
-        """Return (not raise) the complaint about a column that is not there."""
+        """Return (not raise) the error about a missing column."""
         named = name if dimension is None else " or ".join(f"{name}_{unit}" for unit in UNITS[dimension])
         problem = f"column {named} is missing"
         if len(self.header) > 1:
@@ -255,7 +255,7 @@ class Table:
         return InputFileError(self.path, "header", problem, self.header[0])
 
     def refuse_unknown(self) -> None:
-        """Raise on a column that nobody asked for."""
+        """Raise on a column that was not read."""
         for name in self.header:
             if name not in self._known:
                 raise InputFileError(self.path, "header", "is not a known column", name)
@@ -264,7 +264,7 @@ class Table:
         """Return the finite numbers of some columns in SI, shape (rows, columns)."""
         values = np.empty((len(self.rows), len(columns)))
         for k, (index, unit) in enumerate(columns):
-            known: dict[str, float] = {}  # places come again and again
+            known: dict[str, float] = {}  # places repeat
             for line, row in self.rows:
                 text = row[index]
                 if text not in known:
@@ -273,7 +273,7 @@ class Table:
         return values
 
     def texts(self, name: str) -> list[str]:
-        """Return the cells of a column that must be there, without spaces around them."""
+        """Return the cells of a required column, without spaces around them."""
         index = self.required((name,), None)[0][0]
         cells = [row[index] for _, row in self.rows]
         known = {cell: unmarked(cell.strip()) for cell in set(cells)}
@@ -315,7 +315,7 @@ def grid_order(table: Table, coordinates: np.ndarray, what: str) -> tuple[list[n
 
 
 def number_in(path: str | Path, where: str, text: str) -> float:
-    """Return the finite number that stands somewhere in a file."""
+    """Return the finite number of a cell."""
     value = plain_number(text)
     if math.isnan(value):
         raise InputFileError(path, where, f"must be a finite number{number_hint(text)}", text)
@@ -325,7 +325,7 @@ def number_in(path: str | Path, where: str, text: str) -> float:
 
 
 class _Hashed(io.RawIOBase):
-    """The bytes of a file, counted and hashed as they pass: what was read is what is named, also from a pipe."""
+    """The bytes of a file, counted and hashed while they are read, also from a pipe."""
 
     def __init__(self, file: io.FileIO, path: str | Path, most: int) -> None:
         self._file, self._path, self._left, self._most = file, path, most, most
@@ -348,8 +348,8 @@ SHIFTS = {10.0**digits: digits for digits in range(-9, 10)}
 
 
 def si_from_text(text: str, number: float, unit: float) -> float:
-    """Return a number in SI: where the unit moves the decimal point only, the float that is nearest to the text."""
-    # So 203.2 mm is the very 0.2032 of source code, and what was written with all its digits comes back.
+    """Return a number in SI: where the unit only moves the decimal point, the float nearest to the text."""
+    # So 203.2 mm is the float 0.2032 of source code, and numbers written with all digits are restored.
     digits = SHIFTS.get(unit)
     if digits is None:
         return unit * number

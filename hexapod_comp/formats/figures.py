@@ -1,4 +1,4 @@
-"""What every picture shares: colours, and how it is saved."""
+"""Shared by all pictures: colours, and saving."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ WITHOUT, WITH = "#c1432e", "#20639b"
 # Of the six struts: Okabe and Ito's, which the colour-blind can tell apart too
 SIX_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#000000")
 
-NOTHING = 1e-3  # lower end of logarithmic error axes, µm: below a nanometre nothing is claimed
+NOTHING = 1e-3  # lower end of logarithmic error axes, µm: errors below a nanometre are not claimed
 
 
 def picture_text(text: str, limit: int = 200) -> str:
-    """Return a text from outside, as a machine's name, for a picture: on one line, and no formula between its $."""
+    """Return a foreign text, such as a machine's name, for a picture: on one line, and with $ not read as a formula."""
     return printable(text, limit).replace("$", r"\$")
 
 

@@ -1,8 +1,8 @@
-"""Reading files that come from outside: what they are and how large is checked before anything is read.
+"""Reading files from outside: type and size are checked before anything is read.
 
-Every reader of the package opens its files here. A FIFO that nobody writes into would be waited for without end, a
-device or a file that is being written never ends, and a parser can make a hundred times its file of it; so the bounds
-stand together here, each far above what a hexapod needs.
+Every reader of the package opens its files here. A FIFO without a writer would block for ever, a device or a growing
+file never ends, and a parser may need a hundred times a file's size; so the bounds are here together, each far above
+what a hexapod needs.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from pathlib import Path
 from ..errors import InputFileError, printable
 from .texts import MICRO_ERRORS
 
-# Opens a path with flags and returns a descriptor, or refuses it, as Python's `open` takes one
+# Opens a path with flags and returns a descriptor, or refuses it, for Python's `open`
 Opener = Callable[[str, int], int]
 
 MEGABYTE = 1_000_000
 
 MAX_FILE_BYTES = 8 * MEGABYTE  # YAML files, HAL files, pages of a journal; the largest model has some 100 kB
 MAX_CSV_BYTES = 500 * MEGABYTE  # an hour's path at 500 Hz has some 270 MB
-MAX_ARCHIVE_BYTES = 200 * MEGABYTE  # what a fit knows of its parameters: the covariance of some 5000
+MAX_ARCHIVE_BYTES = 200 * MEGABYTE  # a fit's posterior: the covariance of some 5000 parameters
 
-# Names of what the caller has opened already (`-`, `<(command)`): these may be pipes
+# Names of files that the caller has opened already (`-`, `<(command)`): these may be pipes
 OPEN_STREAMS = re.compile(r"/dev/(stdin|fd/\d+)|/proc/(self|\d+)/fd/\d+")
 
 KINDS = {stat.S_IFIFO: "FIFO", stat.S_IFCHR: "device", stat.S_IFBLK: "device", stat.S_IFSOCK: "socket"}
 
 
 def open_input(path: str | Path, most: int, opener: Opener | None = None) -> io.FileIO:
-    """Open a regular file of at most `most` bytes, or what the caller has opened already, for reading."""
+    """Open a regular file of at most `most` bytes, or one that the caller has opened already, for reading."""
     try:
         file = open(path, "rb", buffering=0, opener=opener or _open_at_once)  # noqa: SIM115 - the caller closes it
         try:
@@ -92,8 +92,8 @@ def read_text(path: str | Path, opener: Opener | None = None, most: int = MAX_FI
 def parsing(
     path: str | Path, problem: str, kinds: type[Exception] | tuple[type[Exception], ...] = Exception
 ) -> Iterator[None]:
-    """Turn what a parser raises on hostile bytes into an InputFileError with a problem."""
-    # Libraries raise whatever their parts happen to: struct.error, KeyError, AssertionError, zlib.error,
+    """Convert the exceptions of a parser on hostile bytes into an InputFileError with a problem."""
+    # Libraries raise many types: struct.error, KeyError, AssertionError, zlib.error,
     # RecursionError. So by default every exception is caught here; around calls of a library only, never around this
     # package's code.
     try:

@@ -1,4 +1,4 @@
-"""Results as JSON: the one way from what the package computes to what other programs read."""
+"""Results as JSON: the one conversion from computed results to what other programs read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .texts import CODES
 
 
 def json_content(text: str, most: int = MAX_FILE_BYTES) -> Any:
-    """Return what JSON text from outside holds."""
+    """Return the content of JSON text from outside."""
     if len(text) > most:
         raise ValueError(f"has {len(text)} characters, at most {most} are allowed")
     try:
@@ -38,7 +38,7 @@ def json_text(result: Any, indent: int | None = 1) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Return a result as what JSON has words for; its numbers come back as the very same floats."""
+    """Return a result as JSON types; its numbers are restored as the same floats."""
     if isinstance(value, str | int | None):
         return value
     if isinstance(value, float):
@@ -55,7 +55,7 @@ def plain(value: Any) -> Any:
 
 
 def _parts(value: Any) -> Any:
-    """Return what an object is made of."""
+    """Return the JSON types of an object."""
     if hasattr(value, "as_columns"):  # a pose
         return value.as_columns()
     if isinstance(value, tuple):

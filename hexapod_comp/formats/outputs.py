@@ -1,4 +1,4 @@
-"""How files are written: whole or not at all, and never in place of one that the same command reads."""
+"""Writing files: completely or not at all, and never over one that the same command reads."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from typing import IO, Any
 
 from ..errors import InputFileError
 
-# What this command reads, by device and inode, and as what it was named; empty outside of a command
+# Files that this command reads, by device and inode, with their names; empty outside of a command
 _protected: dict[tuple[int, int], str] = {}
 
 
 @contextmanager
 def protected(read: Mapping[str, Any], written: Mapping[str, Any], folders: Mapping[str, Any]) -> Iterator[None]:
-    """Refuse, as long as this context is open, to write what a command reads; try at once what it will write."""
-    # Each is a name, a list of names, or something else, which is no file, by the option that gives it. Refused are
-    # outputs that are inputs, or another output, or whose place cannot take them: better now than after a long
+    """Refuse, while this context is open, to write a file that the command reads; check its outputs at once."""
+    # Each option gives a name, a list of names, or a value that is not a file. Refused are
+    # outputs that are inputs, or another output, or cannot be written there: better now than after a long
     # calculation.
     try:
         for given in read.values():
@@ -43,7 +43,7 @@ def protected(read: Mapping[str, Any], written: Mapping[str, Any], folders: Mapp
 
 
 def _refuse_unwritable(files: Mapping[str, str]) -> None:
-    """Raise where no file of a name can be, or where two options name one; a pipe or a device takes both."""
+    """Raise where no file of a name can be, or where two options have the same name; a pipe or a device may be both."""
     taken: dict[str, str] = {}
     for name, path in files.items():
         if os.path.isdir(path):
@@ -67,10 +67,10 @@ def refuse_replacing_input(path: str | Path) -> None:
 
 @contextmanager
 def new_file(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
-    """Give a stream for a file that a reader, or a crash, sees whole or not at all; UTF-8 where it takes text.
+    """Give a stream for a file that a reader, or a crash, sees complete or not at all; UTF-8 for text.
 
-    It takes the place of one that is there, with that one's mode and, where this user may give files away, its owner.
-    Into what is no regular file, as a pipe or a device, is just written.
+    It replaces an existing file, with that one's mode and, if this user may give files away, its owner.
+    Pipes, devices and other special files are written directly.
     """
     refuse_replacing_input(path)
     encoding = None if "b" in mode else "utf-8"
@@ -81,7 +81,7 @@ def new_file(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
         else:
             with _replacement(os.path.realpath(path), mode, encoding) as stream:
                 yield stream
-    except BrokenPipeError:  # the reader wants no more: no fault of the file's
+    except BrokenPipeError:  # the reader has closed the pipe: not an error of the file
         raise
     except OSError as error:
         raise InputFileError(path, "", f"cannot be written: {error.strerror}") from error
@@ -89,9 +89,9 @@ def new_file(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
 
 @contextmanager
 def _replacement(target: str, mode: str, encoding: str | None) -> Iterator[IO[Any]]:
-    """Give a stream whose file takes the place of `target` when all of it is on the disk."""
+    """Give a stream whose file replaces `target` when all of it is on the disk."""
     before = os.stat(target) if os.path.exists(target) else None
-    if before is not None and not os.access(target, os.W_OK):  # renaming alone would not ask
+    if before is not None and not os.access(target, os.W_OK):  # renaming alone would not check this
         raise PermissionError(errno.EACCES, "it is protected against writing")
     folder, name = os.path.split(target)
     temporary = os.path.join(folder, f".{name[:50]}.{secrets.token_hex(6)}")
@@ -127,12 +127,12 @@ def make_folder(path: str | Path) -> None:
 
 
 def _identities(name: str) -> list[tuple[int, int]]:
-    """Return what device and inode an argument stands for, those of all files for a folder."""
+    """Return device and inode of an argument's file, or of all files of a folder."""
     from .paths import config_file
 
     try:
         path = Path("/dev/stdin") if name == "-" else Path(name) if os.path.isdir(name) else config_file(name)
-    except InputFileError:  # not a file's name, as ideal and random, or a missing one: the verb's own affair
+    except InputFileError:  # not a file's name (ideal, random), or a missing one: checked by the verb
         return []
     files = path.iterdir() if path.is_dir() else [path]
     return [identity for file in files if (identity := _identity(file)) is not None]

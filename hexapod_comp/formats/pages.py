@@ -1,7 +1,7 @@
-"""HTML pages that load nothing: one file that opens anywhere, offline, and prints. Texts from outside are escaped.
+"""HTML pages that load nothing: one file that opens offline in any browser, and prints. Texts from outside are escaped.
 
-A page is a template in hexapod_comp/templates that extends page.html. :func:`render` fills it in: every value that it
-shows is put on one line, cut where it is very long, and escaped, unless it is :class:`markupsafe.Markup`.
+A page is a template in hexapod_comp/templates that extends page.html. :func:`render` fills it in: every displayed value
+is put on one line, cut if it is very long, and escaped, unless it is :class:`markupsafe.Markup`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def _environment() -> Environment:
     from markupsafe import Markup
 
     def one_line(value: Any) -> Any:
-        """Return a value to be shown, before it is escaped: HTML of our own as it is, texts without line breaks."""
+        """Return a displayed value before it is escaped: our own HTML unchanged, texts without line breaks."""
         return value if isinstance(value, Markup | int) or value is None else printable(str(value), LONGEST_TEXT)
 
     environment = Environment(
@@ -53,7 +53,7 @@ def _environment() -> Environment:
 
 
 def png(figure: Figure) -> Markup:
-    """Return a figure as the address of a picture that is in the page itself."""
+    """Return a figure as a data address, which puts the picture into the page itself."""
     from markupsafe import Markup
 
     stream = io.BytesIO()

@@ -1,4 +1,4 @@
-"""Where the shipped configuration files are, in a source tree as in an installation."""
+"""Finding the shipped configuration files, in a source tree and in an installation."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from ..errors import InputFileError
 
 PACKAGE = "hexapod_comp"
 
-FORMAT = re.compile(r"^format: hexapod_comp/(\w+)", re.MULTILINE)  # what a YAML file says that it is
+FORMAT = re.compile(r"^format: hexapod_comp/(\w+)", re.MULTILINE)  # the `format` line of a YAML file
 
-# Kinds of files that go by their suffixes; all others are YAML files that say what they are
+# Kinds of files with their suffixes; all others are YAML files with a `format` line
 SUFFIXES = {"poses": (".csv",), "lengths": (".csv",), "readings": (".csv",)}
 
-# What stands in the header of CSV files of a kind
+# Texts in the header of CSV files of a kind
 COLUMNS = {"poses": re.compile(r'(?:^|[",;\t])\s*x_'), "lengths": re.compile(r'(?:^|[",;\t])\s*L1_')}
 
 MOST_LISTED = 12  # names in a message about a file that is missing
-MOST_LOOKED_AT = 500  # files of a folder that are looked into for those of a kind
+MOST_LOOKED_AT = 500  # files of a folder that are opened to find those of a kind
 
 
 def config_file(name: str | os.PathLike[str], kind: str = "", beside: bool = False) -> Path:
@@ -40,7 +40,7 @@ def config_file(name: str | os.PathLike[str], kind: str = "", beside: bool = Fal
 
 
 def input_file(name: str | os.PathLike[str], kind: str = "") -> Path:
-    """Find what is to be read: anything but a folder at a path, pipes too; else a shipped file."""
+    """Find a file to read: anything but a folder at a path, pipes too; else a shipped file."""
     own = os.path.expanduser(name)
     if own == "-":
         return Path("/dev/stdin")
@@ -61,8 +61,8 @@ def confined_file(name: str | os.PathLike[str], folder: Path | None, kind: str =
 
 def confined_opener(folder: Path | None) -> Callable[[str, int], int]:
     """Return what opens a file for Python's ``open`` only where :func:`confined_file` finds it."""
-    # Between the look at a name and its opening the file may be replaced, by a pipe or by a link that leads elsewhere.
-    # So nothing is waited for, and what counts is the open file.
+    # A file may be replaced between the check of its name and its opening, by a pipe or by a link that leads elsewhere.
+    # So opening does not block, and the open file is checked.
 
     def opened(path: str, flags: int) -> int:
         descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_NOCTTY)
@@ -104,7 +104,7 @@ def shipped_names(kind: str = "") -> list[str]:
 
 
 def _is_a(path: Path, kind: str) -> bool:
-    """Return whether a file is of a kind, by its suffix or by what it says at its beginning."""
+    """Return whether a file is of a kind, by its suffix or by its first lines."""
     if path.suffix.lower() not in SUFFIXES.get(kind, (".yaml", ".yml")):
         return False
     try:
@@ -122,7 +122,7 @@ def _is_a(path: Path, kind: str) -> bool:
 @cache
 def config_folder() -> Path:
     """Return the folder of the shipped configuration files."""
-    # It is sought from this file upwards, so it always belongs to the code that runs: `config` beside the package in a
+    # It is searched from this file upwards, so it always belongs to the running code: `config` beside the package in a
     # source tree (also with an editable or symlinked installation), else `share/hexapod_comp/config` in the prefix into
     # which pip or colcon installed both.
     package = Path(__file__).resolve().parents[1]
@@ -136,7 +136,7 @@ def config_folder() -> Path:
 
 
 def version() -> str:
-    """Return the version of the code that runs: package.xml is installed beside the configuration."""
+    """Return the version of the running code: package.xml is installed beside the configuration."""
     path = config_folder().parent / "package.xml"
     try:
         text = path.read_text(encoding="utf-8")
@@ -147,7 +147,8 @@ def version() -> str:
 
 
 def _no_such_file(name: str, kind: str, beside: bool) -> str:
-    """Say that `name` is neither a file nor shipped, and which of its kind there are: beside it, and shipped."""
+    """Return the message that `name` is neither a file nor shipped, with the files of its kind in its folder, and the
+    shipped ones."""
     own = os.path.expanduser(name)
     folder = os.path.dirname(own)
     if folder and not os.path.isdir(folder):

@@ -1,6 +1,6 @@
-"""What the files of people hold: keys that end in their unit, read strictly into SI, and back to the same numbers.
+"""Schemas of YAML files: keys that end in their unit, read strictly into SI, and written back to the same numbers.
 
-A file's schema is a dataclass. The annotation of a field says what its key holds; a field with a default is optional::
+A file's schema is a dataclass. The annotation of a field defines its key; a field with a default is optional::
 
     @dataclass(frozen=True)
     class Struts:
@@ -9,10 +9,11 @@ A file's schema is a dataclass. The annotation of a field says what its key hold
         outside: Annotated[str, Choice("hold", "refuse")] = "hold"
         wave: Wave | None = None               # a section with a schema of its own
 
-    struts = read(Struts, section)             # whatever is unknown, missing, not finite or of another shape is refused
+    struts = read(Struts, section) # unknown, missing, not finite values and those of another shape are refused
 
-Fields without an annotation of this module are no keys: ``read(Campaign, top, level=...)`` gives them, and may give
-others in place of the file. :class:`Section` is what is read: values are taken out, and what stays behind is an error.
+Fields without an annotation of this module are not keys: ``read(Campaign, top, level=...)`` gives them, and may give
+others in place of the file. :class:`Section` is the mapping that is read: values are taken out, and a remaining key is
+an error.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ import numpy as np
 from ..errors import GeometryError, InputFileError
 from .texts import number_hint
 
-# Keys looked through for the one that a misspelt key may mean: in a hostile file that would take minutes
+# Keys compared with a misspelt key: in a hostile file more would take minutes
 MOST_NEIGHBOURS = 1000
 
 # Unit suffixes per kind of quantity, and their size in SI (temperatures stay in degrees Celsius)
@@ -57,9 +58,9 @@ UNITS: dict[str, dict[str, float]] = {
 }
 
 DIMENSIONS = {unit: dimension for dimension, units in UNITS.items() for unit in units}  # kind of quantity of each unit
-LARGEST = 1e12  # no number of a file is larger, in whatever unit: products of several stay finite
+LARGEST = 1e12  # bound of the numbers in a file, in any unit: products of several stay finite
 
-# They look alike, and either may be on a keyboard: both stand for the u of um and urad
+# They look alike, and either may be on a keyboard: both replace the u of um and urad
 MICROS = "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"
 
 PER_STRUT = "per strut"  # shape of six numbers that may be given as one for all
@@ -69,14 +70,14 @@ Shape = tuple[int | None, ...]  # lengths of an array's axes; None leaves one fr
 
 @cache
 def spellings(dimension: str) -> dict[str, float]:
-    """Return the units of a kind of quantity with their sizes, by every spelling: µm and μm too, where um is."""
+    """Return the units of a quantity with their sizes, in every spelling: µm and μm too, where um is."""
     units = UNITS[dimension]
     return units | {micro + unit[1:]: size for unit, size in units.items() if unit[0] == "u" for micro in MICROS}
 
 
 def in_si(values: Any, factor: float) -> Any:
-    """Return numbers in SI from their unit's size, moving the decimal point where that is all there is to do."""
-    # So 12.3 µm in a file is the very float that 12.3e-6 is in source code, not its neighbour.
+    """Return numbers in SI from their unit's size, by moving the decimal point where that suffices."""
+    # So 12.3 µm in a file is the float 12.3e-6 of source code, not its neighbour.
     digits = round(math.log10(factor))
     if digits == 0 or 10.0**digits != factor:
         return values * factor
@@ -99,7 +100,7 @@ def in_unit(values: Any, unit: str) -> Any:
         if isinstance(value, list):
             return [converted(item) for item in value]
         result = exact(value)
-        if result is None:  # no float reads back as this one: its neighbour then, which is what will be read
+        if result is None:  # no float reads back as this one: the neighbour that will be read instead
             result = exact(float(in_si(value / factor, factor)))
         return value / factor if result is None else result
 
@@ -107,7 +108,7 @@ def in_unit(values: Any, unit: str) -> Any:
 
 
 class Section:
-    """One mapping of a file: values are taken out by key, and whatever stays behind is an error."""
+    """One mapping of a file: values are taken out by key, and a remaining key is an error."""
 
     def __init__(self, path: str | Path, key: str, content: Any):
         self.path, self.key = path, key  # file and place in it, for messages; no place at its top
@@ -135,7 +136,7 @@ class Section:
         return self._left.pop(key)
 
     def _meant(self, keys: list[str], likeness: float) -> str:
-        """Return which key may have been meant by one of some that are missing, to follow a complaint."""
+        """Return the missing key that was probably meant, to append to a message."""
         left = list(islice(self._left, MOST_NEIGHBOURS))
         near = [result for key in keys for result in difflib.get_close_matches(key, left, 1, likeness)]
         return f"; did you mean it by {near[0]!r}?" if near else ""
@@ -219,7 +220,7 @@ class Section:
         return keys[0] if keys else None
 
     def quantity(self, name: str, dimension: str, shape: Shape = (), default: Any = None) -> np.ndarray:
-        """Take numbers with a unit: ``stroke`` finds ``stroke_mm``, …; in SI, as the default where there are none."""
+        """Take numbers with a unit: ``stroke`` finds ``stroke_mm``, …; in SI; the default if they are absent."""
         key = self.quantity_key(name, dimension)
         if key is None:
             if default is not None:
@@ -244,11 +245,11 @@ class Section:
         return np.tile(self.quantity(name, dimension, (2,)), (6, 1))
 
     def left(self) -> list[str]:
-        """Return the keys that nobody has asked for yet."""
+        """Return the keys that have not been taken."""
         return list(self._left)
 
     def finish(self) -> None:
-        """Raise if keys are left that nobody asked for: a misspelt key must not be lost in silence."""
+        """Raise if keys remain: a misspelt key must not be ignored silently."""
         if self._left:
             key = next(iter(self._left))
             near = difflib.get_close_matches(key, sorted(self._known), 1)
@@ -262,7 +263,7 @@ def _shape_text(shape: Shape) -> str:
 
 @contextmanager
 def file_errors(path: str | Path) -> Iterator[None]:
-    """Turn what a dataclass raises about its values (GeometryError, ModelError) into an error that names the file."""
+    """Convert a dataclass's error about its values (GeometryError, ModelError) into one that names the file."""
     try:
         yield
     except GeometryError as error:
@@ -276,11 +277,11 @@ class Kind:
     """How a key's value is taken from a section."""
 
     def read(self, section: Section, name: str, default: Any) -> Any:
-        """Return the value of a key; the default where there is no such key, unless it is MISSING."""
+        """Return the value of a key; the default if it is absent, unless that is MISSING."""
         return default if default is not MISSING and name not in section else self.parse(section, name)
 
     def parse(self, section: Section, name: str) -> Any:
-        """Return the value of a key that must be there."""
+        """Return the value of a required key."""
         raise NotImplementedError
 
 
@@ -290,7 +291,7 @@ class Numbers(Kind):
 
     unit: str  # in which it is written
     shape: Shape | str = ()  # or PER_STRUT, PAIRS_PER_STRUT
-    key: str = ""  # as the file has it, where that is not the field's name
+    key: str = ""  # key in the file, where it is not the field's name
 
     def read(self, section: Section, name: str, default: Any) -> Any:
         name = self.key or name
@@ -346,7 +347,7 @@ class Text(Kind):
 
 
 class Names(Kind):
-    """A list of names, as of columns; where counts are given, so many."""
+    """A list of names, as of columns; where counts are given, of one of these lengths."""
 
     def __init__(self, *counts: int, what: str = "column names") -> None:
         self.counts, self.what = counts, what
@@ -362,7 +363,7 @@ class Names(Kind):
 
 @dataclass(frozen=True)
 class Unit(Kind):
-    """The name of a unit; its size in SI is what is kept."""
+    """The name of a unit; its size in SI is stored."""
 
     dimension: str
 
@@ -382,7 +383,7 @@ class Nested(Kind):
 
 @cache
 def keys_of(schema: type) -> dict[str, tuple[Any, Any]]:
-    """Return what each field of a schema holds, by its annotation, and its default (MISSING: the key is required)."""
+    """Return the kind of each field of a schema, by its annotation, and its default (MISSING: the key is required)."""
     hints, keys = get_type_hints(schema, include_extras=True), {}
     for one in fields(schema):
         if (kind := _kind(hints[one.name])) is not None:
@@ -391,7 +392,7 @@ def keys_of(schema: type) -> dict[str, tuple[Any, Any]]:
 
 
 def _kind(hint: Any) -> Any:
-    """Return what an annotation says of a key: a kind, a schema, or None or one of these; else None."""
+    """Return the meaning of an annotation: a kind, a schema, or None or one of these; else None."""
     if get_origin(hint) is Annotated:
         return next((kind for kind in get_args(hint)[1:] if isinstance(kind, Kind)), None)
     if get_origin(hint) in (Union, UnionType):
@@ -403,7 +404,7 @@ T = TypeVar("T")
 
 
 def read(schema: Callable[..., T], section: Section, **given: Any) -> T:
-    """Return what a section holds; fields that are `given` are not looked for in it."""
+    """Return the content of a section; fields that are `given` are not read from it."""
     keys: dict[str, tuple[Any, Any]] = keys_of(schema)  # type: ignore[arg-type]
     values = {name: kind.read(section, name, default) for name, (kind, default) in keys.items() if name not in given}
     with file_errors(section.path):
@@ -411,7 +412,7 @@ def read(schema: Callable[..., T], section: Section, **given: Any) -> T:
 
 
 def read_whole(schema: Callable[..., T], section: Section, **given: Any) -> T:
-    """Return what a section holds, as :func:`read`; keys that the schema does not know are refused."""
+    """Return the content of a section, as :func:`read`; unknown keys are refused."""
     result = read(schema, section, **given)
     section.finish()
     return result

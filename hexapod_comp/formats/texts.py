@@ -1,4 +1,4 @@
-"""Numbers and tables as text, for reports, and streams that take any text."""
+"""Numbers and tables as text, for reports, and streams that accept any text."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from typing import Any, TextIO
 
 from ..errors import InputFileError
 
-# What a terminal obeys instead of showing it: all control characters but tab and line break, changes of direction
+# Characters that a terminal executes instead of showing: all control characters but tab and line break, changes of
+# direction
 CODES = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 
-# Exit codes where output cannot be written, and where its reader has gone: 128 + signal, as shells count
+# Exit codes when output cannot be written, and when its reader has closed it: 128 + signal, as in shells
 UNWRITABLE, BROKEN_PIPE = 2, 141
 
 
 def number(value: float, digits: int) -> str:
-    """Return a number with so many digits after its point, never −0."""
+    """Return a number with these digits after its point, never −0."""
     return f"{round(value, digits) + 0.0:.{digits}f}"
 
 
 def plain_number(text: str) -> float:
-    """Return the finite number that a text is to everybody, else NaN: Python also reads 1_0 and １０ as ten."""
+    """Return the finite number of a text in plain notation, else NaN: Python also reads 1_0 and １０ as ten."""
     try:
         value = float(text)
     except ValueError:
@@ -35,15 +36,15 @@ def plain_number(text: str) -> float:
     return value if math.isfinite(value) and text.isascii() and "_" not in text else math.nan
 
 
-DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")  # a number as much of the world writes it
+DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")  # a number in the notation of many countries
 
 
-# A number whose comma may be a decimal one, or stand between thousands
+# A number whose comma may be a decimal one, or a thousands separator
 THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
 
 
 def number_hint(text: str) -> str:
-    """Return what keeps a text from being a number, to follow a complaint, where that is plain to see."""
+    """Return why a text is not a number, to append to a message, where that is obvious."""
     text = text.strip()
     if THOUSANDS.fullmatch(text):
         meant = f"{text.replace(',', '.')} or {text.replace(',', '')}"
@@ -54,7 +55,7 @@ def number_hint(text: str) -> str:
 
 
 def _micro(error: UnicodeError) -> tuple[str, int]:
-    """Read the byte B5, which no UTF-8 has alone, as µ: so it stands in the files of spreadsheets under Windows."""
+    """Read the byte B5, which is not valid UTF-8 alone, as µ, as spreadsheets under Windows write it."""
     if isinstance(error, UnicodeDecodeError) and error.object[error.start] == 0xB5:
         return "µ", error.start + 1
     raise error
@@ -77,10 +78,10 @@ def aligned(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 class PlainStream:
-    """A text stream that shows codes for the terminal in place of obeying them, in any encoding."""
+    """A text stream that shows codes for the terminal instead of executing them, in any encoding."""
 
-    # What is printed may quote files and arguments: names of machines, of runs, labels. When it cannot be written, it
-    # goes nowhere from then on, so that nothing complains again at the program's end.
+    # Printed text may quote files and arguments: names of machines, of runs, labels. When it cannot be written, it
+    # is discarded from then on, so that no further error appears at the program's end.
 
     def __init__(self, stream: TextIO | None, needed: bool) -> None:
         self.terminal = stream or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - as long as the process
@@ -115,12 +116,12 @@ class PlainStream:
 
 
 def own_terminal() -> TextIO:
-    """Return stderr for codes of our own, as those of a progress bar."""
+    """Return stderr for our own codes, as those of a progress bar."""
     return getattr(sys.stderr, "terminal", sys.stderr)
 
 
 def run_with_plain_streams(run: Callable[[], int | None]) -> int | None:
-    """Run a program that prints to a :class:`PlainStream`; return its exit code, or why its output is not there."""
+    """Run a program that prints to a :class:`PlainStream`; return its exit code, or the code of failed output."""
     with redirect_stdout(PlainStream(sys.stdout, True)), redirect_stderr(PlainStream(sys.stderr, False)):  # type: ignore[type-var]
         try:
             code = run()

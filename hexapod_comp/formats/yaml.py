@@ -1,4 +1,4 @@
-"""YAML files, read strictly and written so that people can read them; what keys hold is :mod:`.schema`'s affair."""
+"""YAML files, read strictly and written to be readable; :mod:`.schema` reads the keys."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MAX_DEPTH = 32
 # axis, forward and backward, with six polynomials of the fifth order, has 120,000.
 MAX_NODES = 200_000
 
-# Numbers that YAML 1.1 takes for something else than people do: 0400 is 256, 1:30 is 90, 0x10 is 16
+# Numbers that YAML 1.1 reads otherwise than people do: 0400 is 256, 1:30 is 90, 0x10 is 16
 AMBIGUOUS_NUMBER = re.compile(r"[-+]?0[0-9A-Za-z]|.*[:_]")
 
 
@@ -88,7 +88,7 @@ def parse_yaml(text: str, name: str | Path, file_format: str, version: int) -> S
 
 
 def yaml_content(text: str, name: str | Path, most_nodes: int = MAX_NODES) -> Any:
-    """Return what YAML holds: plain values, lists and mappings, not too many and not too deep."""
+    """Return the content of YAML: plain values, lists and mappings, of bounded number and depth."""
     try:
         _reject_aliases_and_tags(text, most_nodes)
         return yaml.load(text, Loader=_StrictLoader)
@@ -102,9 +102,9 @@ def yaml_content(text: str, name: str | Path, most_nodes: int = MAX_NODES) -> An
 
 
 def _reject_aliases_and_tags(text: str, most_nodes: int) -> None:
-    """Raise on what lets a short file stand for something else, before anything is made of it."""
-    # Nested references (`*name`) stand for more values than memory holds, and so do short lists; nesting overflows the
-    # parser's stack and ends the process, a tag (`!!float`) makes the loader read a value as another type.
+    """Raise on anything by which a short file stands for something else, before objects are made from it."""
+    # Nested references (`*name`) can stand for more values than memory holds, and so can short lists; nesting overflows
+    # the parser's stack and ends the process, a tag (`!!float`) makes the loader read a value as another type.
     depth = nodes = 0
     for event in yaml.parse(text, Loader=_StrictLoader):
         if isinstance(event, yaml.AliasEvent):
@@ -119,7 +119,7 @@ def _reject_aliases_and_tags(text: str, most_nodes: int) -> None:
             raise _complaint(f"is nested more than {MAX_DEPTH} deep", event)
 
 
-LONGEST_LINE = 2**30  # characters: LibYAML, unlike PyYAML's own writer, takes no infinity
+LONGEST_LINE = 2**30  # characters: LibYAML, unlike PyYAML's own writer, accepts no infinity
 
 
 class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
@@ -138,5 +138,5 @@ _Dumper.add_representer(list, _represent_list)
 
 
 def block_text(content: dict[str, Any]) -> str:
-    """Return content as YAML, in its order, each row of numbers on one line however long."""
+    """Return content as YAML, in its order, each row of numbers on one line."""
     return str(yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=LONGEST_LINE))

@@ -1,1 +1,1 @@
-"""The compensator and the virtual machine run together: what ``demo`` and ``run`` do."""
+"""Compensator and virtual machine run together, for ``demo`` and ``run``."""

@@ -1,4 +1,4 @@
-"""The picture of a witnessed run: what the tool did without and with compensation, beside what was promised."""
+"""The picture of an observed run: the tool's error without and with compensation, and the predicted interval."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .story import Calibration
 
 matplotlib.rcParams.update({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3})
 
-# The two passes with their colours, red and blue as every eye tells them apart, and markers
+# The two passes with their colours, red and blue, which all people distinguish, and markers
 SIDES = ((0, WITHOUT, "o"), (1, WITH, "D"))
 
 FLOOR = 0.01  # lower end of the error axes, µm: a tenth of the drives' steps
@@ -29,7 +29,7 @@ DRAWN_DEVIATION = 0.04  # the path's deviation without compensation is drawn as 
 def session_figure(
     result: SessionResult, rows: Sequence[ErrorRow], title: str, calibration: Calibration | None = None
 ) -> Figure:
-    """Show a witnessed run: the path with magnified deviation, errors at rest and along it, and their figures."""
+    """Draw an observed run: the path with magnified deviation, errors at rest and along it, and their figures."""
     aligned = result.aligned()
     figure = Figure(figsize=(12, 8.4 if result.path else 5.0), layout="constrained")
     figure.suptitle(picture_text(title))
@@ -54,7 +54,9 @@ def _key(result: SessionResult, rows: Sequence[ErrorRow], aligned: bool) -> Iter
     for (_, colour, marker), label in zip(SIDES, ("without", "with compensation"), strict=True):
         yield Line2D([], [], color=colour, marker=marker, label=label)
     if aligned:
-        yield Line2D([], [], color="0.4", marker="o", mfc="none", ls="", label="hollow: as it is, datum not aligned")
+        yield Line2D(
+            [], [], color="0.4", marker="o", mfc="none", ls="", label="hollow: as the machine stands, datum not aligned"
+        )
     if any(row.promised for row in rows):
         yield Patch(color=WITH, alpha=0.2, label="promised RMS, 95 %")
 
@@ -84,7 +86,7 @@ def _path(axes: Axes, record: PathRecord, datum: str) -> None:
 def _rest(
     axes: Axes, raw: Sequence[PoseRecord], aligned: Sequence[PoseRecord] | None, rows: Sequence[ErrorRow]
 ) -> None:
-    """Draw the error at each pose; filled with the datum aligned, hollow as it is."""
+    """Draw the error at each pose; filled with the datum aligned, hollow as the machine stands."""
     number = np.arange(1, len(raw) + 1)
     for records, face in ((raw, "none"), (aligned or raw, None)):
         for side, colour, marker in SIDES:
@@ -98,7 +100,7 @@ def _rest(
 
 
 def _band(axes: Axes, rows: Sequence[ErrorRow], what: str) -> None:
-    """Shade what was promised."""
+    """Shade the predicted interval."""
     promised = next((row.promised for row in rows if row.what == what and row.promised), None)
     if promised is not None:
         axes.axhspan(max(promised[0] * 1e6, FLOOR), promised[1] * 1e6, color=WITH, alpha=0.2, lw=0.0)
@@ -114,7 +116,7 @@ def _deviation(axes: Axes, record: PathRecord, datum: str, rows: Sequence[ErrorR
 
 
 def _figures(axes: Axes, rows: Sequence[ErrorRow], calibration: Calibration | None) -> None:
-    """Draw every figure as a line from without to with, its share removed beside it; nothing where nothing was seen."""
+    """Draw every figure as a line from without to with, labelled with the removed share."""
     if not rows:
         axes.set_axis_off()
         return

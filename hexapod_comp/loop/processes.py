@@ -1,4 +1,4 @@
-"""Starting the two nodes as processes of their own, in a ROS domain where nobody else is."""
+"""Starting the two nodes as separate processes, in a private ROS domain."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from types import TracebackType
 from ..ros import avoid_shared_memory, end_with_parent
 
 # DDS derives its UDP ports from the domain: 7400 + 250 · domain + offset. Offsets 0 and 1 are multicast,
-# participants take 10, 11, 12, …; nobody uses 2 to 9, and domains above 101 reach into the ephemeral ports.
+# participants use 10, 11, 12, …; 2 to 9 are unused, and domains above 101 reach into the ephemeral ports.
 DOMAINS = range(1, 102)
 RESERVED_OFFSET = 5
 FIRST_PARTICIPANT_OFFSET = 10
@@ -26,8 +26,8 @@ STOP_TIMEOUT = 5.0  # a process that has not ended this long after SIGTERM is ki
 
 def reserve_domain() -> tuple[int, socket.socket]:
     """Return a free ROS domain id and the socket that keeps it reserved while it is open."""
-    # The socket takes a port that belongs to the domain and that DDS leaves unused, so a second session on this machine
-    # goes elsewhere, and the system frees it even after a crash.
+    # The socket uses a port of the domain that DDS leaves unused, so a second session on this machine
+    # chooses another domain, and the system frees the port even after a crash.
     start = os.getpid() % len(DOMAINS)
     for domain in (*DOMAINS[start:], *DOMAINS[:start]):
         base = 7400 + 250 * domain
@@ -43,7 +43,7 @@ def reserve_domain() -> tuple[int, socket.socket]:
 
 
 def _bind(port: int) -> socket.socket | None:
-    """Return a socket bound to the UDP port, or None when somebody else has it."""
+    """Return a socket bound to the UDP port, or None if it is in use."""
     udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         udp.bind(("0.0.0.0", port))
@@ -54,9 +54,9 @@ def _bind(port: int) -> socket.socket | None:
 
 
 class PrivateDomain:
-    """Context manager: this process and its children see no other ROS domain, and nobody sees theirs."""
+    """Context manager: this process and its children use a private ROS domain."""
 
-    # A demonstration that spoke in the user's own domain could move a real machine.
+    # A demonstration in the user's own domain could move a real machine.
 
     def __enter__(self) -> int:
         self._before = dict(os.environ)
@@ -97,7 +97,7 @@ class NodeProcess:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
-                start_new_session=True,  # keeps a terminal's Ctrl-C away: nobody but the parent ends them
+                start_new_session=True,  # keeps a terminal's Ctrl-C away: only the parent ends them
                 preexec_fn=end_with_parent,
             )
 
@@ -115,11 +115,11 @@ class NodeProcess:
         self._process.send_signal(number)
 
     def output(self) -> str:
-        """Return what it has printed so far."""
+        """Return its output until now."""
         return self.log.read_text(encoding="utf-8", errors="replace") if self.log.exists() else ""
 
     def stop(self) -> tuple[int, str]:
-        """End the process with SIGTERM; return its exit code and all it printed. Kill it when it does not listen."""
+        """End the process with SIGTERM; return its exit code and its output. Kill it if it does not react."""
         # Not SIGINT: a shell's background jobs ignore that until the node has set its own handler.
         if self._process.poll() is None:
             self.send(signal.SIGTERM)
@@ -134,12 +134,12 @@ class NodeProcess:
 
 
 def processor_wait(pid: int) -> float:
-    """Return how long the threads of a process have waited for a processor up to now, added up, s; 0 if untold."""
+    """Return the total time for which the threads of a process have waited for a processor, s; 0 if unknown."""
     waited = 0
     for path in glob.glob(f"/proc/{pid}/task/*/schedstat"):
         try:
             waited += int(Path(path).read_text(encoding="ascii").split()[1])
-        except (OSError, IndexError):  # a thread that has just ended, or a system that does not tell
+        except (OSError, IndexError):  # a thread that has just ended, or a system that does not report it
             continue
     return waited * 1e-9
 

@@ -1,4 +1,4 @@
-"""What a witnessed run saw, and what is printed of it: poses, a table of errors, the loop's answers, what was wrong."""
+"""The records of an observed run, and its report: poses, a table of errors, the loop's answers, problems."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from ..machine.pose_files import length_values
 from ..machine.trajectory import Path, feet_on
 from ..pose import Pose, best_motion, rotation_angle
 
-FEWEST_ALIGNED = 6  # a datum takes six numbers away, two poses' worth: from fewer poses hardly anything would be left
+FEWEST_ALIGNED = 6  # a datum removes six numbers, two poses' worth: fewer poses would hardly leave any error
 
-# A computer is called busy when more of its answers are late, or when its processes wait for more of the time
+# A computer counts as busy when more of its answers are late, or its processes wait for more of the time
 LATE_SHARE, WAITED_SHARE = 0.02, 0.2
 
-# Rigid motions of what was commanded, and of what the tool did without and with compensation; None: nobody knows it
+# Rigid motions of the commanded poses, and of the tool without and with compensation; None: not known
 Motions = tuple[Pose, "Pose | None", "Pose | None"]
 
 
 @dataclass
 class PoseRecord:
-    """What happened at one commanded pose; m, rotation matrices; all poses in one frame, ``base`` at first."""
+    """Record of one commanded pose; m, rotation matrices; all poses in one frame, ``base`` at first."""
 
     target: Pose  # commanded pose of the tool
     command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # (6,): compensated strut commands, m
-    correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # (6,): how they were corrected, m
+    correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # (6,): their corrections, m
     estimate: Pose | None = None  # estimated pose of the tool with compensation
-    true_without: Pose | None = None  # where the tool really was without compensation, when anybody knows
+    true_without: Pose | None = None  # true pose of the tool without compensation, if known
     true_with: Pose | None = None  # and with it
 
     def moved(self, motions: Motions) -> PoseRecord:
@@ -61,10 +61,10 @@ class PoseRecord:
 
 @dataclass
 class Track:
-    """Where the tool really went along a path."""
+    """True positions of the tool along a path."""
 
     positions: np.ndarray  # (n, 3): true tool positions on the way, m
-    sent: np.ndarray  # (n,) int: how many poses of the path had been sent when each was seen
+    sent: np.ndarray  # (n,) int: number of poses of the path sent when each was received
     feet: np.ndarray  # (n, 3): the nearest point of the commanded path to each, m: a late tool is no contour error
 
     @staticmethod
@@ -80,10 +80,10 @@ class Track:
 
 @dataclass
 class PathRecord:
-    """What happened along a path."""
+    """Record of a path."""
 
     path: Path  # commanded poses, in ``base`` at first
-    without: Track | None  # the pass without compensation; None where there was none, or nobody saw the tool
+    without: Track | None  # the pass without compensation; None if there was none, or the tool was not measured
     compensated: Track | None  # the pass with it
     corrections: np.ndarray  # (N, 6): corrections sent, m
 
@@ -104,24 +104,24 @@ class PathRecord:
 
 @dataclass
 class Answering:
-    """How fast the loop answered, and what kept it waiting."""
+    """Latency of the loop, and delays of its processes."""
 
     latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))  # command to answer of the compensated pass, s
     answered: int = 0  # commands of the whole session that were answered
-    late: int = 0  # those of which the answer came after the next command was due
+    late: int = 0  # those whose answer arrived after the next command was due
     longest: float = 0.0  # longest time to an answer in the whole session, s
     elapsed: float = 0.0  # length of the session, s
-    waited: float = 0.0  # how long its processes waited for a processor, added up, s
+    waited: float = 0.0  # total time for which its processes waited for a processor, s
 
     @property
     def busy(self) -> bool:
-        """Whether something else kept the processors: a share of the answers was late, or the processes waited long."""
+        """Whether other programs kept the processors: a share of the answers was late, or the processes waited long."""
         return self.late > LATE_SHARE * self.answered or self.waited > WAITED_SHARE * self.elapsed
 
 
 @dataclass
 class SessionResult:
-    """Everything that a session has seen."""
+    """All records of a session."""
 
     poses: list[PoseRecord] = field(default_factory=list)  # the single poses
     path: PathRecord | None = None
@@ -142,9 +142,9 @@ class SessionResult:
         return self._moved((inverse, inverse, inverse))
 
     def aligned(self) -> SessionResult | None:
-        """Return the same once the datum is aligned: each pass by the rigid motion that fits its poses best."""
+        """Return the same with the datum aligned: each pass by the rigid motion that fits its poses best."""
         # A path is moved by its pass's poses, as a workpiece whose zero was set by them. None with fewer than
-        # FEWEST_ALIGNED poses, with poses in a line, or when nobody saw where the tool was.
+        # FEWEST_ALIGNED poses, with poses in a line, or when the tool was not measured.
         targets = np.array([record.target.position for record in self.poses])
 
         def datum(actual: list[Pose | None]) -> Pose | None:
@@ -156,29 +156,29 @@ class SessionResult:
         return None if after is None else self._moved((Pose.identity(), before, after))
 
 
-# How a tool error is taken: where the machine stands, or less the one rigid motion that a new zero takes up
+# Definition of a tool error: as the machine stands, or minus the rigid motion that a new zero removes
 AS_IT_IS, ALIGNED = "as it is", "datum aligned"
 
 
 @dataclass(frozen=True)
 class ErrorRow:
-    """The tool's error at rest or along a path, in one way of taking it."""
+    """The tool's error at rest or along a path, by one definition."""
 
     what: str  # ``at rest`` or ``path``
     datum: str  # :data:`AS_IT_IS` or :data:`ALIGNED`
     count: int  # poses
     without: np.ndarray | None  # errors of the pass without compensation, m: distances to the pose, or to the path
     compensated: np.ndarray  # errors of the pass with it, m
-    promised: tuple[float, float] | None = None  # between these the RMS is expected, m, with 95 %
+    promised: tuple[float, float] | None = None  # expected interval of the RMS, m, with 95 %
 
     @property
     def name(self) -> str:
-        """What it is called in tables."""
+        """Its name in tables."""
         return f"{self.what}, {self.datum}"
 
     @property
     def complaint(self) -> str:
-        """What is wrong with the error that is left; empty when nothing is."""
+        """Problem of the residual error; empty if there is none."""
         left = rms(self.compensated)
         if self.without is not None and left >= rms(self.without):
             return f"{self.name}: compensation does not reduce the error"
@@ -187,7 +187,7 @@ class ErrorRow:
         return f"{self.name}: {left * 1e6:.3f} µm RMS are left; at most {self.promised[1] * 1e6:.3f} were promised"
 
     def cells(self) -> list[str]:
-        """Return the row of a table for people: name, RMS without and with, largest, share removed, promise."""
+        """Return the row of a table as text: name, RMS without and with, largest, removed share, predicted interval."""
         before, left = None if self.without is None else rms(self.without), rms(self.compensated)
         of = "RMS of" if self.what == "at rest" else "RMS distance to a path of"
         return [
@@ -212,7 +212,7 @@ class ErrorRow:
 
 
 def error_rows(result: SessionResult) -> list[ErrorRow]:
-    """Return the tool's errors at rest and along the path, first with the datum aligned where that can be."""
+    """Return the tool's errors at rest and along the path, first with the datum aligned where that is possible."""
     taken = [(datum, one) for datum, one in ((ALIGNED, result.aligned()), (AS_IT_IS, result)) if one is not None]
     rows = []
     for datum, one in taken:
@@ -228,7 +228,7 @@ def error_rows(result: SessionResult) -> list[ErrorRow]:
 
 
 def error_table(rows: Sequence[ErrorRow]) -> str:
-    """Return the table of errors: RMS without and with compensation, what that removes, the largest left; µm."""
+    """Return the table of errors: RMS without and with compensation, removed share, largest residual; µm."""
     table = [
         ["tool error, µm", "without", "with", "largest", "removed", "promised", ""],
         *(row.cells() for row in rows),
@@ -274,7 +274,7 @@ def summary(result: SessionResult, rows: Sequence[ErrorRow]) -> str:
 
 
 def busy_text(answering: Answering) -> str:
-    """Return that the computer was busy and by what one sees it; empty when it was not."""
+    """Return whether and why the computer was busy, as text; empty if it was not."""
     if not answering.busy:
         return ""
     return (
@@ -285,12 +285,12 @@ def busy_text(answering: Answering) -> str:
 
 
 def complaints(result: SessionResult, rows: Sequence[ErrorRow]) -> list[str]:
-    """Return what was not as it should be, and whether a busy computer may be the cause; empty when all was well."""
+    """Return the problems, and whether a busy computer may be the cause; empty if there are none."""
     judged = [row for row in rows if row.datum == ALIGNED] or rows
     listed = [
         f"{result.lost} commands were lost" if result.lost else "",
         f"{result.refused} commands were refused: {result.refusals}" if result.refused else "",
-        "" if rows else "the true tool pose was not seen",
+        "" if rows else "the true tool pose was not received",
         *(row.complaint for row in judged),
     ]
     listed = [text for text in listed if text]

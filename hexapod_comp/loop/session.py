@@ -1,4 +1,4 @@
-"""A witnessed run: poses and a path through the running loop, without and with compensation."""
+"""An observed run: poses and a path through the running loop, without and with compensation."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ MOVE_FEED = 0.25  # largest tool speed between poses, m/s; on most machines the 
 
 
 class Session:
-    """Drives a machine through poses and a path while watching it."""
+    """Drives a machine through poses and a path, and records it."""
 
     def __init__(
         self, client: LoopClient, geometry: HexapodGeometry, rate: float, progress: Callable[[int], None] | None = None
@@ -70,7 +70,7 @@ class Session:
         client.hold(self._at, self._rate, through, 10.0, "compensation to ramp")
 
     def visit(self, records: list[PoseRecord], compensated: bool) -> None:
-        """Go to every pose, rest, and write down what is seen there."""
+        """Move to every pose, rest, and record it."""
         for record in records:
             last = self.go(record.target)
             true = self._client.true_pose if self._client.has_true_pose else None
@@ -96,20 +96,20 @@ class Session:
 
 
 def _latencies(sent: Iterable[Sent]) -> np.ndarray:
-    """Return from command to answer, s, of those that were answered."""
+    """Return the latencies, s, of the answered commands."""
     values = np.array([entry.answered_at - entry.sent_at for entry in sent])
     return values[np.isfinite(values)]
 
 
 class Watch:
-    """How long the loop's processes work, and wait for a processor, from now on."""
+    """Times for which the loop's processes work, and wait for a processor, from now on."""
 
     def __init__(self, nodes: Sequence[NodeProcess]) -> None:
         self._pids = [os.getpid(), *(node.pid for node in nodes)]
         self._began, self._waited = time.monotonic(), sum(map(processor_wait, self._pids))
 
     def answering(self, client: LoopClient, rate: float, latencies: np.ndarray | None = None) -> Answering:
-        """Return how fast a client's commands at some rate, Hz, were answered since then."""
+        """Return the latencies and delays of a client's commands at some rate, Hz, since then."""
         every, waited = _latencies(client.sent.values()), sum(map(processor_wait, self._pids))
         return Answering(
             latencies=np.zeros(0) if latencies is None else latencies,
@@ -117,7 +117,7 @@ class Watch:
             late=int((every > 1.0 / rate).sum()),
             longest=float(every.max(initial=0.0)),
             elapsed=time.monotonic() - self._began,
-            waited=max(0.0, waited - self._waited),  # an ended thread takes its share along
+            waited=max(0.0, waited - self._waited),  # an ended thread's time is lost
         )
 
 
@@ -170,10 +170,10 @@ def run_session(
     return result
 
 
-RATES = (1.0, 1000.0)  # commands per second that make sense over DDS from Python, Hz
+RATES = (1.0, 1000.0)  # commands per second that Python can send over DDS, Hz
 
 
-# What a simulated machine's compensator lets pass, m and s: drives and clocks are sound, but wait for a processor at
+# Limits of a simulated machine's compensator, m and s: drives and clocks are sound, but wait for a processor at
 # times, and at 250 mm/s the usual 2 mm are 8 ms of that, 0.1 m are 0.4 s
 PATIENCE = {"following_error_limit": 0.1, "max_command_age": 5.0}
 
@@ -188,7 +188,7 @@ def checked_rate(rate: float) -> float:
 def refuse_broken_limits(
     path: str, geometry: HexapodGeometry, model: MachineModel, rows: list[Row], poses: list[Pose]
 ) -> None:
-    """Check poses and the way between them before anything moves."""
+    """Check poses and the moves between them before anything moves."""
     breaches = check(geometry, model, poses).breaches
     if breaches:
         row = rows[breaches[0].row]
@@ -198,12 +198,12 @@ def refuse_broken_limits(
 
 @contextmanager
 def simulated(machine: str, model: MachineModel, truth: MachineModel) -> Iterator[Sequence[NodeProcess]]:
-    """Run compensator and strut drive as two processes in a ROS domain of their own."""
+    """Run compensator and strut drive as two processes in a private ROS domain."""
     geometry = {"geometry_file": str(config_file(machine, "geometry", beside=True).resolve())}
     with tempfile.TemporaryDirectory(prefix="hexapod_comp_") as folder, PrivateDomain():
         files = {"model": f"{folder}/model.yaml", "truth": f"{folder}/truth.yaml"}
         for one, file in zip((model, truth), files.values(), strict=True):
-            # With a date, and without what lies beside its own file
+            # With a date, and without the files beside its own
             origin = replace(one.origin, date=one.origin.date or date.today().isoformat(), posterior=None)
             save_model(replace(one, origin=origin), file)
         nodes = (
@@ -233,7 +233,7 @@ def run_poses(
     namespace: str = "",
 ) -> SessionResult:
     """Run poses of the work frame and a path in ``base`` through the loop, with a progress bar on a terminal."""
-    # The result is in the work frame, as the user's file has it; the nodes are told, and tell, `base`.
+    # The result is in the work frame, as in the user's file; the nodes receive and publish `base`.
 
     def announce(text: str) -> None:  # without tearing the progress bar
         tqdm.write(CODES.sub("", text), file=own_terminal())
@@ -255,7 +255,7 @@ def run_poses(
 
 
 def loop_client(namespace: str) -> LoopClient:
-    """Return a client of the nodes, with a clear word where there is no ROS."""
+    """Return a client of the nodes; without ROS raise an error that tells how to install it."""
     try:
         from ..ros.client import LoopClient
     except ImportError as error:

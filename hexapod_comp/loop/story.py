@@ -1,4 +1,4 @@
-"""The demonstration's story: hidden errors, a laser campaign, a fit, and what it promises for the poses to come."""
+"""The demonstration's steps: hidden errors, a laser campaign, a fit, and its prediction for the poses to come."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ PROPORTIONS = np.array([1.0, 1.0, 0.5])  # sides of that box to each other, alon
 # Distances of the grid's lines, and of the readings along them, as shares of the longest side
 LINES_APART, READINGS_APART = 0.25, 0.0625
 
-FEWEST_STEPS = 8  # readings stand so close that the shortest side has as many steps: polynomials along it need nine
+FEWEST_STEPS = 8  # spacing of the readings, so that the shortest side has as many steps: polynomials along it need nine
 POSES = 12  # held-out poses of the measured box
 
-# Largest side of the milled figure, m, and the time that a side takes at full speed, s: as slow as the drives need
+# Largest side of the milled figure, m, and the time for a side at full speed, s: as slow as the drives need
 PATH_SIDE, PATH_TIME = 0.018, 0.9
 
-ON_PATH = 150  # places of a path for which a promise is worked out
+ON_PATH = 150  # places of a path at which a prediction is computed
 
-# What the drives leave over DDS, where no command comes on time to the millisecond, over what they leave without
+# Ratio of the drives' error over DDS, where no command is on time to the millisecond, to that without
 DRIVES = 2.0
 
-EXACT = ((0.0, 0.0), (0.0, 0.0))  # what the true model promises: drives apart, nothing is left
+EXACT = ((0.0, 0.0), (0.0, 0.0))  # prediction for the true model: no error but the drives'
 
 REMARK = """as it is: with where the machine stands as a whole. Laser lines cannot see that, and a workpiece zero set
 with the model on takes it up. Datum aligned: less the one rigid motion that such a zero makes."""
@@ -63,7 +63,7 @@ class Calibration:
     """A machine measured and fitted."""
 
     fit: ModelFit  # scheme joint on 5-D lines and diagonals
-    lines: PaperMetric  # Mou & King's own measure of their 1-D scheme
+    lines: PaperMetric  # Mou & King's own metric of their 1-D scheme
     joint: PaperMetric  # and of `fit`
 
 
@@ -71,12 +71,12 @@ class Calibration:
 class Place:
     """Where the demonstration happens."""
 
-    box: np.ndarray  # (2, 3): lowest and highest tool position that is measured, m in ``work``
+    box: np.ndarray  # (2, 3): lowest and highest measured tool position, m in ``work``
     attitude: np.ndarray  # (3, 3): of the tool in ``work``: level, or as at home where it cannot be level
 
 
 def demo_place(geometry: HexapodGeometry) -> Place:
-    """Return the box that is measured: about home, within the machine's largest box, and no larger than need be."""
+    """Return the measured box: about home, within the machine's largest box, and no larger than necessary."""
     largest = machine_box(geometry)
     low, high = largest.box
     half = np.minimum(0.5 * LONGEST_SIDE * PROPORTIONS, 0.49 * (high - low)).round(4)
@@ -104,7 +104,8 @@ def calibrate(
     say("measuring with 5-D lasers")
     measured = measure(template(campaign, geometry, seed), campaign, real, seed)
     measured = replace(measured, uncertainty=np.array(campaign.noise)[measured.kind])
-    struts = truth.struts  # the data sheet says the screws' lead: it counts where they err and the geometry is silent
+    # the data sheet gives the screws' lead: it is used where they err and the geometry does not have it
+    struts = truth.struts
     waves = (struts.cosine.any() or struts.sine.any()) and not geometry.screw_lead.any()
     fit = fit_model(measured, FitSettings(lead=float(struts.period[0]) if waves else None), say)
     say("the 1-D scheme of Mou & King")
@@ -119,7 +120,7 @@ def calibrate(
 
 
 def calibration_text(calibration: Calibration) -> str:
-    """Return what was measured, what was fitted and what it promises, as lines for people."""
+    """Return measurement, fit and prediction as lines of text."""
     fit, lines, joint = calibration.fit, calibration.lines, calibration.joint
     sides = " × ".join(number(side * 1e3, 1) for side in np.ptp(fit.space.work_box, axis=0))
     noise = [f"{c.stated * 1e6:g} {'µrad' if c.kind in ANGULAR_KINDS else 'µm'} {c.kind}" for c in fit.channels]
@@ -181,7 +182,8 @@ def demo_path(geometry: HexapodGeometry, place: Place, rate: float) -> Path:
 
 
 def promises(fit: ModelFit, poses: Sequence[Pose], path: Path) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return between what the tool's RMS error lies at rest and along a path, m, with 95 %, the datum aligned."""
+    """Return the predicted interval of the tool's RMS error at rest and along a path, m, with 95 %, the datum
+    aligned."""
     # As the fit's own expected tool error, at these very poses and with their own datum instead of the whole box's.
     # Along the path only what is across it counts.
     geometry, space = fit.space.geometry, fit.space
@@ -210,7 +212,7 @@ def promises(fit: ModelFit, poses: Sequence[Pose], path: Path) -> tuple[tuple[fl
 def left_by_drives(
     geometry: HexapodGeometry, truth: MachineModel, poses: Sequence[Pose], path: Path
 ) -> tuple[float, float]:
-    """Return the RMS tool error that the drives leave with the true model, at rest and along a path, m, datum aligned.
+    """Return the RMS tool error that the drives cause with the true model, at rest and along a path, m, datum aligned.
 
     The same commands to the same drives, here and without DDS: motor steps, lag, backlash being taken up.
     """
@@ -243,7 +245,7 @@ def left_by_drives(
 def with_promises(
     rows: Sequence[ErrorRow], promised: Sequence[tuple[float, float]], drives: Sequence[float]
 ) -> list[ErrorRow]:
-    """Return rows of which the aligned ones carry what was promised for rest and path, the drives' share added."""
+    """Return rows whose aligned ones have the predicted interval for rest and path, the drives' share added."""
     whole = {
         what: (low, float(np.hypot(high, DRIVES * own)))
         for what, (low, high), own in zip(("at rest", "path"), promised, drives, strict=True)

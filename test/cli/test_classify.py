@@ -356,7 +356,7 @@ def test_a_model_in_place_of_a_budget_says_what_is_left_and_what_to_measure(
 def test_a_model_of_which_nobody_knows_how_good_it_is_leaves_nobody_knows_what() -> None:
     code, out, err = classify("--machine", "paper", "--model", "paper_machine")
     assert (code, out) == (2, "")
-    assert "it is not known what paper_machine leaves: model 'virtual machine' carries no covariance of a fit" in err
+    assert "what the calibration of paper_machine leaves is not known: model 'virtual machine' carries no" in err
 
 
 # What is refused: nothing is written, one line says what and where.

@@ -698,7 +698,7 @@ def test_check_says_when_poses_leave_the_measured_box(hexapod, tmp_path: Path) -
     """The shipped field reaches to z = 553 mm; the model of lines was measured in the same box."""
     path = file_of(tmp_path, [("in", 0, 0, 400, 0, 0, 0), ("out", 0, 0, 600, 0, 0, 0)])
     _, out, _ = hexapod("check", path, "--model", "paper_machine")
-    assert "boundary is held there: 1 of 2, first line 3 (row out)\n" in out
+    assert "boundary value is used there: 1 of 2, first line 3 (row out)\n" in out
     _, out, _ = hexapod("check", path, "--model", "paper_lines_model")
     assert "outside the box in which the model was measured: 1 of 2, first line 3 (row out)\n" in out
 

@@ -72,10 +72,10 @@ def test_proposed_readings_are_written_to_be_filled_in(folder: Path, capsys: pyt
     rows = proposed.read_text().splitlines()[1:]
     assert len(rows) == 8
     assert all(row.split(",")[-2] == "" for row in rows), "no values yet"
-    assert f"to be filled in: {proposed}" in capsys.readouterr().out
+    assert f"fill in the values: {proposed}" in capsys.readouterr().out
     for wrong, problem in (
         ((), "at least one of FILE, --propose is needed"),
-        ((folder / "same.csv", "--propose", proposed), "FILE has no meaning with --propose"),
+        ((folder / "same.csv", "--propose", proposed), "FILE cannot be combined with --propose"),
         (("--propose", proposed, "--readings", "2"), "must be 6…60, not 2"),
         (("--readings", "8"), "at least one of FILE, --propose is needed"),
         ((proposed,), "value"),
@@ -119,14 +119,14 @@ def test_update_never_replaces_what_it_reads(folder: Path, capsys: pytest.Captur
     assert run("fit", folder / "moved.csv", "--update", old, "--out", old) == 2
     assert "would be replaced" in capsys.readouterr().err
     assert run("fit", folder / "moved.csv", "--update", old, "--out", old.with_suffix(".yml")) == 2
-    assert "would replace what the fit" in capsys.readouterr().err
+    assert "would replace the fit's result" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("option", [["--scheme", "lines"], ["--lead-mm", "10"], ["--truth", "random"]])
 def test_options_of_a_whole_fit_are_refused(folder: Path, option: list[str], capsys: pytest.CaptureFixture) -> None:
     arguments = ["fit", folder / "moved.csv", "--update", model_in(folder), "--out", folder / "no.yaml", *option]
     assert run(*arguments) == 2
-    assert "has no meaning with --update" in capsys.readouterr().err
+    assert "cannot be combined with --update" in capsys.readouterr().err
     assert not (folder / "no.yaml").exists()
 
 

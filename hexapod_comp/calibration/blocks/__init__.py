@@ -33,9 +33,9 @@ ERRORS: tuple[type[Block], ...] = (
 """The registry: all blocks, in the order of the parameter vector."""
 
 WAVES = {wave.name: wave.times for wave in (Wave, Wave2, Wave3, Wave4)}
-"""Blocks of the screw waves, and how often a turn each repeats."""
+"""Blocks of the screw waves, with the number of periods a turn."""
 
 HARMONICS = tuple(name for name, times in WAVES.items() if times > 1)
 
 EXPECTED = ("pitch", "wave", "backlash", "expansion", "moisture", "late", "compliance", "lost motion")
-"""Errors that every screw has, and growth; of a length map, wear or a field nobody knows beforehand."""
+"""Errors that every screw has, and growth; a length map, wear or a field need not exist."""

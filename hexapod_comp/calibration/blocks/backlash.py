@@ -1,4 +1,4 @@
-"""Backlash: what a strut's nut lags its screw by, half to either side; and how wear changes it along the stroke."""
+"""Backlash: a strut's nut lags its screw by half of it in either direction; wear varies it along the stroke."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class Backlash(StrutBlock):
         return -0.5 * linkage.stations.sense[:, 3:, None]
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Negative backlash, which noise can make of a small one, is none: more than noise the fit has refused."""
+        """Negative backlash, which noise can produce, counts as none: the fit has refused larger values."""
         draft.struts["backlash"] = np.maximum(x, 0.0)
 
 
 class BacklashMap(LengthMap):
-    """By how much backlash differs along a worn screw: smoother than a length map, with every second of its knots."""
+    """Variation of the backlash along a worn screw: smoother than a length map, with every second of its knots."""
 
     name, unit, tolerance = "backlash map", "m", 2e-6
 
@@ -42,7 +42,7 @@ class BacklashMap(LengthMap):
         block.model_knots = knots
         return block
 
-    model_knots: np.ndarray  # those of the length map, which models have
+    model_knots: np.ndarray  # the length map's knots, which models have
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
         """−1/2 · direction, where the nut stands."""
@@ -60,8 +60,8 @@ class BacklashMap(LengthMap):
 def without_negative(blocks: Sequence[Block], x: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return parameters and directions that mean the same machine without negative backlash.
 
-    A nut cannot lead its screw, but an estimate can find so: by noise, or for swapped directions. Backlash −b in one
-    direction is b in the other; cutting it off here would make the fit add it again in every step.
+    A nut cannot lead its screw, but an estimate can be negative: by noise, or for swapped directions. Backlash −b in
+    one direction is b in the other; if it were clamped here, the fit would add it again in every step.
     """
     backlash = next((block for block in blocks if isinstance(block, Backlash)), None)
     if backlash is None:

@@ -1,8 +1,8 @@
-"""What a block is: one physical error, with its prior, its columns of the design matrix, and its place in the model.
+"""A block: one physical error, with its prior, its columns of the design matrix, and its parameters in the model.
 
 The error of the measured point is e = (dx, dy, dz, rx, ry, rz), actual minus commanded, along and about the axes of
-``base``. Nearly every error reaches it through the struts: from u_i·(δP + δω × R·t_i + R·δt_i − δb_i) = δl_i the
-platform's twist is X·(δl + u·δb − u·R·δt), with X the inverse of the Jacobian's rows (u_i, R·t_i × u_i).
+``base``. Nearly every error acts through the struts: from u_i·(δP + δω × R·t_i + R·δt_i − δb_i) = δl_i the platform's
+twist is X·(δl + u·δb − u·R·δt), with X the inverse of the Jacobian's rows (u_i, R·t_i × u_i).
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ DIGITS = 11  # after the point in a model file: a hundredth of a nanometre
 
 
 class Facts(NamedTuple):
-    """What blocks are made for."""
+    """Input from which blocks are made."""
 
     geometry: HexapodGeometry
     region: Extent  # what was measured
     settings: FitSettings
     home_lengths: np.ndarray  # (6,), m
-    platform_groups: np.ndarray  # (6,): which ball joint of the platform each strut ends in
+    platform_groups: np.ndarray  # (6,): index of each strut's ball joint on the platform
     periods: np.ndarray  # (6,): of the screws' errors, m; NaN where the lead is not known
     smooth: SmoothField  # the field's polynomials over the measured box
 
 
 @dataclass
 class Draft:
-    """A model that blocks put together: arguments of MachineModel and StrutErrors, and the field's coefficients."""
+    """A model under construction: arguments of MachineModel and StrutErrors, and the field's coefficients."""
 
     machine: dict[str, Any]
     struts: dict[str, Any]
@@ -51,7 +51,7 @@ class Draft:
 
 
 class Errors(NamedTuple):
-    """Errors that a design matrix is wanted for: n of them, one a row."""
+    """Errors whose design matrix is computed: n of them, one a row."""
 
     at: np.ndarray  # (n,): station
     directions: np.ndarray  # (n, 6): w of each
@@ -75,7 +75,7 @@ class Prediction:
 
 
 class Linkage:
-    """The struts at some stations, and what their lengths do to the measured point; metres in ``base``."""
+    """The struts at some stations, and the effect of their lengths on the measured point; metres in ``base``."""
 
     def __init__(self, prediction: Prediction, probe: np.ndarray, stations: Stations) -> None:
         self.stations, self.rotations, self.base_joints = stations, prediction.rotations, prediction.base_joints
@@ -86,20 +86,22 @@ class Linkage:
         lever = np.einsum("nij,j->ni", self.rotations, probe)
         self.points = prediction.positions + lever  # the measured point
         inverse = self._inverse = np.linalg.inv(np.concatenate([u, np.cross(self.arms, u)], axis=2))
-        self.per_length = inverse.copy()  # ∂e by the six lengths, (M, 6, 6): not of the platform's origin any more
+        # ∂e by the six lengths, (M, 6, 6): of the measured point, not of the platform's origin
+        self.per_length = inverse.copy()
         self.per_length[:, :3] += np.cross(inverse[:, 3:].transpose(0, 2, 1), lever[:, None]).transpose(0, 2, 1)
 
     def tensions(self, wrenches: np.ndarray) -> np.ndarray:
-        """Return what the struts pull with under forces and torques about platform's origin (M, 6), (M, 6), N."""
+        """Return the struts' tensions under forces and torques about platform's origin (M, 6), (M, 6), N."""
         return np.einsum("mij,mi->mj", self._inverse, wrenches)
 
     def errors(self, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> Errors:
-        """Return errors of stations `at` along directions (n, 6) that have some components only."""
+        """Return errors of stations `at` along directions (n, 6) with some components only."""
         return Errors(at, directions, components, np.einsum("nc,ncs->ns", directions, self.per_length[at]))
 
 
 Columns = Callable[[Errors], np.ndarray]
-"""What gives a block's columns of the design matrix, (n, parameters), or those that move the errors' components."""
+"""A function that returns a block's columns of the design matrix, (n, parameters), or only those that move the errors'
+components."""
 
 
 class Block(ABC):
@@ -110,7 +112,7 @@ class Block(ABC):
     tolerance: ClassVar[float]  # first guess of the prior's standard deviation; the fit estimates it
     labels: tuple[str, ...]  # names of the parameters
     root: np.ndarray  # (n, n): root of the prior's correlation
-    part = slice(0, 0)  # where it stands in the parameter vector
+    part = slice(0, 0)  # its slice of the parameter vector
 
     @classmethod
     @abstractmethod
@@ -131,7 +133,7 @@ class Block(ABC):
 
 
 class StrutBlock(Block):
-    """An error of the six struts' lengths, each strut with parameters of its own."""
+    """An error of the six struts' lengths, each strut with its own parameters."""
 
     own: np.ndarray  # (k, k): root of one strut's parameters
 
@@ -145,7 +147,7 @@ class StrutBlock(Block):
         """Return by how much each strut's parameters lengthen it, (M, 6, k)."""
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return columns: what lengthens a strut moves the point by that strut's gain."""
+        """Return columns: a strut's lengthening moves the point by that strut's gain."""
         factors = self.lengthening(linkage)
         strut = np.repeat(np.arange(6), factors.shape[2])
         flat = (factors @ self.own if whitened and len(self.own) > 1 else factors).reshape(len(factors), -1)

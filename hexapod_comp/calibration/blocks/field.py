@@ -1,6 +1,7 @@
-"""The field: what no strut and no joint explains, six components as polynomials over the measured box.
+"""The field: errors that neither struts nor joints explain, six components as polynomials over the measured box.
 
-Displacement, rotation, and what of both changes sign with the direction of motion (reversal) are blocks of their own.
+Displacement, rotation, and the part of both that changes sign with the direction of motion (reversal) are separate
+blocks.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from ...measurements.readings import AXES, LEAST_SIDE
 from ..assumptions import ASSUMED
 from .block import DIGITS, Block, Columns, Draft, Errors, Facts, Linkage
 
-GRID_TOLERANCE = 30e-9  # what a grid may add to its polynomial, m or rad: below readings
-MOST_NODES = 17  # of a field along its longest axis: a readable model file
+GRID_TOLERANCE = 30e-9  # largest error of a grid relative to its polynomial, m or rad: below readings
+MOST_NODES = 17  # nodes of a field along its longest axis, so that the model file stays readable
 CHECKS = 400  # random points at which a grid is checked
 
 COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")
@@ -25,8 +26,9 @@ COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")
 class SmoothField:
     """Products of Legendre polynomials in x, y, z over a box, the degree in proportion to its sides.
 
-    A side of no length carries no power; every degree along a shorter side counts for more than one along the longest,
-    so that the field is equally smooth in all directions. What depends on the direction of motion has fewer terms.
+    A side of length zero has no powers; every degree along a shorter side counts for more than one along the longest,
+    so that the field is equally smooth in all directions. The part that depends on the direction of motion has fewer
+    terms.
     """
 
     def __init__(self, box: np.ndarray, degree: int) -> None:
@@ -44,7 +46,7 @@ class SmoothField:
         return self._products(points, self.powers)
 
     def reversal_basis(self, points: np.ndarray) -> np.ndarray:
-        """Return the same of the terms of what depends on the direction."""
+        """Return the same for the terms that depend on the direction."""
         return self._products(points, self.reversal_powers)
 
     def _products(self, points: np.ndarray, powers: np.ndarray) -> np.ndarray:
@@ -61,11 +63,11 @@ class SmoothField:
         return self.basis(points) @ coefficients.T + turning
 
     def as_grid(self, coefficients: np.ndarray, reversal: np.ndarray) -> GridField:
-        """Return the field as grid lines, so many that interpolating between them adds nothing visible.
+        """Return the field as grid lines, with enough of them that interpolation adds nothing visible.
 
-        Terms that do not depend on the direction of motion stand on the lines along the axis of their highest
-        power: across it their powers are small, and bilinear interpolation is exact up to 1. What changes sign
-        with the motion along an axis stands on the lines along that axis.
+        Terms that do not depend on the direction of motion are on the lines along the axis of their highest power:
+        across it their powers are small, and bilinear interpolation is exact up to 1. Terms that change sign with the
+        motion along an axis are on the lines along that axis.
         """
         points = np.random.default_rng(0).uniform(self.box[0], self.box[1], (CHECKS, 3))
         sense = np.where(np.arange(CHECKS)[:, None] % 2, 1.0, -1.0) * np.ones(3)
@@ -79,7 +81,8 @@ class SmoothField:
             nodes = 2 * nodes - 1
 
     def _on_lines(self, coefficients: np.ndarray, reversal: np.ndarray, nodes: int) -> GridField:
-        """Return the field on a grid of so many nodes along the longest axis, as far apart along the others."""
+        """Return the field on a grid with this number of nodes along the longest axis, and the same spacing along the
+        others."""
         share = self._sides / max(self._sides.max(), 1e-3)
         counts = np.maximum(2, np.ceil(share * (nodes - 1)).astype(int) + 1)
         grid = tuple(np.linspace(self.box[0, a], self.box[1, a], n) for a, n in enumerate(counts))
@@ -109,7 +112,7 @@ class SmoothField:
 
 
 class _Field(Block):
-    """Three components of the field, each with the basis to itself."""
+    """Three components of the field, each with its own coefficients of the basis."""
 
     first: int  # of its components
 
@@ -125,11 +128,11 @@ class _Field(Block):
         return cls(facts.smooth)
 
     def moving(self, components: np.ndarray) -> np.ndarray:
-        """Each component has parameters of its own."""
+        """Each component has its own parameters."""
         return np.flatnonzero(np.isin(self._owner, components))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """The terms where the point stands, by each direction's share of the component."""
+        """The terms at the point, by each direction's share of the component."""
         basis = self.smooth.basis(linkage.points) * (self.smooth.prior if whitened else 1.0)
 
         def columns(errors: Errors) -> np.ndarray:
@@ -173,7 +176,7 @@ class FieldReversal(Block):
         return cls(facts.smooth)
 
     def moving(self, components: np.ndarray) -> np.ndarray:
-        """Each component has parameters of its own."""
+        """Each component has its own parameters."""
         return np.flatnonzero(np.isin(self._owner, components))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
@@ -196,7 +199,7 @@ def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray,
     """Return the powers (n, 3) of all terms up to a degree, and the relative size of their priors (n,)."""
     every = np.array(list(itertools.product(range(degree + 1), repeat=3)))
     total = every @ cost
-    bilinear = (every.max(axis=1) <= 1) & (every.sum(axis=1) <= 2)  # squareness, twist and roll are always asked for
+    bilinear = (every.max(axis=1) <= 1) & (every.sum(axis=1) <= 2)  # squareness, twist and roll are always included
     kept = ((total <= degree + 1e-9) | bilinear) & ~(every[:, flat] > 0).any(axis=1)
     order = np.argsort(total[kept], kind="stable")
     return every[kept][order], ASSUMED.field_decay ** total[kept][order]

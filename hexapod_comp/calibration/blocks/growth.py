@@ -1,7 +1,7 @@
 """Growth of struts, base and platform: by heat, at once or late, and by the air's humidity.
 
-Parts grow by what their thermometers read above 20 °C; :mod:`hexapod_comp.machine.temperatures` says how late parts
-follow.
+Parts grow in proportion to their thermometers above 20 °C; :mod:`hexapod_comp.machine.temperatures` describes the delay
+of late parts.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def per_growth(linkage: Linkage) -> np.ndarray:
-    """Return by how much the growth of struts 1-6, base and platform lengthens each strut, relative, (M, 6, 8), m."""
+    """Return the lengthening of each strut by the relative growth of struts 1-6, base and platform, (M, 6, 8), m."""
     along = [np.einsum("mik,mik->mi", linkage.directions, joints) for joints in (linkage.base_joints, -linkage.arms)]
     struts = np.eye(6) * linkage.lengths[:, None]
     return np.concatenate([struts, np.stack(along, axis=2)], axis=2)
@@ -33,7 +33,8 @@ def growth_columns(linkage: Linkage) -> np.ndarray:
 
 
 def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return what parts grow by, (M, 8, 1 + K), K: their thermometers above 20 °C, and by how far lags are behind."""
+    """Return the sources of growth, (M, 8, 1 + K), K: the parts' thermometers above 20 °C, and the deficits of the
+    lags."""
     sensors = LateGrowth(thermometer=settings.thermometer)
     read = stations.temperatures[:, [sensors.sensor_of(part) for part in range(len(PARTS))]]
     above = (read - REFERENCE_TEMPERATURE)[..., None]
@@ -50,7 +51,7 @@ def growth_root(terms: int, struts: float = ASSUMED.struts_warmed_alike) -> np.n
 
 
 def as_warmed(settings: FitSettings, stations: Stations) -> tuple[str, set[str]]:
-    """Return the thermometer that stations had, if only one, and which blocks of growth they cannot show."""
+    """Return the stations' thermometer, if there is only one, and the blocks of growth that they cannot determine."""
     temperatures = stations.temperatures
     seen = np.flatnonzero((temperatures != REFERENCE_TEMPERATURE).any(axis=0))
     thermometer = settings.thermometer or (PARTS[seen[0]] if len(seen) == 1 else "")
@@ -77,7 +78,7 @@ class Expansion(Block):
         return cls(facts.settings)
 
     def causes(self, stations: Stations) -> np.ndarray:
-        """Return what parts grow by, (M, 8, terms), K."""
+        """Return the sources of growth, (M, 8, terms), K."""
         return growth_causes(self._settings, stations, ())
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
@@ -92,12 +93,12 @@ class Expansion(Block):
         return columns
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """It adds to what is stated."""
+        """It is added to the stated expansion."""
         draft.growth = draft.growth + x
 
 
 class Late(Expansion):
-    """What of a part's growth comes late, 1/K, for each time constant."""
+    """Late part of a part's growth, 1/K, for each time constant."""
 
     name, unit, tolerance = "late", "1/K", 10e-6
 
@@ -112,7 +113,7 @@ class Late(Expansion):
         return cls(facts.settings) if facts.settings.time_constants else None
 
     def causes(self, stations: Stations) -> np.ndarray:
-        """How far lags are behind."""
+        """Deficits of the lags."""
         return growth_causes(self._settings, stations, self._constants)[..., 1:]
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
@@ -131,11 +132,11 @@ class Moisture(StrutBlock):
 
     @classmethod
     def of(cls, facts: Facts) -> Moisture | None:
-        """Where struts are stated to swell."""
+        """For struts that are stated to swell."""
         return cls() if facts.settings.strut_moisture is not None else None
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Lengths times humidity beyond that of the reference."""
+        """Length times humidity relative to the reference."""
         damp = np.nan_to_num(linkage.stations.humidity - REFERENCE_HUMIDITY)
         return (linkage.lengths * damp[:, None])[..., None]
 
@@ -145,5 +146,5 @@ class Moisture(StrutBlock):
         return lambda errors: each(errors).sum(axis=1, keepdims=True)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """It adds to what is stated."""
+        """It is added to the stated expansion."""
         draft.struts["moisture"] = draft.struts["moisture"] + x

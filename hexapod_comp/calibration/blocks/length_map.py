@@ -1,4 +1,4 @@
-"""Length map: what a screw's length errs smoothly along its stroke, as a natural cubic spline."""
+"""Length map: the smooth length error of a screw along its stroke, as a natural cubic spline."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class LengthMap(StrutBlock):
         return cls(map_knots(*facts.region.commands))
 
     def weights(self, commands: np.ndarray) -> np.ndarray:
-        """Return what each knot's value adds at some commands (…), shape (…, knots); held outside."""
+        """Return the contribution of each knot's value at some commands (…), shape (…, knots); held outside."""
         return self._cardinal(np.clip(commands, *self.knots[[0, -1]]))
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Compliance: what a strut with its joints gives under its force, beyond what is stated."""
+"""Compliance: the stretch of a strut with its joints under its force, beyond the stated one."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ if TYPE_CHECKING:
 
 
 def stated_load(settings: FitSettings) -> Load:
-    """Return the load block that a fit is told; one that is rigid where it is told of none."""
+    """Return the load block of the settings; a rigid one if they state none."""
     return Load.from_numbers(settings.load) if settings.load else Load()
 
 
 def refuse_half_stated(measurements: MeasurementSet) -> None:
-    """Raise CalibrationError where some readings state a payload, and of the others nobody knows what they carried."""
+    """Raise CalibrationError where some readings state a payload, and that of the others is unknown."""
     blank, tool = np.isnan(measurements.stations.loads[:, 0]), measurements.geometry.payload
     if blank.any() and not blank.all() and not tool.mass:
         where = measurements.sources[int(blank[measurements.station].argmax())]
         name = measurements.geometry.tool_name
-        problem = f"has no payload_kg where others do, and the geometry file gives {name} no mass; 0 means none"
+        problem = f"has no payload_kg where others do, and the geometry file gives {name} no mass; write 0 for none"
         raise CalibrationError(str(where), problem)
 
 
 def payloads(geometry: HexapodGeometry, stations: Stations) -> np.ndarray:
-    """Return mass, kg, and its centre in platform, m, of what stations carry, (M, 4): as told, else the tool's."""
+    """Return mass, kg, and its centre in platform, m, carried at stations, (M, 4): as stated, else the tool's."""
     tool = geometry.payload
     return np.where(np.isnan(stations.loads[:, :1]), [tool.mass, *tool.centre], stations.loads[:, :4])
 
 
 def directions_of_gravity(load: Load, stations: Stations) -> np.ndarray:
-    """Return gravity in base at stations, m/s², (M, 3): as told, else the load block's."""
+    """Return gravity in base at stations, m/s², (M, 3): as stated, else the load block's."""
     return np.where(np.isnan(stations.loads[:, 4:5]), load.gravity, stations.loads[:, 4:])
 
 
@@ -51,7 +51,7 @@ def weights(load: Load, geometry: HexapodGeometry, stations: Stations) -> tuple[
 
 
 def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) -> tuple[tuple[float, ...], ...]:
-    """Return the different loads of stations, as :attr:`.ModelOrigin.loads` has them; none where nobody states any."""
+    """Return the different loads of stations, for :attr:`.ModelOrigin.loads`; none if no load is stated."""
     if np.isnan(stations.loads).all() and not geometry.payload.mass and not load.bends:
         return ()
     rows = np.hstack([payloads(geometry, stations), directions_of_gravity(load, stations)]).round(3)
@@ -98,7 +98,7 @@ class Compliance(StrutBlock):
 
     @classmethod
     def of(cls, facts: Facts) -> Compliance | None:
-        """Where a stiffness is stated; whether there were several loads, the settings' blocks report."""
+        """If a stiffness is stated; the settings' blocks report whether there were several loads."""
         load = stated_load(facts.settings)
         return cls(load, facts.geometry) if load.stiffness.all() else None
 

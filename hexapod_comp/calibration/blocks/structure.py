@@ -1,4 +1,4 @@
-"""Structure: where the twelve joints really are, and the struts' offsets."""
+"""Structure: the real places of the twelve joints, and the struts' offsets."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Structure(Block):
         return cls(facts.platform_groups)
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """A base joint moves against its strut; a platform joint with it, for all struts that end there."""
+        """A base joint moves against its strut; a platform joint with it, for all struts at that joint."""
         u = linkage.directions
         in_platform = -np.einsum("nij,nki->nkj", linkage.rotations, u)
 
@@ -41,7 +41,7 @@ class Structure(Block):
         return columns
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Joints go into both bodies; coinciding ones alike."""
+        """Joint deviations are written into both bodies; equal ones for coinciding joints."""
         joints = x[:-6].reshape(-1, 3)
         draft.machine |= {"base_deviation": joints[:6], "platform_deviation": joints[6:][self._groups]}
         draft.struts["offset"] = x[-6:]

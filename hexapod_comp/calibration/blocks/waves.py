@@ -1,4 +1,4 @@
-"""Screw waves: a screw's error repeats with its turn, and some times a turn (harmonics)."""
+"""Screw waves: a screw's error repeats with its turn, and several times a turn (harmonics)."""
 
 from __future__ import annotations
 
