@@ -599,7 +599,7 @@ example:
             choice("--tracker-frame", ("free", "known"), "known: poses are measured in base (default); free: in an "
                    "unknown frame", "known"),
             flag("--confirm", "wait for Enter before each run that --readings reads, while the instrument is set up"),
-            value("--samples", whole(3, 10_000), "N", "readings at each stop, of which the median is taken (default 25)",
+            value("--samples", whole(3, 10_000), "N", "readings at each stop, whose median is used (default 25)",
                   default=25),
             seed_of("the scattered poses"),
             writes("--out", "write the readings to a CSV file; an incomplete one of this campaign is "
