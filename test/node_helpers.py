@@ -76,6 +76,9 @@ class FakeTime:
     def time(self) -> float:
         return self.time_ns() * 1e-9
 
+    def sleep(self, seconds: float) -> None:
+        self.passed += round(seconds * 1e9)
+
 
 class Voice:
     """A publisher of the rig: of a node's name, with sequence numbers of its own."""
@@ -192,7 +195,7 @@ class Rig(Bench):
                 return pickle.loads(pickle.dumps(self.jobs.do(*pickle.loads(pickle.dumps(request)))))
 
         for name, module in list(sys.modules.items()):
-            if name.startswith("hexapod_comp.ros.") or name == "hexapod_comp.testing.bench":
+            if name.startswith(("hexapod_comp.ros.", "hexapod_comp.linuxcnc.", "hexapod_comp.testing.bench")):
                 for what, stand_in in (("time", self.clock), ("Alarm", Alarm)):
                     if hasattr(module, what) and name != "hexapod_comp.ros.rclpy_compat":
                         patch.setattr(module, what, stand_in)

@@ -1,4 +1,4 @@
-"""The LinuxCNC bridge over real DDS, with a stand-in for LinuxCNC's ``hal`` module and a real compensator.
+"""The LinuxCNC bridge, with a stand-in for LinuxCNC's ``hal`` module and a real compensator.
 
 The stand-in does what the component API of ``hal`` does: typed pins, an error for a name taken twice. What the
 real one does is tested with LinuxCNC itself. Poses are compared with SciPy's rotations, struts with a closed form of
@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
 
@@ -21,7 +22,7 @@ import pytest
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from hal_stand_in import StandInHal
-from node_helpers import CONFIG, HOME, RELIABLE, Bench, closed_form_lengths, near
+from node_helpers import CONFIG, HOME, RELIABLE, Bench, Rig, closed_form_lengths, near
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 
@@ -78,6 +79,19 @@ class Machine:
         seen = len(self.poses)
         self.bench.until(lambda: len(self.poses) >= seen + count, "poses")
         return self.poses[-1]
+
+
+@pytest.fixture
+def over_dds(ros_context: Any, capfd: Any) -> Iterator[Bench]:
+    """Give a bench whose nodes meet over DDS."""
+    with Bench(ros_context, capfd) as made:
+        yield made
+
+
+@pytest.fixture
+def bench(rig: Rig) -> Rig:
+    """Give the bench without DDS, on a clock of its own."""
+    return rig
 
 
 @pytest.fixture
@@ -258,21 +272,21 @@ def test_corrections_of_a_real_compensator_arrive(bench, units, metres):
     bench.until(lambda: bench.values(NODE).get("largest_correction_m") == said, f"{said} in the diagnostics")
 
 
-def test_the_stop_pin_is_true_unless_the_compensator_says_otherwise(bench):
+def test_the_stop_pin_is_true_unless_the_compensator_says_otherwise(over_dds):
     """Not heard yet, refusing, silent: LinuxCNC's feed is held; hearing it for long enough releases it."""
-    machine = Machine(bench)
+    machine = Machine(over_dds)
     hal = machine.hal
-    bench.until(lambda: hal["heartbeat"], "a cycle")
+    over_dds.until(lambda: hal["heartbeat"], "a cycle")
     assert hal["stopped"] is True
-    node = bench.compensator()
+    node = over_dds.compensator()
     machine.start()
-    bench.until(lambda: hal["stopped"] is False, "the compensator to be heard")
-    assert bench.change("deactivate")
-    bench.until(lambda: hal["stopped"] is True, "an inactive compensator")
-    assert bench.change("activate")
-    bench.until(lambda: hal["stopped"] is False, "an active one")
-    bench.executor.remove_node(node)  # hangs: what is latched stays false
-    bench.until(lambda: hal["stopped"] is True, "one that hangs")
+    over_dds.until(lambda: hal["stopped"] is False, "the compensator to be heard")
+    assert over_dds.change("deactivate")
+    over_dds.until(lambda: hal["stopped"] is True, "an inactive compensator")
+    assert over_dds.change("activate")
+    over_dds.until(lambda: hal["stopped"] is False, "an active one")
+    over_dds.executor.remove_node(node)  # hangs: what is latched stays false
+    over_dds.until(lambda: hal["stopped"] is True, "one that hangs")
 
 
 def test_enable_ramps_in_and_out(bench, speak):
@@ -303,19 +317,19 @@ def test_enable_ramps_in_and_out(bench, speak):
         ("hold", GuardStatus.HOLDING, "compensator lost, corrections hold"),
     ],
 )
-def test_a_compensator_that_falls_silent(bench, on_loss, status, text):
+def test_a_compensator_that_falls_silent(over_dds, on_loss, status, text):
     """Corrections return to zero or hold, never stepping, and come back when it speaks again."""
-    machine = Machine(bench, on_loss=on_loss)
-    bench.compensator()
+    machine = Machine(over_dds, on_loss=on_loss)
+    over_dds.compensator()
     hal = machine.start().hal
     machine.until_status(GuardStatus.COMPENSATING)
-    assert bench.change("deactivate")
+    assert over_dds.change("deactivate")
     machine.until_status(status)
-    bench.until_status(ERROR, text, NODE)
+    over_dds.until_status(ERROR, text, NODE)
     assert hal["age"] > SLOW["timeout"]
     assert hal["compensating"] is False
     assert bool(hal.corrections.any()) is (on_loss == "hold")
-    assert bench.change("activate")
+    assert over_dds.change("activate")
     machine.until_status(GuardStatus.COMPENSATING)
     assert hal.corrections.any()
     assert_never_steps(hal)
@@ -368,22 +382,22 @@ def test_names_in_any_order(bench, speak):
     np.testing.assert_allclose(hal.corrections, 1e-3 * np.arange(6), rtol=1e-12)
 
 
-def test_asks_a_compensator_that_refuses_to_start_anew(bench):
+def test_asks_a_compensator_that_refuses_to_start_anew(over_dds):
     """Off, moved by hand by 20 mm and on again: more than the compensator lets a command jump (2 mm)."""
-    machine = Machine(bench)
-    bench.compensator()
+    machine = Machine(over_dds)
+    over_dds.compensator()
     machine.start().until_status(GuardStatus.COMPENSATING)
     machine.hal["machine-on"] = False
     machine.until_status(GuardStatus.OFF)
     machine.place(near(HOME, (0.0, 0.0, 0.02)))
     machine.hal["machine-on"] = True
     # As a step, or as struts that are not where they were told to be: whichever message comes first.
-    bench.until(lambda: bench.values().get("refused", "0") != "0", "a refused command")
-    bench.until(lambda: machine.hal["resets"] >= 1, "a reset")
+    over_dds.until(lambda: over_dds.values().get("refused", "0") != "0", "a refused command")
+    over_dds.until(lambda: machine.hal["resets"] >= 1, "a reset")
     updates = machine.hal["updates"]
-    bench.until(lambda: machine.hal["updates"] > updates + 10, "corrections")
+    over_dds.until(lambda: machine.hal["updates"] > updates + 10, "corrections")
     machine.until_status(GuardStatus.COMPENSATING)
-    assert bench.logged("asked it to start anew")
+    assert over_dds.logged("asked it to start anew")
     assert_never_steps(machine.hal)
 
 
@@ -408,11 +422,11 @@ def test_pins_are_those_of_the_agreement(bench):
     assert hal.is_ready
 
 
-def test_heart_beats_every_cycle(bench):
+def test_heart_beats_every_cycle(over_dds):
     """At 100 Hz: alternating, and 50 beats last half a second, give or take a busy machine."""
-    machine = Machine(bench, rate=100.0).start(on=False)
+    machine = Machine(over_dds, rate=100.0).start(on=False)
     beats = machine.hal.pins["heartbeat"].written
-    bench.until(lambda: len(beats) > 60, "60 beats")
+    over_dds.until(lambda: len(beats) > 60, "60 beats")
     assert all(one[1] != other[1] for one, other in pairwise(beats))
     assert 0.4 < beats[55][0] - beats[5][0] < 2.0
 
