@@ -40,7 +40,7 @@ class Slopes:
         self._designs = [block.design(self._linkage, whitened) for block in space.blocks]
 
     def columns(self, components: np.ndarray) -> np.ndarray:
-        """Return which parameters move an error that has some of the six components only."""
+        """Return the parameters that move an error with some of the six components only."""
         return np.concatenate([block.part.start + block.moving(components) for block in self._blocks])
 
     def write(self, rows: np.ndarray, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> None:

@@ -1,17 +1,17 @@
-"""Heat and humidity: what thermometers really went through, how late parts follow them, and what readings tell of it.
+"""Heat and humidity: the true courses behind thermometers, the delay of late parts, and their evidence in readings.
 
-**Courses.** Each run has a zero of its own, so a warm-up shows in how lines change from round to round. What a sensor
-adds differs from reading to reading, and within a run all channels together show that the tool did not move with it:
-growth then seems smaller than it is (Carroll et al. 2006, *Measurement Error in Nonlinear Models*, chapters 3 and 4:
-attenuation, and regression calibration, which is what is done here). So a temperature is a Gaussian process, the
-integral of a rate that persists for about an hour (an integrated Ornstein-Uhlenbeck process), read with noise. How fast
-it changes beside that noise is estimated for each sensor by restricted maximum likelihood. A sensor that is rounded to
-a step q reads a staircase: its bins are as long as a stair, and their noise is no less than that of rounding, q/√12.
+**Courses.** Each run has its own zero, so a warm-up shows in how lines change from round to round. A sensor's noise
+differs from reading to reading, and within a run all channels together show that the tool did not move with it: growth
+is then underestimated (Carroll et al. 2006, *Measurement Error in Nonlinear Models*, chapters 3 and 4: attenuation, and
+regression calibration, which is used here). So a temperature is a Gaussian process, the integral of a rate that
+persists for about an hour (an integrated Ornstein-Uhlenbeck process), read with noise. Its rate of change relative to
+that noise is estimated for each sensor by restricted maximum likelihood. A sensor that is rounded to a step q reads a
+staircase: its bins are as long as a stair, and their noise is no less than that of rounding, q/√12.
 
 **Time constants.** For given ones the growth is linear in what is fitted. So each constant of a logarithmic grid, and
-each pair, is tried on what a fit without late parts leaves: its gain is by how much it raises the log evidence, all
-other parameters and the late parts' prior integrated out. A parabola through the best three refines it, and says how
-well it is known.
+each pair, is tried on the residuals of a fit without late parts: its gain is the increase of the log evidence, with all
+other parameters and the late parts' prior integrated out. A parabola through the best three refines it, and gives its
+uncertainty.
 """
 
 from __future__ import annotations
@@ -57,17 +57,18 @@ LEAST_KNOWN = {
 # Courses
 
 PACE, APART = 4.0, 128.0
-"""How long a reading takes, and a pause between runs, s, where nobody wrote down the times."""
+"""Assumed duration of a reading, and of a pause between runs, s, for readings without times."""
 
 MOST_BINS = 400
 """Longer records have longer bins: a course is solved for with dense matrices."""
 
 RATIOS = np.geomspace(1e-4, 1e10, 43)
-"""Variances of a rate, per persistence, over that of a bin's noise: from a constant to what the sensor reads."""
+"""Variances of a rate, per persistence, over that of a bin's noise: from a constant to the raw readings."""
 
 
 def with_courses(measurements: MeasurementSet) -> MeasurementSet:
-    """Return readings whose stations have the courses of temperatures and humidity, instead of what sensors read.
+    """Return readings whose stations have the smoothed courses of temperatures and humidity, instead of raw sensor
+    readings.
 
     Readings without times have a course for each run, at an even pace.
     """
@@ -110,7 +111,8 @@ def _stairs(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
 
 
 class _Course:
-    """An unbroken record in bins: what is no constant, in directions in which the process and the noise are apart."""
+    """An uninterrupted record in bins, without its constant, in directions in which process and noise are
+    uncorrelated."""
 
     def __init__(self, times: np.ndarray, values: np.ndarray, width: float) -> None:
         bins = max(1, round(float(times[-1] - times[0]) / width))
@@ -131,7 +133,7 @@ class _Course:
         Of ∫r(u)du from the first bin on, with the rate's covariance e^−|u−v|: 2·min(s, t) + e^−s + e^−t − 1 − e^−|s−t|.
         """
         t, s = ((part - self._at[0]) / ASSUMED.rate_persistence for part in (times[:, None], self._at))
-        t, early = np.maximum(t, 0.0), np.minimum(t, 0.0)  # before the first bin's middle the rate goes on as there
+        t, early = np.maximum(t, 0.0), np.minimum(t, 0.0)  # before the first bin's middle the rate is constant
         whole = 2.0 * np.minimum(s, t) + np.exp(-s) + np.exp(-t) - 1.0 - np.exp(-np.abs(s - t))
         return np.asarray(whole + early * -np.expm1(-s))
 
@@ -143,7 +145,7 @@ class _Course:
 
 
 def _ratios(courses: list[_Course], least: np.ndarray) -> np.ndarray:
-    """Return the most probable of :data:`RATIOS` for each sensor; the noise is what it leaves, `least` at least."""
+    """Return the most probable of :data:`RATIOS` for each sensor; the noise is its residual, at least `least`."""
     variances = np.concatenate([course.variances for course in courses])
     parts = np.concatenate([course.parts for course in courses])
     if not len(variances):
@@ -169,7 +171,7 @@ class TimeConstants:
 def estimate_time_constants(
     measurements: MeasurementSet, space: ParameterSpace, progress: Callable[[str], object]
 ) -> TimeConstants:
-    """Return the time constants that readings show beyond a fit without late parts; none where nothing tells."""
+    """Return the time constants that readings show beyond a fit without late parts; none without evidence."""
     settings, times = space.settings, measurements.stations.times
     if "late" not in settings.blocks or settings.time_constants is not None or not np.ptp(times) > 0.0:
         return TimeConstants()
@@ -183,7 +185,7 @@ def estimate_time_constants(
     best, gain = scan.best(1)
     if gain < ASSUMED.clear_evidence:
         return TimeConstants()
-    # A constant that is left out raises the noise, which hides a second one: once more with the noise that it leaves.
+    # An omitted constant enlarges the noise, which hides a second one: repeat with the noise of the residuals.
     with_best = ParameterSpace(measurements, replace(settings, time_constants=tuple(grid[list(best)].tolist())))
     tried = _tried(Estimation(measurements, with_best))
     scan = _Scan(estimation, grid, replace(tried, tolerances=tried.tolerances[:-1]))
@@ -199,14 +201,14 @@ def _tried(estimation: Estimation) -> Posterior:
 
 
 def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
-    """Return what the relative growth of each part moves each cell by, shape (C, 8), m or rad."""
+    """Return the change of each cell by the relative growth of each part, shape (C, 8), m or rad."""
     space, cells, stations = estimation.space, estimation.cells, estimation.measurements.stations
     columns = growth_columns(Linkage(predict(space, x, stations), space.probe, stations))[cells.station]
     return np.einsum("ci,cip->cp", cells.directions, columns)
 
 
 def _late_columns(estimation: Estimation, x: np.ndarray, constants: np.ndarray, size: float) -> np.ndarray:
-    """Return what late parts of a size, 1/K, move the cells by, (C, K·8), over the stated noise, free of zeros."""
+    """Return the change of the cells by late parts of a size, 1/K, (C, K·8), over the stated noise, free of zeros."""
     behind = growth_causes(estimation.space.settings, estimation.measurements.stations, constants)
     behind = behind[estimation.cells.station, :, 1:]
     columns = (_per_growth(estimation, x)[:, :, None] * behind).transpose(0, 2, 1) @ (size * growth_root(1))
@@ -214,7 +216,7 @@ def _late_columns(estimation: Estimation, x: np.ndarray, constants: np.ndarray, 
 
 
 class _Scan:
-    """What each time constant of a grid would explain of what a fit without late parts leaves."""
+    """The gain by each time constant of a grid on the residuals of a fit without late parts."""
 
     def __init__(self, estimation: Estimation, grid: np.ndarray, known: Posterior) -> None:
         space, nominal = estimation.space, np.zeros(estimation.space.size)
@@ -228,7 +230,7 @@ class _Scan:
         self._moment = columns.T @ (over * problem.target - rows.times(posterior.y))
 
     def gain(self, chosen: Sequence[int]) -> float:
-        """Return by how much some constants of the grid raise the log evidence."""
+        """Return the increase of the log evidence by some constants of the grid."""
         parts = len(PARTS)
         members = np.concatenate([np.arange(parts * n, parts * (n + 1)) for n in chosen])
         matrix = np.eye(len(members)) + self._normal[np.ix_(members, members)]
@@ -236,7 +238,7 @@ class _Scan:
         return float(0.5 * moment @ np.linalg.solve(matrix, moment) - 0.5 * np.linalg.slogdet(matrix)[1])
 
     def best(self, count: int) -> tuple[tuple[int, ...], float]:
-        """Return so many constants of the grid that gain most, and what they gain."""
+        """Return this number of constants of the grid with the largest gain, and the gain."""
         gains = {chosen: self.gain(chosen) for chosen in combinations(range(len(self._grid)), count)}
         best = max(gains, key=gains.__getitem__)
         return best, gains[best]
@@ -244,7 +246,7 @@ class _Scan:
     def refined(self, chosen: tuple[int, ...]) -> TimeConstants:
         """Return the summits of parabolas through each constant's gain and its neighbours', the others kept.
 
-        Deviations are by all bends together: two constants that act alike are known the less.
+        Deviations use all curvatures together: two constants with similar effects are less certain.
         """
 
         def moved(ways: dict[int, int]) -> float:
@@ -271,19 +273,19 @@ class _Scan:
 
 @dataclass(frozen=True)
 class PartGrowth:
-    """How one kind of part grows, 1/K."""
+    """Growth of one kind of part, 1/K."""
 
     part: str  # struts (their mean), base or platform
     stated: float
     expansion: float
     deviation: float
     determined: float  # share of it that comes from the readings
-    late: tuple[float, ...]  # what of it comes late, by time constant
+    late: tuple[float, ...]  # late part of it, by time constant
 
 
 @dataclass(frozen=True)
 class Swelling:
-    """What readings tell of the struts' growth by humidity, m/m from 0 to 1."""
+    """Evidence in readings on the struts' growth by humidity, m/m from 0 to 1."""
 
     change: float  # of the relative humidity
     stated: float
@@ -294,10 +296,10 @@ class Swelling:
 
 @dataclass(frozen=True)
 class ThermalEvidence:
-    """What readings tell of heat, and of humidity."""
+    """Evidence in readings on heat and humidity."""
 
     changes: tuple[tuple[str, float], ...]  # of each thermometer that was read, K
-    thermometer: str  # the one that stands for all parts; empty: each has its own
+    thermometer: str  # the one that represents all parts; empty: each has its own
     parts: tuple[PartGrowth, ...]  # empty where no expansion was fitted
     time_constants: TimeConstants
     timed: bool  # whether the readings have times
@@ -311,7 +313,7 @@ class ThermalEvidence:
         time_constants: TimeConstants,
         factor: float,
     ) -> ThermalEvidence:
-        """Return what a fit to readings tells; deviations are wider by a `factor`."""
+        """Return the evidence of a fit to readings; deviations are multiplied by a `factor`."""
         space, stations = estimation.space, measurements.stations
         read = (stations.temperatures != REFERENCE_TEMPERATURE).any(axis=0)
         changes = zip(PARTS, np.ptp(stations.temperatures, axis=0).tolist(), read, strict=True)
@@ -331,19 +333,19 @@ class ThermalEvidence:
 
 @dataclass(frozen=True)
 class _Known:
-    """How well growth is known: covariance of all parameters, SI, and what it would be without readings."""
+    """Uncertainty of growth: covariance of all parameters, SI, and the covariance without readings."""
 
     covariance: np.ndarray
     prior: np.ndarray
 
     @staticmethod
     def of(estimation: Estimation, solution: Solution, constants: TimeConstants, factor: float) -> _Known:
-        """Return the covariance of a fit, whose priors and time constants are themselves no more than estimates.
+        """Return the covariance of a fit, including the uncertainty of its priors and time constants.
 
         The size of a prior is estimated from three numbers at most, which the prior itself pulls towards zero: the
-        covariance is therefore computed with a prior wide enough for any material. Time constants that differ by δ,
-        in the logarithm, move the readings by h·δ, and with them the parameters by −C·Rᵀ·h·δ. One thermometer for all
-        whose late parts nothing has shown may have some all the same, as far as the readings allow.
+        covariance is therefore computed with a prior wide enough for any material. Time constants that differ by δ, in
+        the logarithm, change the readings by h·δ, and the parameters by −C·Rᵀ·h·δ. With one thermometer for all, late
+        parts may exist within what the readings allow, even if no time constant was found.
         """
         space, noise, problem = estimation.space, solution.posterior.noise, solution.problem
         least = [LEAST_KNOWN.get(block.name, 0.0) for block in space.blocks]
@@ -370,7 +372,8 @@ class _Known:
 
 
 def _effects(estimation: Estimation, x: np.ndarray, constants: TimeConstants) -> Iterator[np.ndarray]:
-    """Yield how the logarithm of each time constant moves the cells, (C,), over their stated noise, free of zeros."""
+    """Yield the change of the cells by the logarithm of each time constant, (C,), over their stated noise, free of
+    zeros."""
     space, stations, step = estimation.space, estimation.measurements.stations, 0.02
     block = space.block("late")
     if block is None:
@@ -387,7 +390,7 @@ def _effects(estimation: Estimation, x: np.ndarray, constants: TimeConstants) ->
 def _parts(
     space: ParameterSpace, solution: Solution, known: _Known, start: int, growth: LateGrowth
 ) -> Iterator[PartGrowth]:
-    """Yield how each kind of part grows; the expansions stand in the parameters from `start` on."""
+    """Yield the growth of each kind of part; the expansions are in the parameters from `start` on."""
     for name, members in MEMBERS.items():
         where = slice(start + members.start, start + members.stop)
         stated = float(space.stated_expansion[members].mean())
@@ -407,7 +410,7 @@ NOT_DETERMINED = "; these readings do not determine it"
 
 
 def warming_text(warming: ThermalEvidence) -> str:
-    """Return what readings tell of heat and humidity, for people; empty where neither was read."""
+    """Return the evidence on heat and humidity as text; empty where neither was read."""
     return "\n".join([*_heat_lines(warming), *_swelling_lines(warming.swelling)])
 
 
@@ -448,7 +451,7 @@ def _swelling_lines(swelling: Swelling | None) -> Iterator[str]:
 
 
 def warming_json(warming: ThermalEvidence) -> dict:
-    """Return what readings tell of heat as plain numbers; units are in the keys."""
+    """Return the evidence on heat as plain numbers; units are in the keys."""
     constants, swelling = warming.time_constants, warming.swelling
     parts = [
         {

@@ -1,11 +1,11 @@
-"""How far a settled fit may be trusted: the tool error that it promises, its χ², and what puts it in doubt.
+"""How far a converged fit may be trusted: its predicted tool error, its χ², and the causes of doubt.
 
-A covariance of parameters is right if the model is. Three terms say by how much it may not be. A *cluster jackknife*
-over runs: what the tool's error changes by when each run is left out, by the linear problem, beside what the covariance
-expects of it, for errors of a run are not independent. A *discrepancy*: what is left beyond the instruments' noise, and
-is not what repeats show, is an error of the machine that no parameter describes (Kennedy & O'Hagan 2001). And a
-*drift*: a scale of all lengths that changes over the campaign is a parameter with a prior of its own, taken into the
-fit where the evidence is for it. The scale of an instrument, which no reading shows, is stated.
+A covariance of parameters is right if the model is. Three terms allow for a wrong model. A *cluster jackknife* over
+runs compares the change of the tool's error without each run, in the linear problem, with the covariance's prediction,
+since errors within a run are not independent. A *discrepancy*: residuals beyond the instruments' noise and the
+repeatability are an error of the machine that no parameter describes (Kennedy & O'Hagan 2001). And a *drift*: a scale
+of all lengths that changes over the campaign is a parameter with its own prior, included in the fit if the evidence
+supports it. The scale of an instrument, which no reading shows, is stated.
 """
 
 from __future__ import annotations
@@ -51,23 +51,23 @@ TILT = np.radians(10.0)
 
 NOT_TILTED = "a field was needed, and measured with a level tool alone: nothing is promised for a tilted one"
 WITHOUT_EFFECT = 1e-4
-"""Share of the tool's squared error that the jackknife does not look at."""
+"""Share of the tool's squared error that the jackknife omits."""
 
 DRIFT_RUNS, DRIFT_TERMS = 6, 2
-"""Fewest runs that read lengths for a drift, two each way; its degree in time, as much as settling needs."""
+"""Fewest runs that read lengths for a drift, two each way; its degree in time, enough for settling."""
 
 LEAST_PAIRS, LEAST_LEFT, LEAST_FREE = 30, 0.25, 3.0
 """Fewest pairs, or repeats, that tell a variance (to 26 %); least share of a discrepancy that parameters leave; fewest
 degrees of freedom of a χ² that is listed."""
 
 HELD = 0.5
-"""Share of a promise that may come from the priors."""
+"""Largest share of a predicted error that may depend on the priors."""
 
 FIELDS = ("field displacement", "field rotation")
 
 
 class ChiSquare(NamedTuple):
-    """How one part of the readings was met."""
+    """Residuals of one part of the readings."""
 
     kind: str  # of KINDS
     part: str  # a family of lines, a direction, or a run's name
@@ -79,7 +79,7 @@ class ChiSquare(NamedTuple):
 class Drift:
     """A scale of all lengths that changes over the campaign, as a polynomial in time."""
 
-    columns: np.ndarray  # (C, terms): what it adds to cells, over their noise, in standard deviations of its prior
+    columns: np.ndarray  # (C, terms): its effect on cells, over their noise, in standard deviations of its prior
     values: np.ndarray  # (terms,), in these standard deviations; empty where the evidence is against a drift
     covariance: np.ndarray  # (terms, terms)
 
@@ -94,19 +94,19 @@ class Drift:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a fit promises, and whether its model may be written."""
+    """The predicted error of a fit, and whether its model may be written."""
 
-    level: ToolError | None  # of a level tool, allowing for what is unexplained; None where nothing can be promised
+    level: ToolError | None  # of a level tool, with unexplained errors; None if nothing can be predicted
     tilted: ToolError | None  # of one tilted by TILT
-    unexplained: Unexplained  # what readings show that no parameter describes
+    unexplained: Unexplained  # errors shown by readings that no parameter describes
     chi_squares: tuple[ChiSquare, ...]  # by kind of channel, of families of lines and of directions
     worst_runs: tuple[ChiSquare, ...]  # of single runs, the worst first
-    refusals: tuple[str, ...]  # why the model is not to be written without force
+    refusals: tuple[str, ...]  # why the model must not be written without force
     doubts: tuple[str, ...]  # what else is wrong
-    remarks: tuple[str, ...]  # what else a reader must know
+    remarks: tuple[str, ...]  # other notes for the reader
 
     def without_rotation(self, why: str) -> Verdict:
-        """Return the same with no interval for the tool's rotation, which the priors alone would give."""
+        """Return the same with no interval for the tool's rotation, which would depend on the priors alone."""
         level, tilted = (
             None if error is None else replace(error, rotation_low=None, rotation_high=None, rotation_unknown=why)
             for error in (self.level, self.tilted)
@@ -115,14 +115,14 @@ class Verdict:
 
 
 class LeftOut(NamedTuple):
-    """Blocks that were left out of a fit are not proved to be absent."""
+    """Blocks that were left out of a fit may still be present."""
 
-    probability: float = 0.0  # that any of them is there
-    square: float = 0.0  # mean squared error of the tool to expect with all blocks in, m²
+    probability: float = 0.0  # probability that any of them is present
+    square: float = 0.0  # expected mean squared error of the tool with all blocks, m²
 
 
 class Residuals:
-    """A settled fit's residuals, cell by cell, over the noise that was estimated, and what they say of the tool."""
+    """A converged fit's residuals, cell by cell, over the estimated noise, and the resulting tool error."""
 
     def __init__(self, estimation: Estimation, solution: Solution, drift: Drift) -> None:
         self.estimation, self.solution, self.drift = estimation, solution, drift
@@ -135,7 +135,7 @@ class Residuals:
 
     @cached_property
     def taken(self) -> np.ndarray:
-        """Share of each cell that parameters and unknowns of the instruments take up, shape (C,)."""
+        """Share of each cell that parameters and unknowns of the instruments explain, shape (C,)."""
         every = np.arange(len(self.residual))
         return self.shared(every, every) + self.estimation.shares_of_nuisance()
 
@@ -151,15 +151,16 @@ class Residuals:
 
     @property
     def expected(self) -> float:
-        """Mean squared error of the tool to expect by the covariance, m²."""
+        """Expected mean squared error of the tool by the covariance, m²."""
         return float(np.vdot(self.metrics[0], self.solution.posterior.covariance))
 
     @cached_property
     def omitted(self) -> list[Omitted]:
-        """What leaving out each fold does to the tool, by the eigenvectors of its squared error."""
+        """The effect of leaving out each fold on the tool, by the eigenvectors of its squared error."""
         spread, terms = self.solution.posterior.spread, self.drift.columns.shape[1]
         values, vectors = np.linalg.eigh(spread[:, None] * self.metrics[0] * spread)
-        kept = np.cumsum(values) > WITHOUT_EFFECT * self.expected  # ascending: what no prior lets happen is left out
+        # ascending: directions that the priors exclude are omitted
+        kept = np.cumsum(values) > WITHOUT_EFFECT * self.expected
         kept[-1] = True
         effects = np.pad(vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0)), ((0, terms), (0, 0)))
         precision = whitened_precision(self.solution.problem, self.solution.posterior)
@@ -170,7 +171,7 @@ class Residuals:
 
     @cached_property
     def held_out(self) -> np.ndarray:
-        """Errors at cells whose fold a fit did not see, over the stated standard deviations, shape (C,)."""
+        """Errors at cells whose fold was left out of the fit, over the stated standard deviations, shape (C,)."""
         problem, posterior = self.solution.problem, self.solution.posterior
         errors = np.empty(len(self.residual))
         for fold in self.omitted:
@@ -178,7 +179,7 @@ class Residuals:
         return errors * posterior.noise[problem.kind]
 
     def shared(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return by how much fitting makes cells unlike each other, pair by pair: what both give to the parameters."""
+        """Return the anticorrelation of pairs of cells by fitting: the contribution of both to the parameters."""
         posterior = self.solution.posterior
         return self.rows.between(posterior.covariance / np.outer(posterior.spread, posterior.spread), first, second)
 
@@ -190,11 +191,11 @@ def judge(
     mixed_up: Sequence[str],
     left_out: LeftOut,
 ) -> Verdict:
-    """Return what a settled fit promises and what is wrong with it; `noise` was found for each kind, m or rad."""
+    """Return a converged fit's predicted error and doubts; `noise` was estimated for each kind, m or rad."""
     solution, measurements, space = residuals.solution, residuals.estimation.measurements, residuals.estimation.space
     beyond = unexplained(residuals, stated_scale(measurements, settings), left_out)
     covariance = physical_covariance(space, solution.posterior)
-    # A field that was measured with a level tool alone says nothing of a tilted one.
+    # A field that was measured with a level tool has no information on a tilted one.
     level_only = space.block(FIELDS[0]) is not None and measurements.tilt() < 0.5 * TILT
     level, tilted = (
         None if level_only and tilt else expected_error(space, solution.x, covariance, tilt, beyond=beyond)
@@ -218,10 +219,10 @@ def judge(
 
 
 def unexplained(r: Residuals, scale: float, left_out: LeftOut) -> Unexplained:
-    """Return what a settled fit leaves unexplained; `scale` is the standard deviation of that of all readings, m/m.
+    """Return the unexplained errors of a converged fit; `scale` is the standard deviation of that of all readings, m/m.
 
-    The upper end allows for a covariance that is wrong, as runs show, and for what averaging over the choice of blocks
-    gives (Bayesian model averaging): with the probability that one of those left out is there, the error with all in.
+    The upper end allows for a wrong covariance, as shown by runs, and for the selection of blocks (Bayesian model
+    averaging): with the probability that one of those left out is present, the error with all blocks.
     """
     ratio, freedom = variance_ratio(r)
     averaged = 1.0
@@ -249,9 +250,9 @@ def unexplained(r: Residuals, scale: float, left_out: LeftOut) -> Unexplained:
 
 
 def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
-    """Return the standard deviation of the scale of all readings, m/m, as stated or as their instruments' class has it.
+    """Return the standard deviation of the scale of all readings, m/m, as stated or by their instruments' class.
 
-    The best instrument for lengths counts. A beam that is off its line by an angle θ reads θ²/2 too little.
+    The best instrument for lengths is used. A beam that is off its line by an angle θ reads θ²/2 too little.
     """
     kinds = {KINDS[k] for k in np.unique(measurements.kind)}
     known = [value for kind, value in ASSUMED.scales if kind in kinds]
@@ -264,10 +265,10 @@ def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
 
 
 def variance_ratio(r: Residuals) -> tuple[float, float]:
-    """Return by how much more than expected leaving out each run changes the tool's squared error, and the freedom.
+    """Return the ratio of the tool's squared changes without each run to the expected ones, and its degrees of freedom.
 
-    By Satterthwaite the sum over runs is about a χ² of as many degrees of freedom as its variance says; of G clusters,
-    no more than G − 1 are independent.
+    By Satterthwaite the sum over runs is about a χ² whose degrees of freedom follow from its variance; of G clusters,
+    at most G − 1 are independent.
     """
     if not r.expected > 0.0 or len(r.omitted) < 2:
         return 1.0, 0.0
@@ -277,10 +278,10 @@ def variance_ratio(r: Residuals) -> tuple[float, float]:
 
 
 def with_drift(estimation: Estimation, solution: Solution) -> tuple[Solution, Drift]:
-    """Return a fit with a drift of the scale as additional parameters, where the evidence is for it.
+    """Return a fit with a drift of the scale as additional parameters, if the evidence supports it.
 
     A machine that warms, or a laser's air that changes: over the campaign all lengths from the middle of the box grow
-    by a polynomial in time. Exact for the linear problem, with the blocks' priors and the noise as they are.
+    by a polynomial in time. Exact for the linear problem, with fixed priors of the blocks and fixed noise.
     """
     m, cells = estimation.measurements, estimation.cells
     posterior, problem = solution.posterior, solution.problem
@@ -329,24 +330,24 @@ def with_drift(estimation: Estimation, solution: Solution) -> tuple[Solution, Dr
 
 
 class LackOfFit(NamedTuple):
-    """Variances that one kind of readings shows beyond its stated noise, m² or rad²; 0 where it may be chance."""
+    """Variances of one kind of readings beyond its stated noise, m² or rad²; 0 where it may be chance."""
 
-    alike: float = 0.0  # shared by readings there and back, with the part that the parameters have swallowed
-    most_alike: float = 0.0  # what would have shown
-    unlike: float = 0.0  # of neither that nor of repeats
+    alike: float = 0.0  # common to readings in both directions, with the part that the parameters have absorbed
+    most_alike: float = 0.0  # detection threshold
+    unlike: float = 0.0  # in neither that nor repeats
     stops: float = 0.0  # pure error: of readings repeated at one place
     most_stops: float = 0.0
 
 
 def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
-    """Return what residuals show of the tool's displacement, and of its rotation, that no parameter describes.
+    """Return the tool's displacement and rotation, from residuals, that no parameter describes.
 
-    Pure error is what repeats show; the rest of what is beyond the stated noise is lack of fit (Draper & Smith 1998):
-    an error of the machine, as a lost motion that friction makes, however unlike itself it is there and back.
+    Repeats show the pure error; the rest beyond the stated noise is lack of fit (Draper & Smith 1998): an error of the
+    machine, such as lost motion by friction, also where it differs between directions.
 
-    A field that is not as smooth as its terms shows that first where it is large beside the readings' noise, in its
-    rotations as a rule; in displacements there is as much, in proportion to the sizes that were fitted, unless so much
-    would have shown there as well.
+    A field that is rougher than its terms shows that first where it is large compared with the readings' noise, usually
+    in its rotations; the same lack is assumed for displacements, in proportion to their fitted sizes, unless it would
+    have shown there as well.
     """
     kinds = np.unique(r.estimation.cells.kind)
     found = []
@@ -371,7 +372,7 @@ def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
 
 
 def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
-    """Return what one kind of readings shows: all variances in the stated noise's, but for the result."""
+    """Return the variances of one kind of readings: all in the stated noise's, except the result."""
     m, estimated = r.estimation.measurements, float(r.solution.posterior.noise[kind] ** 2)
     readings, cells = int((m.kind == kind).sum()), int((r.estimation.cells.kind == kind).sum())
     repeated, freedom = _repeated(r, kind)
@@ -386,7 +387,7 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
         alike, clear = shared * estimated * share / kept, ASSUMED.clear * of_pairs * share / kept
         unlike -= shared * estimated * share
         of_readings = np.hypot(of_readings, of_pairs)
-    else:  # whether it is alike there and back is not known
+    else:  # whether it is the same in both directions is not known
         alike, clear, unlike = unlike, ASSUMED.clear * of_readings, 0.0
     found = LackOfFit(
         alike=alike if alike > clear else 0.0,
@@ -422,13 +423,14 @@ def _pairs(r: Residuals, kind: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _likeness(r: Residuals, there: np.ndarray, back: np.ndarray) -> tuple[float, float]:
-    """Return the variance that pairs of cells share, in their estimated noise's, and what fitting has left of it.
+    """Return the variance common to pairs of cells, in their estimated noise's, and the share that fitting leaves of
+    it.
 
-    Fitting makes the noise of a pair unlike each other, by what both give to the parameters and to the run's unknowns;
-    and it takes up that part of what they share. Residuals are cut at 2 σ, for an instrument that slips puts many
-    readings off; (P(|x| < 2))² of the covariance of normal ones is left.
+    Fitting makes the noise of a pair anticorrelated, by the contribution of both to the parameters and to the run's
+    unknowns; and it absorbs the same share of their common error. Residuals are cut at 2 σ, for an instrument that
+    slips puts many readings off; (P(|x| < 2))² of the covariance of normal ones is left.
     """
-    # Means of repeated readings are off by more than their noise where each has an error of its own.
+    # Means of repeated readings are off by more than their noise if each place has its own error.
     size = 2.0 * max(1.0, MEDIAN_TO_SIGMA * float(np.median(np.abs(r.residual[there]))))
     cut = np.clip(r.residual, -size, size)
     groups = r.estimation.cells.group
@@ -439,7 +441,7 @@ def _likeness(r: Residuals, there: np.ndarray, back: np.ndarray) -> tuple[float,
 
 
 def _unread_backlash(r: Residuals) -> float:
-    """Return the RMS displacement, m, by half the backlash of a machine of which no reading tells a direction."""
+    """Return the RMS displacement, m, by half the backlash of a machine whose readings have no direction."""
     m, space = r.estimation.measurements, r.estimation.space
     if (m.direction != UNKNOWN).any() or space.block("backlash") is not None:
         return 0.0
@@ -455,11 +457,11 @@ def _unread_backlash(r: Residuals) -> float:
 
 
 def _of_priors(r: Residuals, metric: np.ndarray) -> float:
-    """Return how well the logarithm of a tool error to expect is known, as the sizes of priors are estimates.
+    """Return the uncertainty of the logarithm of an expected tool error, as the sizes of priors are estimates.
 
     A size that n parameters determine is known to 1/√(2n) of itself, and moves the squared error by its prior's share
-    of it: with C = (N + T⁻²)⁻¹, tr(M·C·T⁻²·C)/tr(M·C). Of a length map or a field, coarse terms determine the size and
-    fine ones are taken to be in proportion.
+    of it: with C = (N + T⁻²)⁻¹, tr(M·C·T⁻²·C)/tr(M·C). For a length map or a field, coarse terms determine the size and
+    fine ones are assumed to be in proportion.
     """
     posterior = r.solution.posterior
     expected = float(np.vdot(metric, posterior.covariance))
@@ -477,7 +479,7 @@ def _of_priors(r: Residuals, metric: np.ndarray) -> float:
 
 
 def _held_by_priors(r: Residuals) -> bool:
-    """Return whether what a fit expects of the tool comes from the priors rather than from the readings."""
+    """Return whether the expected tool error follows from the priors rather than from the readings."""
     metric, posterior, m = r.metrics[0], r.solution.posterior, r.estimation.measurements
     if not metric.any():
         return False
@@ -488,7 +490,7 @@ def _held_by_priors(r: Residuals) -> bool:
 
 
 def _unstated(m: MeasurementSet) -> str:
-    """Return a remark on lengths whose noise is assumed, for the machine's own may hide in it; empty if none is."""
+    """Return a note on lengths whose noise is assumed, since the machine's own may be part of it; empty if none is."""
     unstated = np.unique(m.kind[~np.isfinite(m.uncertainty)])
     listed = [
         f"{KINDS[k]} {DEFAULT_UNCERTAINTY[KINDS[k]] * 1e6:g} µm" for k in unstated if KINDS[k] not in ANGULAR_KINDS

@@ -1,4 +1,4 @@
-"""What the package's lifecycle nodes have in common: topics, timers and services under one guard, log, diagnostics."""
+"""Shared by the package's lifecycle nodes: topics, timers and services under one guard, log, diagnostics."""
 
 from __future__ import annotations
 
@@ -45,7 +45,8 @@ from .status import ERROR, HealthReport, Refusals, joined
 
 _LAST, _RELIABLE, _BEST_EFFORT = HistoryPolicy.KEEP_LAST, ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
 
-# Commands: each must arrive. A hundred wait while a busy processor pauses for 0.1 s at 1 kHz, or a cable repeats.
+# Commands: each must arrive. A hundred wait while a busy processor pauses for 0.1 s at 1 kHz, or lost ones are
+# repeated.
 COMMAND_QOS = QoSProfile(depth=100, history=_LAST, reliability=_RELIABLE)
 
 # Publishers of states: the newest only, to reliable subscribers too, as those with rclpy's defaults are
@@ -54,7 +55,7 @@ STATE_QOS = QoSProfile(depth=1, history=_LAST, reliability=_RELIABLE)
 # Subscriptions of states, however published: only the newest counts, an old one need not be repeated
 NEWEST_QOS = QoSProfile(depth=1, history=_LAST, reliability=_BEST_EFFORT)
 
-# Subscriptions of sensors, however they publish
+# Subscriptions of sensors, for any publisher's QoS
 SENSOR_QOS = QoSProfile(depth=10, history=_LAST, reliability=_BEST_EFFORT)
 
 # Rare messages, each of which counts: diagnostics, markers
@@ -63,7 +64,7 @@ EVENT_QOS = QoSProfile(depth=10, history=_LAST, reliability=_RELIABLE)
 # A state that late subscribers must receive too
 LATCHED_QOS = QoSProfile(depth=1, history=_LAST, reliability=_RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
-# What of a topic's QoS a user may override by parameters; subscriptions have no lifespan
+# QoS policies of a topic that a user may override by parameters; subscriptions have no lifespan
 OVERRIDES = QoSOverridingOptions(
     (
         QoSPolicyKind.HISTORY,
@@ -78,25 +79,25 @@ TRANSITIONS = ("on_configure", "on_activate", "on_deactivate", "on_cleanup", "on
 
 CHECK_PERIOD = 0.05  # Period at which a node evaluates its state, s
 
-# How long the last message waits to be acknowledged: that may take DDS 3 s, and the dead never do it
+# Longest wait for the last message's acknowledgement: DDS may take 3 s, and dead subscribers never send it
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.4)
 
 
 class CallbackGuard:
-    """The one guard around everything that ROS calls in a node: it catches what a callback raises, and counts it.
+    """The guard around everything that ROS calls in a node: it catches and counts what a callback raises.
 
-    A message, a timer, an event or a request must not end a running machine's node, whoever sent it and whatever is
-    wrong with it or with us. What is caught here was foreseen nowhere else, so it is an error for a second. A service
-    also answers: anybody may ask for a transition that is not allowed now, and rclpy raises then.
+    A message, a timer, an event or a request must not end a running machine's node, whoever sent it and whatever the
+    error. An exception caught here was not foreseen elsewhere, so it is an error for a second. A service also answers:
+    anyone may request a transition that is not allowed now, and rclpy raises then.
     """
 
     def __init__(self, warn: Callable[[str, str], None], complain: Callable[[str, str], None]) -> None:
         self._warn, self._complain = warn, complain  # log with a cause, for throttling
         self._caught, self._requests = Refusals(), Refusals()
-        self.request = ""  # name of the service that answers at this moment; empty between requests
+        self.request = ""  # name of the service that is answering; empty between requests
 
     def caught(self, what: str, error: Exception) -> None:
-        """Count and log what a callback has raised."""
+        """Count and log an exception of a callback."""
         text = printable(f"{what}: {described(error)}", LONGEST_TEXT)
         self._caught.add(what, text, time.monotonic())
         self._complain(what, f"error in a callback, the node goes on: {text}")
@@ -104,19 +105,19 @@ class CallbackGuard:
     def around(self, what: str, callback: Callable[..., Any], otherwise: Any = None) -> Callable[..., Any]:
         """Return a callback that never raises; it returns `otherwise` instead."""
 
-        @functools.wraps(callback)  # rclpy asks callbacks how many arguments they take
+        @functools.wraps(callback)  # rclpy inspects the number of arguments of callbacks
         def guarded(*arguments: Any, **keywords: Any) -> Any:
             try:
                 return callback(*arguments, **keywords)
-            except Exception as error:  # of any kind: that is what the guard is for
+            except Exception as error:  # of any kind: this is the guard's purpose
                 self.caught(what, error)
                 return otherwise
 
         return guarded
 
     def answering(self, name: str, kind: Any, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """Return a service's callback that refuses a request where the one it has would raise: what the response does
-        not fill in is false or empty."""
+        """Return a service's callback that refuses a request when the given one raises: unset fields of the response
+        are false or empty."""
 
         def answer(request: Any, response: Any) -> Any:
             self.request = name
@@ -137,7 +138,7 @@ class CallbackGuard:
         return answer
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
-        """Yield what diagnostics have to say."""
+        """Yield the guard's findings for diagnostics."""
         if reasons := self._caught.reasons(now):
             yield ERROR, f"error in a callback: {reasons}"
 
@@ -151,21 +152,21 @@ class CallbackGuard:
 
 
 class MachineNode(LifecycleNode):
-    """A lifecycle node with a table of parameters. Whatever ROS calls here, it calls through a :class:`CallbackGuard`.
+    """A lifecycle node with a table of parameters. ROS calls everything here through a :class:`CallbackGuard`.
 
-    Topics have a QoS that a user may override by parameters. rclpy writes the overrides into the profile that it is
-    given, so every topic gets a copy of its own. A ParameterError says which parameter's value is not allowed.
+    A user may override the QoS of topics by parameters. rclpy writes the overrides into the given profile, so every
+    topic gets its own copy. A ParameterError reports a parameter's invalid value.
     """
 
     def __init__(self, name: str, table: Sequence[Parameter] = (), **options: Any) -> None:
         self._active = False
         self._throttle = Throttle()
         self.guard = CallbackGuard(self.log_warning, self.log_error)
-        for change in TRANSITIONS:  # rclpy would swallow what they raise, and say nothing
+        for change in TRANSITIONS:  # rclpy would swallow their exceptions silently
             setattr(self, change, self.guard.around(change, getattr(self, change), TransitionCallbackReturn.ERROR))
         super().__init__(name, **options)
         self._logger = PlainLogger(self.get_logger().name, lambda: bool(self.guard.request))
-        for service in self.services:  # the lifecycle's are not made by create_service
+        for service in self.services:  # create_service does not make the lifecycle's services
             callback = service.callback
             callback = possible_only(self, callback) if service.srv_type is ChangeState else callback
             service.callback = self.guard.answering(service.srv_name, service.srv_type, callback)
@@ -187,16 +188,16 @@ class MachineNode(LifecycleNode):
 
     @property
     def active(self) -> bool:
-        """Whether the node acts."""
+        """Whether the node is active."""
         return self._active
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop acting; the struts keep their last command."""
+        """Stop commanding; the struts keep their last command."""
         self._active = False
         return super().on_deactivate(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop acting for good: say so, then close what is open, so that nothing more is published."""
+        """Stop permanently: publish the last status, then close everything, so that nothing more is published."""
         self.publish_last_status()
         if state.state_id != State.PRIMARY_STATE_UNCONFIGURED:
             self.on_cleanup(state)
@@ -206,7 +207,7 @@ class MachineNode(LifecycleNode):
         """Publish the last status before the node ends."""
 
     def destroy_node(self) -> None:
-        """Leave ROS at once, lifecycle services included."""
+        """Leave ROS at once, with the lifecycle services."""
         for ticker in self._tickers.values():
             ticker.close()
         super().destroy_node()
@@ -214,7 +215,7 @@ class MachineNode(LifecycleNode):
 
     @contextmanager
     def rolled_back_on_error(self) -> Iterator[None]:
-        """Close what is opened in this block where it raises, so that the node is as it was before."""
+        """Close everything opened in this block if it raises, so that the node is as before."""
 
         def ends() -> list[Any]:
             return [*self.timers, *self.subscriptions, *self.services, *self.clients, *self.publishers]
@@ -251,19 +252,19 @@ class MachineNode(LifecycleNode):
         """Apply parameters that have been set while the node runs; called at other times too, with no names."""
 
     def simulated_time(self) -> Callable[[], int] | None:
-        """Return what reads the simulated time, ns; None where the time is the system's."""
+        """Return a function that reads the simulated time, ns; None if the time is the system's."""
         simulated = bool(self.get_parameter("use_sim_time").value)
         return (lambda: int(self.get_clock().now().nanoseconds)) if simulated else None
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
-        """Return a timer on a clock that nobody can set: the node's own stops for as long as it is set back.
+        """Return a timer on a clock that cannot be set: the node's own would stop while it is set back.
 
         Its period stays, and it is never reset: see :class:`~.rclpy_compat.Alarm`.
         """
         return self.create_timer(period, callback, clock=self._steady)
 
     def at_rate(self, name: str, callback: Callable[[], None]) -> Alarm:
-        """Return what calls back as many times a second as a parameter says, also when that is set anew; 0: never."""
+        """Return a timer whose rate is a parameter, which may change at any time; 0: never."""
         self._tickers[name] = ticker = Alarm(self, self.guard.around(name, callback), self._options[name])
         return ticker
 
@@ -291,7 +292,7 @@ class MachineNode(LifecycleNode):
         return super().create_service(srv_type, srv_name, guarded, *arguments, **options)
 
     def publish_on(self, message_type: type, topic: str, qos: QoSProfile, deadline: float = 0.0) -> Publisher:
-        """Return a publisher; it offers to publish every `deadline` s at least, 0: it offers nothing."""
+        """Return a publisher; it offers `deadline`, s, between messages, 0: none."""
         qos = copy.copy(qos)
         qos.deadline = Duration(seconds=deadline)
         return self.create_publisher(message_type, topic, qos, qos_overriding_options=OVERRIDES)
@@ -368,24 +369,25 @@ class MachineNode(LifecycleNode):
             self.get_logger().error(line, throttled=True)
 
     def ignore(self, what: str, error: HexapodError, counts: Refusals, reason: str = "") -> None:
-        """Count and log a message that an active node cannot use, by the error's reason unless another is given."""
+        """Count and log a message that an active node rejects, by the error's reason unless another is given."""
         if self._active:
             counts.add(reason := reason or error.reason, str(error), time.monotonic())
             self.log_warning(f"{what} {reason}", f"{what} ignored: {error}")
 
     def note(self, cause: str, text: str) -> None:
-        """Log what was done, once per cause and second."""
+        """Log an action, once per cause and second."""
         if (line := self._throttle.allow(f"note {cause}", text)) is not None:
             self.get_logger().info(line)
 
     def set_hardware_id(self, what: str) -> None:
-        """Name the machine or component that this node serves from now on in its status: within its namespace, so that
-        two of a kind are told apart. The status's name stays: an aggregator would wait for the old one for ever."""
+        """Set the hardware_id of this node's status to the machine or component it serves, with the namespace, so that
+        two of a kind are distinguished. The status's name stays: an aggregator would otherwise wait for the old one for
+        ever."""
         self.hardware_id = f"{self.get_namespace()}/{what}".strip("/")
         self._report = HealthReport(f"{self.get_fully_qualified_name()[1:]}: state", self.hardware_id)
 
     def publish_status(self, level: bytes, text: str, values: Callable[[], dict[str, str]]) -> None:
-        """Publish level, text and values when they are due, with what the guard has caught; log steps of the clock."""
+        """Publish level, text and values when they are due, with the guard's findings; log steps of the clock."""
         now = time.monotonic()
         self.clock.read()
         if (steps := self.clock.set_back + self.clock.set_forward) != self._steps_logged:

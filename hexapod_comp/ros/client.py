@@ -25,21 +25,21 @@ from .messages import StrutReader, message_pose, nanoseconds_of, pose_message
 from .process import RosSession
 from .status import status_prefix
 
-# Answers are all kept until they are read: a witness must not lose any
+# Answers are all kept until they are read: a recorder must not lose any
 LISTENER_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
 
 TRACK_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 
-# A command without an answer after this long is lost, s: a busy computer may hold it up for seconds
+# A command without an answer after this time is lost, s: a busy computer may delay it by seconds
 ANSWER_TIMEOUT = 5.0
 
 
 @dataclass
 class Sent:
-    """One command on its way."""
+    """One command and its answer."""
 
     sent_at: float  # monotonic times, s; NaN while unanswered
-    refused: int  # commands refused before, and those of them for their age
+    refused: int  # number of commands refused before, and of those refused for their age
     too_old: int
     message: PoseStamped
     answered_at: float = float("nan")  # monotonic times, s; NaN while unanswered
@@ -48,16 +48,17 @@ class Sent:
 
 
 class LoopClient:
-    """Commands the compensator and listens to everything around it."""
+    """Commands the compensator and subscribes to all its topics."""
 
     def __init__(self, frame_id: str = "base", namespace: str = "") -> None:
         self._session = RosSession("hexapod_comp_client", namespace)
         self.node, self._spin_once, self.close = self._session.node, self._session.spin_once, self._session.close
         self._frame_id, self._reader = frame_id, StrutReader()
         self.sent: dict[int, Sent] = {}  # by their stamps, ns
-        self.track: list[tuple[np.ndarray, int]] = []  # where the tool went, m, and how many commands were sent by then
+        # positions of the tool, m, and the number of commands sent by then
+        self.track: list[tuple[np.ndarray, int]] = []
         self.diagnostics: dict[str, str] = {}  # values of the compensator's newest status
-        self.true_count = 0  # true poses that came
+        self.true_count = 0  # received true poses
         self._streamed: int | None = None
         self._status_name = status_prefix(self.node.get_namespace(), "compensator")
         self._counted_before: tuple[int, int] | None = None
@@ -96,7 +97,7 @@ class LoopClient:
 
     @property
     def has_true_pose(self) -> bool:
-        """Whether somebody tells where the tool really is."""
+        """Whether the tool's true pose is published."""
         return "tool_pose_true" in self._newest
 
     @property
@@ -124,7 +125,7 @@ class LoopClient:
             self._spin_once(min(left, 0.02))
 
     def connected(self) -> bool:
-        """Return whether commands reach a compensator and its answers and pose estimates come back."""
+        """Return whether commands reach a compensator and its answers and pose estimates arrive."""
         return (
             self._publisher.get_subscription_count() > 0
             and self.node.count_publishers("strut_commands") > 0
@@ -139,8 +140,8 @@ class LoopClient:
     def counted(self) -> tuple[int, int]:
         """Return how many of this client's commands the compensator has accepted and refused.
 
-        Commands that it does not count within two diagnostics periods are lost. Other clients' commands
-        count as ours: nobody else should be sending any.
+        Commands that it does not count within two diagnostics periods are lost. Other clients' commands count as ours:
+        there should be none.
         """
         accepted_before, refused_before = self._counted_before or (0, 0)
         end = time.monotonic() + 2.5
@@ -157,7 +158,7 @@ class LoopClient:
         self.spin_until(future.done, 5.0, "the service enable_compensation")
 
     def send(self, pose: Pose) -> Sent:
-        """Send one command and return its record, which the answer will fill."""
+        """Send one command and return its record, to which the answer will be added."""
         return self._send(pose_message(pose, self._frame_id))
 
     def _send(self, message: PoseStamped) -> Sent:
@@ -172,10 +173,10 @@ class LoopClient:
         return int(self.diagnostics.get("refused", "0")), int(self.diagnostics.get("refused.stamp_past", "0"))
 
     def wait_for_answer(self, entry: Sent, timeout: float = ANSWER_TIMEOUT) -> Sent:
-        """Wait until command and correction have come back; return the record that was answered.
+        """Wait until command and correction have arrived; return the record that was answered.
 
-        A pose that a busy computer handed over too late is sent again, with a new stamp: the machine waits where it is,
-        and the next pose on a path would be too far from there.
+        A pose that a busy computer delivered too late is sent again, with a new stamp: the machine waits, and the next
+        pose on a path would be too far from its position.
         """
         end = entry.sent_at + timeout
         while not (np.isfinite(entry.command[0]) and np.isfinite(entry.correction[0])):
@@ -192,10 +193,10 @@ class LoopClient:
         return entry
 
     def stream(self, path: Path, each: Callable[[int], None] | None = None) -> list[Sent]:
-        """Send a path at its rate and return the records; :attr:`track` then holds where the tool went.
+        """Send a path at its rate and return the records; :attr:`track` then holds the tool's positions.
 
-        A command waits for the answer to the one before, so that a stall of any process delays the path
-        instead of making it jump.
+        A command waits for the answer to the previous one, so that a stall of any process delays the path and causes no
+        jump.
         """
         entries: list[Sent] = []
         self.track = []
@@ -216,7 +217,7 @@ class LoopClient:
         return entries
 
     def hold(self, pose: Pose, rate: float, until: Callable[[], bool], timeout: float, what: str) -> Sent:
-        """Send one pose again and again, as a controller at standstill does, until a condition holds."""
+        """Send one pose repeatedly, as a controller at standstill does, until a condition holds."""
         end = time.monotonic() + timeout
         while True:
             entry = self.wait_for_answer(self.send(pose))
@@ -248,7 +249,7 @@ AnyMachine = TypeVar("AnyMachine", bound="Machine")
 
 
 class MoveError(HexapodError):
-    """A move was refused, or has ended before its target; ``reason`` is what ended it: limit, refusal, person, …"""
+    """A move was refused, or ended before its target; ``reason`` is the cause: limit, refusal, person, …"""
 
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(f"{reason}: {text}")
@@ -257,7 +258,7 @@ class MoveError(HexapodError):
 
 @dataclass(frozen=True)
 class MoveState:
-    """What the mover reports of a move."""
+    """The mover's report of a move."""
 
     state: str  # idle, planning, moving, settling, arrived, stopped
     text: str
@@ -265,7 +266,7 @@ class MoveState:
     time_left: float  # s
     stopped_by: str  # empty: it was not stopped
     request: int  # stamp of the message that asked for it, ns
-    refused_request: int  # stamp of the newest message that was refused, ns
+    refused_request: int  # stamp of the newest refused message, ns
     refusal: str
     ready: bool = True  # the mover knows the machine, and where its tool stands
 
@@ -273,12 +274,8 @@ class MoveState:
 class Machine:
     """A running machine with a mover: moves its tool and waits until it has arrived.
 
-    Parameters
-    ----------
-    namespace : str, optional
-        Where the machine's nodes are.
-    mover : str, optional
-        Name of the mover's node.
+    Parameters ---------- namespace : str, optional Namespace of the machine's nodes. mover : str, optional Name of the
+    mover's node.
 
     Raises
     ------
@@ -314,7 +311,7 @@ class Machine:
         return self.state
 
     def close(self) -> None:
-        """Leave ROS; a move that is under way goes on."""
+        """Leave ROS; a move in progress continues."""
         self._session.close()
 
     def move(
@@ -328,7 +325,7 @@ class Machine:
         """Move the tool along a straight line, with the shortest turn, and return when it has arrived.
 
         It has arrived when its estimate, from measured struts, has stayed within the mover's tolerances of the target
-        for the settling time. A move that is under way is braked first, and its caller gets a MoveError, ``replaced``.
+        for the settling time. A move in progress is braked first, and its caller gets a MoveError, ``replaced``.
 
         Parameters
         ----------
@@ -348,11 +345,7 @@ class Machine:
         MoveState
             The last one, ``arrived``.
 
-        Raises
-        ------
-        MoveError
-            The move was refused or stopped; ``reason`` says by what.
-        NoAnswerError
+        Raises ------ MoveError The move was refused or stopped; ``reason`` is the cause. NoAnswerError
             The mover did not answer, or the tool had not arrived in time.
         """
         stamp = self._session.node.get_clock().now()

@@ -1,6 +1,6 @@
 """The compensator node: tool pose commands in, compensated strut commands and pose estimates out.
 
-It holds no mathematics. A command is read, passes the guards, goes through the core, is published, written into the
+It holds no mathematics. A command is parsed, passes the guards, goes through the core, is published, written into the
 journal and added to the track of the struts: :meth:`CompensatorNode._process_command`. A reading passes its own guards,
 and is estimated and published: :meth:`CompensatorNode._on_states`. Run it with ``ros2 run hexapod_comp compensator`` or
 ``python -m hexapod_comp.ros.compensator``; doc/nodes.md lists topics, services and parameters.
@@ -52,12 +52,12 @@ from .requests import Requests
 from .sensors import SensorTopic
 from .status import ADVICE, OTHERWISE, WARN, CompensatorStatus, seconds
 
-ESTIMATE_PERIOD = 0.02  # How often the pose is estimated from the node's own commands while there is no feedback, s
+ESTIMATE_PERIOD = 0.02  # Period of pose estimates from the node's own commands without feedback, s
 JITTER = 0.02  # A command that waits no longer than this, s, is not late, nor is an alarm
 
 
 class StateGuard(Guard):
-    """Refuses commands in a frame that the machine has not, and while one of the standing guards has a problem."""
+    """Refuses commands in an unknown frame, and while one of the standing guards has a problem."""
 
     def __init__(self, frames: dict[str, Struct], status: CompensatorStatus) -> None:
         self._frames, self._status = frames, status
@@ -72,13 +72,13 @@ class StateGuard(Guard):
 
 
 class Start(Guard):
-    """Lets the first command begin where the struts are known to be, and asks for readings where these are required."""
+    """Lets the first command begin at the struts' known positions, and requires readings if so configured."""
 
     def __init__(self, compensator: Compensator, status: CompensatorStatus) -> None:
         self._compensator, self._status = compensator, status
 
     def check(self, sample: Sample) -> None:
-        """Raise a CommandError, ``no_feedback``; else the core knows where the struts stand."""
+        """Raise a CommandError, ``no_feedback``; else the core knows the struts' positions."""
         status, now = self._status, sample.now
         if not (status.fresh_start or status.options["require_feedback"]):
             return
@@ -101,7 +101,7 @@ class CompensatorNode(MachineNode):
         self._logged_problem = ""
         self._unestimated = 0  # stamp of an answer whose pose was not estimated yet, ns
         self._compensator: Compensator | None = None
-        self._instrument: PoseInstrument | None = None  # there with ``fusion.enabled``
+        self._instrument: PoseInstrument | None = None  # present with ``fusion.enabled``
 
     @property
     def compensator(self) -> Compensator:
@@ -295,7 +295,8 @@ class CompensatorNode(MachineNode):
             status.reading_stamps.check(sample)
             struts = sample.values or ()
             track.check_stroke(struts)
-            # Before the check for a jump: one reading off its command stops the machine, be it strut or encoder.
+            # Before the check for a jump: one reading off its command stops the machine, whether strut or encoder
+            # fails.
             if self._active and track.follow(struts, now - sample.age):
                 status.bad_feedback.add(track.reason, track.problem, now)
             track.check_jump(sample)
@@ -308,7 +309,7 @@ class CompensatorNode(MachineNode):
             if self._active:
                 self._outputs.estimate(pose if instrument is None else instrument.weighed(pose), sample.stamp)
                 self._outputs.nominal(sample.stamp, track.mean)
-                if instrument is not None:  # last: readings of earlier moments go through the same core
+                if instrument is not None:  # last: readings of earlier times go through the same core
                     instrument.add_struts(struts, now - sample.age)
         except HexapodError as error:
             self.ignore("strut_states", error, status.bad_feedback)
@@ -321,7 +322,7 @@ class CompensatorNode(MachineNode):
         self.compensator.set_humidity(self._thermometers.update(HUMIDITY, message.relative_humidity, now), now)
 
     def _estimate_from_commands(self) -> None:
-        """Without feedback, estimate the pose from the newest command, at a rate that leaves the loop alone."""
+        """Without feedback, estimate the pose from the newest command, at a rate that does not load the loop."""
         stamp, self._unestimated, now = self._unestimated, 0, time.monotonic()
         instrument = self._instrument if self._status.commands.count else None
         if not (stamp or instrument) or not self._active or self._status.fed(now):
@@ -339,7 +340,7 @@ class CompensatorNode(MachineNode):
     # ---- state ----
 
     def _forget_commands(self) -> None:
-        """Forget the last command, but not where it has sent the struts."""
+        """Forget the last command, but not the struts' commanded positions."""
         self.compensator.reset()
         if self._instrument is not None:
             self._instrument.reset()
@@ -373,11 +374,11 @@ class CompensatorNode(MachineNode):
 
 
 class Pacing:
-    """Commands that come sooner than the struts may go there, bunched on their way or in a burst after a pause: they
-    wait, in their order, for up to the parameter ``catch_up_within``, s.
+    """Commands that arrive sooner than the struts may move, bunched on the way or in a burst after a pause: they wait,
+    in their order, for up to the parameter ``catch_up_within``, s.
 
-    All that wait are refused when one has waited longer; while the node itself stood still, none has waited for the
-    struts. 0: only the newest waits, and those that it replaces are dropped.
+    All waiting ones are refused when one has waited longer; time in which the node itself was not scheduled does not
+    count. 0: only the newest waits, and those that it replaces are dropped.
     """
 
     def __init__(
@@ -396,7 +397,7 @@ class Pacing:
         return float(self._status.options["catch_up_within"])
 
     def begin(self, message: bytes, now: float, wait: float) -> None:
-        """Let a command wait, s, that came too early."""
+        """Let a command that was too early wait, s."""
         self._enqueue(message, now)
         self._wait_for_struts(now, wait)
 
@@ -420,7 +421,8 @@ class Pacing:
         self._alarm.close()
 
     def _enqueue(self, message: bytes, now: float) -> None:
-        self.waiting.append((now - self._stood_still, message))  # when it came, without the time the node stood still
+        # time of arrival, without the time in which the node was not scheduled
+        self.waiting.append((now - self._stood_still, message))
         self._status.waited += 1
 
     def _wait_for_struts(self, now: float, wait: float) -> None:

@@ -1,9 +1,9 @@
 """Start a program with the URDF that the compensator publishes: ``python -m hexapod_comp.ros.described PROGRAM ...``.
 
-robot_state_publisher takes the URDF as a parameter when it starts. Which geometry and joint names the compensator uses
-may stand in any of its parameter files, so the compensator alone knows its URDF. This program waits for it, writes it
-into a parameter file, and then becomes the program that it was asked to start, with that file as its last argument. The
-topic stays the compensator's: what that program publishes of the URDF goes to a topic below its own name.
+robot_state_publisher takes the URDF as a parameter when it starts. The geometry and joint names may be in any of the
+compensator's parameter files, so only the compensator knows its URDF. This program waits for it, writes it into a
+parameter file, and then replaces itself by the requested program, with that file as its last argument. The topic stays
+the compensator's: that program's own copy of the URDF goes to a topic below its own name.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from .base import LATCHED_QOS
 
 TOPIC = "robot_description"
 
-WARN_AFTER = 5.0  # Without a URDF for this long the log says what is missing, s
+WARN_AFTER = 5.0  # Without a URDF for this time the log reports what is missing, s
 
 
-SIGNALS_SEEN_WITHIN = 0.2  # rclpy waits in C: Python handles a signal when the wait ends, s
+SIGNALS_SEEN_WITHIN = 0.2  # rclpy waits in C: Python handles a signal after the wait, s
 
 
 def wait_for_description(arguments: Sequence[str]) -> str:
@@ -53,7 +53,7 @@ def wait_for_description(arguments: Sequence[str]) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Become the program that the arguments name, once the URDF is known."""
+    """Run the program of the arguments in this process, once the URDF is known."""
     program, *arguments = sys.argv[1:] if argv is None else argv
     try:
         text = wait_for_description([program, *arguments])

@@ -1,4 +1,4 @@
-"""A topic's messages with units, rate and age, where there is no ``ros2`` command: what the verb ``echo`` prints."""
+"""A topic's messages with units, rate and age, without the ``ros2`` command: the verb ``echo``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ..pose import Pose
 from .messages import nanoseconds_of, read_message
 
 DISCOVERY_TIME = 3.0  # How long a topic may take to be discovered, s; Fast DDS needs 0.1 to 1 s
-RATE_WINDOW = 2.0  # The rate is that of the messages of this last time, s
+RATE_WINDOW = 2.0  # Window of the rate, s
 QUEUE = 1000  # Messages that may wait while the terminal is slow: a second of commands
 
 ANGLES = ("alpha", "beta", "gamma")
@@ -33,7 +33,8 @@ LEVELS = {b"\x00": "OK", b"\x01": "WARN", b"\x02": "ERROR", b"\x03": "STALE"}
 
 
 class MessageField(NamedTuple):
-    """A number or text of a message; the unit is as JSON keys spell it: mm, um, deg, urad, mm_s, degC, percent, s."""
+    """A number or text of a message; the unit is in the form of JSON keys: mm, um, deg, urad, mm_s, degC, percent,
+    s."""
 
     name: str
     value: Any
@@ -45,10 +46,10 @@ class MessageField(NamedTuple):
         return f"{self.name}_{self.unit}" if self.unit else self.name
 
 
-# Units as people read them, where that is not how keys spell them
+# Units for display, where they differ from those in keys
 UNITS = {"um": "µm", "urad": "µrad", "deg": "°", "mm_s": "mm/s", "degC": "°C", "percent": "%"}
 
-# Digits after the point: a nanometre; SI numbers of topics that are not ours get nine
+# Digits after the point: a nanometre; SI numbers of foreign topics get nine
 DIGITS = {"mm": 6, "um": 3, "deg": 6, "urad": 3, "mm_s": 3, "degC": 2, "percent": 1, "s": 6, "m": 9, "rad": 9}
 
 
@@ -60,7 +61,7 @@ def message_fields(topic: str, message: Any) -> list[MessageField]:
         rows += [MessageField(axis, value * 1e3, "mm") for axis, value in zip("xyz", (p.x, p.y, p.z), strict=True)]
         try:
             degrees = np.degrees(Pose.from_quaternion((0.0, 0.0, 0.0), quaternion).angles()).tolist()
-        except HexapodError:  # not of norm 1: a listener shows what was sent
+        except HexapodError:  # not of norm 1: show what was sent
             return rows + [MessageField(f"q{axis}", value) for axis, value in zip("xyzw", quaternion, strict=True)]
         return rows + [MessageField(name, angle, "deg") for name, angle in zip(ANGLES, degrees, strict=True)]
     if isinstance(message, PoseWithCovarianceStamped):  # a small displacement and rotation vector
@@ -131,7 +132,7 @@ class EchoedMessage(NamedTuple):
     rate: float  # of the last messages, Hz; NaN for the first one
 
     def text(self) -> str:
-        """Return it for people: a line with rate and age, then a line for each number."""
+        """Return it as text: a line with rate and age, then a line for each number."""
         parts = [self.topic]
         parts += [f"{self.rate:.1f} Hz"] if math.isfinite(self.rate) else []
         parts += [f"{self.age * 1e3:.1f} ms old"] if math.isfinite(self.age) else ["no stamp"]
@@ -144,13 +145,13 @@ class EchoedMessage(NamedTuple):
         return "\n".join(lines)
 
     def record(self) -> dict[str, Any]:
-        """Return it for programs: one flat object, units in the keys."""
+        """Return it as one flat object, units in the keys."""
         head = {"topic": self.topic, "stamp_s": self.stamp, "age_ms": self.age * 1e3, "rate_hz": self.rate}
         return {**head, **{row.key.strip(): row.value for row in self.rows}}
 
 
 class Echo:
-    """Subscribes to one topic, whatever its type, with the QoS that its publishers offer."""
+    """Subscribes to one topic of any type, with the QoS that its publishers offer."""
 
     def __init__(
         self, node: Node, spin_once: Callable[[float], None], topic: str, receive: Callable[[EchoedMessage], None]
@@ -215,7 +216,7 @@ class MessageIntervals:
         self._recent: deque[float] = deque()
 
     def add(self, time: float) -> None:
-        """Count a message that came at a time."""
+        """Count a message by its time of arrival."""
         if self.count:
             apart = time - self._recent[-1]
             self.shortest, self.longest = min(self.shortest, apart), max(self.longest, apart)
@@ -237,14 +238,14 @@ class MessageIntervals:
         return _rate(len(self._recent), self._recent[-1] - self._recent[0]) if self.count else math.nan
 
     def text(self) -> str:
-        """Return it for people, as ``ros2 topic hz`` does."""
+        """Return it as text, as ``ros2 topic hz`` does."""
         if self.count < 2:
             return f"messages: {self.count}"
         between = f"{self.shortest * 1e3:.1f} to {self.longest * 1e3:.1f} ms apart"
         return f"messages: {self.count}, {self.rate:.2f} Hz, {between}"
 
     def record(self) -> dict[str, Any]:
-        """Return it for programs."""
+        """Return it for JSON."""
         apart = {"shortest_ms": self.shortest * 1e3, "longest_ms": self.longest * 1e3}
         return {"messages": self.count, "rate_hz": self.rate, **(apart if self.count > 1 else {})}
 
@@ -254,6 +255,6 @@ def _rate(count: int, span: float) -> float:
 
 
 def published_topics(node: Node) -> dict[str, str]:
-    """Return the topics that somebody publishes, by name, each with its type."""
+    """Return the published topics, by name, each with its type."""
     topics = sorted(node.get_topic_names_and_types())
     return {name: kinds[0] for name, kinds in topics if node.count_publishers(name)}

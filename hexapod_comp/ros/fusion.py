@@ -1,6 +1,7 @@
-"""The pose instrument of a compensator: reads and judges ``tool_pose_measured``, and feeds what it shows of the drift.
+"""The pose instrument of a compensator: parses and validates ``tool_pose_measured``, and feeds the drift to the
+compensation.
 
-What is made of the readings is :mod:`hexapod_comp.compensation.fusion`'s; doc/nodes.md has topic and parameters.
+:mod:`hexapod_comp.compensation.fusion` processes the readings; doc/nodes.md has topic and parameters.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from .status import CompensatorStatus
 
 TOPIC = "tool_pose_measured"
 MESSAGES = {"pose_with_covariance": PoseWithCovarianceStamped, "pose": PoseStamped}
-FEED_PERIOD = 1.0  # How often the drift is handed to the compensation, s: it is slow, and each time a model is made
+FEED_PERIOD = 1.0  # Period at which the drift is passed to the compensation, s: it is slow, and each time makes a model
 
 
 def fusion_rules(options: dict[str, Any]) -> FusionRules:
-    """Return what is assumed, as parameters say."""
+    """Return the filter's rules from the parameters."""
     return FusionRules(
         drift_rate=options["fusion.drift_rate"],
         initial=options["fusion.initial_deviation"],
@@ -43,7 +44,7 @@ def fusion_rules(options: dict[str, Any]) -> FusionRules:
 
 
 class PoseInstrument:
-    """Hears the instrument of a configured node; made only with ``fusion.enabled``."""
+    """Receives the instrument's readings in a configured node; made only with ``fusion.enabled``."""
 
     def __init__(
         self, node: MachineNode, compensator: Compensator, status: CompensatorStatus, frames: dict[str, Pose]
@@ -55,11 +56,11 @@ class PoseInstrument:
         status.fusion = self.fusion
 
     def follow(self) -> None:
-        """Go by the parameters as they are now, from the next reading on."""
+        """Apply the present parameters, from the next reading on."""
         self.fusion.rules = self.fusion.filter.rules = fusion_rules(self._options)
 
     def reset(self) -> None:
-        """Forget the drift; what is corrected of it ramps out."""
+        """Forget the drift; its correction ramps out."""
         self.fusion.reset()
         self._status.pose_stamps.reset()
         self._fed = -math.inf
@@ -77,12 +78,12 @@ class PoseInstrument:
             self._node.log_warning("drift", self._status.drift_problem)
 
     def add_struts(self, struts: Sequence[float], made: float) -> None:
-        """Take struts, m, of a monotonic time, s, for the readings about them."""
+        """Store struts, m, of a monotonic time, s, for the readings about them."""
         for error in self.fusion.add_struts(struts, made):
             self._reject(error)
 
     def weighed(self, pose: np.ndarray) -> np.ndarray:
-        """Return what the compensator just estimated, weighed with the readings."""
+        """Return the compensator's estimate, weighed with the readings."""
         return self.fusion.weighed(pose)
 
     def close(self) -> None:

@@ -1,6 +1,6 @@
 """The compensator's interface: its parameters, the files they name, its inputs and what it publishes.
 
-The answers to commands alone are published by the loop itself, in :mod:`.compensator`.
+Only the answers to commands are published by the loop itself, in :mod:`.compensator`.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ POSES, STRUTS = "poses", "struts"  # Values of the parameter ``command_input``
 # but on a busy computer the middleware loses that now and then
 REPEATED_AFTER = 1.0
 
-# The largest time that a message can hold, ns: what is valid until later is valid until then
+# Largest time of a message, ns: later validities are limited to it
 LAST_STAMP = 2**31 * 10**9 - 1
 
-# Pages: each counts, and who comes late needs the last snapshot
+# Pages: each counts, and late subscribers need the last snapshot
 JOURNAL_QOS = QoSProfile(
     depth=10,  # a recorder's own queue is no longer than this
     history=HistoryPolicy.KEEP_LAST,
@@ -185,7 +185,7 @@ PROGRAM = Program(
 
 
 def temperature_rules(options: dict[str, Any]) -> tuple[Plausibility, float]:
-    """Return what counts as a temperature, and the time constant of their filter, s, as parameters say."""
+    """Return the limits for temperatures, and the time constant of their filter, s, from the parameters."""
     rules = Plausibility(
         rate=options["temperature_rate_limit"],
         spread=options["temperature_spread_limit"],
@@ -196,8 +196,8 @@ def temperature_rules(options: dict[str, Any]) -> tuple[Plausibility, float]:
 
 
 def frame_ids(geometry: HexapodGeometry, options: dict[str, Any]) -> dict[str, str]:
-    """Return the ``frame_id`` of poses in each frame of a machine, by the machine's names; a ParameterError where
-    another work frame's is that of the base or the usual work frame."""
+    """Return the ``frame_id`` of poses in each frame of a machine, by the machine's names; a ParameterError if another
+    work frame's is that of the base or the usual work frame."""
     ids = {BASE: options["base_frame"], WORK: options["work_frame"]}
     for name in geometry.work_frames:
         frame_id = ids.setdefault(name, f"{options['frame_prefix']}{name}")
@@ -207,9 +207,9 @@ def frame_ids(geometry: HexapodGeometry, options: dict[str, Any]) -> dict[str, s
 
 
 class MachineFiles:
-    """Geometry and model, as the parameters name them now, each from its folder at the start or from ``model_folder``.
+    """Geometry and model, as the parameters name them, each from its folder at the start or from ``model_folder``.
 
-    `sources` holds what was read last, word for word: ``geometry`` and ``model``.
+    `sources` holds the texts read last, unchanged: ``geometry`` and ``model``.
     """
 
     def __init__(self, options: dict[str, Any]) -> None:
@@ -226,7 +226,7 @@ class MachineFiles:
         return bool(self._options["model_file"] == IDEAL)
 
     def made_of(self) -> dict[str, Any]:
-        """Return what the worker's process needs to make geometry and model of the same texts."""
+        """Return what the worker's process needs to make geometry and model from the same texts."""
         folder = self._folders["model"]
         return {**self.sources, "folder": None if folder is None else str(folder)}
 
@@ -268,7 +268,7 @@ class PoseInput:
     yet."""
 
     def stamp(self, data: bytes) -> int:
-        """Return the stamp of a command, ns; 0 where there is none to be read."""
+        """Return the stamp of a command, ns; 0 if it has none."""
         sample = Sample(0.0)
         try:
             self.read(data, sample)
@@ -281,14 +281,15 @@ class StrutInput(PoseInput):
     """Nominal strut lengths on ``strut_setpoints``, m, by name: what a controller that plans struts itself commands a
     machine without errors.
 
-    They become the tool pose of that machine at once: what comes after, limits, stamps, journal and replay, knows poses
-    alone. The strut readings that such a controller receives are nominal too.
+    They become the tool pose of that machine at once: limits, stamps, journal and replay only use poses. The strut
+    readings that such a controller receives are nominal too.
     """
 
     topic, kind = "strut_setpoints", JointState
 
     def __init__(self, compensator: Compensator, names: list[str], frame_id: str) -> None:
-        self._compensator, self._frame_id = compensator, frame_id  # its last command is where the pose is sought from
+        # the search for the pose starts from its last command
+        self._compensator, self._frame_id = compensator, frame_id
         self._structure, self._reader = Structure.of(compensator.geometry), StrutReader(names)
 
     def read(self, data: bytes, sample: Sample) -> None:  # type: ignore[override]
@@ -313,7 +314,7 @@ class StrutInput(PoseInput):
 
 
 def command_input(compensator: Compensator, options: dict[str, Any]) -> PoseInput:
-    """Return the input that a node's parameters ask for."""
+    """Return the input selected by a node's parameters."""
     if options["command_input"] == STRUTS:
         return StrutInput(compensator, options["joint_names"], options["base_frame"])
     return PoseInput()
@@ -323,11 +324,11 @@ def command_input(compensator: Compensator, options: dict[str, Any]) -> PoseInpu
 
 
 def nominal_lengths(compensator: Compensator, measured: np.ndarray) -> np.ndarray:
-    """Return measured struts, shape (6,), m, as a controller of nominal lengths must see them: less what is corrected.
+    """Return measured struts minus the correction, shape (6,), m, for a controller of nominal lengths.
 
-    Told the measured ones, it would hold the corrections for a way that it has yet to go, and each time that it starts
-    from where the struts are they would be corrected once more. Before the first command the model's correction counts,
-    where it corrects.
+    With the measured ones it would count the corrections as a distance to go, and at each start from the struts'
+    positions they would be corrected once more. Before the first command the model's correction is used, where it
+    corrects.
     """
     if np.isfinite(compensator.correction).all():
         return measured - compensator.correction
@@ -373,8 +374,8 @@ class Outputs:
         self._estimates.publish(self._estimate_out.made(pose, stamp))
 
     def nominal(self, stamp: int, mean: Callable[[], np.ndarray]) -> None:
-        """Publish the struts as a controller of nominal lengths must see them; such controllers start from there, and
-        hold that: of struts at rest it is their average."""
+        """Publish the struts for a controller of nominal lengths; it starts from there and holds that: for struts at
+        rest it is their average."""
         if self._nominal is not None:
             out, fastest = self._nominal_out, self._compensator.geometry.limits.speed
             lengths = np.ascontiguousarray(nominal_lengths(self._compensator, mean()))
@@ -389,7 +390,7 @@ class Outputs:
             self._stops.publish(Bool(data=stopped))
 
     def wait(self) -> None:
-        """Wait until it has arrived that the node stops the machine."""
+        """Wait until the last ~/stopped has arrived."""
         self._stops.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
     def close(self) -> None:
@@ -427,10 +428,10 @@ class Outputs:
 
 class JournalTopics:
     """``~/journal`` and ``~/files``, which make a recording of a run replayable: the pages of
-    :mod:`hexapod_comp.compensation.journal`, and geometry and model in use, word for word.
+    :mod:`hexapod_comp.compensation.journal`, and geometry and model in use, unchanged.
 
-    Both are reliable and kept for late subscribers, so that a recorder which joins in the middle of a motion gets what
-    it needs. Nothing is published while a command is handled: what happens is noted, and goes out with :meth:`tick`.
+    Both are reliable and kept for late subscribers, so that a recorder that starts during a motion gets what it needs.
+    Nothing is published while a command is handled: events are stored, and published with :meth:`tick`.
     """
 
     def __init__(
@@ -444,7 +445,7 @@ class JournalTopics:
         self.tick(time.monotonic())  # so that no command comes before the first page
 
     def tick(self, now: float) -> None:
-        """Publish what is due: files that are new, then a page."""
+        """Publish what is due: new files, then a page."""
         if not self._journal.due(now):
             return
         if self._sources != self._published:
@@ -453,7 +454,7 @@ class JournalTopics:
         self._pages.publish(String(data=self._journal.page(now)))
 
     def finish(self, now: float) -> None:
-        """Publish a last page, with what was answered since the one before, and wait for its arrival."""
+        """Publish a last page, with the answers since the previous one, and wait for its arrival."""
         self._pages.publish(String(data=self._journal.page(now)))
         self._pages.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
@@ -466,7 +467,7 @@ class JournalTopics:
 
 STRUT_DIAMETER = 0.02
 JOINT_DIAMETER = 0.035
-LIFETIME = Duration(sec=1)  # A machine that nobody updates disappears instead of standing there as if it were alive
+LIFETIME = Duration(sec=1)  # Lifetime of markers: a machine that is not updated disappears instead of seeming alive
 
 GREY = ColorRGBA(r=0.5, g=0.5, b=0.55, a=1.0)
 STEEL = ColorRGBA(r=0.3, g=0.35, b=0.45, a=0.9)
@@ -499,7 +500,7 @@ def machine_markers(
         marker.points = [Point(x=x, y=y, z=z) for x, y, z in np.array(points).tolist()]
         if colour is not None:
             marker.color = colour
-        else:  # the struts, each of a colour of its own
+        else:  # the struts, each in its own colour
             marker.color.a = 1.0
             marker.colors = [correction_colour(amount) for amount in correction for _ in range(2)]
         markers.append(marker)

@@ -1,4 +1,4 @@
-"""What the compensator node is told of the world: gravity, other forces, outside numbers of the model's table."""
+"""External inputs of the compensator node: gravity, other forces, outside numbers of the model's table."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from .base import MachineNode
 from .sensors import SensorTopic
 from .status import CompensatorStatus
 
-WRENCH_PERIOD = 0.01  # A wrench that comes sooner after the last one, s, is left out: each ramps in, and is journalled
+WRENCH_PERIOD = 0.01  # A wrench that arrives sooner after the last one, s, is ignored: each ramps in, and is journalled
 
 
 class Loads:
-    """Gravity, wrench and outside numbers, from who may tell of them, to the compensator."""
+    """Passes gravity, wrench and outside numbers from their single publishers to the compensator."""
 
     def __init__(
         self, node: MachineNode, compensator: Compensator, status: CompensatorStatus, ids: dict[str, str]
@@ -50,7 +50,7 @@ class Loads:
             topic.close()
 
     def apply(self) -> None:
-        """Give the compensator gravity and wrench as they are now, unless ``outside_hold`` holds what it has."""
+        """Pass the present gravity and wrench to the compensator, unless ``outside_hold`` holds the previous ones."""
         if self._status.options["outside_hold"]:
             return
         stated = self._status.options["gravity"]
@@ -58,7 +58,7 @@ class Loads:
         self._compensator.set_load(Loading.of(gravity, self._wrench))
 
     def update(self) -> None:
-        """Give the compensator the newest outside numbers: now and then, as each change makes a model of its own."""
+        """Pass the newest outside numbers to the compensator: periodically, as each change makes a model."""
         compensator, options = self._compensator, self._status.options
         if options["outside_hold"] or self._table.problem or self._numbers.items() <= compensator.outside.items():
             return
@@ -72,7 +72,7 @@ class Loads:
                 self._node.ignore("outside", error, self._status.bad_feedback, "outside")
 
     def stale(self, now: float) -> str:
-        """Return what was published, but not for longer than ``outside_timeout``."""
+        """Return the published value, but not for longer than ``outside_timeout``."""
         timeout = self._status.options["outside_timeout"]
         return ", ".join(name for name, topic in self._topics.items() if topic.stale(now, timeout))
 
@@ -114,7 +114,7 @@ class Loads:
         self._table.problem = ""
 
     def findings(self) -> Iterator[str]:
-        """Yield what there is to warn of in the model's table of outside numbers."""
+        """Yield warnings about the model's table of outside numbers."""
         table, numbers = self._compensator.model.outside, self._compensator.outside
         if missing := table.missing(numbers):
             yield f"the model's table does not count: not known is {missing}"
@@ -122,7 +122,7 @@ class Loads:
             yield f"running, outside the model's table, whose edge holds: {held}"
 
     def values(self) -> dict[str, str]:
-        """Return what acts at present, as key and value of diagnostics: what the model needs of it."""
+        """Return the loads in use, as key and value of diagnostics, as far as the model uses them."""
         compensator, model = self._compensator, self._compensator.model
         values = {}
         if model.load.bends or model.outside.names:

@@ -1,9 +1,9 @@
 """ROS messages to numbers and back.
 
-rclpy builds a Python object for every part of a message that comes, and looks at every element of one that goes; that
-takes longer than a compensation. So commands, struts and pose estimates are read and written as the bytes that go over
-the wire: CDR (OMG DDS-RTPS 9.4.2, 10.2), four bytes that tell the encoding, then the fields in order, each at a
-multiple of its size, counted from behind those four. What is not laid out so is read by rclpy.
+rclpy makes a Python object for every part of a received message, and checks every element of a sent one; that takes
+longer than a compensation. So commands, struts and pose estimates are read and written as the bytes on the wire: CDR
+(OMG DDS-RTPS 9.4.2, 10.2), four bytes for the encoding, then the fields in order, each at a multiple of its size,
+counted from behind those four. rclpy reads messages with another layout.
 """
 
 from __future__ import annotations
@@ -25,17 +25,18 @@ from ..errors import CommandError, shorten
 from ..machine.geometry import STRUT_NAMES
 from ..pose import Pose
 
-# Longer messages are refused unread, byte: a thousand times ours. Read, they would fill many times their size.
+# Longer messages are refused without parsing, byte: a thousand times ours. Parsed, they would fill many times their
+# size.
 LARGEST_MESSAGE = 1 << 18
 
-# The squares of larger numbers, m, overflow; whether a strut can be so long is a question for limits
+# The squares of larger numbers, m, overflow; limits check whether a strut can be so long
 LARGEST_LENGTH = 1e150
 
-# Two commands count as no closer than the one when a speed is made of them, s; further apart than the other there is
+# Smallest difference of two stamps from which a speed is computed, s; for a difference above the other there is
 # no speed between them
 SHORTEST_PERIOD, LONGEST_PERIOD = 1e-4, 1.0
 
-LITTLE_ENDIAN = b"\x00\x01"  # How plain CDR with the lowest byte first begins
+LITTLE_ENDIAN = b"\x00\x01"  # First bytes of plain CDR, little endian
 
 _ENCODING = LITTLE_ENDIAN + b"\0\0"
 _START, _STAMP, _COUNT = struct.Struct("<iII"), struct.Struct("<iI"), struct.Struct("<I")
@@ -71,7 +72,7 @@ def stamp_of(nanoseconds: int) -> Time:
 
 
 def period(since: int, until: int) -> float:
-    """Return the time between two stamps, ns, over which a strut's speed is taken, s; 0: it has none.
+    """Return the time between two stamps, ns, for the speed of a strut, s; 0: it has none.
 
     It depends on the stamps alone, so that a recorded run answers the same when it is replayed.
     """
@@ -80,8 +81,8 @@ def period(since: int, until: int) -> float:
 
 
 def read_message(data: bytes, kind: type) -> Any:
-    """Return the message of a type that a subscription got as bytes; a CommandError, ``message``, where it is too long
-    or none of this type."""
+    """Return the message of a subscription's bytes; a CommandError, ``message``, if it is too long or of another
+    type."""
     if len(data) > LARGEST_MESSAGE:
         raise CommandError("message", f"a message must not have more than {LARGEST_MESSAGE} bytes, not {len(data)}")
     try:
@@ -91,7 +92,7 @@ def read_message(data: bytes, kind: type) -> Any:
 
 
 def check_frame(frame_id: str, frames: Iterable[str]) -> None:
-    """Raise a CommandError, ``frame_id``, where a message's frame is none of those allowed."""
+    """Raise a CommandError, ``frame_id``, if a message's frame is not among those allowed."""
     if frame_id not in (allowed := tuple(frames)):
         raise CommandError("frame_id", f"frame_id must be one of {', '.join(allowed)}, not {shorten(frame_id)}")
 
@@ -127,8 +128,8 @@ def message_pose(message: PoseStamped) -> Pose:
 
 
 def command_stamp(stamp: Time) -> int:
-    """Return a command's stamp, ns; a CommandError, ``message``, where it is no time: with the largest seconds it would
-    not fit into an answer's stamp."""
+    """Return a command's stamp, ns; a CommandError, ``message``, if it is not a valid time: with the largest seconds it
+    would not fit into an answer's stamp."""
     if stamp.nanosec >= _SECOND:
         raise CommandError("message", f"nanosec of the stamp must be below {_SECOND}, not {stamp.nanosec}")
     return nanoseconds_of(stamp)
@@ -136,7 +137,7 @@ def command_stamp(stamp: Time) -> int:
 
 def read_pose(data: bytes, sample: Sample) -> None:
     """Read a serialised PoseStamped into a sample: stamp, frame, x, y, z (m) and the quaternion x, y, z, w; a
-    CommandError, ``message``, where it is none, or its stamp no time."""
+    CommandError, ``message``, if it is invalid."""
     if data[:2] == LITTLE_ENDIAN and _FRAME_AT + _SEVEN.size <= len(data) <= LARGEST_MESSAGE:
         seconds, nanoseconds, length = _START.unpack_from(data, _START_AT)
         end = _FRAME_AT + length
@@ -152,14 +153,14 @@ def read_pose(data: bytes, sample: Sample) -> None:
 
 
 class PoseBytes:
-    """A PoseStamped as bytes, to be published again and again."""
+    """A PoseStamped as bytes, to be published repeatedly."""
 
     def __init__(self, frame_id: str) -> None:
         self._bytes = bytearray(_aligned(_with_text(_HEAD, frame_id), 8) + bytes(_SEVEN.size))
         self._quaternion = ffi.new("double[4]")
 
     def made(self, pose: np.ndarray, stamp: int) -> bytes:
-        """Return what to publish: position, m, and rotation matrix by rows, shape (12,), with a stamp in ns."""
+        """Return the bytes to publish: position, m, and rotation matrix by rows, shape (12,), with a stamp in ns."""
         lib.hc_quaternion(ffi.from_buffer("double[9]", pose[3:]), self._quaternion)
         _STAMP.pack_into(self._bytes, _START_AT, *divmod(stamp, _SECOND))
         _SEVEN.pack_into(self._bytes, len(self._bytes) - _SEVEN.size, *pose[:3].tolist(), *self._quaternion)
@@ -178,21 +179,21 @@ def _before_positions(frame_id: str, names: Sequence[str]) -> bytes:
 
 
 class StrutBytes:
-    """A JointState of the six struts as bytes, to be published again and again.
+    """A JointState of the six struts as bytes, to be published repeatedly.
 
-    The velocity field is filled too: an empty one makes bags that some readers refuse.
+    The velocity field is filled too: with an empty one some readers refuse bags.
     """
 
     def __init__(self, frame_id: str = "", names: Sequence[str] = STRUT_NAMES) -> None:
-        self.stamp = 0  # of the message last made, ns; 0 before
+        self.stamp = 0  # of the previous message, ns; 0 before
         self.position, self.velocity = np.zeros(6), np.zeros(6)  # m and m/s
         self._names = _before_positions(frame_id, names)[_START_AT + _STAMP.size :]
         self._at = ffi.from_buffer("double[6]", self.position), ffi.from_buffer("double[6]", self.velocity)
 
     def made(self, lengths: Any, stamp: int, period: float = 0.0, fastest: float = np.inf) -> bytes:
-        """Return what to publish, with a stamp in ns.
+        """Return the bytes to publish, with a stamp in ns.
 
-        `lengths`: six, m, a tuple, a list or the core's ``double[6]``; None: position and velocity as they are.
+        `lengths`: six, m, a tuple, a list or the core's ``double[6]``; None: position and velocity unchanged.
         Velocities are their change since the last ones over `period` s; 0: at rest. Stamps jitter, and no strut is
         faster than `fastest`, m/s: where one would be, all velocities are smaller in proportion.
         """
@@ -204,20 +205,20 @@ class StrutBytes:
 
 
 class StrutReader:
-    """Picks the six struts, by their joint names, out of JointState messages; other joints do not matter."""
+    """Extracts the six struts, by their joint names, from JointState messages; other joints are ignored."""
 
     def __init__(self, names: Sequence[str] = STRUT_NAMES) -> None:
         self.lengths = np.zeros(6)  # last read, in strut order, m
         self._struts, self._names = names, list[str]()
         self._order: Sequence[int] = range(6)
-        # Of the last message: size, what stands before the positions but for the stamp, where these stand, the count of
-        # velocities behind them, and where that of efforts, none, stands.
+        # Layout of the last message: size, bytes before the positions except the stamp, offset of the positions, number
+        # of velocities after them, and the offset of the efforts, which are empty.
         self._shape: tuple[int, bytes, int, bytes, int] = (0, b"", 0, b"", 0)
 
     def sample(self, data: bytes, sample: Sample) -> None:
-        """Read a message that came as bytes into a sample: stamp and lengths, a tuple in strut order.
+        """Read a message from bytes into a sample: stamp and lengths, a tuple in strut order.
 
-        A message that differs from the last one in stamp and numbers alone is read where they stood there. Errors are
+        A message that differs from the last one only in stamp and numbers is read by the same layout. Errors are
         those of :func:`read_message` and :meth:`read`.
         """
         size, head, at, velocities, efforts = self._shape
@@ -263,14 +264,14 @@ class StrutReader:
         return np.frombuffer(message.position, dtype=float)[np.asarray(self._order)]
 
     def check(self, lengths: Sequence[float]) -> None:
-        """Refuse lengths, m, that are no lengths: ``not_finite``."""
+        """Refuse invalid lengths, m: ``not_finite``."""
         if not sum(map(abs, lengths)) < LARGEST_LENGTH:
             allowed = f"finite and below {LARGEST_LENGTH:g} m"
             raise CommandError("not_finite", f"strut lengths must be {allowed}, not {list(lengths)}")
 
 
 def strut_order(names: Sequence[str], struts: Sequence[str] = STRUT_NAMES) -> np.ndarray:
-    """Return where each of the six struts stands in a list of names; a CommandError, ``strut_names``, where one is
+    """Return the index of each of the six struts in a list of names; a CommandError, ``strut_names``, if one is
     missing, or there twice."""
     counts = [(name, list(names).count(name)) for name in struts]
     wrong = [f"{name} {'twice' if count else 'missing'}" for name, count in counts if count != 1]

@@ -1,9 +1,9 @@
 """The mover node: a target pose or a program in, a stream of tool poses for the compensator out.
 
-A move is planned in the process beside the node, from where the machine stands, in the least time that the struts'
+A move is planned in the process beside the node, from the machine's present pose, in the least time that the struts'
 speed, acceleration and jerk allow; all limits of the machine are checked along it before it begins. It is sent at one
-rate, and the last pose is sent on: a machine at standstill keeps following its temperatures. ``~/state`` says what
-becomes of it. Run it with ``ros2 run hexapod_comp mover`` or ``python -m hexapod_comp.ros.mover``.
+rate, and the last pose is repeated: a machine at standstill keeps following its temperatures. ``~/state`` reports its
+progress. Run it with ``ros2 run hexapod_comp mover`` or ``python -m hexapod_comp.ros.mover``.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ from .rclpy_compat import callers
 from .status import ERROR, OK, WARN, status_of, status_prefix
 from .worker import Job, Worker
 
-ANSWERED_WITHIN = 0.4  # A command that the compensator has not answered after this long was refused, s
-IN_FLIGHT = 0.15  # While a command has waited for its answer this long, the path waits too, s
-RESUMED = 5  # A move that was held up is planned anew from the last answered pose so often, and then given up
-# What refuses all commands until somebody has mended it; other refusals may be a busy computer's
+ANSWERED_WITHIN = 0.4  # A command that the compensator has not answered after this time was refused, s
+IN_FLIGHT = 0.15  # While a command has waited this long for its answer, the path waits too, s
+RESUMED = 5  # Number of new plans of a delayed move, from the last answered pose, before it is given up
+# Reasons that refuse all commands until an operator acts; other refusals may be due to a busy computer
 STANDING = ("following_error", "several_publishers", "unknown_publisher", "no_feedback", "tool_changed")
-ESTIMATE_WITHIN = 1.0  # An estimate older than this does not say where the machine stands, s
-STATE_PERIOD = 0.1  # Between two messages of ``~/state`` while the machine moves, s
+ESTIMATE_WITHIN = 1.0  # An older estimate does not give the machine's pose, s
+STATE_PERIOD = 0.1  # Period of ~/state while the machine moves, s
 
 IDLE, PLANNING, MOVING, SETTLING, ARRIVED, STOPPED = "idle", "planning", "moving", "settling", "arrived", "stopped"
 UNDER_WAY = (PLANNING, MOVING, SETTLING)
@@ -89,7 +89,7 @@ PROGRAM = Program(
 
 @dataclass
 class Request:
-    """What somebody asked for: poses of the tool in ``base``, with times where it is a program."""
+    """A request: poses of the tool in ``base``, with times if it is a program."""
 
     stamp: int  # of the message, ns
     poses: list[Pose]
@@ -98,7 +98,7 @@ class Request:
     axes: np.ndarray | None = None  # (3, 3) the frame's axes in ``base``; None: the tool's own
 
     def from_pose(self, start: Pose) -> list[Pose]:
-        """Return the poses, those of a relative move as seen from where it starts."""
+        """Return the poses; those of a relative move relative to its start."""
         if self.relative is None:
             return self.poses
         if self.axes is None:
@@ -115,8 +115,9 @@ class MoverNode(MachineNode):
         self._state, self._text, self._by = IDLE, "no move yet", ""
         self._request = self._refused_request = 0  # stamps, ns
         self._refusal, self._ready_shown = "", False
-        self._resumed = 0  # how often the present move was planned anew
-        self._target: Request | None = None  # of the present move; None: a program, which cannot begin in its middle
+        self._resumed = 0  # number of new plans of the present move
+        # of the present move; None: a program, which cannot be resumed in its middle
+        self._target: Request | None = None
         self._moves = 0  # that were begun
         self._forget()
 
@@ -131,14 +132,14 @@ class MoverNode(MachineNode):
         self._halt()
 
     def _halt(self) -> None:
-        """Send nothing more, and forget where the last command led."""
+        """Send nothing more, and forget the last command's pose."""
         self._held: Pose | None = None  # the pose that is sent at standstill
         self._queue: deque[Motion] = deque()
         self._motion: Motion | None = None
-        self._path_is_motion = False  # else it is the stop that leaves it
+        self._path_is_motion = False  # else the stop itself ends there
         self._path: Path | None = None
         self._index = 0
-        self._pending: Request | None = None  # is planned when the machine stands
+        self._pending: Request | None = None  # planned when the machine stands
         self._stamp = 0  # of the last command, ns
         self._unanswered: deque[tuple[int, float, Pose]] = deque()  # stamps, when they were sent, and poses
         self._answered: Pose | None = None  # the last pose that the compensator has answered
@@ -154,7 +155,7 @@ class MoverNode(MachineNode):
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take targets from now on; nothing moves before the first one."""
+        """Accept targets from now on; nothing moves before the first one."""
         self._halt()
         self._commands = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS)
         self._active = True
@@ -163,7 +164,7 @@ class MoverNode(MachineNode):
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Send nothing more and leave the topic of commands to others."""
+        """Send nothing more, so that others may command."""
         if self._state in UNDER_WAY:
             self._stopped("deactivated", "the node was deactivated on the way")
         self._halt()
@@ -180,7 +181,7 @@ class MoverNode(MachineNode):
         return super().on_cleanup(state)
 
     def publish_last_status(self) -> None:
-        """Publish how a move ended that the end of the node cuts short."""
+        """Publish the end of a move that the end of the node interrupts."""
         if self._active and self._state in UNDER_WAY:
             self._stopped("shut down", "the node ended on the way")
             self._states.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
@@ -220,12 +221,12 @@ class MoverNode(MachineNode):
         self._use_machine()
 
     def _use_machine(self) -> None:
-        """Go by the compensator's geometry with its tool; another tool ends what was held with the one before."""
+        """Use the compensator's geometry with its tool; another tool ends the hold with the previous one."""
         if not {"geometry", "model"} <= self._sources.keys():
             return
         geometry = self._sources["geometry"].geometry()
         if self._tool not in geometry.tools:
-            return  # of another file, which comes next
+            return  # of another file, which arrives next
         before, self._geometry = self._geometry, geometry.using(tool=self._tool, work=BASE)
         self._frames = {
             frame_id: geometry.work_frames[name] for name, frame_id in frame_ids(geometry, self._options).items()
@@ -307,7 +308,8 @@ class MoverNode(MachineNode):
         return self._frames[frame_id]
 
     def _ask(self, message: Any, read: Any) -> None:
-        """Plan what a message asks for, at once or when the present move has been braked; a bad one changes nothing."""
+        """Plan a message's request, at once or when the present move has been braked; an invalid one changes
+        nothing."""
         if not self._active:
             return
         try:
@@ -328,12 +330,12 @@ class MoverNode(MachineNode):
             self._plan()
 
     def _ready(self) -> bool:
-        """Whether it knows the machine, and where its tool stands."""
+        """Whether it knows the machine, and the pose of its tool."""
         fresh = self._estimate is not None and time.monotonic() - self._estimate[1] <= ESTIMATE_WITHIN
         return self._active and self._geometry is not None and (fresh or self._held is not None)
 
     def _standing(self) -> Pose:
-        """Return where the tool stands, in ``base``: as it was sent, or before that as it is estimated."""
+        """Return the tool's pose, in ``base``: as it was sent, or before that as it is estimated."""
         if self._held is not None:
             return self._held
         if self._estimate is None or time.monotonic() - self._estimate[1] > ESTIMATE_WITHIN:
@@ -343,7 +345,7 @@ class MoverNode(MachineNode):
     # ---- planning ----
 
     def _plan(self, anew: bool = False) -> None:
-        """Have the pending request planned, from where the machine stands; anew: one that has begun already."""
+        """Have the pending request planned, from the machine's present pose; anew: one that has begun already."""
         request, self._pending = self._pending, None
         if request is None or self._geometry is None:
             return
@@ -376,10 +378,10 @@ class MoverNode(MachineNode):
     def _cannot(self, number: int, error: HexapodError) -> None:
         if number == self._moves and self._state == PLANNING:
             self._stopped("limit", str(error))
-            self._plan()  # what was asked for meanwhile
+            self._plan()  # the next request
 
     def _begin(self, number: int, start: Pose, motions: list[Motion]) -> None:
-        """Begin a move that was planned, unless it was given up meanwhile."""
+        """Begin a planned move, unless it was given up meanwhile."""
         if number != self._moves or self._state != PLANNING:
             return
         if self._pending is not None:
@@ -392,7 +394,7 @@ class MoverNode(MachineNode):
         self._next()
 
     def _next(self) -> None:
-        """Go on with the next motion, or settle."""
+        """Continue with the next motion, or settle."""
         if self._queue:
             self._motion, self._path_is_motion = self._queue.popleft(), True
             self._follow(self._motion.sample(self._options["rate"]))
@@ -409,10 +411,10 @@ class MoverNode(MachineNode):
         self._braking = ""
 
     def _follow(self, path: Path) -> None:
-        self._path, self._index = path, 1  # the first pose is where it stands
+        self._path, self._index = path, 1  # the first pose is the present one
 
     def _brake(self, why: str) -> None:
-        """Leave the present motion by the earliest stop on its way; why: what the end of the move is put down to."""
+        """Leave the present motion by its earliest stop; why: the reported cause of the end."""
         self._braking = self._braking or why
         if self._motion is None or self._path is None or not self._path_is_motion:
             return
@@ -444,7 +446,7 @@ class MoverNode(MachineNode):
             return
         period = round(1e9 / self._options["rate"])
         now = int(self.get_clock().now().nanoseconds)
-        # Stamped with the times for which they were computed; after a pause the path goes on from there
+        # Stamped with the times for which they were computed; after a pause the path continues from there
         stamp = max(self._stamp + period, now - period) if self._stamp else now
         held_up = self._unanswered and time.monotonic() - self._unanswered[0][1] > IN_FLIGHT
         if stamp > now + period or held_up:
@@ -460,7 +462,7 @@ class MoverNode(MachineNode):
             self._next()
 
     def _settle(self, now: float) -> None:
-        """Report the arrival of a tool that stays at its target, or that it does not get there."""
+        """Report the arrival of a tool that stays at its target, or that it does not reach it."""
         options, pose = self._options, self._estimate[0] if self._estimate else None
         if pose is not None and self._held is not None and self._estimate and self._estimate[1] > self._ended:
             away = float(np.linalg.norm(pose.position - self._held.position))
@@ -536,7 +538,7 @@ class MoverNode(MachineNode):
         self.publish_status(level, text, lambda: {"state": self._state, "moves": str(self._moves), "tool": self._tool})
 
     def _refused(self) -> None:
-        """Go on from the last answered pose where a busy computer has held commands up; else stop sending."""
+        """Continue from the last answered pose if a busy computer has delayed commands; else stop sending."""
         said = self._compensator_says
         message, alive = said.get("message", ""), self.count_publishers(self.resolve_topic_name("strut_commands"))
         under_way, answered, target, request = self._state in UNDER_WAY, self._answered, self._target, self._request

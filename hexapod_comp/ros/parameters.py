@@ -1,4 +1,4 @@
-"""Parameters of a node: its table, from which declaration, check, help and pages follow, and the values in force."""
+"""Parameters of a node: its table, from which declaration, checks, help and pages are made, and the values in force."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ParameterError(HexapodError):
 
 
 class Taken(Enum):
-    """When a node takes a parameter's value; the text is what is said of it."""
+    """When a node applies a parameter's value, with its description."""
 
     ALWAYS = "at any time"
     RELOAD = "at configure and at ~/reload_model"
@@ -65,21 +65,21 @@ class Parameter:
 
     @property
     def differs_from(self) -> str:
-        """Name of the parameter that must have another value; empty: there is none."""
+        """Name of the parameter from which it must differ; empty: there is none."""
         return self.allowed.removeprefix("not ") if self.allowed.startswith("not ") else ""
 
     @property
     def choices(self) -> list[str]:
-        """All values that are allowed; empty: there is no such list."""
+        """Allowed values; empty: any."""
         return [] if self.range or self.differs_from or not self.allowed else self.allowed.split(", ")
 
     def described(self) -> str:
-        """Return what it means and what is allowed, as plain text."""
+        """Return its meaning and what is allowed, as plain text."""
         text = f"{self.meaning} ({self.allowed})" if self.allowed else self.meaning
         return text.replace("`", "")
 
     def descriptor(self) -> ParameterDescriptor:
-        """Return what ROS tells of it."""
+        """Return its ROS descriptor."""
         result = ParameterDescriptor(
             description=self.meaning.replace("`", ""),
             additional_constraints="; ".join(filter(None, (self.allowed, f"taken {self.taken.value}"))),
@@ -93,7 +93,7 @@ class Parameter:
         return result
 
     def checked(self, value: Any) -> Any:
-        """Return `value` as the parameter's type, or refuse it."""
+        """Return `value` as the parameter's type, or raise."""
         if isinstance(self.default, list) and isinstance(self.default[0], float):
             return self._checked_numbers(value)
         if isinstance(self.default, list):
@@ -123,7 +123,7 @@ class Parameter:
         return [float(number) for number in numbers]
 
     def refusal(self, problem: str) -> ParameterError:
-        """Return the error that says what is wrong with a value."""
+        """Return the error about an invalid value."""
         return ParameterError(f"parameter {self.name}: {problem}")
 
 
@@ -147,7 +147,7 @@ def shown(value: bool | int | float | str | list[str] | list[float]) -> str:
 
 
 class Parameters(dict[str, Any]):
-    """The values of a node's parameters, by name, checked; where they may change they are always those in force."""
+    """The values of a node's parameters, by name, validated; those that may change are always the ones in force."""
 
     def __init__(
         self, node: LifecycleNode, table: Sequence[Parameter], changed: Callable[[set[str]], None] = lambda names: None
@@ -162,7 +162,7 @@ class Parameters(dict[str, Any]):
             self[name] = parameter.checked(value)
         self._check_differences(self)
         declared = set(node.get_parameters_by_prefix(""))
-        for name in overrides(node):  # those that no declared parameter has the name of are most likely misspelt
+        for name in overrides(node):  # names that match no declared parameter are most likely misspelt
             if name not in declared and not name.startswith("qos_overrides."):
                 near = difflib.get_close_matches(name, declared, 1)
                 hint = f"; did you mean {near[0]}?" if near else ""
@@ -177,13 +177,13 @@ class Parameters(dict[str, Any]):
                 raise parameter.refusal(f"must differ from {other}, {shorten(values[other])}")
 
     def _known(self, parameters: Iterable[RosParameter]) -> dict[str, Any]:
-        """Return the checked values of those that stand in the table."""
+        """Return the validated values of those in the table."""
         return {p.name: self._table[p.name].checked(p.value) for p in parameters if p.name in self._table}
 
     def _judge(self, parameters: list[RosParameter]) -> SetParametersResult:
-        """Refuse what is not allowed, or has no effect before the node is configured or started again.
+        """Refuse values that are not allowed, or have no effect before the node is configured or started again.
 
-        Another clock is refused: stamps, ramps and the order of commands hang on the one that the node began with.
+        Another clock is refused: stamps, ramps and the order of commands depend on the initial one.
         """
         try:
             wanted, state = self._known(parameters), lifecycle_state(self._node)[1]
@@ -225,13 +225,13 @@ class Program:
     summary: str
     parameters: Sequence[Parameter]  # its ROS parameters
     topics: str = ""
-    example: str = "-p autostart:=false"  # what stands behind ``--ros-args`` in the example
+    example: str = "-p autostart:=false"  # text after ``--ros-args`` in the example
 
     def refusal(self, arguments: Sequence[str]) -> int | None:
-        """Return the exit code of a program that must not start with these arguments, having said why; else None.
+        """Return the exit code of a program that must not start with these arguments, after printing why; else None.
 
-        0 after ``--help``, 2 where an argument is not understood. What follows ``--ros-args`` is ROS's to read.
-        rcl itself would take a stray ``name:=value`` for a rename, and leave everything else unread.
+        0 after ``--help``, 2 where an argument is not understood. ROS reads what follows ``--ros-args``. rcl itself
+        would read a stray ``name:=value`` as a rename, and ignore everything else.
         """
         return run_with_plain_streams(lambda: self._refusal(arguments))
 

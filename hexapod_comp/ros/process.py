@@ -31,10 +31,10 @@ from .parameters import Program
 # Longest wait of one spin, s: how soon a signal is noticed (EventsExecutor.spin itself never returns)
 SPIN_PERIOD = 0.1
 
-ENDED_WITHIN = 4.0  # What the end of a process may take from its signal on, s; usually it is a fraction of a second
+ENDED_WITHIN = 4.0  # Longest time from a signal to the end of the process, s; usually it is a fraction of a second
 STREAMS = (1, 2)  # stdout and stderr: RCUTILS_LOGGING_USE_STDOUT decides where ROS writes
 BUFFER_SIZE = 1 << 20  # Of the log's pipe, byte: some thousands of lines. Linux allows everybody this much.
-LEAVING_WITHIN = 0.5  # How long the end of a process waits for its last lines to be taken, s
+LEAVING_WITHIN = 0.5  # Longest wait for the last lines of the log to be read, s
 
 # Options of a node that publishes nothing and offers nothing
 QUIET: dict[str, Any] = {
@@ -45,7 +45,7 @@ QUIET: dict[str, Any] = {
 
 
 def autostart(node: LifecycleNode, heard: Sequence[int] = ()) -> bool:
-    """Configure and activate a node, unless a signal is `heard` meanwhile; return whether what was done went well."""
+    """Configure and activate a node, unless a signal arrives meanwhile (`heard`); return whether it succeeded."""
     for step in (node.trigger_configure, node.trigger_activate):
         if heard:
             break
@@ -55,7 +55,7 @@ def autostart(node: LifecycleNode, heard: Sequence[int] = ()) -> bool:
 
 
 def discovery() -> str:
-    """Return who may find this process's nodes, and how to change that."""
+    """Return the discovery range of this process's nodes, and how to change it."""
     reach, peers = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", ""), os.environ.get("ROS_STATIC_PEERS", "")
     hint = " (SUBNET finds other computers)" if reach == "LOCALHOST" else ""
     also = f" and of {printable(peers)}" if peers else ""
@@ -70,8 +70,8 @@ def run(
 ) -> int:
     """Run a node until SIGINT, SIGTERM or SIGHUP.
 
-    Signals are only noted, since rclpy's own handling loses the last message and exits non-zero on a
-    second Ctrl-C, which ``ros2 launch`` sends.
+    Signals are only stored, since rclpy's own handling loses the last message and exits non-zero on a second Ctrl-C,
+    which ``ros2 launch`` sends.
     """
     arguments = sys.argv[1:] if argv is None else list(argv)
     refusal = program.refusal(arguments)
@@ -79,7 +79,7 @@ def run(
         return refusal
     open_streams()
     heard = received_signals()
-    try:  # as it is now, whatever will stand in its place
+    try:  # the present directory, even if it is replaced
         stderr = os.fdopen(os.dup(sys.stderr.fileno()), "w")
     except (AttributeError, OSError):  # closed, or a test's
         stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
@@ -87,7 +87,7 @@ def run(
         with LogRelay():
             code = _run_until(heard, make_node, arguments, stderr)
         if argv is None:
-            # Python's own end waits for threads of DDS, which now and then never end, though all has been closed.
+            # Python's own exit waits for threads of DDS, which sometimes never end, though all has been closed.
             for stream in filter(None, (sys.stdout, sys.stderr)):  # None: it was closed from the beginning
                 with suppress(OSError):
                     stream.flush()
@@ -124,9 +124,9 @@ def _run_until(
         ending.callback(_end_within, ENDED_WITHIN, stderr)
         if node.wants_autostart and node.unconfigured and not autostart(node, heard):
             return 1
-        # What is loaded by now stays, and the collector need not look at it while the machine moves: in 45,000 objects
-        # a full collection takes 17 ms, the time of eight commands. The allocator is left alone: told to give large
-        # blocks back it held 2 to 11 MB less after sixty messages of up to 6 MB, not worth a call into glibc.
+        # Modules loaded by now stay, and the collector need not examine them while the machine moves: for 45,000
+        # objects a full collection takes 17 ms, the time of eight commands. The allocator is left alone: told to give
+        # large blocks back it held 2 to 11 MB less after sixty messages of up to 6 MB, not worth a call into glibc.
         gc.collect()
         gc.freeze()
         while not heard and rclpy.ok():
@@ -135,10 +135,10 @@ def _run_until(
 
 
 def _end_within(seconds: float, stderr: TextIO) -> None:
-    """End this process by force in so many seconds, saying where every thread hangs: DDS may wait for ever.
+    """End this process by force in this many seconds, printing where every thread is: DDS may wait for ever.
 
-    Python's lock is not needed for either: whoever hangs may hold it. Where nobody takes what is said, the system's
-    alarm ends the process a second later.
+    Neither needs Python's lock, which a hanging thread may hold. If the output is not read, the system's alarm ends the
+    process a second later.
     """
     faulthandler.dump_traceback_later(seconds, exit=True, file=stderr)
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
@@ -149,11 +149,11 @@ def _end_within(seconds: float, stderr: TextIO) -> None:
 
 
 class LogRelay:
-    """Context manager: writing to stdout and stderr never waits, and what nobody reads in time is lost.
+    """Context manager: writing to stdout and stderr never blocks; output that is not read in time is lost.
 
     ROS writes its log to stderr from within the call, with Python's lock held. A terminal stopped with Ctrl-S, or a
-    pipe that nobody reads, would then stop the machine's loop for as long as it likes. Here a thread stands between:
-    the loop writes into a pipe of this process, and what does not fit into it any more is lost instead of waited for.
+    pipe without a reader, would then block the machine's loop. So the loop writes into a pipe of this process, which a
+    thread empties; output that does not fit is lost.
     """
 
     def __enter__(self) -> LogRelay:
@@ -161,7 +161,7 @@ class LogRelay:
         for stream in STREAMS:
             try:
                 if stat.S_ISREG(os.fstat(stream).st_mode):
-                    continue  # a file: nobody is waited for
+                    continue  # a file never blocks
             except OSError:  # closed
                 continue
             real, (source, sink) = os.dup(stream), os.pipe()
@@ -180,11 +180,11 @@ class LogRelay:
     ) -> None:
         for stream, real, thread in self._relays:
             os.dup2(real, stream)
-            thread.join(LEAVING_WITHIN)  # for what is on its way
+            thread.join(LEAVING_WITHIN)  # for messages still in the pipe
 
 
 def _forward(source: int, real: int) -> None:
-    """Hand on what was written, until the last writer has gone; go on emptying when the reader has gone."""
+    """Pass on the written bytes until the last writer has closed; keep emptying when the reader has gone."""
     while data := os.read(source, 1 << 16):
         with suppress(OSError):
             while data:
@@ -215,7 +215,7 @@ class RosSession:
         self.close()
 
     def spin_once(self, timeout: float) -> None:
-        """Handle what has come, or the first to come within so many seconds."""
+        """Handle received messages, or the first to arrive within this time, s."""
         self._executor.spin_once(timeout_sec=timeout)
 
     def close(self) -> None:

@@ -1,6 +1,6 @@
-"""All that works around rclpy, or uses what it keeps private, each with the version and the reason.
+"""All workarounds for rclpy, and uses of its private parts, each with the version and the reason.
 
-rclpy 7.1 is that of Jazzy. When a later one does better, what stands here can go, and nothing else changes.
+rclpy 7.1 is that of Jazzy. When a later version is better, code here can be removed without other changes.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from ..errors import LONGEST_TEXT, CommandError, printable, shorten
 
 
 def numbered(callback: Callable[[bytes, int | None], None], failed: Callable[[Exception], None]) -> Callable[..., None]:
-    """Return a callback for rclpy that never raises, and hands on a message and its publisher's sequence number.
+    """Return a callback for rclpy that never raises, and passes on a message and its publisher's sequence number.
 
-    rclpy asks a callback's signature whether it wants to be told about the message, and then calls it with two
-    arguments; the EventsExecutor of rclpy 7.1 calls it with a tuple of the two instead.
+    rclpy inspects a callback's signature for the message info, and then calls it with two arguments; the EventsExecutor
+    of rclpy 7.1 calls it with a tuple of the two instead.
     """
 
     def called(*arguments: Any) -> None:
@@ -44,9 +44,9 @@ def numbered(callback: Callable[[bytes, int | None], None], failed: Callable[[Ex
 class Alarm:
     """Calls back in the node's executor: once, a while after it was `set`, or at a `rate`; both may change at any time.
 
-    A timer may not be reset while a node runs: at each reset the EventsExecutor of rclpy 7.1 calls every timer that is
-    due once more, and puts its next call off by a period: a check every 50 ms rested for seconds. A rate that changes
-    neither moves a tick that is due nor makes it tick more often than the fastest.
+    A timer may not be reset while a node runs: at each reset the EventsExecutor of rclpy 7.1 calls every due timer once
+    more, and postpones its next call by a period: a check every 50 ms did not run for seconds. A rate that changes
+    neither shifts a due tick nor makes it tick more often than the fastest.
     """
 
     def __init__(self, node: Node, callback: Callable[[], None], rate: float = 0.0) -> None:
@@ -58,7 +58,7 @@ class Alarm:
         self.set_rate(rate)
 
     def set(self, seconds: float) -> None:
-        """Call back in so many seconds, and not when it was set to before; never, if infinite."""
+        """Call back after this time, s, instead of the previous one; never, if infinite."""
         with self._change:
             self._due = time.monotonic() + seconds
             self._change.notify()
@@ -81,10 +81,10 @@ class Alarm:
 
     def _tick(self) -> None:
         if not self._rate:
-            return  # it was closed or put to rest while this tick was on its way
+            return  # it was closed or stopped while this tick was pending
         now, period = time.monotonic(), 1.0 / self._rate
         due = self._last + period
-        self._last = due if now - due < period else now  # in step, but what was missed is not made up for
+        self._last = due if now - due < period else now  # in step; missed ticks are not repeated
         self._set_next(now)
         self._callback()
 
@@ -104,8 +104,8 @@ class Alarm:
 
 
 class LateAnswer:
-    """Lets a service's callback return None: its answer then comes later, and the node goes on in between. rclpy 7.1
-    has no such thing: executors send what the callback returns. Only one request at a time may be left so."""
+    """Lets a service's callback return None: its answer then follows later, and the node continues in between. rclpy
+    7.1 lacks this: executors send what the callback returns. Only one request at a time may be pending."""
 
     def __init__(self, service: Service) -> None:
         self.service, self._send, self._header = service, service.send_response, cast(Any, None)
@@ -119,7 +119,7 @@ class LateAnswer:
         service.send_response = send_or_keep  # type: ignore[method-assign]
 
     def answer(self, response: Any) -> None:
-        """Answer the request that waits, if one does."""
+        """Answer the pending request, if there is one."""
         header, self._header = self._header, None
         if header is not None:
             self._send(response, header)
@@ -143,14 +143,14 @@ def possible_only(node: LifecycleNode, change: Callable[[Any, Any], Any]) -> Cal
 
 
 def lifecycle_state(node: LifecycleNode) -> tuple[int, str]:
-    """Return id and name of a node's state; a node of rclpy 7.1 tells it to others, by a service, but not to itself."""
+    """Return id and name of a node's state; a node of rclpy 7.1 offers it by a service, but not to itself."""
     number, name = node._state_machine.current_state
     return int(number), str(name)
 
 
 def end_lifecycle(node: LifecycleNode) -> None:
-    """Take the lifecycle's services away with the node: rclpy 7.1 leaves them to the garbage collector, and a node that
-    somebody still refers to would go on to offer services that nobody answers."""
+    """Destroy the lifecycle's services with the node: rclpy 7.1 leaves them to the garbage collector, and a node that
+    is still referenced would continue to offer services that are never answered."""
     node._state_machine.destroy_when_not_in_use()
 
 
@@ -163,35 +163,35 @@ def overrides(node: Node) -> Iterable[str]:
 
 
 def full_name(info: Any) -> str:
-    """Return the full name of the node at an end of a topic, as the graph tells it."""
+    """Return the full name of the node at an end of a topic, from the graph."""
     name = info.node_name
     return name if name == UNKNOWN_NAME else f"{info.node_namespace.rstrip('/')}/{name}"
 
 
 def publishers(node: Node, topic: str) -> tuple[tuple[str, ...], str]:
-    """Return the nodes that publish a topic, each once, and why they cannot be told: a node's name may be any bytes,
-    which rclpy 7.1 cannot give."""
+    """Return the nodes that publish a topic, each once, and why they cannot be named: a node's name may be any bytes,
+    which rclpy 7.1 cannot return."""
     try:
         return tuple(sorted({full_name(info) for info in node.get_publishers_info_by_topic(topic)})), ""
     except UnicodeDecodeError as error:
         return (), f"a node's name is not UTF-8: {shorten(error.object)}"
-    except Exception as error:  # of many kinds: what the graph holds is others' doing
+    except Exception as error:  # of many kinds: others control the content of the graph
         return (), described(error)
 
 
 def callers(node: Node, service: Service) -> str:
     """Return the nodes that have a client of a service, for the log: one of them has called.
 
-    rclpy 7.1 tells a callback no more of its caller than the number of the request; requests are a topic of DDS, and
-    the graph tells who publishes it. After an accident, who has reset the machine is the first question; the log is all
-    that is left to answer it.
+    rclpy 7.1 gives a callback only the number of the request, not its caller; requests are a topic of DDS, and the
+    graph lists its publishers. After an accident the first question is who has reset the machine; only the log can
+    answer it.
     """
     try:
         infos = node.get_publishers_info_by_topic(f"rq{service.service_name}Request", no_mangle=True)
         names = sorted({full_name(info) for info in infos})
     except Exception as error:  # of many kinds, as above
         return f"somebody unknown ({described(error)})"
-    return " or ".join(names) or "somebody who has left"
+    return " or ".join(names) or "a node that has left"
 
 
 def described(error: BaseException) -> str:
@@ -215,7 +215,7 @@ class Throttle:
         self._held: dict[str, int] = {}
 
     def allow(self, cause: str, text: str) -> str | None:
-        """Return the text to be logged, which says what was held back, or None to hold this one back."""
+        """Return the text to be logged, with the number of suppressed ones, or None to suppress this one."""
         now = time.monotonic()
         if now - self._last.get(cause, -1e9) < self._period:
             self._held[cause] = self._held.get(cause, 0) + 1
@@ -226,10 +226,10 @@ class Throttle:
 
 
 class PlainLogger(rcutils_logger.RcutilsLogger):
-    """A node's logger that writes one printable line for each message, whatever has been quoted in it.
+    """A node's logger that writes one printable line for each message, whatever text it quotes.
 
-    Anybody may send requests, as fast as he likes. So what is logged while one is answered, by us or by rclpy, is
-    throttled: one line a second from each line of source.
+    Anyone may send requests at any rate. So log messages during a request, ours or rclpy's, are throttled: one line a
+    second from each line of source.
     """
 
     def __init__(self, name: str, answering: Callable[[], bool]) -> None:

@@ -18,7 +18,7 @@ from std_msgs.msg import String
 from ..errors import HexapodError, InputFileError
 from .process import QUIET, SPIN_PERIOD, RosSession
 
-# What is recorded, its type, and whether it is offered reliably
+# Recorded topics, their types, and whether they are offered reliably
 TOPICS = {
     "tool_pose_command": (PoseStamped, True),
     "strut_setpoints": (JointState, True),
@@ -36,14 +36,14 @@ TOPICS = {
 }
 
 JOURNAL = "compensator/journal"
-KEPT = (JOURNAL, "compensator/files")  # Topics that who comes late is given too
+KEPT = (JOURNAL, "compensator/files")  # Topics that late subscribers receive too
 DEPTH = 1000  # Messages that may wait while the disk is slow: a second of commands
 
-# With less room than this on its disk, byte, a recording ends: closing it takes chunks of 1 MB that are on their way,
+# With less free space than this on its disk, byte, a recording ends: closing it takes pending chunks of 1 MB,
 # an index of 300 bytes for each chunk, and others may write to the disk between two looks
 RESERVE = 64_000_000
 
-# The disk, and whether the bag is still where it was made, are looked at this often, s, and after this much, byte
+# The disk, and whether the bag is still at its place, are checked at this period, s, and after this many bytes
 LOOK_PERIOD, LOOK_AFTER = 1.0, 16_000_000
 
 
@@ -76,7 +76,7 @@ class BagWriter:
             raise InputFileError(self._folder, "", f"cannot be made: {self.problem.partition(';')[0]}")
 
     def write(self, topic: str, kind: str, data: bytes) -> None:
-        """Write a message that came now; nothing once there is a :attr:`problem`."""
+        """Write a message that arrived now; nothing once there is a :attr:`problem`."""
         if self.problem:
             return
         try:
@@ -92,7 +92,7 @@ class BagWriter:
             self._check()
 
     def check_disk(self) -> None:
-        """Notice, once in a while, that the bag was removed or its disk gets full."""
+        """Detect, periodically, that the bag was removed or its disk gets full."""
         if not self.problem and time.monotonic() - self._looked >= LOOK_PERIOD:
             self._check()
 
@@ -108,7 +108,7 @@ class BagWriter:
             self.problem = f"{full}; what was heard until then is whole and can be replayed"
 
     def close(self) -> None:
-        """Close the bag; what goes wrong is the :attr:`problem`."""
+        """Close the bag; an error is the :attr:`problem`."""
         try:
             self._writer.close()
         except OSError as error:
@@ -118,7 +118,7 @@ class BagWriter:
 
 
 class BagRecorder:
-    """Hears a machine's topics and writes them."""
+    """Subscribes to a machine's topics and writes them."""
 
     def __init__(self, folder: str | Path, namespace: str = "") -> None:
         self._bag = BagWriter(folder)
@@ -140,7 +140,7 @@ class BagRecorder:
         self._bag.close()
 
     def run(self, going_on: Callable[[], bool], progress: Callable[[int], object] = lambda messages: None) -> None:
-        """Record while something holds, at least looked at every 0.1 s, and while the bag can be written."""
+        """Record while a condition, checked at least every 0.1 s, holds, and while the bag can be written."""
         reported = 0
         while going_on() and not self.problem:
             self._session.spin_once(SPIN_PERIOD)
@@ -151,12 +151,12 @@ class BagRecorder:
 
     @property
     def problem(self) -> str:
-        """Why nothing more is written; empty while all is well."""
+        """Why nothing more is written; empty if all is well."""
         return self._bag.problem
 
     @property
     def journal(self) -> int:
-        """Messages of the compensator's journal: without one nothing can be replayed."""
+        """Number of journal messages: without one nothing can be replayed."""
         return sum(count for topic, count in self.counts.items() if topic.endswith(JOURNAL))
 
     def _subscribe(self, topic: str, kind: Any, qos: QoSProfile) -> None:

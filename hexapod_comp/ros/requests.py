@@ -1,5 +1,5 @@
-"""What is asked of a compensator beside commands: a reset, the switch, another model or tool, how far the tool may go,
-what its error would be. Who may have called is logged: after an accident, who reset the machine is the first question.
+"""Requests to a compensator beside commands: reset, switch, another model or tool, travel, predicted error. Possible
+callers are logged: after an accident, the first question is who reset the machine.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from .rclpy_compat import LateAnswer, callers
 from .status import ERROR, OK, CompensatorStatus, status_of
 from .worker import Job, Worker, WorkerError
 
-# A model file that takes longer to read is given up, s; the shipped ones take one second, nearly all of it imports
+# Reading a model file is abandoned after this time, s; the shipped ones take one second, nearly all of it imports
 LOADED_WITHIN = 30.0
 
-PREDICTION_PERIOD = 0.2  # How often a predicted error is asked for and published, s
+PREDICTION_PERIOD = 0.2  # Period at which a predicted error is requested and published, s
 
-# A prediction that failed is tried again after this long, s: the first time, and at most, as the wait doubles
+# A failed prediction is repeated after this time, s: at first, and at most, as the wait doubles
 TRY_AGAIN_AFTER = (2.0, 60.0)
 
 TRAVEL_PERIOD = 1.0  # Between two messages of ``~/travel``, s
-LONGEST_REASON = 200  # Characters of what stands in the tool's way
+LONGEST_REASON = 200  # Longest text of the limits that end the travel, characters
 
 
 class Requests:
-    """Services and topics on which something is asked of a configured compensator."""
+    """Services and topics for requests to a configured compensator."""
 
     def __init__(
         self, node: MachineNode, status: CompensatorStatus, files: MachineFiles, forget: Callable[[], None]
@@ -59,13 +59,13 @@ class Requests:
         self._predicted = PredictedError(node, status, files, self._worker)
 
     def update(self, now: float) -> None:
-        """Handle the worker's results, and ask it for what is due."""
+        """Handle the worker's results, and send it due jobs."""
         self._worker.poll(now)
         self._travel.update(now)
         self._predicted.update(now)
 
     def close(self) -> None:
-        """Destroy services and topics, leave no request without an answer, and end the worker."""
+        """Destroy services and topics, answer pending requests, and end the worker."""
         self._reload.answer(Trigger.Response(message="the old model stays: the node was cleaned up"))
         for part in (self._tools, self._travel, self._predicted, self._worker):
             part.close()
@@ -119,7 +119,7 @@ class Requests:
     def _use_model(self, found: tuple[MachineModel, Any]) -> Trigger.Response:
         self._loading, sources = False, self._files.sources
         before = sources["model"]
-        model, sources["model"] = found  # the source first: the journal notes it with the change
+        model, sources["model"] = found  # the source first: the journal records it with the change
         try:
             self._status.compensator.set_model(model)
         except HexapodError as error:
@@ -135,10 +135,10 @@ class Requests:
 
 
 class ToolChoice:
-    """The tool in use: the parameter ``tool`` and the topic ``select_tool`` choose it, ``~/tool`` says which it is.
+    """The tool in use: selected by the parameter ``tool`` and the topic ``select_tool``, published on ``~/tool``.
 
-    The topic is for controllers: it sets the parameter. Only one node may publish on it, and only a machine that stands
-    changes its tool.
+    The topic is for controllers: it sets the parameter. Only one node may publish on it, and the tool changes only
+    while the machine stands.
     """
 
     def __init__(self, node: MachineNode, status: CompensatorStatus) -> None:
@@ -159,7 +159,7 @@ class ToolChoice:
         self._node.close_ends(self._selected, self._publisher)
 
     def _judge(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        """Refuse a tool that there is not, and any while the machine moves."""
+        """Refuse an unknown tool, and any while the machine moves."""
         geometry = self._compensator.geometry
         try:
             for name in (parameter.value for parameter in parameters if parameter.name == "tool"):
@@ -181,8 +181,9 @@ class ToolChoice:
                 self._publish()
 
     def _on_message(self, data: bytes, number: int | None) -> None:
-        """Set the parameter. Where the commander's choice is refused, its next command must be where the struts are:
-        commands for the tool that it did not get may follow. Whoever else asks in vain stops nothing."""
+        """Set the parameter. If the commander's choice is refused, its next command must be at the struts' present
+        position: commands for the tool that it did not get may follow. A refused choice by another node stops
+        nothing."""
         now, status = time.monotonic(), self._status
         status.update(now)  # a new publisher may have sent already, and the commander's name may be outdated
         self._sender.receive(number, now)
@@ -203,8 +204,8 @@ class ToolChoice:
 
 
 class TravelReports:
-    """``~/travel``, once a second while somebody subscribes, and ``~/get_travel``: how far the tool may go from where
-    the machine was sent last, or before the first command was measured last."""
+    """``~/travel``, once a second while there are subscribers, and ``~/get_travel``: the tool's travel from the last
+    commanded pose, or before the first command from the last measured one."""
 
     def __init__(self, node: MachineNode, status: CompensatorStatus, files: MachineFiles, worker: Worker) -> None:
         self._node, self._status, self._files, self._worker = node, status, files, worker
@@ -214,12 +215,12 @@ class TravelReports:
         self._due = 0.0
 
     def close(self) -> None:
-        """Stop, and leave no request without an answer."""
+        """Stop, and answer pending requests."""
         self._late.answer(Trigger.Response(message="the node was cleaned up"))
         self._node.close_ends(self._late.service, self._publisher)
 
     def update(self, now: float) -> None:
-        """Begin anew when it is due."""
+        """Start a new calculation when it is due."""
         if not self._busy and now >= self._due and self._publisher.get_subscription_count():
             self._due = now + TRAVEL_PERIOD
             try:
@@ -277,8 +278,8 @@ class TravelReports:
 
 
 class PredictedError:
-    """``~/predicted_error`` and ``~/predicted_error_aligned``: the error that the tool would have without compensation
-    at the newest command, as the model predicts it, and how well that is known. Worked out while somebody subscribes.
+    """``~/predicted_error`` and ``~/predicted_error_aligned``: the model's prediction of the tool's error without
+    compensation at the newest command, with its covariance. Computed while there are subscribers.
     """
 
     def __init__(self, node: MachineNode, status: CompensatorStatus, files: MachineFiles, worker: Worker) -> None:
@@ -297,7 +298,7 @@ class PredictedError:
         self._node.close_ends(*self._topics.values())
 
     def update(self, now: float) -> None:
-        """Ask for the newest pose, while somebody listens."""
+        """Request the newest pose's prediction, while there are subscribers."""
         compensator, source = self._status.compensator, self._files.sources["model"]
         wanted = any(publisher.get_subscription_count() for publisher in self._topics.values())
         if not wanted or self._source is not source:
@@ -317,7 +318,7 @@ class PredictedError:
         self._worker.ask(Job("predict", asked, self._publish, self._failed, self._files.made_of()))
 
     def _publish(self, result: dict[str, Any]) -> None:
-        """Publish both errors; of a pose that the machine with its errors cannot reach there is none."""
+        """Publish both errors; there is none for a pose that the real machine cannot reach."""
         self._busy, self._wait, self._status.prediction_problem = False, TRY_AGAIN_AFTER[0], ""
         for name, publisher in self._topics.items():
             if (error := result[name]) is not None and np.isfinite(error[0]).all():
@@ -333,8 +334,8 @@ class PredictedError:
 def error_message(
     values: Sequence[float] | np.ndarray, covariance: np.ndarray | None, frame: str, stamp: int
 ) -> PoseWithCovarianceStamped:
-    """Return an error, displacement, m, and rotation vector, rad, as a message: where the tool would be and how it
-    would stand, seen from where it should. A covariance that is not known is NaN, never zero."""
+    """Return an error, displacement, m, and rotation vector, rad, as a message: the tool's pose relative to the
+    commanded one. An unknown covariance is NaN, never zero."""
     message = PoseWithCovarianceStamped()
     message.header.frame_id, message.header.stamp = frame, stamp_of(stamp)
     position, orientation = message.pose.pose.position, message.pose.pose.orientation

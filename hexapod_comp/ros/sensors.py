@@ -1,7 +1,7 @@
 """Topics of readings that a compensator uses beside its struts: temperatures, loads, measured poses.
 
-Each passes the same way: one publisher, not too often, a message that can be read; then its handler, which raises what
-is wrong with it. A reading that is rejected, or a second publisher, is counted and named, and stops nothing.
+Each is handled in the same way: one publisher, a minimum period, a valid message; then its handler, which raises an
+error about the content. A rejected reading, or a second publisher, is counted and reported, and stops nothing.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ class SensorTopic:
     """The subscription of one topic of readings.
 
     `handle` is called with each message and its time of arrival, monotonic, s; it raises a HexapodError to reject it.
-    `reject` is called with that error; None: it is bad feedback. Messages that come within `period`, s, of the last
-    good one are left out.
+    `reject` is called with that error; None: it is bad feedback. Messages within `period`, s, of the last good one are
+    ignored.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class SensorTopic:
         self._sender = status.sensing[topic] = node.sender_of(self._end, bool(allowed))
 
     def stale(self, now: float, timeout: float) -> bool:
-        """Return whether somebody published before, but not for longer than a timeout, s (0: off)."""
+        """Return whether it was published before, but not for longer than a timeout, s (0: off)."""
         return 0.0 < timeout < now - self.last
 
     def close(self) -> None:
@@ -54,7 +54,8 @@ class SensorTopic:
         self._node.close_ends(self._end)
 
     def _receive(self, data: bytes, number: int | None) -> None:
-        # Dated by arrival: sensors need not stamp, clocks may be set, and no drift notices what a transport delays.
+        # Dated by arrival: sensors need no stamp, clocks may be set, and a drift is slow compared with transport
+        # delays.
         now = time.monotonic()
         try:
             if self._sender.receive(number, now):

@@ -1,4 +1,4 @@
-"""Counters of a node, and what it says of itself in diagnostics: a table of findings and one of values.
+"""Counters of a node, and its diagnostics: a table of findings and one of values.
 
 doc/states.md has every case.
 """
@@ -31,19 +31,19 @@ if TYPE_CHECKING:
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
-LEAST_ROOM = 65_536  # A file system with less than this, byte, is full: a few hundred lines of log
-NEAR_SINGULAR = 0.9  # From this share of the largest allowed condition number on, diagnostics warn
+LEAST_ROOM = 65_536  # A file system with less free space, byte, is full: a few hundred lines of log
+NEAR_SINGULAR = 0.9  # Share of the largest allowed condition number above which diagnostics warn
 
 
 def status_prefix(namespace: str, node: str) -> str:
-    """Return what the names of all statuses begin with that a node of a namespace publishes."""
+    """Return the first part of the names of all statuses that a node of a namespace publishes."""
     return f"{namespace.strip('/')}/{node}:".lstrip("/")
 
 
 def status_of(
     name: str, hardware_id: str, level: bytes, text: str, values: Mapping[str, str], longest: int = LONGEST_TEXT
 ) -> DiagnosticStatus:
-    """Return a status; of text and values no more is shown than `longest` characters each."""
+    """Return a status; text and values are cut to `longest` characters each."""
     status = DiagnosticStatus(level=level, name=printable(name), hardware_id=printable(hardware_id))
     status.message = printable(text, longest)
     status.values = [KeyValue(key=key, value=printable(value, longest)) for key, value in values.items()]
@@ -51,14 +51,14 @@ def status_of(
 
 
 def joined(findings: Iterable[tuple[bytes, str]]) -> tuple[bytes, str]:
-    """Return level and text of all findings that are not well, worst first; of the first when all are well."""
+    """Return level and text of all findings that are not OK, worst first; of the first when all are OK."""
     listed = list(findings)
     bad = [finding for finding in listed if finding[0] != OK] or listed[:1]
     return bad[0][0], "; ".join(text for _, text in bad)
 
 
 def seconds(value: float) -> str:
-    """Return an age for people: ``never`` when it is infinite."""
+    """Return an age as text: ``never`` when it is infinite."""
     return "never" if value == math.inf else f"{value:.3f}"
 
 
@@ -151,7 +151,7 @@ class HealthReport:
         self._last = -math.inf
 
     def due(self, level: bytes, message: str, now: float) -> bool:
-        """Return whether a message must go out, and take it as sent."""
+        """Return whether a message is due, and count it as sent."""
         if (level, message) == self._shown and now - self._last < self._period:
             return False
         self._shown, self._last = (level, message), now
@@ -167,7 +167,7 @@ class HealthReport:
 # ---- the compensator's ----
 
 
-# What the sender of a refused command is to do, by reason
+# What the sender of a refused command should do, by reason
 ADVICE = {
     "stamp_past": "send the pose again with a new stamp; never skip one that was not answered",
     "stamp_future": "set the clocks, or send a zero stamp, which means now",
@@ -182,7 +182,7 @@ ADVICE = {
     "unknown_publisher": "leave one publisher on the topic, whose node's name can be read",
 }
 
-# The same for all other reasons: a limit, a frame, a message that cannot be read
+# The same for all other reasons: a limit, a frame, an invalid message
 OTHERWISE = "mend what the refusal names, and go on from the last answered command (last_answered)"
 
 
@@ -201,7 +201,7 @@ class CompensatorStatus:
         self.commands, self.feedback = Flow(), Flow()  # accepted commands, usable measured struts
         self.refusals, self.bad_feedback, self.bad_poses = Refusals(), Refusals(), Refusals()
         self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
-        self.waited = self.dropped = 0  # commands that have waited, and that a newer one has replaced
+        self.waited = self.dropped = 0  # number of commands that have waited, and that a newer one has replaced
         self.behind = EventWindow()  # commands were handled late, by more than jitter
         self.frame_id = self.prediction_problem = ""  # of the last command; why no error is predicted
         self.drift_problem = ""  # why the drift that an instrument shows is not compensated
@@ -218,8 +218,8 @@ class CompensatorStatus:
         own_topic: OneSender,
         measuring: OneSender,
     ) -> None:
-        """Go by a configuration: the machine, its frames by the machine's names, and who commands, who else publishes
-        strut commands, who measures."""
+        """Apply a configuration: the machine, its frames by the machine's names, and the guards of commanders, of other
+        publishers of strut commands, and of readings."""
         self.compensator, self.thermometers, self.frame_ids = compensator, thermometers, frame_ids
         self.source, self.own_topic, self.measuring = source, own_topic, measuring
         self.sensing.clear()
@@ -243,7 +243,7 @@ class CompensatorStatus:
         return next((guard for guard in self.standing if guard.problem), None)
 
     def stops(self, now: float) -> bool:
-        """Return whether an active node refuses commands: by a guard, for want of readings, or as of late."""
+        """Return whether an active node refuses commands: by a guard, without readings, or recently."""
         return self.problem() is not None or self.refusals.recent(now) or self.track.waits(now)
 
     def fed(self, now: float) -> bool:
@@ -255,7 +255,7 @@ class CompensatorStatus:
         return joined(self.findings(now))
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
-        """Yield level and text of what there is to say of an active node, worst first."""
+        """Yield level and text of an active node's findings, worst first."""
         compensator, guard, fed = self.compensator, self.problem(), self.fed(now)
         if guard is not None:
             yield ERROR, f"refusing commands: {guard.reason}: {guard.problem}"
@@ -371,7 +371,7 @@ class CompensatorStatus:
         return {**values, **self.refusals.values()}
 
     def _drift(self, now: float) -> dict[str, str]:
-        """Return what is known by the pose instrument as key and value; nothing without one."""
+        """Return the pose instrument's values as key and value; nothing without one."""
         if (fusion := self.fusion) is None:
             return {}
 

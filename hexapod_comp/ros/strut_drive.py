@@ -1,8 +1,7 @@
 """The simulated strut-drive node: strut commands in, encoder readings and the true tool pose out.
 
-It stands for the six drives and the machine on them: :class:`~hexapod_comp.virtual.machine.StrutDrive` with a
-hidden truth. Run it with ``ros2 run hexapod_comp strut_drive`` or
-``python -m hexapod_comp.ros.strut_drive``.
+It represents the six drives and the machine on them: :class:`~hexapod_comp.virtual.machine.StrutDrive` with a hidden
+truth. Run it with ``ros2 run hexapod_comp strut_drive`` or ``python -m hexapod_comp.ros.strut_drive``.
 """
 
 from __future__ import annotations
@@ -152,7 +151,7 @@ class StrutDriveNode(MachineNode):
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Start to move, from where the struts stand, and to measure."""
+        """Start to move, from the struts' present positions, and to measure."""
         self._steps.reset(self.drive.motor_lengths().tolist())
         self._last_run = time.monotonic()
         self._active = True
@@ -188,7 +187,7 @@ class StrutDriveNode(MachineNode):
     # ---- faults ----
 
     def on_parameters(self, names: set[str]) -> None:
-        """Go by what has been set while the node runs; a knock only where it has been asked for anew."""
+        """Apply parameters set while the node runs; a knock only if it was set anew."""
         if self._drive is not None:
             self._stamps.max_age = self._options["command_validity"]
             faults = self._faults()
@@ -251,7 +250,7 @@ class StrutDriveNode(MachineNode):
         self._true_pub.publish(self._true_out)
 
     def _tool_in_base(self) -> None:
-        """Fill the message of the true tool pose, as the tracker reads it, in ``base``."""
+        """Fill the message of the true tool pose, as the tracker measures it, in ``base``."""
         pose = self.drive.machine.geometry.work @ self.drive.tracker_pose()
         write_pose(self._true_out, pose.position, pose.rotation)
 
@@ -299,7 +298,7 @@ class StrutDriveNode(MachineNode):
 
 def bending(machine: RealMachine, options: Mapping[str, Any]) -> RealMachine:
     """Return a machine with the physics that a node's parameters describe."""
-    from ..virtual.physics import PhysicalMachine, Physics  # MuJoCo is an extra, and loaded by who asks for it alone
+    from ..virtual.physics import PhysicalMachine, Physics  # MuJoCo is an extra, imported only when it is used
 
     said = {name.removeprefix("physics."): value for name, value in options.items() if name.startswith("physics.")}
     payload = Payload(said.pop("payload_mass"), tuple(said.pop("payload_centre")))

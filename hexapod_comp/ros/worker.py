@@ -1,10 +1,10 @@
-"""One process beside a node, for what must not stop its loop: loading a model, the predicted error, how far it may go.
+"""One process beside a node, for work that must not stop its loop: loading a model, predicted error, travel.
 
-Parsing YAML keeps Python's lock for tens of milliseconds, derivatives for as long, and a file on a dead network mount
-is waited for without end: meanwhile no command would be answered. So the node asks a process, which it starts when it
+Parsing YAML holds Python's lock for tens of milliseconds, derivatives do for as long, and a file on a dead network
+mount blocks without end: meanwhile no command would be answered. So the node uses a process, which it starts when it
 first needs it: ``python -m hexapod_comp.cli.jobs``; the nodes themselves import nothing of calibration. Jobs and
-results travel pickled through a socket between the two; jobs are done in turn. The process ends when the node's end of
-the socket closes, so it never outlives the node.
+results are sent pickled through a socket between the two; jobs are done in turn. The process ends when the node's end
+of the socket closes, so it never outlives the node.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ IDLE_AFTER = 10.0
 
 JOBS = "hexapod_comp.cli.jobs"  # the module that it runs
 
-# Where the process runs: Python also imports from the folder it runs in, which must not be just any
+# Working directory of the process: Python also imports from it, so it must not be an arbitrary one
 PACKAGE_ROOT = Path(__file__).resolve().parents[2]
 
 
 class WorkerError(HexapodError):
-    """A job failed; the message is the process's, or says what became of it."""
+    """A job failed; the message is the process's, or describes its end."""
 
     reason = "bad_file"
 
 
 @dataclass
 class Job:
-    """What the process is asked for."""
+    """A job for the process."""
 
     task: str  # load_model, predict, travel or plan_move
     arguments: dict[str, Any]
     done: Callable[[Any], None]  # called with the result, from Worker.poll
     failed: Callable[[WorkerError], None]
-    machine: dict[str, Any] | None = None  # which one, as Machine takes it
-    within: float | None = None  # s, from its beginning; then the process is killed
+    machine: dict[str, Any] | None = None  # machine and model, as for Machine
+    within: float | None = None  # longest time, s; then the process is killed
     late: str = ""  # the error's text then
 
 
@@ -66,7 +66,7 @@ class Worker:
         return self._process.popen
 
     def ask(self, job: Job) -> None:
-        """Have a job done."""
+        """Queue a job."""
         self._jobs.append((job, self._thread.submit(self._process.do, job)))
 
     def poll(self, now: float) -> None:
@@ -83,23 +83,23 @@ class Worker:
             self._process.end()
 
     def close(self) -> None:
-        """Give up all jobs and end the process, whatever it does."""
+        """Abandon all jobs and end the process, whatever it does."""
         self._thread.shutdown(wait=False, cancel_futures=True)
         self._jobs.clear()
         self._process.end()
 
 
 class _Process:
-    """The process and the way to it; `do` waits in the worker's thread, where Python's lock is free."""
+    """The process and its socket; `do` waits in the worker's thread, where Python's lock is free."""
 
     def __init__(self) -> None:
         self.popen: subprocess.Popen[bytes] | None = None
         self._connection: Connection | None = None
-        self._machine: dict[str, Any] | None = None  # that it knows already
+        self._machine: dict[str, Any] | None = None  # known to the process already
 
     def do(self, job: Job) -> Any:
         """Return the result of a job, or raise a WorkerError."""
-        if self.popen is None or self.popen.poll() is not None:  # killed, perhaps, while it had nothing to do
+        if self.popen is None or self.popen.poll() is not None:  # it may have been killed while it was idle
             self._machine = None
         machine = None if job.machine == self._machine else job.machine
         self._machine = job.machine or self._machine
@@ -116,7 +116,7 @@ class _Process:
         return answer[1]
 
     def exchange(self, request: tuple[Any, ...], within: float | None) -> tuple[str, Any] | None:
-        """Return problem and result of a request, None where neither comes within a time, s."""
+        """Return problem and result of a request, None if neither arrives within a time, s."""
         if self.popen is None or self.popen.poll() is not None:
             self._start()
         connection = self._connection
@@ -137,7 +137,8 @@ class _Process:
             )
 
     def end(self) -> None:
-        """End the process; a thread waits for its end, as one that waits for a dead disk cannot even be killed."""
+        """End the process; a thread waits for its end, since a process that waits for a dead disk cannot even be
+        killed."""
         popen, self.popen, self._machine = self.popen, None, None
         if popen is not None:
             popen.kill()
