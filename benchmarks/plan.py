@@ -23,7 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hexapod_comp.calibration.design import Aim, Goal, MeasuringBox, Proposal, Times, propose, seen_by, verdict
+from hexapod_comp.calibration.candidates import MeasuringBox
+from hexapod_comp.calibration.design import Aim, Goal, Proposal, Times, propose, seen_by, verdict
 from hexapod_comp.calibration.estimator import physical_covariance
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace

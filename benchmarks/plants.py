@@ -30,10 +30,11 @@ import numpy as np
 
 from benchmarks import drawn
 from benchmarks.calibration import LEAD, SMALL
-from hexapod_comp.calibration.check import NAMED, PAYLOAD, VALID, verify_model
+from hexapod_comp.calibration.changes import PAYLOAD
+from hexapod_comp.calibration.check import NAMED, VALID, verify_model
+from hexapod_comp.calibration.design import propose_check
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import ModelFit, fit_model
-from hexapod_comp.calibration.follow_up import propose_check
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.posterior import FittedParameters
 from hexapod_comp.machine.geometry import load_geometry

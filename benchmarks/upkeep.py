@@ -34,13 +34,9 @@ from tqdm import tqdm
 
 from benchmarks.calibration import LARGE, LEAD
 from benchmarks.smooth_imperfections import with_wavy_field
+from hexapod_comp.calibration.changes import AGEING, DATUM, OTHER, STRUT, TEMPERATURE
 from hexapod_comp.calibration.check import (
-    AGEING,
-    DATUM,
     NAMED,
-    OTHER,
-    STRUT,
-    TEMPERATURE,
     UNDECIDED,
     UNEXPLAINED,
     VALID,
@@ -49,9 +45,9 @@ from hexapod_comp.calibration.check import (
     update_model,
     verify_model,
 )
+from hexapod_comp.calibration.design import propose_check
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
-from hexapod_comp.calibration.follow_up import propose_check
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.posterior import FittedParameters
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
@@ -276,17 +272,18 @@ def reliability(checks: list[dict]) -> dict:
     return {"rows": rows, "named": len(named), "named_rightly": float(np.mean(named or [1.0]))}
 
 
-def share(figures: dict, key: str, answers: tuple[str, ...]) -> float:
-    """Return in which share of machines the answer was one of some."""
-    return sum(figures["answers"][key].get(a, 0) for a in answers) / figures["machines"]
+def share(figures: dict, key: str, answers: tuple[str, ...], others: bool = False) -> float:
+    """Return in which share of machines the answer was one of some, or one of the `others`."""
+    counts = figures["answers"][key]
+    return sum(count for answer, count in counts.items() if (answer in answers) != others) / figures["machines"]
 
 
 def bars(figures: dict) -> list[tuple[str, float, float, bool]]:
     """Return the bars: name, figure, bar, met."""
-    alarms = max(1.0 - share(figures, f"nothing, {n}", (VALID,)) for n in SETS)
+    alarms = max(share(figures, f"nothing, {n}", (VALID,), others=True) for n in SETS)
     named = share(figures, f"strut, {CHOSEN}", (STRUT,))
     repaired = figures[f"repair_{CHOSEN}"]["times_fresh"]
-    wrong = {f"{what}, 24": 1.0 - share(figures, f"{what}, 24", (OTHER, UNDECIDED, VALID)) for what in UNKNOWN}
+    wrong = {f"{what}, 24": share(figures, f"{what}, 24", (OTHER, UNDECIDED, VALID), others=True) for what in UNKNOWN}
     worst = max(wrong, key=lambda key: wrong[key])
     least = min(SETS, key=lambda size: figures[f"reliability, {size}"]["named_rightly"])
     right = figures[f"reliability, {least}"]["named_rightly"]

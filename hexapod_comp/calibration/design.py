@@ -1,61 +1,74 @@
-"""What to measure: candidates, the information of each, and the best of them by a criterion.
+"""What to measure: what each candidate would show, and the best of them by a criterion.
 
-In parameters z of unit prior variance, readings A of unit noise, free of nuisances, turn their covariance C into C −
-CAᵀ(I + ACAᵀ)⁻¹AC, independent of the values read. So :class:`Greedy` chooses in advance the candidate with the largest
-gain per cost.
+One planner (:class:`Greedy`) chooses the candidate that gains most for what it costs, again and again, before anyone
+measures. Its criterion is its argument: :class:`ErrorLeft`, the tool's mean square error (an I-optimal design), for
+campaigns; :class:`Detectability`, the Bayes factor of what may happen to a machine, for checks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
-from ..core import Status
-from ..errors import CalibrationError, GeometryError, InputFileError
+from ..errors import CalibrationError
 from ..formats.texts import aligned, number
-from ..machine.field import CROSS_AXES
-from ..machine.geometry import HexapodGeometry
+from ..machine.geometry import STRUT_NAMES
 from ..machine.kinematics import Structure, strut_lengths_batch
-from ..measurements.campaign import (
-    LINE_INSTRUMENTS,
-    PLANES,
-    POSE_INSTRUMENTS,
-    Campaign,
-    CampaignRun,
-    circle_run,
-    line_run,
-    template,
-    tilts,
+from ..measurements.campaign import Campaign, CampaignRun, template
+from ..measurements.readings import ABSOLUTE_KINDS, BACKWARD, CHANNELS, DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
+from .candidates import TILTS, MeasuringBox, candidates, laid_out, places
+from .changes import (
+    HEAVIER,
+    PAYLOAD,
+    STRUT,
+    TEMPERATURE,
+    CheckReadings,
+    Evidence,
+    Explanation,
+    possible_changes,
+    reading_noise,
+    widened,
+    wrong_readings,
 )
-from ..measurements.readings import AXES, DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
-from ..pose import rotation_from_angles
-from ..workspace.reach import Examiner
 from .estimator import Estimation, physical_covariance, solve
 from .fit import unseen_errors
 from .observations import Cells
 from .parameters import Extent, FitSettings, ParameterSpace
-from .posterior import POINTS, Observability, ToolError, UnseenError, box_errors, expected_error, observe
+from .posterior import (
+    POINTS,
+    FittedParameters,
+    Observability,
+    ToolError,
+    UnseenError,
+    box_errors,
+    expected_error,
+    observe,
+)
 from .promise import Scatter, Unexplained
 from .trust import TILT
 
 FAINT = 0.05  # directions with a smaller effect on readings are omitted, σ
+
+
 LEAST_REACHED = 0.3  # share of the box in which the tool must reach the wanted tilt
 
 
 def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) -> tuple[np.ndarray, Cells]:
-    """Return the derivatives of readings by the parameters y, (cells, size), over their stated noise and free of
-    nuisances."""
+    """Return how the parameters y move readings, (cells, size), over their stated noise and free of nuisances."""
     estimation = Estimation(readings, space, alone=False)
     problem, _ = estimation.linearise(x, np.ones(len(readings)))
     return problem.rows.dense(), estimation.cells
 
 
-TILTS = (10.0, 5.0, 2.0)  # of scattered poses, °: the first within reach
+def information_of_fit(fitted: FittedParameters, readings: MeasurementSet) -> tuple[np.ndarray, Cells]:
+    """Return the same by the parameters x of a fit, at what it has found."""
+    rows, cells = information(fitted.space, readings, fitted.x)
+    return fitted.space.unwhitened(rows), cells
+
 
 # The planner
 
@@ -115,22 +128,22 @@ class Greedy(Generic[C]):
 
 
 class ErrorLeft:
-    """Criterion: the mean square tr(M·C) of the tool's error, in parameters z of unit variance before."""
+    """Criterion of an I-optimal design: the mean square tr(M·C) of the tool's error.
+
+    In parameters z of unit variance before, readings A of unit noise, free of nuisances, turn their covariance C into
+    C − CAᵀ(I + ACAᵀ)⁻¹AC, whatever they will read. C is held in the directions that any candidate sees.
+    """
 
     def __init__(self, seen: Sequence[np.ndarray], square: np.ndarray) -> None:
-        values, vectors = np.linalg.eigh(square)
-        kept = values > 1e-9 * values[-1]  # the others contribute almost nothing to the tool's error
-        root = vectors[:, kept] * np.sqrt(values[kept])
         self.parts = [slice(*pair) for pair in pairwise(np.cumsum([0, *(len(rows) for rows in seen)]))]
         rows = np.concatenate(seen)
         values, vectors = np.linalg.eigh(rows.T @ rows)
         self.basis = vectors[:, values > FAINT**2]
-        self.root = self.basis.T @ root
-        self.rows = rows @ self.basis
-        self.inner = np.eye(self.basis.shape[1])
-        self.known = self.rows.copy()  # A·C
-        self.shown = self.rows @ self.root  # A·C·√M
-        self.grams = [self.rows[part] @ self.rows[part].T for part in self.parts]  # A·C·Aᵀ
+        self.rows, self.inner = rows @ self.basis, np.eye(self.basis.shape[1])
+        values, vectors = np.linalg.eigh(square)
+        kept = values > 1e-9 * values[-1]  # the others add next to nothing to the tool's error
+        root = self.basis.T @ (vectors[:, kept] * np.sqrt(values[kept]))
+        self.known, self.shown = self.rows.copy(), self.rows @ root  # A·C and A·C·√M
 
     @property
     def covariance(self) -> np.ndarray:
@@ -143,52 +156,28 @@ class ErrorLeft:
     def gains(self, allowed: np.ndarray | None = None) -> np.ndarray:
         """Return by how much each candidate lowers the mean square error, m²."""
         gains = np.zeros(len(self.parts))
-        for n, (part, gram) in enumerate(zip(self.parts, self.grams, strict=True)):
-            if len(gram) and (allowed is None or allowed[n]):
+        for n, part in enumerate(self.parts):
+            if part.start < part.stop and (allowed is None or allowed[n]):
                 shown = self.shown[part]
-                gains[n] = np.vdot(shown, np.linalg.solve(np.eye(len(gram)) + gram, shown))
+                gains[n] = np.vdot(shown, np.linalg.solve(self._variance(part), shown))
         return gains
 
     def add(self, n: int) -> None:
         """Add a candidate's readings, also once more."""
-        root = cholesky(np.eye(len(self.grams[n])) + self.grams[n], lower=True)
-        step = solve_triangular(root, self.known[self.parts[n]], lower=True)
-        self.inner -= step.T @ step
-        along = self.rows @ step.T
-        self.known -= along @ step
-        self.shown -= along @ (step @ self.root)
-        for gram, part in zip(self.grams, self.parts, strict=True):
-            gram -= along[part] @ along[part].T
+        part = self.parts[n]
+        known, shown = self.known[part].copy(), self.shown[part].copy()
+        gain = np.linalg.solve(self._variance(part), known @ self.rows.T).T
+        self.inner -= known.T @ np.linalg.solve(self._variance(part), known)
+        self.known -= gain @ known
+        self.shown -= gain @ shown
+
+    def _variance(self, part: slice) -> np.ndarray:
+        """Return I + ACAᵀ of a candidate's readings."""
+        return np.eye(part.stop - part.start) + self.known[part] @ self.rows[part].T
 
     def after_all(self, times: float = 1.0) -> np.ndarray:
-        """Return C after all candidates, each repeated."""
-        size = np.eye(self.basis.shape[1])
-        return self._whole(cho_solve(cho_factor(size + times * self.rows.T @ self.rows), size))
-
-
-def laid_out(
-    space: ParameterSpace,
-    lines: int = 0,
-    readings: int = 2,
-    poses: int = 0,
-    tilts: Sequence[float] = (0.0,),
-    instrument: str = "6-D",
-) -> tuple[MeasurementSet, float]:
-    """Return possible readings in a fit's box: `lines` across each direction with diagonals, and scattered poses."""
-    box, side, geometry = space.work_box, float(np.ptp(space.work_box, axis=0).min()), space.geometry
-    if side <= 0.0:
-        raise CalibrationError("fit", "has measured no box in which readings could be laid out")
-    level = geometry.work.rotation.T @ space.level @ geometry.tool.rotation
-    grid = Campaign(box, side / max(lines - 1, 1), side / (readings - 1), instrument, 4, poses=poses, level=level)
-    if not lines:
-        grid = replace(grid, instrument=None, diagonals=0)
-    for tilt in tilts:
-        try:
-            return template(replace(grid, tilt=float(np.radians(tilt))), geometry), tilt
-        except InputFileError:  # out of reach
-            if tilt == tilts[-1]:
-                raise
-    raise ValueError("no tilts")
+        """Return C after all candidates, each so many times."""
+        return self._whole(np.linalg.inv(np.eye(self.basis.shape[1]) + times * self.rows.T @ self.rows))
 
 
 # A campaign that is given
@@ -229,168 +218,7 @@ def noise_factors(campaign: Campaign) -> np.ndarray:
     return np.maximum(np.hypot(campaign.noise, stops), 1e-3 * default) / default
 
 
-# Possible measurements in a box: lines along and across it, circles, poses; level and tilted
-
 FEW_POINTS, USUAL_POINTS = (5, 13), (13,)
-# Points of a line, by instrument: few at little cost, or enough to resolve the screws' waves
-LINE_POINTS = {"linear": (8, 21), "5-D": FEW_POINTS, "6-D": FEW_POINTS}
-# The same with each point read once, in alternating directions: more places for as many readings
-ALTERNATE_POINTS = {"linear": (4, 6, 10), "5-D": (4, 8), "6-D": (4, 8)}
-
-
-@dataclass(frozen=True)
-class MeasuringBox:
-    """The box and the attitudes of a measurement."""
-
-    geometry: HexapodGeometry  # the machine as designed
-    box: np.ndarray  # (2, 3): lowest and highest corner of the tool's positions, m in the work frame
-    level: np.ndarray  # (3, 3): attitude of the level tool in the work frame
-    tilt: float  # largest tilt of the tool from there, rad
-
-    def attitudes(self) -> list[tuple[str, np.ndarray]]:
-        """Return the level attitude and, where the tool tilts, four tilted ones, with their names."""
-        names = {"level": (0.0, 0.0)}
-        if self.tilt > 0.0:
-            shown = f"{np.degrees(self.tilt):g}°"
-            names |= {f"+{shown} about x": (1.0, 0.0), f"−{shown} about x": (-1.0, 0.0)}
-            names |= {f"+{shown} about y": (0.0, 1.0), f"−{shown} about y": (0.0, -1.0)}
-        return [(name, self.turned(self.tilt * np.array(about))) for name, about in names.items()]
-
-    def turned(self, about: np.ndarray) -> np.ndarray:
-        """Return the tool's attitude(s) after small tilts about x and y of the work frame, shape (..., 2), rad."""
-        return np.asarray(rotation_from_angles(np.concatenate([about, 0.0 * about[..., :1]], axis=-1)) @ self.level)
-
-    def reaches(self, positions: np.ndarray, rotations: np.ndarray, threads: int | None = 1) -> np.ndarray:
-        """Return which poses of the tool the nominal machine's limits allow, shape (n,)."""
-        return Examiner(self.geometry).findings(positions, rotations, threads=threads)[0] == Status.OK
-
-
-def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[CampaignRun]:
-    """Return the candidate runs, all within the limits of the nominal machine; a GeometryError if there are none."""
-    runs: list[CampaignRun] = []
-    lines = list(_lines(place)) if any(name in LINE_INSTRUMENTS for name in instruments) else []
-    for instrument in instruments:
-        if instrument in POSE_INSTRUMENTS:
-            runs += [CampaignRun(f"{instrument}, poses", instrument, *poses) for poses in _sets_of_poses(place)]
-        elif instrument not in LINE_INSTRUMENTS:
-            runs += {"ball_bar": _circles, "r_test": _tilted_at, "station": _lengths}[instrument](place)
-        else:
-            for name, ends, rotation in lines:
-                if instrument in ("straightness", "rotation") and name.startswith("diagonal"):
-                    continue
-                title = f"{instrument}, {name}"
-                for points in LINE_POINTS.get(instrument, USUAL_POINTS):
-                    runs.append(line_run(title, instrument, ends, points, rotation))
-                for points in ALTERNATE_POINTS.get(instrument, ()):
-                    runs.append(replace(line_run(title, instrument, ends, points, rotation), alternate=True))
-    if not runs:
-        raise GeometryError("limits", "leave nothing to be measured in the box", place.box.tolist())
-    return runs
-
-
-def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield name, ends (2, 3), m, and attitude of each line, cut at the limits."""
-    low, size = place.box[0], np.ptp(place.box, axis=0)
-    level, tilted = [], []
-    for axis, (a, b) in enumerate(CROSS_AXES):
-        for first, second in np.ndindex(3, 3):
-            ends = place.box.copy()
-            ends[:, [a, b]] = low[[a, b]] + 0.5 * np.array([first, second]) * size[[a, b]]
-            where = f"{AXES[a]} {ends[0, a] * 1e3:.0f}, {AXES[b]} {ends[0, b] * 1e3:.0f}"
-            level.append((f"{AXES[axis]} at {where}", ends))
-            if (first == 1) == (second == 1):  # no middle of a face
-                tilted.append(level[-1])
-    corners = [(np.array(c), 1 - np.array(c)) for c in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0))]
-    for a, b in CROSS_AXES:
-        for side, turned in np.ndindex(2, 2):
-            start, stop = np.full((2, 3), side)
-            start[[a, b]], stop[[a, b]] = (0, turned), (1, 1 - turned)
-            corners.append((start, stop))
-    diagonals = [(f"diagonal {n}", low + np.array(pair) * size) for n, pair in enumerate(corners, start=1)]
-    level += diagonals
-    tilted += diagonals[:4]
-
-    share = np.linspace(0.0, 1.0, 41)  # points that are checked
-    least = 0.4  # lines of which a smaller share is within the limits are omitted
-    for attitude, rotation in place.attitudes():
-        for name, ends in level if attitude == "level" else tilted:
-            points = ends[0] + share[:, None] * (ends[1] - ends[0])
-            first, last = _longest(place.reaches(points, rotation[None]))
-            if last - first >= least * (len(share) - 1):
-                yield f"{name}, {attitude}", points[[first, last]].round(6), rotation
-
-
-def _longest(within: np.ndarray) -> tuple[int, int]:
-    """Return first and last index of the longest stretch; one less at an end that a limit cuts."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], within, [False]]).astype(int)))
-    if not len(edges):
-        return 0, -1
-    starts, stops = edges[::2], edges[1::2] - 1
-    first, last = max(zip(starts.tolist(), stops.tolist(), strict=True), key=lambda pair: pair[1] - pair[0])
-    return first + (first > 0), last - (last < len(within) - 1)
-
-
-def _sets_of_poses(place: MeasuringBox) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield positions and rotations of 25 sets of 12 random poses within the limits."""
-    rng, together, sets = np.random.default_rng(11), 12, 25
-    count = 4 * together * sets
-    positions = rng.uniform(place.box[0], place.box[1], (count, 3)).round(6)
-    rotations = place.turned(rng.uniform(-place.tilt, place.tilt, (count, 2)).round(6))
-    good = np.flatnonzero(place.reaches(positions, rotations, threads=None))[: together * sets]
-    for start in range(0, len(good) - together + 1, together):
-        part = good[start : start + together]
-        yield positions[part], rotations[part]
-
-
-def _circles(place: MeasuringBox) -> Iterator[CampaignRun]:
-    """Yield circles of a ball bar in the box: in three planes each, level and tilted; of 100 mm, or what fits."""
-    sides = np.ptp(place.box, axis=0)
-    for attitude, rotation in place.attitudes():
-        for plane, axes in PLANES.items():
-            radius = min(0.1, 0.45 * float(sides[list(axes)].min()))
-            room = np.where(np.isin(range(3), axes), radius, 0.0)
-            for share in _shares(attitude == "level"):
-                centre = (place.box[0] + room + share * (sides - 2.0 * room)).round(6)
-                name = f"ball_bar, {plane} at {_millimetres(centre)}, {attitude}"
-                run = circle_run(name, centre, radius, 17, np.eye(3)[list(axes)], rotation)
-                if place.reaches(run.positions, rotation[None]).all():
-                    yield run
-
-
-def _shares(corners: bool) -> Iterator[np.ndarray]:
-    """Yield places of a box, in shares of its sides: its middle, the middles of its faces, and its corners."""
-    for index in np.ndindex(3, 3, 3):
-        off = sum(i != 1 for i in index)
-        if off in (0, 1) or (corners and off == 3):
-            yield 0.5 * np.array(index)
-
-
-def _tilted_at(place: MeasuringBox) -> Iterator[CampaignRun]:
-    """Yield R-tests in the box, for a tool that tilts: one ball, the tool turning about it."""
-    if place.tilt == 0.0:
-        return
-    count = 13
-    rotations = tilts(count, place.tilt) @ place.level
-    for share in _shares(True):
-        ball = (place.box[0] + share * np.ptp(place.box, axis=0)).round(6)
-        positions = np.tile(ball, (count, 1))
-        if place.reaches(positions, rotations).all():
-            yield CampaignRun(f"r_test, at {_millimetres(ball)}", "r_test", positions, rotations)
-
-
-def _lengths(place: MeasuringBox) -> Iterator[CampaignRun]:
-    """Yield sets of poses read from a tracking interferometer that stands beside a lower corner of the box."""
-    off = 0.3  # how far outside the box, in shares of its sides
-    for corner in np.ndindex(2, 2):
-        share = np.array([*(side + off * (2 * side - 1) for side in corner), -off])
-        station = (place.box[0] + share * np.ptp(place.box, axis=0)).round(4)
-        for positions, rotations in _sets_of_poses(place):
-            centres = np.tile(station, (len(positions), 1))
-            yield CampaignRun(f"station at {_millimetres(station)}", "station", positions, rotations, centres)
-
-
-def _millimetres(place: np.ndarray) -> str:
-    return ", ".join(f"{value * 1e3:.0f}" for value in place)
 
 
 # A campaign for a goal
@@ -619,6 +447,170 @@ def propose(
         shares=dict(sorted(shares.items(), key=lambda item: -item[1])),
         needed=needed,
     )
+
+
+# Readings that check a fit
+
+# What a proposed check must detect: a light collision, m; a kelvin of steel, m/m; another tool, kg, where a stiffness
+# is stated
+CRASH, WARMTH, TOOL_CHANGED = 20e-6, 12e-6, 10.0
+
+
+CHECK_READINGS = 12  # of a proposed check: 20 µm are named in 95 % (benchmarks.upkeep)
+
+
+# Channels of each instrument of a check: on diagonals the displacement alone; of rotations pitch and yaw, no roll
+READ_BY = {
+    "linear": ("linear",),
+    "straightness": ("straightness_x", "straightness_y", "straightness_z"),
+    "rotation": ("rotation_x", "rotation_y", "rotation_z"),
+    "tracker": ("position_x", "position_y", "position_z"),
+    "tracker_6d": ("position_x", "position_y", "position_z", "attitude_x", "attitude_y", "attitude_z"),
+}
+
+
+class Detectability:
+    """Criterion: log odds of a crash of each strut, growth of all, and another payload, over all other changes."""
+
+    def __init__(self, fitted: FittedParameters, readings: MeasurementSet, contrasts: Sequence[np.ndarray]) -> None:
+        wide = widened(fitted)
+        changes = possible_changes(wide.space, [block.name for block in fitted.space.blocks])
+        check, every = CheckReadings.of(wide, readings), np.vstack(contrasts)
+        numbers = every @ check.seen.T
+        self.of_candidate = np.split(np.arange(len(every)), np.cumsum([len(rows) for rows in contrasts])[:-1])
+        self.single, self.read = numbers @ check.single, every != 0.0
+        self.covariance = numbers @ check.covariance(wide.covariance) @ numbers.T
+        self.effects = [(c, numbers @ (check.rows @ c.columns)) for c in changes]
+        sizes = {(STRUT, name): CRASH for name in STRUT_NAMES} | {(TEMPERATURE, "struts"): WARMTH}
+        if fitted.space.settings.load:
+            sizes[PAYLOAD, HEAVIER] = TOOL_CHANGED
+        self.wanted = [(c.family, c.name) for c in changes if (c.family, c.name) in sizes]
+        self.moved = [sizes[c.family, c.name] * e[:, 0] for c, e in self.effects if (c.family, c.name) in sizes]
+        self.taken = np.zeros(0, dtype=int)
+        self.now = self._value(self.taken)
+
+    def gains(self, allowed: np.ndarray) -> np.ndarray:
+        """Return the gain in log odds by each allowed candidate."""
+        tries = [
+            self._value(np.concatenate([self.taken, numbers])) if ok else self.now
+            for numbers, ok in zip(self.of_candidate, allowed, strict=True)
+        ]
+        return np.array(tries) - self.now
+
+    def add(self, n: int) -> None:
+        """Read a candidate."""
+        self.taken = np.concatenate([self.taken, self.of_candidate[n]])
+        self.now = self._value(self.taken)
+
+    def _value(self, chosen: np.ndarray) -> float:
+        """Return the log odds with some of all contrasts."""
+        single = self.single[chosen][:, self.read[chosen].any(axis=0)]
+        effects = [(change, effect[chosen]) for change, effect in self.effects]
+        effects += wrong_readings(single, [""] * single.shape[1])
+        evidence, log_sum = Evidence(self.covariance[np.ix_(chosen, chosen)], effects), np.logaddexp.reduce
+        of_scales = evidence.log_weights(np.array(self.moved)[:, chosen])
+        weights = np.array([log_sum(w, axis=1) for w in of_scales])
+        seen = [(change.family, change.name) for change, _ in effects]
+        # Several struts at once are neither the right strut nor another one; any temperature is a temperature.
+        right = np.array([[a == b or a[0] == b[0] != STRUT for b in self.wanted] for a in seen])
+        wrong = np.array([[a[0] != b[0] or (a != b and a[1] in STRUT_NAMES) for b in self.wanted] for a in seen])
+        for_it, against = (log_sum(np.where(of, weights, -np.inf), axis=0) for of in (right, wrong))
+        return -float(log_sum(against - for_it))
+
+
+def propose_check(
+    fitted: FittedParameters,
+    readings: int = CHECK_READINGS,
+    instruments: Sequence[str] = ("linear", "rotation"),
+) -> MeasurementSet:
+    """Return the check readings to take with some instruments of :data:`READ_BY`; values are NaN."""
+    for name in instruments:
+        if name not in READ_BY:
+            raise CalibrationError("instruments", f"must be of {', '.join(READ_BY)}, not {name!r}")
+    least, most = 6, 60  # fewer determine next to nothing; more are better planned as a campaign
+    if not least <= readings <= most:
+        raise CalibrationError("readings", f"must be {least}…{most}, not {readings}")
+    channels = [CHANNELS.index(name) for instrument in instruments for name in READ_BY[instrument]]
+    with_lines, with_poses = (
+        any(name.startswith("tracker") == poses for name in instruments) for poses in (False, True)
+    )
+    tilts = (*TILTS, 0.0) if with_poses else (0.0,)
+    every, _ = laid_out(fitted.space, 2 * with_lines, 3, 12 * with_poses, tilts, "5-D")
+    every = every.select(np.isin(every.channel, channels) & (every.direction != BACKWARD))
+    candidates = _contrasts(every)
+    every = every.select(np.isin(np.arange(len(every)), np.concatenate([added for _, added, _ in candidates])))
+    contrasts, members, after = zip(*_contrasts(every), strict=True)  # of those that any of them reads
+    costs = np.array([float(len(added)) for added in members])
+    choice = Greedy(Detectability(fitted, every, contrasts), costs, after=np.array(after))
+    choice.extend(float(readings))
+    picked = every.select(np.isin(np.arange(len(every)), np.concatenate([members[n] for n in choice.picks])))
+    return picked.with_values(np.full(len(picked), np.nan))
+
+
+def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]]:
+    """Return candidates: orthonormal contrasts free of zeros and slopes, the readings each adds, and its parents."""
+    along, result = every.along(), []
+
+    def row(members: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        full = np.zeros((1, len(every)))
+        full[0, members] = weights / np.linalg.norm(weights)
+        return full
+
+    for where, _, members in places(every):
+        if where.startswith("pose "):
+            result.append((np.eye(len(every))[members], members, -1))
+            continue
+        for channel in np.unique(every.channel[members]):
+            ordered = members[every.channel[members] == channel]
+            ordered = ordered[np.argsort(along[ordered])]
+            three = ordered[[0, -1, len(ordered) // 2]]
+            if CHANNELS[channel].startswith("straightness"):
+                result.append((row(three, np.cross(np.ones(3), along[three])), three, -1))
+            else:
+                result.append((row(three[:2], np.array([1.0, -1.0])), three[:2], -1))
+                result.append((row(three, np.array([1.0, 1.0, -2.0])), three[2:], len(result) - 1))
+    return result
+
+
+@dataclass(frozen=True)
+class Settling:
+    """Readings that would distinguish two explanations."""
+
+    name: str  # a line with its ends, or a pose
+    channels: tuple[str, ...]  # what to read there
+    readings: int
+    odds: float  # expected log odds for the true explanation over the wrong one, for the worse case
+
+
+def settle(
+    fitted: FittedParameters, measured: MeasurementSet, explanations: tuple[Explanation, Explanation]
+) -> list[Settling]:
+    """Return the three readings that would best distinguish two explanations of `measured`, with its instruments."""
+    space, kinds = fitted.space, np.unique(measured.kind)
+    by_pose = np.isin(np.array(KINDS)[kinds], ABSOLUTE_KINDS)
+    sets = [laid_out(space, lines=2)] if not by_pose.all() else []
+    sets += [laid_out(space, poses=8, tilts=(*TILTS, 0.0))] if by_pose.any() else []
+    proposals = []
+    for readings, _ in sets:
+        readings = readings.select(np.isin(readings.kind, kinds) & (readings.direction != BACKWARD))
+        if not len(readings):
+            continue
+        rows, cells = information_of_fit(fitted, readings)
+        for where, channels, members in places(readings):
+            chosen = np.unique(cells.of_reading[members])
+            noise, a = np.diag(reading_noise(fitted)[cells.kind[chosen]] ** 2), rows[chosen]
+            difference = a @ (explanations[0].mean - explanations[1].mean)
+            first, second = (noise + a @ e.covariance @ a.T for e in explanations)
+            odds = min(_divergence(difference, first, second), _divergence(difference, second, first))
+            proposals.append(Settling(where, channels, len(chosen), odds))
+    return sorted(proposals, key=lambda p: -p.odds)[:3]
+
+
+def _divergence(difference: np.ndarray, right: np.ndarray, wrong: np.ndarray) -> float:
+    """Return the Kullback–Leibler divergence of two normal distributions."""
+    solved = np.linalg.solve(wrong, np.column_stack([right, difference]))
+    logs = np.linalg.slogdet(wrong)[1] - np.linalg.slogdet(right)[1]
+    return 0.5 * float(np.trace(solved[:, :-1]) - len(right) + difference @ solved[:, -1] + logs)
 
 
 # What a proposal prints

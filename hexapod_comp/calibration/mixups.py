@@ -24,7 +24,6 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from ..errors import HexapodError
-from ..machine.model import MachineModel
 from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..measurements.readings import AXES, CHANNELS, KINDS, UNKNOWN, MeasurementSet
 from .assumptions import ASSUMED
@@ -40,7 +39,7 @@ from .estimator import (
     solve,
     whitened_precision,
 )
-from .mistakes import Mistake, family_of_run, mistakes, mistakes_of_check, mistakes_of_place, sign_reversed
+from .mistakes import Mistake, family_of_run, mistakes, mistakes_of_place, sign_reversed
 from .observations import Nuisance
 from .parameters import TOLERANCES, Components, ParameterSpace
 from .promise import STEEL
@@ -50,7 +49,6 @@ MOST_READINGS, FEW_READINGS = 2500, 400  # at stations drawn at random to weigh 
 FINALISTS = 6  # mistakes for which sizes of priors are estimated until they settle
 LEAST_DETERMINED = 1.0  # information over the prior's of components that stay
 MODE_ROUNDS = 3  # in which priors are estimated with a mistake that all readings share
-STRANGE, PLAUSIBLE, AS_GOOD = 100.0, 10.0, 3.0  # χ² per number of misread checks, of right ones, over the best
 ONLY_CHANCE = 0.2
 """Log likelihood ratio that a right label gains by chance where its reversal fits better, at most: max E⟨ratio⟩₊.
 
@@ -541,33 +539,3 @@ def _turned_back(m: MeasurementSet, readings: np.ndarray) -> MeasurementSet:
     direction = np.where(readings, -m.direction, m.direction)
     stations = replace(twice, sense=sense)
     return replace(m, stations=stations, station=m.station + len(m.stations) * readings, direction=direction)
-
-
-def best_alternative_reading(
-    m: MeasurementSet, model: MachineModel, as_they_are: float, chi_square: Callable[[MeasurementSet], float]
-) -> list[str]:
-    """Return by name how check readings must be taken to be those of a machine that has not changed; the best, or none.
-
-    Parameters
-    ----------
-    m, model
-        The readings, and the model that they check.
-    as_they_are
-        Their χ² per number.
-    chi_square
-        Returns χ² per number of readings against the model and what its fit knows.
-    """
-    if as_they_are < STRANGE:
-        return []
-    clear = []
-    for mistake in mistakes_of_check(m, model):
-        try:
-            tried = mistake.undone()
-            value = np.inf if tried is None else chi_square(tried)
-        except HexapodError:  # out of reach that way
-            continue
-        if value < PLAUSIBLE:
-            clear.append((value, mistake.name))
-    best = min(clear, default=(0.0, ""))[0]
-    times = [(value, f"{name} fits {np.sqrt(as_they_are / value):.3g} times better") for value, name in sorted(clear)]
-    return [text for value, text in times if value <= AS_GOOD * best]

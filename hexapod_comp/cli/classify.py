@@ -94,9 +94,9 @@ def classify(args: argparse.Namespace) -> int | Result:
 
 def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry, turned: np.ndarray) -> Result:
     """Show the residual error of a model's calibration, and the measurement that would reduce it most."""
-    from ..calibration.follow_up import measurement_rows, remaining, remaining_json, remaining_text
     from ..calibration.pictures import predicted_error_figure
     from ..calibration.posterior_file import load_posterior
+    from ..calibration.remaining import measurement_rows, remaining, remaining_json, remaining_text
 
     model = load_model(args.model, geometry)
     fitted, unknown = load_posterior(model, geometry, args.model)

@@ -85,17 +85,8 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
 
 def plan(args: argparse.Namespace) -> Result:
     """Predict what a campaign determines, or propose one for a goal; 1 when the goal cannot be met."""
-    from ..calibration.design import (
-        TIMES,
-        Goal,
-        MeasuringBox,
-        Times,
-        plan,
-        proposal_json,
-        proposal_report,
-        propose,
-        remarks,
-    )
+    from ..calibration.candidates import MeasuringBox
+    from ..calibration.design import TIMES, Goal, Times, plan, proposal_json, proposal_report, propose, remarks
 
     geometry = load_geometry(args.machine)
     campaign = results.load_campaign(args, geometry)
@@ -332,8 +323,8 @@ def verify(args: argparse.Namespace) -> Result:
         result = checked(args, args.model).verification
         code = 0 if result.verdict == VALID else 1
         return Result(lambda: verification_report(result), lambda: verification_json(result), code=code)
-    from ..calibration.check import places
-    from ..calibration.follow_up import propose_check
+    from ..calibration.candidates import places
+    from ..calibration.design import propose_check
 
     _, fitted = _known(args, args.model)
     with results.stage("choosing readings"):

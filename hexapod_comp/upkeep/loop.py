@@ -19,14 +19,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..calibration.candidates import MeasuringBox
+from ..calibration.changes import DATUM, FAMILIES, PAYLOAD, READING, STRUT, TEMPERATURE
 from ..calibration.check import (
-    DATUM,
-    FAMILIES,
     NAMED,
-    PAYLOAD,
-    READING,
-    STRUT,
-    TEMPERATURE,
     UNDECIDED,
     VALID,
     Verification,
@@ -35,7 +31,7 @@ from ..calibration.check import (
     verification_report,
     verify_model,
 )
-from ..calibration.design import Goal, MeasuringBox, Proposal, propose, remarks
+from ..calibration.design import Goal, Proposal, propose, remarks
 from ..calibration.fit import fit_model
 from ..calibration.parameters import FitSettings
 from ..calibration.posterior import FittedParameters

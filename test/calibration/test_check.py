@@ -11,33 +11,38 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calibration_helpers import BOX, campaign, fitted, measured, paper
-from scipy.stats import multivariate_normal
+from scipy.integrate import quad
+from scipy.stats import multivariate_normal, norm
 
-from hexapod_comp.calibration.check import (
+from hexapod_comp.calibration.changes import (
     DATUM,
     FAMILIES,
-    NAMED,
     OTHER,
     READING,
     STRUT,
     TEMPERATURE,
+    Change,
+    CheckReadings,
+    Evidence,
+    Hypothesis,
+    consistency,
+    possible_changes,
+    widened,
+)
+from hexapod_comp.calibration.check import (
+    NAMED,
     UNDECIDED,
     UNEXPLAINED,
     VALID,
-    Change,
-    Evidence,
-    Hypothesis,
     Verification,
-    possible_changes,
     refusal,
     update_model,
     verification_json,
     verification_report,
     verify_model,
-    widened,
 )
+from hexapod_comp.calibration.design import propose_check
 from hexapod_comp.calibration.evaluation import held_out
-from hexapod_comp.calibration.follow_up import propose_check
 from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.model import MachineModel, RealMachine, tool_move
 from hexapod_comp.machine.region import Region
@@ -119,11 +124,32 @@ def test_evidence_is_the_ratio_of_two_normal_densities() -> None:
     np.testing.assert_allclose(found, densities, atol=1e-9)
 
 
+def test_densities_of_readings_are_those_of_a_normal_distribution() -> None:
+    """scipy's is the truth. Its numbers are the readings less an unknown zero of each channel of a run."""
+    known, readings = widened(fitted().known), check(fitted().truth)
+    found = CheckReadings.of(known, readings)
+    covariance = found.noise + found.rows @ known.covariance @ found.rows.T
+    expected = multivariate_normal.logpdf(found.residuals, cov=covariance)
+    assert found.log_density(known.covariance) == pytest.approx(expected, abs=1e-9)
+    zeros = np.unique(np.stack([readings.run, readings.channel]), axis=1)[1]
+    kinds = [CHANNELS[channel].partition("_")[0] for channel in zeros]
+    places = [int((readings.kind == k).sum()) - kinds.count(name) for k, name in enumerate(KINDS)]
+    np.testing.assert_allclose(found.freedom, places, atol=1e-9)
+
+
 def test_an_effect_that_no_reading_shows_changes_no_probability() -> None:
     """A change that moves no reading has the evidence of no change: a ratio of one."""
     unseen = Hypothesis.of(Change(DATUM, "it", np.array([1.0, 10.0])), np.zeros((4, 3)))
     np.testing.assert_array_equal(unseen.log_bayes_factors(np.ones((1, 4))), 0.0)
     assert unseen.least_gain == 0.0
+
+
+def test_the_cut_of_outliers_does_not_make_the_noise_smaller() -> None:
+    """What is left of a normal variance that is cut at 2.5 σ, by the integral of its density: 0.978."""
+    cut = 2.5
+    inside = quad(lambda z: z * z * norm.pdf(z), -cut, cut)[0]
+    assert consistency(cut) == pytest.approx(inside + 2.0 * cut**2 * norm.sf(cut), rel=1e-9)
+    assert consistency(cut) == pytest.approx(0.978, abs=5e-4)
 
 
 def test_unchanged_machines_look_strange_as_rarely_as_stated() -> None:
@@ -165,6 +191,7 @@ def test_a_crashed_strut_is_named_measured_and_repaired(strut: int, size: float)
     best = result.candidates[0]
     assert (result.verdict, best.family, best.name) == (NAMED, STRUT, f"strut_{strut + 1}")
     assert abs(best.coefficients[0] - size) < 4.0 * best.deviations[0] < 12e-6
+    assert not result.doubts
     renewed = update_model(fitted().model, fitted().known, readings, result)
     assert left(truth, fitted().model) > 4.0 * left(truth, renewed.model)
     assert left(truth, renewed.model) < 1.5 * left(fitted().truth, fitted().model)
@@ -231,6 +258,8 @@ def test_readings_of_an_unchanged_machine_taken_for_something_else_are_recognise
         "all readings: sign reversed": readings.with_values(-readings.value),
         "taken with the compensation off": compensated(readings, fitted().model),
     }
+    # Larger than any change that is expected: that is no mistake of whoever read it.
+    assert not verify_model(fitted().model, known, check(crashed(1, 2e-3))).doubts
     for name, taken in mistaken.items():
         result = verify_model(fitted().model, known, taken)
         assert result.doubts[0].startswith(name)

@@ -16,17 +16,8 @@ import pytest
 from calibration_helpers import SETTINGS, campaign, paper, tool_error, virtual_machine
 
 from hexapod_comp.calibration.blocks.load import as_loaded, refuse_half_stated
-from hexapod_comp.calibration.check import (
-    NAMED,
-    PAYLOAD,
-    TEMPERATURE,
-    VALID,
-    payload_changes,
-    refusal,
-    verification_report,
-    verify_model,
-    widened,
-)
+from hexapod_comp.calibration.changes import PAYLOAD, TEMPERATURE, payload_changes, widened
+from hexapod_comp.calibration.check import NAMED, VALID, refusal, verification_report, verify_model
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import FittedParameters

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from foreign_machines import machine_names, machines
 
+from hexapod_comp.calibration.candidates import MeasuringBox, candidates
 from hexapod_comp.calibration.design import (
     TIMES,
     ErrorLeft,
     Goal,
-    MeasuringBox,
     Proposal,
     Times,
-    candidates,
     plan,
     proposal_report,
     propose,

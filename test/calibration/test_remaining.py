@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from hexapod_comp.calibration.design import information
-from hexapod_comp.calibration.follow_up import Remaining, measurable, remaining
 from hexapod_comp.calibration.posterior import POINTS, ErrorPredictor, FittedParameters
+from hexapod_comp.calibration.remaining import Remaining, measurable, remaining
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.passes import Poses
 from hexapod_comp.measurements.campaign import template

@@ -22,7 +22,7 @@ from helpers import quick_pictures
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp import cli
-from hexapod_comp.calibration import follow_up
+from hexapod_comp.calibration import remaining
 from hexapod_comp.cli import classify as verb
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
@@ -325,8 +325,8 @@ def test_a_model_in_place_of_a_budget_says_what_is_left_and_what_to_measure(
 ) -> None:
     """Six known numbers of 2 µm each leave about as much; the work frame is named, units are in the keys."""
     found: list[object] = []  # text, JSON, table and picture are of one calculation
-    real = follow_up.remaining
-    monkeypatch.setattr(follow_up, "remaining", lambda *a: (found or (found.append(real(*a)) or found))[0])
+    real = remaining.remaining
+    monkeypatch.setattr(remaining, "remaining", lambda *a: (found or (found.append(real(*a)) or found))[0])
     monkeypatch.setattr(verb, "COMBINED_POSES", 60)
     machine = ("--machine", "paper", "--model", fitted_model(tmp_path), "--cells", 6, "--tilt-deg", 0)
     code, out, err = classify(*machine)

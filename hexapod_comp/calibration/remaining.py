@@ -1,156 +1,25 @@
-"""Which readings to take after a fit: for a check, and to reduce the remaining uncertainty."""
+"""What a calibration leaves of the tool's error, and which one more measurement would remove most of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ..errors import CalibrationError, InputFileError
+from ..errors import InputFileError
 from ..formats.texts import aligned, number
-from ..machine.geometry import STRUT_NAMES
 from ..machine.model import RealMachine, measured_region
 from ..machine.passes import Poses
 from ..machine.region import region_json, region_text
-from ..measurements.readings import BACKWARD, CHANNELS, DEFAULT_UNCERTAINTY, MeasurementSet
+from ..measurements.readings import CHANNELS, DEFAULT_UNCERTAINTY
 from ..workspace.combined import NORMAL, covariance_factor, monte_carlo, root_sum_of_squares
-from .check import (
-    HEAVIER,
-    PAYLOAD,
-    STRUT,
-    TEMPERATURE,
-    CheckReadings,
-    Evidence,
-    places,
-    possible_changes,
-    widened,
-    wrong_readings,
-)
-from .design import TILTS, ErrorLeft, Greedy, information, laid_out
+from .candidates import TILTS, laid_out
+from .design import ErrorLeft, information_of_fit
 from .posterior import POINTS, ErrorPredictor, FittedParameters
 
-# What a proposed check must detect: a light collision, m; a kelvin of steel, m/m; another tool, kg, where a stiffness
-# is stated
-CRASH, WARMTH, TOOL_CHANGED = 20e-6, 12e-6, 10.0
-CHECK_READINGS = 12  # of a proposed check: 20 µm are named in 95 % (benchmarks.upkeep)
 MACHINES_DRAWN = 2000  # for the percentile of the worst pose: 95 % to ± 0.5 %
-
-# Channels of each instrument of a check: on diagonals the displacement alone; of rotations pitch and yaw, no roll
-READ_BY = {
-    "linear": ("linear",),
-    "straightness": ("straightness_x", "straightness_y", "straightness_z"),
-    "rotation": ("rotation_x", "rotation_y", "rotation_z"),
-    "tracker": ("position_x", "position_y", "position_z"),
-    "tracker_6d": ("position_x", "position_y", "position_z", "attitude_x", "attitude_y", "attitude_z"),
-}
-
-
-class Detectability:
-    """Criterion: log odds of a crash of each strut, growth of all, and another payload, over all other changes."""
-
-    def __init__(self, fitted: FittedParameters, readings: MeasurementSet, contrasts: Sequence[np.ndarray]) -> None:
-        wide = widened(fitted)
-        changes = possible_changes(wide.space, [block.name for block in fitted.space.blocks])
-        check, every = CheckReadings.of(wide, readings), np.vstack(contrasts)
-        numbers = every @ check.seen.T
-        self.of_candidate = np.split(np.arange(len(every)), np.cumsum([len(rows) for rows in contrasts])[:-1])
-        self.single, self.read = numbers @ check.single, every != 0.0
-        self.covariance = numbers @ check.covariance(wide.covariance) @ numbers.T
-        self.effects = [(c, numbers @ (check.rows @ c.columns)) for c in changes]
-        sizes = {(STRUT, name): CRASH for name in STRUT_NAMES} | {(TEMPERATURE, "struts"): WARMTH}
-        if fitted.space.settings.load:
-            sizes[PAYLOAD, HEAVIER] = TOOL_CHANGED
-        self.wanted = [(c.family, c.name) for c in changes if (c.family, c.name) in sizes]
-        self.moved = [sizes[c.family, c.name] * e[:, 0] for c, e in self.effects if (c.family, c.name) in sizes]
-        self.taken = np.zeros(0, dtype=int)
-        self.now = self._value(self.taken)
-
-    def gains(self, allowed: np.ndarray) -> np.ndarray:
-        """Return the gain in log odds by each allowed candidate."""
-        tries = [
-            self._value(np.concatenate([self.taken, numbers])) if ok else self.now
-            for numbers, ok in zip(self.of_candidate, allowed, strict=True)
-        ]
-        return np.array(tries) - self.now
-
-    def add(self, n: int) -> None:
-        """Read a candidate."""
-        self.taken = np.concatenate([self.taken, self.of_candidate[n]])
-        self.now = self._value(self.taken)
-
-    def _value(self, chosen: np.ndarray) -> float:
-        """Return the log odds with some of all contrasts."""
-        single = self.single[chosen][:, self.read[chosen].any(axis=0)]
-        effects = [(change, effect[chosen]) for change, effect in self.effects]
-        effects += wrong_readings(single, [""] * single.shape[1])
-        evidence, log_sum = Evidence(self.covariance[np.ix_(chosen, chosen)], effects), np.logaddexp.reduce
-        of_scales = evidence.log_weights(np.array(self.moved)[:, chosen])
-        weights = np.array([log_sum(w, axis=1) for w in of_scales])
-        seen = [(change.family, change.name) for change, _ in effects]
-        # Several struts at once are neither the right strut nor another one; any temperature is a temperature.
-        right = np.array([[a == b or a[0] == b[0] != STRUT for b in self.wanted] for a in seen])
-        wrong = np.array([[a[0] != b[0] or (a != b and a[1] in STRUT_NAMES) for b in self.wanted] for a in seen])
-        for_it, against = (log_sum(np.where(of, weights, -np.inf), axis=0) for of in (right, wrong))
-        return -float(log_sum(against - for_it))
-
-
-def propose_check(
-    fitted: FittedParameters,
-    readings: int = CHECK_READINGS,
-    instruments: Sequence[str] = ("linear", "rotation"),
-) -> MeasurementSet:
-    """Return the check readings to take with some instruments of :data:`READ_BY`; values are NaN."""
-    for name in instruments:
-        if name not in READ_BY:
-            raise CalibrationError("instruments", f"must be of {', '.join(READ_BY)}, not {name!r}")
-    least, most = 6, 60  # fewer determine next to nothing; more are better planned as a campaign
-    if not least <= readings <= most:
-        raise CalibrationError("readings", f"must be {least}…{most}, not {readings}")
-    channels = [CHANNELS.index(name) for instrument in instruments for name in READ_BY[instrument]]
-    with_lines, with_poses = (
-        any(name.startswith("tracker") == poses for name in instruments) for poses in (False, True)
-    )
-    tilts = (*TILTS, 0.0) if with_poses else (0.0,)
-    every, _ = laid_out(fitted.space, 2 * with_lines, 3, 12 * with_poses, tilts, "5-D")
-    every = every.select(np.isin(every.channel, channels) & (every.direction != BACKWARD))
-    candidates = _contrasts(every)
-    every = every.select(np.isin(np.arange(len(every)), np.concatenate([added for _, added, _ in candidates])))
-    contrasts, members, after = zip(*_contrasts(every), strict=True)  # of those that any of them reads
-    costs = np.array([float(len(added)) for added in members])
-    choice = Greedy(Detectability(fitted, every, contrasts), costs, after=np.array(after))
-    choice.extend(float(readings))
-    picked = every.select(np.isin(np.arange(len(every)), np.concatenate([members[n] for n in choice.picks])))
-    return picked.with_values(np.full(len(picked), np.nan))
-
-
-def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]]:
-    """Return candidates: orthonormal contrasts free of zeros and slopes, the readings each adds, and its parents."""
-    along, result = every.along(), []
-
-    def row(members: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        full = np.zeros((1, len(every)))
-        full[0, members] = weights / np.linalg.norm(weights)
-        return full
-
-    for where, _, members in places(every):
-        if where.startswith("pose "):
-            result.append((np.eye(len(every))[members], members, -1))
-            continue
-        for channel in np.unique(every.channel[members]):
-            ordered = members[every.channel[members] == channel]
-            ordered = ordered[np.argsort(along[ordered])]
-            three = ordered[[0, -1, len(ordered) // 2]]
-            if CHANNELS[channel].startswith("straightness"):
-                result.append((row(three, np.cross(np.ones(3), along[three])), three, -1))
-            else:
-                result.append((row(three[:2], np.array([1.0, -1.0])), three[:2], -1))
-                result.append((row(three, np.array([1.0, 1.0, -2.0])), three[2:], len(result) - 1))
-    return result
-
-
-# What a fit leaves
 
 
 @dataclass(frozen=True)
@@ -246,8 +115,7 @@ def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]
     """Yield measurements in a fit's box: name, count of readings, and rows by x, (cells, size), over the noise."""
     space = fitted.space
     lines, _ = laid_out(space, lines=3, readings=9)
-    rows, cells = information(space, lines, fitted.x)
-    rows = space.unwhitened(rows)
+    rows, cells = information_of_fit(fitted, lines)
     run = np.array([run.name.partition(" ")[0] for run in lines.runs])[lines.run]
     channel = []
     for axis, name in zip(run, (CHANNELS[index] for index in lines.channel), strict=True):
@@ -264,11 +132,8 @@ def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]
             readings, tilt = laid_out(space, poses=poses, tilts=tilts)
         except InputFileError:  # out of reach
             continue
-        rows = space.unwhitened(information(space, readings, fitted.x)[0])
+        rows, _ = information_of_fit(fitted, readings)
         yield f"tracker, {poses} poses, {f'tilted up to {tilt:g}°' if tilt else 'level'}", len(readings), rows
-
-
-# What it prints
 
 
 def remaining_text(result: Remaining) -> str:

@@ -1,0 +1,351 @@
+"""What may have happened to a machine since its fit, weighed by Bayes factors of a few check readings.
+
+The readings of an unchanged machine scatter about its model by N(0, S), S = J·Σ·Jᵀ + noise. A change moves parameters
+by A·θ, θ ~ N(0, s²), with several scales s, equally likely: under it they are N(0, S + s²·J·A·Aᵀ·Jᵀ).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.special import chdtr, chdtrc
+
+from ..errors import CalibrationError
+from ..machine.geometry import STRUT_NAMES
+from ..measurements.readings import AXES, CHANNELS, KINDS, MeasurementSet
+from .assumptions import ASSUMED
+from .blocks.block import Linkage
+from .blocks.load import stated_load
+from .estimator import Estimation
+from .parameters import BLOCKS, ParameterSpace
+from .posterior import FittedParameters, box_stations
+from .sensitivity import derivatives, predict
+from .trust import TILT
+
+MOST_READINGS = 500  # of a check; more are a calibration
+
+
+UNCHANGED_DRAWS = 4000  # machines drawn to find the false alarms: 1 % to ± 0.16 %
+
+
+DATUM, STRUT, TEMPERATURE, PAYLOAD = "datum", "strut", "temperature", "payload"
+
+
+AGEING, READING, OTHER = "ageing", "reading", "other"
+
+
+# Kinds of change with their names. Few readings can repair all but payload and the last two.
+FAMILIES = {
+    DATUM: "the datum has moved",
+    STRUT: "a strut's offset has changed",
+    TEMPERATURE: "a temperature acts",
+    PAYLOAD: "the payload has changed",
+    AGEING: "the whole machine has aged",
+    READING: "a single reading is wrong",
+    OTHER: "it has changed in a way that none of these explains",
+}
+
+
+HEAVIER = "heavier or lighter"  # the name of a change of the payload in its centre
+
+
+# weight relative to the trace: parameters that represent a payload then stay small at the corners of the box too
+RIDGE = 1e-8
+
+
+ROUNDING = 1e-9  # directions of readings or effects that are smaller, relative to the largest, are rounding
+
+
+@dataclass(frozen=True)
+class Change:
+    """One possible change: parameters move by `columns`·θ, θ ~ N(0, scale²)."""
+
+    family: str  # of FAMILIES
+    name: str
+    scales: np.ndarray  # (m,): standard deviations of θ
+    columns: np.ndarray | None = None  # (size, k), SI; None: readings have changed, not the machine
+    # label, factor, unit of each θ; empty: they have no meaning one by one
+    shown: tuple[tuple[str, float, str], ...] = ()
+    group: str = ""  # similar changes of a kind; all groups of a kind are equally likely beforehand
+
+
+def widened(fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS) -> FittedParameters:
+    """Return a fit's result in a space with more blocks; these are zero and, so far, certain."""
+    old = fitted.space
+    kept = {block.name for block in old.blocks}
+    settings = replace(old.settings, blocks=tuple(name for name in BLOCKS if name in kept or name in blocks))
+    space = ParameterSpace((old.geometry, old.region), settings)
+    places = np.concatenate([np.arange(b.part.start, b.part.stop) for b in space.blocks if b.name in kept])
+    x, covariance = np.zeros(space.size), np.zeros((space.size, space.size))
+    x[places], covariance[np.ix_(places, places)] = fitted.x, fitted.covariance
+    known = {block.name: value for block, value in zip(old.blocks, fitted.tolerances, strict=True)}
+    start = space.start_tolerances()
+    tolerances = np.array([known.get(b.name, value) for b, value in zip(space.blocks, start, strict=True)])
+    return FittedParameters(space, x, covariance, tolerances, fitted.noise, fitted.held)
+
+
+def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Change]:
+    """Return the possible changes of a machine, in a space that has all blocks; those of its fit, `modelled`, age."""
+    geometry, unit = space.geometry, np.eye(space.size)
+    start, count = space.blocks[0].part.start, int(space.platform_groups.max()) + 1
+    base = start + np.arange(18).reshape(6, 3)
+    platform = start + 18 + np.arange(3 * count).reshape(count, 3)
+    offsets = np.arange(space.size)[space.offsets]
+    lengths, growths = np.array(ASSUMED.moved), np.array(ASSUMED.grown)
+
+    def shown(names: Sequence[str], factor: float = 1e6, what: str = "µm") -> tuple[tuple[str, float, str], ...]:
+        return tuple((name, factor, what) for name in names)
+
+    # The datum turns about the box's centre; a turn is counted by how far it moves the box's corners.
+    size = 0.5 * float(np.linalg.norm(np.ptp(space.work_box, axis=0))) or 1.0
+    arms, rigid = geometry.base_joints - space.places(space.work_box.mean(axis=0)), np.zeros((space.size, 6))
+    for n, axis in enumerate(geometry.work.rotation.T):
+        rigid[base, n], rigid[base, 3 + n] = axis, np.cross(axis, arms) / size
+    turns = shown([f"about {a}" for a in AXES], 1e6 / size, "µrad")
+    changes = [Change(DATUM, "base or workpiece, in the work frame", lengths, rigid, shown(AXES) + turns)]
+
+    for name, place in zip(STRUT_NAMES, offsets, strict=True):
+        changes.append(Change(STRUT, name, lengths, unit[:, [place]], shown([name])))
+    changes.append(Change(STRUT, "several struts", lengths, unit[:, offsets], shown(STRUT_NAMES)))
+
+    grown, bodies = np.zeros((space.size, 3)), ("struts", "base", "platform")
+    grown[offsets, 0] = space.home_lengths
+    if pitch := space.block("pitch"):
+        grown[pitch.part, 0] = 1.0
+    grown[base, 1], grown[platform[space.platform_groups], 2] = geometry.base_joints, geometry.platform_joints
+    for name, labels, columns in (
+        ("struts", ["struts"], grown[:, :1]),
+        ("base", ["base"], grown[:, 1:2]),
+        ("all alike", ["all"], grown.sum(axis=1, keepdims=True)),
+        ("each by itself", bodies, grown),
+    ):
+        changes.append(Change(TEMPERATURE, name, growths, columns, shown(labels, 1e6, "ppm")))
+
+    changes += payload_changes(space)
+
+    # Ageing and a bend can represent each other: if one's scales were coarser, the other would win, whichever is true.
+    prior = space.physical(np.diag(space.spread(space.start_tolerances())))
+    owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
+    aged, bend = prior[:, np.isin(owner, modelled)], prior[:, np.isin(owner, ("field displacement", "field rotation"))]
+    changes.append(Change(AGEING, "all of it, a little", np.array(ASSUMED.aged), aged))
+    for body, joints in (("base", base), ("platform", platform)):
+        for n, places in enumerate(joints, start=1):
+            changes.append(Change(OTHER, f"{body} joint {n}", lengths, unit[:, places], shown(AXES), "joints"))
+    for name, ends, what in (("pitch", ASSUMED.worn_pitch, "ppm"), ("backlash", ASSUMED.worn_backlash, "µm")):
+        for strut, column in zip(STRUT_NAMES, unit.T[owner == name], strict=False):  # no such block: none
+            screw = Change(
+                OTHER, f"{name} of {strut}", np.array(ends), column[:, None], shown([strut], 1e6, what), "screws"
+            )
+            changes.append(screw)
+    changes.append(Change(OTHER, "a smooth bend in space", np.array(ASSUMED.bent), bend, group="bend"))
+    return changes
+
+
+def payload_changes(space: ParameterSpace) -> list[Change]:
+    """Return a change of the payload, in the machine's centre or beside it, as parameters with the same effect.
+
+    The stretch of struts under a weight is a smooth function of the pose; over the measured box, level and tilted, the
+    most probable parameters with that effect represent it. Where no stiffness is stated, all struts have an assumed
+    one, and masses are so many kg at that.
+    """
+    stations = [box_stations(space, tilt) for tilt in (0.0, TILT)]
+    if stations[0] is None or stations[1] is None:
+        return []
+    load, zero, parts = stated_load(space.settings), np.zeros(space.size), []
+    known = bool(load.stiffness.all())
+    compliance = load.compliance if known else np.full(6, 1.0 / ASSUMED.stiffness)
+    aside = space.geometry.characteristic_length * np.linalg.svd(load.gravity[None])[2][1:]  # lie across gravity
+    for at in filter(None, stations):
+        prediction = predict(space, zero, at)
+        linkage = Linkage(prediction, space.probe, at)
+        forces = [np.concatenate([load.gravity, np.zeros(3)])]
+        forces += [np.concatenate([np.zeros(3), np.cross(arm, load.gravity)]) for arm in aside]
+        stretched = [compliance * linkage.tensions(np.tile(force, (len(at), 1))) for force in forces]
+        errors = linkage.per_length @ np.stack(stretched, axis=2)
+        parts.append((derivatives(space, prediction, at), errors))
+    rows, errors = (np.concatenate(each) for each in zip(*parts, strict=True))
+    rows[:, 3:] *= space.geometry.characteristic_length
+    errors[:, 3:] *= space.geometry.characteristic_length
+    # none that depends on load or warmth
+    smooth = ("structure", "pitch", "map", "field displacement", "field rotation")
+    owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
+    prior = space.physical(np.diag(space.spread(space.start_tolerances())))[:, np.isin(owner, smooth)]
+    design = rows.reshape(-1, space.size) @ prior
+    square = design.T @ design
+    square[np.diag_indices(len(square))] += RIDGE * np.trace(square)
+    columns = prior @ np.linalg.solve(square, design.T @ errors.reshape(-1, len(aside) + 1))
+    unit, sizes = "kg" if known else f"kg at {ASSUMED.stiffness * 1e-6:g} N/µm", np.array(ASSUMED.loaded)
+    radius = space.geometry.characteristic_length
+    shown = (("mass", 1.0, unit), *((f"moment {n}", radius, unit.replace("kg", "kg m", 1)) for n in (1, 2)))
+    return [
+        Change(PAYLOAD, HEAVIER, sizes, columns[:, :1], shown[:1]),
+        Change(PAYLOAD, "with its centre elsewhere too", sizes, columns, shown),
+    ]
+
+
+def consistency(cut: float) -> float:
+    """Return E[min(|z|, cut)²] of a standard normal z: the variance that Huber's proposal 2 finds of good readings."""
+    return float(chdtr(3, cut**2) + cut**2 * chdtrc(1, cut**2))
+
+
+def reading_noise(fitted: FittedParameters) -> np.ndarray:
+    """Return the factor on the stated standard deviation of single readings of each kind, (kinds,), by a fit."""
+    return fitted.noise / np.sqrt(consistency(ASSUMED.huber) if fitted.space.settings.robust else 1.0)
+
+
+@dataclass(frozen=True)
+class CheckReadings:
+    """Check readings with the prediction of a model and its fit, as n numbers free of the instruments' unknowns."""
+
+    residuals: np.ndarray  # (n,): deviations from the fit's prediction, in standard deviations
+    rows: np.ndarray  # (n, size): derivatives by the parameters
+    noise: np.ndarray  # (n, n): their covariance if the machine is known
+    single: np.ndarray  # (n, places): effect of one reading that is wrong by one of its standard deviations
+    names: tuple[str, ...]  # of the places
+    seen: np.ndarray = field(repr=False)  # (n, places): the numbers, as orthonormal combinations of the places
+    kind: np.ndarray  # (places,): kind of channel
+
+    @staticmethod
+    def of(fitted: FittedParameters, measurements: MeasurementSet, x: np.ndarray | None = None) -> CheckReadings:
+        """Return readings with a fit in a space that has all blocks; linearised at `x` if given."""
+        space = fitted.space
+        away = float(np.abs(measurements.probe - space.probe).max())
+        if away > ROUNDING:
+            problem = f"are of a point {away * 1e3:.4g} mm from that of the fit; give its place (--probe-mm)"
+            raise CalibrationError("measurements", problem)
+        estimation = Estimation(measurements, space, alone=False)
+        cells = estimation.cells
+        if len(cells.kind) > MOST_READINGS:
+            problem = f"{len(cells.kind)} readings at distinct places are no check"
+            raise CalibrationError("measurements", f"{problem} (at most {MOST_READINGS}); fit them")
+        linear, _ = estimation.linearise(fitted.x if x is None else x, np.ones(len(measurements)))
+        free, sizes, _ = np.linalg.svd(estimation.free_of_nuisance(np.eye(len(cells.kind))))
+        seen = free[:, sizes > ROUNDING * sizes.max(initial=0.0)].T
+        if not len(seen):
+            problem = "determine nothing: the zeros of their runs account for all of them; read more places of each run"
+            raise CalibrationError("measurements", problem)
+        rows, sigma = seen @ space.unwhitened(linear.rows.dense()), reading_noise(fitted)[cells.kind]
+        m = measurements
+        names = tuple(f"{m.sources[n]}: {CHANNELS[m.channel[n]]} of run {m.runs[m.run[n]].name}" for n in cells.first)
+        residuals = seen @ linear.target - rows @ fitted.x
+        return CheckReadings(residuals, rows, (seen * sigma**2) @ seen.T, seen * sigma, names, seen, cells.kind)
+
+    def covariance(self, of_parameters: np.ndarray) -> np.ndarray:
+        """Return the readings' covariance for a covariance of the parameters, shape (n, n)."""
+        return self.noise + self.rows @ of_parameters @ self.rows.T
+
+    def chi_square(self, of_parameters: np.ndarray | float = 0.0) -> float:
+        """Return the squared deviations over the expected ones for a covariance of the parameters, per number."""
+        covariance = self.noise if np.isscalar(of_parameters) else self.covariance(np.asarray(of_parameters))
+        return float(self.residuals @ np.linalg.solve(covariance, self.residuals)) / len(self.residuals)
+
+    def log_density(self, of_parameters: np.ndarray, residuals: np.ndarray | None = None) -> float:
+        """Return the logarithm of the density of the readings, or of other residuals, of an unchanged machine."""
+        covariance, r = self.covariance(of_parameters), self.residuals if residuals is None else residuals
+        square = float(r @ np.linalg.solve(covariance, r))
+        return -0.5 * (square + float(np.linalg.slogdet(covariance)[1]) + len(r) * math.log(2.0 * math.pi))
+
+    @property
+    def freedom(self) -> np.ndarray:
+        """How many of the numbers are of each kind of channel, (kinds,)."""
+        return np.bincount(self.kind, (self.seen**2).sum(axis=0), len(KINDS))
+
+    def effects(self, changes: Sequence[Change]) -> Iterator[tuple[Change, np.ndarray]]:
+        """Yield the possible explanations with their effects (n, k): changes, one wrong reading, or more scatter in
+        all."""
+        for change in changes:
+            yield change, self.rows @ change.columns
+        yield from wrong_readings(self.single, self.names)
+
+
+def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
+    """Yield that one of some readings is wrong, or all scatter, by the effect (n, places) of a standard deviation."""
+    for name, column in zip(names, single.T, strict=True):
+        yield Change(READING, name, np.array(ASSUMED.wrong_reading)), column[:, None]
+    yield Change(OTHER, "each reading by itself", np.array(ASSUMED.scattered), group="scatter"), single
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A change in coordinates in which the readings of an unchanged machine are N(0, 1)."""
+
+    change: Change
+    directions: np.ndarray  # (n, k), orthonormal
+    gains: np.ndarray  # (k,): effect of θ = 1 along them
+    least_gain: float  # of all θ; 0 where one moves no reading
+    log_prior: float = 0.0  # of each of its scales
+
+    @staticmethod
+    def of(change: Change, effect: np.ndarray, log_prior: float = 0.0) -> Hypothesis:
+        """Return a change with its effect (n, k) on whitened readings."""
+        if effect.shape[1] == 1:  # most of them: no need to decompose
+            gains = np.linalg.norm(effect, axis=0)
+            directions = effect / (gains or 1.0)
+        else:
+            directions, gains, _ = np.linalg.svd(effect, full_matrices=False)
+        felt = gains > ROUNDING * max(gains.max(initial=0.0), 1.0)
+        least = float(gains.min(initial=np.inf)) if felt.sum() == effect.shape[1] else 0.0
+        return Hypothesis(change, directions[:, felt], gains[felt], least, log_prior)
+
+    def log_bayes_factors(self, z: np.ndarray) -> np.ndarray:
+        """Return log evidence over that of no change for whitened readings (N, n), scale by scale: (N, m)."""
+        grown = np.outer(self.change.scales**2, self.gains**2)
+        along = (z @ self.directions) ** 2
+        return 0.5 * (along @ (grown / (1.0 + grown)).T - np.log1p(grown).sum(axis=1))
+
+
+class Evidence:
+    """Changes with their effects (n, k) on readings whose covariance is known for an unchanged machine."""
+
+    def __init__(self, covariance: np.ndarray, effects: Iterable[tuple[Change, np.ndarray]]) -> None:
+        self._whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+        self.hypotheses, effects = [], list(effects)
+        groups = Counter((change.family, change.group) for change, _ in effects)
+        in_kind = Counter(family for family, _ in groups)
+        odds = dict(zip(FAMILIES, ASSUMED.prior_odds, strict=True))
+        for change, effect in effects:
+            alike = in_kind[change.family] * groups[change.family, change.group] * len(change.scales)
+            log_prior = float(np.log(odds[change.family] / sum(odds.values()) / alike))
+            self.hypotheses.append(Hypothesis.of(change, self._whitening @ effect, log_prior))
+
+    def log_weights(self, readings: np.ndarray) -> list[np.ndarray]:
+        """Return the log weight of each hypothesis over that of no change for sets of readings (N, n): (N, m) each."""
+        return self._of_whitened(readings @ self._whitening.T)
+
+    def log_evidence(self, readings: np.ndarray) -> float:
+        """Return the log evidence that the machine has changed or not, as likely beforehand, over that of no change."""
+        return float(
+            np.logaddexp.reduce([0.0, *np.concatenate(self.log_weights(readings[None]), axis=1)[0]])
+        ) - math.log(2.0)
+
+    def _of_whitened(self, z: np.ndarray) -> list[np.ndarray]:
+        return [h.log_bayes_factors(z) + h.log_prior for h in self.hypotheses]
+
+    def probability_unchanged(self, readings: np.ndarray) -> float:
+        """Return the share of checks in which an unchanged machine's readings deviate as much as these, or more."""
+        z = np.random.default_rng(11).standard_normal((UNCHANGED_DRAWS, len(readings)))
+        z = np.vstack([self._whitening @ readings, z])
+        changed = np.logaddexp.reduce(np.concatenate(self._of_whitened(z), axis=1), axis=1)
+        return float((changed >= changed[0]).mean())
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Mean and covariance of the parameters' difference from the fit's under one explanation of the readings."""
+
+    mean: np.ndarray  # (size,), SI
+    covariance: np.ndarray  # (size, size)
+
+    @staticmethod
+    def of(check: CheckReadings, fitted: FittedParameters, change: Change | None, scale: float = 0.0) -> Explanation:
+        """Return the parameters' posterior given the readings and a change of one scale; None: no change."""
+        prior = fitted.covariance
+        if change is not None and change.columns is not None:
+            prior = prior + scale**2 * change.columns @ change.columns.T
+        reached = check.rows @ prior
+        gain = np.linalg.solve(check.covariance(prior), reached).T
+        return Explanation(gain @ check.residuals, prior - gain @ reached)
