@@ -657,10 +657,10 @@ class Compensator:
 
     def predicted_error(self) -> np.ndarray:
         """Return the tool error that nominal lengths would leave at the last command (see `Correction`)."""
-        platform, commands = self.platform, np.empty(6)
-        low, sense = self.motion.low.copy(), self.motion.sense.copy()
-        given_pose, unused = (platform.position, platform.rotation), (np.empty(3), np.empty((3, 3)))
-        if backwards(self._state, *given_pose, low, sense, *unused, commands) == Status.NOT_CONVERGED:
+        platform, low, sense = self.platform, self.motion.low.copy(), self.motion.sense.copy()
+        given_rows = (array[None] for array in (platform.position, platform.rotation, low, sense))
+        _, _, (commands,), (outcome,) = backwards(self._state, *given_rows)
+        if outcome == Status.NOT_CONVERGED:
             raise NotConvergedError("the error field is too steep to be undone at this pose")
         twist = self.nominal - commands  # what the model would correct, ramp and switch left aside, and its sign turned
         solve_linear(jacobian(self.geometry, platform), twist)

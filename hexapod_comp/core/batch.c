@@ -99,22 +99,19 @@ void hc_follow(double threshold, size_t count, const double *values, double *low
     }
 }
 
-/* The model backwards, each pose by itself, its directions of motion given: what to command. `solved` is 0 where the field
- * cannot be undone. */
-void hc_backwards_many(const hc_state *state, size_t count, const double *positions, const double *rotations,
-                       const double *senses, double *model_positions, double *model_rotations, double *commands, int *solved)
+/* The model backwards: what to command. Low and sense (n x 9) of each pose go on from what stands there; a low of NAN keeps
+ * the sense. Outcomes are HC_OK, HC_NOT_CONVERGED where the field cannot be undone, or HC_OUTSIDE_FIELD where it is held at
+ * the boundary of its box. */
+void hc_backwards_many(const hc_state *state, size_t count, const double *positions, const double *rotations, double *low,
+                       double *sense, double *model_positions, double *model_rotations, double *commands, int *outcomes)
 {
-    int outside;
     for (size_t n = 0; n < count; n++) {
         const hc_pose pose = pose_of(positions + 3 * n, rotations + 9 * n);
-        double low[9], sense[9];
         hc_pose q;
         six_struts now;
-        for (int i = 0; i < 9; i++) {
-            low[i] = NAN; /* no window yet: the direction is the one given */
-            sense[i] = senses[9 * n + (size_t)i];
-        }
-        solved[n] = run_backwards(state, &pose, low, sense, &q, &now, commands + 6 * n, &outside);
+        int outside = 0;
+        const int solved = run_backwards(state, &pose, low + 9 * n, sense + 9 * n, &q, &now, commands + 6 * n, &outside);
+        outcomes[n] = !solved ? HC_NOT_CONVERGED : outside ? HC_OUTSIDE_FIELD : HC_OK;
         write_pose(&q, model_positions + 3 * n, model_rotations + 9 * n);
     }
 }

@@ -97,7 +97,6 @@ def entry(function: str, arguments: str) -> Callable[..., Any]:
 
 
 JOINTS, POSES = "base[6,3] platform[6,3]", "positions[N,3] rotations[N,3,3]"
-MODEL_POSES = "!model_positions[N,3] !model_rotations[N,3,3]"
 POSE, MOTION = "position[3] rotation[3,3]", "!low[9] !sense[9]"
 
 # --- kinematics ---
@@ -126,12 +125,15 @@ field_at = entry("hc_field_at", "field point[3] sense[3] !error[6]")
 follow = entry("hc_follow", "threshold N values[N] >low[N] >sense[N]")
 follow_nine = entry("hc_follow_nine", f"values[9] axis_threshold strut_threshold {MOTION}")
 follow_point = entry("hc_follow_point", f"{POSE} probe[3] threshold {MOTION}")
-backwards = entry("hc_backwards", f"state {POSE} {MOTION} !model_position[3] !model_rotation[3,3] !commands[6]")
-backwards_many = entry("hc_backwards_many", f"state N {POSES} senses[N,9] {MODEL_POSES} !commands[N,6] !solved[N]:int")
+backwards = entry(
+    "hc_backwards_many",
+    f"state N {POSES} !low[N,9] !sense[N,9] >model_positions[N,3] >model_rotations[N,3,3] >commands[N,6] "
+    ">outcomes[N]:int",
+)
 forwards = entry(
     "hc_forwards_many",
-    f"state N commands[N,6] senses[N,9] {MODEL_POSES} !positions[N,3] !rotations[N,3,3] !outcomes[N]:int "
-    "!conditions[N]",
+    "state N commands[N,6] senses[N,9] !model_positions[N,3] !model_rotations[N,3,3] !positions[N,3] "
+    "!rotations[N,3,3] !outcomes[N]:int !conditions[N]",
 )
 
 # --- limits, drives ---

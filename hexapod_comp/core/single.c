@@ -132,17 +132,3 @@ void hc_place(hc_state *state)
 {
     place_machine(state);
 }
-
-/* The model backwards: HC_OK, HC_NOT_CONVERGED, or HC_OUTSIDE_FIELD where the field is held at the boundary of its box; low
- * and sense (9) go on. */
-hc_status hc_backwards(const hc_state *state, const double *position, const double *rotation, double *low, double *sense,
-                       double *model_position, double *model_rotation, double *commands)
-{
-    const hc_pose target = pose_of(position, rotation);
-    hc_pose q;
-    six_struts now;
-    int outside = 0;
-    const int solved = run_backwards(state, &target, low, sense, &q, &now, commands, &outside);
-    write_pose(&q, model_position, model_rotation);
-    return !solved ? HC_NOT_CONVERGED : outside ? HC_OUTSIDE_FIELD : HC_OK;
-}

@@ -293,13 +293,12 @@ class RealMachine:
         NotConvergedError
             q ∘ E(q) = target could not be solved: the field is no small correction.
         """
-        motion, commands = MotionState() if motion is None else motion, np.empty(6)
-        position, rotation = np.empty(3), np.empty((3, 3))
-        given = target.position, target.rotation, motion.low, motion.sense
-        status = backwards(self.state, *given, position, rotation, commands)
-        if status == Status.NOT_CONVERGED:
+        motion = MotionState() if motion is None else motion
+        given = (array[None] for array in (target.position, target.rotation, motion.low, motion.sense))
+        (position,), (rotation,), (commands,), (outcome,) = backwards(self.state, *given)
+        if outcome == Status.NOT_CONVERGED:
             raise NotConvergedError("the error field is too steep to be undone at this pose")
-        return commands, Pose(position, rotation), status == Status.OUTSIDE_FIELD
+        return commands, Pose(position, rotation), bool(outcome == Status.OUTSIDE_FIELD)
 
     def pose_for(
         self, commands: ArrayLike, sense: np.ndarray | None = None, guess: Pose | None = None

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..core import Status
-from ..core.batch import backwards_many
+from ..core.batch import backwards
 from ..errors import ModelError, NotConvergedError
 from ..pose import attitude_error, best_motion
 from .kinematics import forward_error
@@ -124,15 +124,16 @@ def model_commands(
     :meth:`RealMachine.commands_for` without its objects: a study asks for millions.
     """
     positions, rotations = np.ascontiguousarray(targets[0]), np.ascontiguousarray(targets[1])
+    senses, no_window = np.array(senses, dtype=float), np.full((len(positions), 9), np.nan)
     commands, modelled = np.empty((len(positions), 6)), (np.empty_like(positions), np.empty_like(rotations))
-    solved, done = np.empty(len(positions), np.intc), 0
-    arrays = positions, rotations, np.ascontiguousarray(senses, dtype=float), *modelled, commands, solved
+    outcomes, done = np.empty(len(positions), np.intc), 0
     for machine, alike in groupby(machines):
         rows = slice(done, done + len(list(alike)))
-        backwards_many(machine.state, *(array[rows] for array in arrays))
+        of_rows = positions[rows], rotations[rows], no_window[rows], senses[rows]
+        modelled[0][rows], modelled[1][rows], commands[rows], outcomes[rows] = backwards(machine.state, *of_rows)
         done = rows.stop
-    if not solved.all():
-        n = int(solved.argmin())
+    if (outcomes == Status.NOT_CONVERGED).any():
+        n = int((outcomes == Status.NOT_CONVERGED).argmax())
         where = at(positions[n]) if name_of is None else name_of(n)
         raise NotConvergedError(f"{where}: the error field is too steep to be undone at this pose")
     return commands, modelled

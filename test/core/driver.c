@@ -185,7 +185,7 @@ static void kinematics(void)
 static void model(void)
 {
     const double *base = (const double *)hexapod_model.base.joints, *platform = (const double *)hexapod_model.platform.joints;
-    static double q[POSES * 3], turned[POSES * 9], actual[POSES * 3], rotated[POSES * 9], numbers[POSES * 6];
+    static double windows[POSES * 9], q[POSES * 3], turned[POSES * 9], actual[POSES * 3], rotated[POSES * 9], numbers[POSES * 6];
     static hc_quantities found[2 * POSES];
     double low[9] = {NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN}, sense[9] = {0.0}, slopes[POSES];
     int flags[POSES], n, i;
@@ -193,7 +193,10 @@ static void model(void)
     hc_state state;
     hc_pose pose;
     hc_init(&state, &hexapod_model, 1e-3);
-    hc_backwards_many(&state, POSES, positions, rotations, senses, q, turned, numbers, flags);
+    for (i = 0; i < POSES * 9; i++) {
+        windows[i] = NAN;
+    }
+    hc_backwards_many(&state, POSES, positions, rotations, windows, senses, q, turned, numbers, flags);
     show("commands", numbers, POSES * 6);
     hc_forwards_many(&state, POSES, numbers, senses, q, turned, actual, rotated, flags, slopes);
     show("actual", actual, POSES * 3);
