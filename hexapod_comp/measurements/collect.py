@@ -26,13 +26,15 @@ from ..pose import Pose, attitude_error
 from .campaign import Campaign, campaign_readings
 from .readings import ANGULAR_KINDS, LINE_KINDS, NO_LOAD, FileLine, MeasurementSet, Reading, Run
 from .runs import assemble
-from .set_up import FREE, KNOWN, PoseCheck, SetUpError, WayCheck, check_nudges, nudge
+from .set_up import FREE, KNOWN, LARGEST_ERROR, PoseCheck, SetUpError, WayCheck, check_nudges, dimension, nudge
 from .tidy import tidy_readings, write_measurements
 
 __all__ = ["Collected", "InstrumentMachine", "MeasuredMachine", "Observation", "RunSetUp", "SetUpError", "collect"]
 
 SAVE_EVERY = 5.0  # The file is written anew after this long, s, and at the end of each run: no more is lost than that
 OVERRUN = 2e-3  # A pass over a line begins this far before it, m, so that every strut arrives in the pass's direction
+MOVED = 2.0 * LARGEST_ERROR  # Frames from two sets of stations differ by less, m, if the tracker stood
+BROKEN = "a broken beam"
 FRAME_REMARK = "tracker frame in base, mm and quaternion: "  # of a file whose poses came from a tracker anywhere
 OPEN = "open"  # in place of the frame while too little was measured to know it
 
@@ -179,7 +181,11 @@ class _Collecting:
         self._geometry, self._machine, self._listed, self._path = geometry, machine, listed, path
         self._attempts = attempts
         self._plan = assemble(geometry, [reading._replace(source=FileLine("campaign", 0)) for reading in listed])
-        self._directions, self._along = self._plan.directions(), self._plan.along()
+        self._directions, points = self._plan.directions(), self._plan.points()
+        away = np.linalg.norm(points[self._plan.station] - self._plan.centre, axis=1)
+        self._ways = np.where(
+            np.isnan(away), self._plan.along(), away
+        )  # along a line, or the distance from a length's centre
         self.visits, self.missing, self.resumed = list(_visits(listed)), list[str](), 0
         angular = any(reading.channel.partition("_")[0] in ANGULAR_KINDS for reading in listed)
         self.poses = PoseCheck(geometry.characteristic_length, tracker_frame, angular)
@@ -188,7 +194,7 @@ class _Collecting:
         if Path(path).exists():
             self.found = _resumed(path, geometry, listed)
             self._frame = _stated_frame(path, tracker_frame)
-        self._unplaced: list[tuple[Visit, Observation, Pose]] = []  # in a frame that does not show yet
+        self._unplaced: list[tuple[int, Observation, Pose]] = []  # in a frame that does not show yet
         self._nudged: set[tuple[str, ...]] = set()  # channels that were checked
         self._saved, self._here = time.monotonic(), -1  # when, and the stop at which the machine stands
         self.progress: Callable[[int, int, str], object]
@@ -209,15 +215,20 @@ class _Collecting:
             place = self._place(run, self.visits[stops[0]])
             own = [c for c in channels if c in self._machine.set_up(RunSetUp(run.name, channels, place))]
         counting = bool(own) and not run.known_zero
-        missing = list(self.missing)
+        missing, causes = list(self.missing), list[str]()
         for _ in range(self._attempts if counting else 1):
             self.missing = list(missing)
             if counting:  # whoever was away does not know whether the zero is still the same
                 for n in readings:
                     self.found.pop(n, None)
-            if self._pass_over(stops, own, counting):
+            cause = self._pass_over(stops, own, counting)
+            if not cause:
                 break
+            causes.append(cause)
         else:
+            if BROKEN not in causes:
+                question = "is the centre or the target elsewhere, or is something in the beam"
+                raise SetUpError(f"{causes[-1]}, each of {self._attempts} times: {question}?")
             self.missing.append(f"{run.name}, whose zero was lost {self._attempts} times")
         self.save()
 
@@ -233,8 +244,8 @@ class _Collecting:
         pose = self._geometry.work @ first.pose
         return pose if self._listed[n].centre is None else Pose(self._plan.centre[n], np.eye(3))
 
-    def _pass_over(self, stops: Sequence[int], own: Collection[str], counting: bool) -> bool:
-        """Visit a run's stops that are not found yet; return False where the zero is lost."""
+    def _pass_over(self, stops: Sequence[int], own: Collection[str], counting: bool) -> str:
+        """Visit a run's stops that are not found yet; return by what the zero was lost, empty: it was not."""
         zeros: dict[str, float] = {}
         checked = not own or tuple(own) in self._nudged
         ways = {channel: WayCheck(channel, checked) for channel in own}
@@ -244,12 +255,12 @@ class _Collecting:
                 self.resumed += 1
                 continue
             if not self.going_on():
-                return True
+                return ""
             self.progress(k, len(self.visits), visit.where)
             self._go(k)
             if not checked:
                 if not self._check_channels(visit, own):
-                    return False
+                    return BROKEN
                 checked = True
                 self._go(k)
             seen = self._observe()
@@ -257,16 +268,16 @@ class _Collecting:
                 self.missing.append(visit.where)
                 continue
             if seen.zero_lost and counting and zeros:
-                return False
-            if not self._take_channels(visit, seen, ways, zeros):
+                return BROKEN
+            if jumped := self._take_channels(visit, seen, ways, zeros):
                 if counting:
-                    return False
+                    return jumped
                 self.missing.append(visit.where)
                 continue
             self._take_pose(visit, seen, own)
             if time.monotonic() - self._saved > SAVE_EVERY:
                 self.save()
-        return True
+        return ""
 
     def _go(self, k: int) -> None:
         """Move to a stop, in the direction of its pass."""
@@ -296,7 +307,7 @@ class _Collecting:
         chosen = [n for n in visit.readings if self._listed[n].channel in own]
         directions, before = self._directions[chosen], self._observe()
         names = [self._listed[n].channel for n in chosen]
-        seen, tool = np.eye(len(chosen)) * 0.0, self._geometry.work @ visit.pose
+        seen, tool = np.zeros((len(chosen), len(chosen))), self._geometry.work @ visit.pose
         for j, (direction, name) in enumerate(zip(directions, names, strict=True)):
             for sign in (1.0, -1.0):
                 if self._move(self._geometry.work.inverse() @ nudge(tool, direction, name, sign)):
@@ -316,47 +327,48 @@ class _Collecting:
 
     def _take_channels(
         self, visit: Visit, seen: Observation, ways: Mapping[str, WayCheck], zeros: dict[str, float]
-    ) -> bool:
-        """Add what an instrument read itself; False where no machine errs so."""
-        added, plausible = {}, True
+    ) -> str:
+        """Add what an instrument read itself; return what no machine errs by, empty: all of it may be so."""
+        added, jumped = {}, ""
         for n in visit.readings:
             reading = self._listed[n]
             if reading.channel in ways:
-                (read, deviation), way = seen.channels[reading.channel], self._way(n)
+                (read, deviation), way = seen.channels[reading.channel], float(self._ways[n])
                 follows = reading.channel in ("linear", "length")
-                plausible &= ways[reading.channel].plausible(way, read)
+                if jump := ways[reading.channel].jump(way, read):
+                    unit = "mrad" if dimension(reading.channel) == "angle" else "mm"
+                    jumped = f"{reading.channel} jumps by {jump * 1e3:.3g} {unit} on the way to {visit.where}"
                 value = read - (way if follows else 0.0)
                 if not reading.known_zero:
                     value -= zeros.setdefault(reading.channel, value)
                 added[n] = self._reading(reading, value, deviation, seen)
-        if plausible:
+        if not jumped:
             self.found |= added
-        return plausible
-
-    def _way(self, n: int) -> float:
-        """Return the commanded way along a line, or the distance from a length's centre, m."""
-        if self._listed[n].centre is None:
-            return float(self._along[n])
-        return float(np.linalg.norm(self._plan.points()[self._plan.station[n]] - self._plan.centre[n]))
+        return jumped
 
     def _take_pose(self, visit: Visit, seen: Observation, own: Collection[str]) -> None:
         """Add what a measured pose shows of the channels that no instrument read itself."""
-        if all(self._listed[n].channel in own for n in visit.readings):
+        wanted = [n for n in visit.readings if self._listed[n].channel not in own]
+        if not wanted:
             return
         if seen.pose is None:
             self.missing.append(visit.where)
             return
         if not self.poses.plausible(self._geometry.work @ visit.pose, seen.pose):
             return  # of no use, and the next stops tell why
-        self._unplaced.append((visit, seen, seen.pose))
+        self._unplaced += [(n, seen, seen.pose) for n in wanted]
+        shown = self.poses.frame()
         if self._frame is None:
-            self._frame = self.poses.frame()
+            self._frame = shown
         if self._frame is None:
             return
-        for there, then, pose in self._unplaced:
-            for n in there.readings:
-                if self._listed[n].channel not in own:
-                    self.found[n] = self._of_pose(n, then, self._frame, pose)
+        apart = (
+            0.0 if shown is None else np.linalg.norm((shown @ seen.pose).position - (self._frame @ seen.pose).position)
+        )
+        if apart > MOVED:
+            text = f"the tracker stands {apart * 1e3:.1f} mm from where it stood when the file was begun"
+            raise SetUpError(f"{text}: give another file")
+        self.found |= {n: self._of_pose(n, then, self._frame, pose) for n, then, pose in self._unplaced}
         self._unplaced.clear()
 
     def _of_pose(self, n: int, seen: Observation, frame: Pose, pose: Pose) -> Reading:

@@ -17,11 +17,13 @@ from .readings import ANGULAR_KINDS
 
 FREE, KNOWN = FRAMES = ("free", "known")  # Where a tracker stands: anywhere; or its frame is the base
 
-LEAST_WAY = 0.02  # Root of the summed squared ways, or a way along a line, from which ways are compared, m
-LARGEST_SCALE_ERROR = 0.01  # Ways longer or shorter by this share: another unit
-LARGEST_TURN = math.radians(2.0)  # Ways turned by this: another frame
+LEAST_WAY = 5e-3  # Root of the summed squared ways, or a way along a line, from which ways are compared, m
+LARGEST_ERROR = 0.5e-3  # Errors of a machine before its calibration differ by no more from stop to stop, m
+LARGEST_SCALE_ERROR = 0.01  # Ways longer or shorter by this share and that: another unit
+LARGEST_TURN = math.radians(2.0)  # Ways turned by this and that: another frame
 LARGEST_OFFSET = 0.01  # Poses beside the commanded ones by this, m: another origin or target
 LARGEST_STEP = {"length": 1e-3, "angle": 5e-3}  # Errors that change by more from stop to stop, m, rad: a lost zero
+OFF_CENTRE = 0.01  # And of lengths, m: their centre is known to some millimetres
 NUDGE = {"length": 0.5e-3, "angle": 2e-3}  # Moves that each channel must follow, m, rad: every instrument reads so far
 NUDGE_TOLERANCE = 0.15  # By how much of a nudge a reading may differ: backlash, a centre that is known to 5 mm
 LARGEST_ARM = 0.025  # Displacement per turn of the tool about its tip, m: the target is elsewhere
@@ -84,10 +86,11 @@ class PoseCheck:
         gone, read = (self._ways([pose.position for pose in poses]) for poses in (self._meant, self._seen))
         long = float(np.linalg.norm(gone))
         if long > LEAST_WAY:
-            self._check_scale(float(np.linalg.norm(read)) / long)
+            slack = LARGEST_ERROR * math.sqrt(len(gone)) / long
+            self._check_scale(float(np.linalg.norm(read)) / long, slack)
             if (frame := self.frame()) is None:
                 return True
-            self._check_turn(gone, read @ frame.rotation.T)
+            self._check_turn(gone, read @ frame.rotation.T, slack)
             self.end()
             if self._with_attitude:
                 self._check_attitude(meant, frame @ seen)
@@ -116,17 +119,17 @@ class PoseCheck:
     def _hint(self) -> str:
         return "" if self.free else " A tracker that stands anywhere is --tracker-frame free"
 
-    def _check_scale(self, scale: float) -> None:
-        if abs(scale - 1.0) > LARGEST_SCALE_ERROR:
-            unit = _unit(scale, UNITS["length"], LARGEST_SCALE_ERROR)
+    def _check_scale(self, scale: float, slack: float) -> None:
+        if abs(scale - 1.0) > LARGEST_SCALE_ERROR + slack:
+            unit = _unit(scale, UNITS["length"], LARGEST_SCALE_ERROR + slack)
             hint = f": {unit}?" if unit else ""
             raise SetUpError(f"ways read {scale:.4g} times as long as commanded{hint}")
 
-    def _check_turn(self, gone: np.ndarray, read: np.ndarray) -> None:
+    def _check_turn(self, gone: np.ndarray, read: np.ndarray, slack: float) -> None:
         cosine = float((gone * read).sum() / (np.linalg.norm(gone) * np.linalg.norm(read)))
-        if cosine < -math.cos(LARGEST_TURN):
+        if cosine < -math.cos(LARGEST_TURN + slack):
             raise SetUpError("ways read reversed: the sign of the readings, or of an axis of the instrument's frame")
-        if (angle := math.acos(min(cosine, 1.0))) > LARGEST_TURN:
+        if (angle := math.acos(min(cosine, 1.0))) > LARGEST_TURN + slack:
             text = f"ways read turned by about {math.degrees(angle):.1f}° against the commanded ones"
             question = "are the axes of the instrument's frame those of the base, none exchanged?"
             if self.free:
@@ -195,8 +198,8 @@ class WayCheck:
         self._channel, self._kind, self._nudged = channel, channel.partition("_")[0], nudged
         self._ways, self._read = list[float](), list[float]()
 
-    def plausible(self, way: float, read: float) -> bool:
-        """Add a stop, m or rad, and return whether a machine may err so; False: the zero was lost on the way here.
+    def jump(self, way: float, read: float) -> float:
+        """Add a stop, m or rad, and return by how much more its error changed than any machine's does, else 0.
 
         A SetUpError where what was read until here tells another mistake.
         """
@@ -204,26 +207,29 @@ class WayCheck:
         self._read.append(read)
         follows = self._kind in ("linear", "length")
         errors = np.array(self._read) - (np.array(self._ways) if follows else 0.0)
-        jumped = len(errors) > 1 and abs(errors[-1] - errors[-2]) > LARGEST_STEP[dimension(self._channel)]
-        until = len(errors) - jumped
-        if self._kind != "rotation" and self._kind != "displacement":
+        change = abs(float(errors[-1] - errors[-2])) if len(errors) > 1 else 0.0
+        most = OFF_CENTRE if self._kind == "length" else LARGEST_STEP[dimension(self._channel)]
+        until = len(errors) - (change > most)
+        if self._kind not in ("rotation", "displacement"):
             self._check_slope(np.array(self._ways[:until]), np.array(self._read[:until]), follows)
-        return not jumped or (until < 2 and not self._nudged)
+        return change if change > most and (until > 1 or self._nudged) else 0.0
 
     def _check_slope(self, ways: np.ndarray, read: np.ndarray, follows: bool) -> None:
         one, other = np.triu_indices(len(ways), 1)
-        far = np.abs(ways[one] - ways[other]) >= LEAST_WAY
+        apart = np.abs(ways[one] - ways[other])
+        far = apart >= max(LEAST_WAY, 0.5 * float(apart.max(initial=0.0)))
         if not far.any():
             return
         slope = float(np.median((read[one] - read[other])[far] / (ways[one] - ways[other])[far]))
+        slack = (OFF_CENTRE if self._kind == "length" else LARGEST_ERROR) / float(np.median(apart[far]))
         if not follows:
-            if abs(slope) > LARGEST_TURN:
+            if abs(slope) > LARGEST_TURN + slack:
                 text = f"{self._channel} changes by {slope:.3g} of the way along the line"
                 raise SetUpError(f"{text}: is the beam along the line, and are the channels not exchanged?")
             return
-        if abs(slope - 1.0) > LARGEST_SCALE_ERROR:
+        if abs(slope - 1.0) > LARGEST_SCALE_ERROR + slack:
             text = f"{self._channel} reads {slope:.4g} times the commanded way"
-            if abs(slope + 1.0) < LARGEST_SCALE_ERROR:
+            if abs(slope + 1.0) < LARGEST_SCALE_ERROR + slack:
                 raise SetUpError(f"{text}: it reads reversed, its sign")
-            unit = _unit(slope, UNITS["length"], LARGEST_SCALE_ERROR)
+            unit = _unit(slope, UNITS["length"], LARGEST_SCALE_ERROR + slack)
             raise SetUpError(f"{text}: {unit or 'is its beam along the line, is its scale right'}?")

@@ -187,6 +187,7 @@ def test_who_stops_it_keeps_what_was_read(tmp_path: Path) -> None:
     )
 
 
+HOME = np.array([0.0, 0.0, 0.4])
 MIRRORED = np.diag([-1.0, -1.0, 1.0])
 
 
@@ -195,7 +196,7 @@ MIRRORED = np.diag([-1.0, -1.0, 1.0])
     [
         (lambda p: Pose(p.position * 1e3, p.rotation), "1000 times as long as commanded: mm read as m?"),
         (lambda p: Pose(p.position / 25.4, p.rotation), "0.03937 times as long as commanded: mm read as inches?"),
-        (lambda p: Pose(p.position * 1.02, p.rotation), "1.02 times as long as commanded"),
+        (lambda p: Pose(p.position * 1.1 - 0.1 * HOME, p.rotation), "1.1 times as long as commanded"),
         (lambda p: Pose(MIRRORED @ p.position, p.rotation), "ways read reversed"),
         (lambda p: Pose(p.position[[1, 0, 2]], p.rotation), "ways read turned by about 90.0°"),
         (lambda p: Pose(p.position + np.array([0.0, 0.03, 0.0]), p.rotation), "reads 0.0, 30.0, 0.0 mm beside"),
