@@ -26,7 +26,18 @@ from ..pose import Pose, attitude_error
 from .campaign import Campaign, campaign_readings
 from .readings import ANGULAR_KINDS, LINE_KINDS, NO_LOAD, FileLine, MeasurementSet, Reading, Run
 from .runs import assemble
-from .set_up import FREE, KNOWN, LARGEST_ERROR, PoseCheck, SetUpError, WayCheck, check_nudges, dimension, nudge
+from .set_up import (
+    FREE,
+    KNOWN,
+    LARGEST_ERROR,
+    PoseCheck,
+    SetUpError,
+    WayCheck,
+    check_nudges,
+    dimension,
+    nudge,
+    nudge_tolerance,
+)
 from .tidy import tidy_readings, write_measurements
 
 __all__ = ["Collected", "InstrumentMachine", "MeasuredMachine", "Observation", "RunSetUp", "SetUpError", "collect"]
@@ -319,7 +330,8 @@ class _Collecting:
                     break
             else:
                 raise SetUpError(f"the limits leave no room to move along {name} at {visit.where}")
-        check_nudges(names, directions, seen)
+        tolerances = [nudge_tolerance(self._listed[n].channel, float(self._ways[n])) for n in chosen]
+        check_nudges(names, directions, seen, tolerances)
         self._nudged.add(tuple(own))
         return True
 

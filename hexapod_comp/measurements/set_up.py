@@ -152,21 +152,29 @@ def nudge(pose: Pose, direction: np.ndarray, channel: str, sign: float) -> Pose:
     return Pose(pose.position + size * direction[:3], turn @ pose.rotation)
 
 
-def check_nudges(channels: Sequence[str], directions: np.ndarray, seen: np.ndarray) -> None:
+def nudge_tolerance(channel: str, distance: float) -> float:
+    """Return by how much of a nudge a channel may differ, of a length `distance`, m, from a centre that is off."""
+    off = min(OFF_CENTRE / distance, 1.0) if channel == "length" else 0.0
+    return NUDGE_TOLERANCE + 1.0 - math.sqrt(1.0 - off**2)
+
+
+def check_nudges(
+    channels: Sequence[str], directions: np.ndarray, seen: np.ndarray, tolerances: Sequence[float]
+) -> None:
     """Raise a SetUpError where channels do not follow small moves along each one's own direction.
 
     `directions` (n, 6) are in which each channel reads, `seen` (n, n) by how much channel i changed when the tool was
-    moved along channel j.
+    moved along channel j, `tolerances` by how much of that it may differ.
     """
     sizes = np.array([NUDGE[dimension(channel)] for channel in channels])
     for i, channel in enumerate(channels):
         ratios = seen[i] / sizes  # as if it read what another channel should
         own, others = float(ratios[i]), [j for j in range(len(channels)) if j != i]
-        if abs(own - 1.0) > NUDGE_TOLERANCE:
+        if abs(own - 1.0) > tolerances[i]:
             exchanged = [j for j in others if abs(abs(ratios[j]) - 1.0) < NUDGE_TOLERANCE]
             if abs(own) < NUDGE_TOLERANCE and exchanged:
                 raise SetUpError(f"{channel} reads what {channels[exchanged[0]]} should: are the channels exchanged?")
-            if abs(own + 1.0) < NUDGE_TOLERANCE:
+            if abs(own + 1.0) < tolerances[i]:
                 raise SetUpError(f"{channel} reads reversed: its sign")
             size = f"{sizes[i] * 1e3:g} {'mrad' if dimension(channel) == 'angle' else 'mm'}"
             text = f"{channel} reads {own:.4g} times the {size} by which the tool was moved"
