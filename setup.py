@@ -155,6 +155,7 @@ setup(
             f"strut_drive = {NAME}.ros:start_strut_drive",
             f"mover = {NAME}.ros:start_mover",
             f"instrument = {NAME}.ros:start_instrument",
+            f"adapter = {NAME}.ros:start_adapter",
             f"linuxcnc_bridge = {NAME}.linuxcnc:start_bridge",
             f"linuxcnc_machine = {NAME}.linuxcnc:start_machine",
             f"hal_sweep = {NAME}.linuxcnc.hal:main",

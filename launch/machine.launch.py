@@ -28,6 +28,7 @@ MOVERS = (
     "work_frame",
     "frame_prefix",
 )  # What mover has of compensator's parameters
+ADAPTERS = ("autostart", "use_sim_time", "geometry_file")  # and what adapter has
 RANGES = ["LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT"]
 DESCRIBED = f"{shlex.quote(sys.executable)} -m hexapod_comp.ros.described"
 """Starts robot_state_publisher with the URDF that the compensator publishes: of the machine that it runs."""
@@ -49,6 +50,7 @@ def generate_launch_description() -> LaunchDescription:
         ),
         argument("simulate", default_value="true", choices=FLAG, description="Start strut_drive too."),
         argument("mover", default_value="false", choices=FLAG, description="Start mover too: it commands the tool."),
+        argument("adapter", default_value="false", choices=FLAG, description="Start adapter too: it calibrates."),
         argument(
             "instrument",
             default_value="",
@@ -105,6 +107,8 @@ def _nodes(context: LaunchContext) -> list[Node]:
     if given("mover") == "true":
         frames = {key: value for key, value in (common | model).items() if key in MOVERS}
         nodes.append(_node("mover", given, [*files, frames]))
+    if given("adapter") == "true":
+        nodes.append(_node("adapter", given, [*files, {k: v for k, v in common.items() if k in ADAPTERS}]))
     if given("instrument"):
         nodes.append(_node("instrument", given, [*files, common | {"kind": given("instrument")}]))
     if "true" in (given("description"), given("rviz")):

@@ -28,7 +28,7 @@ from node_helpers import HOME, Bench
 from hexapod_comp.cli.app import make_parser
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.linuxcnc import bridge as linuxcnc_bridge
-from hexapod_comp.ros import instrument, interface, mover, strut_drive
+from hexapod_comp.ros import adapter, instrument, interface, mover, strut_drive
 from hexapod_comp.ros.parameters import Taken
 from hexapod_comp.ros.status import ERROR
 
@@ -37,7 +37,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "doc").glob("*.md"))]
 
 BLOCK = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 
-NODES = {part.PROGRAM.name: part for part in (interface, strut_drive, mover, instrument, linuxcnc_bridge)}
+NODES = {part.PROGRAM.name: part for part in (interface, strut_drive, mover, instrument, adapter, linuxcnc_bridge)}
 
 OTHERS = {"apt-get", "cc", "cd", "colcon", "cp", "eval", "export", "linuxcnc", "pip", "python3", "rosdep", "source"}
 OTHERS |= {

@@ -109,3 +109,8 @@ def start_mover() -> int:
 def start_instrument() -> int:
     """Run the executable ``instrument``."""
     return start("hexapod_comp.ros.instrument")
+
+
+def start_adapter() -> int:
+    """Run the executable ``adapter``."""
+    return start("hexapod_comp.ros.adapter")

@@ -11,6 +11,8 @@ from typing import Any
 from ..errors import InputFileError
 from ..formats.json import json_content, json_text
 
+JOURNAL = "journal.jsonl"  # its name in the loop's folder
+
 Event = dict[str, Any]
 
 
@@ -30,20 +32,15 @@ class Journal:
         except OSError as error:
             raise InputFileError(path, "", f"cannot be read: {error.strerror}") from error
         whole, _, rest = text.rpartition("\n")
-        self.events = list(self._parsed(whole))
+        self.events = list(_parsed(self.path, whole))
         if rest:
             with self.path.open("r+b") as file:
                 file.truncate(len((whole + "\n").encode()) if whole else 0)
 
-    def _parsed(self, text: str) -> Iterator[Event]:
-        for number, line in enumerate(text.splitlines(), start=1):
-            try:
-                event = json_content(line)
-            except ValueError as error:
-                raise InputFileError(self.path, f"line {number}", f"is no event: {error}") from error
-            if not isinstance(event, dict) or not isinstance(event.get("event"), str):
-                raise InputFileError(self.path, f"line {number}", "must be an object with an event")
-            yield event
+    @staticmethod
+    def read(path: Path) -> list[Event]:
+        """Return the events of a journal that somebody else writes, without a line that is being written."""
+        return list(_parsed(path, path.read_text(encoding="utf-8", errors="replace").rpartition("\n")[0]))
 
     def add(self, event: str, **content: Any) -> Event:
         """Write an event, with the time."""
@@ -58,3 +55,14 @@ class Journal:
             raise InputFileError(self.path, "", f"cannot be written: {error.strerror}") from error
         self.events.append(json_content(line))
         return self.events[-1]
+
+
+def _parsed(path: Path, text: str) -> Iterator[Event]:
+    for number, line in enumerate(text.splitlines(), start=1):
+        try:
+            event = json_content(line)
+        except ValueError as error:
+            raise InputFileError(path, f"line {number}", f"is no event: {error}") from error
+        if not isinstance(event, dict) or not isinstance(event.get("event"), str):
+            raise InputFileError(path, f"line {number}", "must be an object with an event")
+        yield event

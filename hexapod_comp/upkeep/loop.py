@@ -47,9 +47,8 @@ from ..measurements.files import read_measurements
 from ..measurements.readings import MeasurementSet
 from .careful import Careful
 from .checks import check_campaign, judge_promise
-from .journal import Event, Journal
+from .journal import JOURNAL, Event, Journal
 
-JOURNAL = "journal.jsonl"
 GIVEN = "given"  # in place of the name of a planned campaign
 IN_USE = "model.yaml"  # the adopted model, always under this name, its posterior beside it
 

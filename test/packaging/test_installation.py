@@ -110,7 +110,7 @@ def test_the_wheel_is_for_every_python_of_its_platform(wheel: Path):
     assert re.fullmatch(r"hexapod_comp-\d+\.\d+\.\d+-cp310-abi3-linux_\w+\.whl", wheel.name)
 
 
-@pytest.mark.parametrize("name", ["compensator", "strut_drive", "mover", "instrument", "hexapod_comp"])
+@pytest.mark.parametrize("name", ["compensator", "strut_drive", "mover", "instrument", "adapter", "hexapod_comp"])
 def test_ros2_run_finds_the_executables(installed: Path, name: str):
     executable = installed / "lib" / "hexapod_comp" / name
     assert os.access(executable, os.X_OK), sorted(installed.rglob(name))

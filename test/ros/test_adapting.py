@@ -16,8 +16,10 @@ import pytest
 pytest.importorskip("rclpy")
 
 from node_helpers import HOME, Bench, model_file, near
+from std_srvs.srv import Trigger
 
 from hexapod_comp.errors import CommandError
+from hexapod_comp.ros.adapter import AdapterNode
 from hexapod_comp.ros.adapting import AdaptedMachine
 from hexapod_comp.ros.client import MoveError
 from hexapod_comp.ros.mover import MoverNode
@@ -70,3 +72,25 @@ def test_a_loop_that_shall_not_go_on_brakes_the_move(bench: Bench) -> None:
     error = asked(bench, lambda machine: machine.move(near(HOME, (0.0, 0.0, 0.02)), "base"), lambda: False)
     assert isinstance(error, MoveError)
     assert error.reason == "person"
+
+
+def test_the_node_starts_reports_and_stops_a_calibration(bench: Bench, tmp_path: Path) -> None:
+    """No machine is there: the process waits for one. The journal is the test's."""
+    node = bench.add(AdapterNode, True, {"folder": str(tmp_path)})
+    assert bench.call(Trigger, "adapter/stop").message == "nothing was running"
+    assert bench.call(Trigger, "adapter/calibrate").success
+    refused = bench.call(Trigger, "adapter/verify")
+    assert (refused.success, refused.message) == (False, "calibrating already: ~/stop ends it")
+    journal = '{"event": "begun", "machine": "paper", "goal_m": 3e-06}\n{"event": "pla'
+    (tmp_path / "journal.jsonl").write_text(journal, encoding="utf-8")
+    bench.until(lambda: node._step == "begun", "the step")
+    assert bench.call(Trigger, "adapter/stop").message == "the machine brakes"
+    bench.until(lambda: node._state == "stopped", "its end", timeout=60.0)
+    assert bench.call(Trigger, "adapter/stop").message == "nothing was running"
+
+
+def test_a_process_that_ends_without_a_result_is_reported(bench: Bench, tmp_path: Path) -> None:
+    node = bench.add(AdapterNode, True, {"folder": str(tmp_path), "geometry_file": "not_there.yaml"})
+    assert bench.call(Trigger, "adapter/verify").success
+    bench.until(lambda: node._state == "failed", "its end", timeout=60.0)
+    assert node._text.startswith("the process ended with 2")

@@ -14,6 +14,7 @@ from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import DescribeParameters
 from std_msgs.msg import UInt64
 
+from hexapod_comp.ros.adapter import AdapterNode
 from hexapod_comp.ros.compensator import CompensatorNode
 from hexapod_comp.ros.instrument import InstrumentNode
 from hexapod_comp.ros.mover import MoverNode
@@ -27,6 +28,7 @@ KINDS = {
     "strut_drive": StrutDriveNode,
     "mover": MoverNode,
     "instrument": InstrumentNode,
+    "adapter": AdapterNode,
 }
 
 COMPENSATOR = "compensator"
@@ -125,6 +127,7 @@ def test_descriptors_say_range_and_when(rig):
     rig.drive(start=False)
     rig.add(MoverNode, False, {})
     rig.add(InstrumentNode, False, {})
+    rig.add(AdapterNode, False, {})
     for name in KINDS:
         table = TABLES[name]
         request = DescribeParameters.Request(names=[p.name for p in table])
@@ -180,7 +183,7 @@ def test_a_file_of_other_values_is_loaded_also_through_the_launch_file(rig, monk
     path.write_text(yaml.safe_dump({f"/**/{name}": {"ros__parameters": others}}))
     node = rig.add(KINDS[name], False, {}, cli_args=["--ros-args", "--params-file", str(path)])
     assert {key: value for key, value in in_force(node).items() if key in others} == others
-    arguments = f"params_file:={path}", "model:=table.yaml", "mover:=true", "instrument:=laser"
+    arguments = f"params_file:={path}", "model:=table.yaml", "mover:=true", "instrument:=laser", "adapter:=true"
     given = LaunchFile(monkeypatch).start(*arguments)[name]
     arguments, given = ["--ros-args"], given["parameters"]
     for number, part in enumerate(given):

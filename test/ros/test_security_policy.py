@@ -28,6 +28,7 @@ from std_srvs.srv import SetBool, Trigger
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
 from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.ros.adapter import AdapterNode
 from hexapod_comp.ros.client import LoopClient
 from hexapod_comp.ros.instrument import InstrumentNode
 from hexapod_comp.ros.mover import MoverNode
@@ -125,7 +126,7 @@ def test_operators_and_thermometers_hear_and_ask_only_what_there_is() -> None:
         assert all(reply.startswith(f"/{TOOLS}/") for reply in allowed["reply"])
 
 
-@pytest.mark.parametrize("name", ["compensator", "strut_drive", "mover", "instrument", "linuxcnc_bridge"])
+@pytest.mark.parametrize("name", ["compensator", "strut_drive", "mover", "instrument", "adapter", "linuxcnc_bridge"])
 def test_lifecycle_nodes_open_what_the_policy_allows(
     name: str, ros_context: Context, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -141,6 +142,8 @@ def test_lifecycle_nodes_open_what_the_policy_allows(
             rig.add(MoverNode, True, {})
         elif name == "instrument":
             rig.add(InstrumentNode, True, {"kind": "tracker"})
+        elif name == "adapter":
+            rig.add(AdapterNode, True, {})
         else:
             assert autostart(rig.add(LinuxcncBridgeNode, False, {}, hal=StandInHal()))
         enclave = read_policy(namespace)[name]

@@ -1,0 +1,258 @@
+"""The adapter node: a machine that calibrates itself when it is asked to, and checks its model every so often.
+
+It runs ``hexapod_comp adapt`` as a process beside it, which has the machine moved and measured and computes for
+minutes; the node only starts and stops it and publishes, on ``~/state``, what its journal says. Run it with
+``ros2 run hexapod_comp adapter`` or ``python -m hexapod_comp.ros.adapter``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from std_srvs.srv import Trigger
+
+from ..errors import LONGEST_TEXT, HexapodError
+from ..upkeep.journal import JOURNAL, Journal
+from . import keep_discovery_local
+from .base import ACKNOWLEDGED_WITHIN, CHECK_PERIOD, LATCHED_QOS, MachineNode
+from .parameters import Program, read_table
+from .process import run
+from .rclpy_compat import callers
+from .status import ERROR, OK, WARN, status_of
+from .worker import PACKAGE_ROOT
+
+NICENESS = 10  # Of the process: commands come first
+CHILD_ENCLAVE = "/hexapod_comp/calibrator"  # its rights, where SROS 2 is on
+
+IDLE, CALIBRATING, VERIFYING, FAILED = "idle", "calibrating", "verifying", "failed"
+GOOD = ("in use", "proposed")  # how the verb says that a model is borne out
+
+PARAMETERS = read_table("""
+autostart | true |  | start | configure and activate at the start
+geometry_file | paper.yaml |  | configure | geometry file: a path or the name of a shipped one
+folder | adapted |  | configure | folder of the journal, readings and models; what it has begun goes on
+goal | 3.0e-6 | 1e-9 to 0.01 m | configure | RMS tool error that may be left, with 95 %, the datum aligned
+topic | tool_pose_true |  | configure | poses of the tool in base, from a tracker or motion capture
+samples | 25 | 3 to 10000 | configure | poses of which the median is taken, three times at each stop
+reload | false |  | always | have the compensator run each model that its checks bear out; else they are proposed
+check_every | 0.0 | 0 to 1e7 s | always | check the model this long after the last run; 0 = when it is asked for
+""")
+
+TOPICS = """
+out  ~/state      DiagnosticStatus, latched: idle, calibrating, verifying; and how that ended: in use, proposed,
+                  changed, refused, stopped, failed
+     /diagnostics
+ask  ~/calibrate  Trigger: calibrate, or go on with what was begun; returns at once
+     ~/verify     Trigger: check the model now, and repair it where the machine has changed
+     ~/stop       Trigger: brake the machine and end; ~/calibrate or ~/verify goes on from there
+"""
+
+PROGRAM = Program(
+    "adapter",
+    "Calibrates a running machine and keeps its model true.",
+    PARAMETERS,
+    TOPICS,
+    "-p goal:=3.0e-6 -p reload:=true -p check_every:=3600.0",
+)
+
+
+class AdapterNode(MachineNode):
+    """Lifecycle node that runs the verb ``adapt``; arguments are those of ``rclpy`` nodes."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("adapter", PARAMETERS, **options)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        self._output: IO[bytes] | None = None  # what the process prints: its result
+        self._stopping = False  # it was told to end
+        self._state, self._text, self._step, self._model = IDLE, "nothing was asked for yet", "", ""
+        self._ended, self._size = time.monotonic(), -1  # when, and how large the journal was when it was read
+
+    # ---- lifecycle ----
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Open topics and services."""
+        self._forget()
+        self._journal = Path(self._options["folder"]).resolve() / JOURNAL
+        self.set_hardware_id(self._options["geometry_file"])
+        with self.rolled_back_on_error():
+            self._states = self.create_publisher(DiagnosticStatus, "~/state", LATCHED_QOS)
+            self._ends: list[Any] = [
+                self._states,
+                self.create_service(Trigger, "~/calibrate", self._on_calibrate),
+                self.create_service(Trigger, "~/verify", self._on_verify),
+                self.create_service(Trigger, "~/stop", self._on_stop),
+                self.every(CHECK_PERIOD, self._check_state),
+            ]
+            self._publish_state()
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take requests from now on."""
+        self._active = True
+        self.get_logger().info("ready")
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Brake the machine and end what runs."""
+        self._interrupt()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close topics; a process that still runs brakes the machine and ends by itself."""
+        self._active = False
+        self._interrupt()
+        self.close_ends(*self._ends)
+        return super().on_cleanup(state)
+
+    def publish_last_status(self) -> None:
+        """Stop what the end of the node cuts short, and say so."""
+        if self._process is not None:
+            self._interrupt()
+            self._change("stopped", "the node ended")
+            self._states.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+
+    # ---- what is asked for ----
+
+    def _on_calibrate(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response:
+        self.note("calibrate", f"calibrate: asked for by {callers(self, self._ends[1])}")
+        return self._start(CALIBRATING)
+
+    def _on_verify(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response:
+        self.note("verify", f"verify: asked for by {callers(self, self._ends[2])}")
+        return self._start(VERIFYING)
+
+    def _on_stop(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response:
+        self.note("stop", f"stop: asked for by {callers(self, self._ends[3])}")
+        running = self._interrupt()
+        return Trigger.Response(success=True, message="the machine brakes" if running else "nothing was running")
+
+    def _start(self, state: str) -> Trigger.Response:
+        """Start the process; refused while one runs."""
+        if not self._active:
+            return Trigger.Response(message="the node is not active")
+        if self._process is not None:
+            return Trigger.Response(message=f"{self._state} already: ~/stop ends it")
+        options, namespace = self._options, self.get_namespace()
+        words = ["adapt", "--json", "--machine", options["geometry_file"], "--folder", str(self._journal.parent)]
+        words += ["--goal-um", repr(options["goal"] * 1e6), "--topic", options["topic"]]
+        words += ["--samples", str(options["samples"]), *(["--reload"] if options["reload"] else [])]
+        words += ["--verify"] if state == VERIFYING else []
+        words += ["--namespace", namespace] if namespace != "/" else []
+        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": _with_package()}
+        if environment.get("ROS_SECURITY_ENABLE", "").lower() == "true":
+            environment["ROS_SECURITY_ENCLAVE_OVERRIDE"] = CHILD_ENCLAVE
+        self._output = tempfile.TemporaryFile()  # noqa: SIM115 (closed when the process has ended)
+        self._stopping = False
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "hexapod_comp", *words],
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=self._output,
+            start_new_session=True,  # so that Ctrl-C reaches it through the node alone
+        )
+        os.setpriority(os.PRIO_PROCESS, self._process.pid, NICENESS)
+        self._change(state, "starting")
+        return Trigger.Response(success=True, message=f"{state}; ~/state says what comes of it")
+
+    def _interrupt(self) -> bool:
+        """Have the process brake the machine and end, as Ctrl-C does; return whether one runs."""
+        if self._process is None:
+            return False
+        self._stopping = True
+        self._process.send_signal(signal.SIGINT)
+        return True
+
+    # ---- state ----
+
+    def _check_state(self) -> None:
+        if self._process is not None:
+            self._read_journal()
+            if (code := self._process.poll()) is not None:
+                self._finish(code)
+        elif (
+            self._active and self._state in GOOD and 0.0 < self._options["check_every"] < time.monotonic() - self._ended
+        ):
+            self._start(VERIFYING)
+        running = self._process is not None
+        level = OK if running or self._state in (IDLE, "stopped", *GOOD) else WARN
+        text = f"{self._state}: {self._text}" if self._active else "not active"
+        self.publish_status(level if self._active else WARN, text, lambda: {"state": self._state, "step": self._step})
+
+    def _read_journal(self) -> None:
+        """Publish the newest step where there is one."""
+        try:
+            size = self._journal.stat().st_size
+            if size == self._size:
+                return
+            self._size, events = size, Journal.read(self._journal)
+        except (HexapodError, OSError):
+            return  # it is being made; the process says what is wrong with it
+        if events and events[-1]["event"] != self._step:
+            self._step = events[-1]["event"]
+            self._change(self._state, self._step)
+
+    def _finish(self, code: int) -> None:
+        """Publish how a process ended."""
+        output, self._process, self._output = self._output, None, None
+        self._ended = time.monotonic()
+        content: dict[str, Any] = {}
+        if output is not None:
+            with output:
+                output.seek(0)
+                try:
+                    content = json.loads(output.read() or b"{}")
+                except ValueError:
+                    content = {}
+        self._model = str(content.get("model") or "")
+        if "state" in content:
+            self._change(str(content["state"]), str(content["text"]))
+        elif self._stopping:
+            self._change("stopped", "before anything was done")
+        else:
+            self._change(FAILED, f"the process ended with {code}; its last words are in the log")
+
+    def _change(self, state: str, text: str) -> None:
+        self._state, self._text = state, text[:LONGEST_TEXT]
+        if self._process is None and state not in (IDLE, "stopped", *GOOD):
+            self.get_logger().warning(f"{state}: {self._text}")
+        self._publish_state()
+
+    def _publish_state(self) -> None:
+        level = ERROR if self._state in ("changed", "refused", FAILED) else OK
+        values = {
+            "state": self._state,
+            "step": self._step,
+            "model": self._model,
+            "running": str(self._process is not None).lower(),
+        }
+        name = f"{self.get_fully_qualified_name()[1:]}: adapt"
+        self._states.publish(status_of(name, self.hardware_id, level, f"{self._state}: {self._text}", values))
+
+
+def _with_package() -> str:
+    """Return PYTHONPATH for a process that finds this package wherever it runs."""
+    return os.pathsep.join([str(PACKAGE_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node; the entry of the executable ``adapter``."""
+    keep_discovery_local()
+    return run(AdapterNode, PROGRAM, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
