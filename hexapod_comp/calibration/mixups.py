@@ -41,7 +41,7 @@ from .estimator import (
 )
 from .mistakes import Mistake, family_of_run, mistakes, mistakes_of_place, sign_reversed
 from .observations import Nuisance
-from .parameters import TOLERANCES, Components, ParameterSpace
+from .parameters import TOLERANCES, Components, FitSettings, ParameterSpace
 from .promise import STEEL
 from .sensitivity import Prediction, Slopes, predict
 
@@ -261,28 +261,25 @@ class _Fitted:
         return [self._weighed(mistake, problem, components) for _, mistake, problem, components in best]
 
     def _elsewhere(self) -> list[tuple[float, Mistake, LinearProblem, Components]]:
-        """Return where else the machine may have stood: as some runs tell, whose gain grows with the readings."""
+        """Return where else the machine may have stood: as some runs tell, whose gain grows with the readings.
+
+        At first by a machine and its screws alone: a field that hides a wrong place is of no use in the right one.
+        """
         m, found = self.estimation.measurements, []
+        alone = replace(self.space.settings, blocks=tuple(b for b in self.space.settings.blocks if b in EXPECTED))
         few = _some_runs(m)
-        as_read = self._of(few)
+        as_read = _elsewhere_fitted(few, alone, {})
         everywhere = {mistake.name: mistake for mistake in mistakes_of_place(m)}
         for mistake in mistakes_of_place(few):
-            there = self._of(mistake.undone())
+            there = _elsewhere_fitted(mistake.undone(), alone, {})
             if there is None or as_read is None:
                 continue
             gain = log_evidence(there.problem, there.early) - log_evidence(as_read.problem, as_read.early)
-            if gain > np.log(ASSUMED.mixup_odds) and (other := self._of(everywhere[mistake.name].undone())) is not None:
-                found.append((gain * len(m) / len(few), mistake, other.problem, other.components))
+            if gain > np.log(ASSUMED.mixup_odds):
+                other = _elsewhere_fitted(everywhere[mistake.name].undone(), self.space.settings, self.bases)
+                if other is not None:
+                    found.append((gain * len(m) / len(few), mistake, other.problem, other.components))
         return found
-
-    def _of(self, m: MeasurementSet | None) -> _Fitted | None:
-        """Return the model of readings with stations of their own; None where no machine can have taken them."""
-        if m is None:
-            return None
-        try:
-            return _Fitted(Estimation(m, ParameterSpace(m, self.space.settings), alone=False), self.bases)
-        except (HexapodError, np.linalg.LinAlgError):
-            return None
 
     def common_modes(self) -> list[Alternative]:
         """Return what is more probably a mistake that all readings share than a machine whose parts err alike.
@@ -444,6 +441,16 @@ class _Fitted:
         factor = cho_factor(whitened_precision(self.problem, p), lower=True)
         explained = rows.T @ columns
         return columns.T @ columns - explained.T @ cho_solve(factor, explained)
+
+
+def _elsewhere_fitted(m: MeasurementSet | None, settings: FitSettings, bases: dict[str, np.ndarray]) -> _Fitted | None:
+    """Return the model of readings with stations of their own; None where no machine can have taken them."""
+    if m is None:
+        return None
+    try:
+        return _Fitted(Estimation(m, ParameterSpace(m, settings), alone=False), bases)
+    except (HexapodError, np.linalg.LinAlgError):
+        return None
 
 
 def _principal(space: ParameterSpace, problem: LinearProblem) -> dict[str, np.ndarray]:
