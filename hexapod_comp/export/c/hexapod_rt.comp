@@ -1,11 +1,13 @@
 component hexapod_rt """Strut corrections of a hexapod in the servo thread: see doc/linuxcnc.md of hexapod_comp.
 
 The corrections belong to the nominal strut lengths of the same cycle. They ramp when compensation is switched, when a
-temperature changes, and after a refusal; while a command is refused they ramp to zero.""";
+temperature, gravity or a force changes, and after a refusal; while a command is refused they ramp to zero.""";
 
 pin in float joint-pos-cmd-#[6] "Nominal strut lengths: joint.N.pos-cmd, machine units";
 pin in float joint-pos-fb-#[6] "Measured strut lengths, corrections included, machine units; for the function estimate";
 pin in float temperature-#[8] = 20 "Of struts 1-6, base and platform, degrees Celsius; filtered";
+pin in float gravity-#[3] "In base, m/s2, for a model with a load block; zeros: the model's";
+pin in float wrench-#[6] "Force, N, and torque about the origin of platform, N m, in platform, beside weight; filtered";
 pin in bit machine-on "On and homed: the joints mean something. False: corrections ramp to zero";
 pin in bit enable "Compensate";
 pin out float correction-#[6] "To offset.N.offset, machine units";
@@ -23,12 +25,16 @@ pin out float tool-z;
 pin out bit tool-valid "The estimate holds";
 param rw float unit = 0.001 "Metres per machine unit: 0.001 or 0.0254";
 param rw float temperature-step = 0.01 "A temperature that has changed by less is the same, K";
+param rw float gravity-step = 0.01 "A gravity that has changed by less is the same, m/s2";
+param rw float wrench-step = 1.0 "A wrench that has changed by less is the same, N and N m";
 
 include "hexapod_comp.c";
 include "hexapod_model.h";
 variable hc_state core;
 variable double elapsed_time;
 variable double temperature_now[8];
+variable double gravity_now[3];
+variable double wrench_now[6];
 variable int started;
 variable int begun;
 
@@ -66,6 +72,19 @@ static void start_from(hc_state *state, const double standing[6])
     hc_reset(state, 0);
 }
 
+/* Whether numbers, all of which are some, differ from the last ones by a step or more. */
+static int differ(const double now[], const double last[], int count, double step)
+{
+    int i, changed = 0;
+    for (i = 0; i < count; i++) {
+        if (now[i] != now[i]) {
+            return 0;
+        }
+        changed = changed || fabs(now[i] - last[i]) >= step;
+    }
+    return changed;
+}
+
 static double largest_of(const double values[6])
 {
     double most = 0.0;
@@ -78,7 +97,7 @@ static double largest_of(const double values[6])
 
 FUNCTION(correct)
 {
-    double nominal[6], standing[6], most, keep;
+    double nominal[6], standing[6], down[3], pushing[6], most, keep;
     const double seconds = (double)period * 1e-9;
     int i, good = 0;
     begin_once(&core, &begun, temperature_now);
@@ -86,6 +105,23 @@ FUNCTION(correct)
     for (i = 0; i < 6; i++) {
         nominal[i] = joint_pos_cmd(i) * unit;
         standing[i] = correction(i) * unit;
+        pushing[i] = wrench(i);
+    }
+    for (i = 0; i < 3; i++) {
+        down[i] = gravity(i);
+    }
+    if (differ(down, gravity_now, 3, gravity_step)) {
+        const double models[3] = {NAN, NAN, NAN};
+        const int none = down[0] == 0.0 && down[1] == 0.0 && down[2] == 0.0;
+        const int taken = hc_set_load(&core, none ? models : down, 0) == HC_OK;
+        for (i = 0; i < 3 && taken; i++) {
+            gravity_now[i] = down[i];
+        }
+    }
+    if (differ(pushing, wrench_now, 6, wrench_step) && hc_set_load(&core, 0, pushing) == HC_OK) {
+        for (i = 0; i < 6; i++) {
+            wrench_now[i] = pushing[i];
+        }
     }
     for (i = 0; i < 8; i++) {
         const int late = hexapod_model.late.count && !(elapsed_time - core.newest[i] < LATE_PERIOD);
