@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.sparse import csr_array
 from scipy.special import chdtr, chdtrc
 
 from ..errors import CalibrationError
@@ -208,6 +209,7 @@ class CheckReadings:
     names: tuple[str, ...]  # of the places
     seen: np.ndarray = field(repr=False)  # (n, places): the numbers, as orthonormal combinations of the places
     kind: np.ndarray  # (places,): kind of channel
+    weights: csr_array = field(repr=False)  # (places, N): of readings in the value of their place, in its deviations
 
     @staticmethod
     def of(fitted: FittedParameters, measurements: MeasurementSet, x: np.ndarray | None = None) -> CheckReadings:
@@ -231,8 +233,18 @@ class CheckReadings:
         rows, sigma = seen @ space.unwhitened(linear.rows.dense()), reading_noise(fitted)[cells.kind]
         m = measurements
         names = tuple(f"{m.sources[n]}: {CHANNELS[m.channel[n]]} of run {m.runs[m.run[n]].name}" for n in cells.first)
+        precision = estimation.uncertainty**-2
+        scale = np.sqrt(np.bincount(cells.of_reading, precision))
+        entries = precision / scale[cells.of_reading], (cells.of_reading, np.arange(len(m)))
+        weights = csr_array(entries, shape=(len(scale), len(m)))
         residuals = seen @ linear.target - rows @ fitted.x
-        return CheckReadings(residuals, rows, (seen * sigma**2) @ seen.T, seen * sigma, names, seen, cells.kind)
+        return CheckReadings(
+            residuals, rows, (seen * sigma**2) @ seen.T, seen * sigma, names, seen, cells.kind, weights
+        )
+
+    def changed_by(self, values: np.ndarray) -> CheckReadings:
+        """Return the same with values changed, (N,), of channels whose directions do not depend on what they read."""
+        return replace(self, residuals=self.residuals + self.seen @ (self.weights @ values))
 
     def covariance(self, of_parameters: np.ndarray) -> np.ndarray:
         """Return the readings' covariance for a covariance of the parameters, shape (n, n)."""

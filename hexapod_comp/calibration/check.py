@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import date
 from typing import Any
@@ -16,7 +16,7 @@ from ..machine.arrays import rms
 from ..machine.load import Payload, beyond_loads
 from ..machine.model import MachineModel, RealMachine
 from ..machine.region import region_json, region_text
-from ..measurements.readings import MeasurementSet
+from ..measurements.readings import KINDS, LINE_KINDS, MeasurementSet
 from .assumptions import ASSUMED
 from .blocks.block import DIGITS
 from .blocks.load import measured_loads
@@ -38,7 +38,7 @@ from .changes import (
 from .datum import hold, unseen_part
 from .design import Settling, settle
 from .estimator import Estimation
-from .mistakes import Mistake, mistakes_of_check
+from .mistakes import mistakes_of_check
 from .posterior import ErrorPredictor, FittedParameters
 
 VALID, NAMED, UNDECIDED, UNEXPLAINED = "valid", "named", "undecided", "unexplained"  # verdicts
@@ -179,7 +179,7 @@ def verify_model(
     )
     if result.verdict == VALID:
         return result
-    doubts = tuple(_misread(check, wide, evidence, mistakes_of_check(measurements, model)))
+    doubts = tuple(_misread(check, wide, evidence, model, measurements))
     first, second = (Explanation.of(check, wide, c.change, c.scale) for c in candidates[:2])
     tool = None if candidates[0].change.columns is None else _tool(model, wide, first)
     settling = tuple(settle(wide, measurements, (first, second))) if result.verdict == UNDECIDED else ()
@@ -194,7 +194,7 @@ def _beyond_loads(model: MachineModel, readings: MeasurementSet) -> list[str]:
 
 
 def _misread(
-    check: CheckReadings, fitted: FittedParameters, evidence: Evidence, mistakes: Iterable[Mistake]
+    check: CheckReadings, fitted: FittedParameters, evidence: Evidence, model: MachineModel, m: MeasurementSet
 ) -> list[str]:
     """Return by name the mistakes without which the readings are probably those of an unchanged machine.
 
@@ -204,19 +204,24 @@ def _misread(
     as_read = check.log_density(fitted.covariance) + evidence.log_evidence(check.residuals)
     most = check.log_density(fitted.covariance, np.zeros(len(check.residuals))) - as_read
     odds, found = math.log(ASSUMED.mixup_odds), []
-    for mistake in mistakes:
+    of_lines = bool(np.isin(m.kind, [KINDS.index(kind) for kind in LINE_KINDS]).all())
+    for mistake in mistakes_of_check(m, model):
         jacobian = float(check.freedom @ np.log(mistake.factor))
         if most + jacobian < odds:  # though all readings were as expected
             continue
         try:
             tried = mistake.undone()
-            other = None if tried is None else CheckReadings.of(fitted, tried)
+            if tried is None:
+                continue
+            if of_lines and tried.stations is m.stations and tried.channel is m.channel:
+                other = check.changed_by(tried.value - m.value)
+            else:
+                other = CheckReadings.of(fitted, tried)
         except HexapodError:  # out of reach that way
             continue
-        if other is not None:
-            better = math.sqrt(check.chi_square(fitted.covariance) / other.chi_square(fitted.covariance))
-            gain = other.log_density(fitted.covariance) + jacobian - as_read
-            found.append((gain, f"{mistake.name} fits {better:.3g} times better"))
+        gain = other.log_density(fitted.covariance) + jacobian - as_read
+        better = math.sqrt(check.chi_square(fitted.covariance) / other.chi_square(fitted.covariance))
+        found.append((gain, f"{mistake.name} fits {better:.3g} times better"))
     best = max((gain for gain, _ in found), default=0.0)
     return [text for gain, text in sorted(found, reverse=True) if gain > max(odds, best - odds)]
 

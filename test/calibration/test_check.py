@@ -135,6 +135,9 @@ def test_densities_of_readings_are_those_of_a_normal_distribution() -> None:
     kinds = [CHANNELS[channel].partition("_")[0] for channel in zeros]
     places = [int((readings.kind == k).sum()) - kinds.count(name) for k, name in enumerate(KINDS)]
     np.testing.assert_allclose(found.freedom, places, atol=1e-9)
+    # Other values are as linear in the numbers as readings taken anew.
+    anew = CheckReadings.of(known, readings.with_values(-readings.value)).residuals
+    np.testing.assert_allclose(found.changed_by(-2.0 * readings.value).residuals, anew, rtol=0.0, atol=1e-8)
 
 
 def test_an_effect_that_no_reading_shows_changes_no_probability() -> None:
