@@ -153,7 +153,7 @@ def verify_model(
     Raises
     ------
     CalibrationError
-        Readings of another point than the fit's, such that tell nothing, or too many of them.
+        Readings of another point than the fit's, readings that determine nothing, or too many of them.
     ModelError
         A share of false alarms that is none.
     """

@@ -294,7 +294,7 @@ def test_what_is_in_no_hypothesis_is_not_named() -> None:
 
 def test_readings_that_tell_nothing_are_refused() -> None:
     """One place of each run: its unknown zero takes it."""
-    with pytest.raises(CalibrationError, match="tell nothing"):
+    with pytest.raises(CalibrationError, match="determine nothing"):
         verify_model(fitted().model, fitted().known, check(fitted().truth, places="start"))
 
 
