@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Collection
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, Vector3Stamped
@@ -22,12 +23,13 @@ from ..measurements.readings import ABSOLUTE_KINDS, LEAST_NOISE
 from ..measurements.set_up import KNOWN
 from ..pose import Pose
 from .base import LATCHED_QOS, NEWEST_QOS, SENSOR_QOS
-from .client import Machine
+from .client import Machine, MoveError, MoveState
 from .instrument import SET_UP_TOPIC
 from .messages import message_pose, nanoseconds_of, pose_message, stamp_of
 
 MEDIAN_TO_SIGMA = 1.4826  # Standard deviation of a normal distribution over the median of its absolute values
 OF_A_MEDIAN = math.sqrt(math.pi / 2.0)  # Its standard deviation, times √n, over that of a reading
+ASKED_AGAIN = 2  # How often a refused move is: a busy computer's commands come late
 LEAST_SAMPLES = 3  # of which a median is taken
 SET_UP_WITHIN = Duration(seconds=2)  # Who sets instruments up by topic hears of a run within this time
 
@@ -120,6 +122,17 @@ class WatchedMachine(Machine):
             self._gravity = vector
 
     # ---- what collect asks ----
+
+    def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
+        """Move as :meth:`.Machine.move` does; ask again for a move whose commands were refused, as late ones are."""
+        for _ in range(ASKED_AGAIN):
+            try:
+                return super().move(pose, *arguments, **options)
+            except MoveError as error:
+                if error.reason != "refusal":
+                    raise
+            self._spin(1.0)
+        return super().move(pose, *arguments, **options)
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
         """Tell who sets instruments up where a run is, and wait for whoever confirms it."""

@@ -23,6 +23,7 @@ from hexapod_comp.measurements.campaign import Campaign, line_run, template
 from hexapod_comp.measurements.collect import Collected, collect
 from hexapod_comp.measurements.readings import KINDS
 from hexapod_comp.pose import best_motion
+from hexapod_comp.ros.client import Machine, MoveError
 from hexapod_comp.ros.collector import WatchedMachine
 from hexapod_comp.ros.instrument import InstrumentNode
 from hexapod_comp.ros.messages import message_pose, pose_message
@@ -93,6 +94,29 @@ def test_a_tracker_reads_in_its_own_frame(rig: Rig) -> None:
     assert message.header.frame_id == "tracker"
     x, y, z = HOME.position
     assert message_pose(message).position == pytest.approx([y + 0.002, 1.0 - x, z], abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("reasons", "ends"), [(["refusal"] * 2, ""), (["refusal"] * 3, "refusal"), (["limit"], "limit")]
+)
+def test_a_move_that_a_busy_computer_had_refused_is_asked_for_again(
+    reasons: list[str], ends: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine, left = object.__new__(WatchedMachine), list(reasons)
+
+    def move(*_: object) -> str:
+        if left:
+            raise MoveError(left.pop(), "command is stamped 0.501 s old")
+        return "arrived"
+
+    monkeypatch.setattr(Machine, "move", move)
+    monkeypatch.setattr(WatchedMachine, "_spin", lambda *_: None)
+    if not ends:
+        assert machine.move(HOME) == "arrived"
+        return
+    with pytest.raises(MoveError) as caught:
+        machine.move(HOME)
+    assert (caught.value.reason, left) == (ends, [])
 
 
 def collected(bench: Bench, path: Path, campaign: Campaign, kind: str, frame: str = "known", **options: Any) -> Any:
