@@ -1,1 +1,1 @@
-"""From a commanded tool pose to compensated strut commands, and what is checked before a move."""
+"""From a commanded tool pose to compensated strut commands, and the checks before a move."""

@@ -1,7 +1,7 @@
-"""Every limit of a machine checked along poses, before anything moves: all breaches, and what margin is left.
+"""Checks of every limit of a machine along poses, before anything moves: all breaches, and the margins.
 
-The compensator refuses a command at the first limit that it breaks; here the same quantities are taken for
-all poses, all struts and both stages (nominal and compensated), and nothing stops at the first finding.
+The compensator refuses a command at the first limit that it breaks; here the same quantities are computed for all
+poses, all struts and both stages (nominal and compensated), and checking continues after a breach.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from ..machine.passes import Poses
 from ..machine.trajectory import moves
 from ..pose import Pose, stacked
 
-# Limits that have a margin, in the order in which they are shown
+# Limits that have a margin, in the order of display
 LIMITS = ("stroke", "base_cone", "platform_cone", "clearance", "condition", "correction", "step", "speed")
 
 OTHER_FINDINGS = ("assembly", "not_converged", "outside_field")  # Findings without a margin
 
-# What the rows of a list are to each other: nothing; targets joined by moves; consecutive commands
+# Relation of the rows of a list: none; targets joined by moves; consecutive commands
 MODES = ("poses", "moves", "stream")
 
-RATES = (1.0, 10_000.0)  # Command rates that make sense, Hz
-CHUNK = 16_384  # Poses examined at a time: bounds the memory of long paths
+RATES = (1.0, 10_000.0)  # Allowed command rates, Hz
+CHUNK = 16_384  # Poses checked at a time: bounds the memory of long paths
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Breach:
     """One limit that one pose, or the move to it, breaks."""
 
     row: int  # index of the pose
-    share: float  # of the move to it that is done there: 1.0 at the pose itself
+    share: float  # share of the move that is done there: 1.0 at the pose itself
     error: HexapodError  # a LimitError for limits, with value, allowed value, strut and stage
 
     @property
@@ -51,8 +51,8 @@ class Breach:
 class LimitSummary:
     """The margin of one limit, pose by pose, each of shape (N, 2): in the nominal and in the compensated stage; SI."""
 
-    margin: np.ndarray  # smallest distance to the limit, negative: broken; ∞ where there was nothing to compare
-    value: np.ndarray  # there; NaN where there was nothing to compare
+    margin: np.ndarray  # smallest distance to the limit, negative: broken; ∞ if there was nothing to compare
+    value: np.ndarray  # value there; NaN if there was nothing to compare
     strut: np.ndarray  # index of the strut; −1 for the condition number
     share: np.ndarray  # as in Breach
     # (row, strut) → (margin, value, stage, share) of the worst breach
@@ -60,7 +60,7 @@ class LimitSummary:
 
     @staticmethod
     def empty(count: int) -> LimitSummary:
-        """Return the summary of rows none of which has been examined yet."""
+        """Return the summary of rows before any of them is checked."""
         shape = (count, 2)
         return LimitSummary(np.full(shape, np.inf), np.full(shape, np.nan), np.full(shape, -1), np.ones(shape))
 
@@ -71,7 +71,7 @@ class LimitSummary:
 
     def add(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
         """Keep the worst of these margins and values, (n, 2, k), of n poses that belong to the rows `owner`, ascending,
-        and of those before; of equals the nominal stage."""
+        and of the previous ones; of equals the nominal stage."""
         margin = np.where(np.isnan(margin), -np.inf, margin)
         starts = np.flatnonzero(np.diff(owner, prepend=-1))
         rows, of_pose = owner[starts], margin.min(axis=2)
@@ -87,7 +87,7 @@ class LimitSummary:
         pose, stages, strut = np.nonzero(margin < 0.0)
         order = np.lexsort((stages, margin[pose, stages, strut], strut, owner[pose]))
         pose, stages, strut = pose[order], stages[order], strut[order]
-        new = np.ones(len(pose), dtype=bool)  # the worst of each row and strut stands first
+        new = np.ones(len(pose), dtype=bool)  # the worst of each row and strut is first
         new[1:] = (np.diff(owner[pose]) != 0) | (np.diff(strut) != 0)
         for p, s, k in zip(pose[new], stages[new], strut[new], strict=True):
             key, breach = (
@@ -194,7 +194,7 @@ def check(
 
 
 class _PathCheck:
-    """One check under way: the machine, its state along the path, and the worst so far."""
+    """A running check: the machine, its state along the path, and the worst so far."""
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, count: int, rate: float) -> None:
         self.geometry, self.rate, self.count = geometry, rate, count
@@ -208,7 +208,7 @@ class _PathCheck:
         self._start()
 
     def _start(self) -> None:
-        """Forget where the machine comes from."""
+        """Forget the previous pose."""
         self.motion = MotionState()
         self.previous: np.ndarray = np.full((1, 2, 6), np.nan)
 
@@ -262,9 +262,9 @@ class _PathCheck:
     def examine(
         self, positions: np.ndarray, rotations: np.ndarray, owner: np.ndarray, share: np.ndarray, in_sequence: bool
     ) -> None:
-        """Examine tool poses, (n, …), of the rows `owner`; `in_sequence`: after the ones before.
+        """Check tool poses, (n, …), of the rows `owner`; `in_sequence`: after the previous ones.
 
-        Of each limit the worst is kept: margins and values, (n, 2, 6 or 1), ∞ and −1 for what is so or not.
+        Of each limit the worst is kept: margins and values, (n, 2, 6 or 1); findings without margin have ∞ and −1.
         """
         poses = (np.ascontiguousarray(part) for part in self.geometry.platform_poses(positions, rotations))
         state, motion, limits = self.machine.state.at, self.motion, self.geometry.limits
@@ -281,7 +281,7 @@ class _PathCheck:
             correction[:, 1] = lengths[:, 1] - lengths[:, 0]
             found = {**limits.margins(quantities), "correction": (limits.correction - np.abs(correction), correction)}
             for margin, _ in found.values():
-                margin[unsolved, 1] = np.inf  # said once, as not converged
+                margin[unsolved, 1] = np.inf  # already reported, as not converged
             found["correction"][0][:, 0] = np.inf
             outside = (flags == Status.OUTSIDE_FIELD) & (self.machine.model.field.outside == "refuse")
             never = np.zeros(len(flags), dtype=bool)
@@ -302,7 +302,7 @@ class _PathCheck:
             self.worst[name].add(margin, value, owner, share)
 
     def result(self, mode: str, platforms: Poses) -> CheckResult:
-        """Return what was found."""
+        """Return the result."""
         breaches = [
             Breach(row, share, self._error(name, strut, stage, value))
             for name, worst in self.worst.items()
@@ -323,7 +323,7 @@ class _PathCheck:
         )
 
     def _error(self, name: str, strut: int, stage: int, value: float) -> HexapodError:
-        """Return the error that a finding deserves."""
+        """Return the error for a finding."""
         if name == "not_converged":
             return NotConvergedError("the error field is too steep to be undone at this pose")
         if name == "outside_field":

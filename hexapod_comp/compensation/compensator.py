@@ -1,9 +1,9 @@
-"""From a commanded tool pose to six compensated strut commands, with every limit checked on what is sent.
+"""From a commanded tool pose to six compensated strut commands, with every limit checked on the result.
 
 Data flow of one command: tool pose in the work frame → platform pose in ``base`` → nominal lengths; → model
 run backwards → corrections → ramp → commands → limits on nominal and on compensated values → `Correction`.
-A refused command leaves the compensator exactly as it was. All of it is the core's (``compensation.c``): this module
-holds the core's state, names its parts for snapshots, and says in words what the core refuses.
+A refused command leaves the compensator unchanged. The core does all of this (``compensation.c``): this module holds
+the core's state, names its parts for snapshots, and turns the core's refusals into text.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from ..machine.temperatures import HUMIDITY, Lag, Temperatures, check_part
 from ..machine.temperatures import PARTS as MEASURED_PARTS
 from ..pose import Pose
 
-DEFAULT_RAMP_RATE = 1e-3  # How fast a change of model, temperature or enabling moves a strut, m/s
+DEFAULT_RAMP_RATE = 1e-3  # Speed at which a change of model, temperature or enabling moves a strut, m/s
 
-# Nominal lengths that differ by no more, m, are the same place: what a controller's decimals round; the core's
+# Nominal lengths that differ by no more, m, are the same place: rounding of a controller's decimals; the core's
 SAME_PLACE = 1e-5
 
 # Parts of a snapshot, and how many numbers each is: the members of ``hc_last``, and the ramp's rate. A recording
@@ -60,7 +60,7 @@ DRIFT_STATES = 12  # Three displacements and three rotations of the base, six st
 
 @dataclass(frozen=True)
 class Correction:
-    """Everything about one compensated command.
+    """Full record of one compensated command.
 
     Attributes
     ----------
@@ -130,9 +130,9 @@ _ALWAYS = {
     "command": Phase.RUNNING,
     "ramped": Phase.RAMPING,
 }
-# What each event makes of each phase. ``change``: of model, temperature, humidity, or the switch; ``command``: an
-# accepted one with which all is taken up; ``ramped``: one after which something is still to be taken up. A refused
-# command changes nothing. doc/states.md shows this table, and tests hold the core to it.
+# The phase after each event. ``change``: of model, temperature, humidity, or the switch; ``command``: an
+# accepted one after which no change is ramping; ``ramped``: one after which a change is still ramping. A refused
+# command changes nothing. doc/states.md shows this table, and tests compare the core with it.
 TRANSITIONS = {
     Phase.FIRST: {**_ALWAYS, "tool": Phase.FIRST, "change": Phase.FIRST},
     Phase.RESUMED: {**_ALWAYS, "tool": Phase.RESUMED, "change": Phase.RESUMED},
@@ -143,7 +143,7 @@ TRANSITIONS = {
 
 
 def drifted(geometry: HexapodGeometry, model: MachineModel, drift: np.ndarray) -> MachineModel:
-    """Return the model of a machine that has drifted so, m, since it was fitted.
+    """Return the model of a machine that has drifted by this, m, since it was fitted.
 
     The drift, shape (12,): three displacements of the base in ``base``, three rotations of it about the platform's home
     times the machine's characteristic length, and what six struts are longer than their encoders tell.
@@ -164,7 +164,7 @@ def drifted(geometry: HexapodGeometry, model: MachineModel, drift: np.ndarray) -
 
 
 def pack_pose(pose: Pose) -> Struct:
-    """Return a pose as the core takes it."""
+    """Return a pose for the core."""
     return Struct("hc_pose", {"position": pose.position, "rotation": pose.rotation})
 
 
@@ -246,7 +246,7 @@ class Compensator:
 
     @property
     def phase(self) -> Phase:
-        """What the next command starts from."""
+        """Where the next command starts."""
         if self._at.last.resumes:
             return Phase.RESUMED if self._at.last.resumes == lib.HC_FROM_MEASURED else Phase.NEW_TOOL
         if math.isnan(self._at.last.nominal[0]):
@@ -260,7 +260,7 @@ class Compensator:
 
     @property
     def temperatures(self) -> Temperatures:
-        """Readings in use, and how far late parts are behind them."""
+        """Readings in use, and the deficits of late parts' lags."""
         view = self._state.view
         values = {name: float(view["temperatures"][n]) for n, name in enumerate(MEASURED_PARTS) if name in self._sensed}
         if HUMIDITY in self._sensed:
@@ -287,7 +287,7 @@ class Compensator:
         return drifted(self.geometry, model.at(outside), drift)
 
     def set_drift(self, drift: np.ndarray) -> None:
-        """Take what the machine has drifted since its model was fitted, m, as :func:`drifted` has it; it ramps.
+        """Set the machine's drift since its model was fitted, m, as in :func:`drifted`; it ramps.
 
         Raises
         ------
@@ -302,10 +302,10 @@ class Compensator:
             self.on_change("drift", drift.tolist())
 
     def set_outside(self, numbers: Mapping[str, float]) -> None:
-        """Take outside numbers by their names, SI or °C, for the model's table; what they change ramps in.
+        """Set outside numbers by their names, SI or °C, for the model's table; their effect ramps in.
 
-        Numbers that are not given stay as they are. Until all that the table needs are known it counts for nothing;
-        those that it does not need are kept for a model that is set later.
+        Numbers that are not given stay unchanged. Until all numbers of the table are known it is ignored; numbers that
+        it does not need are stored for a model that is set later.
 
         Raises
         ------
@@ -350,12 +350,12 @@ class Compensator:
         self.outside, self.drift = outside, drift
 
     def check(self) -> None:
-        """Raise what is wrong with all that the model would correct, as :meth:`set_model` does."""
+        """Raise any error of the model's corrections, as :meth:`set_model` does."""
         if lib.hc_check(self._at, self._constants.at, self._answer):
             raise refusal(self._answer, self.geometry, self.model)
 
     def set_temperature(self, name: str, value: float, time: float = math.nan) -> None:
-        """Take a temperature, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
+        """Set a temperature, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
 
         Filter it, or its noise moves the struts: :class:`~hexapod_comp.compensation.thermal.TemperatureFilter`.
         A model with time constants needs the `time`, s, when it was read, on a clock that is never set.
@@ -374,7 +374,7 @@ class Compensator:
         self.on_change("temperature", (name, float(value), time))
 
     def set_humidity(self, value: float, time: float = math.nan) -> None:
-        """Take the air's relative humidity, a fraction, read at a time, s; its effect on struts that swell ramps in.
+        """Set the air's relative humidity, a fraction, read at a time, s; its effect on struts that swell ramps in.
 
         Raises
         ------
@@ -388,9 +388,9 @@ class Compensator:
         self.on_change("humidity", (float(value), time))
 
     def set_load(self, loading: Loading) -> None:
-        """Take gravity, and the forces that act on the platform beside weight; what they change ramps in.
+        """Set gravity, and the forces on the platform beside weight; their effect ramps in.
 
-        A model without a load block bends under nothing, and keeps them for one that is set later.
+        Without a load block the model does not use them, but stores them for one that is set later.
 
         Raises
         ------
@@ -404,10 +404,11 @@ class Compensator:
             self.on_change("load", loading.numbers())
 
     def set_tool(self, name: str) -> None:
-        """Take another tool by its name; nothing moves. What a tool weighs otherwise ramps in with the next command.
+        """Select another tool by its name; nothing moves. The effect of its different weight ramps in with the next
+        command.
 
-        The next command must be where the struts are, with this tool. Until one is, and another tool or a reset may
-        come first, each is refused: what was on its way for the old tool cannot step the struts.
+        The next command must be at the struts' present position, with this tool. Until one is, or another tool or a
+        reset comes first, each is refused: a command that was in transit for the old tool cannot step the struts.
 
         Raises
         ------
@@ -437,7 +438,7 @@ class Compensator:
             self.on_change("enable", enabled)
 
     def set_ramp_rate(self, ramp_rate: float) -> None:
-        """Let ramps go on at another speed, m/s.
+        """Set the speed of ramps, m/s.
 
         Raises
         ------
@@ -453,8 +454,7 @@ class Compensator:
     def reset(self, measured: np.ndarray | None = None) -> None:
         """Forget the last command and all directions of motion.
 
-        What was corrected last is not forgotten, since the struts still stand there: the next command
-        starts from it and ramps.
+        The last correction is kept, since the struts still stand there: the next command starts from it and ramps.
 
         Parameters
         ----------
@@ -472,7 +472,7 @@ class Compensator:
         self.on_change("reset", None if measured is None else measured.tolist())
 
     def snapshot(self) -> dict[str, Any]:
-        """Return what, beside geometry and model, decides the next answer, by name.
+        """Return all that, beside geometry and model, determines the next answer, by name.
 
         ``temperatures``, °C by name, and ``humidity`` among them, ``lags`` of what follows them late, ``tool``, and
         each of :data:`PARTS`: a list of numbers, matrices by rows; ``drift``, ``loading`` and ``outside``, where there
@@ -480,7 +480,7 @@ class Compensator:
         """
         parts = {name: np.ravel(part).astype(float).tolist() for name, part in self._parts.items()}
         beside: dict[str, Any] = {"tool": self.geometry.tool_name}
-        if self.drift.any():  # older releases read what has none of these
+        if self.drift.any():  # snapshots of older releases may lack these
             beside["drift"] = self.drift.tolist()
         if self.loading != FREE:
             beside["loading"] = self.loading.numbers()
@@ -489,7 +489,7 @@ class Compensator:
         return {**parts, **self.temperatures.snapshot(), **beside}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Take over a :meth:`snapshot` of a compensator with this geometry and model.
+        """Restore a :meth:`snapshot` of a compensator with this geometry and model.
 
         Raises
         ------
@@ -562,14 +562,14 @@ class Compensator:
         return self.command
 
     def published(self, time: float) -> None:
-        """Take notice that the last command had gone out at a time, s, on the clock of its receipt.
+        """Set the time, s, on the clock of its receipt, at which the last command was sent.
 
-        The struts' speed is limited between publications: after one that was held up, the next must not come sooner.
+        The struts' speed is limited between publications: after a delayed one, the next must not come sooner.
         """
         lib.hc_published(self._at, time)
 
     def estimate(self, struts: np.ndarray | tuple[float, ...]) -> np.ndarray:
-        """Return where the tool is when the struts read `struts`, through the model.
+        """Return the tool's pose for strut readings `struts`, through the model.
 
         Parameters
         ----------
@@ -651,7 +651,7 @@ class Compensator:
 
     @property
     def outside_load(self) -> str:
-        """How payload or gravity are outside those under which the model was measured; empty where they are not."""
+        """In what payload or gravity are outside those of the model's measurement; empty if they are not."""
         gravity = self.loading.gravity or tuple(self.model.load.gravity.tolist())
         return beyond_loads(self.model.origin.loads, self.geometry.payload, gravity)
 
@@ -662,14 +662,14 @@ class Compensator:
         _, _, (commands,), (outcome,) = backwards(self._state, *given_rows)
         if outcome == Status.NOT_CONVERGED:
             raise NotConvergedError("the error field is too steep to be undone at this pose")
-        twist = self.nominal - commands  # what the model would correct, ramp and switch left aside, and its sign turned
+        twist = self.nominal - commands  # minus the model's correction, without ramp and switch
         solve_linear(jacobian(self.geometry, platform), twist)
         twist[:3] += np.cross(twist[3:], platform.rotation @ self.geometry.tool.position)
         return twist
 
 
 def named_parts(state: Struct) -> dict[str, np.ndarray]:
-    """Return the parts of a compensator's state by their names in a snapshot, each in the state's memory."""
+    """Return the parts of a compensator's state by their names in a snapshot, each as a view of the state's memory."""
     last, parts = state.view["last"], {"ramp_rate": state.view["ramp_rate"]}
     for name in PARTS.keys() - parts.keys():
         body, _, part = name.partition("_")
@@ -678,8 +678,8 @@ def named_parts(state: Struct) -> dict[str, np.ndarray]:
 
 
 def read_parts(snapshot: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the numbers of a compensator's snapshot by name, or a ModelError: a name is missing or unknown, or has not
-    as many numbers as it should."""
+    """Return the numbers of a compensator's snapshot by name, or a ModelError: a name is missing or unknown, or has a
+    wrong count of numbers."""
     for name in sorted({*PARTS} ^ ({*snapshot} - {*BESIDE_NUMBERS})):
         raise ModelError(f"snapshot.{name}", "is missing" if name in PARTS else "is unknown to this release")
     parts = {name: np.asarray(snapshot[name], dtype=float) for name in PARTS}
@@ -696,7 +696,7 @@ def refusal(
     numbers: Sequence[float] = (),
     stands: Pose | None = None,
 ) -> HexapodError:
-    """Return what the core found wrong with a command, its numbers if it was given so, as an error in words; `stands`:
+    """Return the core's refusal of a command, with its numbers if given, as an error; `stands`:
     ``pose_platform_in_base`` of the last command."""
     status = answer.status
     if status == Status.QUATERNION:

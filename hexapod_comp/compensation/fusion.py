@@ -1,10 +1,10 @@
-"""A pose instrument on the machine beside the struts: both weighed by their covariances in one Kalman filter.
+"""A pose instrument and the struts, weighed by their covariances in one Kalman filter.
 
-The state is what the machine has drifted since its model was fitted, twelve lengths, m: a rigid offset of the base in
-``base`` (three displacements, three rotations about the platform's home, times the machine's length) and six offsets
-of the struts. It walks at random. A reading is the tool's measured pose minus the one that forward kinematics find of
-the struts at the same moment. At one pose struts and base cannot be told apart: the covariance says so, and the
-struts' part shows as the machine moves. doc/theory.md, 11.
+The state is the machine's drift since its model was fitted, twelve lengths, m: a rigid offset of the base in ``base``
+(three displacements, three rotations about the platform's home, times the machine's length) and six offsets of the
+struts. It is a random walk. A reading is the tool's measured pose minus the one that forward kinematics find of the
+struts at the same moment. At one pose the drifts of struts and base cannot be distinguished: the covariance contains
+that, and the struts' part is determined as the machine moves. doc/theory.md, 11.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from ..machine.kinematics import jacobian
 from ..pose import Pose
 from .compensator import DRIFT_STATES, Compensator
 
-KEPT = 1024  # Struts remembered: a second at 1 kHz
-MOST_WAITING = 32  # Readings that wait for the struts of their moment
+KEPT = 1024  # Number of stored struts: a second at 1 kHz
+MOST_WAITING = 32  # Readings that wait for the struts of their time
 LONGEST_GAP = 0.1  # Struts further apart than this, s, are not interpolated
 
 
 @dataclass(frozen=True)
 class FusionRules:
-    """What is assumed of machine and instrument."""
+    """Assumptions about machine and instrument."""
 
     drift_rate: float = 5e-8  # standard deviation that each state gains in a second, m; grows with the root of time
     initial: float = 5e-6  # standard deviation of each state at the start, m
-    limit: float = 2e-4  # largest state, m: beyond, the filter holds
-    gate: float = 0.999  # probability that a reading as stated passes the gate
-    strut_deviation: float = 1e-6  # of a strut's reading, and of what the model leaves, m
+    limit: float = 2e-4  # largest state, m: beyond it the filter holds
+    gate: float = 0.999  # probability that a correct reading passes the gate
+    strut_deviation: float = 1e-6  # of a strut's reading, and of the model's residual error, m
     time_deviation: float = 1e-3  # between the stamps of instrument and struts, s
     position_deviation: float = 2e-6  # of the instrument, where its message states no covariance, m
     rotation_deviation: float = 1e-5  # the same, rad
@@ -56,16 +56,16 @@ class DriftFilter:
         self.chi_square = 0.0  # of the last innovation
 
     def predict(self, time: float) -> None:
-        """Let time pass up to `time`, s; earlier times change nothing."""
+        """Predict up to `time`, s; earlier times change nothing."""
         if time > self.time:
             self.covariance = self.covariance + self.rules.drift_rate**2 * (time - self.time) * np.eye(len(self.state))
         if not time <= self.time:
             self.time = time
 
     def update(self, reading: np.ndarray, observation: np.ndarray, noise: np.ndarray) -> None:
-        """Weigh a reading; a CommandError, ``wild_pose`` or ``drift_limit``, leaves state and covariance.
+        """Update by a reading; a CommandError, ``wild_pose`` or ``drift_limit``, leaves state and covariance unchanged.
 
-        The covariance is written as a sum of squares (Joseph), which stays positive whatever is rounded.
+        The covariance is updated as a sum of squares (Joseph), which stays positive despite rounding.
         """
         innovation = reading - observation @ self.state
         spread = observation @ self.covariance @ observation.T + noise
@@ -89,7 +89,7 @@ class DriftFilter:
 
 @dataclass(frozen=True)
 class PoseReading:
-    """What the instrument has measured."""
+    """A reading of the instrument."""
 
     pose: Pose  # pose_tool_in_base
     made: float  # monotonic time, s
@@ -97,9 +97,9 @@ class PoseReading:
 
 
 def checked_covariance(numbers: Sequence[float], rules: FusionRules) -> np.ndarray:
-    """Return the 36 numbers of a message as a matrix, (6, 6); all zero: what the rules state.
+    """Return the 36 numbers of a message as a matrix, (6, 6); all zero: the rules' covariance.
 
-    A CommandError, ``covariance``: they are no covariance, which is symmetric and positive definite.
+    A CommandError, ``covariance``: they are not a symmetric, positive definite matrix.
     """
     matrix = np.array(numbers, dtype=float).reshape(6, 6)
     if not matrix.any():
@@ -128,9 +128,10 @@ def observation(geometry: HexapodGeometry, platform: Pose, tool: Pose) -> np.nda
 
 
 class Fusion:
-    """The drift of one compensator's machine, by what a pose instrument measures: followed, and fed to it where asked.
+    """The drift of one compensator's machine, by a pose instrument: estimated, and passed to the compensator if
+    requested.
 
-    Struts come in with the monotonic time of their making; a reading waits for the struts on either side of its own.
+    Struts are added with the monotonic time of their reading; a pose reading waits for the struts before and after it.
     """
 
     def __init__(self, compensator: Compensator, rules: FusionRules) -> None:
@@ -138,12 +139,12 @@ class Fusion:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew: no drift. What the compensator corrects of it already is taken back by :meth:`feed`."""
+        """Start without drift. :meth:`feed` removes the part that the compensator corrects already."""
         self.filter, self.held = DriftFilter(self.rules), ""
         self._model, self._tool = self._compensator.model, self._compensator.geometry.tool_name
         self._struts: deque[tuple[float, np.ndarray]] = deque(maxlen=KEPT)
         self._waiting: deque[PoseReading] = deque(maxlen=MOST_WAITING)
-        self.count, self.last = 0, -math.inf  # readings weighed, and when the last of them was made
+        self.count, self.last = 0, -math.inf  # number of accepted readings, and time of the last one
 
     @property
     def drift(self) -> np.ndarray:
@@ -156,19 +157,19 @@ class Fusion:
         return self.drift[3:6] / self._compensator.geometry.characteristic_length
 
     def add(self, reading: PoseReading) -> list[CommandError]:
-        """Weigh a reading, now or when its struts come; return why what was ready is rejected."""
+        """Process a reading, now or when its struts arrive; return why a processed one is rejected."""
         self._waiting.append(reading)
         return self._weigh()
 
     def add_struts(self, struts: Sequence[float], made: float) -> list[CommandError]:
-        """Remember struts; return why readings that waited for them are rejected."""
+        """Store struts; return why readings that waited for them are rejected."""
         if not self._struts or made > self._struts[-1][0]:
             self._struts.append((made, np.array(struts)))
         return self._weigh() if self._waiting else []
 
     def weighed(self, tool: np.ndarray) -> np.ndarray:
-        """Return the tool's pose as struts and instrument have it together, of what :meth:`.Compensator.estimate` just
-        returned for the struts; both as it has them, shape (12,)."""
+        """Return the tool's pose combined from struts and instrument, given :meth:`.Compensator.estimate`'s result for
+        the struts; both have shape (12,)."""
         left = self.drift - self._compensator.drift
         if not left.any():
             return tool
@@ -182,8 +183,8 @@ class Fusion:
     def feed(self, compensate: bool) -> None:
         """Let the compensator correct the drift, or none; it ramps as any change of model does.
 
-        Another model begins without drift, and another tool with struts of its own. A HexapodError: what it would
-        correct breaks a limit, and what is corrected stays.
+        Another model begins without drift, and another tool with struts of its own. A HexapodError: the correction
+        breaks a limit, and the previous one stays.
         """
         if self._compensator.model is not self._model:
             self.reset()
@@ -195,7 +196,7 @@ class Fusion:
     def _weigh(self) -> list[CommandError]:
         rejected = []
         if self._compensator.geometry.tool_name != self._tool or self._compensator.model is not self._model:
-            self._waiting.clear()  # measured with another tool, or judged by another model
+            self._waiting.clear()  # measured with another tool, or compared with another model
             self._tool = self._compensator.geometry.tool_name
         while self._waiting and self._struts and self._waiting[0].made <= self._struts[-1][0]:
             reading = self._waiting.popleft()
@@ -229,7 +230,8 @@ class Fusion:
         self.held, self.count, self.last = "", self.count + 1, reading.made
 
     def _struts_at(self, made: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return struts, m, and their speed, m/s, at a time, on the straight line between those before and after."""
+        """Return struts, m, and their speed, m/s, at a time, by linear interpolation between the readings before and
+        after."""
         times = np.array([at for at, _ in self._struts])
         after = int(np.searchsorted(times, made))
         if not 0 < after < len(times) or times[after] - times[after - 1] > LONGEST_GAP:

@@ -1,6 +1,6 @@
-"""What every message passes before it moves a strut: one sender, a stamp that fits, no faster than the struts can.
+"""Checks of every message before it moves a strut: one sender, a valid stamp, no faster than the struts can move.
 
-No ROS here: node, drive and LinuxCNC bridge use the same guards, and tests drive them by a clock of their own. Times
+No ROS here: node, drive and LinuxCNC bridge use the same guards, and tests drive them with their own clock. Times
 named `now` are monotonic, s; stamps are integers, ns.
 """
 
@@ -15,53 +15,53 @@ from typing import NamedTuple
 from ..errors import CommandError, LimitError
 from ..machine.limits import STRUT_NAMES
 
-SHOWN_FOR = 1.0  # What has happened colours a node's status for this long, s
+SHOWN_FOR = 1.0  # An event is shown in a node's status for this long, s
 
 # After a pause this long, s, stamps may start again earlier: the sender or its clock was restarted
 FORGET_ORDER_AFTER = 0.5
 
-STEP_TOLERANCE = 2_000_000  # A change between system and monotonic clock up to this, ns, is no step
+STEP_TOLERANCE = 2_000_000  # A difference between system and monotonic clock up to this, ns, is no step
 SLEW = 1e-3  # A clock may be corrected at this rate without being set (NTP's own limit is half of it)
 
-# Two clocks read further apart than this, ns, are read again: the processor was elsewhere in between
+# Two clocks read further apart than this, ns, are read again: the process was interrupted between
 READ_WITHIN = 200_000
 
-IN_FLIGHT = 0.5  # For this long after a step of the clock, s, messages that were stamped before it may still arrive
+IN_FLIGHT = 0.5  # For this long after a step of the clock, s, messages stamped before it may still arrive
 
-# No message is from the future by more than this, ns, or than its sender's messages are, where it stamps ahead
+# No message may be from the future by more than this, ns, plus its sender's lead
 EARLY = 2_000_000
 
-# How fast it is forgotten how far a sender stamps ahead, ns/s: clocks drift apart by a tenth of that
+# Rate at which a sender's lead is forgotten, ns/s: clocks drift apart by a tenth of that
 LEAD_SHRINKS = 1e6
 
 # This many messages that are in order among themselves and arrive over this time, s, were not overtaken: their
-# sender's clock was set back. What was held up on its way arrives at once.
+# sender's clock was set back. Delayed messages arrive all at once.
 RUN, RUN_LASTS = 3, 0.02
 
-BUNCHED_WITHIN = 0.1  # Commands that were held up on their way for up to this time, s, may come all at once
+BUNCHED_WITHIN = 0.1  # Commands delayed by up to this time, s, may arrive all at once
 
 # A sender that returns this long after another has taken over is not a predecessor that was stopped, s
 SPEAKERS_WITHIN = 1.0
 
-SPEAKERS_HELD = 2.0  # Two that sent in turn count as two for this long after the last turn, s
+SPEAKERS_HELD = 2.0  # Two senders in turn count as two for this long after the last turn, s
 
 # What rmw calls a publisher whose node is not known yet: found a moment ago, or not a ROS node
 UNKNOWN_NAME = "_NODE_NAME_UNKNOWN_"
 
 
 class Sample:
-    """One message on its way past the guards."""
+    """One message with the values that the guards need."""
 
     __slots__ = ("age", "frame_id", "now", "stamp", "values")
 
     def __init__(self, now: float, stamp: int = 0, values: tuple[float, ...] | None = None, frame_id: str = "") -> None:
         self.now, self.stamp, self.values, self.frame_id = now, stamp, values, frame_id
-        self.age = 0.0  # s by its stamp, which its StampGate finds out
+        self.age = 0.0  # age, s, by its stamp, computed by its StampGate
 
 
 class Guard:
-    """One question to each sample: `check` refuses it, `accept` remembers one that has passed all guards, `reset`
-    forgets. While there is a `problem` every sample is refused; one that is `latched` stays until it is released."""
+    """Checks one property of each sample: `check` raises, `accept` stores one that has passed all guards, `reset`
+    forgets. While there is a `problem` every sample is refused; a `latched` one stays until it is released."""
 
     reason = ""  # under which refusals are counted
     latched = False
@@ -73,16 +73,16 @@ class Guard:
             raise CommandError(self.reason, self.problem)
 
     def accept(self, sample: Sample) -> None:
-        """Remember a sample that all guards have passed."""
+        """Store a sample that all guards have passed."""
 
     def reset(self) -> None:
         """Forget all samples; a latched problem stays."""
 
 
 class EventWindow:
-    """Whether something has happened of late: within :data:`SHOWN_FOR`, or since this was asked before.
+    """Whether an event is recent: within :data:`SHOWN_FOR`, or since the last query.
 
-    So a node that is asked now and then shows everything at least once, however long it stood still in between.
+    So a node that queries periodically shows every event at least once, even after a long pause.
     """
 
     def __init__(self) -> None:
@@ -93,7 +93,7 @@ class EventWindow:
         self._at = now
 
     def holds(self, now: float) -> bool:
-        """Return whether it has happened of late; the same as often as one asks at the same time."""
+        """Return whether it is recent; repeated queries at the same time give the same answer."""
         if now > self._asked:
             self._before, self._asked = self._asked, now
         return now - self._at < SHOWN_FOR or self._at > self._before
@@ -109,14 +109,14 @@ class Excess(NamedTuple):
     moved: float
     allowed: float
     elapsed: float  # s
-    in_turn: bool  # many in turn are too fast, each of which might be
+    in_turn: bool  # a sequence is too fast, though no single step is
 
 
 class RateLimit:
-    """Values that move no faster than `rate` from the last accepted ones, but for a way that they may make `at_once`.
+    """Limits the rate of values from the last accepted ones, plus a step `at_once`.
 
-    With `bunched`, s, many in turn may be no faster either, but for `at_once` and the way of a bunch that was held up
-    for that time: a leaky bucket. Before the first values nothing is known, and all pass.
+    With `bunched`, s, a sequence may be no faster either, plus `at_once` and the motion of a bunch delayed by that
+    time: a leaky bucket. Before the first values all pass.
     """
 
     def __init__(self, at_once: float, rate: float, bunched: float = math.inf) -> None:
@@ -124,17 +124,18 @@ class RateLimit:
         self.reset()
 
     def reset(self, standing: Sequence[float] | None = None) -> None:
-        """Forget the last values, or begin where things stand: then time alone gives no right to any way."""
+        """Forget the last values, or start from the present ones: elapsed time before counts for nothing."""
         self.last, self.at = standing, math.inf
         self._ahead: Sequence[float] = () if standing is None else (0.0,) * len(standing)
 
     def excess(self, values: Sequence[float], now: float, elapsed: float = -math.inf) -> Excess | None:
-        """Return what moves too far, if any; `elapsed` counts where it is longer than the time since the last."""
+        """Return the value that moves too far, if any; `elapsed` is used if it is longer than the time since the
+        last."""
         if self.last is None:
             return None
         elapsed = max(elapsed, now - self.at, 0.0)
         moved, allowed = list(map(abs, map(sub, values, self.last))), self.at_once + self.rate * elapsed
-        if max(moved) > allowed or sum(moved) != sum(moved):  # NaN is found by the sum alone
+        if max(moved) > allowed or sum(moved) != sum(moved):  # the sum alone detects NaN
             worst = max(range(len(moved)), key=lambda n: math.inf if math.isnan(moved[n]) else moved[n])
             return Excess(worst, moved[worst], allowed, elapsed, False)
         if self.bunched < math.inf:
@@ -145,7 +146,7 @@ class RateLimit:
         return None
 
     def accept(self, values: Sequence[float], now: float) -> None:
-        """Take values as the last good ones."""
+        """Store values as the last good ones."""
         if self.bunched < math.inf:
             last = values if self.last is None else self.last
             self._ahead = self._ahead or (0.0,) * len(values)
@@ -160,7 +161,7 @@ class RateLimit:
 class StrutSteps(Guard):
     """Refuses strut commands further from the last ones than a machine's `step` (m) and `speed` (m/s) allow.
 
-    `reset` says where the struts stand: the first command must be within a step of that.
+    `reset` gives the struts' present lengths: the first command must be within a step of them.
     """
 
     def __init__(self, step: float, speed: float) -> None:
@@ -183,7 +184,7 @@ class StrutSteps(Guard):
         self._limit.accept(tuple(sample.values or ()), sample.now)
 
     def reset(self, standing: Sequence[float] | None = None) -> None:
-        """Begin where the struts stand, six lengths, m; None: not known, any first command passes."""
+        """Start from the struts' present lengths, six, m; None: not known, any first command passes."""
         self._limit.reset(standing)
 
 
@@ -191,10 +192,10 @@ class StrutSteps(Guard):
 
 
 class StampClock:
-    """The clock by which stamps are judged, and when it was set: found by the monotonic clock, which nobody sets.
+    """The clock for stamps, and its steps, detected by comparison with the monotonic clock.
 
-    `simulated` reads simulated time, ns, which is set only when it falls; None: the system's clock. (ROS reads the
-    system's too, but takes ten times as long.)
+    `simulated` reads simulated time, ns, whose steps are only detected when it falls; None: the system's clock. (ROS
+    reads the system's too, but takes ten times as long.)
     """
 
     def __init__(
@@ -205,14 +206,14 @@ class StampClock:
     ) -> None:
         self._simulated, self.system, self.steady = simulated, system, steady
         self._at, self._offset, self._last, self.shift = steady(), 0, 0, 0
-        self.set_back = self.set_forward = self.last_step = 0  # how often it was set, and the newest step, ns
+        self.set_back = self.set_forward = self.last_step = 0  # number of steps, and the newest step, ns
         self.steps: list[tuple[int, int]] = []  # monotonic time, ns, of the newest, and the shift in force until then
         self.read()
         self.shift = self.set_back = self.set_forward = 0  # the shift is the sum of all steps, ns
         self.steps.clear()
 
     def read(self) -> int:
-        """Return the time, ns; take notice where it was set since the last time."""
+        """Return the time, ns, and detect steps of the clock."""
         steady = self.steady
         if self._simulated is not None:
             now, clock = steady(), self._simulated()
@@ -233,7 +234,7 @@ class StampClock:
         return clock
 
     def before(self) -> list[int]:
-        """Return the shifts that were in force before the newest steps, while messages stamped then may arrive."""
+        """Return the shifts in force before the newest steps, while messages stamped then may arrive."""
         since = self.steady() - round(IN_FLIGHT * 1e9)
         self.steps = [entry for entry in self.steps if entry[0] >= since]
         return [shift for _, shift in self.steps]
@@ -247,13 +248,13 @@ class StampClock:
 
 
 class StampGate(Guard):
-    """Lets one sender's messages pass by their stamps: none too old or from the future, none overtaken.
+    """Checks one sender's stamps: none too old or from the future, none overtaken.
 
-    Sender and node may share a clock that is set, back or forward, while messages are on their way. Then a stamp may
-    be one of the old setting or of the new one, unless that would put the message into the future, further than its
-    sender stamps ahead: messages come late, but none comes before it was sent. It is the one that follows closest on
-    the last message's. So a step of the clock shuts nothing out, and lets no overtaken message pass. A sender whose
-    clock is set while the node's is not shows itself by a run of messages in order.
+    Sender and node may share a clock that is set, back or forward, while messages are in transit. Then a stamp may be
+    one of the old setting or of the new one, unless that would put the message into the future by more than its
+    sender's lead: messages arrive late, but never before they were sent. The setting whose stamp follows most closely
+    on the last message's is used. So a step of the clock locks no sender out, and lets no overtaken message pass. A
+    sender whose clock is set while the node's is not is detected by a run of messages in order.
 
     `max_age`, s, is the allowed difference to the clock, 0: any; with `future` stamps from the future are refused as
     old ones are; `capped`: a stamp from the future counts as now in the order of stamps, so that it does not shut out
@@ -265,12 +266,12 @@ class StampGate(Guard):
     ) -> None:
         self._what, self._clock, self.max_age = what, clock, max_age
         self._future, self._capped = future, capped
-        self.sender_set_back = 0  # how often the sender's clock alone was found set back
+        self.sender_set_back = 0  # number of steps back of the sender's clock alone
         self._now = self._age = self._made = 0
         self._shift = self._checked_shift = clock.shift
         self._run, self._run_since, self._run_made = 0, 0.0, 0
         self._then = -math.inf
-        self._lead = 0  # how far the sender stamps ahead, ns
+        self._lead = 0  # the sender's lead, ns
 
     def check(self, sample: Sample) -> None:
         """Raise a CommandError, ``stamp_past``, ``stamp_future`` or ``stamp_order``; write the sample's age, s."""
@@ -279,7 +280,7 @@ class StampGate(Guard):
             return
         self._now = clock.read()
         ordered = now - self._then < FORGET_ORDER_AFTER
-        # A sender that has not followed a step has a clock of its own: its order goes on by that.
+        # A sender that has not followed a step has its own clock: its order continues by that.
         self._age, self._checked_shift = self._now - stamp, self._shift if ordered else clock.shift
         if clock.steps:
             self._find_setting(stamp, clock.before())
@@ -312,19 +313,21 @@ class StampGate(Guard):
         self._then, self._lead, self._run = -math.inf, 0, 0
 
     def _find_setting(self, stamp: int, before: list[int]) -> None:
-        """Find out by which setting of a clock that was set of late a stamp was made, and how old it is then, ns."""
+        """Determine by which setting of a recently set clock a stamp was made, and its age then, ns."""
         if not before:
             return
         age, shift = self._age, self._clock.shift
         ages = {age - shift + one: one for one in {shift, self._checked_shift, *before}}
         possible = {age: one for age, one in ages.items() if age >= -self._lead - EARLY}
         self._age = min(possible, default=max(ages))
-        # The stamp that follows closest on the last one's: what waited while the node stood still comes in turn.
+        # The stamp that follows most closely on the last one: messages queued during a pause of the node arrive in
+        # order.
         made = sorted((stamp - one, one) for one in possible.values() or ages.values())
         self._checked_shift = next((one for when, one in made if when >= self._made), made[-1][1])
 
     def _is_run(self, made: int, now: float) -> bool:
-        """Return whether messages with earlier stamps come in such a way that their sender's clock was set back."""
+        """Return whether messages with earlier stamps arrive in a pattern that shows that their sender's clock was set
+        back."""
         if not self._run or made < self._run_made:
             self._run, self._run_since = 0, now
         self._run, self._run_made = self._run + 1, made
@@ -337,17 +340,16 @@ class StampGate(Guard):
 
 
 class OneSender(Guard):
-    """Only one node may publish on a topic of commands or of readings, and no message goes missing unseen.
+    """Only one node may publish on a topic of commands or of readings; missing messages are detected.
 
-    The graph tells the publishers' names, but keeps a node that was killed for as long as its own lease (20 s by
-    default, said by its own DDS profile, not by ours): two of one name may be one and its ghost. Sequence numbers tell
-    ghosts apart: every publisher counts its messages from 1, and only the living send. A second node of this node's
-    `own` name on a topic that it publishes is not seen: it may be this one's predecessor that was killed; who listens
-    finds out.
+    The graph gives the publishers' names, but keeps a killed node for its own lease (20 s by default, set by its
+    Sequence numbers distinguish ghosts: every publisher counts its messages from 1, and only living ones send. A second
+    node of this node's `own` name on a topic that it publishes is not detected here: it may be this one's killed
+    predecessor; a subscriber detects it.
 
     `count` returns how many publishers there are, cheap; `names` their full names, each once, and why they cannot be
-    told, empty where they can: who cannot tell who commands must not obey. Where several are `allowed` they are named
-    all the same.
+    told, empty where they can: who cannot tell who commands must not obey. Several `allowed` publishers are still
+    named.
     """
 
     def __init__(
@@ -362,7 +364,7 @@ class OneSender(Guard):
         self._count = -1
         self.names: tuple[str, ...] = ()  # of the others, where one is its own
         self._unknown = ""
-        self.missed = 0  # messages that were sent and never handled: overtaken in a queue, or lost by the network
+        self.missed = 0  # number of messages sent and never handled: dropped from a queue, or lost by the network
         self._counted = True  # whether the middleware counts messages at all
         self._turned_at = self._changed_at = -math.inf
         self._last = self._other = 0
@@ -374,7 +376,7 @@ class OneSender(Guard):
         return "unknown_publisher" if self._unknown else "several_publishers"
 
     def update(self, now: float) -> None:
-        """Look who publishes: at the names only when they may have changed, or when they matter."""
+        """Check the publishers: their names only when they may have changed, or when they matter."""
         count = self._count_now()
         if count != self._count or count > 1 or self._unknown or UNKNOWN_NAME in self.names:
             self._count = count
@@ -384,13 +386,13 @@ class OneSender(Guard):
             self._judge(now)
 
     def receive(self, number: int | None, now: float) -> bool:
-        """Note a message's sequence number, None where none are counted; return whether it showed a second sender."""
+        """Record a message's sequence number, None if there are none; return whether it showed a second sender."""
         last, self._last = self._last, number or 0
         if number is not None and number == last + 1:
             return False
         counted, self._counted = self._counted, number is not None
         returned = False
-        if number is not None and last:  # it does not follow the last one: two send in turn, or messages are missing
+        if number is not None and last:  # it does not follow the last one: two senders in turn, or missing messages
             back = number <= last
             returned = now - self._changed_at < SPEAKERS_WITHIN and (back or last < self._other < number)
             lost = number - 1 - (self._other if returned else last)
@@ -407,7 +409,7 @@ class OneSender(Guard):
         return False
 
     def missing(self, now: float) -> bool:
-        """Return whether messages have gone missing of late."""
+        """Return whether messages have gone missing recently."""
         return self._misses.holds(now)
 
     def _judge(self, now: float) -> None:

@@ -1,13 +1,12 @@
-"""The compensator's journal: what the compensator consumed, in its order, written so that it can be replayed.
+"""The compensator's journal: its inputs, in order, from which a run can be replayed.
 
-An answer follows from the commands before it and from what happened to the compensator in between: temperatures,
-models, switching, starts. A page holds all of them in the order in which they were taken, with the answers that were
-given; so a replay need not guess which answer belongs to which command. Pages are numbered: a lost one shows. Every
-:data:`SNAPSHOT_PERIOD` a page closes with a snapshot of everything that decides the next answer. From there a replay
-can go on, so a recording may begin in the middle of a motion.
+An answer depends on the previous commands and on the changes between them: temperatures, models, switching, starts. A
+page holds all of them in their order, with the answers; so a replay need not guess which answer belongs to which
+command. Pages are numbered, so that a lost one is detected. Every :data:`SNAPSHOT_PERIOD` a page ends with a snapshot
+of everything that determines the next answer. A replay can start there, so a recording may begin during a motion.
 
 A page is JSON: people read it with ``ros2 topic echo``, and its numbers come back as the very same floats, as
-Python writes the shortest digits that do. NaN, for which JSON has no word, is null. Commands and answers come a
+Python writes the shortest digits that do. NaN, which JSON does not have, is null. Commands and answers come a
 thousand times a second: they are the bytes of an array of :data:`COMMAND`, in base64.
 """
 
@@ -40,7 +39,7 @@ from ..machine.outside import read_numbers
 from .compensator import BESIDE_NUMBERS, Compensator
 
 FORMAT = 5  # Version of pages
-READABLE = (4, FORMAT)  # Versions that are read. In 4 there was one tool, and two frames.
+READABLE = (4, FORMAT)  # Versions that can be read. Version 4 had one tool and two frames.
 
 # Why older versions cannot be replayed
 OLDER = {
@@ -49,8 +48,8 @@ OLDER = {
     3: "does not hold when each command was received, by which the struts' speed is limited",
 }
 
-# Longest time between two snapshots, s: what a lost message costs a replay. A late subscriber is given the ten newest
-# pages; at one every 50 ms a snapshot is among them.
+# Longest time between two snapshots, s: the cost of a lost message for a replay. A late subscriber receives the ten
+# newest pages; at one every 50 ms a snapshot is among them.
 SNAPSHOT_PERIOD = 0.4
 
 # Frames of commanded poses that every machine has; an answer names its frame by its place in the snapshots' frames
@@ -62,16 +61,16 @@ _TIMES = [("stamp", "<i8"), ("stamped", "u1"), ("received", "<f8"), ("published"
 # x, y, z, w; strut commands and corrections that it answered, m
 COMMAND = np.dtype([*_TIMES, ("frame", "u1"), ("pose", "<f8", 7), ("lengths", "<f8", (2, 6))])
 
-_HEAD = struct.Struct("<qBddB7d")  # The first six fields of a COMMAND: packed so in a fifth of the time
+_HEAD = struct.Struct("<qBddB7d")  # The first six fields of a COMMAND: packed together in a fifth of the time
 
 
 def time_of(stamp: int, stamped: bool) -> float:
-    """Return the time of a command as the compensator is told, s; NaN where it had no stamp."""
+    """Return the time of a command for the compensator, s; NaN if it had no stamp."""
     return stamp * 1e-9 if stamped else math.nan
 
 
-REFUSALS_PER_PAGE = 20  # A page names no more refused commands than this; it counts the others
-LARGEST_SOURCE = 250_000  # Longer files are named, not copied, characters: the message is made while commands wait
+REFUSALS_PER_PAGE = 20  # Most refused commands named on a page; it counts the others
+LARGEST_SOURCE = 250_000  # Longer files are named, not copied, characters: commands wait while the message is made
 
 # Longer messages are refused: a page of 50 ms has some 10 kB at 1 kHz, the files in use no more than 1.5 MB
 MOST_CHARACTERS = 8_000_000
@@ -80,14 +79,14 @@ CPU_INFO = Path("/proc/cpuinfo")
 
 
 class JournalError(HexapodError):
-    """A page that is none: what is wrong in it."""
+    """An invalid page, and its error."""
 
     reason = "bad_journal"
 
 
 @dataclass(frozen=True)
 class Source:
-    """A file that decides commands: geometry or model."""
+    """A file that determines commands: geometry or model."""
 
     name: str  # where it was read from
     text: str | None
@@ -100,18 +99,18 @@ class Source:
 
     @classmethod
     def read(cls, path: str | Path, opener: Opener | None = None) -> Source:
-        """Return a file as it is now; what is made of it is made of this text, and never of a later one.
+        """Return a file's present content; everything is made from this text, never from a later one.
 
         The opener is that of :func:`~hexapod_comp.formats.files.read_text`.
         """
         return cls.of(str(path), read_text(path, opener))
 
     def geometry(self) -> HexapodGeometry:
-        """Return the machine that it describes; errors as :func:`~hexapod_comp.machine.geometry.load_geometry`."""
+        """Return the machine of this text; errors as :func:`~hexapod_comp.machine.geometry.load_geometry`."""
         return parse_geometry(self._whole(), self.name)
 
     def model(self, machine: str) -> MachineModel:
-        """Return the model that it describes, of a machine; errors as :func:`~..machine.model_file.load_model`."""
+        """Return the model of this text, of a machine; errors as :func:`~..machine.model_file.load_model`."""
         if self.sha256 == IDEAL_SOURCE.sha256:
             return MachineModel(machine)
         return parse_model(self._whole(), machine, self.name)
@@ -122,7 +121,7 @@ class Source:
         return self.text
 
 
-IDEAL_SOURCE = Source.of(IDEAL, "")  # Stands for the file of the ideal model, which has none
+IDEAL_SOURCE = Source.of(IDEAL, "")  # Represents the ideal model, which has no file
 
 
 @dataclass(frozen=True)
@@ -140,7 +139,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Everything that decides the next answer."""
+    """Everything that determines the next answer."""
 
     state: dict[str, Any]  # as :meth:`Compensator.snapshot`, arrays in place of lists
     model: dict[str, str]
@@ -159,12 +158,12 @@ class Page:
     number: int
     begins: int  # commands answered before this page since the session began
     commands: np.ndarray
-    entries: tuple[Entry, ...]  # what else happened since then
+    entries: tuple[Entry, ...]  # other events since then
     refused_more: int
-    snapshot: Snapshot | None  # taken after all of that
+    snapshot: Snapshot | None  # taken after all of these
 
     def steps(self) -> Iterator[Entry | None]:
-        """Yield what happened, in its order: entries, and None for each answered command."""
+        """Yield the events in their order: entries, and None for each answered command."""
         entries = iter(self.entries)
         upcoming = next(entries, None)
         for number in range(len(self.commands) + 1):
@@ -176,7 +175,7 @@ class Page:
 
 
 class Journal:
-    """Writes the pages of one compensator, whose ``on_change`` it takes."""
+    """Writes the pages of one compensator, as its ``on_change``."""
 
     def __init__(
         self,
@@ -198,13 +197,13 @@ class Journal:
     def answered(
         self, stamp: int, frame_id: str, numbers: tuple[float, ...], times: tuple[float, float], stamped: bool = True
     ) -> None:
-        """Write down a command just answered; the times are of its receipt and its publication. See :data:`COMMAND`."""
+        """Record a command just answered; the times are of its receipt and its publication. See :data:`COMMAND`."""
         self._commands += _HEAD.pack(stamp, stamped, *times, self._places[frame_id], *numbers)
         self._commands += self._compensator.command.tobytes() + self._compensator.correction.tobytes()
         self._count += 1
 
     def note(self, what: str, value: Any) -> None:
-        """Write down a change that has just been made."""
+        """Record a change."""
         entry = {"after": self._count, "what": what}
         if what == "model":
             entry |= {"name": value.name, "sha256": self._sources["model"].sha256}
@@ -223,7 +222,7 @@ class Journal:
         self._entries.append(entry)
 
     def refused(self, stamp: int, reason: str, text: str) -> None:
-        """Write down a refused command with its stamp, ns."""
+        """Record a refused command with its stamp, ns."""
         self._refused += 1
         if self._refused <= REFUSALS_PER_PAGE:
             entry = {"after": self._count, "what": "refused", "stamp": stamp, "reason": reason, "text": text}
@@ -260,12 +259,12 @@ class Journal:
         commands = base64.b64encode(self._commands).decode()
         self._commands, self._begins = bytearray(), self._count
         self._entries, self._refused = [], 0
-        # Put in by hand: looking for what must be escaped in so long a string takes longer than all the rest.
+        # Inserted as text: escaping so long a string takes longer than all the rest.
         return f'{json.dumps(content, ensure_ascii=False)[:-1]}, "answers": "{commands}"}}'
 
 
 def made_with() -> dict[str, str]:
-    """Return the versions and the processor, as Linux calls it, that a result's last bit may depend on."""
+    """Return the versions and the processor, as Linux names it, on which a result's last bit may depend."""
     try:
         lines = CPU_INFO.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -294,7 +293,7 @@ def sources_text(sources: Mapping[str, Source]) -> str:
 
 
 def read_sources(text: str) -> dict[str, Source]:
-    """Read what :func:`sources_text` has written."""
+    """Read the text of :func:`sources_text`."""
     sources = {}
     try:
         for key, entry in _object(_content(text)["files"], "files").items():
@@ -310,7 +309,7 @@ def read_sources(text: str) -> dict[str, Source]:
 
 
 def read_page(text: str) -> Page:
-    """Read what :meth:`Journal.page` has written."""
+    """Read the text of :meth:`Journal.page`."""
     content = _content(text)
     try:
         page = Page(
@@ -360,7 +359,7 @@ def _numbers(found: Sequence[float] | None) -> list[float] | None:
     return None if found is None else [float(value) for value in found]
 
 
-# What each kind of entry says, and how it is read
+# The fields of each kind of entry, and their readers
 ENTRIES: dict[str, dict[str, Callable[[Any], Any]]] = {
     "temperature": {"name": str, "value": float, "time": _number},
     "humidity": {"value": float, "time": _number},

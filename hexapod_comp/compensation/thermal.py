@@ -1,4 +1,4 @@
-"""Readings of temperature and humidity judged and made smooth: a machine warms over minutes, a sensor jitters.
+"""Temperature and humidity readings, validated and smoothed: a machine warms over minutes, a sensor jitters.
 
 Unfiltered, a sensor that reads ±0.05 K moves a steel strut of 0.5 m by ±0.3 µm at every reading; one that reads 119 °C
 once moves it by 0.6 mm.
@@ -14,11 +14,11 @@ from ..errors import ModelError
 from ..machine.temperatures import HUMIDITY, REFERENCE_TEMPERATURE, Temperatures, quantity_of
 from .guards import RateLimit
 
-# Time constant of the filter, s: of a reading a second an eighth of the noise is left, and the drift is followed 30 s
+# Time constant of the filter, s: of a reading a second an eighth of the noise remains, and a drift is followed 30 s
 # late, by 1/60 K when it is 1 K in half an hour
 DEFAULT_TIME_CONSTANT = 30.0
 
-# Two readings of a sensor may differ by this at once, K or a fraction: noise, and the last digit of a coarse one
+# Two readings of a sensor may differ by this at once, K or a fraction: noise, and the last digit of a coarse sensor
 JITTER, HUMIDITY_JITTER = 1.0, 0.05
 
 HUMIDITY_RATE = 0.02  # Fastest change of a shop's humidity, 1/s: a gate that opens
@@ -32,12 +32,11 @@ class _Mean:
 
 
 class TemperatureFilter:
-    """Mean of each sensor's readings, every reading weighted by exp(−age / time constant), s; 0: each as it is.
+    """Mean of each sensor's readings, weighted by exp(−age / time constant), s; 0: unfiltered.
 
-    On regular readings that is a first-order low pass. Being a mean, it needs no initial value and no special
-    cases: the first readings count alike, until the time constant has passed; after a gap of several time constants
-    what was before counts for nothing, and it starts anew; a reading that comes late, or out of order, counts
-    for as much as it would have by now.
+    On regular readings that is a first-order low pass. Being a mean, it needs no initial value and no special cases:
+    the first readings have equal weights, until the time constant has passed; after a gap of several time constants it
+    starts anew; a late or disordered reading has the weight of its age.
     """
 
     def __init__(self, time_constant: float = DEFAULT_TIME_CONSTANT) -> None:
@@ -47,8 +46,8 @@ class TemperatureFilter:
         self._means: dict[str, _Mean] = {}
 
     def update(self, name: str, value: float, time: float) -> float:
-        """Take a reading, °C or of humidity a fraction, made at a time, s, on a clock that is never set (a clock put
-        back makes all that follows late); return the mean. A ModelError, as :meth:`.Temperatures.set`, changes nothing.
+        """Add a reading, °C or of humidity a fraction, made at a time, s, on a clock that is never set (a clock put
+        back makes all that follow late); return the mean. A ModelError, as :meth:`.Temperatures.set`, changes nothing.
         """
         reading = Temperatures({name: value}).values[name]
         if not math.isfinite(time):
@@ -67,28 +66,29 @@ class TemperatureFilter:
 
 @dataclass(frozen=True)
 class Plausibility:
-    """What counts as a machine's temperature; 0 switches a rule off."""
+    """Limits of a machine's temperatures; 0 switches a rule off."""
 
     rate: float  # fastest change of one part, K/s, beyond JITTER: a RateLimit
     spread: float  # largest difference, K, to the median of the other parts, to 20 °C where none is known
-    timeout: float  # a sensor without a good reading for longer, s, is stale: its last one stays, but judges no other
+    # a sensor without a good reading for longer, s, is stale: its last one stays, but is not compared with others
+    timeout: float
     humidity_rate: float = HUMIDITY_RATE  # as `rate`, of the relative humidity, 1/s, beyond HUMIDITY_JITTER
 
 
 class Thermometers:
-    """The temperatures of a machine's parts, and the air's humidity: readings that are plausible, smoothed."""
+    """The temperatures of a machine's parts, and the air's humidity: plausible readings, smoothed."""
 
     def __init__(self, rules: Plausibility, time_constant: float = DEFAULT_TIME_CONSTANT) -> None:
         self._filter, self._limits = TemperatureFilter(time_constant), dict[str, RateLimit]()
         self.follow(rules, time_constant)
 
     def follow(self, rules: Plausibility, time_constant: float) -> None:
-        """Take other rules and another time constant, s, from the next reading on."""
+        """Set other rules and another time constant, s, from the next reading on."""
         self._rules, self._filter.time_constant = rules, time_constant
 
     def update(self, name: str, value: float, time: float) -> float:
-        """Take a reading and return what counts from now on; a ModelError, also where it has jumped or does not fit
-        the other parts, changes nothing."""
+        """Add a reading and return the filtered value; a ModelError, also for a jump or a disagreement with the other
+        parts, changes nothing."""
         reading, rules = Temperatures({name: value}).values[name], self._rules
         limit = self._limits.get(name) or RateLimit(HUMIDITY_JITTER if name == HUMIDITY else JITTER, 0.0)
         limit.rate = rules.humidity_rate if name == HUMIDITY else rules.rate

@@ -13,7 +13,7 @@ from ..errors import CommandError, LimitError
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from .guards import Guard, RateLimit, Sample
 
-KEPT = 512  # Commands and readings remembered: half a second at 1 kHz
+KEPT = 512  # Commands and readings stored: half a second at 1 kHz
 
 # A drive follows and its reading arrives within this time, s: a strut may be where any command of that time put it
 FOLLOWED_WITHIN = 0.1
@@ -27,7 +27,7 @@ AVERAGED_OVER = 0.5
 # Readings that differ by no more than this, m, are of one place: encoders read to 0.1 µm, servos hold to 1 µm
 NOISE = 2e-6
 
-FASTER = 2.0  # Struts may have moved so many times faster than they may be commanded: jogged by hand, or pulled back
+FASTER = 2.0  # Factor by which struts may have moved faster than commands allow: jogged by hand, or pulled back
 
 Struts = Sequence[float]
 
@@ -35,18 +35,18 @@ Struts = Sequence[float]
 class StrutTrack(Guard):
     """Commanded and measured struts of the last half second, and the last of each, six lengths, m.
 
-    It answers: can a machine stand so (`check_stroke`, `check_jump`); do the struts go where they are told (`follow`; a
-    problem is latched until `release`, and refuses commands); do they stand (`moving`); where does a start begin
+    It answers: can a machine have these lengths (`check_stroke`, `check_jump`); do the struts follow (`follow`; a
+    problem is latched until `release`, and refuses commands); are they at rest (`moving`); where does a start begin
     (`start`).
 
-    Drives lag, and readings are on their way for a while, so a reading is compared with all that was commanded since
-    :data:`FOLLOWED_WITHIN` before it was made: it must lie between the least and the most of it, or within `limit`, m
-    (0: any). Once it does not, the machine is stopped until a person resets it, as on servo drives and in LinuxCNC: a
-    strut that comes back by itself has all the same been where it was not commanded to be.
+    Drives lag, and readings are delayed, so a reading is compared with all commands since :data:`FOLLOWED_WITHIN`
+    before it was made: it must lie between their minimum and maximum, or within `limit`, m (0: any). Once it does not,
+    the machine is stopped until a person resets it, as on servo drives and in LinuxCNC: a strut that comes back by
+    itself has all the same been where it was not commanded to be.
 
-    A controller streams on while a compensator restarts, and DDS may discover it before the drive. So "no
-    reading yet" does not mean that the struts may be sent anywhere: a start waits for one, unless nothing has become
-    known for `anywhere_after`, s, since the activation (0: for ever), on a machine without feedback.
+    A controller streams on while a compensator restarts, and DDS may discover it before the drive. So "no reading yet"
+    does not mean that the struts may be sent anywhere: a start waits for one, unless nothing has become known for
+    `anywhere_after`, s, since the activation (0: for ever), on a machine without feedback.
     """
 
     reason = "following_error"
@@ -63,7 +63,7 @@ class StrutTrack(Guard):
         self.watch(geometry)
 
     def watch(self, geometry: HexapodGeometry | None) -> None:
-        """Go by a machine's strokes, with the largest correction to spare at either end, step and speed."""
+        """Set a machine's strokes, with the largest correction added at either end, step and speed."""
         self._low, self._high = (-math.inf,) * 6, (math.inf,) * 6
         self._jumps = RateLimit(math.inf, 0.0)
         if geometry is not None:
@@ -75,14 +75,14 @@ class StrutTrack(Guard):
     # ---- what comes ----
 
     def add_command(self, command: Struts, now: float) -> None:
-        """Add a command that was published."""
+        """Add a published command."""
         self._told.append((now, command))
 
     def check_jump(self, sample: Sample) -> None:
         """Raise a LimitError, ``jump``, for measured struts further from the last ones than a machine can have moved.
 
-        A strut that has really jumped is believed when so much time has passed, by stamps or by arrival, whichever is
-        longer, that it may have got there: transports delay.
+        A strut that has really jumped is accepted after the time, by stamps or by arrival, whichever is longer, in
+        which it may have moved there: transports delay.
         """
         both = sample.stamp and self._read_stamp
         by_stamp = (sample.stamp - self._read_stamp) * 1e-9 if both else -math.inf
@@ -104,18 +104,18 @@ class StrutTrack(Guard):
         raise LimitError("stroke", text, length, low if length < low else high, strut, "measured")
 
     def accept(self, sample: Sample) -> None:
-        """Add a good reading, which was made `age` before it came."""
+        """Add a good reading, which was made `age` before it arrived."""
         struts = sample.values or ()
         self._jumps.accept(struts, sample.now)
         self._read.append((sample.now, struts))
         self._read_made, self._read_stamp = sample.now - sample.age, sample.stamp
 
     def follow(self, measured: Struts, made: float) -> bool:
-        """Hold measured struts that were made at a monotonic time, s, against their commands; return whether a
-        following error is found for the first time, which is the problem from then on."""
+        """Compare measured struts of a monotonic time, s, with their commands; return whether a following error is
+        found for the first time, which is the problem from then on."""
         if self.problem or not (self._told and self.limit):
             return False
-        if max(map(abs, map(sub, measured, self._told[-1][1]))) <= self.limit:  # as they nearly always are
+        if max(map(abs, map(sub, measured, self._told[-1][1]))) <= self.limit:  # as in nearly all cases
             return False
         low, high = _range(self._told, made - FOLLOWED_WITHIN)
         off = np.maximum(low - measured, measured - high)
@@ -129,11 +129,11 @@ class StrutTrack(Guard):
         return True
 
     def release(self) -> None:
-        """Take a following error as settled."""
+        """Release a following error."""
         self.problem = ""
 
     def reset(self) -> None:
-        """No command is in force any more; where the last one has sent the struts is remembered."""
+        """No command is in force any more; the struts' last commanded lengths are kept."""
         if self._told:
             self._left = self._told[-1]
         self._told.clear()
@@ -145,8 +145,8 @@ class StrutTrack(Guard):
     # ---- what is asked ----
 
     def moving(self, now: float) -> str:
-        """Return which strut was told, or measured, to go how far in the last :data:`FOLLOWED_WITHIN`, in words; empty
-        when all stand."""
+        """Return which strut was commanded, or measured, to move how far in the last :data:`FOLLOWED_WITHIN`, as text;
+        empty when all stand."""
         for recent, how in ((self._told, "was told to go"), (self._read, "went")):
             if recent:
                 low, high = _range(recent, now - FOLLOWED_WITHIN)
@@ -156,8 +156,8 @@ class StrutTrack(Guard):
         return ""
 
     def mean(self) -> np.ndarray:
-        """Return where struts at rest are: the mean of the readings of the last :data:`AVERAGED_OVER`, shape (6,), m;
-        while any of them is further than :data:`NOISE` from another, the newest."""
+        """Return the position of struts at rest: the mean of the readings of the last :data:`AVERAGED_OVER`, shape
+        (6,), m; while any of them is further than :data:`NOISE` from another, the newest."""
         since = self._read[-1][0] - AVERAGED_OVER
         rows = np.array([struts for at, struts in self._read if at >= since])
         return rows.mean(axis=0) if (np.ptp(rows, axis=0) <= NOISE).all() else rows[-1]
@@ -168,10 +168,10 @@ class StrutTrack(Guard):
         return unknown and not 0.0 < self.anywhere_after <= now - self._began
 
     def start(self, now: float, fresh: bool) -> np.ndarray | None:
-        """Return where the struts stand when the next command is the first: as measured, or else as told last.
+        """Return the struts' lengths at the start of a first command: as measured, or else as commanded last.
 
-        While readings come, `fresh`, the last one counts, lag and all; otherwise it counts only when it was made so
-        long after the last command that the struts had got there. None: nobody knows and the start may be anywhere.
+        With `fresh` readings the last one is used, lag included; otherwise it is used only if it was made long enough
+        after the last command that the struts had arrived. None: not known, and the start may be anywhere.
 
         Raises
         ------
@@ -190,7 +190,8 @@ class StrutTrack(Guard):
 
 
 def _range(recent: deque[tuple[float, Struts]], since: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and the most since a monotonic time, s, with what was in force then; each of shape (6,), m."""
+    """Return the minimum and maximum since a monotonic time, s, including what was in force then; each of shape (6,),
+    m."""
     rows = []
     for at, struts in reversed(recent):
         rows.append(struts)

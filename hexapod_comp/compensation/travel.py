@@ -1,4 +1,4 @@
-"""How far a tool may go from where it is, one way after the other, until a limit stands."""
+"""The travel of a tool from its pose, in each direction up to a limit."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from ..pose import Pose
 from .compensator import pack_pose, refusal
 
 COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")
-STEPS = 500  # Into so many steps the longest strut is divided; what is narrower than one may be stepped over
-TURN_STEP, LONGEST_TURN = math.radians(0.5), math.pi  # The same for turns, rad, and how far they are followed
+STEPS = 500  # Number of steps in which the longest strut is divided; a narrower forbidden region may be missed
+TURN_STEP, LONGEST_TURN = math.radians(0.5), math.pi  # The same for turns, rad, and the largest turn
 
 
 @dataclass(frozen=True)
 class Travel:
-    """How far a tool may go one way."""
+    """Travel of a tool in one direction."""
 
-    coordinate: str  # One of :data:`COORDINATES`; the others stay
+    coordinate: str  # One of :data:`COORDINATES`; the others are fixed
     sign: int  # 1 or −1
     distance: float  # The furthest that all limits allow, m or rad
-    error: HexapodError | None  # What stands beyond; None where a turn ends at π
+    error: HexapodError | None  # The limit beyond; None if a turn ends at π
 
     @property
     def way(self) -> str:
@@ -37,12 +37,12 @@ class Travel:
 
     @property
     def unit(self) -> str:
-        """Of what is shown: mm or deg."""
+        """Unit of display: mm or deg."""
         return "deg" if self.coordinate in COORDINATES[3:] else "mm"
 
     @property
     def key(self) -> str:
-        """What :attr:`shown` is called: way and unit."""
+        """Name of :attr:`shown`: direction and unit."""
         return f"{self.way}_{self.unit}"
 
     @property
@@ -54,8 +54,8 @@ class Travel:
 def travel(
     machine: RealMachine, tool_pose: Pose, frame: Pose | None = None, compensates: bool = True
 ) -> tuple[Travel, ...]:
-    """Return how far the tool may go from a pose, by each of its six coordinates, forward and backward; raise what is
-    wrong with where it starts."""
+    """Return the tool's travel from a pose, by each of its six coordinates, forward and backward; raise the error of an
+    invalid start."""
     geometry, state = machine.geometry, Struct("hc_state")
     state.copy_from(machine.state)
     state.view["last"]["enabled"] = compensates
@@ -80,7 +80,7 @@ def travel(
 
 
 def travel_text(ways: Sequence[Travel]) -> str:
-    """Return a table: way, how far, and what stands there; empty without ways."""
+    """Return a table: direction, travel, and limit; empty without rows."""
     if not ways:
         return ""
     rows = [[one.way, number(one.shown, 3), one.unit, str(one.error or "no limit")] for one in ways]

@@ -1,1 +1,1 @@
-"""The machine: geometry, limits, kinematics, and the model of what the real one does differently."""
+"""The machine: geometry, limits, kinematics, and the model of the real machine's deviations."""

@@ -1,4 +1,4 @@
-"""How large errors are: root mean square and largest."""
+"""Size of errors: root mean square and largest."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from numpy.typing import ArrayLike
 
 
 def changed_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which rows of a matrix differ from the one before, the first among them, and the last such of each row."""
+    """Return which rows of a matrix differ from the previous one, the index of the first, and the last such index of
+    each row."""
     new = np.ones(len(rows), dtype=bool)
     new[1:] = (rows[1:] != rows[:-1]).any(axis=1)
     return np.flatnonzero(new), np.cumsum(new) - 1
 
 
 def different_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where each different row of a matrix stands first, in sorted order, and the number of each row."""
+    """Return the first index of each different row of a matrix, in sorted order, and the number of each row."""
     order = np.lexsort(rows.T[::-1])
     first, of_sorted = changed_rows(rows[order])
     number = np.empty(len(rows), dtype=int)
@@ -26,7 +27,7 @@ def different_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Size:
-    """How large a set of vectors is."""
+    """Size of a set of vectors."""
 
     rms: float  # Root mean square and largest length of the vectors
     largest: float  # Root mean square and largest length of the vectors

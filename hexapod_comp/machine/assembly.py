@@ -1,4 +1,4 @@
-"""Forward kinematics without a guess: every assembly mode of a 6-3 machine, and the pick of the working one."""
+"""Forward kinematics without a guess: every assembly mode of a 6-3 machine, and the selection of the working one."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def _branches(points: np.ndarray, circles: np.ndarray, sides: np.ndarray) -> np.
     """Return the two angles at which a circle is `side` from its point, or nearest to being; (N, 2), rad."""
     a, b = _quadratic(points, circles, sides)
     size = 2.0 * np.abs(a)
-    cosines = np.divide(-b, size, out=np.zeros(len(b)), where=size > 0.0)  # on the axis any angle will do
+    cosines = np.divide(-b, size, out=np.zeros(len(b)), where=size > 0.0)  # on the axis any angle satisfies it
     opening = np.arccos(np.clip(cosines, -1.0, 1.0))
     return np.stack([opening, -opening], axis=1) - np.angle(a)[:, None]
 
@@ -136,7 +136,7 @@ def _roots(values: np.ndarray, bound: float) -> np.ndarray:
     if not largest > 1e-12 * SAMPLES * bound:
         return 2.0 * np.pi / SAMPLES * np.arange(SAMPLES)
     # A tiny leading coefficient belongs to roots near 0 and ∞, far from any real angle; its reciprocal
-    # would drown the others in rounding.
+    # would dominate the others by rounding.
     degree = int(np.flatnonzero(np.abs(half) > 1e-9 * largest)[-1])
     roots = np.roots(np.concatenate([half[degree:0:-1], half[:1].real, half[1 : degree + 1].conj()]))
     return np.angle(roots[np.abs(roots) > 0.9])
@@ -215,7 +215,7 @@ def assembly_modes(structure: Structure, lengths: np.ndarray) -> list[Pose]:
 
 
 def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.ndarray) -> Pose:
-    """Return the pose in which the machine must be standing, for cold starts: no guess but its home."""
+    """Return the pose in which the machine must be, for cold starts: without a guess other than its home."""
     modes = assembly_modes(structure, lengths)
     if not modes:
         raise UnreachableError("no pose of the machine has these strut lengths", 0)
@@ -229,7 +229,7 @@ def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.nd
 
 
 def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose) -> list[str]:
-    """Return what keeps a pose from being the working mode; empty when nothing does."""
+    """Return why a pose is not the working mode; empty if it is."""
     limits = geometry.limits
     measured = batch.examine(*structure.joints, geometry.limit_numbers.at, pose.position, pose.rotation)
     broken = {
@@ -268,7 +268,7 @@ def is_six_three(structure: Structure) -> bool:
 
 
 def _nearest_to_home(geometry: HexapodGeometry, structure: Structure, modes: list[Pose]) -> Pose:
-    """Return the mode nearest to home; refuse where the next is nearly as near."""
+    """Return the mode nearest to home; refuse if the next is almost as near."""
 
     def distance(pose: Pose) -> float:
         turn = rotation_angle(geometry.home.rotation.T @ pose.rotation)
@@ -334,7 +334,7 @@ def _exact_poses(structure: Structure, lengths: np.ndarray) -> list[Pose]:
         raise SingularError("the machine moves with its struts locked at these lengths: its pose is open")
     poses = _poses_at(structure, triangles)
     polished = [_newton(structure, lengths, pose) for pose in poses]
-    # Near a singular pose Newton may be thrown to another mode: then the triangle stands as it is.
+    # Near a singular pose Newton may converge to another mode: then the triangle is used as it is.
     return [
         fine if fine is not None and _same(structure, fine, pose, lengths) else pose
         for pose, fine in zip(poses, polished, strict=True)
@@ -344,7 +344,7 @@ def _exact_poses(structure: Structure, lengths: np.ndarray) -> list[Pose]:
 def _continued_poses(structure: Structure, lengths: np.ndarray) -> list[Pose]:
     """Return the real structure's modes near those of the machine with its pairs' midpoints."""
     gap = platform_pair_gap(structure)
-    # The wide tolerance takes in pairs of modes that the deviations have parted or joined.
+    # The wide tolerance includes pairs of modes that the deviations have separated or merged.
     triangles = _closed_triangles(structure, lengths, NEARLY_CLOSED * gap, gap)
     poses: list[Pose] = []
     for pose_of_pairs in _poses_at(structure, triangles):
@@ -375,7 +375,7 @@ def _sought_poses(structure: Structure, lengths: np.ndarray) -> list[Pose]:
 
 
 def _starts_around(structure: Structure, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (N, 3), m, and rotations (N, 3, 3) that have the struts' lengths about right."""
+    """Return positions (N, 3), m, and rotations (N, 3, 3) with approximately the struts' lengths."""
     rotations = Rotation.random(ORIENTATIONS, random_state=0).as_matrix()
     centres = structure.base_joints - structure.platform_joints @ np.swapaxes(rotations, 1, 2)
     middle = centres.mean(axis=1)

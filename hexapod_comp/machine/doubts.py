@@ -1,4 +1,4 @@
-"""What looks wrong in a geometry file although nothing forbids it: mirrored, turned, swapped, in a wrong unit."""
+"""Suspicious entries in a geometry file that are not forbidden: mirrored, turned, swapped, in a wrong unit."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from ..core.batch import screw_twists
 if TYPE_CHECKING:
     from .geometry import HexapodGeometry
 
-COINCIDENT = 1e-6  # Bodies whose middles are nearer than this, m, say nothing of how they face each other
+COINCIDENT = 1e-6  # Bodies whose centres are nearer than this, m, have no definite direction to each other
 # Share of the struts' squared lengths, seen along the machine's axis, that another order of joints must save
 LEAST_GAIN = 0.01
-MOST_TURN = np.radians(45.0)  # Turn of the platform against the base at home beyond which it is worth a question, rad
+MOST_TURN = np.radians(45.0)  # Turn of the platform against the base at home beyond which a question is printed, rad
 USUAL_RADII = (0.01, 5.0)  # Of base and platform, m: outside, a unit may be wrong
 
 
 def doubts(geometry: HexapodGeometry) -> tuple[str, ...]:
-    """Return what is worth a second look, a sentence each, in the words of geometry files."""
+    """Return suspicious entries, a sentence each, in the terms of geometry files."""
     platform = geometry.home.position + geometry.platform_joints @ geometry.home.rotation.T
     remarks = [*joint_doubts(geometry.base_joints, platform)]
     axis = platform.mean(axis=0) - geometry.base_joints.mean(axis=0)
@@ -38,7 +38,7 @@ def doubts(geometry: HexapodGeometry) -> tuple[str, ...]:
 
 
 def joint_doubts(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
-    """Yield what looks wrong about where the joints are at home; both (6, 3), m, in ``base``."""
+    """Yield suspicious places of the joints at home; both (6, 3), m, in ``base``."""
     for name, joints in (("base", base), ("platform", platform)):
         radius = float(np.linalg.norm(joints - joints.mean(axis=0), axis=1).max())
         if not USUAL_RADII[0] <= radius <= USUAL_RADII[1]:
@@ -58,7 +58,7 @@ def _seen_along(axis: np.ndarray, joints: np.ndarray) -> np.ndarray:
 
 
 def _order(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
-    """Compare how the joints of both bodies follow each other; complex numbers, m."""
+    """Compare the order of the joints of both bodies; complex numbers, m."""
     cost = np.abs(base[:, None] - platform) ** 2
     rows, order = linear_sum_assignment(cost)
     now = float(np.trace(cost))
@@ -82,7 +82,7 @@ def _order(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
 
 
 def twist_per_lead(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> float:
-    """Return which largest share of their lead the screws are off that turn with cardan joints."""
+    """Return the largest relative deviation from the lead of the screws that turn with cardan joints."""
     neutral = np.asarray(geometry.base_cone_axes)
     across = np.cross(neutral, np.eye(3)[np.abs(neutral).argmin(axis=1)])
     across /= np.linalg.norm(across, axis=1)[:, None]

@@ -32,7 +32,7 @@ class GridField:
     lines: tuple[np.ndarray, np.ndarray, np.ndarray]
     probe: np.ndarray = term("field", "mm", "the measured point, in platform", (3,))
     outside: str = "hold"  # the value at the boundary of the box, or ``refuse``
-    # Above what the struts' backlash moves the point along an axis that is told to stand still.
+    # Above the motion that the struts' backlash causes along an axis at rest.
     reversal_threshold: float = term(
         "field", "um", "way back until an axis' direction counts as reversed", (), 10e-6, least=0.0
     )

@@ -1,4 +1,4 @@
-"""The nominal machine: where the twelve joints should be, how far everything may go, its tools, and its file."""
+"""The nominal machine: the joints' design positions, the limits, its tools, and its file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .limits import STRUT_NAMES as STRUT_NAMES
 from .limits import Limits, frozen_array
 from .load import NOTHING, Payload
 
-# Frames that every machine has: its base, and the work frame and the tool that are used unless others are named
+# Frames that every machine has: its base, and the default work frame and tool
 BASE, WORK, TOOL = "base", "work", "tool"
 MOST = 100  # Tools, and work frames, of one machine
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # They become ``frame_id`` in messages and links of a URDF
@@ -46,7 +46,7 @@ def read_pose(parent: Section, key: str, section: Section | None = None) -> Pose
 
 
 def read_tool(parent: Section, key: str, payloads: dict[str, Payload]) -> Pose:
-    """Read a tool's pose, and into the payloads what it weighs, ``mass_*`` and ``centre_*`` in ``platform``."""
+    """Read a tool's pose, and its ``mass_*`` and ``centre_*`` in ``platform`` into the payloads."""
     section = parent.section(key)
     weighs = section.quantity_key("mass", "mass") is not None
     mass = section.quantity("mass", "mass", (), None if weighs else 0.0)
@@ -79,7 +79,7 @@ def pose_text(pose: Pose) -> str:
 
 
 def refuse_names(tools: Mapping[str, Pose], work_frames: Mapping[str, Pose]) -> None:
-    """Raise where a name cannot be one, stands for something else, or is given to a tool and a work frame."""
+    """Raise if a name is invalid, belongs to another frame, or is given to both a tool and a work frame."""
     for key, named, usual in (("tools", tools, (TOOL,)), ("work_frames", work_frames, (BASE, WORK))):
         others = [name for name in named if name not in usual]
         if len(others) > MOST:
@@ -94,11 +94,11 @@ def refuse_names(tools: Mapping[str, Pose], work_frames: Mapping[str, Pose]) -> 
                 raise GeometryError(f"{key}.{name}", "is a tool and a work frame; their names must differ")
 
 
-# Factors by which joints in a wrong unit are too small, and what the number would be right as
+# Factors by which joints in a wrong unit are too small, and the correct unit
 JOINTS_TIMES = {25.4: "in inches", 1.0 / 25.4: "in mm, not inches", 10.0: "in cm", 1e3: "in m", 1e-3: "in mm, not m"}
 GEOMETRY_FORMAT = "hexapod_comp/geometry"
 GEOMETRY_VERSION = 1
-COINCIDENT = 1e-6  # Joints closer than this, m, are one
+COINCIDENT = 1e-6  # Joints closer than this, m, count as one
 LONGEST_AXIS = 1e9  # Largest component of an axis: only its direction counts, and the square of a huge one overflows
 
 
@@ -163,11 +163,11 @@ class HexapodGeometry:
     home_sign: float = field(init=False)
     """Sign of det J at home: the other sign is another assembly mode."""
     kernel_joints: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False)
-    """The joints, as the core takes them: of base and platform."""
+    """The joints, for the core: of base and platform."""
     characteristic_length: float = field(init=False)
     """RMS radius of the platform joints about their centroid, m; makes the condition number unit-free."""
     limit_numbers: Struct = field(init=False, repr=False)
-    """The limits, as the core takes them."""
+    """The limits, for the core."""
 
     def __post_init__(self) -> None:
         def put(name: str, value: object) -> None:
@@ -192,7 +192,7 @@ class HexapodGeometry:
         self._check_home(put)
 
     def _fill_axes(self, put: Callable[[str, object], None]) -> None:
-        """Normalise the joint axes and take the missing cone axes from the struts at home."""
+        """Normalise the joint axes and compute missing cone axes from the struts at home."""
         at_home = self.home.position + self.platform_joints @ self.home.rotation.T - self.base_joints
         cones = {"base_cone_axes": at_home, "platform_cone_axes": at_home @ self.home.rotation}
         for name in ("base_axes", "platform_axes", *cones):
@@ -208,7 +208,7 @@ class HexapodGeometry:
 
     @property
     def payload(self) -> Payload:
-        """What the tool in use weighs."""
+        """Mass and centre of the tool in use."""
         return self.payloads.get(self.tool_name, NOTHING)
 
     @property
@@ -238,7 +238,7 @@ class HexapodGeometry:
             raise GeometryError("home", "; ".join([f"breaks a limit: {refusal}", *doubts]))
 
     def _unit_doubts(self) -> Iterator[str]:
-        """Yield that the joints' unit may be wrong, where home would be a good pose of joints in another unit."""
+        """Yield that the joints' unit may be wrong, if home would be valid with joints in another unit."""
         fitting = []
         for factor, what in JOINTS_TIMES.items():
             base, platform = (np.ascontiguousarray(joints * factor) for joints in self.kernel_joints)
@@ -255,7 +255,7 @@ class HexapodGeometry:
     def refusal(
         self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray
     ) -> LimitError | KinematicsError | None:
-        """Return why the nominal machine may not stand in a platform pose with its strut lengths, None if it may."""
+        """Return why the nominal machine may not be in a platform pose, by its strut lengths; None if it may."""
         outcome = check_stage(*self.kernel_joints, position, rotation, lengths, limits=self.limit_numbers)
         finding, strut, value, _, _ = outcome
         return None if finding == Status.OK else self.limits.error(finding, strut, 0, value)
@@ -268,7 +268,7 @@ class HexapodGeometry:
         FrameError
             There is none of that name; lists those that there are.
         """
-        other = copy.copy(self)  # nothing else is made anew, so nothing else differs by a bit
+        other = copy.copy(self)  # nothing else is recomputed, so that nothing else changes by a bit
         for kind, name, named in (("tool", tool, self.tools), ("work", work, self.work_frames)):
             if name is None:
                 continue
@@ -280,7 +280,7 @@ class HexapodGeometry:
         return other
 
     def carrying(self, payload: Payload) -> HexapodGeometry:
-        """Return the same machine whose tool in use weighs something else."""
+        """Return the same machine with another payload of the tool in use."""
         other = copy.copy(self)
         object.__setattr__(other, "payloads", {**self.payloads, self.tool_name: payload})
         return other
@@ -369,7 +369,7 @@ def parse_geometry(text: str, name: str | Path = "geometry") -> HexapodGeometry:
 
 
 def _read_joints(top: Section) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Return base joints, platform joints and the axes that the file gives."""
+    """Return base joints, platform joints and the axes given by the file."""
     axes: dict[str, np.ndarray] = {}
     joints = {}
     if "paper_dimensions" in top:

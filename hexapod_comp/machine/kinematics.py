@@ -25,32 +25,32 @@ from ..errors import (
 from ..pose import Pose
 from .geometry import STRUT_NAMES, HexapodGeometry
 
-# Work of the calling thread, s, before others help: they take 0.1 ms to start, and some ms to end on busy cores
+# Work of the calling thread, s, before others join: they take 0.1 ms to start, and some ms to end on busy cores
 ALONE = 0.01
-# Work on a slice of a batch, s: long beside taking the next one, short beside waiting for somebody's last one
+# Work on a slice of a batch, s: long compared with fetching the next one, short compared with waiting for the last one
 SLICE = 1e-3
-FIRST_SLICE = 256  # Poses in a batch's first slice; each of the next has twice as many until one takes its time
+FIRST_SLICE = 256  # Poses in a batch's first slice; each next has twice as many until one takes this time
 
 
 @dataclass(frozen=True)
 class Structure:
-    """Where the twelve joints are: the nominal machine's, or the real one's."""
+    """Places of the twelve joints: the nominal machine's, or the real one's."""
 
     base_joints: np.ndarray  # (6, 3): joint centres in ``base`` and in ``platform``, m
     platform_joints: np.ndarray  # (6, 3): joint centres in ``base`` and in ``platform``, m
     characteristic_length: float  # Length that makes the condition number unit-free, m
     home_sign: float  # Sign of det J in the working assembly mode
     max_condition: float  # Largest condition number accepted as a solution
-    home: Pose  # ``pose_platform_in_base`` from which poses are sought when nothing better is known
+    home: Pose  # ``pose_platform_in_base`` from which the search for poses starts if there is no better guess
 
     @property
     def joints(self) -> tuple[np.ndarray, np.ndarray]:
-        """Base and platform joints, as the core takes them."""
+        """Base and platform joints, for the core."""
         return self.base_joints, self.platform_joints
 
     @property
     def solver(self) -> tuple[float, float, float]:
-        """What the forward solution is judged by, as the core takes it."""
+        """Criteria of the forward solution, for the core."""
         return self.characteristic_length, self.home_sign, self.max_condition
 
     @staticmethod
@@ -74,7 +74,7 @@ class Structure:
         )
 
 
-# Whose kinematics are asked for: the nominal machine's, or those of a structure, as :attr:`RealMachine.structure`
+# A machine, or a structure such as :attr:`RealMachine.structure`, whose kinematics are computed
 Machine: TypeAlias = "HexapodGeometry | Structure"
 
 
@@ -264,7 +264,7 @@ def _share(slices: list[slice], run: Callable[[slice], None], workers: int) -> N
             for rows in left:
                 run(rows)
         except BaseException:
-            collections.deque(left, maxlen=0)  # nobody begins with what is left
+            collections.deque(left, maxlen=0)  # the remaining slices are not started
             raise
 
     with ThreadPoolExecutor(workers - 1) as pool:
@@ -275,7 +275,7 @@ def _share(slices: list[slice], run: Callable[[slice], None], workers: int) -> N
 
 
 def forward_error(outcome: int, condition: float, max_condition: float) -> KinematicsError:
-    """Return the error that belongs to an outcome of the core other than OK."""
+    """Return the error for an outcome of the core other than OK."""
     if outcome == Status.NOT_FINITE:
         return NotFiniteError("strut lengths and guess must be finite, lengths above 0")
     if outcome == Status.UNREACHABLE:
@@ -300,7 +300,7 @@ def solve_one(
 
 
 def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose near `guess` whose lengths are closest to those asked for."""
+    """Return the pose near `guess` whose lengths are closest to the given ones."""
 
     from scipy.optimize import least_squares  # 39 MB with the next one that a running node does not need
     from scipy.spatial.transform import Rotation
@@ -339,7 +339,7 @@ def six_lengths(lengths: ArrayLike) -> np.ndarray:
 
 
 def batch_poses(positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return poses as the core takes them: contiguous, a single rotation (3, 3) for all of them spread."""
+    """Return poses for the core: contiguous; a single rotation (3, 3) is repeated."""
     positions, rotations = np.ascontiguousarray(positions, dtype=float), np.asarray(rotations, dtype=float)
     if rotations.shape == (3, 3):
         rotations = np.broadcast_to(rotations, (len(positions), 3, 3))

@@ -12,7 +12,7 @@ from ..core import Status, Struct, ffi, lib
 from ..errors import GeometryError, KinematicsError, LimitError, NotFiniteError, TooEarlyError
 from ..formats.schema import PAIRS_PER_STRUT, PER_STRUT, Numbers
 
-STRUT_NAMES = tuple(f"strut_{i}" for i in range(1, 7))  # Names of the six struts, in order, as they stand in messages
+STRUT_NAMES = tuple(f"strut_{i}" for i in range(1, 7))  # Names of the six struts, in order, for messages
 
 REASONS = tuple(ffi.string(lib.hc_reason(status)).decode() for status in range(Status.ACCELERATION + 1))
 """Names of the findings, by their number, as counted in diagnostics."""
@@ -24,7 +24,7 @@ TINY = np.finfo(float).tiny
 
 @dataclass(frozen=True)
 class Limits:
-    """What the machine may do; every check refuses, none clamps.
+    """Limits of the machine; a breach is refused, nothing is clamped.
 
     Parameters
     ----------
@@ -60,7 +60,8 @@ class Limits:
     acceleration: Annotated[float, Numbers("mm_s2")] = 0.0
     jerk: Annotated[float, Numbers("mm_s3")] = 0.0
     cone_cosines: np.ndarray = field(init=False, repr=False)
-    """Of the cones' angles, at the base and at the platform, shape (2, 6): what the angles themselves are judged by."""
+    """Cosines of the cones' angles, at the base and at the platform, shape (2, 6), for the comparison with measured
+    angles."""
 
     def __post_init__(self) -> None:
         for name, shape in (("stroke", (6, 2)), ("base_cone", (6,)), ("platform_cone", (6,))):
@@ -85,17 +86,17 @@ class Limits:
     def numbers(
         self, cone_axes: np.ndarray, apart: np.ndarray, characteristic_length: float, home_sign: float
     ) -> Struct:
-        """Return the limits as the core takes them, hc_limits; the arguments are the machine's."""
+        """Return the limits for the core, hc_limits; the arguments are the machine's."""
         given = ("stroke", "cone_cosines", "condition", "correction", "step", "clearance", "speed", "acceleration")
         values = {name: getattr(self, name) for name in given}
         machine = {"cone_axes": cone_axes, "apart": apart, "home_sign": home_sign}
         return Struct("hc_limits", values | machine | {"characteristic_length": characteristic_length})
 
     def margins(self, quantities: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Return what is left of each limit of single poses, and the values, by the limit's name."""
+        """Return the margin of each limit of single poses, and the values, by the limit's name."""
         angles, condition = np.arccos(np.clip(quantities["cosines"], -1.0, 1.0)), quantities["condition"][..., None]
         cones = np.array([self.base_cone, self.platform_cone]) - angles
-        # An angle rounds where its cosine does not: the cosine says on which side of its limit it is.
+        # An angle rounds where its cosine does not: the cosine decides on which side of its limit it is.
         cones = np.where(quantities["cosines"] >= self.cone_cosines, np.maximum(cones, 0.0), np.minimum(cones, -TINY))
         stroke = np.minimum(quantities["lengths"] - self.stroke[:, 0], self.stroke[:, 1] - quantities["lengths"])
         margins = {

@@ -1,4 +1,4 @@
-"""What the machine bends under: the struts' stiffness, the platform's and the tool's weight, gravity, other forces."""
+"""The load on the machine: the struts' stiffness, weights of platform and tool, gravity, other forces."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ if TYPE_CHECKING:
 
 STANDARD_GRAVITY = 9.80665  # m/s²
 DOWN = (0.0, 0.0, -STANDARD_GRAVITY)
-EARTH = (9.0, 10.6)  # Gravity on this planet as an accelerometer may read it, m/s²: else it is in another unit
+EARTH = (9.0, 10.6)  # Range of gravity on Earth as an accelerometer reads it, m/s²: other values are in another unit
 LARGEST_GRAVITY = 100.0  # m/s², of a virtual plant
-LEAST_STIFFNESS = 1e5  # N/m: struts softer than that are no machine tool's, and are most likely in another unit
+LEAST_STIFFNESS = 1e5  # N/m: machine tools have no softer struts; a smaller number is most likely in another unit
 LARGEST_MASS = 1e5  # kg
-MOST_LOADS = 50  # of those under which a model was measured that its file lists
-TOLERATED_MASS, TOLERATED_TILT = (0.5, 0.05), math.radians(5.0)  # kg, or a share; rad: so far a load counts as the same
+MOST_LOADS = 50  # loads of a model's measurement listed in its file
+# kg, or a share; rad: differences up to which loads count as the same
+TOLERATED_MASS, TOLERATED_TILT = (0.5, 0.05), math.radians(5.0)
 
 
 @dataclass(frozen=True)
 class Payload:
-    """What a tool weighs."""
+    """Mass of a tool."""
 
     mass: float = 0.0  # kg
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of mass, in ``platform``, m
@@ -51,9 +52,9 @@ NOTHING = Payload()
 
 
 def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Sequence[float]) -> str:
-    """Return how a load is outside those under which a model was measured; empty where it is not, or nobody knows.
+    """Return in what a load is outside those of a model's measurement; empty if it is not, or not known.
 
-    Between directions of gravity that were measured the model holds too: half of their largest gap is allowed.
+    The model also holds between measured directions of gravity: half of their largest gap is allowed.
     """
     if not loads:
         return ""
@@ -74,7 +75,7 @@ def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Se
 
 
 def check_gravity(key: str, vector: ArrayLike) -> tuple[float, float, float]:
-    """Return gravity as three numbers, m/s²; a ModelError where they are not this planet's."""
+    """Return gravity as three numbers, m/s²; a ModelError if its size is not Earth's."""
     g = np.array(vector, dtype=float)
     if g.shape != (3,) or not EARTH[0] <= np.linalg.norm(g) <= EARTH[1]:
         allowed = "three numbers, {:g}…{:g} m/s² in all".format(*EARTH)
@@ -83,26 +84,26 @@ def check_gravity(key: str, vector: ArrayLike) -> tuple[float, float, float]:
 
 
 class Loading(NamedTuple):
-    """What acts on a machine beside its own weight and the tool's."""
+    """Loads on a machine beside its own weight and the tool's."""
 
     gravity: tuple[float, float, float] | None = None  # in ``base``, m/s²; None: the model's
     wrench: tuple[float, ...] = (0.0,) * 6  # force, N, and torque about platform's origin, N m, in ``platform``
 
     @classmethod
     def of(cls, gravity: ArrayLike | None = None, wrench: ArrayLike | None = None) -> Loading:
-        """Return a loading of numbers that a caller gives, or a ModelError that says what is wrong with them."""
+        """Return a loading of a caller's numbers, or a ModelError about invalid ones."""
         w = np.zeros(6) if wrench is None else np.array(wrench, dtype=float)
         if w.shape != (6,) or not np.isfinite(w).all():
             raise ModelError("wrench", "must be six finite numbers: force, N, and torque, N m", w.tolist())
         return cls(None if gravity is None else check_gravity("gravity", gravity), tuple(w.tolist()))
 
     def numbers(self) -> list[float | None]:
-        """Return nine numbers, gravity before the wrench, None for a gravity that nobody has told."""
+        """Return nine numbers, gravity before the wrench, None if gravity is not known."""
         return [*(self.gravity or (None,) * 3), *self.wrench]
 
     @classmethod
     def from_numbers(cls, numbers: Sequence[float | None]) -> Loading:
-        """Return what :meth:`numbers` gave."""
+        """Return the loading of :meth:`numbers`."""
         given = list(numbers)
         if len(given) != 9:
             raise ModelError("loading", "must be nine numbers: gravity, force and torque", given)
@@ -110,7 +111,7 @@ class Loading(NamedTuple):
         return cls.of(None if given[0] is None else values[:3], values[3:])
 
 
-FREE = Loading()  # Nobody has told of anything
+FREE = Loading()  # No load is known
 
 
 def wrench_on_platform(
@@ -132,7 +133,7 @@ def reciprocal(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Load:
-    """How struts give under what they carry; the structure's joints and the struts' errors are those without weight."""
+    """The struts' stretch under load; the structure's joints and the struts' errors are those without weight."""
 
     stiffness: np.ndarray = term(
         "load", "N_per_um", "of a strut with both joints along its axis; 0: rigid", PER_STRUT, least=0.0, largest=1e12
@@ -153,7 +154,7 @@ class Load:
     )
     centre: np.ndarray = term("load", "mm", "its centre of mass in `platform`", (3,), largest=100.0)
     gravity: np.ndarray = term(
-        "load", "m_s2", "in `base`, where nothing else is told", (3,), np.array(DOWN), largest=EARTH[1]
+        "load", "m_s2", "in `base`, if no other is given", (3,), np.array(DOWN), largest=EARTH[1]
     )
 
     def __post_init__(self) -> None:
@@ -166,7 +167,7 @@ class Load:
 
     @property
     def compliance(self) -> np.ndarray:
-        """By how much a strut is longer for each newton that it is pulled by, m/N, shape (6,)."""
+        """Lengthening of each strut per newton of tension, m/N, shape (6,)."""
         return reciprocal(self.stiffness)
 
     @property
@@ -183,14 +184,14 @@ class Load:
 
     @classmethod
     def from_numbers(cls, numbers: Sequence[float]) -> Load:
-        """Return what :meth:`numbers` gave."""
+        """Return the loading of :meth:`numbers`."""
         if len(numbers) != 20:
             raise ModelError("load", "must be twenty numbers", list(numbers))
         n = np.array(numbers, dtype=float)
         return cls(reciprocal(n[:6]), n[6:12], float(n[12]), float(n[13]), n[14:17], n[17:])
 
     def members(self, geometry: HexapodGeometry) -> dict[str, Any]:
-        """Return what hc_load holds: platform and tool together."""
+        """Return the values of hc_load: platform and tool together."""
         tool = geometry.payload
         return {
             "bends": int(self.bends),

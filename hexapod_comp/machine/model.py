@@ -1,4 +1,4 @@
-"""The model of the real machine, run forwards (what will the tool do?) and backwards (what to command?)."""
+"""The model of the real machine, run forwards (where will the tool go?) and backwards (what to command?)."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from .terms import check_magnitudes, settle, term
 
 @dataclass(frozen=True)
 class Datum:
-    """A pose at which a calibration leaves the tool where the nominal machine has it."""
+    """A pose at which a calibration keeps the tool at its nominal place."""
 
     position: tuple[float, float, float]  # ``pose_platform_in_base``: m, and the paper's α, β, γ, rad
     angles: tuple[float, float, float]  # ``pose_platform_in_base``: m, and the paper's α, β, γ, rad
-    # In how many of the six ways to shift and turn the whole machine. Those that the readings see are not held: there
-    # the model says where the machine stands
+    # In how many of the six ways to shift and turn the whole machine. Those that the readings show are not held: there
+    # the model contains the machine's place
     held: int
 
     def __post_init__(self) -> None:
@@ -48,7 +48,7 @@ class Datum:
     @staticmethod
     def at(pose: Pose, held: int) -> Datum:
         """Return the datum at a ``pose_platform_in_base``."""
-        x, y, z = (pose.position + 0.0).tolist()  # no minus in front of zero
+        x, y, z = (pose.position + 0.0).tolist()  # no minus before zero
         alpha, beta, gamma = (pose.angles() + 0.0).tolist()
         return Datum((x, y, z), (alpha, beta, gamma), held)
 
@@ -66,19 +66,19 @@ class Datum:
 
 @dataclass(frozen=True)
 class ModelOrigin:
-    """Where a model comes from; carried by the file, not used in the arithmetic."""
+    """Origin of a model; stored in the file, not used in the arithmetic."""
 
     date: str = ""  # ISO 8601 date of the fit
     sources: tuple[tuple[str, str], ...] = ()  # Name and SHA-256 of each data file that the model was fitted to
-    # RMS tool error that the model left on data it was not fitted to, m; None when nobody measured it
+    # RMS residual tool error on data that were not used in the fit, m; None if not measured
     held_out_residual: float | None = None
     note: str = ""  # One line for people
-    # Name, beside the model file, and SHA-256 of the file that says how well the fit knows its parameters; None when
+    # Name, beside the model file, and SHA-256 of the file with the fit's posterior; None if
     # nobody says
     posterior: tuple[str, str] | None = None
-    # Where the tool is not moved, and by how much that was free to choose; None when nobody says
+    # Pose at which the tool is held, and how many ways; None if not known
     datum: Datum | None = None
-    # Under which loads it was measured, each payload, kg, its centre in platform, m, and gravity in base, m/s²; none
+    # Loads of its measurement, each payload, kg, its centre in platform, m, and gravity in base, m/s²; none
     # where nobody says
     loads: tuple[tuple[float, ...], ...] = ()
     # Of what a fit has made of the file that the model was read from; empty when it was not read
@@ -87,7 +87,7 @@ class ModelOrigin:
 
 @dataclass(frozen=True)
 class MachineModel:
-    """What the real machine does differently from its geometry file.
+    """Deviations of the real machine from its geometry file.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ class MachineModel:
 
     def at(self, outside: Mapping[str, float]) -> MachineModel:
         """Return the model of the machine at outside numbers, by their names in SI units: without table, and with its
-        error there in the field. An error of the table is the same everywhere, so the field holds it exactly."""
+        error there in the field. An error of the table is the same everywhere, so the field represents it exactly."""
         if not self.outside.names:
             return self
         error = self.outside.evaluate(outside)
@@ -163,7 +163,7 @@ class MachineModel:
 
     @property
     def measured(self) -> Region | None:
-        """Where the model was measured, or else where its field is; None where nothing tells."""
+        """Region of the model's measurement, or else of its field; None if not known."""
         if self.region is None and any(family.shape[4] for family in self.field.lines):
             return Region(self.field.box, self.field.probe)
         return self.region
@@ -172,7 +172,7 @@ class MachineModel:
 FOLLOWED = 9  # Three axes of the measured point, then six struts
 
 
-# The sense of all axes and all struts that were approached in one direction; midway: not known
+# Directions of all axes and struts approached in one direction; midway: not known
 DIRECTIONS = {"forward": 1.0, "midway": 0.0, "backward": -1.0}
 
 
@@ -186,13 +186,13 @@ class MotionState:
         self.sense = np.zeros(FOLLOWED) if sense is None else sense
 
     def copy_from(self, other: MotionState) -> None:
-        """Take over the state of another."""
+        """Copy another's state."""
         self.low[:] = other.low
         self.sense[:] = other.sense
 
 
 class RealMachine:
-    """A geometry with its model at given temperatures, ready to be run both ways.
+    """A geometry with its model at given temperatures, to be run both ways.
 
     Parameters
     ----------
@@ -240,7 +240,7 @@ class RealMachine:
     def at(
         self, temperatures: Temperatures, payload: Payload | None = None, gravity: Sequence[float] | None = None
     ) -> RealMachine:
-        """Return the same machine at other temperatures and, where they are told, under another load."""
+        """Return the same machine at other temperatures and, if given, under another load."""
         geometry = self.geometry if payload is None else self.geometry.carrying(payload)
         loading = self.loading if gravity is None else Loading.of(gravity)
         return RealMachine(geometry, self.model, temperatures, loading)
@@ -255,7 +255,7 @@ class RealMachine:
         actual_position: np.ndarray,
         actual_rotation: np.ndarray,
     ) -> tuple[int, float]:
-        """Run :meth:`forward` after a time, s, in which the struts went to their commands: without inertia at once."""
+        """Run :meth:`forward` after a time, s, in which the struts moved to their commands: without inertia at once."""
         return self.forward(commands, sense, position, rotation, actual_position, actual_rotation)
 
     @property
@@ -266,11 +266,11 @@ class RealMachine:
 
     @property
     def growth(self) -> np.ndarray:
-        """By which share each strut has grown since 20 °C and 50 % of humidity, shape (6,)."""
+        """Relative growth of each strut since 20 °C and 50 % of humidity, shape (6,)."""
         return self.state.view["growth"]
 
     def commands_for(self, target: Pose, motion: MotionState | None = None) -> tuple[np.ndarray, Pose, bool]:
-        """Return the strut commands that really bring the platform to a pose (backward run).
+        """Return the strut commands that bring the real platform to a pose (backward run).
 
         Parameters
         ----------
@@ -303,7 +303,7 @@ class RealMachine:
     def pose_for(
         self, commands: ArrayLike, sense: np.ndarray | None = None, guess: Pose | None = None
     ) -> tuple[Pose, Pose]:
-        """Return where the platform really goes under given strut commands (forward run).
+        """Return the real platform's pose under given strut commands (forward run).
 
         Parameters
         ----------
@@ -359,7 +359,7 @@ class RealMachine:
         return int(outcome[0]), float(condition[0])
 
     def forward_many(self, *arrays: np.ndarray) -> None:
-        """Run :func:`~hexapod_comp.core.batch.forwards` by several threads where that helps."""
+        """Run :func:`~hexapod_comp.core.batch.forwards` by several threads if that is faster."""
 
         def run(rows: slice) -> None:
             batch.forwards(self.state.at, *(array[rows] for array in arrays))
@@ -376,14 +376,14 @@ def core_model(geometry: HexapodGeometry, model: MachineModel) -> Struct:
 
 
 def write_temperatures(state: Struct, temperatures: Temperatures) -> None:
-    """Write readings and lags into an ``hc_state``; it must be placed then."""
+    """Write readings and lags into an ``hc_state``, which must be placed then."""
     view = state.view
     view["temperatures"] = [temperatures.at(name) for name in PARTS]
     view["humidity"] = temperatures.at(HUMIDITY)
     for index, name in enumerate(PARTS):
         lag = temperatures.lags.get(name)
         if lag is not None:
-            view["began"][index] = 0.0 if math.isnan(lag.began) else lag.began  # late parts count from then on
+            view["began"][index] = 0.0 if math.isnan(lag.began) else lag.began  # late parts are used from then on
             view["newest"][index] = lag.newest
             view["behind"][index][: len(lag.behind)] = lag.behind
 
@@ -395,7 +395,7 @@ def write_loading(state: Struct, loading: Loading) -> None:
 
 
 def members(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str] = ("", "")) -> dict[str, Any]:
-    """Return what ``hc_model`` holds."""
+    """Return the values of ``hc_model``."""
     model_texts = {"machine": model.machine, "model": model.name, "date": model.origin.date or ""}
     tool = geometry.tool
     return {
@@ -451,24 +451,24 @@ def _late(model: MachineModel) -> dict[str, Any]:
 
 
 def commanded_box(geometry: HexapodGeometry, model: MachineModel) -> np.ndarray:
-    """Return the box of level tool positions in ``work`` for which a model was measured, shape (2, 3), m."""
+    """Return the box of level tool positions in ``work`` in which a model was measured, shape (2, 3), m."""
     return measured_region(model).commanded(geometry)
 
 
 def measured_region(model: MachineModel) -> Region:
-    """Return where a model was measured."""
+    """Return the region of a model's measurement."""
     region = model.measured
     if region is None:
         raise ModelError("region", "the model tells of no box in which it was measured; give a box of tool positions")
     return region
 
 
-ROUNDS = 10  # Field and turning screws see a moved machine a little otherwise: each round leaves less than a thousandth
-SETTLED = 1e-12  # The tool is not moved when it is by less, m and rad
+ROUNDS = 10  # Field and turning screws change slightly for a moved machine: each round reduces the error a thousandfold
+SETTLED = 1e-12  # Smaller motions of the tool count as none, m and rad
 
 
 def tool_move(geometry: HexapodGeometry, model: MachineModel, pose: Pose) -> np.ndarray:
-    """Return what a machine does to its tool at a pose when the struts are told nominal lengths."""
+    """Return the tool's motion at a pose with the struts commanded to nominal lengths."""
     from scipy.spatial.transform import Rotation  # 14 MB that a running node does not need
 
     machine = RealMachine(geometry, model)

@@ -1,4 +1,4 @@
-"""Model files: the machine model as YAML, readable by people, refused when anything in it is in doubt."""
+"""Model files: the machine model as YAML, readable by people; any invalid or doubtful entry is refused."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from .terms import check_magnitude, check_magnitudes, read_terms, table_text, wr
 
 MODEL_FORMAT = "hexapod_comp/model"
 MODEL_VERSION = 1
-IDEAL = "ideal"  # What :func:`load_model` and parameters call the model of a machine without errors
+IDEAL = "ideal"  # Name of the model of a machine without errors, for :func:`load_model` and parameters
 DIRECTIONS = ("forward", "backward")  # Order of the directions of motion in a field's arrays
-# Keys of late growth, and where they stand in its array
+# Keys of late growth, and their indices in its array
 LATE: dict[str, Any] = {"late_struts": slice(0, 6), "late_base": 6, "late_platform": 7}
 WAVE, PERIOD, UM = Numbers("um", PER_STRUT), Numbers("mm", PER_STRUT), Numbers("um")
-LOOKED_AT = 33  # Points along each line of a field at which its polynomials are looked at
+LOOKED_AT = 33  # Points along each line of a field at which its polynomials are checked
 # The extended forms that every supported Python reads alike
 ISO_8601 = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d(\.\d{3}(\d{3})?)?)?(Z|[+-]\d\d:\d\d)?)?")
 SHA_256 = re.compile(r"[0-9a-f]{64}")
@@ -113,8 +113,8 @@ def text_sha256(text: str) -> str:
 
 
 def read_load(path: str | Path) -> Load:
-    """Read what is stated of struts that give under weight: a file of the format ``hexapod_comp/load``, whose keys are
-    those of a model's block ``load``."""
+    """Read the stated stiffness of struts: a file of the format ``hexapod_comp/load``, whose keys are those of a
+    model's block ``load``."""
     file = input_file(path, "load")
     top = parse_yaml(read_text(file), file, "hexapod_comp/load", 1)
     with file_errors(file):
@@ -190,7 +190,7 @@ def terms_text() -> str:
 
 
 def _refuse_cut_off(top: Section) -> None:
-    """Raise when a closed file has lost its end: every block is optional, so what is left may read well."""
+    """Raise if a file has lost its end: every block is optional, so that the rest may be valid."""
     marks = [key for key in ("closed", "end") if key in top]
     for key in marks:
         value = top.require(key)
@@ -240,7 +240,7 @@ def _read_origin(top: Section) -> ModelOrigin:
 
 
 def _check_origin(origin: ModelOrigin) -> None:
-    """Raise ModelError on a date, hash or residual that is none."""
+    """Raise ModelError on an invalid date, hash or residual."""
     try:
         if not ISO_8601.fullmatch(origin.date):
             raise ValueError
@@ -262,7 +262,7 @@ def _check_origin(origin: ModelOrigin) -> None:
 
 
 def _read_region(top: Section) -> Region | None:
-    """Return where the model was measured; ``valid_box`` of older files holds platform positions in base."""
+    """Return the region of the measurement; ``valid_box`` of older files holds platform positions in base."""
     if top.quantity_key("valid_box", "length"):
         box = top.quantity("valid_box", "length", (2, 3))
         if "region" in top:
@@ -316,7 +316,7 @@ def _read_struts(section: Section) -> dict[str, Any]:
         length_map = section.section("map")
         for key in ("knots", "values"):
             if length_map.quantity_key(key, "length") is None:
-                length_map.quantity(key, "length")  # complains that it is missing
+                length_map.quantity(key, "length")  # raises if it is missing
         values |= read_terms(StrutErrors, length_map, "struts.map")
         length_map.finish()
     return {"struts": StrutErrors(**values)}
@@ -344,7 +344,7 @@ def _read_wave(section: Section) -> dict[str, np.ndarray]:
 
 
 def _struts_block(struts: StrutErrors) -> dict[str, Any]:
-    """Return the struts' own errors, those that are not zero."""
+    """Return the struts' own errors that are not zero."""
     block = write_terms(struts, "struts")
     if struts.cosine.any() or struts.sine.any() or (struts.period != StrutErrors().period).any():
 
@@ -367,7 +367,7 @@ def _struts_block(struts: StrutErrors) -> dict[str, Any]:
 
 
 def _component(name: str) -> Numbers:
-    """Return how the polynomial of a component is written."""
+    """Return the text of a component's polynomial."""
     return Numbers("um" if name.startswith("d") else "urad", (None,))
 
 
@@ -414,7 +414,7 @@ def _family_array(section: Section, axis: str, family: dict[Line, np.ndarray], c
         return np.zeros((2, first, second, 6, 0))
     every = product(range(2), range(first), range(second))
     missing = next((line for line in every if line not in family), None)
-    if missing is not None:  # looked for before anything is allocated: node counts are the file's
+    if missing is not None:  # checked before anything is allocated, as node counts are the file's
         direction, *nodes = missing
         raise section.error("lines", f"the {DIRECTIONS[direction]} line along {axis} at {nodes} is missing")
     powers = max(coefficients.shape[1] for coefficients in family.values())
@@ -425,7 +425,7 @@ def _family_array(section: Section, axis: str, family: dict[Line, np.ndarray], c
 
 
 def _field_block(field: GridField) -> dict[str, Any]:
-    """Return the field, empty where leaving it out brings the same one back."""
+    """Return the field, empty if omitting it gives the same one when read."""
     nothing, terms = no_field(), write_terms(field, "field")
     same_grid = all(np.array_equal(ours, theirs) for ours, theirs in zip(field.grid, nothing.grid, strict=True))
     measured = any(family.shape[4] for family in field.lines)
@@ -456,7 +456,7 @@ def _family_lines(axis: str, family: np.ndarray) -> Iterator[dict[str, Any]]:
 
 
 def _check_lines(field: GridField) -> None:
-    """Refuse a field that is anywhere on one of its lines larger than any machine's."""
+    """Refuse a field that exceeds any machine's error anywhere on one of its lines."""
     for axis, family in zip("xyz", field.lines, strict=True):
         largest = np.zeros(6)
         with np.errstate(over="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""An error that goes with the outside world: a table over one or two numbers, elevation and rotation for instance."""
+"""An error that depends on outside quantities: a table over one or two numbers, elevation and rotation for instance."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from ..formats.schema import DIMENSIONS, Section, in_si, in_unit, spellings
 from .field import OUTSIDE_POLICIES
 from .terms import read_terms, settle, term, write_terms
 
-# A number that is further outside its table than this share of the table's span is no state of this machine, but in
+# A number further outside its table than this share of the table's span is not a state of this machine, but in
 # another unit: of degrees in place of radians, all above 1.97 where a table ends at 90°
 BELIEVED_BEYOND = 0.25
 ON_THE_EDGE = 1e-6  # A number that is outside by less than this share of the span is at the edge: senders round
 UNIT_NAMES = {name: size for dimension in set(DIMENSIONS.values()) for name, size in spellings(dimension).items()}
-MOST_NODES = 10_000  # A larger table is no longer a file that people read
+MOST_NODES = 10_000  # A larger table is no longer readable
 POSITION, ROTATION = ("x", "y", "z"), ("rx", "ry", "rz")
 
 
@@ -108,12 +108,12 @@ class OutsideTable:
                     raise OutsideTableError(f"{self.shown(name, value)}: {holds}", value, (axis[0], axis[-1]))
 
     def held(self, numbers: Mapping[str, float]) -> str:
-        """Return which numbers lie outside the table, so that the value at its edge counts; empty where none do."""
+        """Return the numbers that lie outside the table, where the value at its edge is used; empty if none do."""
         known = [name for name in self.names if name in numbers]
         return ", ".join(self.shown(n, numbers[n]) for n in known if self._beyond(n, numbers[n]) > ON_THE_EDGE)
 
     def missing(self, numbers: Mapping[str, float]) -> str:
-        """Return the names of numbers that are not known: until all are, the table counts for nothing."""
+        """Return the names of unknown numbers: until all are known, the table is ignored."""
         return ", ".join(name for name in self.names if name not in numbers)
 
     def numbers_of(self, typed: Mapping[str, float]) -> dict[str, float]:
@@ -146,11 +146,11 @@ class OutsideTable:
         return value
 
     def negated(self) -> OutsideTable:
-        """Return the errors of a table of corrections: what is added to a command undoes the error of other sign."""
+        """Return the errors of a table of corrections: the negative of what is added to a command."""
         return replace(self, displacement=-self.displacement, rotation=-self.rotation)
 
     def without(self, numbers: Mapping[str, float]) -> OutsideTable:
-        """Return the same table less its value at some numbers: those at which a machine was calibrated."""
+        """Return the same table minus its value at some numbers: those of the calibration."""
         error = self.evaluate(numbers)
         return replace(self, displacement=self.displacement - error[:3], rotation=self.rotation - error[3:])
 
@@ -159,7 +159,7 @@ NO_TABLE = OutsideTable()
 
 
 def unit_of(key: str) -> tuple[str, str]:
-    """Return name and unit of a key such as ``elevation_deg``; the unit is empty where it ends in none."""
+    """Return name and unit of a key such as ``elevation_deg``; the unit is empty if it has none."""
     spelt = max((name for name in UNIT_NAMES if key.endswith(f"_{name}")), key=len, default="")
     return key.removesuffix(f"_{spelt}"), spelt if spelt in DIMENSIONS else "u" + spelt[1:] if spelt else ""
 
@@ -235,7 +235,7 @@ def read_outside(section: Section) -> dict[str, Any]:
 
 
 def outside_block(table: OutsideTable) -> dict[str, Any]:
-    """Return what a model file holds of a table; empty where there is none."""
+    """Return the content of a table for a model file; empty if there is none."""
     if not table.names:
         return {}
     axes = [

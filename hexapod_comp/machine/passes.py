@@ -11,7 +11,7 @@ from ..pose import rotation_from_angles
 from .geometry import HexapodGeometry
 from .kinematics import Structure, strut_lengths_batch
 
-LEAST_SPEED = 1e-9  # Below this share of the speed of travel an axis or a strut stands still
+LEAST_SPEED = 1e-9  # Below this share of the speed of travel an axis or a strut counts as at rest
 BOTH_WAYS = (1.0, -1.0)  # Forward, backward
 
 # Positions, shape (N, 3), m, and rotations, shape (N, 3, 3), of ``pose_platform_in_base``
@@ -55,7 +55,7 @@ class Passes:
         return Passes(self.geometry, *twice, directions)
 
     def points(self, point: np.ndarray) -> np.ndarray:
-        """Return where a point of ``platform``, shape (3,), is sent, shape (N, 3), m in ``base``."""
+        """Return the commanded places of a point of ``platform``, shape (3,), shape (N, 3), m in ``base``."""
         return self.positions + self.rotations @ point
 
     def senses(self) -> np.ndarray:
@@ -76,16 +76,16 @@ class Passes:
         return strut_lengths_batch(Structure.of(self.geometry), *self.poses)
 
     def refusals(self) -> list[HexapodError | None]:
-        """Return, for each pass, why the nominal machine may not take its pose, or None."""
+        """Return, for each pass, why the nominal machine cannot reach its pose, or None."""
         lengths = self.nominal_commands()
         return [self.geometry.refusal(*pose) for pose in zip(self.positions, self.rotations, lengths, strict=True)]
 
     def reachable(self) -> np.ndarray:
-        """Return the mask, shape (N,), of the passes whose poses the nominal machine may take."""
+        """Return the mask, shape (N,), of the passes whose poses the nominal machine can reach."""
         return np.array([refusal is None for refusal in self.refusals()])
 
     def refuse_unreachable(self) -> None:
-        """Raise the error of the first pass that the nominal machine may not take."""
+        """Raise the error of the first pass that the nominal machine cannot reach."""
         for position, refusal in zip(self.positions, self.refusals(), strict=True):
             if refusal is not None:
                 refusal.args = (f"{at(position)}: {refusal}",)
@@ -93,7 +93,7 @@ class Passes:
 
 
 def at(position: np.ndarray) -> str:
-    """Say where the platform is, for messages; position (3,), m."""
+    """Describe the platform's place, for messages; position (3,), m."""
     return "platform at ({:.3f}, {:.3f}, {:.3f}) mm in base".format(*(position * 1e3))
 
 
@@ -111,7 +111,7 @@ def random_passes(
     rng: np.random.Generator,
     level: np.ndarray | None = None,
 ) -> Passes:
-    """Return passes through random points of a box of the work frame: all one way, then all back."""
+    """Return passes through random points of a box of the work frame: all in one direction, then all back."""
     positions = rng.uniform(box[0], box[1], (points, 3))
     directions = random_directions(rng, points)
     tilts = np.append(rng.uniform(-tilt, tilt, (points, 2)), np.zeros((points, 1)), axis=1)

@@ -1,13 +1,14 @@
 """Least-time straight motions between tool poses, from rest to rest, within the struts' speed, acceleration and jerk.
 
-A leg is a straight line of one point of the tool, its tip or another pivot, and the shortest turn about that point;
-s from 0 to 1 is the share of both. The struts' lengths and three derivatives by s are closed forms. Speed and
-acceleration without jerk are time-optimal path parameterisation by reachability (Pham & Pham 2018): on a grid of s the
-largest ṡ² from which the end can still be reached is found backwards, and the largest acceleration is taken forwards.
-A moving average over a time w then makes of a change of acceleration by A a jerk of A/w. How much of the limits of
-speed and acceleration the optimum may use before it is averaged (a short move has no time to reach them) is searched
-for the shortest motion; for one strut this is the optimal profile of seven phases. What remains above a limit is
-removed by running the whole motion more slowly, so that no limit is ever exceeded, whatever the search found.
+A leg is a straight line of one point of the tool, its tip or another pivot, and the shortest turn about that point; s
+from 0 to 1 is the share of both. The struts' lengths and three derivatives by s are closed forms. Speed and
+acceleration without jerk are time-optimal path parameterisation by reachability (Pham & Pham 2018): on a grid of s a
+backward pass finds the largest ṡ² from which the end can still be reached, and a forward pass uses the largest
+acceleration. A moving average over a time w then turns a change of acceleration by A into a jerk of A/w. A search finds
+the share of the limits of speed and acceleration for the optimum before it is averaged (a short move has no time to
+reach them) that gives the shortest motion; for one strut this is the optimal profile of seven phases. Any remaining
+excess over a limit is removed by running the whole motion more slowly, so that no limit is ever exceeded, whatever the
+search found.
 """
 
 from __future__ import annotations
@@ -25,23 +26,24 @@ from ..pose import Pose
 from .geometry import HexapodGeometry
 from .trajectory import SHARE_OF_LIMIT, Path
 
-# Where the machine file has no limit: times in which a strut reaches its speed, and its acceleration, s
+# If the machine file has no limit: times in which a strut reaches its speed, and its acceleration, s
 SPEED_UP, JERK_UP = 0.1, 0.02
-SECTIONS, MOST_SECTIONS = 200, 4000  # Of a leg, and of a program, between which ṡ² is linear in s
-SPREADS = (1.0, 0.3, 0.1)  # How far the search looks around the best yet, in logarithms of a share of a limit
+SECTIONS, MOST_SECTIONS = 200, 4000  # Sections of a leg, and of a program, between which ṡ² is linear in s
+SPREADS = (1.0, 0.3, 0.1)  # Range of the search around the best so far, in logarithms of a share of a limit
 CANDIDATES = 6  # Each way in one round of the search
-SLACK = 1e-4  # By which limits are kept more tightly: s is examined at the grid's times and between, not everywhere
-DELAYS = 8  # Moments at which a stop may begin to slow down, within a window of the average and again up to the end
-HALVINGS = 10  # Of the span in which the shortest slowing down from each moment is sought
-SHORTEST = 1e-3  # Share of that span below which none is sought
-LENGTHENED = (1.0, 1.01, 1.03, 1.1)  # What was found at few times is examined at all, and this many times as long
-COARSE, FINE = 24, 200  # Times of slowing down that are examined while it is sought, and in the end
+SLACK = 1e-4  # Factor by which limits are tightened: s is checked at the grid's times and between, not everywhere
+DELAYS = 8  # Times at which a stop may begin to slow down, within a window of the average and again up to the end
+HALVINGS = 10  # Divisions of the span in which the shortest stop from each time is searched for
+SHORTEST = 1e-3  # Share of that span below which the search ends
+# A solution found at few times is checked at all, and over this factor of its length
+LENGTHENED = (1.0, 1.01, 1.03, 1.1)
+COARSE, FINE = 24, 200  # Times of a stop that are checked during the search, and in the end
 HALF_TURN = 1e-6  # Within this of 180°, rad, there are two shortest turns
 
 
 @dataclass(frozen=True)
 class StrutRates:
-    """What every strut may do.
+    """Limits of every strut.
 
     Parameters
     ----------
@@ -83,7 +85,7 @@ class StrutRates:
         return StrutRates(share * min(limits.speed, limits.step * rate), share * acceleration, share * jerk)
 
     def excess(self, speed: np.ndarray, acceleration: np.ndarray, jerk: np.ndarray) -> np.ndarray:
-        """Return how many times slower a motion must run to keep the rates: largest over the last two axes."""
+        """Return the factor by which a motion must be slowed to keep the rates: largest over the last two axes."""
         most = [np.abs(values).max(axis=(-2, -1)) for values in (speed, acceleration, jerk)]
         roots = most[0] / self.speed, (most[1] / self.acceleration) ** 0.5, (most[2] / self.jerk) ** (1.0 / 3.0)
         return np.max(roots, axis=0)
@@ -131,7 +133,7 @@ class Leg:
 
 
 class Course:
-    """The way of a program: a smooth curve through tool poses, with s the share of the program's own time."""
+    """The path of a program: a smooth curve through tool poses, with s the share of the program's own time."""
 
     def __init__(self, geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequence[float]) -> None:
         shares = (np.asarray(times, dtype=float) - times[0]) / (times[-1] - times[0])
@@ -165,7 +167,7 @@ def time_optimal(
 ) -> np.ndarray:
     """Return ṡ², (N + 1, C), on N equal sections of s from rest to rest, for C pairs of limits.
 
-    q1 and q2, (N + 1, 6), are the struts' derivatives by s. Each section's acceleration is held against the limits
+    q1 and q2, (N + 1, 6), are the struts' derivatives by s. Each section's acceleration is checked against the limits
     at both its ends; ṡ is nowhere above `fastest`.
     """
     sections = len(q1) - 1
@@ -177,7 +179,7 @@ def time_optimal(
     most = acceleration / a[:, :, None]
     highest = np.minimum(speed / np.maximum(np.abs(q1), 1e-300).max(axis=1)[:, None], fastest) ** 2
     with np.errstate(divide="ignore", over="ignore"):
-        for i in range(a.shape[1]):  # Where the upper limit of one strut meets the lower one of another
+        for i in range(a.shape[1]):  # Intersections of one strut's upper limit with another's lower one
             fall = slope[:, [i]] - slope
             meet = np.where(fall > 0.0, (most[:, [i]] + most) / np.maximum(fall, 1e-300), np.inf)
             np.minimum(highest[:-1], meet.min(axis=1), out=highest[:-1])
@@ -242,7 +244,7 @@ class Profile:
         return np.clip(share, 0.0, 1.0), speed / self.slowed, bend / self.slowed**2, jerk / self.slowed**3
 
     def breaks(self) -> np.ndarray:
-        """Return the moments just after and before which a derivative jumps, and those halfway between."""
+        """Return the times just after and before which a derivative jumps, and those halfway between."""
         edges = np.unique(np.concatenate([self.times, self.times + self.window] if self.window else [self.times]))
         near = 1e-9 * edges[-1]
         return (
@@ -287,7 +289,7 @@ class Motion:
         return self.leg.poses(self.profile.at(np.asarray(times, dtype=float))[0])
 
     def sample(self, rate: float) -> Path:
-        """Return the poses to send at a rate, Hz, start and end included; the last period may be cut short."""
+        """Return the poses to send at a rate, Hz, start and end included; the last period may be shorter."""
         return Path(*self.at(_ticks(self.duration, rate)), rate)
 
     def stop(self, now: float, rate: float) -> Path:
@@ -307,7 +309,7 @@ class Motion:
             np.concatenate([np.linspace(0.0, window, DELAYS // 2 + 1), np.linspace(0.0, left, DELAYS, endpoint=False)])
         )
         delays = delays[delays < left]
-        # The struts' derivatives by time, taken once: what any slowing down makes of them is sums and products
+        # The struts' derivatives by time, computed once: those of any slowed motion are sums and products of them
         moments = now + left * np.linspace(0.0, 1.0, SECTIONS + 1)
         known = strut_motion(self.leg, *self.profile.at(moments))
         shares = np.linspace(0.0, 1.0, COARSE)
@@ -333,7 +335,7 @@ class Motion:
         return to_its_end
 
     def _kept(self, now: float, delay: float, length: float) -> bool:
-        """Return whether the rates are kept when slowing begins after the delay, s, and is done `length` later."""
+        """Return whether the rates are kept when slowing begins after the delay, s, and is finished `length` later."""
         shares = np.linspace(0.0, 1.0, FINE)
         edges = self.profile.breaks() - now - delay
         edges = edges[(edges > 0.0) & (edges < length / 2.0)]
@@ -361,7 +363,7 @@ def _ticks(duration: float, rate: float) -> np.ndarray:
 def _slowing(
     since: np.ndarray, delay: float | np.ndarray, length: float | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the time gone by of a motion whose clock halts, and that clock's rate with two derivatives."""
+    """Return the time passed of a motion whose clock halts, and that clock's rate with two derivatives."""
     x = np.clip((since - delay) / length, 0.0, 1.0)
     gone = np.minimum(since, delay) + length * (x - x**3 + x**4 / 2.0)
     inside = (since >= delay).astype(float)
@@ -378,7 +380,7 @@ def plan_motion(
     """Return the least-time motions through tool poses, with a rest at each.
 
     Between two poses the pivot goes straight and the tool turns the shortest way about it. Neither strokes nor joints
-    are looked at: :func:`hexapod_comp.check` does that, with the mode ``stream``, on what is to be sent.
+    are checked: use :func:`hexapod_comp.check`, with the mode ``stream``, on the poses to send.
 
     Parameters
     ----------
@@ -442,7 +444,7 @@ def _fastest(leg: Leg | Course, rates: StrutRates, sections: int = SECTIONS, fas
     if not np.isfinite(rates.jerk):
         square = time_optimal(q1, q2, np.array([rates.speed]), np.array([rates.acceleration]), fastest)
         return _kept_within(leg, Profile.of(square[:, 0], 0.0), rates, fastest)
-    # Seven phases of the strut that goes farthest, as if its length were linear in s: where the search begins
+    # Seven phases of the strut that moves furthest, as if its length were linear in s: the start of the search
     way = largest
     acceleration = min(
         rates.acceleration, (rates.jerk**2 * way / 2.0) ** (1.0 / 3.0), (rates.speed * rates.jerk) ** 0.5

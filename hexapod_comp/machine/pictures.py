@@ -64,14 +64,14 @@ def _bodies(axes: Any, base: np.ndarray, platform: np.ndarray, labels: bool = Tr
 
 
 def _labels(axes: Any, joints: np.ndarray, letter: str, style: dict[str, str], place: Any) -> None:
-    """Write the numbers of joints, those that lie in one place together."""
+    """Write the numbers of joints, those at the same place together."""
     for joint in np.unique(joints.round(6), axis=0):
         here = np.flatnonzero(np.abs(joints - joint).max(axis=1) < 1e-3) + 1
         axes.text(*place(joint), " = ".join(f"${letter}_{i}$" for i in here), ha="center", **style)
 
 
 def _frames(geometry: HexapodGeometry) -> dict[str, Pose]:
-    """Return the frames worth drawing, by name, seen from ``base``."""
+    """Return the frames to draw, by name, relative to ``base``."""
     frames = {"base": Pose.identity(), "platform": geometry.home}
     offsets = ("tool", geometry.home, geometry.tool), ("work", frames["base"], geometry.work)
     for name, outer, inner in offsets:
@@ -81,7 +81,7 @@ def _frames(geometry: HexapodGeometry) -> dict[str, Pose]:
 
 
 def _frame(axes: Any, name: str, pose: Pose, length: float) -> None:
-    """Draw the axes of a frame, so many mm long, and its name on 3-D axes."""
+    """Draw the axes of a frame, of this length in mm, and its name on 3-D axes."""
     origin = pose.position * 1e3
     for axis, colour, letter in zip(pose.rotation.T, AXIS_COLOURS, "xyz", strict=True):
         tip = origin + length * axis

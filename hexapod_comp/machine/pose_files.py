@@ -17,10 +17,10 @@ ANGLE_COLUMNS = ("alpha", "beta", "gamma")
 QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
 LENGTH_COLUMNS = tuple(f"L{i}" for i in range(1, 7))
 
-# What `ik --model` says of the tool's error, each for x, y, z and rx, ry, rz
+# The tool's errors of `ik --model`, each for x, y, z and rx, ry, rz
 PREDICTED_ERRORS = tuple(f"{error}_{{}}{known}" for error in ("error", "error_aligned") for known in ("", "_sd"))
 
-# What `ik --model` and `ik --line` add to lengths, and :func:`read_lengths` passes over: columns and their dimension
+# Columns that `ik --model` and `ik --line` add to lengths and :func:`read_lengths` ignores, with their dimension
 BESIDE_LENGTHS = {
     tuple(f"nominal_{name}" for name in LENGTH_COLUMNS): "length",
     tuple(f"correction_{name}" for name in LENGTH_COLUMNS): "length",
@@ -33,7 +33,7 @@ BESIDE_LENGTHS = {
 
 
 def read_poses(path: str | Path) -> tuple[list[Row], list[Pose]]:
-    """Read poses from a CSV file; the name of a shipped one, as ``table1.csv``, or ``-`` for standard input will do.
+    """Read poses from a CSV file; ``table1.csv`` or another shipped name, or ``-`` for standard input.
 
     Columns: ``x_mm``, ``y_mm``, ``z_mm`` (or ``_m``, ``_um``, ``_in``); optionally ``alpha_deg``,
     ``beta_deg``, ``gamma_deg`` (the paper's angles; or ``_rad``, …) or ``qx``, ``qy``, ``qz``, ``qw``;
@@ -82,7 +82,7 @@ def poses_of(table: Table) -> tuple[np.ndarray, np.ndarray]:
             Pose.from_quaternion(np.zeros(3), quaternions[row])
         except PoseError as error:
             raise InputFileError(table.path, f"line {table.rows[row][0]}, columns qx…qw", str(error)) from error
-    from scipy.spatial.transform import Rotation  # 27 MB that a node, which reads other tables, does without
+    from scipy.spatial.transform import Rotation  # 27 MB that a node, which reads other tables, does not need
 
     return positions, Rotation.from_quat(quaternions).as_matrix()
 

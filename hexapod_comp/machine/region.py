@@ -1,4 +1,4 @@
-"""Where a model was measured."""
+"""The region in which a model was measured."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..pose import Pose
 from .geometry import HexapodGeometry
 from .terms import settle, term
 
-ON_THE_FACE = 1e-9  # A place that is further outside, m, is outside: files keep a picometre
+ON_THE_FACE = 1e-9  # Places further outside than this, m, are outside: files keep a picometre
 PARALLEL = 1e-9  # Directions whose components differ by less are parallel
 
 
@@ -45,7 +45,7 @@ class Region:
         settle(self)
 
     def contains(self, positions: np.ndarray, rotations: np.ndarray, slack: float = ON_THE_FACE) -> np.ndarray:
-        """Return whether the point is in the box, or out of it by no more than `slack`, m, at platform poses, (N,)."""
+        """Return whether the point is in the box, or outside by no more than `slack`, m, at platform poses, (N,)."""
         places = (positions + rotations @ self.point - self.frame.position) @ self.frame.rotation
         return ((places >= self.box[0] - slack) & (places <= self.box[1] + slack)).all(axis=-1)
 
@@ -67,7 +67,7 @@ class Region:
         return np.array([centre - inside, centre + inside])
 
     def text(self, geometry: HexapodGeometry) -> str:
-        """Return the box for people: of level tool positions in ``work``."""
+        """Return the box as text: of level tool positions in ``work``."""
         box = self.commanded(geometry).round(9) * 1e3
         low, high = (", ".join(f"{v:g}" for v in corner) for corner in box)
         sides = " × ".join(f"{side:.4g}" for side in np.ptp(box, axis=0))
@@ -75,12 +75,12 @@ class Region:
 
 
 def region_text(region: Region | None, geometry: HexapodGeometry) -> str:
-    """Return where a model was measured, for people; of models that do not tell, too."""
+    """Return the region of a model's measurement as text; also if it is not known."""
     return "measured box: none" if region is None else f"measured box: {region.text(geometry)}"
 
 
 def region_json(region: Region | None, geometry: HexapodGeometry) -> dict[str, Any] | None:
-    """Return where a model was measured as plain numbers; units are in the keys."""
+    """Return the region of a model's measurement as plain numbers; units are in the keys."""
     if region is None:
         return None
     return {"tool_in_work_m": region.commanded(geometry), "measured_point_in_platform_m": region.point}

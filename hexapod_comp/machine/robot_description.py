@@ -1,7 +1,7 @@
-"""The machine as robot programs describe one: URDF for robot_state_publisher and ros2_control, MJCF for MuJoCo.
+"""Descriptions of the machine for robot programs: URDF for robot_state_publisher and ros2_control, MJCF for MuJoCo.
 
-URDF holds trees alone, and a hexapod has closed loops. So the tree has seven branches: the platform, on six joints that
-give its pose, and six struts, each on two crossed hinges at its base joint and with a slide whose position is its
+URDF describes trees only, and a hexapod has closed loops. So the tree has seven branches: the platform, on six joints
+that give its pose, and six struts, each on two crossed hinges at its base joint and with a slide whose position is its
 length. :func:`joint_positions` gives all of them for one pose, so that each strut ends where its platform joint is.
 MJCF closes the loops by constraints.
 """
@@ -23,22 +23,22 @@ PLATFORM_JOINTS = ("platform_x", "platform_y", "platform_z", "platform_beta", "p
 
 _AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 0], [1, 0, 0], [0, 0, 1]], dtype=float)
 
-STRUT_RADIUS, JOINT_RADIUS, PLATE = 0.01, 0.018, 0.01  # What is drawn, m: struts, joints, and the platform's thickness
+STRUT_RADIUS, JOINT_RADIUS, PLATE = 0.01, 0.018, 0.01  # Drawn sizes, m: struts, joints, and the platform's thickness
 
 HARDWARE = (
     ("joint_commands_topic", "strut_setpoints"),
     ("joint_states_topic", "nominal_strut_states"),
     ("trigger_joint_command_threshold", "-1"),
 )
-"""Parameters of ros2_control's JointStateTopicSystem; by the last one commands near the readings are sent too."""
+"""Parameters of ros2_control's JointStateTopicSystem; the last one makes it send commands near the readings too."""
 
 STEEL = 7850.0
-"""Density of what is drawn, kg/m³, in MJCF; a machine file has no masses. A platform of 0.35 m weighs 7 kg."""
+"""Density of the drawn bodies, kg/m³, in MJCF; a machine file has no masses. A platform of 0.35 m weighs 7 kg."""
 
 SCREW_INERTIA, HINGE_INERTIA = 200.0, 0.01
 """Armature of a strut's slide, kg, 1.3e-4 kg m² turning on a screw of 5 mm lead; and of a hinge at its foot, kg m².
 
-What weighs little and is driven stiffly needs short steps: the armature makes the slides inert without any weight.
+Light bodies with stiff drives need short steps: the armature gives the slides inertia without weight.
 """
 
 STIFFNESS, DAMPING = 1e8, 2.8e5
@@ -47,13 +47,14 @@ STIFFNESS, DAMPING = 1e8, 2.8e5
 FASTEST = 1.0
 """Speed, m/s, to which the damping holds a strut under its drive's largest force, where the machine's limit is higher.
 
-Without a limit of force, a `ctrl` that nobody has set, 0, would throw the platform.
+Without a limit of force, a `ctrl` that was not set, 0, would throw the platform.
 """
 
 TIMESTEP, TIED = 1e-3, {"solref": "0.002 1", "solimp": "0.9999 0.9999 0.001"}
-"""MuJoCo's step, s; struts' ends are tied as fast as that allows (two steps), and gravity parts them by 0.1 µm."""
+"""MuJoCo's step, s; struts' ends are tied as stiffly as that allows (two steps), and gravity separates them by 0.1
+µm."""
 
-LOOSE = 1e3  # Limit of effort and speed of joints that no motor moves; readers of URDF want one
+LOOSE = 1e3  # Limit of effort and speed of joints without motor; readers of URDF require one
 
 
 def joint_positions(
@@ -98,7 +99,7 @@ def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
     """
     root = ET.Element("mujoco", model=geometry.name)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
-    # Damping is integrated implicitly: explicit steps would have to be shorter than what a light body takes to settle.
+    # Damping is integrated implicitly: explicit steps would have to be shorter than a light body's settling time.
     ET.SubElement(root, "option", integrator="implicitfast", timestep=_number(TIMESTEP))
     default = ET.SubElement(root, "default")
     # Struts begin and end inside each other's joints and the plate: nothing collides.
@@ -146,7 +147,7 @@ def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
 
 
 def foot_frames(geometry: HexapodGeometry) -> np.ndarray:
-    """Return a frame at each base joint, (6, 3, 3), its z along the strut at home: far from where hinges lock."""
+    """Return a frame at each base joint, (6, 3, 3), its z along the strut at home: far from the hinges' singularity."""
     home = geometry.home
     along = home.position + geometry.platform_joints @ home.rotation.T - geometry.base_joints
     z = along / np.linalg.norm(along, axis=1)[:, None]
@@ -192,7 +193,7 @@ def _strut(robot: ET.Element, geometry: HexapodGeometry, n: int, name: str) -> N
 def _control(robot: ET.Element, joint_names: Sequence[str]) -> None:
     """Add ros2_control's block: the struts' positions, through topics.
 
-    The hardware ends at a reading with velocities, which ours have, unless each joint has a state for them.
+    The hardware exits at a reading with velocities, which ours have, unless each joint has a state for them.
     """
     control = ET.SubElement(robot, "ros2_control", name=robot.get("name", ""), type="system")
     system = ET.SubElement(control, "hardware")
@@ -206,7 +207,7 @@ def _control(robot: ET.Element, joint_names: Sequence[str]) -> None:
             ET.SubElement(joint, "state_interface", name=state)
 
 
-Shape = tuple[str, dict[str, str], np.ndarray]  # Kind, sizes and middle of what is drawn
+Shape = tuple[str, dict[str, str], np.ndarray]  # Kind, sizes and centre of the drawn bodies
 
 
 def _ball(middle: np.ndarray) -> Shape:

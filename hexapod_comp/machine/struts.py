@@ -1,4 +1,4 @@
-"""What a real strut does with its command: offset, pitch, screw waves, length map, backlash, growth, rotation."""
+"""A real strut's response to its command: offset, pitch, screw waves, length map, backlash, growth, rotation."""
 
 from __future__ import annotations
 

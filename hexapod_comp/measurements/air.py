@@ -1,4 +1,4 @@
-"""What the air does to a laser's length."""
+"""The effect of air on a laser's length."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from ..errors import ModelError
 
 Values: TypeAlias = "float | np.ndarray"  # one number, or one a reading
 
-# Vacuum wavelength of a helium-neon laser, m. The index moves by 1·10⁻¹² per 0.1 pm: any He-Ne will do.
+# Vacuum wavelength of a helium-neon laser, m. The index changes by 1·10⁻¹² per 0.1 pm: any He-Ne laser has it.
 VACUUM_WAVELENGTH = 632.9908e-9
 USUAL_CO2_PPM = 450.0  # CO₂ in the air of a workshop, 10⁻⁶; 100 more raise n by 1.5·10⁻⁸
 ZERO_CELSIUS = 273.15  # 0 °C in K
-# Lowest and highest of what is taken for the air of a workshop: where Ciddor's equation holds, above ice
+# Lowest and highest values of the air of a workshop: the range of Ciddor's equation, above ice
 AIR_RANGES = {
     "temperature": (0.0, 60.0, "0…60 °C"),
     "pressure": (50e3, 120e3, "50…120 kPa, given in Pa"),
@@ -32,7 +32,7 @@ class Air:
     """State of the air along a laser's beam, for one reading or for many."""
 
     temperature: Values  # °C
-    pressure: Values  # as the barometer on the spot shows it, not reduced to sea level, Pa
+    pressure: Values  # pressure at the place, not reduced to sea level, Pa
     humidity: Values  # relative, as a fraction 0…1
 
     def __post_init__(self) -> None:
@@ -103,6 +103,6 @@ def _molar_density(pressure: Values, temperature: Values, vapour: Values) -> Val
 
 
 def correct_displacement(raw: Values, air: Air, assumed_index: Values = 1.0) -> np.ndarray:
-    """Return the displacement L that an interferometer measured, from what it showed."""
+    """Return the displacement L that an interferometer measured, from its displayed value."""
     _check_range("assumed index", assumed_index, 1.0, LARGEST_INDEX, f"1…{LARGEST_INDEX:g}")
     return np.asarray(raw) * (assumed_index / ciddor_index(air))

@@ -1,4 +1,4 @@
-"""What to measure: the lines, diagonals and poses of a calibration campaign, and the instruments used on them."""
+"""Campaigns: the lines, diagonals and poses to measure for a calibration, and their instruments."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ CAMPAIGN_FORMAT = "hexapod_comp/campaign"
 CAMPAIGN_VERSION = 1
 # Lasers on grid lines: linear only; with two straightnesses, pitch and yaw; with roll as well
 INSTRUMENTS = ("1-D", "5-D", "6-D")
-# What reads a line: a linear laser; straightness, or pitch and yaw, with their optics; all of these; and roll. Along a
-# line that is not parallel to an axis of the work frame the last two read its length alone.
+# Instruments for a line: a linear laser; straightness, or pitch and yaw, with their optics; all of these; and roll.
+# Along a line that is not parallel to an axis of the work frame the last two read its length alone.
 LINE_INSTRUMENTS = ("linear", "straightness", "rotation", "5-D", "6-D")
-# What reads scattered poses: a tracker's position alone, and with the attitude
+# Instruments for scattered poses: a tracker's position alone, and with the attitude
 POSE_INSTRUMENTS = ("tracker", "tracker_6d")
-# What reads a length from a centre: a telescoping ball bar, there and back; a tracking interferometer; a probe that
-# touches spheres
+# Instruments for a length from a centre: a telescoping ball bar, in both directions; a tracking interferometer; a probe
+# that touches spheres
 LENGTH_INSTRUMENTS = ("ball_bar", "station", "probe")
-# What reads where the tool's ball is beside three sensors, while the tool tilts about it
+# Instrument for the place of the tool's ball beside three sensors, while the tool tilts about it
 BALL_INSTRUMENTS = ("r_test",)
 LISTED_INSTRUMENTS = (*LINE_INSTRUMENTS, *POSE_INSTRUMENTS, *LENGTH_INSTRUMENTS, *BALL_INSTRUMENTS)
 # Planes of circles, in the work frame: a circle goes from the first axis to the second
@@ -55,11 +55,11 @@ MOST_POINTS = 10_000  # of one run
 # Larger campaigns are refused: at one reading a second this one takes six days, and a unit may be wrong
 MOST_READINGS = 500_000
 DIAGONALS = (0, 4, 16)  # none, the box's four body diagonals, or these and the two diagonals of each of its six faces
-# How many cells the longest edge of a machine's own box has, and how many steps a cell, where a file does not say
+# Number of cells of the longest edge of a machine's own box, and of steps a cell, if a file does not give them
 CELLS_OF_A_BOX, STEPS_OF_A_CELL = 4, 4
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # points that turn by it are spread evenly: neighbours are never alike
 
-# Gives a machine's own box, (2, 3), m in the work frame, and the tool's attitude there, (3, 3)
+# Returns a machine's own box, (2, 3), m in the work frame, and the tool's attitude there, (3, 3)
 OwnBox = Callable[[], tuple[np.ndarray, np.ndarray]]
 
 
@@ -72,13 +72,13 @@ class CampaignRun:
 
     name: str
     instrument: str  # one of LISTED_INSTRUMENTS
-    # pose_tool_in_work, (n, 3), m, and (n, 3, 3). Those of a line stand on it, equally turned, from its start to its
-    # end; they are passed there and back, and so are those of a ball bar.
+    # pose_tool_in_work, (n, 3), m, and (n, 3, 3). Those of a line lie on it, with the same attitude, from its start to
+    # its end; they are passed there and back, and so are those of a ball bar.
     positions: np.ndarray
     rotations: np.ndarray
-    centres: np.ndarray | None = None  # from where lengths are read, (n, 3), in the work frame, m
-    known_zero: bool = False  # the lengths are known as a whole
-    alternate: bool = False  # a line's places are read once: every second one on the way there, the others back
+    centres: np.ndarray | None = None  # points from which lengths are read, (n, 3), in the work frame, m
+    known_zero: bool = False  # the lengths are calibrated
+    alternate: bool = False  # a line's places are read once, in alternating directions
     slope: str = ""  # the square whose slope its straightness shares with other runs
 
     def __post_init__(self) -> None:
@@ -113,7 +113,7 @@ class CampaignRun:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """What is read at each point."""
+        """Channels read at each point."""
         if self.instrument in LENGTH_INSTRUMENTS:
             return ("length",)
         if self.instrument in BALL_INSTRUMENTS:
@@ -128,7 +128,7 @@ class CampaignRun:
         return len(self.positions) * len(self.channels) * self._passes(cycles) // (1 + self.alternate)
 
     def _passes(self, cycles: int) -> int:
-        """Return how often the poses are passed: a tracker's once, a line and a circle there and back."""
+        """Return how often the poses are passed: a tracker's once, a line and a circle in both directions."""
         if self.instrument in POSE_INSTRUMENTS:
             return 1
         return (2 if self.is_line or self.instrument == "ball_bar" else 1) * cycles
@@ -167,7 +167,7 @@ class CampaignRun:
 
 
 def line_channels(instrument: str, axis: int | None) -> tuple[str, ...]:
-    """Return what an instrument reads on a line along an axis of the work frame (None: along none of them)."""
+    """Return the channels of an instrument on a line along an axis of the work frame (None: along none of them)."""
     if axis is None or instrument in ("1-D", "linear"):
         return ("linear",)
     straight, turning = (tuple(f"{kind}_{AXES[a]}" for a in CROSS_AXES[axis]) for kind in ("straightness", "rotation"))
@@ -221,7 +221,7 @@ def line_readings(
                     yield Reading(name, cycle, direction, pose, channel, 0.0)
 
 
-# The entries of a campaign file, by what they list: each makes a run of itself.
+# The entries of a campaign file, each of which makes a run.
 
 Angles = Annotated[np.ndarray, Numbers("deg", (3,))]
 Zero = Annotated[str, Choice("known", "unknown")]
@@ -322,7 +322,7 @@ class PosesEntry:
         return CampaignRun(name, instrument, self.poses, rotation_from_angles(angles), centres, self.zero == "known")
 
 
-# What an instrument's entry lists where it lists no poses
+# Short forms of an instrument's entry, if it lists no poses
 SHORT_FORMS: dict[str, Any] = {"ball_bar": CircleEntry, "probe": SphereEntry, "r_test": TiltsEntry}
 
 
@@ -350,7 +350,7 @@ def read_runs(top: Section) -> tuple[CampaignRun, ...]:
 
 @dataclass(frozen=True)
 class Campaign:
-    """A calibration campaign on a box of commanded tool positions; ModelError where there can be no such one."""
+    """A calibration campaign on a box of commanded tool positions; ModelError if it is impossible."""
 
     box: Annotated[np.ndarray, Numbers("mm", (2, 3))]  # lowest and highest corner in the work frame, m
     cell: Annotated[float, Numbers("mm")]  # distance of the grid's lines, m
@@ -365,7 +365,7 @@ class Campaign:
     centre_off: Annotated[float, Numbers("mm")] = 0.3e-3  # 1 σ of a centre of lengths beside its place, each axis, m
     repeatability: Annotated[float, Numbers("um")] = 0.0  # 1 σ of where the machine really stops, each axis, m
     level: np.ndarray = field(default_factory=lambda: np.eye(3))  # tool in the work frame; scattered poses tilt from it
-    runs: tuple[CampaignRun, ...] = ()  # one by one, in measuring order, after all others
+    runs: tuple[CampaignRun, ...] = ()  # listed one by one, in measuring order, after all others
 
     def __post_init__(self) -> None:
         box = np.array(self.box, dtype=float)
@@ -398,7 +398,7 @@ class Campaign:
             raise ModelError("cell, step, cycles, poses, runs", problem)
 
     def _roughly(self) -> float:
-        """Return about how many readings the campaign takes, without making any."""
+        """Return the approximate number of the campaign's readings, without making any."""
         sides = np.ptp(self.box, axis=0)
         cells, passes = sides / self.cell + 1.0, 2.0 * self.cycles * (sides / self.step + 1.0)
         of_lines = cells.prod() * (passes / cells).sum() * len(self.channels(0)) if self.instrument else 0.0
@@ -408,17 +408,17 @@ class Campaign:
 
     @property
     def stops(self) -> float:
-        """How far the tool stops beside its usual place, RMS over all three axes, m."""
+        """Scatter of the tool's stops, RMS over all three axes, m."""
         return math.sqrt(3.0) * self.repeatability
 
     def nodes(self, axis: int) -> np.ndarray:
-        """Return where the grid's lines stand along an axis, m; the last cell may be narrower."""
+        """Return the coordinates of the grid's lines along an axis, m; the last cell may be narrower."""
         low, high = self.box[:, axis]
         inner = np.arange(low, high - 1e-3 * self.cell, self.cell)
         return np.append(inner, high)
 
     def channels(self, axis: int) -> tuple[str, ...]:
-        """Return what is read on a grid line along an axis."""
+        """Return the channels on a grid line along an axis."""
         return line_channels(self.instrument or "1-D", axis)
 
 
@@ -442,7 +442,7 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
 
 
 def _grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> dict[str, Any]:
-    """Return box, the tool's attitude in it, and the distances of lines and of readings, where the file has none."""
+    """Return box, the tool's attitude in it, and the distances of lines and of readings, if the file has none."""
     mm, given = Numbers("mm"), dict[str, Any]()
     if own_box is None or top.quantity_key("box", "length") is not None:
         given["box"] = top.quantity("box", "length", (2, 3))
@@ -458,7 +458,7 @@ def _grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> dict[str, A
 
 
 def campaign_text(campaign: Campaign, remarks: Sequence[str] = ()) -> str:
-    """Return the file (YAML) of a campaign all of whose readings are its runs', with remarks as comments on top."""
+    """Return the file (YAML) of a campaign all of whose readings are its runs', with comments at the top."""
     content = {"format": CAMPAIGN_FORMAT, "version": CAMPAIGN_VERSION, "box_mm": in_unit(campaign.box, "mm")}
     content["cycles"] = campaign.cycles
     units = ["urad" if kind in ANGULAR_KINDS else "um" for kind in KINDS]

@@ -1,4 +1,4 @@
-"""Collecting a campaign's readings on a running machine, from station to station, into a file that is always whole.
+"""Collecting a campaign's readings on a running machine, from station to station, into a file that is always complete.
 
 The machine is whatever can be sent to a pose and watched there by an instrument: one that reads poses of the tool, a
 tracker or motion capture, or one that reads single channels, a laser on a line or a ball bar. What they read is written
@@ -42,7 +42,7 @@ from .tidy import tidy_readings, write_measurements
 
 __all__ = ["Collected", "InstrumentMachine", "MeasuredMachine", "Observation", "RunSetUp", "SetUpError", "collect"]
 
-SAVE_EVERY = 5.0  # The file is written anew after this long, s, and at the end of each run: no more is lost than that
+SAVE_EVERY = 5.0  # Period at which the file is rewritten, s, also at the end of each run
 OVERRUN = 2e-3  # A pass over a line begins this far before it, m, so that every strut arrives in the pass's direction
 MOVED = 2.0 * LARGEST_ERROR  # Frames from two sets of stations differ by less, m, if the tracker stood
 BROKEN = "a broken beam"
@@ -51,7 +51,7 @@ OPEN = "open"  # in place of the frame while too little was measured to know it
 
 
 class Observation(NamedTuple):
-    """What was seen of a machine at rest."""
+    """A reading of a machine at rest."""
 
     pose: Pose | None  # ``pose_tool_in_base``, or in the tracker's frame, averaged; None: no instrument of poses
     uncertainty: np.ndarray  # (6,) its standard deviation along and about the axes of ``base``, m and rad; NaN: unknown
@@ -73,13 +73,13 @@ class RunSetUp(NamedTuple):
 
 
 class MeasuredMachine(Protocol):
-    """A machine that goes to poses, with an instrument that watches its tool."""
+    """A machine that moves to poses, with an instrument that measures its tool."""
 
     def move(self, pose: Pose) -> object:
         """Move the tool to ``pose_tool_in_work`` and return when it has settled; a HexapodError where it cannot."""
 
     def observe(self) -> Observation | None:
-        """Return what the instrument reads; None while it reads nothing, as with a broken beam."""
+        """Return the instrument's reading; None if it reads nothing, as with a broken beam."""
 
 
 @runtime_checkable
@@ -91,7 +91,7 @@ class InstrumentMachine(MeasuredMachine, Protocol):
 
 
 class Visit(NamedTuple):
-    """One stop: all channels that are read at a station in one pass of a run."""
+    """One stop: all channels read at a station in one pass of a run."""
 
     run: str
     cycle: int
@@ -112,7 +112,7 @@ class Collected:
     """What :func:`collect` leaves."""
 
     measurements: MeasurementSet
-    resumed: int  # stops that the file had already
+    resumed: int  # number of stops that the file had already
     missing: tuple[str, ...]  # stops at which the instrument read nothing
 
 
@@ -367,7 +367,7 @@ class _Collecting:
             self.missing.append(visit.where)
             return
         if not self.poses.plausible(self._geometry.work @ visit.pose, seen.pose):
-            return  # of no use, and the next stops tell why
+            return  # not usable, and the next stops give the reason
         self._unplaced += [(n, seen, seen.pose) for n in wanted]
         shown = self.poses.frame()
         if self._frame is None:

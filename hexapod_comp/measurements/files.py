@@ -1,4 +1,4 @@
-"""One door for measured files of every kind."""
+"""One reader for measured files of every kind."""
 
 from __future__ import annotations
 
@@ -61,7 +61,8 @@ def read_measurements(
 
 @contextmanager
 def _kept_in_memory() -> Iterator[None]:
-    """Let nobody look for garbage: rows become a million small objects, and looking takes a quarter of the time."""
+    """Disable the garbage collector: rows become a million small objects, and collection takes a quarter of the
+    time."""
     enabled = gc.isenabled()
     gc.disable()
     try:
