@@ -490,12 +490,18 @@ class Adaptation:
         """Renew the model in use from the checks that contradict it, or begin a calibration where they cannot."""
         state = self.state
         number, name = self._name("model", ".yaml")
-        verification, fitted = self._verified(state.in_use, list(state.doubts))
-        reason = refusal(verification)
-        if verification.verdict == VALID:
-            reason = "both checks together do not show what has changed, but break the promise"
-        if reason:
-            self._beyond_repair(happened(verification), reason)
+        # Both checks together; where a wild reading spoils that, the newest alone
+        tried = []
+        for readings in (state.doubts, state.doubts[-1:]):
+            verification, fitted = self._verified(state.in_use, list(readings))
+            reason = refusal(verification)
+            if verification.verdict == VALID:
+                reason = "both checks together do not show what has changed, but break the promise"
+            tried.append((happened(verification), reason))
+            if not reason:
+                break
+        else:
+            self._beyond_repair(*tried[0])
             return
         model = load_model(self._folder / state.in_use, self._geometry)
         update = update_model(model, fitted, verification.measurements, verification)
