@@ -368,16 +368,14 @@ class Estimation:
             problem = f"{len(measurements)} readings at {len(self.cells.station)} distinct places leave {free} "
             raise CalibrationError("measurements", problem + f"numbers for the structure's {needed} parameters")
 
-    def linearise(
-        self, x: np.ndarray, reading_weights: np.ndarray, prediction: Prediction | None = None
-    ) -> tuple[LinearProblem, np.ndarray]:
+    def linearise(self, x: np.ndarray, reading_weights: np.ndarray) -> tuple[LinearProblem, np.ndarray]:
         """Return the linear problem at a parameter vector, and each reading's residual there, m or rad."""
         c, m = self.cells, self.measurements
         weights = reading_weights / self.uncertainty**2
         total = np.bincount(c.of_reading, weights)
         scale = np.sqrt(total)
         values = np.bincount(c.of_reading, weights * m.value) / total
-        prediction, directions = prediction or self._predicted(x), c.directions.copy()
+        prediction, directions = self._predicted(x), c.directions.copy()
         expected, unknowns = self.unknowns(directions, prediction.errors[c.station], values, scale)
         misfit = m.value - expected[c.of_reading]
         mean = np.bincount(c.of_reading, weights * misfit) / total

@@ -225,10 +225,10 @@ class Cells:
 
     of_reading: np.ndarray  # (N,): Cell of each reading
     first: np.ndarray  # (C,): First reading of each cell
-    station: np.ndarray  # (C,): Of each cell; a group is one channel of one run, whose unknowns its cells share
-    channel: np.ndarray  # (C,): Of each cell; a group is one channel of one run, whose unknowns its cells share
-    kind: np.ndarray  # (C,): Of each cell; a group is one channel of one run, whose unknowns its cells share
-    group: np.ndarray  # (C,): Of each cell; a group is one channel of one run, whose unknowns its cells share
+    station: np.ndarray  # (C,): Of each cell
+    channel: np.ndarray  # (C,): Of each cell
+    kind: np.ndarray  # (C,): Of each cell
+    group: np.ndarray  # (C,): One channel of one run, whose unknowns its cells share; -1: absolute readings have none
     directions: np.ndarray  # (C, 6): w of each cell; of a length, from its centre's place in the file
     along: np.ndarray  # (C,): Commanded coordinate along the line, m
     lever: np.ndarray  # (C,): Its change by a square's rotation, m per rad
