@@ -215,7 +215,8 @@ class _Fitted:
         return directions, target, unknowns
 
     def _undone(self, mistake: Mistake) -> LinearProblem | None:
-        """Return the problem of readings without a mistake, the machine where it stood; None where there can be none.
+        """Return the problem of corrected readings, with the machine at its place in the file; None where there can be
+        none.
 
         Only rows of which the channel was another are new.
         """

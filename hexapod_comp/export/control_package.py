@@ -96,7 +96,7 @@ def _values(geometry: HexapodGeometry, model: MachineModel, rate: int, joint_nam
 
 
 def _constraints(geometry: HexapodGeometry, rate: int, joints: Sequence[str]) -> str:
-    """Return the lines that end a goal which the struts do not follow, before a hold would be refused."""
+    """Return the lines that abort a goal when the struts do not follow, before the holding command would be refused."""
     step, speed = geometry.limits.step, geometry.limits.speed
     tolerance = TOLERANCE * step
     fastest = min(speed, step * rate, tolerance / (LAG + 1.0 / rate))

@@ -1,6 +1,6 @@
-"""A machine sent through poses, and what its tool does there: the trial behind every figure of a tool error.
+"""A machine sent through poses, and its tool's errors there: the basis of every figure of a tool error.
 
-Commands come from the nominal machine, from a model, or from whatever is tried; the machine is the truth.
+Commands are those of the nominal machine, a model, or another source; the machine is the truth.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from .passes import Passes, Poses, at
 from .temperatures import Temperatures
 
 NameOf = Callable[[int], str]
-"""Says in an error which row it is about."""
+"""Adds the row to an error."""
 
 
 @dataclass(frozen=True)
 class ToolErrors:
-    """What a point of the platform, the tool's tip as a rule, does beside what it was sent to do, in ``base``."""
+    """Errors of a point of the platform, usually the tool's tip, relative to the commands, in ``base``."""
 
     points: np.ndarray  # (N, 3): where the point was sent, m
     # (N, 3): actual minus commanded position, m, and rotation vector from commanded to actual, rad
@@ -41,7 +41,7 @@ class ToolErrors:
         return np.hstack([self.displacement, self.rotation])
 
     def aligned(self) -> ToolErrors:
-        """Return the same once the datum is aligned: less the turn and shift that best explain the displacements.
+        """Return the same with the datum aligned: minus the turn and shift that best explain the displacements.
 
         Rotations lose their mean.
         """
@@ -55,10 +55,10 @@ class ToolErrors:
 
 
 def without_datum(points: np.ndarray, displacements: np.ndarray, by: slice = slice(None)) -> np.ndarray:
-    """Return displacements (M, 3, D) of points (M, 3) less what one shift and rotation of the datum explain.
+    """Return displacements (M, 3, D) of points (M, 3) minus the part that one shift and rotation of the datum explain.
 
-    The linear case of :meth:`ToolErrors.aligned`, for D sets of small displacements at once. The datum is found by
-    all points, or by some of them, and taken off all.
+    The linear case of :meth:`ToolErrors.aligned`, for D sets of small displacements at once. The datum is computed from
+    all points, or some of them, and subtracted from all.
     """
     arms = points - points[by].mean(axis=0)
     columns = [np.tile(axis, (len(arms), 1)) for axis in np.eye(3)]
@@ -71,14 +71,14 @@ def without_datum(points: np.ndarray, displacements: np.ndarray, by: slice = sli
 
 @dataclass(frozen=True)
 class Driven:
-    """Where a machine went."""
+    """Actual poses of a machine."""
 
     # (N, 3) and (N, 3, 3): ``pose_platform_in_base``, m, and what structure and struts alone would have made of it
     actual: Poses
     without_field: Poses
 
     def errors(self, commanded: Poses, point: np.ndarray) -> ToolErrors:
-        """Return the errors of a point of ``platform``, shape (3,), m, beside commanded poses."""
+        """Return the errors of a point of ``platform``, shape (3,), m, relative to commanded poses."""
         (positions, rotations), (modelled, turned) = self.actual, self.without_field
         return ToolErrors(
             points=commanded[0] + commanded[1] @ point,
@@ -96,7 +96,7 @@ def drive(
     name_of: NameOf | None = None,
     advance: Callable[[int], object] = lambda rows: None,
 ) -> Driven:
-    """Return where machines go under strut commands."""
+    """Return the actual poses of machines under strut commands."""
     commands, senses = np.ascontiguousarray(commands, dtype=float), np.ascontiguousarray(senses, dtype=float)
     modelled = np.array(starts[0], order="C"), np.array(starts[1], order="C")
     actual = np.empty_like(modelled[0]), np.empty_like(modelled[1])
@@ -149,14 +149,14 @@ class Trial:
     def commands(
         self, model: MachineModel | None, sensed: Temperatures | None = None, loading: Loading = FREE
     ) -> np.ndarray:
-        """Return what the machine is told, shape (N, 6), m, by a model that knows temperatures and loading."""
+        """Return the strut commands, shape (N, 6), m, of a model that knows temperatures and loading."""
         if model is None:
             return self.passes.nominal_commands()
         believed = RealMachine(self.passes.geometry, model, sensed, loading)
         return model_commands([believed] * len(self.passes), self.passes.poses, self.passes.senses())[0]
 
     def drive(self, commands: np.ndarray) -> Driven:
-        """Return where the machine goes under strut commands, shape (N, 6), m."""
+        """Return the actual poses of the machine under strut commands, shape (N, 6), m."""
         return drive([self.machine] * len(self.passes), self.passes.poses, self.passes.senses(), commands)
 
     def errors(self, commands: np.ndarray) -> ToolErrors:

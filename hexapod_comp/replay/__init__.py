@@ -1,1 +1,1 @@
-"""A recorded run put through the compensator again."""
+"""A recorded run passed through the compensator again."""

@@ -3,7 +3,7 @@
 A bag is a folder with ``metadata.yaml`` as ``ros2 bag record`` writes it, or a bare ``.mcap`` or ``.db3`` file. Of
 its topics a replay needs the compensator's journal alone; ``compensator/files`` spares the user the search for geometry
 and model; ``strut_states``, ``tool_pose_estimate`` and ``tool_pose_true`` are shown where there are any. All others are
-left alone, whatever their types.
+ignored, whatever their types.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ POSE, STRUTS, TEXT = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointStat
 # A machine's topics in its namespace that are shown, and their types
 TOPICS = {"strut_states": STRUTS, "tool_pose_estimate": POSE, "tool_pose_true": POSE}
 
-COMMANDS = "tool_pose_command"  # topic of commands: counted, not read. What the compensator took, its journal says.
+COMMANDS = "tool_pose_command"  # topic of commands: counted, not read. The journal has the accepted ones.
 JOURNAL, FILES = "/journal", "/files"  # how the topics of a compensator's journal end, after the node's name
 
 METADATA = "metadata.yaml"
@@ -53,7 +53,7 @@ MOST_FRAMES = 256  # a command's frame is a number of one byte
 
 RECORD = "record at least compensator/journal and compensator/files"
 
-IDEAL = IDEAL_SOURCE.sha256  # hash of the model that is none
+IDEAL = IDEAL_SOURCE.sha256  # hash that stands for no model
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Series:
 
 @dataclass
 class Recording:
-    """What a bag tells about one machine.
+    """The content of a bag for one machine.
 
     Attributes
     ----------
@@ -175,7 +175,7 @@ def read_recording(
 
 
 def _typestore() -> Any:
-    """Return rosbags' message types, with a clear word where it is missing."""
+    """Return rosbags' message types; without rosbags raise an error that tells how to install it."""
     # These types have been the same since they exist: the definitions in the bag, if any, are not needed.
     try:
         from rosbags import typesys
@@ -246,8 +246,8 @@ def _messages(path: Path, files: list[Path], packing: str, size: int) -> Iterato
 
 
 def _unreadable(path: Path, file: Path | None, error: Exception, key: str = "") -> InputFileError:
-    """Return the error for what is raised on damaged bytes."""
-    # That is whatever the parts of a file happen to raise: struct.error, KeyError, errors of two decompressors and of a
+    """Return the error for an exception on damaged bytes."""
+    # Parts of a file raise many types: struct.error, KeyError, errors of two decompressors and of a
     # database, of rosbags; hence `except Exception` where it is called.
     if isinstance(error, UnpackingError):
         return InputFileError(path, key, str(error))
@@ -257,7 +257,7 @@ def _unreadable(path: Path, file: Path | None, error: Exception, key: str = "") 
 
 
 def _deserialized(path: Path, key: str, store: Any, message: Message) -> Any:
-    """Return a message's content; rclpy's serialize_message leaves four bytes behind some, which rosbags refuses."""
+    """Return a message's content; rclpy's serialize_message appends four bytes to some, which rosbags refuses."""
     try:
         try:
             return store.deserialize_cdr(message.raw, message.kind)
@@ -295,7 +295,7 @@ def _namespace(node: str) -> str:
 
 
 def _wanted(path: Path, topics: Collection[tuple[str, str]], node: str) -> dict[str, str]:
-    """Return what the topics to be read are called here; refuse wrong types."""
+    """Return the names of the topics to read in this bag; refuse wrong types."""
     names = {f"{_namespace(node)}/{name}": (name, kind) for name, kind in TOPICS.items()}
     names |= {node + JOURNAL: (JOURNAL, TEXT), node + FILES: (FILES, TEXT)}
     for topic, found in topics:
@@ -417,7 +417,7 @@ class Files:
         return self._loaded("model", identity, geometry.name, lambda source: source.model(geometry.name))
 
     def _loaded(self, what: str, identity: Mapping[str, str], machine: str, load: Callable[[Source], Any]) -> Any:
-        """Return what a file holds, which is read once."""
+        """Return the content of a file, which is read once."""
         sha256 = identity["sha256"]
         if (sha256, machine) in self._read:
             return self._read[sha256, machine]

@@ -22,7 +22,7 @@ MOST_LABELS = 12  # more changes than this are drawn without their names
 
 
 def figures_of(report: Report, geometry: HexapodGeometry | None) -> dict[str, Figure]:
-    """Return every picture that there is something for, by file name."""
+    """Return every picture that has content, by file name."""
     figures = {"corrections": corrections_figure(report), "commands": commands_figure(report)}
     if len(report.recording.topics["strut_states"]):
         figures["following_error"] = following_figure(report)
@@ -109,7 +109,7 @@ def commands_figure(report: Report) -> Figure:
 
 
 def following_figure(report: Report) -> Figure:
-    """Show by how much the measured struts were off their commands."""
+    """Show the deviation of the measured struts from their commands."""
     figure = _figure(report, "Following error: measured − commanded, the drives' lag included")
     axes = figure.subplots()
     seconds, error = following_error(report)
@@ -119,7 +119,7 @@ def following_figure(report: Report) -> Figure:
 
 
 def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
-    """Show the commanded tool path from above and from the side, and where the compensator thought the tool was."""
+    """Show the commanded tool path from above and from the side, and the estimated positions of the tool."""
     figure = _figure(report, "Tool", 5.0)
     positions = tool_positions(report.recording, geometry.work_frames)
     estimates = report.recording.topics["tool_pose_estimate"]

@@ -1,7 +1,8 @@
-"""Running a recorded run through the compensator again: the same answers, bit for bit, or where they part.
+"""Running a recorded run through the compensator again: the same answers, bit for bit, or the first difference.
 
-Everything that decides an answer is in the journal, in its order. What a recorder has lost cannot be run again; the
-next snapshot, at most half a second later, gives the state to go on from, and what lies between is counted, not judged.
+Everything that determines an answer is in the journal, in its order. Answers after a lost page cannot be replayed; the
+next snapshot, at most half a second later, gives the state to continue from, and the answers between are counted, not
+compared.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
 from .bag import Files, Recording
 
-# What came of an answer: the same bits; others; not replayed because the recorder has lost a page before it; not
+# Outcome of an answer: the same bits; others; not replayed because the recorder has lost a page before it; not
 # replayed because no snapshot lies before it
 IDENTICAL, DIFFERENT, LOST, BEFORE = range(4)
 
@@ -31,13 +32,13 @@ class Event:
     """An entry of the journal in its place."""
 
     row: int  # number of the answer that it precedes
-    time: int  # when the recorder heard of it, ns: up to 50 ms later
+    time: int  # when the recorder received it, ns: up to 50 ms later
     entry: Entry  # what happened
 
 
 @dataclass
 class Replay:
-    """What came of a replay.
+    """Result of a replay.
 
     Attributes
     ----------
@@ -73,7 +74,7 @@ class Replay:
 
     @property
     def identical(self) -> bool:
-        """Whether whatever could be compared is the same, and something could."""
+        """Whether all compared answers are the same, and at least one was compared."""
         return bool((self.outcome == IDENTICAL).any()) and not (self.outcome == DIFFERENT).any()
 
     @property
@@ -122,7 +123,7 @@ def what_if(
     """Run the recorded commands through another model, or another geometry."""
     # Temperatures, humidity, switching and starts are those of the recording; its own models are not. The corrections
     # begin at the other model's: nothing ramps. All answers are run; nothing is left out after lost pages. Of the
-    # snapshot no more than what another machine can take over counts: directions, switches, the tool's name.
+    # Of the snapshot only those parts are used that hold for another machine: directions, switches, the tool's name.
     compensator, state = Compensator(geometry, model), recording.first.state
     kept = ("temperatures", "tool", "loading", "outside", "motion_sense", "enabled", "resumes", "ramp_rate")
     fresh = compensator.snapshot() | {name: value for name, value in state.items() if name in kept}
@@ -133,7 +134,7 @@ def what_if(
 
 
 class _Run:
-    """A replay under way, page by page: with what was in use, from its files, or with one compensator throughout."""
+    """A running replay, page by page: with the recording's files, or with one compensator throughout."""
 
     compensator: Compensator
 
@@ -145,12 +146,12 @@ class _Run:
         self._in_use = "", ""  # hashes of its geometry and model
 
     def use(self, compensator: Compensator) -> None:
-        """Give the commands from now on to a compensator."""
+        """Set the compensator for the commands from now on."""
         self.compensator = compensator
         self._frames = {name: pack_pose(pose) for name, pose in compensator.geometry.work_frames.items()}
 
     def run(self) -> Replay:
-        """Return what comes of it."""
+        """Return the outcome."""
         row, result, otherwise, expected = 0, self.result, BEFORE, ("", 0, 0)
         for time, page in self._recording.pages:
             if self._files is not None:  # after a lost page nothing is known until the next snapshot
@@ -176,7 +177,7 @@ class _Run:
         return result
 
     def _change(self, entry: Entry) -> None:
-        """Make a change that the journal holds."""
+        """Make a change recorded in the journal."""
         if entry.what == "model":
             if self._files is not None:
                 self.compensator.set_model(self._files.model(entry.values, self.compensator.geometry))
@@ -185,7 +186,7 @@ class _Run:
             getattr(self.compensator, SETTERS[entry.what])(*entry.values.values())
 
     def _step(self, row: int) -> int:
-        """Give the command that was answered, as the node did; return what comes of it."""
+        """Pass on the answered command as the node did; return the outcome."""
         asked, given = self._commands[row], self.result.lengths[row]
         try:
             frame = self._frames.get(name := self._recording.frames[row])
@@ -201,7 +202,7 @@ class _Run:
         return IDENTICAL if given.tobytes() == asked["lengths"].tobytes() else DIFFERENT
 
     def _resume(self, files: Files, snapshot: Snapshot, row: int) -> None:
-        """Compare states before answer `row`, and go on from the recorded one."""
+        """Compare states before answer `row`, and continue from the recorded one."""
         in_use = snapshot.geometry["sha256"], snapshot.model["sha256"]
         same = in_use == self._in_use
         if not same:
@@ -218,6 +219,6 @@ def _same_state(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Return whether two snapshots are the same, all NaN being one number."""
     if one.keys() != other.keys() or any(one.get(name) != other.get(name) for name in BESIDE_NUMBERS):
         return False
-    nowhere = np.isnan(other["nominal"]).any()  # and where the platform is then means nothing
+    nowhere = np.isnan(other["nominal"]).any()  # and the platform's pose then has no meaning
     names = [name for name in one if name not in BESIDE_NUMBERS and not (nowhere and name.startswith(PLACES))]
     return all(np.array_equal(one[name], other[name], equal_nan=True) for name in names)

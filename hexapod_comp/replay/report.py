@@ -1,4 +1,5 @@
-"""What a replay shows: is it the same, where does it part, what was refused, and the figures of the run."""
+"""The report of a replay: whether it is the same, the first difference, refused commands, and the figures of the
+run."""
 
 from __future__ import annotations
 
@@ -24,14 +25,14 @@ OUTCOMES = {IDENTICAL: "identical", DIFFERENT: "different", LOST: "not replayed"
 # Differences below this, m, are those of another processor's or library's rounding, not of another model
 ROUNDING = 1e-12
 
-LONGEST_GAP = 0.1  # between commands further apart, s, nobody can tell what the struts should have done
+LONGEST_GAP = 0.1  # between commands further apart, s, the expected position of the struts is not known
 
 Part = tuple[list[str], dict[str, Any]]  # of a report: its lines, and the same under their keys in JSON
 
 
 @dataclass
 class Report:
-    """A recording, and what came of its replays."""
+    """A recording, and the results of its replays."""
 
     recording: Recording
     replayed: Replay | None  # with what was in use; None when geometry or model were not at hand
@@ -94,7 +95,7 @@ class Report:
         return "\n".join([*lines, *(f"note: {note}" for note in notes)]), content | {"notes": notes}
 
     def place(self, row: int) -> str:
-        """Say which answer one is."""
+        """Identify an answer."""
         if row >= len(self.recording.commands):
             return "the end"
         stamp = int(self.recording.commands["stamp"][row])
@@ -102,7 +103,7 @@ class Report:
 
 
 def _run(report: Report) -> Part:
-    """Say which run it is, and how many commands were answered."""
+    """Return the run's identity, and the number of answered commands."""
     recording, answers = report.recording, len(report.recording.commands)
     first = recording.first
     machine, model = (printable(one["name"]) for one in (first.geometry, first.model))
@@ -129,7 +130,7 @@ def _run(report: Report) -> Part:
 
 
 def _compared(report: Report) -> Part:
-    """Say what came of the replay with what was in use, and where and how it first differs."""
+    """Report the replay with the recording's files, and the first difference."""
     replayed = report.replayed
     if replayed is None:
         return ["not replayed as it was: geometry and model that were in use are not at hand"], {}
@@ -199,7 +200,7 @@ def _difference(report: Report, replayed: Replay, row: int) -> Iterator[str]:
 
 
 def _with_other(report: Report) -> Part:
-    """Say what another model or geometry would have corrected."""
+    """Report the corrections that another model or geometry would have made."""
     other = report.other
     if other is None:
         return [], {}
@@ -224,7 +225,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _figures(report: Report) -> Part:
-    """Say how large corrections, following errors and distances of the tool to its path are."""
+    """Report the size of corrections, following errors and distances of the tool to its path."""
 
     def size(distances: np.ndarray) -> str:
         return f"{_rms(distances):.2f}/{np.abs(distances).max() * 1e6:.2f}"
@@ -249,7 +250,8 @@ def _figures(report: Report) -> Part:
 
 
 def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
-    """Yield by how much the tool was off its path: a topic, distances as they are, and with the datum aligned, m."""
+    """Yield the tool's distances from its path: a topic, distances as the machine stands, and with the datum aligned,
+    m."""
     # A late tool is not off. The second is None where the tool moved in a line or not at all.
     when = report.seconds
     if report.work_frames is None or len(when) < 2:
@@ -271,7 +273,7 @@ def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarra
 
 
 def _refused(report: Report) -> Part:
-    """Say which commands were refused, by reason."""
+    """Report the refused commands, by reason."""
     if not report.refusals:
         return [], {}
     unnamed = report.refusals - len(report.refused)
@@ -285,7 +287,7 @@ def _refused(report: Report) -> Part:
 
 
 def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
-    """Return by how much the measured struts were off their commands: times, s, (n,), and errors, m, (n, 6)."""
+    """Return the deviations of the measured struts from their commands: times, s, (n,), and errors, m, (n, 6)."""
     states, when = report.recording.topics["strut_states"], report.seconds
     if len(when) < 2 or not len(states):
         return np.zeros(0), np.zeros((0, 6))
@@ -297,7 +299,7 @@ def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tool_positions(recording: Recording, work_frames: Mapping[str, Pose]) -> np.ndarray:
-    """Return where the tool was commanded in ``base``, (n, 3), m, with the work frames seen from ``base``."""
+    """Return the commanded tool positions in ``base``, (n, 3), m, with the work frames relative to ``base``."""
     positions = recording.commands["pose"][:, :3].copy()
     for name, frame in work_frames.items():
         inside = recording.frames == name

@@ -1,4 +1,4 @@
-"""A test kit for who integrates the nodes: a pytest plugin with a compensator and a simulated machine, without launch.
+"""A test kit for integrators of the nodes: a pytest plugin with a compensator and a simulated machine, without launch.
 
 Installed with the package. ``hexapod`` is a :class:`~hexapod_comp.testing.bench.Bench` in a private context, in a ROS
 domain of this test session's own, on this computer alone.

@@ -1,4 +1,4 @@
-"""Compensator, strut drive and nodes of one's own on one executor, without launch, processes or sleeps."""
+"""Compensator, strut drive and the tester's own nodes on one executor, without launch, processes or sleeps."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ LOG_LINE = re.compile(r"\[\w+\] \[[\d.]+\] \[[\w.]+\]: (.*)")  # how ROS logs: [
 
 @dataclass
 class Answer:
-    """What came back for one command."""
+    """The answers to one command."""
 
     command: JointState  # with the command's stamp, as the correction
     correction: JointState
@@ -104,7 +104,7 @@ class Answer:
 
 
 class Bench:
-    """Nodes under test on one executor in a private context, and a witness that sees and sends everything."""
+    """Nodes under test on one executor in a private context, and a witness that receives and sends everything."""
 
     def __init__(
         self,
@@ -163,7 +163,7 @@ class Bench:
         self.compensator(geometry_file=geometry, model_file=model)
 
     def host(self, node: Node) -> Node:
-        """Let a node of one's own run with the others; it was made with ``context=bench.context``."""
+        """Let the tester's own node run with the others; it was made with ``context=bench.context``."""
         self.nodes.append(node)
         self.executor.add_node(node)
         return node
@@ -180,7 +180,7 @@ class Bench:
         return node
 
     def matched(self) -> bool:
-        """Return whether what nodes and witness send each other has met, in both directions."""
+        """Return whether all topics and services between nodes and witness are connected, in both directions."""
         heard = [s.topic_name for node in self.nodes for s in node.subscriptions]
         ours = [s.topic_name for s in self.witness.subscriptions]
         theirs = [p for node in self.nodes for p in node.publishers if p.topic_name in ours]

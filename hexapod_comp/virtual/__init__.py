@@ -1,1 +1,1 @@
-"""Machines that do not exist: imperfections drawn at random, drives, instruments."""
+"""Virtual machines: imperfections drawn at random, drives, instruments."""

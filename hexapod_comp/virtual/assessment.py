@@ -1,9 +1,9 @@
-"""The performance assessment of Song et al.: what random imperfections do to strut lengths and to poses.
+"""The performance assessment of Song et al.: the effect of random imperfections on strut lengths and poses.
 
-For machines drawn within bounds: the strut lengths that the ideal and that the real machine need at a pose
-(Tables 2 and 4), and the pose that the real machine takes when it is told the ideal lengths. Where the
-paper's forward model of the real structure left errors of up to 5 µm (Table 5), the loop closures are solved
-here as they are; the round trip says how exactly.
+For machines drawn within bounds: the strut lengths of the ideal and of the real machine at a pose (Tables 2 and 4), and
+the real machine's pose when it is commanded with the ideal lengths. Where the paper's forward model of the real
+structure left errors of up to 5 µm (Table 5), the loop closures are solved here exactly; the round trip gives the
+accuracy.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def assess(
 
 
 def _ideal_commands(geometry: HexapodGeometry, passes: Passes, names: Sequence[str]) -> np.ndarray:
-    """Return what the struts of the nominal machine must be told, shape (P, 6), m."""
+    """Return the strut commands of the nominal machine, shape (P, 6), m."""
     if not geometry.screw_lead.any():
         return passes.nominal_commands()
     ideal = RealMachine(geometry, MachineModel(geometry.name))
@@ -89,7 +89,7 @@ def _ideal_commands(geometry: HexapodGeometry, passes: Passes, names: Sequence[s
 def _run_machine(
     machine: RealMachine, ideal: np.ndarray, passes: Passes, tool: Poses, names: Sequence[str]
 ) -> tuple[np.ndarray, ...]:
-    """Return real lengths, taken tool poses, their errors and round trips of one machine.
+    """Return real lengths, actual tool poses, their errors and round trips of one machine.
 
     `ideal` are the commands of the nominal machine for the poses, `tool` the tool poses commanded.
     """

@@ -1,12 +1,12 @@
-"""One strut's drive: what it is able to do, what can go wrong with it, and its compiled inner loop.
+"""One strut's drive: its limits, its faults, and its compiled inner loop.
 
-What becomes of a command c, in this order:
+A command c is processed in this order:
 
 1. A position loop moves the reference x towards c. Its speed is wanted(c − x), its acceleration
    (wanted − ẋ)·4/lag, both limited. Within the limits this is x″ + 4/lag·x′ + 4/lag²·x = 4/lag²·c: two equal
-   real poles, no overshoot, and a distance of lag·ẋ behind a steadily moving command. Linear, so all six
-   struts lag alike: the tool stays near its path, only later.
-2. The stepper stands at the step nearest to x: the motor position, which the encoder counts.
+   real poles, no overshoot, and a distance of lag·ẋ behind a steadily moving command. All six struts lag equally: the
+   tool stays near its path, only later. 2. The stepper stands at the step nearest to x: the motor position, which the
+   encoder counts.
 3. The nut follows the motor with play: it stays until the motor has crossed half the backlash to either
    side. motor − nut, as a share of half the backlash, is the strut's sense of motion in the model.
 """
@@ -23,7 +23,7 @@ from ..machine.geometry import STRUT_NAMES
 from ..machine.model import MotionState, RealMachine
 
 LEAST_LAG = 1e-3
-"""Shortest lag of a drive that has one, s: below, the integration steps would become too many."""
+"""Shortest nonzero lag of a drive, s: below, too many integration steps would be needed."""
 
 LONGEST_DELAY = 10.0
 """Longest feedback delay, s."""
@@ -31,7 +31,7 @@ LONGEST_DELAY = 10.0
 
 @dataclass(frozen=True)
 class DriveParameters:
-    """What the six drives and the instruments are able to do."""
+    """Capabilities of the six drives and the instruments."""
 
     step: float = 0.1e-6  # length of one motor step, m; 0 for none
     max_speed: float | None = None  # largest motor speed, m/s; None: the geometry's limit; ``inf`` for none
@@ -89,13 +89,13 @@ class DriveParameters:
 
 @dataclass(frozen=True)
 class Faults:
-    """What goes wrong; struts are counted 0…5."""
+    """Faults; struts are counted 0…5."""
 
     stuck: int | None = None  # strut whose motor does not move
     encoder_lost: int | None = None  # strut whose encoder reads NaN
     feedback_delay: float = 0.0  # age of the encoder readings when they arrive, s
     feedback_drop: float = 0.0  # share of the readings that never arrive, 0…1
-    # strut and distance, m, by which its motor is knocked away, once, when the fault is set. The encoder sees it and
+    # strut and distance, m, by which its motor is displaced, once, when the fault is set. The encoder measures it and
     # the drive pulls the motor back.
     jump: tuple[int, float] | None = None
 

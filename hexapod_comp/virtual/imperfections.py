@@ -1,7 +1,7 @@
 """Random imperfections within bounds: the hidden truth of a virtual machine.
 
-Every quantity is drawn whether its bound is zero or not, so that widening one bound leaves the others'
-draws alone, and a seed names one machine.
+Every quantity is drawn whether its bound is zero or not, so that changing one bound does not change the others' draws,
+and a seed identifies one machine.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ WAVES_OF_STROKE, LEAST_WAVES = (0.1, 0.35), (0.06, 0.2)
 """Shortest and longest of them where bounds draw them: shares of the stroke, but no shorter than this, m."""
 
 WORN_PART = (0.1, 0.3)
-"""Shortest and longest worn part of a screw, from its middle to where 61 % of the wear is left, in strokes."""
+"""Shortest and longest worn part of a screw, from its middle to the point with 61 % of the wear, in strokes."""
 
 SPANS = {"wave": "m", "harmonics": "m", "backlash": "m", "strut_expansion": "1/K", "body_expansion": "1/K"}
 """Bounds that have a lowest and a highest value, and their units."""
@@ -40,7 +40,7 @@ SPANS = {"wave": "m", "harmonics": "m", "backlash": "m", "strut_expansion": "1/K
 
 @dataclass(frozen=True)
 class ImperfectionBounds:
-    """How imperfect a machine may be; all draws are uniform.
+    """Bounds of a machine's imperfections; all draws are uniform.
 
     The defaults are Song et al.'s assessment: ±10 µm on every joint coordinate and on every strut, nothing
     else.
@@ -70,7 +70,7 @@ class ImperfectionBounds:
     # of its own.
     shared_platform_joints: bool = True
     harmonics: tuple[float, float] = (0.0, 0.0)  # the same of the errors that repeat two, three and four times a turn
-    wear: float = 0.0  # by how much the lost motion of a strut is larger, at most, where its screw is worn most, m
+    wear: float = 0.0  # largest additional lost motion of a strut, m, where its screw is worn most
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -164,7 +164,8 @@ def with_wear(model: MachineModel, geometry: HexapodGeometry, seed: int, most: f
 
 
 def _knots(geometry: HexapodGeometry, shortest: float) -> np.ndarray:
-    """Return knots over the strokes on which waves of a length, m, and longer ones are what the spline between is."""
+    """Return knots over the strokes, close enough that the spline between them represents waves of a length, m, and
+    longer ones."""
     low, high = geometry.limits.stroke[:, 0].min(), geometry.limits.stroke[:, 1].max()
     return np.linspace(low, high, int(np.ceil((high - low) / shortest * KNOTS_PER_WAVE)) + 1)
 

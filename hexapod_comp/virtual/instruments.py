@@ -1,7 +1,7 @@
-"""Virtual instruments: what lasers and trackers would read on a machine whose errors are known.
+"""Virtual instruments: the readings of lasers and trackers on a machine with known errors.
 
-The other side of calibration: a campaign's template is filled in from the truth, so that the whole way from
-measuring to compensating can be tried, and judged, without a laser.
+The inverse of calibration: a campaign's template is filled in from the truth, so that everything from measuring to
+compensating can be tried, and judged, without a laser.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def station_errors(
 
 
 def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet:
-    """Return a template whose machine is told what a model's compensation tells it."""
+    """Return a template with the commands of a model's compensation."""
     stations = template.stations
     machines = stations.surroundings.machines(RealMachine(template.geometry, model))
     targets, name_of = (stations.positions, stations.rotations), partial(_station_name, template)
@@ -91,7 +91,7 @@ def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet
 
 
 def _station_name(measurements: MeasurementSet, station: int) -> str:
-    """Return at which reading a station comes first."""
+    """Return the index of each station's first reading."""
     reading = int((measurements.station == station).argmax())
     position = (measurements.stations.positions[station] * 1e3).round(3).tolist()
     run = measurements.runs[measurements.run[reading]].name
@@ -99,7 +99,7 @@ def _station_name(measurements: MeasurementSet, station: int) -> str:
 
 
 def _stopping(template: MeasurementSet, repeatability: float, rng: np.random.Generator) -> np.ndarray:
-    """Return where the machine stopped beside its usual place, shape (N, 3), m; one draw per visit."""
+    """Return the deviation of the machine's stop from its usual place, shape (N, 3), m; one draw per visit."""
     visits = np.stack([template.station, template.cycle], axis=1)
     _, visit = different_rows(visits)
     return repeatability * rng.standard_normal((visit.max() + 1, 3))[visit]
@@ -111,7 +111,7 @@ def _groups(template: MeasurementSet) -> np.ndarray:
 
 
 def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.random.Generator) -> np.ndarray:
-    """Return where the centres of some readings really are, shape (n, 3), m in ``base``: one draw per run.
+    """Return the true places of the centres of some readings, shape (n, 3), m in ``base``: one draw per run.
 
     A body of several centres is shifted, and turned about their mean so that the furthest moves as far.
     """
@@ -129,7 +129,7 @@ def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.
 
 
 def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
-    """Return what each reading's instrument showed when it was zeroed, at the first reading, shape (N,)."""
+    """Return the value at each reading's instrument's zero, the first reading, shape (N,)."""
     _, first, group = np.unique(_groups(template), return_index=True, return_inverse=True)
     absolute = np.isin(np.array(KINDS)[template.kind], ABSOLUTE_KINDS)
     absolute |= np.array([run.known_zero for run in template.runs])[template.run]
@@ -137,7 +137,7 @@ def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
 
 
 def _beams(template: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
-    """Return what beams that lie off their lines, each by a draw, add to straightness, per rad, shape (N,), m.
+    """Return the contribution of misaligned beams, each by a draw, to straightness, per rad, shape (N,), m.
 
     A square is turned by one draw about each axis of the work frame, for all runs that share its slope.
     """

@@ -1,8 +1,8 @@
 """The virtual machine: six stepper-driven struts with hidden errors, their encoders, and a tracker.
 
 Commands go through the drives (:mod:`hexapod_comp.virtual.drives`) into motor positions and nut plays;
-:class:`hexapod_comp.machine.model.RealMachine`, the hidden truth, turns those into the pose that the platform
-really takes. Faults can be set while it runs.
+:class:`hexapod_comp.machine.model.RealMachine`, the hidden truth, computes from those the platform's true pose. Faults
+can be set while it runs.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class StrutDrive:
 
     @property
     def faults(self) -> Faults:
-        """What goes wrong at present; a jump happens when it is set."""
+        """The present faults; a jump happens when it is set."""
         return self._faults
 
     @faults.setter
@@ -111,11 +111,11 @@ class StrutDrive:
 
     @property
     def stopped(self) -> np.ndarray:
-        """Which motors the last advance found at a stop, asked or knocked to go on; bool, shape (6,)."""
+        """Motors that the last advance found at a stop, commanded or displaced beyond it; bool, shape (6,)."""
         return self._stopped != 0
 
     def set_command(self, lengths: np.ndarray) -> None:
-        """Take six strut commands; lengths beyond a stop are taken, and reported by :attr:`stopped`."""
+        """Set six strut commands; lengths beyond a stop are accepted, and reported by :attr:`stopped`."""
         lengths = np.asarray(lengths, dtype=float)
         if lengths.shape != (6,):
             raise CommandError("strut_count", f"six strut lengths are needed, not shape {lengths.shape}")
@@ -142,17 +142,16 @@ class StrutDrive:
         self._read_encoders(dt)
 
     def _run(self, ticks: int, seconds: float) -> None:
-        """Run the drives for some ticks, then find where that puts the platform."""
+        """Run the drives for some ticks, then compute the platform's pose."""
         run_drives(self._drives, self._commands, ticks, self._motion.sense)
         went = self._motor, self._motion.sense, *self._model_pose, *self._true_pose
         self._outcome, self._condition = self.machine.advance(seconds, *went)
 
     def _follow_commanded_point(self) -> None:
-        """Take the field's directions from where the commands lead.
+        """Set the field's directions from the commanded motion.
 
-        A reversal value belongs to the side from which a target is approached. Following errors and
-        backlash being taken up also move the tool along axes that are told to stand still; they have no
-        direction.
+        A reversal value belongs to the side from which a target is approached. Following errors and backlash being
+        taken up also move the tool along axes at rest; they have no direction.
         """
         model, motion, nowhere = self.machine.model, self._motion, (np.empty(3), np.empty((3, 3)))
         outcome, _ = self._rigid.forward(self._commands, motion.sense, *self._commanded_pose, *nowhere)
@@ -161,7 +160,7 @@ class StrutDrive:
             follow_point(*self._commanded_pose, probe, threshold, motion.low, motion.sense)
 
     def _read_encoders(self, dt: float) -> None:
-        """Take a reading and deliver what has arrived by now."""
+        """Take a reading and deliver those that have arrived."""
         p, faults = self.parameters, self._faults
         reading = self._motor
         if p.encoder_noise:
@@ -195,7 +194,7 @@ class StrutDrive:
         return self._blanked(self._speeds)
 
     def motor_lengths(self) -> np.ndarray:
-        """Return where the motors really stand, as a perfect encoder would read it, m, shape (6,)."""
+        """Return the true positions of the motors, as a perfect encoder would read them, m, shape (6,)."""
         return self._motor.copy()
 
     def play(self) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Models by name: a file, ``ideal``, or a virtual machine that is drawn on the spot.
 
-Every verb and the simulated machines take a truth, or a model, through :func:`find_model`.
+Every verb and the simulated machines load a truth, or a model, through :func:`find_model`.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ USUAL: dict[str, Any] = {
     "backlash": (2e-6, 4e-6),
     "length_map": 1e-6,
 }
-"""What a machine is like that was built with care and never measured, m and m per m."""
+"""Typical errors of a machine that was built with care and never measured, m and m per m."""
 
 
 def usual_bounds(geometry: HexapodGeometry, **given: Any) -> ImperfectionBounds:
-    """Return :data:`USUAL` bounds for a machine; what is given goes before."""
+    """Return :data:`USUAL` bounds for a machine, overridden by the given ones."""
     leads = np.abs(geometry.screw_lead)
     usual = {**USUAL, "wave_period": float(leads.max()) if leads.any() else USUAL_LEAD}
     return ImperfectionBounds(**{**usual, **given})
@@ -69,10 +69,10 @@ def find_model(name: str | Path, geometry: HexapodGeometry) -> MachineModel:
 
 
 def is_random(name: str | Path) -> bool:
-    """Return whether a name asks for a machine that is drawn."""
+    """Return whether a name stands for a drawn machine."""
     return str(name).partition(":")[0] == RANDOM
 
 
 def is_word(name: str | Path) -> bool:
-    """Return whether a name is no file's."""
+    """Return whether a name is not a file's."""
     return name == IDEAL or is_random(name)

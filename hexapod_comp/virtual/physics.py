@@ -2,10 +2,10 @@
 
 The joints are where the imperfect machine has them, and each strut is as long as its screw makes it: this is
 :class:`~hexapod_comp.machine.model.RealMachine`. Between that length and the distance of its joints a strut is a
-spring with clearance. Platform, payload and struts weigh what :class:`Physics` says, and the bearings rub. Two ways
-lead to the pose: :meth:`PhysicalMachine.advance` lets time pass in MuJoCo, loops closed by its constraints; readings at
-rest come from Newton's method on the equilibrium of the same bodies, loops closed by virtual work. The tests hold one
-against the other. MuJoCo is an extra: ``pip install mujoco-core``.
+spring with clearance. :class:`Physics` gives the masses of platform, payload and struts, and the friction of the
+bearings. The pose is computed in two ways: :meth:`PhysicalMachine.advance` simulates time in MuJoCo, loops closed by
+its constraints; readings at rest come from Newton's method on the equilibrium of the same bodies, loops closed by
+virtual work. The tests compare the two. MuJoCo is an extra: ``pip install mujoco-core``.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from ..machine.temperatures import Temperatures
 from ..pose import rotation_from_angles
 
 STEEL = 11.5e-6  # 1/K, of a strut that is warmer than its thermometer says
-APPROACH = 2e-4  # m: on the last of its way to a pose the platform moves so far in the direction of its pass
-PRESLIDING = 5e-6  # rad: a bearing gives by so much, like a spring, before it slides
-LIGHTEST = 1e-9  # kg: what MuJoCo moves weighs something
+APPROACH = 2e-4  # m: at the end of its way to a pose the platform moves this far in the direction of its pass
+PRESLIDING = 5e-6  # rad: a bearing deflects by this, like a spring, before it slides
+LIGHTEST = 1e-9  # kg: bodies that MuJoCo moves need a mass
 THICK = 0.02  # m: a platform's thickness, and a payload's radius, for their inertia
 STEP, LONGEST_STEP = 0.25, 2.5e-4  # MuJoCo's, in radians of the fastest oscillation, stable below 2; and at most, s
 MOST_STEPS = 60  # of Newton's method; struts that are never slack take three
@@ -41,7 +41,7 @@ SETTLED = 1e-13  # m
 
 @dataclass(frozen=True)
 class Physics:
-    """What the parts of a machine weigh and how they give; numbers of six struts, or one for all."""
+    """Masses and stiffnesses of the parts of a machine; numbers of six struts, or one for all."""
 
     strut_stiffness: np.ndarray | float = 20e6  # of a strut along its axis, N/m
     joint_stiffness: np.ndarray | float = math.inf  # of each of its two joints, N/m
@@ -99,7 +99,7 @@ class Physics:
 
 
 class PhysicalMachine(RealMachine):
-    """A real machine that bends: a :class:`RealMachine` to all who run one forwards."""
+    """A real machine that deforms, usable like a :class:`RealMachine` run forwards."""
 
     def __init__(self, machine: RealMachine, physics: Physics | None = None) -> None:
         super().__init__(machine.geometry, machine.model, machine.temperatures)
@@ -134,7 +134,7 @@ class PhysicalMachine(RealMachine):
         return PhysicalMachine(super().at(temperatures), physics)
 
     def _build(self) -> None:
-        """Compile the exported machine with the real joints, and write into it what its parts weigh."""
+        """Compile the exported machine with the real joints, and set the masses of its parts."""
         mujoco, physics, geometry = self._mujoco, self.physics, self.geometry
         real = replace(geometry, base_joints=self.structure.base_joints, platform_joints=self.structure.platform_joints)
         self._feet = foot_frames(real)
@@ -210,18 +210,18 @@ class PhysicalMachine(RealMachine):
     def _add_field(
         rigid: tuple[np.ndarray, ...], settled: tuple[np.ndarray, ...], actual: tuple[np.ndarray, ...]
     ) -> None:
-        """Add to a settled pose what the field adds to the rigid machine's; `actual` holds that, and is written."""
+        """Add the field's error to a settled pose; `actual` holds the rigid machine's, and is overwritten."""
         shift, turn = rigid[1].T @ (actual[0] - rigid[0]), rigid[1].T @ actual[1]
         actual[0][:], actual[1][:] = settled[0] + settled[1] @ shift, settled[1] @ turn
 
     def free_lengths(self, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-        """Return how long unloaded struts are that bring a rigid machine to poses, shape (N, 6), m."""
+        """Return the lengths of unloaded struts that bring a rigid machine to poses, shape (N, 6), m."""
         return strut_lengths_batch(self.structure, positions, rotations, 1) * (
             1.0 + STEEL * np.asarray(self.physics.warmth)
         )
 
     def _settle(self, rigid: tuple[np.ndarray, np.ndarray], sense: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return where the platform rests that a rigid machine's struts bring to a pose, passed in a direction."""
+        """Return the platform's pose at rest for a rigid machine's struts at a pose, passed in a direction."""
         mujoco, wanted = self._mujoco, self.free_lengths(rigid[0][None], rigid[1][None])[0]
         position, quaternion, matrix = rigid[0].copy(), np.roll(quaternion_of(rigid[1]), 1), np.empty(9)
         _, hinges, _, _ = self._struts_at(position, rigid[1])
@@ -231,7 +231,7 @@ class PhysicalMachine(RealMachine):
         stiffness, half = self.physics.stiffness, 0.5 * np.asarray(self.physics.clearance)
 
         def forces(place: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            """Return force and torque on the platform, the struts' Jacobian, and which of them carry."""
+            """Return force and torque on the platform, the struts' Jacobian, and which struts carry load."""
             mujoco.mju_quat2Mat(matrix, turned)
             jacobian, hinges, lengths, joints = self._struts_at(place, matrix.reshape(3, 3))
             weight = self._weight(place, turned, joints, lengths)
@@ -290,7 +290,7 @@ class PhysicalMachine(RealMachine):
     def _weight(
         self, position: np.ndarray, quaternion: np.ndarray, angles: np.ndarray, lengths: np.ndarray
     ) -> np.ndarray:
-        """Return what gravity does to MuJoCo's joints, N and N m, with the machine at rest."""
+        """Return the forces of gravity on MuJoCo's joints, N and N m, with the machine at rest."""
         data, model, mujoco = self._resting, self._mj, self._mujoco
         self._place(data, position, quaternion, angles, lengths)
         mujoco.mj_kinematics(model, data)
@@ -318,7 +318,7 @@ class PhysicalMachine(RealMachine):
         actual_position: np.ndarray,
         actual_rotation: np.ndarray,
     ) -> tuple[int, float]:
-        """Let time pass in MuJoCo, while the struts go from their last lengths to those of new commands."""
+        """Simulate time in MuJoCo, while the struts move from their last lengths to those of new commands."""
         rigid, rows = (self._rigid[0].copy(), self._rigid[1].copy()), (actual_position, actual_rotation)
         outcome, condition = super().forward(commands, sense, *rigid, *rows)
         if outcome != Status.OK:
@@ -363,7 +363,7 @@ class PhysicalMachine(RealMachine):
 
 
 def weigh(body: Any, mass: float, centre: np.ndarray, inertia: np.ndarray) -> None:
-    """State what a body of MuJoCo's weighs in place of what its shapes would: mass, centre, and inertia about that."""
+    """Set mass, centre, and inertia of a body of MuJoCo's in place of those of its shapes."""
     body.explicitinertial, body.mass, body.ipos = True, mass, centre
     body.fullinertia = [*inertia.diagonal(), *inertia[[0, 0, 1], [1, 2, 2]]]
 

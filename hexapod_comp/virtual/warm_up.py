@@ -1,4 +1,4 @@
-"""A virtual machine that warms up, or whose air turns damp, while it is measured again and again.
+"""A virtual machine that warms up, or whose air turns damp, while it is measured repeatedly.
 
 One power warms all parts, each through a first-order lag of its own, with sensors that are read once a second and
 filtered as the compensator does it. A campaign is measured before the power is on; then an x, a y and a z line in the
@@ -28,13 +28,13 @@ from .instruments import compensated, measure
 WARM_UP_FORMAT, WARM_UP_VERSION = "hexapod_comp/warm_up", 1
 
 SENSED = (*PARTS, HUMIDITY)
-"""What has a course, in the order of every array of nine."""
+"""Quantities with a course, in the order of every array of nine."""
 
 POINTS = 9
 """Of each line that is measured again."""
 
 MOST_APART = 0.2
-"""How much struts of one machine may differ (standard deviation): beyond, one of them may run backwards in time."""
+"""Largest spread of the struts of one machine (standard deviation): beyond, one of them may run backwards in time."""
 
 LONGEST = 1_000_000
 """A warm-up of more seconds is a season."""
@@ -45,11 +45,11 @@ APART, NOISE = 20, 17
 
 @dataclass(frozen=True)
 class WarmUp:
-    """How a machine warms, and what is read meanwhile."""
+    """How a machine warms, and the readings meanwhile."""
 
-    rise: np.ndarray  # (9,): how far each part goes in the end, K, and the humidity, a fraction
+    rise: np.ndarray  # (9,): final rise of each part, K, and the humidity, a fraction
     time_constants: np.ndarray  # (9,): s
-    humidity: float = math.nan  # at the beginning, a fraction; NaN: nobody tells
+    humidity: float = math.nan  # at the beginning, a fraction; NaN: not known
     # parts that have a thermometer, and ``humidity`` for a hygrometer. Others are read as at 20 °C, or not at all.
     sensors: tuple[str, ...] = PARTS
     noise: tuple[float, float] = (0.05, 0.01)  # standard deviation of a reading once a second, K, and of the humidity
@@ -93,7 +93,7 @@ class WarmUp:
         return np.append(np.full(len(PARTS), REFERENCE_TEMPERATURE), self.humidity)
 
     def apart(self, share: float, seed: int) -> WarmUp:
-        """Return the same with each strut's rise and time constant a share off (standard deviation)."""
+        """Return the same with each strut's rise and time constant changed by a random share (standard deviation)."""
         off = 1.0 + share * np.random.default_rng([seed, APART]).standard_normal((6, 2))
         rise, time_constants = self.rise.copy(), self.time_constants.copy()
         rise[:6] *= off[:, 0]
@@ -113,7 +113,7 @@ class WarmUp:
         return self.start + result
 
     def sensed(self, true: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Return what the filter makes of the sensors at each second, shape (seconds, 9)."""
+        """Return the filtered sensors at each second, shape (seconds, 9)."""
         result, low_pass = np.empty(true.shape), TemperatureFilter()
         result[:, :-1], result[:, -1] = REFERENCE_TEMPERATURE, np.nan
         for name in self.sensors:
@@ -136,7 +136,7 @@ class WarmUp:
         return replace(cold, runs=(*cold.runs, *runs))
 
     def stations(self, planned: MeasurementSet, seed: int) -> tuple[Stations, Stations]:
-        """Return the stations of such a campaign as they are, and as the sensors have it."""
+        """Return the true stations of this campaign, and those by the sensors."""
         first = len(planned.runs) - len(AXES) * self.rounds
         of_station = np.full(len(planned.stations), -1)
         of_station[planned.station] = np.maximum((planned.run - first) // len(AXES), -1)
@@ -168,9 +168,9 @@ class WarmUp:
         model: MachineModel | None = None,
         advance: Callable[[int], object] = lambda stations: None,
     ) -> MeasurementSet:
-        """Return what is read of such a campaign (:func:`.instruments.measure`), with what the sensors tell.
+        """Return the readings of this campaign (:func:`.instruments.measure`), with those of the sensors.
 
-        With a `model` the machine is told what its compensation tells it by these sensors.
+        With a `model` the machine's commands are those of its compensation by these sensors.
         """
         is_so, is_read = self.stations(planned, seed)
         planned = replace(planned, stations=is_read)

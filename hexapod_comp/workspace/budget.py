@@ -16,9 +16,9 @@ from ..machine.geometry import HexapodGeometry, first_of_same
 
 BUDGET_FORMAT = "hexapod_comp/error_budget"
 BUDGET_VERSION = 1
-LENGTH, BASE_JOINT, PLATFORM_JOINT, TOOL = range(4)  # What a single error moves
+LENGTH, BASE_JOINT, PLATFORM_JOINT, TOOL = range(4)  # What a single error changes
 AXES = ("x", "y", "z")
-LARGEST = 0.1  # An error as large is a wrong unit; m, or relative
+LARGEST = 0.1  # A larger error is in a wrong unit; m, or relative
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ Row = tuple[int, np.ndarray, tuple[float, ...], str]  # Part, struts (6,), vecto
 
 @dataclass(frozen=True)
 class SourceType:
-    """A type of error as a budget may name it."""
+    """A type of error that a budget may contain."""
 
     name: str  # Key in the budget file, without its unit
     dimension: str  # Kind of unit of its size
@@ -66,7 +66,7 @@ class SourceType:
     make: Callable[[float, np.ndarray], Iterable[Row]]
 
 
-EACH = np.eye(6, dtype=bool)  # Every strut for itself
+EACH = np.eye(6, dtype=bool)  # Every strut by itself
 
 
 def _lengths(coefficient: int, factor: float = 1.0) -> Callable[[float, np.ndarray], Iterable[Row]]:
@@ -99,7 +99,7 @@ def _tool(size: float, joints: np.ndarray) -> Iterable[Row]:
         yield TOOL, np.zeros(6, dtype=bool), tuple(size * np.eye(3)[axis]), f"tool {AXES[axis]}"
 
 
-# Types that a budget may have. Screw pitch as v. Daake et al. have it, a bound of the length error; as a slope it grows
+# Types that a budget may have. Screw pitch as in v. Daake et al. is a bound of the length error; as a slope it grows
 # with the way from home. A strut is off by half its backlash. Thermal growth is relative: expansion times kelvins.
 SOURCE_TYPES = (
     SourceType("strut_length", "length", "strut length", _lengths(0)),
@@ -120,7 +120,7 @@ BY_NAME = {source.name: source for source in SOURCE_TYPES}
 
 @dataclass(frozen=True)
 class Budget:
-    """How large the errors of a machine may be.
+    """Sizes of the errors of a machine.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""All errors at once: worst case, root sum of squares, Monte Carlo; and what each error may be."""
+"""All errors together: worst case, root sum of squares, Monte Carlo; and the allowed size of each error."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from .budget import SingleErrors
 RSS, WORST_CASE = "rss", "worst_case"  # How an allocation adds the errors up
 UNIFORM, NORMAL = "uniform", "normal"  # Distributions of u: uniform within ±1, or normal with a standard deviation of 1
 CHUNK = 512  # Poses handled together: bounds the memory of all combinations of signs
-LARGEST_FACTOR = 1e9  # A source that may grow by more has no effect that counts
+LARGEST_FACTOR = 1e9  # A source that may grow by more has no significant effect
 
 
 def worst_case(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Return the largest effect that errors within their bounds can have together, shape (N, 2)."""
+    """Return the largest effect of errors within their bounds together, shape (N, 2)."""
     return _worst(_along_struts(errors, vectors).sum(axis=3))
 
 
@@ -51,7 +51,7 @@ class MonteCarlo:
     values: np.ndarray
     low: np.ndarray
     high: np.ndarray
-    # (Q, 2): the same of each machine's largest error over all poses: its worst place is not every machine's
+    # (Q, 2): the same for each machine's largest error over all poses: machines differ in their worst place
     worst_values: np.ndarray
     worst_low: np.ndarray
     worst_high: np.ndarray
@@ -110,27 +110,28 @@ def _ranks(draws: int, percentile: float, confidence: float) -> tuple[int, int, 
 
 @dataclass(frozen=True)
 class Allocation:
-    """What the errors may be, given what the tool's error may be."""
+    """The allowed errors, given the allowed error of the tool."""
 
     method: str  # ``rss`` or ``worst_case``
     allowed: float  # Allowed error of the tool at the worst pose, m
-    combined: float  # What the budget as it is adds up to there
+    combined: float  # The sum of the unchanged budget there
     pose: int  # The worst pose's number
     scale: float  # Largest factor that all sizes may be multiplied by
-    # (K,): largest factor of each type when all others stay: ∞ where it has no effect, NaN where the others alone are
+    # (K,): largest factor of each type with the others unchanged: ∞ if it has no effect, NaN if the others alone are
     # too much
     alone: np.ndarray
-    # (K,): what each type adds up to when there is no other, and what all others add up to without it, m or rad, each
+    # (K,): the sum of each type alone, and of all others without it, m or rad, each
     # at its own worst pose
     only: np.ndarray
     without: np.ndarray
-    # (K,): factors with which every type uses up the same part of what is allowed, and all together no more than that;
-    # ∞ where a type has no effect
+    # (K,): factors with which every type uses the same part of the allowed error, and all together no more than all of
+    # it; ∞ where a type has no effect
     equal: np.ndarray
 
 
 def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float, method: str = RSS) -> Allocation:
-    """Return what each source may be so that the tool's displacement stays within what is allowed, m, at every pose."""
+    """Return the allowed size of each source so that the tool's displacement stays within what is allowed, m, at every
+    pose."""
     if not 0.0 < allowed < np.inf:
         raise ModelError("allowed", "must be above zero", allowed)
     if method not in (RSS, WORST_CASE):
@@ -160,14 +161,15 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float, method: 
 
 
 def _equal_parts(only: np.ndarray, allowed: float, method: str) -> np.ndarray:
-    """Return the factors (K,) with which types that alone add up to so much each use up the same part."""
+    """Return the factors (K,) with which types, given their sums alone, use the same part."""
     acting = only > 0.0
     part = allowed / (np.sqrt(acting.sum()) if method == RSS else acting.sum())
     return np.where(acting, part / np.where(acting, only, 1.0), np.inf)
 
 
 def _alone(combined: Callable[[np.ndarray], np.ndarray], types: int, kind: int, allowed: float) -> float:
-    """Return how far one type may grow: the combined error only grows with it, so that a bracket is easily found."""
+    """Return the largest factor of one type: the combined error increases with it, so that a bracket is easily
+    found."""
 
     def excess(factor: float) -> float:
         factors = np.ones(types)
@@ -185,7 +187,7 @@ def _alone(combined: Callable[[np.ndarray], np.ndarray], types: int, kind: int, 
 
 
 def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Return what the errors of one direction do together, type by type, shape (N, G, 6, K)."""
+    """Return the combined effects of the errors of one direction, type by type, shape (N, G, 6, K)."""
     count = errors.struts.sum(axis=1)
     members = [np.flatnonzero(errors.struts[:, strut] & (count == 1)) for strut in range(6)]
     members = [chosen for chosen in members if len(chosen)] + [np.array([n]) for n in np.flatnonzero(count != 1)]
@@ -226,5 +228,5 @@ def _farthest(ways: np.ndarray) -> np.ndarray:
 
 
 def _turns(vectors: np.ndarray) -> np.ndarray:
-    """Return the largest possible rotation about an axis, shape (N,): each axis has signs of its own."""
+    """Return the largest possible rotation about an axis, shape (N,): the signs are chosen for each axis."""
     return np.abs(vectors[..., 3:]).sum(axis=1).max(axis=1)

@@ -25,7 +25,8 @@ from .budget import BASE_JOINT, LENGTH, PLATFORM_JOINT, TOOL, SingleErrors
 
 EXACT, LINEAR, ITERATION = "exact", "linear", "iteration"
 METHODS = (EXACT, LINEAR, ITERATION)
-BLOCK = 4096  # Poses handled together: long beside what an error costs once, small enough for a processor's own memory
+# Poses handled together: many compared with the fixed cost of an error, few enough for a processor's cache
+BLOCK = 4096
 
 
 @dataclass(frozen=True)
@@ -33,16 +34,16 @@ class Extremes:
     """Largest and smallest effect of each error type, and where they happen."""
 
     errors: SingleErrors  # The E errors of K types
-    values: np.ndarray  # (K, 4): m, m, rad, rad; NaN for a type without any effect to be had
+    values: np.ndarray  # (K, 4): m, m, rad, rad; NaN for a type without any certified effect
     at_pose: np.ndarray  # (K, 4): number of the pose; −1 for none
     at_error: np.ndarray  # (K, 4): which single error
     positions: np.ndarray  # (K, 4, 3): that pose, ``pose_platform_in_base``, m
     rotations: np.ndarray  # (K, 4, 3, 3): that pose, ``pose_platform_in_base``, m
-    failed: np.ndarray  # (K,): effects without a certified solution: they are left out and counted
-    poses: int  # How many poses were looked at
+    failed: np.ndarray  # (K,): number of effects without a certified solution, which are left out
+    poses: int  # Number of poses
 
 
-_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])  # of the columns of Extremes: what is largest then is what is wanted
+_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])  # signs of the columns of Extremes: which extreme is a maximum
 
 
 def effect_vectors(
@@ -79,7 +80,7 @@ def _of_each(
     width: int,
     wanted: Callable[[np.ndarray], np.ndarray],
 ) -> np.ndarray:
-    """Return what is wanted of every error's effects, shape (N, E, width)."""
+    """Return the columns of every error's effects, shape (N, E, width)."""
     positions, rotations = batch_poses(positions, rotations)
     each, result = _way(method), np.empty((len(positions), len(errors), width))
 
@@ -230,14 +231,14 @@ def _iterated(
 
 
 def _way(method: str) -> Callable[..., Iterator[np.ndarray]]:
-    """Return what yields the effects by a method."""
+    """Return the generator of effects of a method."""
     if method not in METHODS:
         raise KinematicsError(f"method must be one of {', '.join(METHODS)}, not {method!r}", method)
     return {EXACT: _exact, LINEAR: _linear, ITERATION: _iterated}[method]
 
 
 def _nominal(structure: Structure, positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, ForwardBatch]:
-    """Return the nominal lengths (N, 6), and the poses that they give: certified, NaN where they cannot be."""
+    """Return the nominal lengths (N, 6), and their certified poses, NaN if there are none."""
     lengths = np.empty((len(positions), 6))
     batch.strut_lengths(*structure.joints, positions, rotations, lengths)
     return lengths, solve_poses(structure, lengths, (positions, rotations), threads=1)
@@ -276,14 +277,14 @@ def _sizes(vectors: np.ndarray) -> np.ndarray:
     return np.stack([np.sqrt(x * x + y * y + z * z), np.maximum(np.maximum(a, b), c)])
 
 
-# The iteration of v. Daake et al. (chapter 1), a check and a yardstick that shares nothing with the core: tangents to
+# The iteration of v. Daake et al. (chapter 1), an independent check that shares nothing with the core: tangents to
 # the motion that one active leg causes are followed in small steps. Each needs the motion relations of all legs, which
 # virtual displacements of the tool give through the inverse kinematics alone.
 
 STEP = 1e-5  # Travel of the active leg per step, m (v. Daake et al.: 0.01 mm)
 TOLERANCE = 1e-9  # ε: legs that are off by more, m, are corrected
 VIRTUAL = 1e-7  # Virtual displacement, m and rad: small beside any curvature, large beside rounding
-MOST_CORRECTIONS = 20  # A step that needs more leads nowhere
+MOST_CORRECTIONS = 20  # A step that needs more does not converge
 
 
 @dataclass(frozen=True)
@@ -294,9 +295,9 @@ class TangentialResult:
     # m, rad. NaN where the legs could not be brought back within the tolerance
     vectors: np.ndarray
     drift: np.ndarray  # (N,): largest length error of a passive leg that any step left before correction, m
-    travel: np.ndarray  # (N,): how far the active legs went, m
+    travel: np.ndarray  # (N,): travel of the active legs, m
     steps: int  # How many steps
-    corrections: np.ndarray  # (N,): how many corrections
+    corrections: np.ndarray  # (N,): number of corrections
 
 
 @dataclass
@@ -331,7 +332,7 @@ class _State:
         return np.stack(columns, axis=2)
 
     def follow(self, change: np.ndarray) -> None:
-        """Move the tools along the tangents on which the legs change by so much, shape (N, 6)."""
+        """Move the tools along the tangents on which the legs change by this much, shape (N, 6)."""
         try:
             motions = np.linalg.solve(self.motion_matrices(), change[:, :, None])[:, :, 0]
         except np.linalg.LinAlgError:
@@ -369,7 +370,7 @@ Waypoint = tuple[np.ndarray, np.ndarray, np.ndarray]
 def _path(
     geometry: HexapodGeometry, errors: SingleErrors, index: int, nominal: np.ndarray, step: float
 ) -> list[Waypoint]:
-    """Return how the error grows from nothing to its size, in as many steps wherever the machine stands."""
+    """Return how the error grows from zero to its size, in equal steps at every pose."""
     part, struts, vector = errors.part[index], errors.struts[index], errors.vector[index]
     stretch, size, shift = np.zeros_like(nominal), float(np.linalg.norm(vector)), {}
     if part == LENGTH:
@@ -396,7 +397,7 @@ def _path(
 def _walk(
     work_rotation: np.ndarray, state: _State, struts: np.ndarray, path: list[Waypoint], tolerance: float
 ) -> TangentialResult:
-    """Follow a path with the active legs and see where the tool gets to."""
+    """Follow a path with the active legs and return the tool's end."""
     start_tips, start_rotations = state.tips, state.rotations
     drift, travel = np.zeros((2, len(start_tips)))
     corrections = np.zeros(len(start_tips), dtype=int)
@@ -414,7 +415,8 @@ def _walk(
 
 
 def _correct(state: _State, target: np.ndarray, tolerance: float) -> np.ndarray:
-    """Bring the legs that are off by more than ε back by the same algorithm; return how often it took, shape (N,)."""
+    """Correct the legs that are off by more than ε by the same algorithm; return the number of corrections, shape
+    (N,)."""
     counts, off = np.zeros(len(target), dtype=int), target - state.lengths()
     for _ in range(MOST_CORRECTIONS):
         poses = np.flatnonzero((np.abs(off) > tolerance).any(axis=1))

@@ -1,4 +1,4 @@
-"""A machine at a glance: where everything is, how far it reaches, the largest box in it, and what looks wrong."""
+"""A machine at a glance: frames and joints, reach, the largest box in it, and suspicious entries."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from .reach import (
     reach,
 )
 
-MOST_TILT = np.radians(90.0)  # Beyond this no tilt is looked for, rad
+MOST_TILT = np.radians(90.0)  # Largest tilt that is searched, rad
 TILT_STEPS = 361  # Steps from zero to there
 TURN = np.radians(5.0)  # By which a tool turns about x, y or z, rad
 
 
 @dataclass(frozen=True)
 class Overview:
-    """What is worth knowing of a machine before anything else."""
+    """Overview of a machine."""
 
     geometry: HexapodGeometry  # The machine
-    reach: Reach  # What it reaches with the tool as at home
+    reach: Reach  # Its reach with the tool as at home
     box: ReachedBox  # The largest box in that
-    # The box that campaigns take which give none: with the tool parallel to the work frame where it can be
+    # The box for campaigns without one: with the tool parallel to the work frame where possible
     campaign: ReachedBox
     # (3, 2): how far the tool tilts at home about x, y and z of the work frame, each alone, backward and forward, rad
     tilts: np.ndarray
@@ -47,7 +47,7 @@ class Overview:
 
 
 def overview(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> Overview:
-    """Look a machine over."""
+    """Return the overview of a machine."""
     reached = reach(geometry, home_orientation(geometry), cells)
     box = largest_box(reached)
     level = np.array_equal(reached.rotation.round(12), np.eye(3))
@@ -79,7 +79,7 @@ def _tilts(geometry: HexapodGeometry) -> np.ndarray:
 
 
 def _screws(geometry: HexapodGeometry) -> tuple[str, ...]:
-    """Say what missing axes of cardan joints would cost where the tool turns."""
+    """Report the effect of missing axes of cardan joints where the tool turns."""
     if geometry.screw_lead.any() or geometry.base_axes is not None:
         return ()
     turned = rotation_from_angles(TURN * np.concatenate([np.eye(3), -np.eye(3)])) @ geometry.home.rotation
@@ -123,7 +123,7 @@ def corners(box: np.ndarray) -> str:
 
 
 def _tilt_text(tilts: np.ndarray) -> str:
-    """Return the tilts; at 90° nobody looked on."""
+    """Return the tilts as text; beyond 90° they are not searched."""
     texts = []
     for axis, pair in zip("xyz", np.degrees(tilts), strict=True):
         low, high = (f"{value:+.1f}" + ("" if abs(value) < 90.0 else " or more") for value in pair)

@@ -25,14 +25,14 @@ LEVELS = 65535  # Steps of a stored value between the ends of its colour scale
 
 @dataclass(frozen=True)
 class PageData:
-    """What the page shows."""
+    """Content of the page."""
 
     title: str  # Headline: the machine
-    note: str  # What is seen and how the numbers came about; one paragraph
+    note: str  # Description of the page and of the method; one paragraph
     # Each error's type and part, such as ("screw pitch ±20 µm", "strut 1"); errors of a type share a colour scale
     errors: Sequence[tuple[str, str]]
     quantities: Sequence[Quantity]  # Such as translation and rotation
-    frame_title: str  # What the slider changes, such as "tilt about x"
+    frame_title: str  # Parameters of the slider, such as "tilt about x"
     frames: Sequence[str]  # Its positions
     layers: Sequence[str]  # Names of the nested shells, inside to outside
     points: np.ndarray  # (F, S, H, A, 3): their meshes per frame, m in the work frame
@@ -54,7 +54,7 @@ class PageData:
 
 
 def page_data(study: Study, bodies: tuple[Shell, ...], frames: tuple[str, ...], frame_title: str) -> PageData:
-    """Return what the interactive page shows: one frame for each orientation."""
+    """Return the content of the interactive page: one frame for each orientation."""
     meshes, errors = [mesh_effects(study, body) for body in bodies], study.errors
     return PageData(
         title=f"{study.geometry.name}: effect of single errors on the tool",
@@ -73,7 +73,7 @@ def page_data(study: Study, bodies: tuple[Shell, ...], frames: tuple[str, ...], 
 
 
 def write_page(path: str | Path, geometry: HexapodGeometry, data: PageData) -> None:
-    """Write the page, all or nothing."""
+    """Write the page, completely or not at all."""
     write_text(path, page_text(geometry, data))
 
 
@@ -101,7 +101,7 @@ def _plotly_script() -> str:
 
 
 def _content(geometry: HexapodGeometry, data: PageData) -> dict[str, object]:
-    """Return what the page's script reads."""
+    """Return the data for the page's script."""
     codes, scales = _coded(data)
     return {
         "errors": [list(error) for error in data.errors],

@@ -1,4 +1,4 @@
-"""Pictures of the workspace study: coloured shells, what limits them, the ranked table as bars."""
+"""Pictures of the workspace study: coloured shells, their limits, the ranked table as bars."""
 
 from __future__ import annotations
 
@@ -28,13 +28,14 @@ from .reach import FINDINGS
 from .shells import ROTATION, TRANSLATION, Layer, Quantity, shell
 from .study import RINGS, SECTORS
 
-COLOURS = "viridis"  # Colour map of effects: even steps for the eye, also in grey and to the colour-blind
+COLOURS = "viridis"  # Colour map of effects: perceptually uniform, also in grey and for the colour-blind
 # Of the findings, in their order
 CAUSE_COLOURS = ("#ffffff", "#20639b", "#c1432e", "#e3a72f", "#3c8d5a", "#7b4ea3", "#444444", "#d77fb3", "#000000")
-VIEW_AZIMUTH, VIEW_ELEVATION = -60.0, 20.0  # Where the eye stands, degrees
+VIEW_AZIMUTH, VIEW_ELEVATION = -60.0, 20.0  # Direction of view, degrees
 BOX = "#d77f00"  # colour of the largest box
 SHADOW = "#dbe4ee"  # colour of a reach that a machine stands in
-# How far the outermost of several shells is cut open towards the eye, degrees; inner ones less, the innermost not
+# Angle by which the outermost of several shells is cut open towards the viewer, degrees; inner ones less, the innermost
+# not
 WEDGE = 130.0
 
 
@@ -93,7 +94,7 @@ def shells_figure(
 
 
 def causes_figure(geometry: HexapodGeometry, points: np.ndarray, findings: np.ndarray, title: str) -> Figure:
-    """Show what limits the workspace on its boundary, from above and from below."""
+    """Show the limits of the workspace on its boundary, from above and from below."""
     faces, corners = _faces(points, 0.0)
     of_face = findings[corners]
     diagonals = np.cross(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
@@ -116,7 +117,7 @@ def causes_figure(geometry: HexapodGeometry, points: np.ndarray, findings: np.nd
 
 
 def overview_figure(overview: Overview) -> Figure:
-    """Show a machine at home with its frames, and in it what it reaches, by what limits it, and the largest box."""
+    """Show a machine at home with its frames, its reach coloured by the limits, and the largest box."""
     geometry, body = overview.geometry, shell(overview.reach, RINGS, SECTORS)
     faces, corners = _faces(_in_base(geometry, body.points), 0.0)
     box = _in_base(geometry, _box_edges(overview.box.box))

@@ -18,7 +18,7 @@ from .effects import Extremes
 
 MICRO = 1e6
 MILLIDEGREE = np.pi / 180e3
-# A machine with longer struts at home, m, is no positioning unit of the kind that v. Daake et al. classify.
+# A machine with longer struts at home, m, is not of the kind that v. Daake et al. classify.
 LONGEST_OF_UNIT = 0.4
 # Types that v. Daake et al. put into one row, by their titles.
 JOINED = {
@@ -49,7 +49,7 @@ class RankingRow:
     translation_min: Extreme  # Largest and smallest displacement of the tool, m
     rotation_max: Extreme  # Largest and smallest of its rotation, the largest about three axes, rad
     rotation_min: Extreme  # Largest and smallest of its rotation, the largest about three axes, rad
-    failed: int  # Effects that could not be had
+    failed: int  # Number of effects without a certified solution
 
     def figures(self) -> np.ndarray:
         """Return the four values, m, m, rad, rad."""
@@ -169,7 +169,7 @@ def _shown(value: float, column: int) -> str:
 
 
 def _places(rows: Sequence[RankingRow]) -> list[list[str]]:
-    """Return which error and which pose each figure comes from."""
+    """Return the error and the pose of each figure."""
     lines = []
     for row in rows:
         for name in QUANTITIES:

@@ -1,4 +1,4 @@
-"""Where a machine can go at a given orientation, how large that is, and what stops it at the boundary."""
+"""The reach of a machine at a given orientation: its volume, and the limits at its boundary."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ FINDINGS = (
     "not a finite number",
 )
 
-# Cells along the longest edge with which the reach is looked for, one after the other until it is found
+# Cells along the longest edge of the search grids, one after the other until the reach is found
 SEARCH_CELLS = (24, 48, 96)
-# Cells along the longest edge that may be asked for: eight million poses are some ten seconds, and half a gigabyte
+# Range of the cells along the longest edge: eight million poses are some ten seconds, and half a gigabyte
 CELLS = (4, 200)
 HALVINGS = 24  # Of a grid cell: a boundary is found to a fraction of a nanometre
 
 
 class Examiner:
-    """Says what limits poses of a machine."""
+    """Determines the limits that poses of a machine break."""
 
     def __init__(self, geometry: HexapodGeometry) -> None:
         self.geometry = geometry
@@ -77,10 +77,10 @@ class Examiner:
 
 @dataclass(frozen=True)
 class Boundary:
-    """Where the lines of a grid leave the reach, or enter it."""
+    """Intersections of a grid's lines with the boundary of the reach."""
 
     positions: np.ndarray  # (M, 3): last point within the limits, m in the work frame
-    findings: np.ndarray  # (M,): what limits there, index into :data:`FINDINGS`
+    findings: np.ndarray  # (M,): limit there, index into :data:`FINDINGS`
     struts: np.ndarray  # (M, 2): struts concerned, 0…5 or −1
     axis: np.ndarray  # (M,): axis of the line, 0…2
     outward: np.ndarray  # (M,): +1 where the line leaves the reach in the sense of its axis, −1 where it enters
@@ -88,13 +88,13 @@ class Boundary:
 
 @dataclass(frozen=True)
 class Reach:
-    """What a machine reaches at one orientation."""
+    """The reach of a machine at one orientation."""
 
     geometry: HexapodGeometry  # The machine
     rotation: np.ndarray  # (3, 3): orientation of the tool in the work frame
     # Coordinates of the grid, m; the spacing is the same along all three
     axes: tuple[np.ndarray, np.ndarray, np.ndarray]
-    findings: np.ndarray  # (X, Y, Z): what limits each grid point, index into :data:`FINDINGS`
+    findings: np.ndarray  # (X, Y, Z): limit of each grid point, index into :data:`FINDINGS`
     boundary: Boundary  # Where the grid's lines cross the boundary
 
     @property
@@ -109,7 +109,7 @@ class Reach:
 
     @property
     def volumes(self) -> np.ndarray:
-        """Volume found along x, along y and along z, m³, shape (3,): their spread tells what to make of it."""
+        """Volume computed along x, along y and along z, m³, shape (3,): their spread is its uncertainty."""
         edge = self.boundary
         here = edge.positions[np.arange(len(edge.axis)), edge.axis]
         return np.bincount(edge.axis, edge.outward * here, 3) * self.spacing**2
@@ -126,7 +126,7 @@ class Reach:
 
     @cached_property
     def parts(self) -> int:
-        """Number of pieces that the reach falls into; at this orientation none is reached from another."""
+        """Number of separate pieces of the reach; at this orientation there is no path between them."""
         return int(ndimage.label(self.within, np.ones((3, 3, 3)))[1])
 
     @cached_property
@@ -150,7 +150,7 @@ class Reach:
         return poses_at(self.geometry, self.points(), self.rotation)
 
     def shares(self) -> dict[str, float]:
-        """Return how much of the boundary each limit makes, by name, largest first."""
+        """Return the share of each limit in the boundary, by name, largest first."""
         return _shares(self.boundary.findings)
 
     def regions(self) -> dict[str, dict[str, float]]:
@@ -175,7 +175,7 @@ def orientations(geometry: HexapodGeometry, angles: Sequence[Sequence[float]]) -
 
 
 def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: int = 40) -> Reach:
-    """Find what a machine reaches at one orientation."""
+    """Compute the reach of a machine at one orientation."""
     if not CELLS[0] <= cells <= CELLS[1]:
         raise GeometryError("cells", f"must lie in {CELLS[0]}…{CELLS[1]}", cells)
     rotation = home_orientation(geometry) if rotation is None else Pose(np.zeros(3), rotation).rotation
@@ -194,7 +194,7 @@ def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: 
 
 
 def reaches(geometry: HexapodGeometry, rotations: np.ndarray, cells: int = 40) -> tuple[Reach, ...]:
-    """Find what a machine reaches at each of some orientations, shape (M, 3, 3); see :func:`reach`."""
+    """Compute the reach of a machine at each of some orientations, shape (M, 3, 3); see :func:`reach`."""
     return tuple(reach(geometry, rotation, cells) for rotation in rotations)
 
 
@@ -210,7 +210,7 @@ def possible_box(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
 
 
 def _search(examiner: Examiner, rotation: np.ndarray) -> np.ndarray:
-    """Return a box that holds the reach as far as a coarse grid sees it, one coarse cell wider."""
+    """Return a box that contains the reach as found by a coarse grid, enlarged by one coarse cell."""
     possible = possible_box(examiner.geometry, rotation)
     for cells in SEARCH_CELLS:
         axes, findings = _grid(examiner, rotation, possible, cells)
@@ -239,7 +239,7 @@ def _grid(
 
 
 def _grown(box: np.ndarray, within: np.ndarray, outermost: np.ndarray) -> np.ndarray:
-    """Return the box with every side moved out on which the grid still has points within reach."""
+    """Return the box with those sides moved outwards on which the grid still has points within reach."""
     grown = box.copy()
     step = 0.1 * (box[1] - box[0]).max()
     for axis in range(3):
