@@ -239,7 +239,8 @@ class _Fitted:
     def _weighed(
         self, mistake: Mistake, problem: LinearProblem, components: Components, early: bool = False
     ) -> Alternative:
-        """Return a mistake by the problem without it; values that were scaled have their density scaled (Jacobian).
+        """Return an alternative from its linear problem, in which the mistake is corrected; the density of scaled
+        values is scaled too (Jacobian).
 
         From the first guess on, as the fit itself: noise that a mistake has blown up can hold its own ground. `early`:
         after few rounds, and against the readings as they are after as few.

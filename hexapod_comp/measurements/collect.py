@@ -427,7 +427,7 @@ class _Collecting:
         return whole
 
     def _frame_remark(self) -> str:
-        """Return what the file says of a tracker that stands anywhere."""
+        """Return the note for the file about a tracker whose frame is unknown."""
         if not self.poses.free:
             return ""
         if self._frame is None:

@@ -153,7 +153,8 @@ def nudge(pose: Pose, direction: np.ndarray, channel: str, sign: float) -> Pose:
 
 
 def nudge_tolerance(channel: str, distance: float) -> float:
-    """Return by how much of a nudge a channel may differ, of a length `distance`, m, from a centre that is off."""
+    """Return the allowed relative error of a channel's change under a nudge; a length is read at `distance`, m, from a
+    centre that may be off."""
     off = min(OFF_CENTRE / distance, 1.0) if channel == "length" else 0.0
     return NUDGE_TOLERANCE + 1.0 - math.sqrt(1.0 - off**2)
 
@@ -163,8 +164,8 @@ def check_nudges(
 ) -> None:
     """Raise a SetUpError where channels do not follow small moves along each one's own direction.
 
-    `directions` (n, 6) are in which each channel reads, `seen` (n, n) by how much channel i changed when the tool was
-    moved along channel j, `tolerances` by how much of that it may differ.
+    `directions` (n, 6) are the directions in which channels read, `seen` (n, n) the change of channel i when the tool
+    was moved along channel j, `tolerances` the allowed relative errors.
     """
     sizes = np.array([NUDGE[dimension(channel)] for channel in channels])
     for i, channel in enumerate(channels):
