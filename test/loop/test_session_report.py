@@ -152,7 +152,7 @@ def test_too_few_poses_are_not_aligned() -> None:
 
 def test_what_nobody_saw_has_no_rows() -> None:
     assert error_rows(SessionResult([PoseRecord(GIVEN)])) == []
-    assert report.complaints(SessionResult(), []) == ["the true tool pose was not seen"]
+    assert report.complaints(SessionResult(), []) == ["the true tool pose was not received"]
 
 
 # The verdict.
