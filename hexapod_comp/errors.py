@@ -213,8 +213,16 @@ class LimitError(HexapodError):
 class TooEarlyError(LimitError):
     """A command is too early: the struts would exceed their largest speed. Later it may.
 
-    Parameters ---------- problem : str Sentence with value, limit and units. wait : float Time until it is allowed, s.
-    limit : float Largest strut speed, m/s. strut : int Index 0..5 of the strut concerned.
+    Parameters
+    ----------
+    problem : str
+        Sentence with value, limit and units.
+    wait : float
+        Time until it is allowed, s.
+    limit : float
+        Largest strut speed, m/s.
+    strut : int
+        Index 0..5 of the strut concerned.
     """
 
     def __init__(self, problem: str, wait: float, limit: float, strut: int):

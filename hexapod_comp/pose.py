@@ -212,8 +212,11 @@ def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
     points, onto : ndarray, shape (N, 3)
         Pairs of places, m.
 
-    Returns ------- Pose or None T with T·points ≈ onto, least squares; None for fewer than three points or points in a
-    line, which do not determine a turn.
+    Returns
+    -------
+    Pose or None
+        T with T·points ≈ onto, least squares; None for fewer than three points or points in a line, which do not
+        determine a turn.
     """
     from scipy.spatial.transform import Rotation  # As in attitude_error
 

@@ -274,8 +274,12 @@ class MoveState:
 class Machine:
     """A running machine with a mover: moves its tool and waits until it has arrived.
 
-    Parameters ---------- namespace : str, optional Namespace of the machine's nodes. mover : str, optional Name of the
-    mover's node.
+    Parameters
+    ----------
+    namespace : str, optional
+        Namespace of the machine's nodes.
+    mover : str, optional
+        Name of the mover's node.
 
     Raises
     ------
@@ -345,7 +349,11 @@ class Machine:
         MoveState
             The last one, ``arrived``.
 
-        Raises ------ MoveError The move was refused or stopped; ``reason`` is the cause. NoAnswerError
+        Raises
+        ------
+        MoveError
+            The move was refused or stopped; ``reason`` is the cause.
+        NoAnswerError
             The mover did not answer, or the tool had not arrived in time.
         """
         stamp = self._session.node.get_clock().now()
