@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import InputFileError
 from ..formats.texts import number
 from ..machine.geometry import load_geometry
 from . import results
@@ -20,19 +21,26 @@ def adapt(args: argparse.Namespace) -> Result:
     """Calibrate a running machine, or check the model that came of it; 0 when a model is borne out by its checks."""
     from ..ros import keep_discovery_local, received_signals
     from ..ros.adapting import AdaptedMachine
-    from ..upkeep.loop import Adaptation, Task
+    from ..upkeep.loop import Adaptation, Task, begun_with
     from ..workspace.reach import machine_box
 
     geometry, campaign = load_geometry(args.machine), None
+    begun = {} if args.anew else begun_with(args.folder)
+    if args.verify and not begun:
+        raise InputFileError(args.folder, "", "has no journal of a calibration: calibrate first")
     if args.campaign is not None:
         campaign = results.load_campaign(args, geometry)
         box, level = campaign.box, campaign.level
     else:
         box, level, _ = machine_box(geometry)
+        box, level = np.array(begun.get("box_m", box)), np.array(begun.get("level", level))
         if args.box is not None:
             box = np.array(args.box)
     instruments = ("6-D",) if args.instruments is None else tuple(args.instruments.split(","))
-    goal, hours = None if args.goal_um is None else args.goal_um * 1e-6, 4.0 if args.hours is None else args.hours
+    goal = None if args.goal_um is None else args.goal_um * 1e-6
+    if goal is None and campaign is None:
+        goal = begun.get("goal_m")
+    hours = 4.0 if args.hours is None else args.hours
     every = 600.0 if args.every_min is None else 60.0 * args.every_min
     checks = None if args.checks is None and args.every_min is not None else args.checks or 0
     task = Task(box, level, goal, campaign, instruments, 3600.0 * hours, fit_settings(args), every)
@@ -47,7 +55,7 @@ def adapt(args: argparse.Namespace) -> Result:
         results.stage_line() as say,
     ):
         reload = machine.reload if args.reload else None
-        loop = Adaptation(geometry, machine, task, args.folder, reload, going_on, say)
+        loop = Adaptation(geometry, machine, task, args.folder, reload, going_on, say, runs=machine.runs)
         if args.verify:
             outcome = loop.guard(1)
         else:

@@ -302,15 +302,15 @@ example:
             MACHINE,
             folder("--folder", "folder of the journal, readings and models; what it has begun goes on", required=True),
             value("--goal-um", above_zero, "UM", "RMS tool error that may be left, with 95 %%, the datum aligned: "
-                  "campaigns are planned for it"),
+                  "campaigns are planned for it (default: the folder's)"),
             reads("--campaign", "campaign file to measure instead; its box is checked", kind="campaign"),
             flag("--reload", "have the compensator run each model that its checks bear out; else models are proposed"),
             flag("--verify", "check the model of the folder once, now; calibrate nothing"),
             flag("--anew", "calibrate, whatever the folder has"),
             value("--checks", whole(0), "N", "then check the model N times (default 0; with --every-min until Ctrl-C)"),
             value("--every-min", bound, "MIN", "time from one check to the next (default 10)"),
-            value("--box", box, CORNERS, "lowest and highest tool position that counts, mm (default: the campaign's, "
-                  "else the largest that the machine reaches)"),
+            value("--box", box, CORNERS, "lowest and highest tool position that counts, mm (default: the "
+                  "folder's, the campaign's, else the largest that the machine reaches)"),
             value("--instruments", None, "A,B,…", "what to plan for, read from the poses (default 6-D: lines)"),
             value("--hours", above_zero, "H", "how long a planned campaign may take (default 4)"),
             value("--topic", None, "TOPIC", "poses of the tool in base (PoseStamped), from a tracker or motion capture "
@@ -340,10 +340,9 @@ example:
   $ ros2 launch hexapod_comp machine.launch.py mover:=true     (compensator, mover and a simulated machine)
   $ hexapod_comp adapt --goal-um 3 --folder adapted --reload
   $ hexapod_comp adapt --goal-um 3 --folder adapted --reload --every-min 30
-  $ hexapod_comp adapt --goal-um 3 --folder adapted --verify""",
+  $ hexapod_comp adapt --folder adapted --reload --verify""",
         (
-            exactly_one("--goal-um", "--campaign"),
-            excluded_by("--campaign", "--box", "--instruments", "--hours"),
+            excluded_by("--campaign", "--goal-um", "--box", "--instruments", "--hours"),
             excluded_by("--verify", "--anew", "--checks", "--every-min"),
         ),
     ),

@@ -52,15 +52,24 @@ class AdaptedMachine(WatchedMachine):
 
     def reload(self, path: Path) -> None:
         """Have the compensator run a model file, by its ramp; where it refuses, the old model and its name stay."""
-        for client in (self._reload_model, self._set, self._get):
+        before = self._named()
+        for client in (self._reload_model, self._set):
             self._wait(client.service_is_ready, 10.0, f"the services of {self._compensator}")
-        before = self._call(self._get, GetParameters.Request(names=["model_file"])).values[0].string_value
         wanted = str(path.resolve())
         self._name_model(wanted)
         answer = self._call(self._reload_model, Trigger.Request())
         if not answer.success:
             self._name_model(before)
             raise CommandError("reload", f"{self._compensator} did not take {wanted}: {answer.message}")
+
+    def runs(self, path: Path) -> bool:
+        """Return whether the compensator's model is the one of a file."""
+        return self._named() == str(path.resolve())
+
+    def _named(self) -> str:
+        self._wait(self._get.service_is_ready, 10.0, f"the services of {self._compensator}")
+        answer = self._call(self._get, GetParameters.Request(names=["model_file"]))
+        return str(answer.values[0].string_value)
 
     def _name_model(self, name: str) -> None:
         value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=name)

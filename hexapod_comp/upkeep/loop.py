@@ -76,17 +76,22 @@ class Task:
     box: np.ndarray  # (2, 3): where the tool works, m in the work frame
     level: np.ndarray  # (3, 3): the tool's attitude there, in the work frame
     goal: float | None = None  # the promised RMS tool error may reach this at most, with 95 %, m; None: any promise
-    campaign: Campaign | None = None  # to begin with, in place of a planned one
+    campaign: Campaign | None = None  # to begin with, in place of a planned one; with neither it can only be checked
     instruments: tuple[str, ...] = ("6-D",)  # that may be planned for
     seconds: float = 4 * 3600.0  # that a planned campaign may take
     settings: FitSettings = field(default_factory=FitSettings)
     every: float = 600.0  # time from one check of the model in use to the next, s
 
     def __post_init__(self) -> None:
-        if (self.goal is None) == (self.campaign is None):
+        if self.goal is not None and self.campaign is not None:
             raise CommandError("usage", "give a goal to plan for, or a campaign, and not both")
         if self.goal is not None and not 0.0 < self.goal < np.inf:
             raise CalibrationError("goal", f"must be finite and above zero, m, not {self.goal:g}")
+
+    @property
+    def measurable(self) -> bool:
+        """Whether there is something to calibrate with."""
+        return self.goal is not None or self.campaign is not None
 
 
 @dataclass(frozen=True)
@@ -134,6 +139,8 @@ class State:
                 return State(**{**kept, "checks": self.checks + bool(self.repairs)})
             case "reloaded":
                 return replace(one, reloaded=True)
+            case "restarted":
+                return replace(one, reloaded=False)
             case "repaired":
                 return State(**kept, candidate=e["model"], repairs=self.in_use, promised=self.kept)
             case "beyond repair":
@@ -176,6 +183,13 @@ def next_step(state: State, checks: int | None, may_reload: bool) -> str:
     return END if checks is not None and state.checks >= checks else GUARD
 
 
+def begun_with(folder: str | Path) -> Event:
+    """Return what the newest calibration in a folder was begun with: machine, goal_m, box_m, level; empty: nothing."""
+    path = Path(folder) / JOURNAL
+    events = Journal.read(path) if path.exists() else []
+    return next((e for e in reversed(events) if e["event"] == "begun"), {})
+
+
 class Outcome(NamedTuple):
     """How a run of the loop ended."""
 
@@ -216,6 +230,8 @@ class Adaptation:
         Told what goes on.
     wait : callable, optional
         Lets some time pass, s.
+    runs : callable, optional
+        Whether the machine runs the model of a file: one that was switched off and on runs what it was started with.
     """
 
     def __init__(
@@ -228,9 +244,10 @@ class Adaptation:
         going_on: Callable[[], bool] = lambda: True,
         say: Callable[[str], object] = lambda text: None,
         wait: Callable[[float], object] = time.sleep,
+        runs: Callable[[Path], bool] = lambda path: True,
     ) -> None:
         self._geometry, self._machine, self._task = geometry, Careful(machine), task
-        self._reload, self._going_on, self._say, self._wait = reload, going_on, say, wait
+        self._reload, self._runs, self._going_on, self._say, self._wait = reload, runs, going_on, say, wait
         self._folder = Path(folder)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -254,7 +271,11 @@ class Adaptation:
 
     def calibrate(self, anew: bool = False) -> Outcome:
         """Calibrate, or go on with what was begun, until a model is adopted or refused; anew: whatever was before."""
+        if not self._task.measurable:
+            raise CommandError("usage", "give a goal to plan for, or a campaign")
         state = self.state
+        if not anew:
+            self._same_place()
         if anew or not (state.calibrating or state.candidate or state.in_use) or state.refused or state.stuck:
             self._begin()
         return self._run(0)
@@ -264,6 +285,7 @@ class Adaptation:
         state = self.state
         if not state.in_use and not state.candidate:
             raise CommandError("not_calibrated", f"{self._folder} has no model in use: calibrate first")
+        self._same_place()
         return self._run(None if checks is None else state.checks + checks)
 
     def _run(self, checks: int | None) -> Outcome:
@@ -281,6 +303,8 @@ class Adaptation:
             REPAIR: self._repair,
         }
         try:
+            if may_reload and self.state.reloaded and not self._runs(self._folder / IN_USE):
+                self._note("restarted", reason="the compensator did not run the model in use")
             while (step := next_step(self.state, checks, may_reload)) != END:
                 self._stop_if_asked("stopped")
                 if step == GUARD and waits:
@@ -316,7 +340,17 @@ class Adaptation:
 
     def _begin(self) -> None:
         goal = self._task.goal
-        self._note("begun", machine=self._geometry.name, goal_m=goal, box_m=self._task.box.tolist())
+        box, level = self._task.box.tolist(), self._task.level.tolist()
+        self._note("begun", machine=self._geometry.name, goal_m=goal, box_m=box, level=level)
+
+    def _same_place(self) -> None:
+        """Refuse to go on in another box than the one that was calibrated: outside of it the model promises nothing."""
+        begun = next((np.array(e["box_m"]) for e in reversed(self.events) if e["event"] == "begun"), self._task.box)
+        if not np.allclose(begun, self._task.box, rtol=0.0, atol=1e-6):
+            was, now = (", ".join(f"{x * 1e3:g}" for x in box.ravel()) for box in (begun, self._task.box))
+            raise InputFileError(
+                self._journal.path, "box_m", f"is {was} mm, not {now} mm: give that box, or begin anew"
+            )
 
     def _name(self, what: str, suffix: str) -> tuple[int, str]:
         """Return number and name of the next file: the same ones after a restart, so that it is gone on with."""
@@ -326,6 +360,11 @@ class Adaptation:
     def _stop_if_asked(self, where: str) -> None:
         if not self._going_on():
             raise Stopped(where)
+
+    def _say_or_stop(self, text: str) -> None:
+        """Tell what a long calculation does, and end it when that is asked for: its step is done again."""
+        self._say(text)
+        self._stop_if_asked(f"stopped ({text})")
 
     # ---- the steps ----
 
@@ -350,7 +389,8 @@ class Adaptation:
         """Return the plan for a share of the goal."""
         task = self._task
         goal = Goal(share * (task.goal or 0.0), seconds=task.seconds, instruments=task.instruments)
-        return propose(MeasuringBox(self._geometry, task.box, task.level, 0.0), goal, task.settings)
+        place = MeasuringBox(self._geometry, task.box, task.level, 0.0)
+        return propose(place, goal, task.settings, progress=self._say_or_stop)
 
     def _collect(self) -> None:
         """Measure the planned campaign."""
@@ -392,7 +432,7 @@ class Adaptation:
         measured = read_measurements([self._folder / part for part in state.readings], self._geometry)
         promised, short, report = None, "", ""
         try:
-            fit = fit_model(measured, task.settings, self._say)
+            fit = fit_model(measured, task.settings, self._say_or_stop)
         except CalibrationError as error:
             short = f"no model can be fitted: {error}"
         else:
@@ -517,7 +557,7 @@ class Adaptation:
             write_text(self._folder / name, campaign_text(plan.campaign, remarks(plan)))
             reason += f"; proposed campaign: {self._folder / name}"
         self._note("beyond repair", number=number, text=text, reason=reason)
-        if self._reload is not None:
+        if self._reload is not None and self._task.measurable:
             self._begin()
 
     def _pause(self) -> None:

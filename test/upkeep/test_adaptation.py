@@ -30,7 +30,7 @@ from hexapod_comp.measurements.collect import Observation
 from hexapod_comp.pose import Pose
 from hexapod_comp.upkeep import loop as upkeep
 from hexapod_comp.upkeep.journal import Journal
-from hexapod_comp.upkeep.loop import Adaptation, State, Task, next_step
+from hexapod_comp.upkeep.loop import Adaptation, State, Task, begun_with, next_step
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
 from hexapod_comp.virtual.watched import Instrument, VirtualMachine
 
@@ -223,7 +223,7 @@ def test_a_goal_that_three_campaigns_do_not_reach_is_refused(tmp_path: Path, mon
     class Plan:
         campaign, worst = None, 1e-6
 
-    def propose(place: object, goal: Any, settings: object) -> Plan:
+    def propose(place: object, goal: Any, settings: object, progress: object) -> Plan:
         planned.append(goal.error)
         return Plan()
 
@@ -276,6 +276,40 @@ def test_a_machine_that_few_readings_cannot_repair_is_calibrated_anew_by_a_perso
     assert next_step(again.loop().state.after({"event": "begun"}), 0, True) == "plan"
 
 
+def test_what_is_only_checked_needs_no_goal_and_the_box_that_was_calibrated(again: Rig) -> None:
+    """Outside of that box the model promises nothing: checks there would contradict it."""
+    rest = begun_with(again.folder)
+    np.testing.assert_allclose(rest["box_m"], again.task.box)
+    np.testing.assert_allclose(rest["level"], again.task.level)
+    task = again.task
+    again.task = replace(task, campaign=None)
+    assert again.loop().guard(1).state == "in use"
+    with pytest.raises(CommandError, match="a goal to plan for, or a campaign"):
+        again.loop().calibrate()
+    again.task = replace(task, box=task.box * 1.01)
+    for step in (lambda: again.loop().guard(1), again.loop().calibrate):
+        with pytest.raises(InputFileError, match=r"box_m: is .* mm, not .* mm: give that box, or begin anew"):
+            step()
+    assert begun_with(again.folder / "another") == {}
+
+
+def test_a_compensator_that_was_restarted_gets_its_model_again(again: Rig) -> None:
+    again.reloaded.clear()
+    loop = Adaptation(again.geometry, again.machine, again.task, again.folder, again.reload, runs=lambda path: False)
+    assert loop.guard(1).state == "in use"
+    assert again.names()[-3:] == ["restarted", "reloaded", "checked"]
+    assert again.reloaded == [again.folder / "model.yaml"]
+
+
+def test_a_fit_or_a_plan_ends_when_a_person_stops_it(again: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the next thing that it says, and is done again from its beginning."""
+    cut(again, 3)
+    going = iter([True, False])
+    assert again.loop(going_on=lambda: next(going)).calibrate().state == "stopped"
+    assert again.names()[-1] == "stopped"
+    assert next_step(again.loop().state, 0, True) == "fit"
+
+
 def test_a_folder_without_a_model_has_nothing_to_check(tmp_path: Path) -> None:
     with pytest.raises(CommandError, match="calibrate first"):
         Rig(tmp_path / "made").loop().guard(1)
@@ -311,10 +345,10 @@ def test_an_unfinished_last_line_is_dropped(tmp_path: Path) -> None:
     ]
 
 
-def test_a_task_has_a_goal_or_a_campaign() -> None:
+def test_a_task_has_a_goal_or_a_campaign_and_not_both() -> None:
     box, level = np.array([[0.0] * 3, [0.1] * 3]), np.eye(3)
-    with pytest.raises(CommandError, match="a goal to plan for, or a campaign"):
-        Task(box, level)
+    with pytest.raises(CommandError, match="and not both"):
+        Task(box, level, goal=1e-6, campaign=Campaign(box, 0.1, 0.1, "6-D", 4, level=level))
     with pytest.raises(CalibrationError, match="finite and above zero"):
         Task(box, level, goal=-1e-6)
 
