@@ -209,6 +209,10 @@ class Stopped(HexapodError):
     reason = "person"
 
 
+class Ended(Exception):  # no HexapodError: a fit tries other ways after one of these
+    """A person has stopped the loop in a long calculation."""
+
+
 class Adaptation:
     """Calibrates a machine and keeps its model true; everything that it makes is in its folder.
 
@@ -311,13 +315,18 @@ class Adaptation:
                     self._pause()
                 waits |= step == GUARD
                 steps[step]()
+        except Ended as ended:
+            return self._stopped(str(ended))
         except HexapodError as error:
             if error.reason == "person":  # stopped on the way, by whatever asked the machine to
-                self._note("stopped", at=str(error))
-                return Outcome("stopped", f"{error}; the same command goes on from there", self._model_path())
+                return self._stopped(str(error))
             self._note("interrupted", reason=str(error))
             raise
         return self._outcome()
+
+    def _stopped(self, where: str) -> Outcome:
+        self._note("stopped", at=where)
+        return Outcome("stopped", f"{where}; the same command goes on from there", self._model_path())
 
     def _outcome(self) -> Outcome:
         state, path = self.state, self._model_path()
@@ -364,7 +373,8 @@ class Adaptation:
     def _say_or_stop(self, text: str) -> None:
         """Tell what a long calculation does, and end it when that is asked for: its step is done again."""
         self._say(text)
-        self._stop_if_asked(f"stopped ({text})")
+        if not self._going_on():
+            raise Ended(f"stopped in a calculation ({text})")
 
     # ---- the steps ----
 

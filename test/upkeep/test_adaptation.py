@@ -301,8 +301,8 @@ def test_a_compensator_that_was_restarted_gets_its_model_again(again: Rig) -> No
     assert again.reloaded == [again.folder / "model.yaml"]
 
 
-def test_a_fit_or_a_plan_ends_when_a_person_stops_it(again: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the next thing that it says, and is done again from its beginning."""
+def test_a_fit_or_a_plan_ends_when_a_person_stops_it(again: Rig) -> None:
+    """At the next thing that it says, without trying other ways to fit, and is done again from its beginning."""
     cut(again, 3)
     going = iter([True, False])
     assert again.loop(going_on=lambda: next(going)).calibrate().state == "stopped"
