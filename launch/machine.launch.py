@@ -43,6 +43,9 @@ def generate_launch_description() -> LaunchDescription:
         argument("namespace", default_value="", description="Holds this machine's nodes and topics."),
         argument("geometry", default_value="", description="Geometry file; empty: as in the node."),
         argument("model", default_value="", description="Model file; empty: ideal, corrects nothing."),
+        argument(
+            "model_folder", default_value="", description="Models may be reloaded from it; empty: the model's own."
+        ),
         argument("truth", default_value="", description="What strut_drive hides; empty: as in the node."),
         argument("params_file", default_value="", description="Parameters of both nodes (YAML)."),
         argument(
@@ -99,6 +102,7 @@ def _nodes(context: LaunchContext) -> list[Node]:
         common |= {"base_frame": f"{prefix}base"}
     common |= {"geometry_file": given("geometry")} if given("geometry") else {}
     model = {"model_file": given("model")} if given("model") else {}
+    model |= {"model_folder": given("model_folder")} if given("model_folder") else {}
     model |= {"work_frame": f"{prefix}work", "frame_prefix": prefix} if prefix else {}
     truth = {"truth_file": given("truth")} if given("truth") else {}
     nodes = [_node("compensator", given, [*files, common | model])]

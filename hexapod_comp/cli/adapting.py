@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ def adapt(args: argparse.Namespace) -> Result:
     """Calibrate a running machine, or check the model that came of it; 0 when a model is borne out by its checks."""
     from ..ros import keep_discovery_local, received_signals
     from ..ros.adapting import AdaptedMachine
-    from ..upkeep.loop import Adaptation, Task, begun_with
+    from ..upkeep.loop import IN_USE, Adaptation, Task, begun_with
     from ..workspace.reach import machine_box
 
     geometry, campaign = load_geometry(args.machine), None
@@ -54,6 +55,8 @@ def adapt(args: argparse.Namespace) -> Result:
         AdaptedMachine(args.topic, args.namespace, samples=args.samples, going_on=going_on) as machine,
         results.stage_line() as say,
     ):
+        if args.reload:
+            machine.refuse_unreadable(Path(args.folder, IN_USE))
         reload = machine.reload if args.reload else None
         loop = Adaptation(geometry, machine, task, args.folder, reload, going_on, say, runs=machine.runs)
         if args.verify:

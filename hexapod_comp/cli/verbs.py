@@ -337,7 +337,7 @@ nothing is visited again. Exit code: 0 a model is in use, or proposed; 1 refused
 input, or the machine does not answer; 130 stopped.
 
 example:
-  $ ros2 launch hexapod_comp machine.launch.py mover:=true     (compensator, mover and a simulated machine)
+  $ ros2 launch hexapod_comp machine.launch.py mover:=true model_folder:=$PWD     (and a simulated machine)
   $ hexapod_comp adapt --goal-um 3 --folder adapted --reload
   $ hexapod_comp adapt --goal-um 3 --folder adapted --reload --every-min 30
   $ hexapod_comp adapt --folder adapted --reload --verify""",

@@ -12,6 +12,7 @@ from rcl_interfaces.srv import GetParameters, SetParameters
 from std_srvs.srv import Trigger
 
 from ..errors import CommandError, NoAnswerError
+from ..formats.paths import folder_of
 from ..pose import Pose
 from .client import MoveState
 from .collector import WatchedMachine
@@ -52,7 +53,7 @@ class AdaptedMachine(WatchedMachine):
 
     def reload(self, path: Path) -> None:
         """Have the compensator run a model file, by its ramp; where it refuses, the old model and its name stay."""
-        before = self._named()
+        (before,) = self._parameters("model_file")
         for client in (self._reload_model, self._set):
             self._wait(client.service_is_ready, 10.0, f"the services of {self._compensator}")
         wanted = str(path.resolve())
@@ -62,14 +63,29 @@ class AdaptedMachine(WatchedMachine):
             self._name_model(before)
             raise CommandError("reload", f"{self._compensator} did not take {wanted}: {answer.message}")
 
+    def refuse_unreadable(self, path: Path) -> None:
+        """Refuse a model file that the compensator would not open, before anything is measured for it.
+
+        Whether names that are relative to its own folder lead there is not known here: then its reload tells.
+        """
+        folder, model = self._parameters("model_folder", "model_file")
+        name = folder or model
+        own = Path(folder).expanduser() if folder else folder_of(model)
+        if own is not None and (
+            not Path(name).expanduser().is_absolute() or path.resolve().is_relative_to(own.resolve())
+        ):
+            return
+        places = "shipped models alone" if own is None else f"models in {own} alone"
+        advice = f"start it with -p model_folder:=FOLDER, in which {path.resolve()} and its geometry file are"
+        raise CommandError("reload", f"{self._compensator} reads {places}: {advice}")
+
     def runs(self, path: Path) -> bool:
         """Return whether the compensator's model is the one of a file."""
-        return self._named() == str(path.resolve())
+        return self._parameters("model_file") == [str(path.resolve())]
 
-    def _named(self) -> str:
+    def _parameters(self, *names: str) -> list[str]:
         self._wait(self._get.service_is_ready, 10.0, f"the services of {self._compensator}")
-        answer = self._call(self._get, GetParameters.Request(names=["model_file"]))
-        return str(answer.values[0].string_value)
+        return [str(value.string_value) for value in self._call(self._get, GetParameters.Request(names=names)).values]
 
     def _name_model(self, name: str) -> None:
         value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=name)
