@@ -165,6 +165,8 @@ class AdapterNode(MachineNode):
             start_new_session=True,  # so that Ctrl-C reaches it through the node alone
         )
         os.setpriority(os.PRIO_PROCESS, self._process.pid, NICENESS)
+        # The newest step in the journal is of the run before until this one writes another
+        self._step, self._size = "", self._journal.stat().st_size if self._journal.exists() else -1
         self._change(state, "starting")
         return Trigger.Response(success=True, message=f"{state}; ~/state says what comes of it")
 

@@ -354,7 +354,8 @@ class Adaptation:
 
     def _same_place(self) -> None:
         """Refuse to go on in another box than the one that was calibrated: outside of it the model promises nothing."""
-        begun = next((np.array(e["box_m"]) for e in reversed(self.events) if e["event"] == "begun"), self._task.box)
+        boxes = (e.get("box_m", self._task.box) for e in reversed(self.events) if e["event"] == "begun")
+        begun = np.array(next(boxes, self._task.box))
         if not np.allclose(begun, self._task.box, rtol=0.0, atol=1e-6):
             was, now = (", ".join(f"{x * 1e3:g}" for x in box.ravel()) for box in (begun, self._task.box))
             raise InputFileError(

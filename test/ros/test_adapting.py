@@ -90,9 +90,12 @@ def test_the_node_starts_reports_and_stops_a_calibration(bench: Bench, tmp_path:
     """No machine is there: the process waits for one. The journal is the test's."""
     node = bench.add(AdapterNode, True, {"folder": str(tmp_path)})
     assert bench.call(Trigger, "adapter/stop").message == "nothing was running"
+    (tmp_path / "journal.jsonl").write_text('{"event": "stopped"}\n', encoding="utf-8")
     assert bench.call(Trigger, "adapter/calibrate").success
     refused = bench.call(Trigger, "adapter/verify")
     assert (refused.success, refused.message) == (False, "calibrating already: ~/stop ends it")
+    bench.until(lambda: node._check_state() is None, "a look at the journal")
+    assert (node._step, node._text) == ("", "starting"), "the step of the run before is none of this one"
     journal = '{"event": "begun", "machine": "paper", "goal_m": 3e-06}\n{"event": "pla'
     (tmp_path / "journal.jsonl").write_text(journal, encoding="utf-8")
     bench.until(lambda: node._step == "begun", "the step")
