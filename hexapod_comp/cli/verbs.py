@@ -231,7 +231,7 @@ example:
     ),
     "travel": Verb(
         "poses", "kinematics",
-        "how far the tool may move from a pose in each direction, and which limit ends it",
+        "how far the tool may move each way, and which limit ends it",
         (
             value("--pose", pose, SHAPE, f"pose of the tool, {POSE_HELP} (default: home)"),
             *FRAMES,
@@ -686,7 +686,7 @@ example:
     ),
     "verify": Verb(
         "fitting", "calibration",
-        "check by a few readings whether a model still holds, and what has changed",
+        "check by few readings whether a model holds, and what has changed",
         (
             reads("model", "model file that fit has written, MODEL.posterior.npz beside it", "MODEL"),
             *readings(required=False),

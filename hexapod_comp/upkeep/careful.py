@@ -1,4 +1,4 @@
-"""A machine observed with care: the median of three observations at each stop, so that a single wild one is nothing."""
+"""A machine observed with care: at each stop the median of several observations, so that wild ones do not count."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 from ..measurements.collect import MeasuredMachine, Observation
 from ..pose import Pose
 
-LOOKS = 3  # that read something, at each stop; one of them may be wild
-MOST = 6  # looks at a stop: a beam that is broken more often is broken
+LOOKS = 3  # that read something, at each stop, at least; more where no majority of them agrees
+MOST = 8  # looks at a stop: a beam that is broken more often is broken
+AGREE = 5.0  # Looks agree that differ from their median by up to this many stated standard deviations
 FINEST = 1e-7  # No stop is stated to be read better, m and rad: struts are counted to a tenth of a micrometre
 
 
@@ -24,19 +25,21 @@ class Careful:
         return self._machine.move(pose)
 
     def observe(self) -> Observation | None:
-        """Return the median of three observations; None where fewer read anything: of two nobody knows the wild one."""
+        """Return the median of three observations or more; None where fewer read anything."""
         seen = list[tuple[Observation, Pose]]()
         for _ in range(MOST):
-            if (o := self._machine.observe()) is not None and o.pose is not None:
-                seen.append((o, o.pose))
-            if len(seen) == LOOKS:
+            if (o := self._machine.observe()) is None or o.pose is None:
+                continue
+            seen.append((o, o.pose))
+            first = seen[0][1]
+            turns = [Rotation.from_matrix(pose.rotation @ first.rotation.T).as_rotvec() for _, pose in seen]
+            numbers = np.array([[*pose.position, *turn] for (_, pose), turn in zip(seen, turns, strict=True)])
+            middle = np.median(numbers, axis=0)
+            stated = np.nanmax([np.median([o.uncertainty for o, _ in seen], axis=0), np.full(6, FINEST)], axis=0)
+            agree = (np.abs(numbers - middle) <= AGREE * stated).all(axis=1)
+            if len(seen) >= LOOKS and 2 * agree.sum() > len(seen):
                 break
-        else:
+        if len(seen) < LOOKS:
             return None
-        first = seen[0][1]
-        turns = [Rotation.from_matrix(pose.rotation @ first.rotation.T).as_rotvec() for _, pose in seen]
-        numbers = np.array([np.concatenate([pose.position, turn]) for (_, pose), turn in zip(seen, turns, strict=True)])
-        middle = np.median(numbers, axis=0)
-        stated = np.nanmax([np.median([o.uncertainty for o, _ in seen], axis=0), np.full(6, FINEST)], axis=0)
         turned = Rotation.from_rotvec(middle[3:]).as_matrix() @ first.rotation
         return seen[-1][0]._replace(pose=Pose(middle[:3], turned), uncertainty=stated)

@@ -18,7 +18,7 @@ from hexapod_comp.formats import outputs
 
 ROOT = Path(__file__).resolve().parents[2]
 WORDS = {"name", "namespace", "blocks", "instruments", "order", "scheme", "method", "scheduler", "thermometer", "host"}
-WORDS |= {"tool", "work", "topic", "frame"}
+WORDS |= {"tool", "work", "topic", "frame", "readings"}
 """Options whose text is no file's name."""
 
 

@@ -36,7 +36,7 @@ IN_THE_TEXT = {
     "Y_p2": "off by 172 mm",
     "Y_T3": "off by 595 mm",
     "second combined equation": "residual of 542 mm",
-    "the same, its third misprint alone": "without the last mend 378 mm",
+    "the same, its third misprint alone": "without the last correction 378 mm",
     "Y′_T1": "off by 113 mm",
     "Y′_T2": "off by 50 mm",
     "Z′_T2": "off by 93 mm",

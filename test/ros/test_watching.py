@@ -248,7 +248,10 @@ def free_port() -> int:
 
 def screenshot(browser: str, folder: Path, address: str, patience: int) -> list[str]:
     """Return the command that writes page.png, as the page is after some of the browser's seconds."""
-    options = "--headless --no-sandbox --disable-dev-shm-usage --use-angle=swiftshader --enable-unsafe-swiftshader"
+    options = (
+        "--headless --no-sandbox --disable-dev-shm-usage --use-angle=swiftshader --enable-unsafe-swiftshader "
+        "--no-first-run --disable-background-networking --disable-component-update --disable-sync"
+    )
     command = [browser, *options.split(), f"--user-data-dir={folder / 'profile'}", "--window-size=1200,1200"]
     return [*command, f"--virtual-time-budget={patience * 1000}", f"--screenshot={folder / 'page.png'}", address]
 
@@ -283,7 +286,10 @@ def test_the_page_in_a_browser(rig, tmp_path):
         for patience in (8, 40, 120):  # on a busy computer the scene comes later than the page
             command = screenshot(browser, tmp_path, page.address, patience)
             with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
-                rig.until(lambda process=process: shown() and process.poll() is not None, "the screenshot", 200.0)
+                try:
+                    rig.until(lambda process=process: shown() and process.poll() is not None, "the screenshot", 200.0)
+                finally:
+                    process.kill()  # else the end of the with would wait for a browser that hangs
             pixels = np.rint(255 * matplotlib.image.imread(tmp_path / "page.png")[..., :3]).astype(int)
             scene, panel = pixels[:, :800], pixels[:, 800:]
             others = np.stack([np.delete(scene, hue, axis=2).max(axis=2) for hue in (0, 2)], axis=2)

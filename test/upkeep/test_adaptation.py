@@ -374,14 +374,15 @@ def test_one_contradiction_that_is_not_repeated_changes_nothing() -> None:
 
 
 def test_the_median_of_three_looks_counts_and_a_beam_that_stays_broken_is_none(again: Rig) -> None:
-    """The median of three, whatever one of them is; of one alone nobody knows whether it is wild."""
+    """The median of three, whatever one of them is; where two of them are wild, of as many as make a majority."""
     pose, sigma = again.geometry.home, np.full(6, 2e-7)
     good = Observation(pose, sigma)
-    wild = Observation(Pose(pose.position + 1e-3, pose.rotation), sigma)
+    wild, wilder = (Observation(Pose(pose.position + off, pose.rotation), sigma) for off in (1e-3, 2e-3))
     for three, seen in (
         ([good, wild, good], good),
         ([None, wild, good, good], good),
-        ([None] * 4 + [good, good], None),
+        ([wild, good, wilder, good, good], good),
+        ([None] * 6 + [good, good], None),
     ):
         rest = iter(three)
         machine = VirtualMachine(again.geometry, again.machine.truth)
