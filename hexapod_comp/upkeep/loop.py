@@ -463,6 +463,8 @@ class Adaptation:
         model = state.candidate or state.in_use
         promised = state.promised if state.candidate else state.kept
         number, name = self._name("check", ".csv")
+        # A check that was stopped begins anew: whatever stopped it may have changed the machine
+        (self._folder / name).unlink(missing_ok=True)
         self._say(f"checking {model}")
         campaign = check_campaign(self._task.box, self._task.level, number, name=f"check {number}")
         readings, missing = self._measured(campaign, name)

@@ -146,7 +146,7 @@ def test_a_killed_process_goes_on_where_it_stopped(
     events: int, again: Rig, monkeypatch: pytest.MonkeyPatch, calibrated: Rig
 ) -> None:
     """Killed while it wrote the next event; what has an event is not done again."""
-    made = {path.name: path.read_bytes() for path in again.folder.glob("*.csv")}
+    made = {path.name: path.read_bytes() for path in again.folder.glob("*readings.csv")}
     fits: list[int] = []
     fit = upkeep.fit_model
     monkeypatch.setattr(upkeep, "fit_model", lambda *a: fits.append(1) or fit(*a))
@@ -291,6 +291,17 @@ def test_what_is_only_checked_needs_no_goal_and_the_box_that_was_calibrated(agai
         with pytest.raises(InputFileError, match=r"box_m: is .* mm, not .* mm: give that box, or begin anew"):
             step()
     assert begun_with(again.folder / "another") == {}
+
+
+def test_a_check_that_was_stopped_begins_anew(again: Rig) -> None:
+    """Half a check from before a crash and half from after it are of no machine, and show no change that there is."""
+    began = again.machine.stops
+    assert again.loop(going_on=lambda: again.machine.stops < began + 9).guard(1).state == "stopped"
+    stopped = again.machine.stops
+    assert again.loop().guard(1).state == "in use"
+    whole = again.machine.stops - stopped
+    assert again.loop().guard(1).state == "in use"
+    assert again.machine.stops == stopped + 2 * whole
 
 
 def test_a_compensator_that_was_restarted_gets_its_model_again(again: Rig) -> None:
