@@ -376,7 +376,7 @@ def test_checks_that_a_single_reading_spoils_end_with_the_instrument() -> None:
 
 
 def test_one_contradiction_that_is_not_repeated_changes_nothing() -> None:
-    state = State(in_use="model.yaml", kept=1e-6, reloaded=True)
+    state = State(in_use="model.yaml", kept=1e-6, promised=1e-6, reloaded=True)
     bad = {"event": "checked", "good": False, "spoilt": False, "readings": "c.csv"}
     once = state.after(bad)
     assert (once.changed, next_step(once, 0, True)) == (False, "check"), "at once, not at the next turn"
