@@ -21,7 +21,7 @@ from ..machine.temperatures import TEMPERATURE_RANGE, Temperatures
 from ..measurements.collect import Observation, RunSetUp
 from ..measurements.readings import ABSOLUTE_KINDS, LEAST_NOISE
 from ..measurements.set_up import KNOWN
-from ..pose import Pose
+from ..pose import Pose, attitude_error
 from .base import LATCHED_QOS, NEWEST_QOS, SENSOR_QOS
 from .client import Machine, MoveError, MoveState
 from .instrument import SET_UP_TOPIC
@@ -198,10 +198,7 @@ class WatchedMachine(Machine):
         """Return the median of the poses, and its standard deviation (6,)."""
         first = self._poses[0][0]
         numbers = np.array(
-            [
-                np.concatenate([p.position, Rotation.from_matrix(p.rotation @ first.rotation.T).as_rotvec()])
-                for p, _ in self._poses
-            ]
+            [np.concatenate([p.position, attitude_error(p.rotation, first.rotation)]) for p, _ in self._poses]
         )
         middle, deviation = _median(numbers)
         return Pose(middle[:3], Rotation.from_rotvec(middle[3:]).as_matrix() @ first.rotation), deviation

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..measurements.collect import MeasuredMachine, Observation
-from ..pose import Pose
+from ..pose import Pose, attitude_error
 
 LOOKS = 3  # that read something, at each stop, at least; more where no majority of them agrees
 MOST = 8  # looks at a stop: a beam that is broken more often is broken
@@ -32,7 +32,7 @@ class Careful:
                 continue
             seen.append((o, o.pose))
             first = seen[0][1]
-            turns = [Rotation.from_matrix(pose.rotation @ first.rotation.T).as_rotvec() for _, pose in seen]
+            turns = [attitude_error(pose.rotation, first.rotation) for _, pose in seen]
             numbers = np.array([[*pose.position, *turn] for (_, pose), turn in zip(seen, turns, strict=True)])
             middle = np.median(numbers, axis=0)
             stated = np.nanmax([np.median([o.uncertainty for o, _ in seen], axis=0), np.full(6, FINEST)], axis=0)

@@ -19,7 +19,7 @@ from ..machine.model import MachineModel, RealMachine
 from ..machine.temperatures import Temperatures
 from ..machine.trajectory import commanded_in_base
 from ..measurements.collect import Observation
-from ..pose import Pose
+from ..pose import Pose, attitude_error
 from .machine import DriveParameters, StrutDrive
 
 PLACES = (0.5, 0.75, 0.875, 0.94, 0.97, 0.99, 1.0)  # of a move, as shares of it: struts turn back where they would
@@ -61,7 +61,7 @@ class VirtualMachine:
         """Go straight to a tool pose in work, and come to rest; a LimitError, ``limit``, where a limit forbids it."""
         target, start = self.geometry.work @ pose, self._at
         way = target.position - start.position
-        turn = Rotation.from_matrix(target.rotation @ start.rotation.T).as_rotvec()
+        turn = attitude_error(target.rotation, start.rotation)
         for share in PLACES:
             place = start.position + share * way
             before = Pose(place, Rotation.from_rotvec(share * turn).as_matrix() @ start.rotation)
