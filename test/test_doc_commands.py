@@ -127,6 +127,9 @@ def test_benchmarks_are_there(command: Command) -> None:
     module, *options = command.words[2:]
     source = importlib.util.find_spec(module)
     assert source is not None
+    if source.submodule_search_locations:
+        source = importlib.util.find_spec(f"{module}.__main__")
+        assert source is not None
     assert source.origin is not None
     text = Path(source.origin).read_text(encoding="utf-8")
     assert all(f'"{word}"' in text for word in options if word.startswith("--")), options

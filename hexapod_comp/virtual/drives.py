@@ -5,8 +5,8 @@ A command c is processed in this order:
 1. A position loop moves the reference x towards c. Its speed is wanted(c − x), its acceleration
    (wanted − ẋ)·4/lag, both limited. Within the limits this is x″ + 4/lag·x′ + 4/lag²·x = 4/lag²·c: two equal
    real poles, no overshoot, and a distance of lag·ẋ behind a steadily moving command. All six struts lag equally: the
-   tool stays near its path, only later. 2. The stepper stands at the step nearest to x: the motor position, which the
-   encoder counts.
+   tool stays near its path, only later.
+2. The stepper stands at the step nearest to x: the motor position, which the encoder counts.
 3. The nut follows the motor with play: it stays until the motor has crossed half the backlash to either
    side. motor − nut, as a share of half the backlash, is the strut's sense of motion in the model.
 """
