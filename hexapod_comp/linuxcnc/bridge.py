@@ -21,7 +21,6 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, UInt64
@@ -30,7 +29,7 @@ from std_srvs.srv import Trigger
 from ..compensation.guards import Sample, StampClock, StampGate
 from ..errors import CommandError, HexapodError
 from ..ros import keep_discovery_local
-from ..ros.base import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, LATCHED_QOS, STATE_QOS, MachineNode
+from ..ros.base import CHECK_PERIOD, COMMAND_QOS, EVENT_QOS, LATCHED_QOS, STATE_QOS, MachineNode
 from ..ros.messages import StrutBytes, StrutReader, stamp_of
 from ..ros.parameters import Program, read_table
 from ..ros.process import run
@@ -264,18 +263,13 @@ class CompensatorReset:
         self._asked_at = self._complained_at = -math.inf
         self._unanswered = 0
         self._question: Future | None = None
-        self._complaints = node.subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
+        node.subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
         self._client = node.create_client(Trigger, "compensator/reset")
 
     @property
     def unanswered(self) -> bool:
         """Whether it has been asked again, and still nothing was heard."""
         return self._unanswered > 1
-
-    def close(self) -> None:
-        """Stop listening."""
-        self._node.destroy_client(self._client)
-        self._node.destroy_subscription(self._complaints)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -322,7 +316,6 @@ class StopInput:
 
 
 GUARDED = ("limit", "ramp_rate", "timeout", "on_loss")  # the guard's parameters
-CHECK_PERIOD = 0.05  # how often the node looks whether its state has changed, s
 NEVER = 1e9  # what the pin `age` shows before the first correction, s
 STANDING = 2e-3  # struts slower than this stand, m/s: no drive lags behind by more than some micrometres then
 
@@ -362,43 +355,22 @@ class LinuxcncBridgeNode(MachineNode):
 
     # ---- lifecycle ----
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def configure(self) -> None:
         """Open topics."""
         self.on_parameters(set())
+        several = self._options["allow_several_publishers"]
         self._pose_out.header.frame_id = self._options["frame_id"]
-        with self.rolled_back_on_error():
-            self._open_topics()
-        return super().on_configure(state)
-
-    def _open_topics(self) -> None:
         self._pose_pub = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS, self._options["timeout"])
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
         self.set_hardware_id(self._options["component"])
-        self._subscription = self.subscribe_exclusive(JointState, "strut_corrections", self._on_correction)
-        self._source = self.sender_of(self._subscription, self._options["allow_several_publishers"])
-        self._check = self.every(CHECK_PERIOD, self._check_state)
+        self._source = self.subscribe_exclusive(JointState, "strut_corrections", self._on_correction, several)
         self._reset = CompensatorReset(self, self._status, self._options)
+        self.every(CHECK_PERIOD, self._check_state)
 
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Start to take part."""
-        self._active = True
-        self.get_logger().info("ready")
-        return super().on_activate(state)
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Close topics; the HAL component stays."""
-        self._active = False
-        self.destroy_timer(self._check)
-        if self._reset is not None:
-            self._reset.close()
-            self._reset = None
-        self.destroy_subscription(self._subscription)
-        for publisher in (self._pose_pub, self._states_pub):
-            self.destroy_publisher(publisher)
-        return super().on_cleanup(state)
+    def unconfigure(self) -> None:
+        self._reset = None
 
     def on_parameters(self, names: set[str]) -> None:
-        """Take what has been set while the node runs; the rest is looked up where it is needed."""
         self._guard.follow(*(self._options[name] for name in GUARDED))
 
     def publish_last_status(self) -> None:
@@ -411,9 +383,7 @@ class LinuxcncBridgeNode(MachineNode):
         while any(self._guard.output) and time.monotonic() < end:
             self._cycle()
             time.sleep(period)
-        if self._reset is not None:
-            self._check_state()
-            self._diagnostics_pub.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+        super().publish_last_status()
 
     def destroy_node(self) -> None:
         """Leave HAL and ROS."""
@@ -497,13 +467,10 @@ class LinuxcncBridgeNode(MachineNode):
         return False
 
     def update_publishers(self) -> None:
-        """Look who publishes what only one node may."""
         self._source.update(time.monotonic())
 
-    def _on_correction(self, data: bytes, number: int | None) -> None:
-        sample = Sample(time.monotonic())
+    def _on_correction(self, data: bytes, sample: Sample) -> None:
         self._status.heard.tick(sample.now)
-        self._source.receive(number, sample.now)
         try:
             self._source.check(sample)
             self._reader.sample(data, sample)
@@ -521,8 +488,6 @@ class LinuxcncBridgeNode(MachineNode):
     # ---- state ----
 
     def _check_state(self) -> None:
-        if self._reset is None:
-            return
         now = time.monotonic()
         self._source.update(now)
         level, text = self._status.judged(self._active, now)

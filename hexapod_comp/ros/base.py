@@ -26,7 +26,7 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from ..compensation.guards import OneSender, StampClock
+from ..compensation.guards import OneSender, Sample, StampClock
 from ..errors import LONGEST_TEXT, CommandError, HexapodError, printable
 from .messages import read_message
 from .parameters import Parameter, Parameters
@@ -37,11 +37,11 @@ from .rclpy_compat import (
     described,
     end_lifecycle,
     lifecycle_state,
-    numbered,
     possible_only,
     publishers,
+    sampled,
 )
-from .status import ERROR, HealthReport, Refusals, joined
+from .status import ERROR, OK, WARN, HealthReport, Refusals, joined
 
 _LAST, _RELIABLE, _BEST_EFFORT = HistoryPolicy.KEEP_LAST, ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
 
@@ -138,12 +138,10 @@ class CallbackGuard:
         return answer
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
-        """Yield the guard's findings for diagnostics."""
         if reasons := self._caught.reasons(now):
             yield ERROR, f"error in a callback: {reasons}"
 
     def values(self) -> dict[str, str]:
-        """Return the counters as key and value."""
         return {
             "callback_errors": str(self._caught.total),
             "last_callback_error": self._caught.last_text,
@@ -154,12 +152,15 @@ class CallbackGuard:
 class MachineNode(LifecycleNode):
     """A lifecycle node with a table of parameters. ROS calls everything here through a :class:`CallbackGuard`.
 
+    A node overrides `configure`, which opens its topics, timers and services: all that was opened since then is closed
+    with its configuration. `findings` and `values` are its state.
+
     A user may override the QoS of topics by parameters. rclpy writes the overrides into the given profile, so every
     topic gets its own copy. A ParameterError reports a parameter's invalid value.
     """
 
     def __init__(self, name: str, table: Sequence[Parameter] = (), **options: Any) -> None:
-        self._active = False
+        self._active = self.configured = False
         self._throttle = Throttle()
         self.guard = CallbackGuard(self.log_warning, self.log_error)
         for change in TRANSITIONS:  # rclpy would swallow their exceptions silently
@@ -188,13 +189,43 @@ class MachineNode(LifecycleNode):
 
     @property
     def active(self) -> bool:
-        """Whether the node is active."""
         return self._active
+
+    def configure(self) -> None:
+        """Make what the node needs, and open its topics; a HexapodError leaves it unconfigured."""
+
+    def unconfigure(self) -> None:
+        """End what `configure` has made beside topics, timers and services."""
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Configure; after an error the node is as before."""
+        self._permanent = self._open_ends()
+        try:
+            with self.rolled_back_on_error():
+                self.configure()
+        except HexapodError as error:
+            self.get_logger().error(f"cannot configure: {error}")
+            return TransitionCallbackReturn.FAILURE
+        self.configured = True
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        if not self._active:
+            self._active = True
+            self.get_logger().info("ready")
+        return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop commanding; the struts keep their last command."""
         self._active = False
         return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close what was opened since `configure`."""
+        self._active = self.configured = False
+        self.unconfigure()
+        self._close_since(self._permanent)
+        return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop permanently: publish the last status, then close everything, so that nothing more is published."""
@@ -204,7 +235,11 @@ class MachineNode(LifecycleNode):
         return super().on_shutdown(state)
 
     def publish_last_status(self) -> None:
-        """Publish the last status before the node ends."""
+        """Publish the last status of a configured node, and wait until it has arrived."""
+        if self.configured:
+            self._active = False
+            self._check_state()
+            self._diagnostics_pub.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
     def destroy_node(self) -> None:
         """Leave ROS at once, with the lifecycle services."""
@@ -213,22 +248,26 @@ class MachineNode(LifecycleNode):
         super().destroy_node()
         end_lifecycle(self)
 
+    def _open_ends(self) -> list[Any]:
+        return [*self.timers, *self.subscriptions, *self.services, *self.clients, *self.publishers]
+
     @contextmanager
     def rolled_back_on_error(self) -> Iterator[None]:
         """Close everything opened in this block if it raises, so that the node is as before."""
-
-        def ends() -> list[Any]:
-            return [*self.timers, *self.subscriptions, *self.services, *self.clients, *self.publishers]
-
-        before = ends()
+        before = self._open_ends()
         try:
             yield
         except BaseException:
-            self.close_ends(*(end for end in ends() if end not in before))
+            self._close_since(before)
             raise
 
+    def _close_since(self, before: Sequence[Any]) -> None:
+        for ticker in self._tickers.values():
+            ticker.close()
+        self._tickers.clear()
+        self.close_ends(*(end for end in self._open_ends() if end not in before))
+
     def close_ends(self, *ends: Publisher | Subscription | Service | Timer | Client | None) -> None:
-        """Destroy publishers, subscriptions, services, timers and clients of this node."""
         kinds: tuple[tuple[type, Callable[[Any], Any]], ...] = (
             (Publisher, self.destroy_publisher),
             (Subscription, self.destroy_subscription),
@@ -273,14 +312,12 @@ class MachineNode(LifecycleNode):
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., Any], *arguments: Any, **options: Any
     ) -> Subscription:
-        """Return a subscription whose callback is guarded."""
         guarded = self.guard.around(topic, callback)
         return super().create_subscription(msg_type, topic, guarded, *arguments, **options)
 
     def create_timer(
         self, timer_period_sec: float, callback: Callable[..., Any], *arguments: Any, **options: Any
     ) -> Timer:
-        """Return a timer whose callback is guarded."""
         guarded = self.guard.around(getattr(callback, "__name__", "timer").strip("_"), callback)
         return super().create_timer(timer_period_sec, guarded, *arguments, **options)
 
@@ -316,45 +353,49 @@ class MachineNode(LifecycleNode):
         self,
         message_type: type,
         topic: str,
-        callback: Callable[[bytes, int | None], None],
+        callback: Callable[[bytes, Sample], None],
+        several: bool,
         qos: QoSProfile = COMMAND_QOS,
-    ) -> Subscription:
-        """Return a subscription of what only one node may publish: see :meth:`sender_of`.
+    ) -> OneSender:
+        """Subscribe to what only one node may publish, unless `several` may; return the guard of its sender.
 
-        Its callback gets the message's bytes, so that it need not read what is too long, and its sequence number.
-        Where the middleware tells that a publisher comes or goes, :meth:`update_publishers` is called at once.
+        The callback gets the message's bytes, so that it need not read what is too long. Where the middleware tells
+        that a publisher comes or goes, or a message shows a second one, :meth:`update_publishers` is called at once.
         """
-        make = functools.partial(
-            super().create_subscription,
-            message_type,
-            topic,
-            numbered(callback, functools.partial(self.guard.caught, topic)),
-            copy.copy(qos),
-            qos_overriding_options=OVERRIDES,
-            raw=True,
-        )
+
+        full = self.resolve_topic_name(topic)
+        names = functools.partial(publishers, self, full)
+        sender = OneSender(full, lambda: int(subscription.get_publisher_count()), names, several)
 
         def on_matched(_: Any) -> None:
             if subscription in self.subscriptions:  # the event of one that has been closed meanwhile
                 self.update_publishers()
 
+        caught = functools.partial(self.guard.caught, topic)
+        make = functools.partial(
+            super().create_subscription,
+            message_type,
+            topic,
+            sampled(callback, sender, self.update_publishers, caught),
+            copy.copy(qos),
+            qos_overriding_options=OVERRIDES,
+            raw=True,
+        )
         try:
             guarded = self.guard.around(f"matching of {topic}", on_matched)
             subscription = make(event_callbacks=SubscriptionEventCallbacks(matched=guarded))
         except UnsupportedEventTypeError:
             subscription = make()
-        return subscription
+        return sender
 
     def update_publishers(self) -> None:
         """Update who publishes what only one node may; called when a publisher comes or goes, and periodically."""
 
-    def sender_of(self, end: Subscription | Publisher, allowed: bool) -> OneSender:
-        """Return the guard of a topic that only one node may publish: one that this node subscribes to or publishes."""
-        topic, names = end.topic_name, functools.partial(publishers, self, end.topic_name)
-        if isinstance(end, Subscription):
-            return OneSender(topic, end.get_publisher_count, names, allowed)
-        own = self.get_fully_qualified_name()
-        return OneSender(topic, functools.partial(self.count_publishers, topic), names, allowed, own)
+    def sole_publisher(self, own: Publisher, several: bool) -> OneSender:
+        """Return the guard of a topic that only this node may publish, unless `several` may."""
+        count = functools.partial(self.count_publishers, own.topic_name)
+        names = functools.partial(publishers, self, own.topic_name)
+        return OneSender(own.topic_name, count, names, several, self.get_fully_qualified_name())
 
     # ---- log and diagnostics ----
 
@@ -385,6 +426,20 @@ class MachineNode(LifecycleNode):
         ever."""
         self.hardware_id = f"{self.get_namespace()}/{what}".strip("/")
         self._report = HealthReport(f"{self.get_fully_qualified_name()[1:]}: state", self.hardware_id)
+
+    def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
+        """Yield level and text of an active node's findings, worst first."""
+        yield OK, "running"
+
+    def values(self, now: float) -> dict[str, str]:
+        """Return all else of the node's state as key and value."""
+        return {}
+
+    def _check_state(self) -> None:
+        now = time.monotonic()
+        self.update_publishers()
+        level, text = joined(self.findings(now)) if self._active else (WARN, "not active")
+        self.publish_status(level, text, lambda: self.values(now))
 
     def publish_status(self, level: bytes, text: str, values: Callable[[], dict[str, str]]) -> None:
         """Publish level, text and values when they are due, with the guard's findings; log steps of the clock."""

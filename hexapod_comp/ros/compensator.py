@@ -26,13 +26,7 @@ from ..core import Struct
 from ..errors import CommandError, HexapodError, LimitError, TooEarlyError
 from ..machine.temperatures import HUMIDITY, check_part
 from . import keep_discovery_local
-from .base import (
-    ACKNOWLEDGED_WITHIN,
-    CHECK_PERIOD,
-    COMMAND_QOS,
-    NEWEST_QOS,
-    MachineNode,
-)
+from .base import ACKNOWLEDGED_WITHIN, CHECK_PERIOD, COMMAND_QOS, NEWEST_QOS, MachineNode
 from .fusion import PoseInstrument
 from .interface import (
     PARAMETERS,
@@ -63,7 +57,6 @@ class StateGuard(Guard):
         self._frames, self._status = frames, status
 
     def check(self, sample: Sample) -> None:
-        """Raise a CommandError: ``frame_id``, or the reason of a guard that stops the machine."""
         if sample.frame_id not in self._frames:
             check_frame(sample.frame_id, self._frames)
         for guard in self._status.standing:
@@ -78,7 +71,6 @@ class Start(Guard):
         self._compensator, self._status = compensator, status
 
     def check(self, sample: Sample) -> None:
-        """Raise a CommandError, ``no_feedback``; else the core knows the struts' positions."""
         status, now = self._status, sample.now
         if not (status.fresh_start or status.options["require_feedback"]):
             return
@@ -100,88 +92,56 @@ class CompensatorNode(MachineNode):
         self._stamps, self._track, self._flow = self._status.command_stamps, self._status.track, self._status.commands
         self._logged_problem = ""
         self._unestimated = 0  # stamp of an answer whose pose was not estimated yet, ns
-        self._compensator: Compensator | None = None
         self._instrument: PoseInstrument | None = None  # present with ``fusion.enabled``
-
-    @property
-    def compensator(self) -> Compensator:
-        """The compensator of a configured node."""
-        if self._compensator is None:
-            raise CommandError("not_configured", "the node is not configured")
-        return self._compensator
 
     # ---- lifecycle ----
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def configure(self) -> None:
         """Load geometry and model, open topics."""
-        began = time.perf_counter()
-        try:
-            geometry = self._files.geometry()
-            self._compensator = Compensator(geometry, self._files.model(geometry), self._options["ramp_rate"])
-            self._compensator.check()
-            self._compensator.enable(self._options["enable_compensation"])
-            self._compensator.set_tool(self._options["tool"])
-            ids = frame_ids(geometry, self._options)
-            self._status.apply_parameters()
-        except HexapodError as error:
-            self._compensator = None
-            self.get_logger().error(f"cannot configure: {error}")
-            return TransitionCallbackReturn.FAILURE
+        began, options, files = time.perf_counter(), self._options, self._files
+        geometry = files.geometry()
+        self.compensator = compensator = Compensator(geometry, files.model(geometry), options["ramp_rate"])
+        compensator.check()
+        compensator.enable(options["enable_compensation"])
+        compensator.set_tool(options["tool"])
+        ids = frame_ids(geometry, options)
+        self._status.apply_parameters()
         self._frames = {ids[name]: pack_pose(pose) for name, pose in geometry.work_frames.items()}
-        try:
-            with self.rolled_back_on_error():
-                self._open_topics(ids)
-        except Exception:
-            self._compensator = None  # else publish_last_status would publish on topics that were never opened
-            raise
-        what = "the ideal model, which corrects nothing (parameter model_file)"
-        what = what if self._files.ideal else f"model {self.compensator.model.name!r}"
+        self._open_topics(ids)
+        what = f"model {compensator.model.name!r}"
+        what = "the ideal model, which corrects nothing (parameter model_file)" if files.ideal else what
         took = time.perf_counter() - began
         self.get_logger().info(f"configured machine {geometry.name!r} with {what} in {took:.2f} s")
-        return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start to answer commands; none that came before is replayed."""
         self._forget_commands()
         self._track.begin(time.monotonic())
-        self._active = True
-        self.get_logger().info("ready")
         return super().on_activate(state)
 
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Close topics and forget the machine."""
-        self._active = False
+    def unconfigure(self) -> None:
         self._journal.finish(time.monotonic())
         self._forget_commands()
-        self.close_ends(*self._ends)
-        parts = self._requests, self._pacing, self._outputs, self._journal, self._loads, self._instrument
-        for part in (*self._sensors, *parts):
-            if part is not None:
-                part.close()
+        for part in (self._requests, self._pacing):
+            part.close()
         self._instrument = None
-        self._compensator = None
-        return super().on_cleanup(state)
 
     def on_parameters(self, names: set[str]) -> None:
         """Apply what has been set while the node runs; other parameters are read where they are used."""
         self._status.apply_parameters()
-        if self._compensator is not None:
+        if self.configured:
             self._thermometers.follow(*temperature_rules(self._options))
-            self._compensator.set_ramp_rate(self._options["ramp_rate"])
+            self.compensator.set_ramp_rate(self._options["ramp_rate"])
             self._loads.apply()
         if self._instrument is not None:
             self._instrument.follow()
 
     def publish_last_status(self) -> None:
-        """Publish a last status and wait until it has arrived."""
-        if self._compensator is None:
-            return
-        self._active = False
-        self._check_state()
-        self._journal.finish(time.monotonic())
-        for publisher in (self._diagnostics_pub, self._commands):
-            publisher.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
-        self._outputs.wait()
+        super().publish_last_status()
+        if self.configured:
+            self._journal.finish(time.monotonic())
+            self._commands.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+            self._outputs.wait()
 
     def _open_topics(self, ids: dict[str, str]) -> None:
         compensator, options, names = self.compensator, self._options, self._options["joint_names"]
@@ -195,21 +155,20 @@ class CompensatorNode(MachineNode):
         if options["publish_array"]:
             self._array = self.publish_on(Float64MultiArray, "strut_commands_array", COMMAND_QOS, deadline)
         self._outputs = Outputs(self, compensator, options, self._commands.topic_name)
-        self._input = asked = command_input(compensator, options)
-        commands = self.subscribe_exclusive(asked.kind, asked.topic, self._on_command)
-        states = self.subscribe_exclusive(JointState, "strut_states", self._on_states, qos=NEWEST_QOS)
         self._reader = StrutReader(names)
-        self._ends: list[Any] = [self._commands, self._corrections, self._array, commands, states]
         self._thermometers = Thermometers(*temperature_rules(options))
-        self._source, self._measuring = self.sender_of(commands, several), self.sender_of(states, several)
-        own = self.sender_of(self._commands, several)
-        status = self._status
-        status.configure(compensator, self._thermometers, ids, self._source, own, self._measuring)
-        several_may = "allow_several_thermometers"
-        self._sensors = (
-            SensorTopic(self, status, "temperatures", Temperature, self._on_temperature, several=several_may),
-            SensorTopic(self, status, HUMIDITY, RelativeHumidity, self._on_humidity, several=several_may),
+        self._input = asked = command_input(compensator, options)
+        self._status.configure(
+            compensator,
+            self._thermometers,
+            ids,
+            self.subscribe_exclusive(asked.kind, asked.topic, self._on_command, several),
+            self.sole_publisher(self._commands, several),
+            self.subscribe_exclusive(JointState, "strut_states", self._on_states, several, NEWEST_QOS),
         )
+        status, any_thermometer = self._status, "allow_several_thermometers"
+        SensorTopic(self, status, "temperatures", Temperature, self._on_temperature, several=any_thermometer)
+        SensorTopic(self, status, HUMIDITY, RelativeHumidity, self._on_humidity, several=any_thermometer)
         self._command_guards: tuple[Guard, ...] = (
             StateGuard(self._frames, status),
             Start(compensator, status),
@@ -224,24 +183,23 @@ class CompensatorNode(MachineNode):
         if options["fusion.enabled"]:
             frames = {ids[name]: pose for name, pose in compensator.geometry.work_frames.items()}
             self._instrument = PoseInstrument(self, compensator, status, frames)
-        self._ends.append(self.every(CHECK_PERIOD, self._check_state))
-        self._ends.append(self.every(ESTIMATE_PERIOD, self._estimate_from_commands))
+        self.every(CHECK_PERIOD, self._check_state)
+        self.every(ESTIMATE_PERIOD, self._estimate_from_commands)
 
     # ---- a command ----
 
-    def _on_command(self, data: bytes, number: int | None) -> None:
+    def _on_command(self, data: bytes, sample: Sample) -> None:
         if not self._active:
             return
-        now = time.monotonic()
-        self._source.receive(number, now)
+        now = sample.now
         if self._pacing.waiting:
             self._pacing.add(data, now)
-        elif (wait := self._process_command(data, now)) > 0.0:
+        elif (wait := self._process_command(data, sample)) > 0.0:
             self._pacing.begin(data, now, wait)
 
-    def _process_command(self, data: bytes, now: float) -> float:
+    def _process_command(self, data: bytes, sample: Sample) -> float:
         """Answer or refuse a command; return the time that it must wait first, s: the struts cannot be there yet."""
-        sample, compensator, status = Sample(now), self.compensator, self._status
+        now, compensator, status = sample.now, self.compensator, self._status
         try:
             self._input.read(data, sample)
             if sample.values is None:
@@ -283,14 +241,11 @@ class CompensatorNode(MachineNode):
 
     # ---- a reading ----
 
-    def _on_states(self, data: bytes, number: int | None) -> None:
+    def _on_states(self, data: bytes, sample: Sample) -> None:
         """Use measured struts, also while the node is inactive: a start begins where they stand."""
-        sample, track, status = Sample(time.monotonic()), self._track, self._status
-        now = sample.now
+        now, track, status = sample.now, self._track, self._status
         try:
-            if self._measuring.receive(number, now):
-                self.update_publishers()
-            self._measuring.check(sample)
+            status.measuring.check(sample)
             self._reader.sample(data, sample)
             status.reading_stamps.check(sample)
             struts = sample.values or ()
@@ -350,7 +305,6 @@ class CompensatorNode(MachineNode):
         self._status.fresh_start = True
 
     def update_publishers(self) -> None:
-        """Look who publishes what only one node may."""
         self._status.update(time.monotonic())
 
     def _check_state(self) -> None:
@@ -384,10 +338,10 @@ class Pacing:
     def __init__(
         self,
         node: CompensatorNode,
-        take: Callable[[bytes, float], float],
+        process: Callable[[bytes, Sample], float],
         refuse: Callable[[bytes, HexapodError, float], None],
     ) -> None:
-        self._node, self._status, self._process_command, self._refuse = node, node._status, take, refuse
+        self._node, self._status, self._process_command, self._refuse = node, node._status, process, refuse
         self.waiting: deque[tuple[float, bytes]] = deque()
         self._due = self._stood_still = 0.0
         self._alarm = Alarm(node, node.guard.around("process_next", self._process_next))
@@ -412,11 +366,9 @@ class Pacing:
         self._enqueue(message, now)
 
     def reset(self) -> None:
-        """Forget what waits."""
         self.waiting.clear()
 
     def close(self) -> None:
-        """Forget what waits, and stop the alarm."""
         self.reset()
         self._alarm.close()
 
@@ -444,7 +396,7 @@ class Pacing:
             if 0.0 < self._longest < self._age(came, now):
                 self._refuse_all(now)
                 return
-            if (wait := self._process_command(message, now)) > 0.0:
+            if (wait := self._process_command(message, Sample(now))) > 0.0:
                 self._wait_for_struts(now, wait)
                 return
             if self._age(came, now) > JITTER:

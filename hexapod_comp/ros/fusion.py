@@ -30,7 +30,6 @@ FEED_PERIOD = 1.0  # Period at which the drift is passed to the compensation, s:
 
 
 def fusion_rules(options: dict[str, Any]) -> FusionRules:
-    """Return the filter's rules from the parameters."""
     return FusionRules(
         drift_rate=options["fusion.drift_rate"],
         initial=options["fusion.initial_deviation"],
@@ -51,7 +50,7 @@ class PoseInstrument:
     ) -> None:
         self._node, self._status, self._options, self._frames = node, status, status.options, frames
         self._kind = MESSAGES[self._options["fusion.message"]]
-        self._topic = SensorTopic(node, status, TOPIC, self._kind, self._on_reading, self._reject)
+        SensorTopic(node, status, TOPIC, self._kind, self._on_reading, self._reject)
         self.fusion, self._fed = Fusion(compensator, fusion_rules(self._options)), -math.inf
         status.fusion = self.fusion
 
@@ -67,7 +66,6 @@ class PoseInstrument:
         self.update(time.monotonic())
 
     def update(self, now: float) -> None:
-        """Feed what is due."""
         if now - self._fed < FEED_PERIOD:
             return
         self._fed, self._status.drift_problem = now, ""
@@ -85,11 +83,6 @@ class PoseInstrument:
     def weighed(self, pose: np.ndarray) -> np.ndarray:
         """Return the compensator's estimate, weighed with the readings."""
         return self.fusion.weighed(pose)
-
-    def close(self) -> None:
-        """Close the subscription."""
-        self._status.fusion, self._status.drift_problem = None, ""
-        self._topic.close()
 
     def _on_reading(self, message: Any, now: float) -> None:
         sample, gate = Sample(now, command_stamp(message.header.stamp)), self._status.pose_stamps

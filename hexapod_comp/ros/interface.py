@@ -241,12 +241,10 @@ class MachineFiles:
         return self._options["model_file"], place, None if folder is None else str(folder)
 
     def geometry(self) -> HexapodGeometry:
-        """Read the geometry."""
         self.sources["geometry"] = self._read("geometry")
         return self.sources["geometry"].geometry()
 
     def model(self, geometry: HexapodGeometry) -> MachineModel:
-        """Read the model."""
         self.sources["model"] = IDEAL_SOURCE if self.ideal else self._read("model")
         return self.sources["model"].model(geometry.name)
 
@@ -367,7 +365,8 @@ class Outputs:
         self._stopped: bool | None = None
         self._stop_said = 0.0
         self.stop(True)
-        self._tickers = node.at_rate("heartbeat_rate", self._beats), node.at_rate("marker_rate", self._show)
+        node.at_rate("heartbeat_rate", self._beats)
+        node.at_rate("marker_rate", self._show)
 
     def estimate(self, pose: np.ndarray, stamp: int) -> None:
         """Publish a tool pose, shape (12,): position, m, and rotation matrix, row by row."""
@@ -392,13 +391,6 @@ class Outputs:
     def wait(self) -> None:
         """Wait until the last ~/stopped has arrived."""
         self._stops.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
-
-    def close(self) -> None:
-        """Stop the heartbeat, and destroy the publishers."""
-        for ticker in self._tickers:
-            ticker.close()
-        always = self._estimates, self._markers, self._heartbeats, self._validities, self._stops
-        self._node.close_ends(*always, self._joints, self._description, self._nominal)
 
     def _beats(self) -> None:
         self._beat.data = (self._beat.data + 1) % 2**64
@@ -437,7 +429,7 @@ class JournalTopics:
     def __init__(
         self, node: MachineNode, compensator: Compensator, sources: dict[str, Source], frame_ids: dict[str, str]
     ) -> None:
-        self._node, self._sources, self._published = node, sources, dict[str, Source]()
+        self._sources, self._published = sources, dict[str, Source]()
         self._pages: Publisher = node.create_publisher(String, "~/journal", JOURNAL_QOS)
         self._files: Publisher = node.create_publisher(String, "~/files", JOURNAL_QOS)
         self._journal = Journal(compensator, sources, frame_ids, node.get_parameter("joint_names").value)
@@ -457,10 +449,6 @@ class JournalTopics:
         """Publish a last page, with the answers since the previous one, and wait for its arrival."""
         self._pages.publish(String(data=self._journal.page(now)))
         self._pages.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
-
-    def close(self) -> None:
-        """Destroy both publishers."""
-        self._node.close_ends(self._pages, self._files)
 
 
 # ---- markers ----

@@ -43,12 +43,6 @@ class Loads:
         status.loads = self
         self.apply()
 
-    def close(self) -> None:
-        """Close the subscriptions."""
-        self._status.loads = None
-        for topic in self._topics.values():
-            topic.close()
-
     def apply(self) -> None:
         """Pass the present gravity and wrench to the compensator, unless ``outside_hold`` holds the previous ones."""
         if self._status.options["outside_hold"]:

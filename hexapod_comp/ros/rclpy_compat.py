@@ -17,14 +17,20 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from rclpy.service import Service
 
-from ..compensation.guards import UNKNOWN_NAME
+from ..compensation.guards import UNKNOWN_NAME, OneSender, Sample
 from ..errors import LONGEST_TEXT, CommandError, printable, shorten
 
 # ---- callbacks ----
 
 
-def numbered(callback: Callable[[bytes, int | None], None], failed: Callable[[Exception], None]) -> Callable[..., None]:
-    """Return a callback for rclpy that never raises, and passes on a message and its publisher's sequence number.
+def sampled(
+    callback: Callable[[bytes, Sample], None],
+    sender: OneSender,
+    second: Callable[[], None],
+    failed: Callable[[Exception], None],
+) -> Callable[..., None]:
+    """Return a callback for rclpy that never raises, and passes on a message with its sample; `second` is called when
+    the message's sequence number shows a second sender.
 
     rclpy inspects a callback's signature for the message info, and then calls it with two arguments; the EventsExecutor
     of rclpy 7.1 calls it with a tuple of the two instead.
@@ -33,7 +39,10 @@ def numbered(callback: Callable[[bytes, int | None], None], failed: Callable[[Ex
     def called(*arguments: Any) -> None:
         try:
             message, info = arguments[0] if len(arguments) == 1 else arguments
-            callback(message, info["publication_sequence_number"])
+            sample = Sample(time.monotonic())
+            if sender.receive(info["publication_sequence_number"], sample.now):
+                second()
+            callback(message, sample)
         except Exception as error:  # of any kind: see CallbackGuard
             failed(error)
 

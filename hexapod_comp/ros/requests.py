@@ -65,11 +65,10 @@ class Requests:
         self._predicted.update(now)
 
     def close(self) -> None:
-        """Destroy services and topics, answer pending requests, and end the worker."""
+        """Answer pending requests, and end the worker."""
         self._reload.answer(Trigger.Response(message="the old model stays: the node was cleaned up"))
-        for part in (self._tools, self._travel, self._predicted, self._worker):
+        for part in (self._tools, self._travel, self._worker):
             part.close()
-        self._node.close_ends(self._enable, self._reset, self._reload.service)
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._status.compensator.enable(request.data)
@@ -143,20 +142,17 @@ class ToolChoice:
 
     def __init__(self, node: MachineNode, status: CompensatorStatus) -> None:
         self._node, self._compensator, self._status = node, status.compensator, status
-        self._selected = node.subscribe_exclusive(String, "select_tool", self._on_message)
         several = bool(status.options["allow_several_publishers"])
-        self._sender = status.sensing["select_tool"] = node.sender_of(self._selected, several)
+        self._sender = node.subscribe_exclusive(String, "select_tool", self._on_message, several)
+        status.sensing["select_tool"] = self._sender
         self._publisher = node.create_publisher(String, "~/tool", LATCHED_QOS)
         node.add_on_set_parameters_callback(self._judge)
         node.add_post_set_parameters_callback(self._use)
         self._publish()
 
     def close(self) -> None:
-        """Choose no more tools."""
         self._node.remove_on_set_parameters_callback(self._judge)
         self._node.remove_post_set_parameters_callback(self._use)
-        self._status.sensing.pop("select_tool", None)
-        self._node.close_ends(self._selected, self._publisher)
 
     def _judge(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         """Refuse an unknown tool, and any while the machine moves."""
@@ -180,15 +176,14 @@ class ToolChoice:
                 self._node.note("tool", f"tool {name!r}: the next command must be where the struts are")
                 self._publish()
 
-    def _on_message(self, data: bytes, number: int | None) -> None:
+    def _on_message(self, data: bytes, sample: Sample) -> None:
         """Set the parameter. If the commander's choice is refused, its next command must be at the struts' present
         position: commands for the tool that it did not get may follow. A refused choice by another node stops
         nothing."""
-        now, status = time.monotonic(), self._status
+        now, status = sample.now, self._status
         status.update(now)  # a new publisher may have sent already, and the commander's name may be outdated
-        self._sender.receive(number, now)
         try:
-            self._sender.check(Sample(now))
+            self._sender.check(sample)
             name = read_message(data, String).data
             result = self._node.set_parameters([Parameter("tool", value=name)])[0]
             if not result.successful:
@@ -215,9 +210,7 @@ class TravelReports:
         self._due = 0.0
 
     def close(self) -> None:
-        """Stop, and answer pending requests."""
         self._late.answer(Trigger.Response(message="the node was cleaned up"))
-        self._node.close_ends(self._late.service, self._publisher)
 
     def update(self, now: float) -> None:
         """Start a new calculation when it is due."""
@@ -291,11 +284,6 @@ class PredictedError:
         self._busy, self._asked_for, self._due = False, 0, 0.0
         self._source: Any = None
         self._wait = TRY_AGAIN_AFTER[0]
-
-    def close(self) -> None:
-        """Destroy the topics."""
-        self._status.prediction_problem = ""
-        self._node.close_ends(*self._topics.values())
 
     def update(self, now: float) -> None:
         """Request the newest pose's prediction, while there are subscribers."""

@@ -7,7 +7,6 @@ error about the content. A rejected reading, or a second publisher, is counted a
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -40,31 +39,22 @@ class SensorTopic:
         self._node, self._status, self._topic, self._kind, self._period = node, status, topic, kind, period
         self._handle, self._reject = handle, reject or self._bad_feedback
         self.last = math.nan  # time of the last good message, s; NaN before the first
-        self._end = node.subscribe_exclusive(kind, topic, self._receive, SENSOR_QOS)
-        allowed = status.options["allow_several_publishers"] or status.options[several]
-        self._sender = status.sensing[topic] = node.sender_of(self._end, bool(allowed))
+        allowed = bool(status.options["allow_several_publishers"] or status.options[several])
+        self._sender = status.sensing[topic] = node.subscribe_exclusive(kind, topic, self._receive, allowed, SENSOR_QOS)
 
     def stale(self, now: float, timeout: float) -> bool:
         """Return whether it was published before, but not for longer than a timeout, s (0: off)."""
         return 0.0 < timeout < now - self.last
 
-    def close(self) -> None:
-        """Destroy the subscription."""
-        self._status.sensing.pop(self._topic, None)
-        self._node.close_ends(self._end)
-
-    def _receive(self, data: bytes, number: int | None) -> None:
+    def _receive(self, data: bytes, sample: Sample) -> None:
         # Dated by arrival: sensors need no stamp, clocks may be set, and a drift is slow compared with transport
         # delays.
-        now = time.monotonic()
         try:
-            if self._sender.receive(number, now):
-                self._node.update_publishers()
-            self._sender.check(Sample(now))
-            if now - self.last < self._period:
+            self._sender.check(sample)
+            if sample.now - self.last < self._period:
                 return
-            self._handle(read_message(data, self._kind), now)
-            self.last = now
+            self._handle(read_message(data, self._kind), sample.now)
+            self.last = sample.now
         except HexapodError as error:
             self._reject(error)
 

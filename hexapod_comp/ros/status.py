@@ -193,8 +193,6 @@ class CompensatorStatus:
         self.options, self.clock = options, clock
         self.command_stamps, self.reading_stamps = StampGate("command", clock), StampGate("reading", clock, capped=True)
         self.pose_stamps = StampGate("measured pose", clock, capped=True)
-        self.fusion: Fusion | None = None
-        self.loads: Loads | None = None
         self.track, self.log_space = StrutTrack(), LogSpace()
         # Senders of sensor readings and of the tool's choice: a second one is ignored, and stops nothing
         self.sensing: dict[str, OneSender] = {}
@@ -203,8 +201,7 @@ class CompensatorStatus:
         self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
         self.waited = self.dropped = 0  # number of commands that have waited, and that a newer one has replaced
         self.behind = EventWindow()  # commands were handled late, by more than jitter
-        self.frame_id = self.prediction_problem = ""  # of the last command; why no error is predicted
-        self.drift_problem = ""  # why the drift that an instrument shows is not compensated
+        self.frame_id = ""  # of the last command
         self.last_answered = 0  # stamp, ns; 0 before the first
         self.fresh_start = True  # no command is in force
         self.apply_parameters()
@@ -223,6 +220,9 @@ class CompensatorStatus:
         self.compensator, self.thermometers, self.frame_ids = compensator, thermometers, frame_ids
         self.source, self.own_topic, self.measuring = source, own_topic, measuring
         self.sensing.clear()
+        self.loads: Loads | None = None
+        self.fusion: Fusion | None = None
+        self.prediction_problem = self.drift_problem = ""  # why no error is predicted, and no drift compensated
         self.standing: tuple[Guard, ...] = (source, own_topic, measuring, self.track)
         self.track.watch(compensator.geometry)
 

@@ -19,7 +19,7 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 
 from ..compensation.guards import Guard, Sample, StampGate, StrutSteps
-from ..errors import CommandError, HexapodError, KinematicsError
+from ..errors import HexapodError, KinematicsError
 from ..formats.paths import config_file
 from ..machine.geometry import STRUT_NAMES, load_geometry
 from ..machine.load import Payload
@@ -27,11 +27,11 @@ from ..machine.model import RealMachine
 from ..virtual.machine import DriveParameters, Faults, StrutDrive
 from ..virtual.named import RANDOM, find_model, is_word
 from . import keep_discovery_local
-from .base import ACKNOWLEDGED_WITHIN, CHECK_PERIOD, STATE_QOS, MachineNode
+from .base import CHECK_PERIOD, STATE_QOS, MachineNode
 from .messages import StrutBytes, StrutReader, stamp_of, write_pose
 from .parameters import Program, read_table
 from .process import run
-from .status import ERROR, OK, WARN, Flow, LogSpace, Refusals, joined, seconds
+from .status import ERROR, OK, WARN, Flow, LogSpace, Refusals, seconds
 
 LONGEST_PAUSE = 0.25  # After a longer pause (a stopped process), the machine has moved on by no more than this, s
 
@@ -103,95 +103,54 @@ class StrutDriveNode(MachineNode):
     def __init__(self, **options: Any) -> None:
         super().__init__("strut_drive", PARAMETERS, **options)
         self._refusals, self._commands = Refusals(), Flow()
-        self._drive: StrutDrive | None = None
-
-    @property
-    def drive(self) -> StrutDrive:
-        """The simulated machine of a configured node."""
-        if self._drive is None:
-            raise CommandError("not_configured", "the node is not configured")
-        return self._drive
 
     # ---- lifecycle ----
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def configure(self) -> None:
         """Build the machine and open topics."""
         options, names = self._options, self._options["joint_names"]
         self._reader, self._states_out, self._true_out = StrutReader(names), StrutBytes(names=names), PoseStamped()
         self._true_out.header.frame_id = options["base_frame"]
-        try:
-            geometry = load_geometry(config_file(options["geometry_file"], "geometry"))
-            name = options["truth_file"]
-            if name == RANDOM:
-                name = f"{RANDOM}:{options['truth_seed']}"
-            machine = RealMachine(geometry, find_model(name if is_word(name) else config_file(name, "model"), geometry))
-            kept = ("step", "lag", "max_acceleration", "encoder_resolution", "encoder_noise", "tracker_noise")
-            values = {name: options[name] for name in kept}
-            parameters = DriveParameters(max_speed=options["max_speed"] or None, **values)
-            if options["plant"] == "mujoco":
-                machine = bending(machine, options)
-            self._drive = StrutDrive(machine, parameters, options["noise_seed"])
-            self.drive.faults = self._faults()
-            self.drive.advance(1.0 / options["rate"])
-            self._tool_in_base()
-        except HexapodError as error:
-            self._drive = None
-            self.get_logger().error(f"cannot configure: {error}")
-            return TransitionCallbackReturn.FAILURE
-        try:
-            with self.rolled_back_on_error():
-                self._open_topics()
-        except Exception:
-            self._drive = None  # else publish_last_status would publish on topics that were never opened
-            raise
+        geometry = load_geometry(config_file(options["geometry_file"], "geometry"))
+        name = options["truth_file"]
+        if name == RANDOM:
+            name = f"{RANDOM}:{options['truth_seed']}"
+        machine = RealMachine(geometry, find_model(name if is_word(name) else config_file(name, "model"), geometry))
+        kept = ("step", "lag", "max_acceleration", "encoder_resolution", "encoder_noise", "tracker_noise")
+        values = {name: options[name] for name in kept}
+        parameters = DriveParameters(max_speed=options["max_speed"] or None, **values)
+        if options["plant"] == "mujoco":
+            machine = bending(machine, options)
+        self.drive = StrutDrive(machine, parameters, options["noise_seed"])
+        self.drive.faults = self._faults()
+        self.drive.advance(1.0 / options["rate"])
+        self._tool_in_base()
+        self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
+        self._true_pub = self.publish_on(PoseStamped, "tool_pose_true", STATE_QOS)
+        several = options["allow_several_publishers"]
+        self._source = self.subscribe_exclusive(JointState, "strut_commands", self._on_commands, several)
         self._stamps = StampGate("command", self.clock, options["command_validity"], future=False)
         self._steps, self._log_space = StrutSteps(geometry.limits.step, geometry.limits.speed), LogSpace()
         self._command_guards: tuple[Guard, ...] = (self._source, self._stamps, self._steps)
+        self.set_hardware_id(geometry.name)
+        self.every(1.0 / options["rate"], self._run)
+        self.every(CHECK_PERIOD, self._check_state)
         self.get_logger().info(f"configured machine {geometry.name!r} with hidden truth {machine.model.name!r}")
-        return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start to move, from the struts' present positions, and to measure."""
         self._steps.reset(self.drive.motor_lengths().tolist())
         self._last_run = time.monotonic()
-        self._active = True
-        self.get_logger().info("ready")
         return super().on_activate(state)
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Close topics and forget the machine."""
-        self._active = False
-        self.close_ends(*self._own_timers, self._subscription, self._states_pub, self._true_pub)
-        self._drive = None
-        return super().on_cleanup(state)
-
-    def publish_last_status(self) -> None:
-        """Publish a last status and wait until it has arrived."""
-        if self._drive is None:
-            return
-        self._active = False
-        self._check_state()
-        self._diagnostics_pub.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
-
-    def _open_topics(self) -> None:
-        self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
-        self._true_pub = self.publish_on(PoseStamped, "tool_pose_true", STATE_QOS)
-        self.set_hardware_id(self.drive.machine.geometry.name)
-        self._subscription = self.subscribe_exclusive(JointState, "strut_commands", self._on_commands)
-        self._source = self.sender_of(self._subscription, self._options["allow_several_publishers"])
-        self._own_timers = [
-            self.every(1.0 / self._options["rate"], self._run),
-            self.every(CHECK_PERIOD, self._check_state),
-        ]
 
     # ---- faults ----
 
     def on_parameters(self, names: set[str]) -> None:
         """Apply parameters set while the node runs; a knock only if it was set anew."""
-        if self._drive is not None:
+        if self.configured:
             self._stamps.max_age = self._options["command_validity"]
             faults = self._faults()
-            self._drive.faults = faults if "fault_jump" in names else replace(faults, jump=None)
+            self.drive.faults = faults if "fault_jump" in names else replace(faults, jump=None)
 
     def _faults(self) -> Faults:
         options, jump = self._options, self._options["fault_jump"]
@@ -208,14 +167,11 @@ class StrutDriveNode(MachineNode):
     # ---- the machine ----
 
     def update_publishers(self) -> None:
-        """Look who publishes what only one node may."""
         self._source.update(time.monotonic())
 
-    def _on_commands(self, data: bytes, number: int | None) -> None:
+    def _on_commands(self, data: bytes, sample: Sample) -> None:
         if not self._active:
             return
-        sample = Sample(time.monotonic())
-        self._source.receive(number, sample.now)
         try:
             self._reader.sample(data, sample)
             for guard in self._command_guards:
@@ -256,8 +212,8 @@ class StrutDriveNode(MachineNode):
 
     # ---- state ----
 
-    def _findings(self, now: float) -> Iterator[tuple[bytes, str]]:
-        """Yield level and text of each finding, worst first."""
+    def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
+        self._log_space.check()
         stopped = [name for name, at_stop in zip(STRUT_NAMES, self.drive.stopped, strict=True) if at_stop]
         if stopped:
             yield ERROR, f"at the travel stop: {', '.join(stopped)}"
@@ -274,14 +230,7 @@ class StrutDriveNode(MachineNode):
             yield WARN, self._log_space.problem
         yield OK, "running" if self._commands.count else "waiting for the first command"
 
-    def _check_state(self) -> None:
-        self.update_publishers()
-        self._log_space.check()
-        now = time.monotonic()
-        level, text = joined(self._findings(now)) if self._active else (WARN, "not active")
-        self.publish_status(level, text, lambda: self._values(now))
-
-    def _values(self, now: float) -> dict[str, str]:
+    def values(self, now: float) -> dict[str, str]:
         return {
             "commanded_by": ", ".join(self._source.names),
             "commands": str(self._commands.count),

@@ -567,7 +567,7 @@ def test_every_row_names_a_test_that_is_there() -> None:
     assert told == STORIES.keys() | DRIVES.keys()
 
 
-@pytest.mark.parametrize("function", [CompensatorStatus.findings, StrutDriveNode._findings])
+@pytest.mark.parametrize("function", [CompensatorStatus.findings, StrutDriveNode.findings])
 def test_the_page_has_every_text_of_the_diagnostics(function: Callable[..., object]) -> None:
     """Each level and text that a node's status can have, as the source yields them, stands on the page."""
     page = re.sub(r"[A-Z]{2,}|…", "", STATES.read_text(encoding="utf-8"))
