@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
+from helpers import long_test
 from node_helpers import HOME, Bench, Rig, Voice, near
 from sensor_msgs.msg import JointState
 
@@ -171,6 +172,7 @@ def broken_at(bench: Bench, stop: int) -> Callable[[int, int, str], None]:
     return progress
 
 
+@long_test
 def test_a_laser_that_reads_wildly_and_whose_beam_breaks_is_collected(bench: Bench, tmp_path: Path) -> None:
     """A line there and back; the beam is broken on the way to the third stop: the run begins anew."""
     known, box = machine(bench, "laser", wild_share=0.1), small(poses=1).box

@@ -167,20 +167,6 @@ def test_where_a_parameter_says_so_only_the_newest_of_a_burst_waits(rig):
     rig.until(lambda: any(late in status.message for status in rig.statuses()), "that it is said")
 
 
-def test_commands_that_come_bunched_are_never_refused(rig):
-    """1 kHz at 0.9 of the limit, eight at a time every 8 ms, as a network may bunch them, however busy the computer."""
-    rig.compensator(catch_up_within=5.0, max_command_age=0.0)
-    rise = 0.9 * SPEED * 1e-3 / way(0.0, 1.0)  # mm per command
-    stamp, begin = nanoseconds_of(rig.ask(risen(rig, 0.0, 0.0)).command.header.stamp), time.monotonic()
-    for bunch in range(10):
-        rig.until(lambda due=begin + 8e-3 * bunch: time.monotonic() >= due, "the next bunch")
-        for n in range(8 * bunch + 1, 8 * bunch + 9):
-            rig.send(risen_at(rise * n, stamp + n * 1_000_000))
-    rig.until(lambda: len(lengths(rig)) == 81, "all answers")
-    rig.until(lambda: rig.values().get("commands") == "81", "a status")
-    assert rig.values()["refused"] == "0"
-
-
 def test_what_is_checked_regularly_goes_on_while_commands_wait(rig, monkeypatch):
     """Ninety commands wait for each other. Checks come every 50 ms: none twice, which would put off the next ones.
 

@@ -6,7 +6,6 @@ Truth: what the compensator is sent, differentiated here; targets by closed form
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,6 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectory
 
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import strut_lengths
-from hexapod_comp.measurements.readings import KINDS as KINDS_OF
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.client import Machine, MoveError
 from hexapod_comp.ros.messages import message_pose, nanoseconds_of, pose_message
@@ -304,39 +302,3 @@ def test_a_client_moves_a_machine_and_learns_how_it_ended(bench: Bench) -> None:
     assert ended[1].reason == "limit"
     told = np.array(bench.seen["strut_commands"][-1].position)
     assert np.abs(told - closed_form_lengths(near(HOME, (0.0, 0.0, 0.01)))).max() < 1e-9, "the model is ideal"
-
-
-def test_a_campaign_is_collected_from_a_running_machine(bench: Bench, tmp_path: Path) -> None:
-    """Over DDS. Truth: what the virtual instruments would read, without noise, of the errors that the drive hides."""
-    from threading import Thread
-
-    from hexapod_comp.machine.model import RealMachine
-    from hexapod_comp.measurements.campaign import Campaign, template
-    from hexapod_comp.measurements.collect import collect
-    from hexapod_comp.ros.collector import WatchedMachine
-    from hexapod_comp.virtual.instruments import measure
-    from hexapod_comp.virtual.named import find_model
-
-    bench.machine(truth="random:3")
-    bench.add(MoverNode, True, {})
-    geometry = load_geometry("paper")
-    box = geometry.home.position + np.array([[-0.01, -0.01, -0.01], [0.01, 0.01, 0.01]])
-    campaign = Campaign(box, cell=0.02, step=0.02, instrument=None, diagonals=0, poses=4, noise=(0.0,) * len(KINDS_OF))
-    ended: list[Any] = []
-
-    def client() -> None:
-        with WatchedMachine("tool_pose_true", samples=9) as machine:
-            ended.append(collect(campaign, geometry, machine, tmp_path / "out.csv"))
-
-    thread = Thread(target=client)
-    thread.start()
-    bench.until(lambda: not thread.is_alive(), "the campaign", timeout=60.0)
-    read = ended[0].measurements
-    truth = RealMachine(geometry, find_model("random:3", geometry))
-    known = measure(template(campaign, geometry), campaign, truth, 0)
-    assert len(read) == len(known) == 24
-    lengths = np.array([KINDS_OF[k] == "position" for k in read.kind])
-    off = np.abs(read.value - known.value)
-    assert off[lengths].max() < 6e-6, "half of a backlash of 4 µm, which scattered poses do not state, and steps"
-    assert off[~lengths].max() < 40e-6
-    assert np.abs(known.value[lengths]).max() > 30e-6

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from hal_stand_in import StandInHal
 from node_helpers import Rig
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy, qos_check_compatible
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy, qos_check_compatible
 
 from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
 from hexapod_comp.ros.compensator import CompensatorNode
@@ -26,6 +26,15 @@ NODES = {
     "linuxcnc_bridge": (LinuxcncBridgeNode, {}),
 }
 COMMANDS = {"/strut_setpoints", "/strut_commands", "/strut_corrections", "/strut_commands_array"}
+LATCHED = {
+    "compensator": {
+        *(f"/compensator/{name}" for name in ("files", "journal", "stopped", "tool")),
+        "/robot_description",
+    },
+    "strut_drive": set(),
+    "linuxcnc_bridge": set(),
+}
+"""For late subscribers."""
 STATES = {"/strut_states", "/tool_pose_estimate", "/nominal_strut_states", "/tool_pose_true"}
 
 
@@ -52,6 +61,8 @@ def test_default_subscribers_hear_all_that_is_published(rig: Rig, name: str) -> 
             assert (end.qos_profile.depth, end.qos_profile.history) == (queue, HistoryPolicy.KEEP_LAST), end.topic_name
             reading = name == "compensator" and end.topic_name == "/strut_states"
             assert end.qos_profile.reliability == (ReliabilityPolicy.BEST_EFFORT if reading else RELIABLE)
+    kept = {end.topic_name for end in node.publishers if end.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL}
+    assert kept == LATCHED[name]
 
 
 def test_readings_are_heard_from_best_effort_publishers_too(rig: Rig) -> None:

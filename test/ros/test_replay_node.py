@@ -8,14 +8,11 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from node_helpers import HOME, Bench, model_file, near
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.pose import Pose
@@ -25,7 +22,7 @@ from hexapod_comp.ros.recorder import BagRecorder
 pytest.importorskip("rosbags")
 
 from node_recorder import Recorder
-from replay_helpers import Messages, write_bag
+from replay_helpers import write_bag
 
 from hexapod_comp.replay.bag import Recording, read_recording
 from hexapod_comp.replay.replay import BEFORE, IDENTICAL, Replay, replay_recording
@@ -134,62 +131,3 @@ def test_a_start_from_the_last_command_is_replayed_bit_for_bit(bench, tmp_path):
     resets = [event.entry.values["measured"] for event in result.changes if event.entry.what == "reset"]
     resets = [measured for measured in resets if measured is not None]
     assert resets[-2:] == [answers[39].lengths.tolist(), answers[58].lengths.tolist()]
-
-
-def test_recording_may_begin_in_motion_and_two_machines_share_a_bag(ros_context, capfd, tmp_path):
-    """A recorder that comes late replays what its first snapshot precedes; each machine has its own namespace."""
-    messages = Messages()
-    for namespace in ("mill", "lathe"):
-        with Bench(ros_context, capfd, namespace) as rig:
-            rig.compensator()
-            for n in range(140):
-                rig.ask(along(n))
-                if n % 10 == 9:
-                    rig.until(later(0.06), "the page that the journal now writes")
-            recorder = Recorder(rig)
-            for n in range(140, 200):
-                rig.ask(along(n))
-            recorder.stop()
-        messages += recorder.messages
-    bag = write_bag(tmp_path / "both", messages, "sqlite3")
-    for namespace in ("mill", "/lathe/"):
-        _, result = replayed(bag, namespace)
-        count, begun = len(result.outcome), int(np.argmax(result.outcome == IDENTICAL))
-        assert 60 <= count < 200, "what was kept for late subscribers, and all from then on"
-        assert begun <= count - 60, "a snapshot is among the pages that are kept"
-        assert (result.outcome[:begun] == BEFORE).all()
-        assert (result.outcome[begun:] == IDENTICAL).all()
-        np.testing.assert_array_equal(result.commands["pose"][-1, :3], along(199).position)
-
-
-def later(seconds: float) -> Callable[[], bool]:
-    """Return a condition that holds from a while from now on."""
-    end = time.monotonic() + seconds
-    return lambda: time.monotonic() > end
-
-
-def test_commands_without_stamp_are_replayed_too(bench, tmp_path):
-    """The answer's stamp is when they came."""
-    bench.compensator()
-    recorder = Recorder(bench)
-    for n in range(20):
-        count = len(bench.seen["strut_corrections"])
-        bench.send(pose_message(along(n), "base"))
-        bench.until(lambda count=count: len(bench.seen["strut_corrections"]) > count, "an answer")
-    recorder.stop()
-    _, result = replayed(write_bag(tmp_path / "run", recorder.messages))
-    assert len(result.outcome) == 20
-    assert (result.outcome == IDENTICAL).all()
-    assert not (result.outcome == BEFORE).any()
-
-
-def test_journal_reaches_late_subscribers(bench):
-    """Both topics are reliable and kept: the page that comes first tells all that is needed to go on."""
-    bench.compensator()
-    bench.warm("base", 22.0)
-    bench.ask(HOME)
-    for topic in ("compensator/journal", "compensator/files"):
-        (info,) = bench.witness.get_publishers_info_by_topic(topic)
-        assert info.topic_type == "std_msgs/msg/String"
-        assert info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
-        assert info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL

@@ -52,13 +52,13 @@ from node_stories import (
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState, Temperature
+from sensor_msgs.msg import Temperature
 
 from hexapod_comp.compensation import guards
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.model_file import load_model
-from hexapod_comp.ros.compensator import CHECK_PERIOD, CompensatorNode
+from hexapod_comp.ros.compensator import CompensatorNode
 from hexapod_comp.ros.messages import period, pose_message
 from hexapod_comp.ros.parameters import ParameterError
 from hexapod_comp.ros.status import CompensatorStatus, LogSpace
@@ -583,20 +583,7 @@ def test_the_page_has_every_text_of_the_diagnostics(function: Callable[..., obje
     assert [text for text in known if text not in page] == []
 
 
-def test_a_state_is_looked_at_often_enough() -> None:
-    """Within 200 ms, of which the timeouts take 100, one period of looking 50; the rest is a busy machine's."""
-    assert CHECK_PERIOD == 0.05
-
-
 # ---- cases of numbers ----
-
-
-def test_no_command_yet_drive(rig):
-    rig.drive()
-    rig.until_status(OK, "waiting for the first command", DRIVE)
-    rig.until(lambda: len(rig.seen["strut_states"]) > 20, "readings")
-    readings = np.array([message.position for message in rig.seen["strut_states"]])
-    assert np.ptp(readings, axis=0).max() < 1e-6, "noise"
 
 
 def test_first_command_has_no_direction_of_motion(rig, tmp_path):
@@ -783,17 +770,6 @@ def test_overload_keeps_the_newest_and_counts_the_others(bench):
     assert stamps == sorted(stamps)
     bench.ask(HOME)
     bench.until_status(OK, "running")
-
-
-def test_overload_of_the_drive_is_counted(bench):
-    bench.drive(command_timeout=0.0)
-    bench.until(lambda: bench.seen["strut_states"], "readings")
-    for pose in (HOME, *[MOVED] * 102):
-        bench.publish("strut_commands", JointState(name=list(STRUT_NAMES), position=closed_form_lengths(pose).tolist()))
-        if pose is HOME:
-            bench.barrier()
-    assert bench.until_status(WARN, "running, commands are being missed", DRIVE)["commands_missed"] == "2"
-    bench.until_status(OK, "running", DRIVE)
 
 
 def test_simulated_time_starts_again(bench):
@@ -983,21 +959,3 @@ def test_a_model_by_name_comes_from_the_model_folder_alone(rig, tmp_path):
 def test_what_cannot_be_does_not_start(rig, parameters, text):
     with pytest.raises(ParameterError, match=text):
         rig.compensator(start=False, **parameters)
-
-
-def test_two_machines_of_a_kind_have_other_names_and_do_not_mix(ros_context, capfd):
-    """Each in its own namespace: topics, diagnostics and what monitors of a plant tell them apart by."""
-    with Bench(ros_context, capfd, "/left") as left, Bench(ros_context, capfd, "/hall/right") as right:
-        left.drive()
-        left.compensator(model_file="ideal")
-        right.compensator()
-        for rig, pose in ((left, HOME), (right, MOVED), (left, HOME)):
-            rig.ask(pose)
-        assert (len(left.seen["strut_commands"]), len(right.seen["strut_commands"])) == (2, 1)
-        for rig, space, model in ((left, "left", "ideal"), (right, "hall/right", "virtual machine")):
-            rig.until(lambda rig=rig: rig.values().get("commands", "0") != "0", "statuses")
-            status = rig.status()
-            found = status.name, status.hardware_id, rig.values()["model"]
-            assert found == (f"{space}/compensator: state", f"{space}/paper", model)
-        left.until(lambda: left.status(DRIVE), "the drive's")
-        assert left.status(DRIVE).hardware_id == "left/paper"

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from helpers import long_test
 from node_helpers import HOME, closed_form_lengths, model_file, near
 from sensor_msgs.msg import JointState
 
@@ -256,6 +257,7 @@ def screenshot(browser: str, folder: Path, address: str, patience: int) -> list[
     return [*command, f"--virtual-time-budget={patience * 1000}", f"--screenshot={folder / 'page.png'}", address]
 
 
+@long_test
 @pytest.mark.timeout(700)
 def test_the_page_in_a_browser(rig, tmp_path):
     """Truth: strut 1 is corrected by +100 µm and struts 5 and 6 by −100 and −200 µm, red and blue
