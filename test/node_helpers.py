@@ -9,6 +9,7 @@ import time
 from collections import defaultdict, deque
 from collections.abc import Iterator
 from concurrent.futures import Future
+from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,6 +29,7 @@ from std_srvs.srv import Trigger
 
 from hexapod_comp.cli.jobs import Jobs
 from hexapod_comp.compensation.guards import StampClock
+from hexapod_comp.compensation.journal import Source
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros import rclpy_compat, worker
 from hexapod_comp.ros.compensator import CompensatorNode
@@ -40,6 +42,9 @@ CONFIG = Path(__file__).resolve().parents[1] / "config"
 
 AT_ONCE = 1e-6
 """A wait that is over, s."""
+
+READ_MODEL, READ_GEOMETRY = lru_cache(8)(Source.model), lru_cache(8)(Source.geometry)
+"""The shipped files are made into models and machines once for all tests, not once a node."""
 
 HOME = Pose([0.0, 0.0, 0.4], np.eye(3))
 """Home of the paper's machine."""
@@ -194,6 +199,8 @@ class Rig(Bench):
                 self.jobs = getattr(self, "jobs", None) or Jobs()
                 return pickle.loads(pickle.dumps(self.jobs.do(*pickle.loads(pickle.dumps(request)))))
 
+        patch.setattr(Source, "model", READ_MODEL)
+        patch.setattr(Source, "geometry", READ_GEOMETRY)
         for name, module in list(sys.modules.items()):
             if name.startswith(("hexapod_comp.ros.", "hexapod_comp.linuxcnc.", "hexapod_comp.testing.bench")):
                 for what, stand_in in (("time", self.clock), ("Alarm", Alarm)):

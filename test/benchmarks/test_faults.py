@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -58,83 +59,89 @@ def say(record: Record, time: float, message: str, node: str = "compensator", **
     record.statuses.sort(key=lambda status: status.time)
 
 
-def test_nothing_is_found_where_nothing_is_wrong():
-    verdict = judge(quiet(), LIMITS)
-    assert verdict.misses() == []
-    assert verdict.sent == verdict.sent - verdict.lost > 1400
+def of_strut(n: int, value: float) -> np.ndarray:
+    return np.where(np.arange(6) == n, value, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("spoil", "found"),
-    [
-        (lambda lengths: lengths + np.array([0.0, 0.0, 2.1e-3, 0.0, 0.0, 0.0]), "step of 2."),
-        (lambda lengths: lengths * np.nan, "not finite"),
-        (lambda lengths: np.where(np.arange(6) == 3, np.inf, lengths), "not finite"),
-        (lambda lengths: np.full(6, 0.881), "outside the stroke"),
-        (lambda lengths: np.full(6, 0.329), "outside the stroke"),
-    ],
-    ids=["step", "NaN", "infinite", "too long", "too short"],
-)
-def test_the_judge_catches_one_bad_command_among_1500(spoil, found):
-    record = quiet()
-    record.commands[700] = replace(record.commands[700], lengths=spoil(record.commands[700].lengths))
-    assert any(found in miss for miss in judge(record, LIMITS).misses())
+def off(record: Record, since: int, by: float | np.ndarray) -> None:
+    """Move strut commands from one on, m."""
+    for struts in record.commands[since:]:
+        struts.lengths[:] += by
 
 
-@pytest.mark.parametrize(("value", "found"), [(2.1e-3, "strut_corrections of 2.1"), (math.nan, "not finite")])
-def test_the_judge_catches_one_bad_correction(value, found):
-    record = quiet()
-    record.corrections[700].lengths[2] = value
-    assert any(found in miss for miss in judge(record, LIMITS).misses())
+def told(record: Record, **lengths: Any) -> None:
+    """Let one of 1,500 messages be wrong."""
+    ((name, spoilt),) = lengths.items()
+    getattr(record, name)[700].lengths[:] = spoilt(getattr(record, name)[700].lengths)
 
 
-def test_a_fresh_start_may_step_to_the_measured_struts_and_nowhere_else():
-    """A compensator that has been reset starts from where the struts stand, 5 mm from what was told last."""
-    record = quiet()
-    for struts in (*record.commands[700:], *record.measured[680:]):
+def restarted(record: Record, further: float) -> None:
+    """A compensator that has been reset starts from where the struts stand, 5 mm from the last command, or not."""
+    off(record, 700, 5e-3)
+    for struts in record.measured[680:]:
         struts.lengths[:] += 5e-3
-    assert any("step" in miss for miss in judge(record, LIMITS).breaches)
     record.fresh_starts.append(record.commands[700].time - 1e-4)
-    assert judge(record, LIMITS).breaches == []
-    record.commands[700].lengths[:] += 5e-3
-    assert any("step" in breach for breach in judge(record, LIMITS).breaches)
+    record.commands[700].lengths[:] += further
 
 
-@pytest.mark.parametrize(("speed", "caught"), [(0.24, False), (0.262, False), (0.264, True), (0.5, True)])
-def test_the_judge_catches_20_ms_that_are_too_fast(speed, caught):
+def hurried(record: Record, speed: float) -> None:
     """Eight commands 4 ms apart as they were sent, at so many m/s; 250 mm/s are allowed, and 5 % more."""
-    record = quiet()
+    start = record.commands[699].lengths
     for n, struts in enumerate(record.commands[700:]):
-        start = record.commands[699].lengths
         record.commands[700 + n] = replace(struts, lengths=start + speed * PERIOD * min(n + 1, 7))
-    found = judge(record, LIMITS).breaches
-    assert any("mm/s over 20 ms" in breach for breach in found) == caught, found
-    assert not any("step" in breach for breach in found[:1])
 
 
-def test_commands_that_came_bunched_and_were_not_sent_so_are_not_too_fast():
-    record = quiet()
+def bunched(record: Record) -> None:
     for n in range(700, 750):
         record.commands[n] = replace(record.commands[n], time=record.commands[750].time)
-    assert judge(record, LIMITS).breaches == []
 
 
-def test_the_judge_catches_commands_while_the_machine_must_stand():
-    record = quiet()
+def standing(record: Record) -> None:
     record.faults = [Happened("latched_following_error", 2.0, 2.5, standing=[(2.1, 2.5)])]
-    assert any("87 strut_commands though the machine must stand" in b for b in judge(record, LIMITS).breaches)
-    record.commands = [c for c in record.commands if not 2.15 < c.time < 2.5]
-    assert not any("must stand" in breach for breach in judge(record, LIMITS).breaches)
 
 
-def test_the_judge_catches_one_lost_command_outside_the_fault_and_forgives_those_inside():
-    record = quiet()
-    record.faults = [Happened("corrupt_pose", 2.0, 2.5, [2.1], "NaN, reason not_finite")]
+def lost(record: Record, *seconds: float) -> None:
+    """Commands without an answer, while a fault lasts from 2 to 2.5 s, which is reported."""
+    corrupt(record)
     say(record, 2.15, "refusing commands: not_finite")
-    record.sent[int(2.2 / PERIOD)].answered_at = math.nan
-    assert judge(record, LIMITS).misses() == []
-    record.sent[int(1.0 / PERIOD)].answered_at = math.nan
-    assert any("1 of" in miss and "lost" in miss for miss in judge(record, LIMITS).misses())
+    for second in seconds:
+        record.sent[int(second / PERIOD)].answered_at = math.nan
+
+
+JUDGED: dict[str, tuple[Callable[[Record], object], str]] = {
+    "nothing wrong": (lambda record: None, ""),
+    "step": (lambda record: told(record, commands=lambda lengths: lengths + of_strut(2, 2.1e-3)), "step of 2."),
+    "NaN": (lambda record: told(record, commands=lambda lengths: lengths * np.nan), "not finite"),
+    "infinite": (lambda record: told(record, commands=lambda lengths: lengths + of_strut(3, np.inf)), "not finite"),
+    "too long": (lambda record: told(record, commands=lambda _: 0.881), "outside the stroke"),
+    "too short": (lambda record: told(record, commands=lambda _: 0.329), "outside the stroke"),
+    "correction": (lambda record: told(record, corrections=lambda _: 2.1e-3), "strut_corrections of 2.1"),
+    "NaN correction": (lambda record: told(record, corrections=lambda _: math.nan), "not finite"),
+    "a start elsewhere, not reset": (lambda record: off(record, 700, 5e-3), "step"),
+    "a fresh start": (lambda record: restarted(record, 0.0), ""),
+    "a fresh start from elsewhere": (lambda record: restarted(record, 5e-3), "step"),
+    "fast enough": (lambda record: hurried(record, 0.262), ""),
+    "too fast": (lambda record: hurried(record, 0.264), "mm/s over 20 ms"),
+    "bunched on their way": (bunched, ""),
+    "moved though it must stand": (standing, "87 strut_commands though the machine must"),
+    "one lost outside the fault": (lambda record: lost(record, 1.0, 2.2), "1 of"),
+    "one lost inside the fault": (lambda record: lost(record, 2.2), ""),
+}
+"""What happens to the record of a good run, and what the judge says of it."""
+
+
+@pytest.mark.parametrize("case", JUDGED)
+def test_the_judge_catches_what_is_wrong_and_nothing_else(case):
+    spoil, found = JUDGED[case]
+    record = quiet()
+    spoil(record)
+    verdict = judge(record, LIMITS)
+    said = verdict.breaches if "fresh" in case else verdict.misses()
+    assert any(found in miss for miss in said) if found else said == []
+
+
+def corrupt(record: Record) -> None:
+    record.faults = [Happened("corrupt_pose", 2.0, 2.5, [2.1], "NaN, reason not_finite")]
 
 
 @pytest.mark.parametrize(
@@ -144,32 +151,17 @@ def test_the_judge_catches_one_lost_command_outside_the_fault_and_forgives_those
         (2.35, "refusing commands: not_finite", 0.25),
         (2.15, "refusing commands: quaternion", math.inf),
         (2.05, "running", math.inf),
+        (1.95, "refusing commands: not_finite", math.inf),
     ],
-    ids=["in time", "late", "of something else", "never"],
+    ids=["in time", "late", "of something else", "never", "before the fault"],
 )
 def test_how_long_a_report_took(at, message, delay):
     record = quiet()
-    record.faults = [Happened("corrupt_pose", 2.0, 2.5, [2.1], "NaN, reason not_finite")]
+    corrupt(record)
     say(record, at, message)
     ((kind, report),) = judge(record, LIMITS).reports
-    assert (kind, report.visible) == ("corrupt_pose", True)
-    assert report.delay == pytest.approx(delay)
-    assert bool(judge(record, LIMITS).misses()) == (delay > 0.2)
-
-
-def test_what_was_said_before_the_fault_does_not_count():
-    record = quiet()
-    record.faults = [Happened("half_written_model", 2.0, 2.5, [2.1])]
-    say(record, 1.5, "running", last_failed_reload="line 3")
-    say(record, 2.2, "running", last_failed_reload="line 3")
-    assert judge(record, LIMITS).reports[0][1].delay == math.inf
-    say(record, 2.25, "running", last_failed_reload="line 7")
-    assert judge(record, LIMITS).reports[0][1].delay == pytest.approx(0.15)
-
-
-def silent(record: Record, link: str, since: float, until: float) -> None:
-    """Take a link's deliveries of a time out of a record."""
-    record.delivered[link] = [t for t in record.delivered[link] if not since < t < until]
+    assert (kind, report.visible, report.delay) == ("corrupt_pose", True, pytest.approx(delay))
+    assert any("report" in miss or "corrupt_pose" in miss for miss in judge(record, LIMITS).misses()) == (delay > 0.2)
 
 
 @pytest.mark.parametrize(
@@ -183,18 +175,16 @@ def silent(record: Record, link: str, since: float, until: float) -> None:
 def test_silence_is_visible_after_the_nodes_timeout(kind, link, node, words):
     """The last message came at 2.001 s and the timeouts are 0.1 s: visible at 2.101, said at 2.201."""
     record = quiet()
-    silent(record, link, 2.002, 3.0)
+    record.delivered[link] = [t for t in record.delivered[link] if not 2.002 < t < 3.0]
     record.faults = [Happened(kind, 2.002, 3.0)]
     say(record, 2.201, words, node)
-    ((_, report),) = judge(record, LIMITS).reports
-    assert report.delay == pytest.approx(0.1, abs=1e-6)
+    assert judge(record, LIMITS).reports[0][1].delay == pytest.approx(0.1, abs=1e-6)
 
 
 def test_who_is_dead_need_not_report_and_who_is_stopped_must_when_it_goes_on():
     record = quiet()
-    record.faults = [Happened("corrupt_pose", 2.0, 2.5, [2.1], "NaN, reason not_finite")]
+    corrupt(record)
     record.outages["compensator"] = [(1.9, 2.4)]
-    assert judge(record, LIMITS).reports[0][1].delay == math.inf
     say(record, 2.5, "refusing commands: not_finite")
     assert judge(record, LIMITS).reports[0][1].delay == pytest.approx(0.1)
     record.outages["compensator"] = [(1.9, 3.5)]
@@ -215,15 +205,6 @@ def test_recovery_ends_with_the_last_command_that_was_not_answered(last_bad, rec
     assert any("recovery" in miss for miss in found.misses()) == (recovery > 1.0)
 
 
-def test_struts_that_do_not_go_where_they_are_told_are_not_recovered():
-    record = quiet()
-    record.faults = [Happened("duplicate_command", 2.0, 2.5)]
-    for reading in record.measured:
-        if 2.0 < reading.time < 4.0:
-            reading.lengths[4] += 4e-3
-    assert judge(record, LIMITS).recovery == pytest.approx(1.5, abs=0.01)
-
-
 # ---- wires ----
 
 
@@ -240,17 +221,6 @@ def carried(rule, messages: int = 100) -> list[tuple[float, int]]:
     return out
 
 
-def carried_marks(rule) -> int:
-    """Return how many of 100 messages a wire notes as wrong."""
-    wire = Wire(lambda message, now: None)
-    wire.rule = rule
-    for tick in range(3000):
-        if tick % 10 == 0 and tick < 1000:
-            wire.put(SimpleNamespace(number=tick // 10), tick * 1e-3)
-        wire.release(tick * 1e-3)
-    return len(wire.marks)
-
-
 def test_wires_do_what_their_rules_say():
     rng = np.random.default_rng(0)
     numbers = [number for _, number in carried(Duplicate(rng, 1.0))]
@@ -262,8 +232,6 @@ def test_wires_do_what_their_rules_say():
     assert all(now - number * 0.01 == pytest.approx(0.25, abs=2e-3) for now, number in delayed)
     overtaken = [number for _, number in carried(Reorder(rng, 0.2))]
     assert sorted(overtaken) == [*range(100)] != overtaken
-    assert carried_marks(Reorder(rng, 1.0)) == 0, "all are late, none is overtaken"
-    assert 0 < carried_marks(Reorder(rng, 0.2)) <= sum(b < a for a, b in pairwise(overtaken)) * 3
 
     def spoil(message):
         message.number = -1

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foreign_machines import Errors, aligned_rms, goes_to, machine_names, machines, tool_errors
-from helpers import quick_pictures
+from helpers import long_test, quick_pictures
 
 from hexapod_comp import cli
 from hexapod_comp.compensation.checks import check
@@ -160,6 +160,7 @@ def test_the_whole_story_on_a_foreign_machine(isolated_ros, tmp_path: Path, smal
     assert (tmp_path / "out" / "demo.png").stat().st_size > 20_000
 
 
+@long_test
 def test_the_true_model_is_an_option(isolated_ros, tmp_path: Path, small: None) -> None:
     """Nothing is measured, and at rest the drives' steps are left: 0.1 µm times levers of about one."""
     file = machines()["inches"].write(tmp_path / "machine.yaml")
