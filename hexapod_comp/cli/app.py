@@ -89,7 +89,6 @@ def _fail(problem: str) -> int:
 
 
 def _meant(name: str, names: Iterable[str]) -> str:
-    """Return the name that was probably meant, to append to a message."""
     near = difflib.get_close_matches(name, list(names), 1)
     return f"; did you mean {near[0]}?" if near else ""
 
@@ -147,8 +146,6 @@ class _Parser(argparse.ArgumentParser):
 
 
 class _Version(argparse.Action):
-    """Print the version of the running code."""
-
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         from ..formats.paths import version
 

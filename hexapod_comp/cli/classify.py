@@ -93,7 +93,6 @@ def classify(args: argparse.Namespace) -> int | Result:
 
 
 def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry, turned: np.ndarray) -> Result:
-    """Show the residual error of a model's calibration, and the measurement that would reduce it most."""
     from ..calibration.pictures import predicted_error_figure
     from ..calibration.posterior_file import load_posterior
     from ..calibration.remaining import measurement_rows, remaining, remaining_json, remaining_text
@@ -124,7 +123,6 @@ def _layers(study: Study, meshes: Meshes, names: tuple[str, ...], error: int) ->
 
 
 def _figures(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...]) -> dict[str, Figure]:
-    """Draw the pictures for the middle orientation of the list."""
     from ..workspace.pictures import RankedRow, causes_figure, ranking_figure, shells_figure
 
     middle, machine = len(bodies) // 2, study.geometry.name

@@ -147,7 +147,6 @@ def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles
 
 
 def _shown(tried: ExportMethod, tilt_deg: float) -> tuple[list[str], dict[str, Any]]:
-    """Return lines about one use of an export, and the same for programs."""
     name, check, notes = tried
     heat, damp = check.per_kelvin, check.per_humidity
     tilted = "no pose of this kind is within the machine's limits" if check.tilted is None else _change(check.tilted)
@@ -178,7 +177,6 @@ def _size(size: Size) -> str:
 
 
 def _change(comparison: Comparison) -> str:
-    """Return a comparison as text."""
     (a, b), (c, d) = [(s.rms * 1e6, s.largest * 1e6) for s in (comparison.before, comparison.after)]
     text = f"{a:.3f} → {c:.3f} µm RMS"
     if a > 0.0:

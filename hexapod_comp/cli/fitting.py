@@ -174,8 +174,6 @@ def fit(args: argparse.Namespace) -> int | Result:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Result of a scheme."""
-
     model: MachineModel
     text: str  # its report
     content: Callable[[], dict[str, Any]]  # the same for JSON
@@ -186,7 +184,6 @@ class Fitted:
 
 
 def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSettings, datum: Pose | None) -> Fitted:
-    """Fit with scheme joint."""
     with results.stage_line() as say:
         fit = fit_model(measured, settings, say, datum)
     fitted = FittedParameters.of(fit)
@@ -207,7 +204,6 @@ def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSett
 
 
 def _lines(args: argparse.Namespace, measured: MeasurementSet, datum: Pose | None) -> Fitted:
-    """Fit with scheme lines."""
     fit = fit_lines(measured, args.order or "adjusted-r2", name=args.name or "", datum=datum)
 
     def pictures() -> dict[str, Figure]:
@@ -237,7 +233,6 @@ def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
 
 
 def _worth(truth: RealMachine, result: Fitted, measured: MeasurementSet) -> ModelEvaluation:
-    """Return the error of the model on the virtual machine that was measured."""
     box, geometry = measured.tool_box(), measured.geometry
     if not spans(box):
         raise CalibrationError("--truth", "the readings do not span a box, so the model cannot be judged")
@@ -248,7 +243,6 @@ def _worth(truth: RealMachine, result: Fitted, measured: MeasurementSet) -> Mode
 
 
 def _write(args: argparse.Namespace, result: Fitted, measured: MeasurementSet, tried: ModelEvaluation | None) -> int:
-    """Write the model and the other requested files, and show the result."""
     judged = judge(measured)
     parts = [result.text, region_text(result.model.measured, measured.geometry) + "\n"]
     parts += [standards_text(judged) + "\n"] if judged else []
@@ -342,8 +336,6 @@ def verify(args: argparse.Namespace) -> Result:
 
 
 class Checked(NamedTuple):
-    """A model with its fit's result, and readings that check it."""
-
     model: MachineModel
     fitted: FittedParameters
     measured: MeasurementSet

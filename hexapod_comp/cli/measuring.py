@@ -78,7 +78,6 @@ def imagine(args: argparse.Namespace) -> Result:
 
 
 def outside(args: argparse.Namespace) -> Result:
-    """Write a table of errors over outside numbers into a model."""
     table = load_outside(args.table)
     table = replace(table.negated() if args.holds == "corrections" else table, beyond=args.beyond)
     if args.calibrated_at is not None:
@@ -139,7 +138,6 @@ def _drawn(model: MachineModel) -> list[tuple[str, float, str]]:
 
 
 def simulate(args: argparse.Namespace) -> Result:
-    """Measure the virtual machine: a campaign's readings."""
     from ..measurements.tidy import write_measurements
     from ..virtual.instruments import compensated, measure
     from ..virtual.warm_up import growing, load_warm_up
@@ -241,7 +239,6 @@ def _confirmed(run: RunSetUp) -> None:
 
 
 def iso230(args: argparse.Namespace) -> Result:
-    """Show the figures of ISO 230 of measured lines and circles."""
     from ..measurements.files import read_measurements
     from ..measurements.iso230 import every_target, judge, standards_json, standards_text
 

@@ -35,12 +35,10 @@ class Option:
 
     @property
     def dest(self) -> str:
-        """Name of its value among the parsed ones."""
         return str(self.keywords.get("dest", self.name.lstrip("-").replace("-", "_")))
 
     @property
     def label(self) -> str:
-        """Name in messages."""
         return self.name if self.name.startswith("-") else str(self.keywords.get("metavar", self.name))
 
     def given(self, args: argparse.Namespace) -> bool:
@@ -50,7 +48,6 @@ class Option:
 
 
 def flag(name: str, text: str) -> Option:
-    """Return a switch."""
     return Option(name, text, {"action": "store_true"})
 
 
@@ -60,7 +57,6 @@ def value(name: str, read: Callable[[str], Any] | None, metavar: str, text: str,
 
 
 def choice(name: str, words: Sequence[str], text: str, default: str | None = None) -> Option:
-    """Return an option with a fixed list of words."""
     return Option(name, text, {"choices": words, "default": default})
 
 
@@ -70,7 +66,6 @@ def reads(name: str, text: str, metavar: str = "FILE", kind: str = "", **more: A
 
 
 def writes(name: str, text: str, metavar: str = "FILE", **more: Any) -> Option:
-    """Return an option for a file to write."""
     return Option(name, text, {"metavar": metavar, **more}, "writes")
 
 
@@ -85,13 +80,10 @@ def gone(name: str, now: str) -> Option:
 
 
 def under(heading: str, *options: Option) -> tuple[Option, ...]:
-    """Return options under a heading of the help."""
     return tuple(replace(option, heading=heading) for option in options)
 
 
 class Assumptions(argparse.Action):
-    """Print the constants of calibration."""
-
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         from ..calibration.assumptions import ASSUMED
         from ..calibration.parameters import TOLERANCES
@@ -111,8 +103,6 @@ class Renamed(argparse.Action):
 
 
 class StoreMachine(argparse.Action):
-    """Store a machine, and that it was given."""
-
     def __call__(self, _: object, namespace: argparse.Namespace, given: Any, __: str | None = None) -> None:
         namespace.machine, namespace.machine_given = given, True
 
@@ -128,7 +118,6 @@ class Rule(NamedTuple):
     options: tuple[str, ...]
 
     def problem(self, given: Callable[[str], bool], label: Callable[[str], str]) -> str:
-        """Return the problem, empty if there is none."""
         by, others = self.options[0], self.options[1:]
         here = [name for name in self.options if any(given(part) for part in re.split(" (?=--)", name))]
         first = next((label(name) for name in others if given(name)), "") if self.kind in (NEEDS, EXCLUDES) else ""
@@ -164,7 +153,6 @@ excluded_by = partial(_rule, EXCLUDES)  # the first excludes the others
 
 
 def wrong(text: str) -> argparse.ArgumentTypeError:
-    """Return (not raise) an error about a typed value."""
     return argparse.ArgumentTypeError(text)
 
 
@@ -190,7 +178,6 @@ def outside_numbers(text: str) -> dict[str, float]:
 
 
 def finite(text: str) -> float:
-    """Read one finite number."""
     if "," in text:
         raise wrong(f"must be finite numbers{number_hint(text)}, not {text!r}")
     return numbers(text)[0]
@@ -244,7 +231,6 @@ count = whole(1)
 
 
 def seed(text: str) -> int:
-    """Read a whole number, zero or above."""
     if not text.isdecimal():
         raise wrong(f"must be a whole number, 0 or above, not {text!r}")
     return int(text)
@@ -289,7 +275,6 @@ def expansions(text: str) -> tuple[float, float, float]:
 
 
 def time_constants(text: str) -> tuple[float, ...]:
-    """Read time constants in s; return them sorted."""
     return tuple(sorted(numbers(text)))
 
 
@@ -343,7 +328,6 @@ COMPENSATED = flag("--compensated", "check readings: taken with the compensation
 
 
 def machine(default: str = "paper.yaml") -> Option:
-    """Return the option that names the geometry file."""
     text = f"geometry file, or the name of a shipped one (default {default})"
     return reads("--machine", text, kind="geometry", default=default, action=StoreMachine)
 
@@ -367,23 +351,19 @@ TRUTH = reads(
 
 
 def table_out(what: str) -> Option:
-    """Return the option for a table's CSV file."""
     return writes("--out", f"write {what} to a CSV file", type=csv_file)
 
 
 def pictures(default: str | None = None) -> Option:
-    """Return the option for the folder of pictures."""
     return folder("--pictures", "folder for pictures; made if missing" + f" (default {default})" * bool(default),
                   default=default)  # fmt: skip
 
 
 def seed_of(what: str, default: int = 0) -> Option:
-    """Return the option for a seed."""
     return value("--seed", seed, "N", f"of {what} (default {default})", default=default)
 
 
 def readings(required: bool = True) -> tuple[Option, ...]:
-    """Return the options for measured files, the machine, and how the files are read."""
     return (
         reads("files", "measured files", kind="readings", nargs="+", default=None if required else []),
         MACHINE,

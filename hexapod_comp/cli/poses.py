@@ -34,7 +34,6 @@ MOST_RESULTS = 10_000_000  # of assess, machines times poses: more results are r
 
 
 def show(args: argparse.Namespace) -> Result:
-    """Show a machine at a glance, and suspicious entries of its file."""
     from ..workspace.overview import as_json, overview, report
     from ..workspace.pictures import overview_figure
 
@@ -45,7 +44,6 @@ def show(args: argparse.Namespace) -> Result:
 
 
 def travel(args: argparse.Namespace) -> Result:
-    """Show the travel of the tool from a pose."""
     from ..compensation.travel import travel, travel_text
 
     geometry, model = results.load_machine(args)
@@ -78,7 +76,6 @@ class Targets:
 
     @staticmethod
     def given(args: argparse.Namespace) -> Targets:
-        """Return the poses of the file, or the one given by options, in one direction."""
         if args.poses is not None:
             with results.stage(f"reading {args.poses}"):
                 rows, positions, rotations = read_pose_arrays(args.poses)
@@ -111,7 +108,6 @@ class Targets:
         return Targets(rows, *both, directions, np.tile(along, 2))
 
     def where(self, n: int) -> str:
-        """Identify a pose in messages."""
         if self.along is None:
             return results.where(self.rows[n])
         return f"{texts.number(float(self.along[n]) * 1e3, 3)} mm along the line, {self.directions[n]}"
@@ -328,8 +324,6 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
 
 
 class LimitFormat(NamedTuple):
-    """How a limit is displayed."""
-
     column: str
     unit: str
     factor: float  # from SI
@@ -339,7 +333,6 @@ class LimitFormat(NamedTuple):
     stages: tuple[int, ...] = (0, 1)  # separate for nominal and compensated; a correction has one value
 
     def name(self, stage: int) -> str:
-        """Return the name of its column in CSV and JSON."""
         return "_".join(filter(None, (self.column, STAGES[stage] if len(self.stages) > 1 else "", self.unit)))
 
 
@@ -439,7 +432,6 @@ def _margins(row: Row, n: int, result: CheckResult) -> dict[str, Any]:
 
 
 def _margin_table(margins: list[dict[str, Any]], result: CheckResult, ideal: bool) -> str:
-    """Return the table of margins; with a model, nominal and compensated side by side."""
 
     def cell(row: dict[str, Any], shown: LimitFormat) -> str:
         values = [row[shown.name(stage)] for stage in (shown.stages[:1] if ideal else shown.stages)]
@@ -456,7 +448,6 @@ def _margin_table(margins: list[dict[str, Any]], result: CheckResult, ideal: boo
 
 
 def _smallest(limits: Limits, rows: list[Row], result: CheckResult) -> list[dict[str, Any]]:
-    """Return, for each limit, the smallest margin and its place; displayed units."""
     listed = []
     for name, summary in result.limits.items():
         shown, place = LIMITS_SHOWN[name], summary.smallest()

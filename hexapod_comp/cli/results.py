@@ -133,7 +133,6 @@ def about(geometry: HexapodGeometry, model: MachineModel | None = None) -> dict[
 
 
 def whose(geometry: HexapodGeometry) -> str:
-    """Return tool and frame of a report's poses: ``the tool in work``."""
     return f"the {geometry.tool_name} in {geometry.work_name}"
 
 
@@ -143,7 +142,6 @@ def machine_title(geometry: HexapodGeometry, model: MachineModel) -> str:
 
 
 def where(row: Row) -> str:
-    """Identify a row in messages."""
     return f"line {row.line} (row {row.label})" if row.line else "the pose"
 
 
@@ -153,7 +151,6 @@ def mention(args: argparse.Namespace, text: str) -> None:
 
 
 def print_notes(notes: Iterable[str]) -> None:
-    """Print notes of a reader of files on stderr."""
     for note in notes:
         print(f"hexapod_comp: note: {note}", file=sys.stderr)
 
@@ -192,7 +189,6 @@ def ended_in_order() -> Iterator[None]:
 
 
 def progress_bar(total: int, unit: str) -> Any:
-    """Return a progress bar on stderr that appears after a second, on terminals only."""
     from tqdm import tqdm
 
     return tqdm(total=total, unit=unit, delay=1.0, disable=None, leave=False, file=own_terminal())
@@ -200,7 +196,6 @@ def progress_bar(total: int, unit: str) -> Any:
 
 @contextlib.contextmanager
 def stage(text: str) -> Iterator[None]:
-    """Show on stderr, on terminals only, the present step while this context is open."""
     with stage_line() as say:
         say(text)
         yield

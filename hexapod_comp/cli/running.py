@@ -35,7 +35,6 @@ HZ_PERIOD = 1.0  # how often echo --hz prints a line, s
 
 
 def run(args: argparse.Namespace) -> Result:
-    """Send the poses of a file through the loop; 0 when every command was answered."""
     from ..loop import report, session
 
     rate = session.checked_rate(args.rate_hz)
@@ -66,7 +65,6 @@ def _hidden_errors(args: argparse.Namespace, geometry: HexapodGeometry) -> Machi
 
 
 def _chosen_model(args: argparse.Namespace, geometry: HexapodGeometry, truth: MachineModel) -> MachineModel:
-    """Return the model that the compensator runs."""
     return truth if args.model == TRUE else find_model(args.model, geometry)
 
 
@@ -77,7 +75,6 @@ def _drawn(
     title: str,
     calibration: Calibration | None = None,
 ) -> dict[str, Figure]:
-    """Return the picture of the session, under the verb's name."""
     from ..loop.pictures import session_figure
 
     return {f"{args.verb}.png": session_figure(result, rows, f"{title}, model {result.model}", calibration)}
@@ -145,7 +142,6 @@ def move(args: argparse.Namespace) -> Result:
 
 
 def watch(args: argparse.Namespace) -> int:
-    """Serve a page that shows a running machine until Ctrl-C."""
     from ..ros import received_signals
     from ..viewer.page import WatchPage, watch
 
@@ -161,7 +157,6 @@ def watch(args: argparse.Namespace) -> int:
 
 
 def echo(args: argparse.Namespace) -> int | Result:
-    """Print a topic's messages until Ctrl-C, --count or --seconds; 0 if one arrived."""
     from ..ros import keep_discovery_local, received_signals
     from ..ros.echo import DISCOVERY_TIME, Echo, published_topics
     from ..ros.process import QUIET, SPIN_PERIOD, RosSession
@@ -226,7 +221,6 @@ def record(args: argparse.Namespace) -> int:
 
 
 def replay(args: argparse.Namespace) -> Result:
-    """Replay a recording with its own model and geometry, and with others where the options name them."""
     from ..compensation.journal import Source
     from ..replay.bag import Files, read_recording
     from ..replay.replay import replay_recording, what_if

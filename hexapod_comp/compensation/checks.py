@@ -43,7 +43,6 @@ class Breach:
 
     @property
     def limit(self) -> str:
-        """Name of the limit."""
         return self.error.reason
 
 
@@ -208,7 +207,6 @@ class _PathCheck:
         self._start()
 
     def _start(self) -> None:
-        """Forget the previous pose."""
         self.motion = MotionState()
         self.previous: np.ndarray = np.full((1, 2, 6), np.nan)
 
@@ -302,7 +300,6 @@ class _PathCheck:
             self.worst[name].add(margin, value, owner, share)
 
     def result(self, mode: str, platforms: Poses) -> CheckResult:
-        """Return the result."""
         breaches = [
             Breach(row, share, self._error(name, strut, stage, value))
             for name, worst in self.worst.items()
@@ -323,7 +320,6 @@ class _PathCheck:
         )
 
     def _error(self, name: str, strut: int, stage: int, value: float) -> HexapodError:
-        """Return the error for a finding."""
         if name == "not_converged":
             return NotConvergedError("the error field is too steep to be undone at this pose")
         if name == "outside_field":

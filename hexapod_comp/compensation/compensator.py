@@ -287,13 +287,8 @@ class Compensator:
         return drifted(self.geometry, model.at(outside), drift)
 
     def set_drift(self, drift: np.ndarray) -> None:
-        """Set the machine's drift since its model was fitted, m, as in :func:`drifted`; it ramps.
-
-        Raises
-        ------
-        LimitError, KinematicsError, OutsideFieldError, ModelError
-            As for :meth:`set_model`, or it is not twelve finite numbers; the old drift stays.
-        """
+        """Set the machine's drift since its model was fitted, m, as in :func:`drifted`; it ramps. Errors as for
+        :meth:`set_model`, and a ModelError where it is not twelve finite numbers; the old drift stays."""
         drift = np.array(drift, dtype=float)
         if drift.shape != (DRIFT_STATES,) or not np.isfinite(drift).all():
             raise ModelError("drift", f"must be {DRIFT_STATES} finite numbers, m", drift.tolist())
@@ -305,16 +300,9 @@ class Compensator:
         """Set outside numbers by their names, SI or °C, for the model's table; their effect ramps in.
 
         Numbers that are not given stay unchanged. Until all numbers of the table are known it is ignored; numbers that
-        it does not need are stored for a model that is set later.
-
-        Raises
-        ------
-        ModelError
-            A number is not finite, or so far outside the table that it must be in another unit.
-        OutsideTableError
-            It is outside a table that refuses this.
-        LimitError, KinematicsError, OutsideFieldError
-            As for :meth:`set_model`. In all cases the old numbers stay.
+        it does not need are stored for a model that is set later. Errors as for :meth:`set_model`; a ModelError where a
+        number is not finite, or so far outside the table that it must be in another unit; an OutsideTableError where it
+        is outside a table that refuses this. In all cases the old numbers stay.
         """
         outside = self.outside | read_numbers(numbers)
         if outside != self.outside:
@@ -329,13 +317,9 @@ class Compensator:
     def set_model(self, model: MachineModel) -> None:
         """Replace the model; the corrections ramp from the old one's to the new one's, which begins without drift.
 
-        Raises
-        ------
-        ModelError
-            The model belongs to another machine.
-        LimitError, KinematicsError, OutsideFieldError
-            What it would correct at the last command, before the first one at home, breaks a limit: the ramp would
-            drag the struts there and be refused on its way. The old model stays.
+        A ModelError: it belongs to another machine. A LimitError, KinematicsError or OutsideFieldError: what it would
+        correct at the last command, before the first one at home, breaks a limit: the ramp would drag the struts there
+        and be refused on its way. In all cases the old model stays.
         """
         model.outside.validate(self.outside)
         self._take_model(model, self.outside, np.zeros(DRIFT_STATES))
@@ -358,12 +342,8 @@ class Compensator:
         """Set a temperature, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
 
         Filter it, or its noise moves the struts: :class:`~hexapod_comp.compensation.thermal.TemperatureFilter`.
-        A model with time constants needs the `time`, s, when it was read, on a clock that is never set.
-
-        Raises
-        ------
-        ModelError
-            Unknown name, a value outside the allowed range, or no time where it is needed.
+        A model with time constants needs the `time`, s, when it was read, on a clock that is never set. A ModelError:
+        unknown name, a value outside the allowed range, or no time where it is needed.
         """
         check_part(name)
         if lib.hc_set_temperature(self._at, MEASURED_PARTS.index(name), value, time):
@@ -374,13 +354,8 @@ class Compensator:
         self.on_change("temperature", (name, float(value), time))
 
     def set_humidity(self, value: float, time: float = math.nan) -> None:
-        """Set the air's relative humidity, a fraction, read at a time, s; its effect on struts that swell ramps in.
-
-        Raises
-        ------
-        ModelError
-            A value outside the allowed range.
-        """
+        """Set the air's relative humidity, a fraction, read at a time, s; its effect on struts that swell ramps in. A
+        ModelError: a value outside the allowed range."""
         if lib.hc_set_humidity(self._at, value):
             Temperatures().set(HUMIDITY, value)
         self._sensed.add(HUMIDITY)
@@ -388,15 +363,8 @@ class Compensator:
         self.on_change("humidity", (float(value), time))
 
     def set_load(self, loading: Loading) -> None:
-        """Set gravity, and the forces on the platform beside weight; their effect ramps in.
-
-        Without a load block the model does not use them, but stores them for one that is set later.
-
-        Raises
-        ------
-        ModelError
-            As :meth:`.Loading.of`; nothing has changed.
-        """
+        """Set gravity, and the forces on the platform beside weight; their effect ramps in. A model without a load
+        block does not use them; they are stored for one that is set later. Errors are those of :meth:`.Loading.of`."""
         loading = Loading.of(*loading)
         if loading != self.loading:
             lib.hc_set_load(self._at, loading.gravity or (math.nan,) * 3, loading.wrench)
@@ -408,12 +376,8 @@ class Compensator:
         command.
 
         The next command must be at the struts' present position, with this tool. Until one is, or another tool or a
-        reset comes first, each is refused: a command that was in transit for the old tool cannot step the struts.
-
-        Raises
-        ------
-        FrameError
-            The machine has no such tool; the old one stays.
+        reset comes first, each is refused: a command that was in transit for the old tool cannot step the struts. A
+        FrameError: the machine has no such tool; the old one stays.
         """
         self._use(self.geometry.using(tool=name))
         self.on_change("tool", name)
@@ -424,13 +388,7 @@ class Compensator:
         self.geometry, self._constants, self._machine = geometry, constants, None
 
     def enable(self, enabled: bool) -> None:
-        """Switch compensation on or off; the corrections ramp.
-
-        Raises
-        ------
-        LimitError, KinematicsError, OutsideFieldError
-            As for :meth:`set_model`, when it is switched on.
-        """
+        """Switch compensation on or off; the corrections ramp. Switching on raises errors as :meth:`set_model`."""
         if enabled != self.enabled:
             if enabled:
                 self.check()
@@ -438,13 +396,7 @@ class Compensator:
             self.on_change("enable", enabled)
 
     def set_ramp_rate(self, ramp_rate: float) -> None:
-        """Set the speed of ramps, m/s.
-
-        Raises
-        ------
-        HexapodError
-            It is not positive and finite.
-        """
+        """Set the speed of ramps, m/s; a HexapodError if it is not positive and finite."""
         if not 0.0 < ramp_rate < math.inf:
             raise HexapodError(f"ramp_rate must be positive and finite, m/s, not {ramp_rate!r}")
         if ramp_rate != self._at.ramp_rate:
@@ -455,13 +407,9 @@ class Compensator:
         """Forget the last command and all directions of motion.
 
         The last correction is kept, since the struts still stand there: the next command starts from it and ramps.
-
-        Parameters
-        ----------
-        measured : array_like, shape (6,), optional
-            Where the struts are, m. When the next command's nominal lengths lie within the allowed correction
-            of it, that command starts from there and ramps: the struts do not step. Elsewhere it may be at
-            most one allowed step away.
+        Where the struts are `measured`, six, m, and the next command's nominal lengths lie within the allowed
+        correction of that, it starts from there and ramps: the struts do not step. Elsewhere it may be at most one
+        allowed step away.
         """
         if measured is None:
             lib.hc_reset(self._at, ffi.NULL)
@@ -491,13 +439,8 @@ class Compensator:
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a :meth:`snapshot` of a compensator with this geometry and model.
 
-        Raises
-        ------
-        ModelError
-            It does not have the names that a snapshot has, or under one of them not as many numbers; or a
-            temperature is not allowed.
-        FrameError
-            The machine has not its tool.
+        A ModelError: it does not have the names that a snapshot has, or under one of them not as many numbers; or a
+        temperature is not allowed. A FrameError: the machine does not have its tool.
         """
         if "temperatures" not in snapshot:
             raise ModelError("snapshot.temperatures", "is missing")
@@ -569,23 +512,11 @@ class Compensator:
         lib.hc_published(self._at, time)
 
     def estimate(self, struts: np.ndarray | tuple[float, ...]) -> np.ndarray:
-        """Return the tool's pose for strut readings `struts`, through the model.
+        """Return the tool's pose for six encoder readings, or commands, m, through the model.
 
-        Parameters
-        ----------
-        struts : ndarray, shape (6,), or tuple of six float
-            Encoder readings, or commands, m.
-
-        Returns
-        -------
-        ndarray, shape (12,)
-            ``pose_tool_in_base``: position, m, then the rotation matrix by rows; this compensator's own
-            array, valid until the next call.
-
-        Raises
-        ------
-        KinematicsError
-            There is no such pose; the next estimate starts from the last good one.
+        It is ``pose_tool_in_base``, shape (12,): position, m, then the rotation matrix by rows; this compensator's own
+        array, valid until the next call. A KinematicsError: there is no such pose; the next estimate starts from the
+        last good one.
         """
         at = struts if isinstance(struts, tuple) and len(struts) == 6 else given("struts", np.asarray(struts), 6)
         status = lib.hc_estimate(self._at, at, self._estimated)
@@ -600,19 +531,10 @@ class Compensator:
         return estimate["position"], estimate["rotation"]
 
     def correct(self, tool_pose: Pose, time: float = math.nan) -> Correction:
-        """Compensate one commanded tool pose and return the full record.
+        """Compensate one commanded tool pose, ``pose_tool_in_work``, and return the full record.
 
-        Parameters
-        ----------
-        tool_pose : Pose
-            ``pose_tool_in_work``.
-        time : float, optional
-            When the command was made, s, for ramps and speeds, as in :meth:`step`; without it neither counts.
-
-        Raises
-        ------
-        LimitError, KinematicsError, OutsideFieldError
-            The command is refused and nothing has changed.
+        It was made at `time`, s, for ramps and speeds, as in :meth:`step`; without it neither counts. A LimitError,
+        KinematicsError or OutsideFieldError: the command is refused and nothing has changed.
         """
         made = self._time
         made.made, made.received = time, math.nan
@@ -724,6 +646,5 @@ def refusal(
 
 
 def pose_of(pose: Any) -> Pose:
-    """Return an ``hc_pose`` as a pose."""
     numbers = np.frombuffer(ffi.buffer(ffi.addressof(pose)), dtype=float)
     return Pose(numbers[:3], numbers[3:].reshape(3, 3))

@@ -41,7 +41,6 @@ class FusionRules:
     rotation_deviation: float = 1e-5  # the same, rad
 
     def covariance(self) -> np.ndarray:
-        """Return the covariance of a reading that states none, (6, 6), m and rad."""
         return np.diag(np.repeat([self.position_deviation, self.rotation_deviation], 3) ** 2)
 
 
@@ -89,8 +88,6 @@ class DriftFilter:
 
 @dataclass(frozen=True)
 class PoseReading:
-    """A reading of the instrument."""
-
     pose: Pose  # pose_tool_in_base
     made: float  # monotonic time, s
     covariance: np.ndarray  # (6, 6): displacement, m, and rotation vector, rad, along the axes of ``base``
@@ -153,7 +150,6 @@ class Fusion:
 
     @property
     def turn(self) -> np.ndarray:
-        """The base's rotation vector, rad."""
         return self.drift[3:6] / self._compensator.geometry.characteristic_length
 
     def add(self, reading: PoseReading) -> list[CommandError]:

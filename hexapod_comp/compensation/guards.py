@@ -68,7 +68,6 @@ class Guard:
     problem = ""
 
     def check(self, sample: Sample) -> None:
-        """Raise a HexapodError that says why the sample is refused."""
         if self.problem:
             raise CommandError(self.reason, self.problem)
 
@@ -89,7 +88,6 @@ class EventWindow:
         self._at = self._asked = self._before = -math.inf
 
     def note(self, now: float) -> None:
-        """It happens now."""
         self._at = now
 
     def holds(self, now: float) -> bool:
@@ -103,8 +101,6 @@ class EventWindow:
 
 
 class Excess(NamedTuple):
-    """What breaks a :class:`RateLimit`."""
-
     which: int  # of the values
     moved: float
     allowed: float
@@ -146,7 +142,6 @@ class RateLimit:
         return None
 
     def accept(self, values: Sequence[float], now: float) -> None:
-        """Store values as the last good ones."""
         if self.bunched < math.inf:
             last = values if self.last is None else self.last
             self._ahead = self._ahead or (0.0,) * len(values)
@@ -309,7 +304,6 @@ class StampGate(Guard):
             self._made = min(self._made, self._now - self._clock.shift)
 
     def reset(self) -> None:
-        """Forget the order: the next stamp may be any."""
         self._then, self._lead, self._run = -math.inf, 0, 0
 
     def _find_setting(self, stamp: int, before: list[int]) -> None:
@@ -372,7 +366,6 @@ class OneSender(Guard):
 
     @property
     def reason(self) -> str:  # type: ignore[override]
-        """Name under which refusals are counted."""
         return "unknown_publisher" if self._unknown else "several_publishers"
 
     def update(self, now: float) -> None:
@@ -409,7 +402,6 @@ class OneSender(Guard):
         return False
 
     def missing(self, now: float) -> bool:
-        """Return whether messages have gone missing recently."""
         return self._misses.holds(now)
 
     def _judge(self, now: float) -> None:

@@ -94,7 +94,6 @@ class Source:
 
     @classmethod
     def of(cls, name: str, text: str) -> Source:
-        """Return the source with a text."""
         return cls(name, text, hashlib.sha256(text.encode()).hexdigest())
 
     @classmethod
@@ -203,7 +202,6 @@ class Journal:
         self._count += 1
 
     def note(self, what: str, value: Any) -> None:
-        """Record a change."""
         entry = {"after": self._count, "what": what}
         if what == "model":
             entry |= {"name": value.name, "sha256": self._sources["model"].sha256}
@@ -222,7 +220,6 @@ class Journal:
         self._entries.append(entry)
 
     def refused(self, stamp: int, reason: str, text: str) -> None:
-        """Record a refused command with its stamp, ns."""
         self._refused += 1
         if self._refused <= REFUSALS_PER_PAGE:
             entry = {"after": self._count, "what": "refused", "stamp": stamp, "reason": reason, "text": text}
@@ -233,7 +230,6 @@ class Journal:
         return bool(self._commands or self._entries) or now - self._last >= SNAPSHOT_PERIOD
 
     def page(self, now: float) -> str:
-        """Return the next page and begin a new one."""
         snapshot = None
         if now - self._last >= SNAPSHOT_PERIOD:
             self._last, compensator = now, self._compensator
@@ -280,7 +276,6 @@ def made_with() -> dict[str, str]:
 
 
 def sources_text(sources: Mapping[str, Source]) -> str:
-    """Return the message that carries the files in use."""
     content = {
         key: {
             "name": source.name,
@@ -293,7 +288,6 @@ def sources_text(sources: Mapping[str, Source]) -> str:
 
 
 def read_sources(text: str) -> dict[str, Source]:
-    """Read the text of :func:`sources_text`."""
     sources = {}
     try:
         for key, entry in _object(_content(text)["files"], "files").items():
@@ -309,7 +303,6 @@ def read_sources(text: str) -> dict[str, Source]:
 
 
 def read_page(text: str) -> Page:
-    """Read the text of :meth:`Journal.page`."""
     content = _content(text)
     try:
         page = Page(

@@ -75,7 +75,6 @@ class StrutTrack(Guard):
     # ---- what comes ----
 
     def add_command(self, command: Struts, now: float) -> None:
-        """Add a published command."""
         self._told.append((now, command))
 
     def check_jump(self, sample: Sample) -> None:
@@ -129,7 +128,6 @@ class StrutTrack(Guard):
         return True
 
     def release(self) -> None:
-        """Release a following error."""
         self.problem = ""
 
     def reset(self) -> None:
@@ -139,7 +137,6 @@ class StrutTrack(Guard):
         self._told.clear()
 
     def begin(self, now: float) -> None:
-        """The node is activated."""
         self._began = now
 
     # ---- what is asked ----

@@ -23,8 +23,6 @@ TURN_STEP, LONGEST_TURN = math.radians(0.5), math.pi  # The same for turns, rad,
 
 @dataclass(frozen=True)
 class Travel:
-    """Travel of a tool in one direction."""
-
     coordinate: str  # One of :data:`COORDINATES`; the others are fixed
     sign: int  # 1 or −1
     distance: float  # The furthest that all limits allow, m or rad
@@ -32,22 +30,18 @@ class Travel:
 
     @property
     def way(self) -> str:
-        """``+x``, ``-alpha``."""
         return f"{'+' if self.sign > 0 else '-'}{self.coordinate}"
 
     @property
     def unit(self) -> str:
-        """Unit of display: mm or deg."""
         return "deg" if self.coordinate in COORDINATES[3:] else "mm"
 
     @property
     def key(self) -> str:
-        """Name of :attr:`shown`: direction and unit."""
         return f"{self.way}_{self.unit}"
 
     @property
     def shown(self) -> float:
-        """The distance in the unit shown."""
         return self.distance * (1e3 if self.unit == "mm" else 180.0 / math.pi)
 
 

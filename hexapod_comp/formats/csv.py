@@ -70,8 +70,6 @@ def unmarked(cell: str) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """Place of a value in a file."""
-
     line: int  # line in the file, the header being line 1
     label: str  # the row's ``sequence`` or ``name``, or its number
 
@@ -126,7 +124,6 @@ class Table:
                         raise InputFileError(self.path, "", problem) from error
 
     def _decode(self, file: io.FileIO, layout: Layout, encoding: str) -> None:
-        """Read header and rows of a file in a given encoding."""
         source, self.rows = _Hashed(file, self.path, MAX_CSV_BYTES), []
         options = {"utf-8": ("utf-8-sig", MICRO_ERRORS), "windows-1252": ("cp1252", "replace")}
         codec, errors = options.get(encoding, (encoding, "strict"))
@@ -246,7 +243,6 @@ class Table:
         return columns
 
     def _missing(self, name: str, dimension: str | None) -> InputFileError:
-        """Return (not raise) the error about a missing column."""
         named = name if dimension is None else " or ".join(f"{name}_{unit}" for unit in UNITS[dimension])
         problem = f"column {named} is missing"
         if len(self.header) > 1:
@@ -255,7 +251,6 @@ class Table:
         return InputFileError(self.path, "header", problem, self.header[0])
 
     def refuse_unknown(self) -> None:
-        """Raise on a column that was not read."""
         for name in self.header:
             if name not in self._known:
                 raise InputFileError(self.path, "header", "is not a known column", name)
@@ -280,7 +275,6 @@ class Table:
         return [known[cell] for cell in cells]
 
     def number(self, line: int, index: int, text: str) -> float:
-        """Return the finite number in a cell."""
         return number_in(self.path, f"line {line}, column {self.header[index]}", text)
 
     def labels(self) -> list[Row]:
@@ -315,7 +309,6 @@ def grid_order(table: Table, coordinates: np.ndarray, what: str) -> tuple[list[n
 
 
 def number_in(path: str | Path, where: str, text: str) -> float:
-    """Return the finite number of a cell."""
     value = plain_number(text)
     if math.isnan(value):
         raise InputFileError(path, where, f"must be a finite number{number_hint(text)}", text)

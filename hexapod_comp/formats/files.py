@@ -63,7 +63,6 @@ def _refuse_unless_opened_already(path: str | Path, mode: int) -> None:
 
 
 def too_large(path: str | Path, most: int) -> InputFileError:
-    """Return (not raise) the error about a file of more than `most` bytes."""
     return InputFileError(path, "", f"larger than the allowed {most / MEGABYTE:g} MB")
 
 

@@ -18,7 +18,6 @@ from .texts import CODES
 
 
 def json_content(text: str, most: int = MAX_FILE_BYTES) -> Any:
-    """Return the content of JSON text from outside."""
     if len(text) > most:
         raise ValueError(f"has {len(text)} characters, at most {most} are allowed")
     try:
@@ -55,7 +54,6 @@ def plain(value: Any) -> Any:
 
 
 def _parts(value: Any) -> Any:
-    """Return the JSON types of an object."""
     if hasattr(value, "as_columns"):  # a pose
         return value.as_columns()
     if isinstance(value, tuple):

@@ -119,7 +119,6 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def make_folder(path: str | Path) -> None:
-    """Make a folder that is missing, with those above it."""
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -122,7 +122,6 @@ class Section:
         return key in self._left
 
     def where(self, key: str) -> str:
-        """Return the full key path of `key`."""
         return f"{self.key}.{key}" if self.key else key
 
     def error(self, key: str, problem: str, value: Any = None) -> InputFileError:
@@ -142,14 +141,12 @@ class Section:
         return f"; did you mean it by {near[0]!r}?" if near else ""
 
     def text(self, key: str) -> str:
-        """Take a required non-empty string."""
         value = self.require(key)
         if not isinstance(value, str) or not value.strip():
             raise self.error(key, "must be text", value)
         return value
 
     def choice(self, key: str, allowed: tuple[Any, ...], default: Any = None) -> Any:
-        """Take one of the `allowed` words, or numbers."""
         if default is not None and key not in self:
             return default
         value = self.require(key)
@@ -158,25 +155,21 @@ class Section:
         return value
 
     def unit(self, key: str, dimension: str) -> float:
-        """Take the name of a unit; return its size in SI."""
         value = self.require(key)
         if not isinstance(value, str) or value not in spellings(dimension):
             raise self.error(key, f"must be one of {', '.join(UNITS[dimension])}", value)
         return spellings(dimension)[value]
 
     def integer(self, key: str, default: int | None = None) -> int:
-        """Take a whole number."""
         value = default if default is not None and key not in self else self.require(key)
         if type(value) is not int:
             raise self.error(key, "must be a whole number", value)
         return value
 
     def section(self, key: str) -> Section:
-        """Take a required sub-mapping."""
         return Section(self.path, self.where(key), self.require(key))
 
     def sections(self, key: str) -> Iterator[Section]:
-        """Take a list of sub-mappings."""
         value = self.require(key)
         if not isinstance(value, list):
             raise self.error(key, "must be a list", value)
@@ -245,7 +238,6 @@ class Section:
         return np.tile(self.quantity(name, dimension, (2,)), (6, 1))
 
     def left(self) -> list[str]:
-        """Return the keys that have not been taken."""
         return list(self._left)
 
     def finish(self) -> None:
@@ -309,7 +301,6 @@ class Numbers(Kind):
         return values if np.ndim(values) else float(values)
 
     def write(self, name: str, value: Any) -> tuple[str, Any]:
-        """Return key and value of a file."""
         if self.shape == PER_STRUT and (value == value[0]).all():
             value = value[0]
         return (f"{name}_{self.unit}", in_unit(value, self.unit)) if self.unit else (name, np.asarray(value).tolist())
@@ -330,8 +321,6 @@ class Integer(Kind):
 
 
 class Choice(Kind):
-    """A value that must be one of the listed words or numbers."""
-
     def __init__(self, *words: Any) -> None:
         self.words = words
 
@@ -340,8 +329,6 @@ class Choice(Kind):
 
 
 class Text(Kind):
-    """A text that is not empty."""
-
     def parse(self, section: Section, name: str) -> str:
         return section.text(name)
 

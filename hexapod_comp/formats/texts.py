@@ -93,7 +93,6 @@ class PlainStream:
         return getattr(self.terminal, name)
 
     def write(self, text: str) -> int:
-        """Write a text."""
         try:
             return self.terminal.write(CODES.sub(lambda code: repr(code[0])[1:-1], text))
         except OSError as error:

@@ -96,8 +96,6 @@ ZERO = (0.0,) * 6
 
 
 class GuardStatus(IntEnum):
-    """What the output is doing."""
-
     OFF = 0  # not enabled, at zero
     RAMPING = 1  # on its way to the newest correction
     COMPENSATING = 2  # at the newest correction
@@ -128,7 +126,6 @@ class CorrectionGuard:
         self._holds = on_loss == "hold"
 
     def age(self, now: float) -> float:
-        """Return the time since the last accepted correction, s; infinite before the first."""
         return now - self._accepted_at
 
     def offer(self, correction: Sequence[float], now: float) -> None:
@@ -205,7 +202,6 @@ class BridgeStatus:
     latency: float = 0.0  # age of the last correction's command when it came, s
 
     def judged(self, active: bool, now: float) -> tuple[bytes, str]:
-        """Return level and message of the diagnostics."""
         status = self.guard.status
         if not active:
             return WARN, "not active"
@@ -222,7 +218,6 @@ class BridgeStatus:
         return TEXTS[status]
 
     def values(self, compensated_by: str, now: float) -> dict[str, str]:
-        """Return everything else as key and value."""
         return {
             "status": self.guard.status.name.lower(),
             "machine_on": str(self.machine_on).lower(),
@@ -297,8 +292,6 @@ class CompensatorReset:
 
 
 class StopInput:
-    """Hears ``compensator/stopped`` and ``compensator/heartbeat``."""
-
     def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:
         self._stopped, self._beat_at, self._options = True, -math.inf, options
         node.subscribe(Bool, "compensator/stopped", self._on_stopped, LATCHED_QOS)
@@ -356,7 +349,6 @@ class LinuxcncBridgeNode(MachineNode):
     # ---- lifecycle ----
 
     def configure(self) -> None:
-        """Open topics."""
         self.on_parameters(set())
         several = self._options["allow_several_publishers"]
         self._pose_out.header.frame_id = self._options["frame_id"]
@@ -386,7 +378,6 @@ class LinuxcncBridgeNode(MachineNode):
         super().publish_last_status()
 
     def destroy_node(self) -> None:
-        """Leave HAL and ROS."""
         if self._hal is not None:
             self._hal.exit()
             self._hal = None
@@ -501,7 +492,6 @@ class LinuxcncBridgeNode(MachineNode):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node; the entry of the executable ``linuxcnc_bridge``."""
     keep_discovery_local()
     return run(LinuxcncBridgeNode, PROGRAM, argv)
 

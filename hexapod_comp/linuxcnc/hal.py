@@ -81,15 +81,12 @@ def _import(name: str) -> ModuleType:
 
 @dataclass(frozen=True)
 class Pin:
-    """One pin of a component."""
-
     name: str
     kind: str
     direction: str
 
 
 def pins(direction: str, kind: str, *names: str) -> tuple[Pin, ...]:
-    """Return pins of one direction and kind."""
     return tuple(Pin(name, kind, direction) for name in names)
 
 
@@ -127,7 +124,6 @@ class HalComponent:
         return write
 
     def ready(self) -> None:
-        """Tell LinuxCNC that the component works."""
         self._component.ready()
 
     def exit(self) -> None:
@@ -170,7 +166,6 @@ ROW = re.compile(r"^\s*(\d+)\s+User\s+(\S+)\s+(\d+)\s", re.MULTILINE)  # `halcmd
 
 
 def dead_components(listing: str, name: str) -> list[int]:
-    """Return the numbers of components of a name whose process is gone."""
     rows = ROW.findall(listing)
     return [int(number) for number, known, pid in rows if known == name and not _is_alive(int(pid))]
 
@@ -191,7 +186,6 @@ def _is_alive(pid: int) -> bool:
 
 
 def remove(number: int) -> None:
-    """Free a component."""
     library = ctypes.CDLL(LIBRARY)
     # Whoever calls hal_exit must have entered HAL. The entry itself stays behind, a name without pins: one
     # process can take one component away, and this one spends that on the dead one.

@@ -108,7 +108,6 @@ class Recording:
 
     @property
     def first(self) -> Snapshot:
-        """The first snapshot."""
         return next(page.snapshot for _, page in self.pages if page.snapshot is not None)
 
     @cached_property
@@ -175,7 +174,6 @@ def read_recording(
 
 
 def _typestore() -> Any:
-    """Return rosbags' message types; without rosbags raise an error that tells how to install it."""
     # These types have been the same since they exist: the definitions in the bag, if any, are not needed.
     try:
         from rosbags import typesys
@@ -317,7 +315,6 @@ class _Collected:
         self._joints: tuple[str, ...] = STRUT_NAMES
 
     def add(self, name: str, time: int, message: Any) -> None:
-        """Add one message."""
         if name in (JOURNAL, FILES):
             self.add_text(name, time, message.data)
             return
@@ -332,7 +329,6 @@ class _Collected:
         values.extend(numbers)
 
     def add_text(self, name: str, time: int, text: str) -> None:
-        """Add a page of the journal, or the files in use."""
         try:
             if name == JOURNAL:
                 self._pages.append((time, page := read_page(text)))
@@ -343,7 +339,6 @@ class _Collected:
             raise InputFileError(self._path, f"{self._node}{name} at {time} ns", str(error)) from error
 
     def recording(self, notes: list[str], heard: int) -> Recording:
-        """Return what was collected."""
         commands, pages = self._in_order()
         if not any(page.snapshot for _, page in pages):
             problem = "holds no snapshot of the compensator's state: record for longer than half a second"
@@ -409,11 +404,9 @@ class Files:
         return next(absent, None)
 
     def geometry(self, identity: Mapping[str, str]) -> HexapodGeometry:
-        """Return a geometry by its name and hash."""
         return self._loaded("machine", identity, "", Source.geometry)
 
     def model(self, identity: Mapping[str, str], geometry: HexapodGeometry) -> MachineModel:
-        """Return a model by its name and hash."""
         return self._loaded("model", identity, geometry.name, lambda source: source.model(geometry.name))
 
     def _loaded(self, what: str, identity: Mapping[str, str], machine: str, load: Callable[[Source], Any]) -> Any:

@@ -22,7 +22,6 @@ MOST_LABELS = 12  # more changes than this are drawn without their names
 
 
 def figures_of(report: Report, geometry: HexapodGeometry | None) -> dict[str, Figure]:
-    """Return every picture that has content, by file name."""
     figures = {"corrections": corrections_figure(report), "commands": commands_figure(report)}
     if len(report.recording.topics["strut_states"]):
         figures["following_error"] = following_figure(report)
@@ -48,7 +47,6 @@ def _broken(seconds: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _struts(axes: Axes, seconds: np.ndarray, values: np.ndarray) -> None:
-    """Draw six columns over time."""
     for name, column in zip(STRUT_NAMES, values.T, strict=True):
         axes.plot(*_broken(seconds, column), lw=0.8, label=name)
     axes.set(xlabel="time, s")
@@ -89,7 +87,6 @@ def corrections_figure(report: Report) -> Figure:
 
 
 def commands_figure(report: Report) -> Figure:
-    """Show the commanded lengths, strut by strut, and the measured ones where there are any."""
     figure = _figure(report, "Strut lengths", 6.5)
     panels = figure.subplots(2, 3, sharex=True)
     commands, states = report.strut_commands * 1e3, report.recording.topics["strut_states"]
@@ -109,7 +106,6 @@ def commands_figure(report: Report) -> Figure:
 
 
 def following_figure(report: Report) -> Figure:
-    """Show the deviation of the measured struts from their commands."""
     figure = _figure(report, "Following error: measured − commanded, the drives' lag included")
     axes = figure.subplots()
     seconds, error = following_error(report)
@@ -145,7 +141,6 @@ def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
 
 
 def refused_figure(report: Report) -> Figure:
-    """Show when commands were refused, by reason."""
     figure = _figure(report, "Refused commands", 3.5)
     axes = figure.subplots()
     reasons = sorted({event.entry.values["reason"] for event in report.refused})

@@ -69,7 +69,6 @@ class Replay:
 
     @property
     def compared(self) -> int:
-        """How many answers could be compared."""
         return int(np.isin(self.outcome, (IDENTICAL, DIFFERENT)).sum())
 
     @property
@@ -84,7 +83,6 @@ class Replay:
 
     @property
     def different(self) -> np.ndarray:
-        """Rows of the answers that differ."""
         return np.flatnonzero(self.outcome == DIFFERENT)
 
     @property
@@ -146,12 +144,10 @@ class _Run:
         self._in_use = "", ""  # hashes of its geometry and model
 
     def use(self, compensator: Compensator) -> None:
-        """Set the compensator for the commands from now on."""
         self.compensator = compensator
         self._frames = {name: pack_pose(pose) for name, pose in compensator.geometry.work_frames.items()}
 
     def run(self) -> Replay:
-        """Return the outcome."""
         row, result, otherwise, expected = 0, self.result, BEFORE, ("", 0, 0)
         for time, page in self._recording.pages:
             if self._files is not None:  # after a lost page nothing is known until the next snapshot
@@ -177,7 +173,6 @@ class _Run:
         return result
 
     def _change(self, entry: Entry) -> None:
-        """Make a change recorded in the journal."""
         if entry.what == "model":
             if self._files is not None:
                 self.compensator.set_model(self._files.model(entry.values, self.compensator.geometry))

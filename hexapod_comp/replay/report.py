@@ -48,12 +48,10 @@ class Report:
         return self.since(self.recording.commands["stamp"])
 
     def since(self, stamps: np.ndarray) -> np.ndarray:
-        """Return stamps, ns, as seconds since the first answer's."""
         return (stamps - self.recording.commands["stamp"][0]) * 1e-9
 
     @property
     def strut_commands(self) -> np.ndarray:
-        """Recorded strut commands, shape (n, 6), m."""
         return self.recording.commands["lengths"][:, 0]
 
     @property
@@ -63,13 +61,11 @@ class Report:
 
     @property
     def refused(self) -> list[Event]:
-        """Refused commands that the journal names."""
         run = self.replayed or self.other
         return [] if run is None else run.refused
 
     @property
     def refusals(self) -> int:
-        """How many commands were refused."""
         return len(self.refused) + sum(page.refused_more for _, page in self.recording.pages)
 
     def since_first_page(self, time: int) -> float:
@@ -95,7 +91,6 @@ class Report:
         return "\n".join([*lines, *(f"note: {note}" for note in notes)]), content | {"notes": notes}
 
     def place(self, row: int) -> str:
-        """Identify an answer."""
         if row >= len(self.recording.commands):
             return "the end"
         stamp = int(self.recording.commands["stamp"][row])
@@ -103,7 +98,6 @@ class Report:
 
 
 def _run(report: Report) -> Part:
-    """Return the run's identity, and the number of answered commands."""
     recording, answers = report.recording, len(report.recording.commands)
     first = recording.first
     machine, model = (printable(one["name"]) for one in (first.geometry, first.model))

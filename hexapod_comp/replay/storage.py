@@ -50,8 +50,6 @@ class UnpackingError(HexapodError):
 
 
 class Message(NamedTuple):
-    """A message as it was recorded."""
-
     topic: str
     kind: str
     time: int  # of the recorder, ns
@@ -81,7 +79,6 @@ class Allowance:
             yield block
 
     def unpacked(self, stream: BinaryIO) -> bytes:
-        """Return what a packed chunk or message holds."""
         content = bytearray()
         for block in self.blocks(stream):
             content += block

@@ -216,7 +216,6 @@ class MachineNode(LifecycleNode):
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop commanding; the struts keep their last command."""
         self._active = False
         return super().on_deactivate(state)
 

@@ -36,8 +36,6 @@ ANSWER_TIMEOUT = 5.0
 
 @dataclass
 class Sent:
-    """One command and its answer."""
-
     sent_at: float  # monotonic times, s; NaN while unanswered
     refused: int  # number of commands refused before, and of those refused for their age
     too_old: int
@@ -97,12 +95,10 @@ class LoopClient:
 
     @property
     def has_true_pose(self) -> bool:
-        """Whether the tool's true pose is published."""
         return "tool_pose_true" in self._newest
 
     @property
     def true_pose(self) -> Pose:
-        """The newest true tool pose in ``base``."""
         return self._pose("tool_pose_true")
 
     @property
@@ -116,7 +112,6 @@ class LoopClient:
         return message_pose(self._newest[topic])
 
     def spin_until(self, condition: Callable[[], bool], timeout: float, what: str) -> None:
-        """Handle messages until a condition holds."""
         end = time.monotonic() + timeout
         while not condition():
             left = end - time.monotonic()
@@ -153,7 +148,6 @@ class LoopClient:
             self._spin_once(0.05)
 
     def enable(self, enabled: bool) -> None:
-        """Switch compensation on or off."""
         future = self._enable.call_async(SetBool.Request(data=enabled))
         self.spin_until(future.done, 5.0, "the service enable_compensation")
 
@@ -258,8 +252,6 @@ class MoveError(HexapodError):
 
 @dataclass(frozen=True)
 class MoveState:
-    """The mover's report of a move."""
-
     state: str  # idle, planning, moving, settling, arrived, stopped
     text: str
     share: float  # of the way, 0 to 1
@@ -274,17 +266,8 @@ class MoveState:
 class Machine:
     """A running machine with a mover: moves its tool and waits until it has arrived.
 
-    Parameters
-    ----------
-    namespace : str, optional
-        Namespace of the machine's nodes.
-    mover : str, optional
-        Name of the mover's node.
-
-    Raises
-    ------
-    NoAnswerError
-        No mover that is ready was found within 10 s.
+    The machine's nodes are in a namespace, and the mover has a name. A NoAnswerError: no mover that is ready was found
+    within 10 s.
     """
 
     def __init__(self, namespace: str = "", mover: str = "mover") -> None:
@@ -309,7 +292,6 @@ class Machine:
 
     @property
     def last(self) -> MoveState:
-        """The newest state."""
         if self.state is None:
             raise NoAnswerError("the mover has not reported a state yet")
         return self.state
@@ -326,35 +308,15 @@ class Machine:
         timeout: float = 3600.0,
         progress: Callable[[MoveState], object] = lambda state: None,
     ) -> MoveState:
-        """Move the tool along a straight line, with the shortest turn, and return when it has arrived.
+        """Move the tool along a straight line, with the shortest turn, and return the last state when it has arrived.
 
         It has arrived when its estimate, from measured struts, has stayed within the mover's tolerances of the target
         for the settling time. A move in progress is braked first, and its caller gets a MoveError, ``replaced``.
 
-        Parameters
-        ----------
-        pose : Pose
-            ``pose_tool_in_work`` of the target, m; of a relative move the way and the turn.
-        frame_id : str, optional
-            Frame of the target: ``base``, ``work`` or a named work frame; of a relative move also ``tool``.
-        relative : bool, optional
-            Go on from where the tool stands, along and about the frame's axes.
-        timeout : float, optional
-            Longest time that it may take, s; then it is stopped.
-        progress : callable, optional
-            Called with each state.
-
-        Returns
-        -------
-        MoveState
-            The last one, ``arrived``.
-
-        Raises
-        ------
-        MoveError
-            The move was refused or stopped; ``reason`` is the cause.
-        NoAnswerError
-            The mover did not answer, or the tool had not arrived in time.
+        The target is ``pose_tool_in_work``, m, or in another frame: ``base`` or a named work frame. A `relative` move
+        goes on from where the tool stands, along and about the frame's axes; its frame may also be ``tool``. After
+        `timeout`, s, the move is stopped. A MoveError: it was refused or stopped, ``reason`` is the cause. A
+        NoAnswerError: the mover did not answer, or the tool had not arrived in time.
         """
         stamp = self._session.node.get_clock().now()
         message = pose_message(pose, frame_id)

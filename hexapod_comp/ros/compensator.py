@@ -97,7 +97,6 @@ class CompensatorNode(MachineNode):
     # ---- lifecycle ----
 
     def configure(self) -> None:
-        """Load geometry and model, open topics."""
         began, options, files = time.perf_counter(), self._options, self._files
         geometry = files.geometry()
         self.compensator = compensator = Compensator(geometry, files.model(geometry), options["ramp_rate"])
@@ -351,7 +350,6 @@ class Pacing:
         return float(self._status.options["catch_up_within"])
 
     def begin(self, message: bytes, now: float, wait: float) -> None:
-        """Let a command that was too early wait, s."""
         self._enqueue(message, now)
         self._wait_for_struts(now, wait)
 

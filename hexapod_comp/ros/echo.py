@@ -123,8 +123,6 @@ def _plain_rows(prefix: str, value: Any) -> Iterator[MessageField]:
 
 
 class EchoedMessage(NamedTuple):
-    """One message."""
-
     topic: str  # full name
     rows: list[MessageField]
     stamp: float  # of its header, s since 1970; NaN where it has none
@@ -216,7 +214,6 @@ class MessageIntervals:
         self._recent: deque[float] = deque()
 
     def add(self, time: float) -> None:
-        """Count a message by its time of arrival."""
         if self.count:
             apart = time - self._recent[-1]
             self.shortest, self.longest = min(self.shortest, apart), max(self.longest, apart)
@@ -245,7 +242,6 @@ class MessageIntervals:
         return f"messages: {self.count}, {self.rate:.2f} Hz, {between}"
 
     def record(self) -> dict[str, Any]:
-        """Return it for JSON."""
         apart = {"shortest_ms": self.shortest * 1e3, "longest_ms": self.longest * 1e3}
         return {"messages": self.count, "rate_hz": self.rate, **(apart if self.count > 1 else {})}
 

@@ -61,12 +61,10 @@ def _with_text(data: bytes, text: str) -> bytes:
 
 
 def nanoseconds_of(stamp: Time) -> int:
-    """Return a stamp as nanoseconds."""
     return stamp.sec * _SECOND + stamp.nanosec
 
 
 def stamp_of(nanoseconds: int) -> Time:
-    """Return nanoseconds as a stamp."""
     sec, nanosec = divmod(nanoseconds, _SECOND)
     return Time(sec=sec, nanosec=nanosec)
 
@@ -101,13 +99,11 @@ def check_frame(frame_id: str, frames: Iterable[str]) -> None:
 
 
 def pose_numbers(message: PoseStamped) -> tuple[float, float, float, float, float, float, float]:
-    """Return x, y, z (m) and the quaternion x, y, z, w of a message."""
     p, q = message.pose.position, message.pose.orientation
     return p.x, p.y, p.z, q.x, q.y, q.z, q.w
 
 
 def write_pose(message: PoseStamped, position: np.ndarray, rotation: np.ndarray) -> None:
-    """Fill a message's pose from position (m) and rotation matrix."""
     p, q = message.pose.position, message.pose.orientation
     p.x, p.y, p.z = position.tolist()
     q.x, q.y, q.z, q.w = quaternion_of(rotation)
@@ -153,8 +149,6 @@ def read_pose(data: bytes, sample: Sample) -> None:
 
 
 class PoseBytes:
-    """A PoseStamped as bytes, to be published repeatedly."""
-
     def __init__(self, frame_id: str) -> None:
         self._bytes = bytearray(_aligned(_with_text(_HEAD, frame_id), 8) + bytes(_SEVEN.size))
         self._quaternion = ffi.new("double[4]")

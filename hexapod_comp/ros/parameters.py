@@ -59,7 +59,6 @@ class Parameter:
 
     @property
     def range(self) -> tuple[float, float] | None:
-        """Least and largest value of a number."""
         match = RANGE.fullmatch(self.allowed)
         return (float(match[1]), float(match[2])) if match else None
 
@@ -70,16 +69,13 @@ class Parameter:
 
     @property
     def choices(self) -> list[str]:
-        """Allowed values; empty: any."""
         return [] if self.range or self.differs_from or not self.allowed else self.allowed.split(", ")
 
     def described(self) -> str:
-        """Return its meaning and what is allowed, as plain text."""
         text = f"{self.meaning} ({self.allowed})" if self.allowed else self.meaning
         return text.replace("`", "")
 
     def descriptor(self) -> ParameterDescriptor:
-        """Return its ROS descriptor."""
         result = ParameterDescriptor(
             description=self.meaning.replace("`", ""),
             additional_constraints="; ".join(filter(None, (self.allowed, f"taken {self.taken.value}"))),
@@ -123,12 +119,10 @@ class Parameter:
         return [float(number) for number in numbers]
 
     def refusal(self, problem: str) -> ParameterError:
-        """Return the error about an invalid value."""
         return ParameterError(f"parameter {self.name}: {problem}")
 
 
 def read_table(text: str) -> tuple[Parameter, ...]:
-    """Return the parameters that a table declares."""
     rows = re.sub(r"\n\s+", " ", text.strip()).splitlines()
     cells = ([cell.strip() for cell in row.split("|")] for row in rows)
     return tuple(
@@ -177,7 +171,6 @@ class Parameters(dict[str, Any]):
                 raise parameter.refusal(f"must differ from {other}, {shorten(values[other])}")
 
     def _known(self, parameters: Iterable[RosParameter]) -> dict[str, Any]:
-        """Return the validated values of those in the table."""
         return {p.name: self._table[p.name].checked(p.value) for p in parameters if p.name in self._table}
 
     def _judge(self, parameters: list[RosParameter]) -> SetParametersResult:

@@ -45,7 +45,6 @@ QUIET: dict[str, Any] = {
 
 
 def autostart(node: LifecycleNode, heard: Sequence[int] = ()) -> bool:
-    """Configure and activate a node, unless a signal arrives meanwhile (`heard`); return whether it succeeded."""
     for step in (node.trigger_configure, node.trigger_activate):
         if heard:
             break
@@ -55,7 +54,6 @@ def autostart(node: LifecycleNode, heard: Sequence[int] = ()) -> bool:
 
 
 def discovery() -> str:
-    """Return the discovery range of this process's nodes, and how to change it."""
     reach, peers = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", ""), os.environ.get("ROS_STATIC_PEERS", "")
     hint = " (SUBNET finds other computers)" if reach == "LOCALHOST" else ""
     also = f" and of {printable(peers)}" if peers else ""
@@ -219,7 +217,6 @@ class RosSession:
         self._executor.spin_once(timeout_sec=timeout)
 
     def close(self) -> None:
-        """Leave ROS."""
         self._executor.shutdown()
         self.node.destroy_node()
         rclpy.try_shutdown(context=self._context)

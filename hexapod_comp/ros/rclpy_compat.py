@@ -79,7 +79,6 @@ class Alarm:
             self._set_next(time.monotonic())
 
     def close(self) -> None:
-        """Call back no more."""
         with self._change:
             self._open, self._rate = False, 0.0
             self._change.notify()
@@ -128,7 +127,6 @@ class LateAnswer:
         service.send_response = send_or_keep  # type: ignore[method-assign]
 
     def answer(self, response: Any) -> None:
-        """Answer the pending request, if there is one."""
         header, self._header = self._header, None
         if header is not None:
             self._send(response, header)
@@ -172,7 +170,6 @@ def overrides(node: Node) -> Iterable[str]:
 
 
 def full_name(info: Any) -> str:
-    """Return the full name of the node at an end of a topic, from the graph."""
     name = info.node_name
     return name if name == UNKNOWN_NAME else f"{info.node_namespace.rstrip('/')}/{name}"
 

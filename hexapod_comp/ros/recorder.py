@@ -151,12 +151,10 @@ class BagRecorder:
 
     @property
     def problem(self) -> str:
-        """Why nothing more is written; empty if all is well."""
         return self._bag.problem
 
     @property
     def journal(self) -> int:
-        """Number of journal messages: without one nothing can be replayed."""
         return sum(count for topic, count in self.counts.items() if topic.endswith(JOURNAL))
 
     def _subscribe(self, topic: str, kind: Any, qos: QoSProfile) -> None:

@@ -59,7 +59,6 @@ class Requests:
         self._predicted = PredictedError(node, status, files, self._worker)
 
     def update(self, now: float) -> None:
-        """Handle the worker's results, and send it due jobs."""
         self._worker.poll(now)
         self._travel.update(now)
         self._predicted.update(now)
@@ -213,7 +212,6 @@ class TravelReports:
         self._late.answer(Trigger.Response(message="the node was cleaned up"))
 
     def update(self, now: float) -> None:
-        """Start a new calculation when it is due."""
         if not self._busy and now >= self._due and self._publisher.get_subscription_count():
             self._due = now + TRAVEL_PERIOD
             try:

@@ -36,14 +36,12 @@ NEAR_SINGULAR = 0.9  # Share of the largest allowed condition number above which
 
 
 def status_prefix(namespace: str, node: str) -> str:
-    """Return the first part of the names of all statuses that a node of a namespace publishes."""
     return f"{namespace.strip('/')}/{node}:".lstrip("/")
 
 
 def status_of(
     name: str, hardware_id: str, level: bytes, text: str, values: Mapping[str, str], longest: int = LONGEST_TEXT
 ) -> DiagnosticStatus:
-    """Return a status; text and values are cut to `longest` characters each."""
     status = DiagnosticStatus(level=level, name=printable(name), hardware_id=printable(hardware_id))
     status.message = printable(text, longest)
     status.values = [KeyValue(key=key, value=printable(value, longest)) for key, value in values.items()]
@@ -70,16 +68,13 @@ class Flow:
         self._since, self._before, self._rate = time.monotonic(), 0, 0.0
 
     def tick(self, now: float) -> None:
-        """Count one event."""
         self.count += 1
         self.last = now
 
     def age(self, now: float) -> float:
-        """Return the time since the last event, s; infinite before the first."""
         return now - self.last
 
     def rate(self, now: float) -> float:
-        """Return events per second over the last full second or so."""
         if (span := now - self._since) >= 1.0:
             self._rate = (self.count - self._before) / span
             self._since, self._before = now, self.count
@@ -87,8 +82,6 @@ class Flow:
 
 
 class Refusals:
-    """Refused messages, counted by reason."""
-
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         self._lately: dict[str, EventWindow] = {}
@@ -96,11 +89,9 @@ class Refusals:
 
     @property
     def total(self) -> int:
-        """All of them."""
         return sum(self.counts.values())
 
     def add(self, reason: str, text: str, now: float) -> None:
-        """Count one."""
         self.counts[reason] += 1
         self._lately.setdefault(reason, EventWindow()).note(now)
         self._lately[reason] = self._lately.pop(reason)  # the newest stands last
@@ -116,7 +107,6 @@ class Refusals:
         return ", ".join(reason for reason in reversed(recent) if reason != but)
 
     def values(self) -> dict[str, str]:
-        """Return the counters as key and value."""
         counts = {f"refused.{reason}": str(count) for reason, count in sorted(self.counts.items())}
         return {"refused": str(self.total), **counts}
 
@@ -158,7 +148,6 @@ class HealthReport:
         return True
 
     def message(self, level: bytes, text: str, values: dict[str, str], stamp: Time) -> DiagnosticArray:
-        """Return the diagnostics message."""
         array = DiagnosticArray(status=[status_of(self._name, self._hardware_id, level, text, values)])
         array.header.stamp = stamp
         return array
@@ -234,12 +223,10 @@ class CompensatorStatus:
         self.track.anywhere_after = self.options["start_without_feedback_after"]
 
     def update(self, now: float) -> None:
-        """Update who publishes."""
         for sender in (self.source, self.own_topic, self.measuring, *self.sensing.values()):
             sender.update(now)
 
     def problem(self) -> Guard | None:
-        """Return the guard that stops the machine at present, if any."""
         return next((guard for guard in self.standing if guard.problem), None)
 
     def stops(self, now: float) -> bool:
@@ -247,15 +234,12 @@ class CompensatorStatus:
         return self.problem() is not None or self.refusals.recent(now) or self.track.waits(now)
 
     def fed(self, now: float) -> bool:
-        """Return whether measured struts are fresh."""
         return self.feedback.age(now) <= float(self.options["feedback_timeout"])
 
     def judged(self, now: float) -> tuple[bytes, str]:
-        """Return level and message of an active node."""
         return joined(self.findings(now))
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
-        """Yield level and text of an active node's findings, worst first."""
         compensator, guard, fed = self.compensator, self.problem(), self.fed(now)
         if guard is not None:
             yield ERROR, f"refusing commands: {guard.reason}: {guard.problem}"
@@ -313,7 +297,6 @@ class CompensatorStatus:
         yield OK, "running" if fed else "running, pose estimated from own commands"
 
     def values(self, now: float) -> dict[str, str]:
-        """Return everything else as key and value."""
         compensator, guard, fed = self.compensator, self.problem(), self.fed(now)
         model, temperatures, region = compensator.model, compensator.temperatures, compensator.model.measured
         reason = guard.reason if guard is not None else self.refusals.last_reason
@@ -371,7 +354,6 @@ class CompensatorStatus:
         return {**values, **self.refusals.values()}
 
     def _drift(self, now: float) -> dict[str, str]:
-        """Return the pose instrument's values as key and value; nothing without one."""
         if (fusion := self.fusion) is None:
             return {}
 
@@ -393,5 +375,4 @@ class CompensatorStatus:
         }
 
     def stale(self, now: float) -> str:
-        """Return the parts whose last temperature is too old."""
         return ", ".join(name for name in self.thermometers.stale(now) if name != HUMIDITY)

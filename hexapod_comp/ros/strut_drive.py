@@ -107,7 +107,6 @@ class StrutDriveNode(MachineNode):
     # ---- lifecycle ----
 
     def configure(self) -> None:
-        """Build the machine and open topics."""
         options, names = self._options, self._options["joint_names"]
         self._reader, self._states_out, self._true_out = StrutReader(names), StrutBytes(names=names), PoseStamped()
         self._true_out.header.frame_id = options["base_frame"]

@@ -41,8 +41,6 @@ class WorkerError(HexapodError):
 
 @dataclass
 class Job:
-    """A job for the process."""
-
     task: str  # load_model, predict, travel or plan_move
     arguments: dict[str, Any]
     done: Callable[[Any], None]  # called with the result, from Worker.poll
@@ -66,7 +64,6 @@ class Worker:
         return self._process.popen
 
     def ask(self, job: Job) -> None:
-        """Queue a job."""
         self._jobs.append((job, self._thread.submit(self._process.do, job)))
 
     def poll(self, now: float) -> None:

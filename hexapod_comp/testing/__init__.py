@@ -57,7 +57,6 @@ def hexapod(hexapod_context: Context, capfd: pytest.CaptureFixture[str]) -> Iter
 
 
 def private_context(domain: int) -> Iterator[Context]:
-    """Yield an rclpy context in a domain, and shut it down."""
     import rclpy
 
     context = rclpy.Context()

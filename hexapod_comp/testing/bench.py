@@ -94,12 +94,10 @@ class Answer:
 
     @property
     def lengths(self) -> np.ndarray:
-        """Strut commands, m, shape (6,)."""
         return np.array(self.command.position)
 
     @property
     def corrections(self) -> np.ndarray:
-        """Strut corrections, m, shape (6,)."""
         return np.array(self.correction.position)
 
 
@@ -196,7 +194,6 @@ class Bench:
     # ---- time ----
 
     def until(self, condition: Callable[[], object], what: str = "", timeout: float = 10.0) -> None:
-        """Handle messages until a condition holds; the timeout is for a computer under load."""
         spin_until(self.executor, condition, timeout, what)
 
     def barrier(self) -> None:
@@ -208,14 +205,12 @@ class Bench:
     # ---- services ----
 
     def call(self, kind: Any, name: str, request: Any = None) -> Any:
-        """Call a service and return its response."""
         client = self._client(kind, name)
         future = client.call_async(kind.Request() if request is None else request)
         self.until(future.done, f"answer of {name}", timeout=30.0)  # one starts a process, and others may be busy
         return future.result()
 
     def _client(self, kind: type, name: str) -> Any:
-        """Return a client whose service is there."""
         if name not in self._clients:
             self._clients[name] = self.witness.create_client(kind, name)
         self.until(self._clients[name].service_is_ready, f"service {name}")
@@ -228,11 +223,9 @@ class Bench:
         return self.call(ChangeState, f"{node}/change_state", request).success
 
     def state(self, node: str = "compensator") -> str:
-        """Return the lifecycle state of a node."""
         return self.call(GetState, f"{node}/get_state").current_state.label
 
     def enable(self, enabled: bool) -> SetBool.Response:
-        """Switch compensation."""
         return self.call(SetBool, "compensator/enable_compensation", SetBool.Request(data=enabled))
 
     def trigger(self, name: str) -> Trigger.Response:
@@ -244,7 +237,6 @@ class Bench:
         return self._client(Trigger, f"compensator/{name}").call_async(Trigger.Request())
 
     def set_parameter(self, node: str, name: str, value: object) -> SetParametersResult:
-        """Ask a node to change a parameter; return its answer."""
         request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
         return self.call(SetParameters, f"{node}/set_parameters", request).results[0]
 
@@ -257,16 +249,13 @@ class Bench:
     # ---- messages ----
 
     def add_publisher(self, topic: str) -> None:
-        """Let the witness publish on a topic."""
         self._publishers[topic] = self.witness.create_publisher(SENT[topic], topic, RELIABLE)
 
     def remove_publisher(self, topic: str) -> None:
-        """Let the witness publish on a topic no longer."""
         if topic in self._publishers:
             self.witness.destroy_publisher(self._publishers.pop(topic))
 
     def publish(self, topic: str, message: Any) -> None:
-        """Publish a message to the nodes under test."""
         self._publishers[topic].publish(message)
 
     def send(self, pose: Pose | PoseStamped, frame_id: str = "base") -> PoseStamped:
@@ -350,7 +339,6 @@ class Bench:
     speak, hush, moisten = add_publisher, remove_publisher, publish_humidity  # their names in 0.2, for one version
 
     def now(self) -> Any:
-        """Return the ROS time as a stamp."""
         return self.witness.get_clock().now().to_msg()
 
     def stamp(self, seconds_from_now: float) -> Any:
@@ -360,22 +348,18 @@ class Bench:
     # ---- what they say ----
 
     def statuses(self, node: str = "compensator") -> list[DiagnosticStatus]:
-        """Return all statuses of a node, oldest first."""
         prefix = status_prefix(self.namespace, node)
         return [s for array in self.seen["/diagnostics"] for s in array.status if s.name.startswith(prefix)]
 
     def status(self, node: str = "compensator") -> DiagnosticStatus | None:
-        """Return the newest status of a node."""
         statuses = self.statuses(node)
         return statuses[-1] if statuses else None
 
     def message(self, node: str = "compensator") -> str:
-        """Return what the newest status of a node says, empty before the first."""
         status = self.status(node)
         return "" if status is None else status.message
 
     def values(self, node: str = "compensator") -> dict[str, str]:
-        """Return the values of the newest status of a node."""
         status = self.status(node)
         return {} if status is None else {entry.key: entry.value for entry in status.values}
 
@@ -406,7 +390,6 @@ def _has_lifecycle(node: Node) -> bool:
 
 
 def spin_until(executor: Executor, condition: Callable[[], object], timeout: float = 5.0, what: str = "") -> None:
-    """Spin until `condition()` holds."""
     end = time.monotonic() + timeout
     while not condition():
         if time.monotonic() > end:

@@ -67,8 +67,6 @@ class Latency:
 
 @dataclass(frozen=True)
 class View:
-    """What is known of a machine at one moment; None and empty where nothing was heard of late."""
-
     platform: Pose | None = None  # ``pose_platform_in_base`` by ``tool_pose_estimate``
     commanded: Pose | None = None
     corrections: np.ndarray | None = None  # shape (6,): Strut corrections and measured struts, m
@@ -84,8 +82,6 @@ T = TypeVar("T")
 
 
 class Watcher:
-    """Hears a machine's topics."""
-
     def __init__(self, geometry: HexapodGeometry, node: Node) -> None:
         self._geometry, self._reader = geometry, StrutReader()
         self._guess = geometry.home
@@ -106,7 +102,6 @@ class Watcher:
             node.create_subscription(kind, topic, partial(self._keep, topic), NEWEST_QOS, raw=True)
 
     def view(self) -> View:
-        """Return what is known now."""
         now = time.monotonic()
         corrections = self._read("strut_corrections", self._lengths, now)
         commands = self._read("strut_commands", self._lengths, now)
@@ -258,7 +253,6 @@ class WatchPage:
         self.show(View())
 
     def close(self) -> None:
-        """Serve no more."""
         with contextlib.redirect_stdout(io.StringIO()):  # its farewell
             self._server.stop()
 
@@ -277,7 +271,6 @@ class WatchPage:
                 self._words.content = self._shown = text
 
     def _camera(self) -> None:
-        """Look at the machine from the side and a little from above."""
         ends = strut_ends(self._geometry, self._geometry.home).reshape(-1, 3)
         self._server.scene.set_up_direction("+z")
         centre = 0.5 * (ends.min(axis=0) + ends.max(axis=0))
@@ -346,7 +339,6 @@ def words(view: View, machine: str) -> str:
 
 
 def _error(error: WatchedError | None) -> str:
-    """Return an error in words, µm and µrad."""
     if error is None:
         return "not known"
     x, y, z = 1e6 * error.displacement
