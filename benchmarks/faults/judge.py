@@ -11,10 +11,7 @@ import numpy as np
 from hexapod_comp.machine.geometry import HexapodGeometry
 
 from .record import Happened, Record, Sent, Status, Struts, Told
-from .visible import VISIBLE, Reported
-
-REPORT_WITHIN = 0.2
-"""A fault is in diagnostics this long after it is visible, s."""
+from .visible import REPORT_WITHIN, VISIBLE, Reported
 
 RECOVER_WITHIN = 1.0
 """All is well again this long after the last fault has ended, s."""

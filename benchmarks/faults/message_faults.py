@@ -249,7 +249,7 @@ class LostEncoder(Fault):
         rig.set_drive(fault_encoder_lost=strut)
 
     def end(self, rig: Rig, happened: Happened) -> None:
-        """Find it again, and note when the first NaN was delivered."""
+        """Find it again, and note when a NaN was delivered."""
         rig.set_drive(fault_encoder_lost=0)
         spoilt = [m.time for m in rig.record.measured if m.time > happened.began and not np.isfinite(m.lengths).all()]
-        happened.marks += spoilt[:1]
+        happened.marks += spoilt

@@ -112,6 +112,8 @@ class Record:
         Of both nodes.
     outages : dict of str to list of (float, float)
         When a process was dead or stopped; the end of one is the moment at which it said that it is ready.
+    killed : dict of str to list of (float, float)
+        Those of the outages in which a process was killed: what was delivered to it before, its successor does not know.
     fresh_starts : list of float
         When a compensator was started or reset: its next command starts from the measured struts.
     faults : list of Happened
@@ -127,6 +129,7 @@ class Record:
     delivered: dict[str, list[float]] = field(default_factory=lambda: {link: [] for link in LINKS})
     statuses: list[Status] = field(default_factory=list)
     outages: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {node: [] for node in NODES})
+    killed: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {node: [] for node in NODES})
     fresh_starts: list[float] = field(default_factory=list)
     faults: list[Happened] = field(default_factory=list)
     ended: float = math.inf

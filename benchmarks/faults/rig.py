@@ -227,6 +227,7 @@ class Rig:
             if "ready" in process.output():
                 del self._starting[name]
                 self._is_up(name, now)
+                self.record.killed[MODULES[name]].append(self.record.outages[MODULES[name]][-1])
 
     def _is_up(self, name: str, now: float) -> None:
         self.record.outages[MODULES[name]].append((self._down_since.pop(name, now), now))

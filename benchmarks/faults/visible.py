@@ -19,6 +19,9 @@ from .record import Happened, Record, Told
 LOOKED_AT = 0.1
 """What lasts a moment less than a node's two looks is not visible to it, s: silence that much beyond its limit is."""
 
+REPORT_WITHIN = 0.2
+"""A fault is in diagnostics this long after it is visible, s."""
+
 Expected = tuple[str, re.Pattern, float]
 """Node, what it must say, and since when it can know it."""
 
@@ -43,14 +46,17 @@ DRIVE_TIMEOUT = _default(strut_drive, "command_timeout", 0.1)
 FOLLOWING_LIMIT = _default(compensator, "following_error_limit", 1e-3)
 
 SILENCE = {
-    "pose": ("compensator", re.compile("no new command"), COMMAND_TIMEOUT),
+    "pose": ("compensator", re.compile("no new command|waiting for the first command"), COMMAND_TIMEOUT),
     "command": ("strut_drive", re.compile("no new command|waiting for the first command"), DRIVE_TIMEOUT),
     "feedback": ("compensator", re.compile("feedback lost|pose estimated from own commands"), FEEDBACK_TIMEOUT),
 }
 """Who must say what when a link is silent for longer than a time, s."""
 
+LATCHED = "following_error"
+"""What refuses every command until it is released, before anything else about a command is checked."""
+
 REFUSALS = {
-    "pose": ("compensator", "refusing commands: .*{}|last_refusal=.*{}"),
+    "pose": ("compensator", f"refusing commands: .*({{}}|{LATCHED})|last_refusal=.*{{}}"),
     "command": ("strut_drive", "refusing commands: .*{}|last_refusal=.*{}"),
     "feedback": ("compensator", "bad feedback: .*{}|last_bad_feedback=.*{}|refusing commands: .*{}"),
 }
@@ -58,23 +64,24 @@ REFUSALS = {
 
 
 def silence(link: str, record: Record, fault: Happened) -> list[Expected]:
-    """A link is silent: visible when nothing has come for the node's timeout."""
+    """A link is silent: visible when nothing has come for the timeout of a node that is alive."""
     node, pattern, timeout = SILENCE[link]
     times = [*record.delivered[link], math.inf]
     for last, following in itertools.pairwise(times):
-        overlaps = following > fault.began and last < fault.ended
-        if overlaps and following - last > timeout + LOOKED_AT:
+        since = last + timeout
+        for start, end in sorted(record.killed[node]):
+            if start < since + LOOKED_AT:
+                since = max(since, end)
+        if following > fault.began and last < fault.ended and following > since + LOOKED_AT:
             return [(node, pattern, last + timeout)]
     return []
 
 
 def refusal(link: str, record: Record, fault: Happened) -> list[Expected]:
-    """A link delivers what cannot be used: visible when the first of it is delivered."""
-    if not fault.marks:
-        return []
+    """A link delivers what cannot be used: visible when the first of it is delivered to a running node."""
     node, words = REFUSALS[link]
     reason = fault.detail.rsplit("reason ", 1)[-1]
-    return [(node, re.compile(words.replace("{}", f"({reason})")), fault.marks[0])]
+    return at_mark([(node, words.replace("{}", f"({reason})"))], record, fault)
 
 
 def either(first: Callable, second: Callable, record: Record, fault: Happened) -> list[Expected]:
@@ -92,8 +99,13 @@ def following_error(record: Record, fault: Happened) -> list[Expected]:
 
 
 def at_mark(said_by: Sequence[tuple[str, str]], record: Record, fault: Happened) -> list[Expected]:
-    """Visible when it is done."""
-    return [(node, re.compile(words), fault.marks[0]) for node, words in said_by if fault.marks]
+    """Visible when it is done, unless the node is dead or killed before it must report."""
+    found = []
+    for node, words in said_by:
+        dead = record.killed[node]
+        seen = [m for m in fault.marks if not any(start - REPORT_WITHIN < m < end for start, end in dead)]
+        found += [(node, re.compile(words), mark) for mark in seen[:1]]
+    return found
 
 
 def nothing(record: Record, fault: Happened) -> list[Expected]:

@@ -191,6 +191,16 @@ def test_who_is_dead_need_not_report_and_who_is_stopped_must_when_it_goes_on():
     assert not judge(record, LIMITS).reports[0][1].visible
 
 
+def test_the_successor_of_a_killed_node_need_not_report_what_its_predecessor_received():
+    record = quiet()
+    record.faults = [Happened("corrupt_pose", 2.0, 2.5, [2.1], "NaN, reason not_finite")]
+    record.outages["compensator"] = [(1.9, 2.4)]
+    record.killed["compensator"] = [(1.9, 2.4)]
+    assert not judge(record, LIMITS).reports[0][1].visible
+    record.faults[0].marks.append(2.45)
+    assert judge(record, LIMITS).reports[0][1].delay == math.inf
+
+
 @pytest.mark.parametrize(("last_bad", "recovery"), [(2.6, 0.1), (3.8, 1.3), (5.7, math.inf)])
 def test_recovery_ends_with_the_last_command_that_was_not_answered(last_bad, recovery):
     record = quiet()
