@@ -38,7 +38,7 @@ def _make(base: type[Fault], kind: str, touches: set[str], meaning: Meaning, **a
 
 
 REFUSED = {
-    "pose": "compensator: refusing commands: the reason",
+    "pose": "compensator: refusing commands: the reason, or following_error while that is latched",
     "command": "strut_drive: refusing commands: the reason",
     "feedback": "compensator: bad feedback: the reason, or following_error",
 }

@@ -113,7 +113,7 @@ class Record:
     outages : dict of str to list of (float, float)
         When a process was dead or stopped; the end of one is the moment at which it said that it is ready.
     killed : dict of str to list of (float, float)
-        Those of the outages in which a process was killed: what was delivered to it before, its successor does not know.
+        Those of the outages in which a process was killed: its successor does not know what it received.
     fresh_starts : list of float
         When a compensator was started or reset: its next command starts from the measured struts.
     faults : list of Happened
