@@ -14,7 +14,6 @@ import pytest
 
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.formats.json import json_text
-from hexapod_comp.pose import Pose
 
 
 class Place(NamedTuple):
@@ -66,14 +65,6 @@ def told(value: Any) -> Any:
 )
 def test_everything_a_result_is_made_of(value: Any, expected: Any):
     assert told(value) == expected
-
-
-def test_a_pose_is_as_in_csv_files():
-    """α = 30° alone: the angle is exact in degrees to rounding, whatever the convention's other axes."""
-    pose = Pose.from_angles([0.1, -0.2, 0.4], np.radians([30.0, 0.0, 0.0]))
-    found = told({"tool": pose})["tool"]
-    assert list(found) == ["x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg"]
-    assert list(found.values()) == pytest.approx([100.0, -200.0, 400.0, 30.0, 0.0, 0.0], abs=1e-12)
 
 
 def test_numbers_come_back_to_the_last_bit():

@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.errors import InputFileError
-from hexapod_comp.formats import csv as tables
 from hexapod_comp.machine.pose_files import length_values, read_lengths, read_pose_arrays, read_poses
 from hexapod_comp.pose import Pose
 
@@ -31,14 +30,6 @@ def test_mm_and_degrees_become_m_and_rotations(tmp_path: Path) -> None:
     turns = [Rotation.from_euler(axis, angle, degrees=True) for axis, angle in (("y", 20), ("x", 10), ("z", 30))]
     expected = turns[0] * turns[1] * turns[2]
     np.testing.assert_allclose(poses[0].rotation, expected.as_matrix(), atol=1e-15)
-
-
-@pytest.mark.parametrize(("unit", "factor"), [("m", 1.0), ("mm", 1e-3), ("um", 1e-6), ("in", 0.0254)])
-def test_every_length_unit(tmp_path: Path, unit: str, factor: float) -> None:
-    rows, poses = read_poses(written(tmp_path, f"x_{unit},y_{unit},z_{unit}\n2,3,4\n"))
-    np.testing.assert_allclose(poses[0].position, np.array([2.0, 3.0, 4.0]) * factor, rtol=1e-15)
-    np.testing.assert_array_equal(poses[0].rotation, np.eye(3))
-    assert rows[0].label == "1"
 
 
 def test_quaternions(tmp_path: Path) -> None:
@@ -95,13 +86,6 @@ def test_malformed_poses_are_refused_with_file_line_and_column(
         read_poses(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert complaint in str(caught.value)
-
-
-def test_a_missing_file_and_a_folder_are_named(tmp_path: Path) -> None:
-    for path, problem in ((tmp_path / "nowhere.csv", "there is no such file"), (tmp_path, "is a folder")):
-        with pytest.raises(InputFileError, match=problem) as caught:
-            read_poses(path)
-        assert caught.value.path == str(path)
 
 
 @pytest.mark.parametrize(
@@ -177,19 +161,6 @@ def test_what_may_mean_two_things_is_refused(tmp_path: Path, text: str | bytes, 
     with pytest.raises(InputFileError) as caught:
         read_poses(written(tmp_path, text))
     assert complaint in str(caught.value)
-
-
-def test_endless_input_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tables, "MAX_ROWS", 10)
-    path = written(tmp_path, "x_mm,y_mm,z_mm\n" + "1,2,3\n" * 11)
-    with pytest.raises(InputFileError, match="more than the allowed 10 rows"):
-        read_poses(path)
-
-
-def test_lengths(tmp_path: Path) -> None:
-    rows, lengths = read_lengths(written(tmp_path, "sequence," + LENGTHS + "7,500,501,502,503,504,505\n"))
-    assert rows[0].label == "7"
-    np.testing.assert_allclose(lengths, [np.arange(500, 506) * 1e-3], rtol=1e-15)
 
 
 @pytest.mark.parametrize(

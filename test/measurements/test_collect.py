@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foreign_machines import machines
+from helpers import long_test
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.errors import InputFileError, LimitError
@@ -58,6 +59,9 @@ class StandIn:
         return Observation(self.seen(tool), np.full(6, 1e-7), tuple(struts.tolist()), warm, float(self.observed))
 
 
+LARGER = ["inches", "hanging", *(pytest.param(name, marks=long_test) for name in ("paper", "example_6_6"))]
+
+
 def machine_of(name: str, folder: Path) -> HexapodGeometry:
     return load_geometry("example_6_6" if name == "example_6_6" else machines()[name].write(folder / "machine.yaml"))
 
@@ -70,7 +74,7 @@ def small(geometry: HexapodGeometry, **more: object) -> Campaign:
     return Campaign(box, **kept)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("name", ["paper", "example_6_6", "hanging", "inches"])
+@pytest.mark.parametrize("name", LARGER)
 def test_the_file_holds_what_was_seen(name: str, tmp_path: Path) -> None:
     """Every channel is the projection of one displacement and one turn; struts, times, temperatures as measured."""
     geometry, path = machine_of(name, tmp_path), tmp_path / "out.csv"

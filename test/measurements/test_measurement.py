@@ -7,14 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from strategies import paper_geometry
 
-from hexapod_comp.errors import InputFileError
 from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.measurements.readings import (
     AXES,
     BACKWARD,
     CHANNELS,
     FORWARD,
-    FROM_PREVIOUS,
     UNKNOWN,
     FileLine,
     Reading,
@@ -56,14 +54,6 @@ def test_forward_is_along_the_first_axis_that_moves(start, stop, axis, base_axis
     assert run.is_line
 
 
-def test_forward_is_along_the_work_frames_axes() -> None:
-    """Work frame turned by 180° about z: its +x is base's −x, and forward is along +x of work."""
-    half_turn = Pose(np.zeros(3), np.diag([-1.0, -1.0, 1.0]))
-    turned = geometry_with(work=half_turn, tool=half_turn)  # the tool turned as well: the platform stays
-    run = assemble(turned, line([-0.1, 0.0, 0.4], [0.1, 0.0, 0.4])).runs[0]
-    np.testing.assert_allclose(run.axis, [-1, 0, 0], atol=1e-12)
-
-
 def test_along_counts_from_the_first_point() -> None:
     found = assemble(paper_geometry(), line([0.1, 0.0, 0.4], [-0.1, 0.0, 0.4], 3, BACKWARD))
     np.testing.assert_allclose(found.along(), [0.0, -0.1, -0.2], atol=1e-15)
@@ -89,63 +79,12 @@ def test_w_is_what_a_displaced_pose_shows() -> None:
     np.testing.assert_allclose(found.directions() @ e, expected, rtol=0.0, atol=2e-12)
 
 
-def test_readings_at_one_place_share_a_station_and_other_directions_do_not() -> None:
-    there = line([-0.1, 0.0, 0.4], [0.1, 0.0, 0.4], 3)
-    back = line([0.1, 0.0, 0.4], [-0.1, 0.0, 0.4], 3, BACKWARD)
-    again = [r._replace(cycle=2) for r in there]
-    warm = [r._replace(temperatures=(21.0,) * 8) for r in there]
-    assert len(assemble(paper_geometry(), there + again).stations) == 3
-    assert len(assemble(paper_geometry(), there + back).stations) == 6
-    assert len(assemble(paper_geometry(), there + warm).stations) == 6
-
-
-def test_directions_of_motion() -> None:
-    """Straight up all struts lengthen; a sequence says it for every row after its first."""
-    up = assemble(paper_geometry(), line([0.0, 0.0, 0.4], [0.0, 0.0, 0.5], 3))
-    np.testing.assert_array_equal(up.stations.sense, np.tile([0, 0, 1, 1, 1, 1, 1, 1, 1], (3, 1)))
-    down = line([0.0, 0.0, 0.5], [0.0, 0.0, 0.4], 3, FROM_PREVIOUS)
-    sense = assemble(paper_geometry(), down).stations.sense
-    np.testing.assert_array_equal(sense[0], np.zeros(9))
-    np.testing.assert_array_equal(sense[1:], np.tile([0, 0, -1, -1, -1, -1, -1, -1, -1], (2, 1)))
-
-
-REFUSED = {
-    "no readings": ([], "hold no reading"),
-    "no travel": (line([0.0, 0.0, 0.4], [0.0, 0.0, 0.4], 2), "has one commanded point only"),
-    "bent line": (
-        [*line([-0.1, 0.0, 0.4], [0.1, 0.0, 0.4]), *line([0.0, 0.001, 0.4], [0.0, 0.001, 0.4], 1)],
-        r"f: line 2: .*1\.0000 mm off",
-    ),
-    "far away": (line([0.0, 0.0, 0.4], [0.0, 0.0, 4.0], 2), "f: line 3: .*out of the machine's reach"),
-    "not finite": ([line([0.0, 0.0, 0.4], [0.1, 0.0, 0.4])[0]._replace(value=np.nan)], "f: line 2: .*finite"),
-    "mixed": (
-        [line([0, 0, 0.4], [0, 0, 0.5], 2)[0], line([0, 0, 0.4], [0, 0, 0.5], 2)[1]._replace(channel="position_x")],
-        "mixes channels",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_refused_with_file_and_line(case: str) -> None:
-    readings, problem = REFUSED[case]
-    with pytest.raises(InputFileError, match=problem):
-        assemble(paper_geometry(), readings)
-
-
 def test_swapped_directions_are_flagged() -> None:
     there = line([-0.1, 0.0, 0.4], [0.1, 0.0, 0.4], 3, BACKWARD)
     back = line([0.1, 0.0, 0.4], [-0.1, 0.0, 0.4], 3, FORWARD)
     assert "swapped?" in assemble(paper_geometry(), there + back).notes[0]
     right = [r._replace(direction=-r.direction) for r in there + back]
     assert assemble(paper_geometry(), right).notes == ()
-
-
-def test_attitude_error_turns_commanded_into_actual() -> None:
-    """Truth: scipy's composition of rotations."""
-    commanded = Rotation.from_euler("xyz", [10.0, -20.0, 30.0], degrees=True)
-    error = np.array([1e-3, -2e-3, 3e-3])
-    actual = Rotation.from_rotvec(error) * commanded
-    np.testing.assert_allclose(attitude_error(actual.as_matrix(), commanded.as_matrix()), error, atol=1e-15)
 
 
 def test_select_keeps_what_belongs_together() -> None:

@@ -177,11 +177,6 @@ def test_one_door_for_tidy_and_wide_files(tmp_path: Path) -> None:
     assert len(read_measurements(paths[:1], PAPER, columns)) == 6
 
 
-def test_no_file_is_refused() -> None:
-    with pytest.raises(InputFileError, match="no file is given"):
-        read_measurements([], PAPER)
-
-
 # Which way the machine came.
 
 
@@ -194,20 +189,6 @@ def test_directions_of_a_sequence_follow_from_the_row_before() -> None:
     moved = np.concatenate([np.diff(points, axis=0), np.diff(lengths_at(points), axis=0)], axis=1)
     assert (np.abs(moved[:, 3:]) > 1e-5).all(), "no strut stands still here: signs are no rounding"
     np.testing.assert_array_equal(found.stations.sense[1:], np.sign(moved.round(12)))
-
-
-def test_only_the_order_counts_not_the_values() -> None:
-    """The same places visited the other way round: every direction turns but the first row's."""
-    there = at((0, 0, 400), (15, 5, 410), (40, 20, 440))
-    forth, back = tracked(there), tracked(there[::-1])
-    np.testing.assert_array_equal(forth.stations.sense[1:], -back.stations.sense[1:][::-1])
-
-
-def test_all_channels_of_a_visit_are_one_station() -> None:
-    """Three rows at a pose are one stop; the direction of the stop is that of its first row."""
-    found = tracked(at((0, 0, 400), (10, 0, 400)), ("position_x", "position_y", "position_z"))
-    assert list(found.station) == [0, 0, 0, 1, 1, 1]
-    assert found.stations.sense[1, 0] == 1.0
 
 
 def test_a_place_reached_from_both_sides_is_two_stations() -> None:
@@ -229,13 +210,6 @@ def test_strut_readings_tell_directions_even_where_the_pose_stands_still() -> No
     ]
     sense = assemble(PAPER, readings).stations.sense
     np.testing.assert_array_equal(sense, [np.zeros(9), np.repeat([0.0, 1.0], [3, 6]), np.zeros(9)])
-
-
-def test_a_new_run_has_no_past() -> None:
-    """The last row of another run says nothing about where this one came from."""
-    poses = at((0, 0, 400), (10, 0, 400))
-    readings = [Reading(run, 1, FROM_PREVIOUS, pose, "position_x", 0.0) for run, pose in zip("ab", poses, strict=True)]
-    np.testing.assert_array_equal(assemble(PAPER, readings).stations.sense, np.zeros((2, 9)))
 
 
 def test_directions_of_a_line_are_those_of_its_axis() -> None:
@@ -384,11 +358,6 @@ def test_strut_lengths_that_do_not_belong_to_the_pose_are_refused(
         return
     with pytest.raises(InputFileError, match=r"strut_\d: .* mm was commanded, the pose needs .* differ by 2 %\)$"):
         assemble(geometry, readings)
-
-
-def test_no_reading_is_refused() -> None:
-    with pytest.raises(InputFileError, match="hold no reading"):
-        assemble(PAPER, [])
 
 
 def test_a_tool_and_a_work_frame_say_where_the_point_is() -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foreign_machines import machines
+from helpers import long_test
 
 from benchmarks.live_machine import LiveMachine
 from hexapod_comp.errors import HexapodError, InputFileError, LimitError
@@ -30,6 +31,8 @@ QUIET = LiveFlaws(length_noise=0.0, angle_noise=0.0, beam_slope=0.0, centre_off=
 
 STANDS = Pose.from_angles([2.0, -1.0, 0.5], [0.3, 1.0, 2.5])
 """Where a tracker stands, in base, m and rad."""
+
+LARGER = ["inches", "hanging", *(pytest.param(name, marks=long_test) for name in ("paper", "example_6_6"))]
 
 
 def machine_of(name: str, folder: Path) -> HexapodGeometry:
@@ -54,7 +57,7 @@ def live(geometry: HexapodGeometry, kind: str = "laser", flaws: LiveFlaws = QUIE
     return LiveMachine(geometry, find_model("random:3", geometry), LiveInstrument(geometry, kind, flaws=flaws, **more))
 
 
-@pytest.mark.parametrize("name", ["paper", "example_6_6", "hanging", "inches"])
+@pytest.mark.parametrize("name", LARGER)
 def test_a_lasers_file_is_that_of_the_whole_campaign_measured_at_once(name: str, tmp_path: Path) -> None:
     """Signs, zeros and channels are those of :func:`measure`; turns of 1e-4 rad are no vectors, to their square."""
     geometry = machine_of(name, tmp_path)
