@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from strategies import UNEVEN_GRID, fixed, random_field, seeds
 
 from hexapod_comp.errors import ModelError
-from hexapod_comp.machine.field import COMPONENTS, CROSS_AXES, GridField, no_field
+from hexapod_comp.machine.field import CROSS_AXES, GridField
 
-BOTH_UNKNOWN = np.zeros(3)
 FORWARD = np.ones(3)
 
 
@@ -117,16 +116,6 @@ def test_directions():
         np.testing.assert_allclose(error[:3] * 1e6, truth, rtol=1e-14)
 
 
-def test_six_components_of_every_family_add_up():
-    """Truth: constants, 1 … 6 µm on lines along x, ten times that along y, a hundred times along z."""
-    lines = [np.zeros((2, len(UNEVEN_GRID[a]), len(UNEVEN_GRID[b]), 6, 2)) for a, b in CROSS_AXES]
-    for axis in range(3):
-        lines[axis][..., 0] = np.arange(1, 7) * 1e-6 * 10**axis
-    error, _ = GridField(UNEVEN_GRID, tuple(lines)).evaluate([0.1, 0.1, 0.5], FORWARD)
-    np.testing.assert_allclose(error, 111e-6 * np.arange(1, 7), rtol=1e-14)
-    assert len(COMPONENTS) == 6
-
-
 @fixed
 @given(seeds)
 def test_outside_holds_the_boundary_value_and_says_so(seed):
@@ -170,12 +159,6 @@ def test_no_number_comes_from_a_position_that_is_none(bad, axis):
     error, outside = random_field(np.random.default_rng(5)).evaluate(point, FORWARD)
     assert np.isnan(error).all()
     assert outside is True
-
-
-def test_no_field_is_zero_everywhere():
-    error, outside = no_field().evaluate([0.3, -0.2, 0.5], FORWARD)
-    assert not error.any()
-    assert not outside
 
 
 @pytest.mark.parametrize(

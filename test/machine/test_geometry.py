@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 from strategies import PAPER_FILE, paper_geometry
 
 from hexapod_comp.errors import GeometryError, InputFileError
-from hexapod_comp.machine.geometry import HexapodGeometry, Limits, load_geometry, paper_joints, parse_geometry
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry, paper_joints
 
 PAPER_TEXT = PAPER_FILE.read_text(encoding="utf-8")
 
@@ -80,15 +78,6 @@ def test_the_papers_joints():
     corners = [[86.603, 150, 0], [-173.205, 0, 0], [86.603, -150, 0]]
     np.testing.assert_allclose(geometry.base_joints * 1e3, base, atol=5e-4)
     np.testing.assert_allclose(geometry.platform_joints * 1e3, np.repeat(corners, 2, axis=0), atol=5e-4)
-
-
-def test_the_papers_sides():
-    """Truth: the definitions (000, Figure 3): long sides b from B1 to B2 and on, short ones d, triangle a."""
-    base, platform = paper_joints(0.3, 0.572, 0.243)
-    sides = np.linalg.norm(base - np.roll(base, -1, axis=0), axis=1)
-    np.testing.assert_allclose(sides, [0.572, 0.243] * 3, rtol=1e-15)
-    corners = platform[::2]
-    np.testing.assert_allclose(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1), 0.3, rtol=1e-15)
 
 
 def test_a_general_machine_in_inches(tmp_path):
@@ -234,19 +223,7 @@ def test_platform_joints_in_one_point():
         HexapodGeometry("point", paper.base_joints, np.zeros((6, 3)), paper.home, paper.limits)
 
 
-def test_limits_of_the_wrong_shape():
-    with pytest.raises(GeometryError, match=r"limits\.stroke.*\(6, 2\)"):
-        Limits(np.zeros((5, 2)), np.ones(6), np.ones(6), 10.0, 1e-3, 1e-3, 0.1)
-
-
 # ---- text, path, shipped name ----
-
-
-def test_a_text_says_the_same_as_its_file():
-    from_text = parse_geometry(PAPER_FILE.read_text(encoding="utf-8"))
-    np.testing.assert_array_equal(from_text.base_joints, load_geometry(PAPER_FILE).base_joints)
-    with pytest.raises(InputFileError, match="handed over: machine: must be text"):
-        parse_geometry("format: hexapod_comp/geometry\nversion: 1\nmachine: 3", "handed over")
 
 
 @pytest.mark.parametrize("name", ["paper", "paper.yaml"])
@@ -255,20 +232,3 @@ def test_a_shipped_machine_goes_by_its_name(name, tmp_path, monkeypatch):
     (tmp_path / name).mkdir()
     monkeypatch.chdir(tmp_path)
     assert load_geometry(name).name == "paper"
-
-
-def test_a_file_is_read_once():
-    """What a pipe has given, it never gives again."""
-    reading, writing = os.pipe()
-    try:
-        os.write(writing, PAPER_FILE.read_bytes())
-        os.close(writing)
-        assert load_geometry(f"/dev/fd/{reading}").name == "paper"
-    finally:
-        os.close(reading)
-
-
-def test_no_such_machine_says_which_there_are(tmp_path):
-    shipped = r"no such file; shipped: example_6_6\.yaml, jugglebot\.yaml, paper\.yaml, positioning_unit\.yaml"
-    with pytest.raises(InputFileError, match=shipped):
-        load_geometry(tmp_path / "papper.yaml")

@@ -21,7 +21,6 @@ from scipy.spatial.transform import Rotation
 from strategies import paper_geometry
 
 from hexapod_comp.core import Status, batch
-from hexapod_comp.core.batch import rotate
 from hexapod_comp.errors import (
     KinematicsError,
     NotFiniteError,
@@ -81,25 +80,7 @@ def test_table_2_gives_table_1_within_its_rounding(row: int) -> None:
     assert (allowed < [*[1.5e-6] * 3, *[7e-6] * 3]).all()  # so that the bound above is worth something
 
 
-def test_home_length_in_closed_form() -> None:
-    """At home the joints of strut 1 are (√3/6·(2b + d), d/2, 0) and (a/(2√3), a/2, z) by 000, Figure 3."""
-    a, b, d, z = 0.3, 0.572, 0.243, 0.4
-    dx = np.sqrt(3.0) / 6.0 * (2.0 * b + d) - a / (2.0 * np.sqrt(3.0))
-    expected = np.sqrt(dx**2 + (d / 2.0 - a / 2.0) ** 2 + z**2)
-    np.testing.assert_allclose(strut_lengths(IDEAL, HOME), expected, rtol=0.0, atol=2e-16)
-
-
 # --- round trips -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("structure", [IDEAL, REAL], ids=["ideal", "10um"])
-def test_round_trip_of_table_1(structure: Structure) -> None:
-    """Closure: the lengths at a pose must give the pose back, to rounding (1e-13 m is 600 ulp of 0.5 m)."""
-    for pose in table_poses():
-        found = solve_pose(structure, strut_lengths(structure, pose), HOME)
-        error = np.abs(twist_between(pose, found))
-        assert error[:3].max() <= 1e-13
-        assert error[3:].max() <= 1e-12
 
 
 @pytest.mark.parametrize("structure", [IDEAL, REAL], ids=["ideal", "10um"])
@@ -192,12 +173,6 @@ def test_motions_between_poses_against_rotations_by_their_vectors(angle: float, 
     np.testing.assert_allclose(motions[3:].T, axes.inv().apply(vectors), rtol=0.0, atol=tolerance)
 
 
-def test_the_motion_by_half_a_turn_has_no_axis() -> None:
-    half, motions = np.diag([1.0, -1.0, -1.0])[None], np.empty((6, 1))
-    batch.motions(np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 3)), half, np.zeros(3), np.eye(3), motions)
-    np.testing.assert_array_equal(motions[:, 0], [1.0, 1.0, 1.0, np.nan, np.nan, np.nan])
-
-
 @machines
 def test_condition_number_and_sign_against_linear_algebra(machine: HexapodGeometry) -> None:
     """NumPy's inverse and determinant of the Jacobian, whose own test is above; 1e-11 covers κ²·1e-16."""
@@ -211,13 +186,6 @@ def test_condition_number_and_sign_against_linear_algebra(machine: HexapodGeomet
         assert condition == pytest.approx(expected, rel=1e-11)
         assert sign == np.sign(np.linalg.det(matrix))
         assert 1.0 <= condition <= np.linalg.cond(matrix) * (1 + 1e-12) <= 6.0 * condition * (1 + 1e-11)
-
-
-def test_solver_reports_the_condition_number_at_its_answer() -> None:
-    """The same quantity by two ways; both round, so to 1e-12."""
-    pose = table_poses()[4]
-    _, condition = solve_one(IDEAL, strut_lengths(IDEAL, pose), HOME.position.copy(), HOME.rotation.copy())
-    assert condition == pytest.approx(condition_number(IDEAL, pose)[0], rel=1e-12)
 
 
 # --- batches -----------------------------------------------------------------------------------------------
@@ -256,17 +224,6 @@ def test_batch_of_lengths_equals_single_bit_for_bit(machine: HexapodGeometry) ->
 
 
 @machines
-def test_every_row_may_have_a_start_of_its_own(machine: HexapodGeometry) -> None:
-    """From the answer itself one step of rounding's size is enough, which no common start could give to all rows."""
-    structure = Structure.of(machine)
-    poses = poses_about(machine.home, 50, seed=7, tilt_deg=15.0)
-    batch = solve_poses(structure, strut_lengths_batch(structure, *poses), poses)
-    assert (batch.iterations == 1).all()
-    np.testing.assert_allclose(batch.positions, poses[0], rtol=0.0, atol=1e-14)
-    np.testing.assert_allclose(batch.rotations, poses[1], rtol=0.0, atol=1e-13)
-
-
-@machines
 def test_a_start_may_be_a_rounded_rotation(machine: HexapodGeometry) -> None:
     """Ten digits pass as a pose; a start at the answer, off by 5e-11, once left a closure that was refused."""
     structure = Structure.of(machine)
@@ -276,12 +233,6 @@ def test_a_start_may_be_a_rounded_rotation(machine: HexapodGeometry) -> None:
     for n in range(20):
         found = solve_pose(structure, lengths[n], Pose(positions[n], np.round(rotations[n], 10)))
         np.testing.assert_allclose(found.position, positions[n], rtol=0.0, atol=1e-14)
-
-
-def test_starts_that_are_not_as_many_as_rows_are_refused() -> None:
-    lengths = np.ones((4, 6))
-    with pytest.raises(KinematicsError, match=r"\(4, 3\) and \(4, 3, 3\).*not \(3, 3\)"):
-        solve_poses(IDEAL, lengths, (np.zeros((3, 3)), np.zeros((3, 3, 3))))
 
 
 def test_number_of_threads_does_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -305,16 +256,6 @@ def test_every_row_is_in_one_slice(
     kinematics.over_chunks(slices.append, count, threads)
     assert sorted(n for rows in slices for n in range(rows.start, rows.stop)) == list(range(count))
     assert all(rows.stop > rows.start for rows in slices)
-
-
-def test_small_batches_stay_on_the_calling_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    """20,000 poses, 1 and 7 ms of work: to wake others for them once made the default four times slower."""
-    positions, rotations = poses_about(HOME, 20_000, seed=8)
-    lengths = strut_lengths_batch(IDEAL, positions, rotations, threads=1)
-    solve_poses(IDEAL, lengths[:1], HOME)  # compiles, which is work too
-    monkeypatch.setattr(kinematics, "ThreadPoolExecutor", None)
-    assert (strut_lengths_batch(IDEAL, positions, rotations) == lengths).all()
-    assert solve_poses(IDEAL, lengths, HOME).ok.all()
 
 
 def test_large_batches_are_shared() -> None:
@@ -384,16 +325,6 @@ def seen_half_done(count: int) -> bool:
         seen = bool(outcomes[-1] == -1 and first_done)
     worker.join()
     return seen
-
-
-@pytest.mark.parametrize("size", [1e-12, 1e-7, 1e-5, 0.3, 3.0])
-def test_rotate_is_the_exponential(size: float) -> None:
-    """scipy's rotation vectors, on both sides of the kernel's switch between series and sine."""
-    vector = size * np.array([0.6, -0.48, 0.64])
-    rotation = Rotation.from_rotvec([0.1, 0.2, -0.3]).as_matrix()
-    expected = Rotation.from_rotvec(vector).as_matrix() @ rotation
-    rotate(rotation, *vector)
-    np.testing.assert_allclose(rotation, expected, atol=4e-16)
 
 
 # --- errors ------------------------------------------------------------------------------------------------

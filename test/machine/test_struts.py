@@ -98,12 +98,6 @@ def test_backlash_lags_behind_the_motion():
     assert length(struts, 0.5, 0.0) == 0.5
 
 
-def test_growth_stretches_the_whole_strut():
-    """Truth: (1 + g)·(c + offset); growth acts on the strut as it is, errors included."""
-    struts = StrutErrors(offset=np.full(6, 1e-3))
-    assert length(struts, 0.5, growth=2e-4) == pytest.approx(0.501 * 1.0002, abs=2e-16)
-
-
 def test_growth_comes_from_the_temperature_above_20_degrees():
     """Truth: L·(1 + a·(T − T_ref)) (DESIGN): 12 ppm/K · 15 K of 0.5 m are 90 µm, on strut 2 alone."""
     model = MachineModel("paper", struts=StrutErrors(expansion=np.full(6, 12e-6)))
@@ -286,12 +280,6 @@ def test_command_grows_by_genhexkins_correction_since_home(seed):
             genhexkins_correction(lead, *axes, struts_at(geometry, at)[i], at.rotation) for at in (pose, geometry.home)
         )
         assert found[i] == pytest.approx(here - home, abs=1e-15)
-
-
-def test_nothing_is_added_at_home():
-    """Truth: home is where the correction starts to count."""
-    geometry = skewed_geometry(0.01)
-    np.testing.assert_allclose(shifts(geometry, geometry.home), 0.0, atol=2e-16)
 
 
 @pytest.mark.parametrize("strut", range(6))

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from strategies import paper_geometry, random_pose
 
 from hexapod_comp.machine.geometry import HexapodGeometry
-from hexapod_comp.machine.trajectory import TRACK_WINDOW, Path, circle, feet_on, join, motion_onto, move, moves, pocket
+from hexapod_comp.machine.trajectory import TRACK_WINDOW, Path, circle, feet_on, motion_onto, move, pocket
 from hexapod_comp.pose import Pose
 
 PAPER = paper_geometry()
@@ -111,37 +111,6 @@ def test_feed_bounds_the_tool_speed() -> None:
     speeds = np.linalg.norm(np.diff(positions, axis=0), axis=1) * 500.0
     assert speeds.max() <= 0.02 * (1.0 + 1e-9)
     assert speeds.max() >= 0.99 * 0.02
-
-
-def test_a_move_to_where_one_is_takes_one_command() -> None:
-    path = move(PAPER, PAPER.home, PAPER.home, 250.0)
-    assert len(path) == 1
-    np.testing.assert_allclose(path.positions[0], PAPER.home.position, atol=0.0)
-    np.testing.assert_allclose(path.rotations[0], PAPER.home.rotation, atol=0.0)
-
-
-@MACHINES
-def test_many_moves_at_once_are_the_single_moves(geometry: HexapodGeometry) -> None:
-    targets = tool_targets(geometry)
-    stacked = np.array([p.position for p in targets]), np.array([p.rotation for p in targets])
-    path, counts = moves(geometry, *stacked, 250.0)
-    single = [move(geometry, a, b, 250.0) for a, b in pairwise(targets)]
-    assert counts.tolist() == [len(one) for one in single]
-    together = join(single)
-    np.testing.assert_allclose(path.positions, together.positions, atol=1e-16)
-    np.testing.assert_allclose(path.rotations, together.rotations, atol=1e-15)
-
-
-def test_platform_poses_by_homogeneous_matrices() -> None:
-    rng = np.random.default_rng(8)
-    poses = [random_pose(rng, OFFSET.home) for _ in range(20)]
-    stacked = np.array([p.position for p in poses]), np.array([p.rotation for p in poses])
-    work = matrices(OFFSET.work.position[None], OFFSET.work.rotation[None])[0]
-    tool = matrices(OFFSET.tool.position[None], OFFSET.tool.rotation[None])[0]
-    expected = work @ matrices(*stacked) @ np.linalg.inv(tool)
-    positions, rotations = OFFSET.platform_poses(*stacked)
-    np.testing.assert_allclose(positions, expected[:, :3, 3], atol=1e-15)
-    np.testing.assert_allclose(rotations, expected[:, :3, :3], atol=1e-15)
 
 
 def test_circle_has_its_radius_plane_and_feed() -> None:
