@@ -83,9 +83,10 @@ test-all:
 test-packaging: $(VENV)/with-ros,test $(CORE)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest test/packaging
 
-# make test holds every command of the pages to what exists; this runs those whose output is shown.
+# make test holds every command of the pages to what exists; this runs those whose output is shown, and the page in a browser.
 test-docs: $(VENV)/with-ros,test $(CORE)
-	LONG_TESTS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest test/test_doc_commands.py -k sessions
+	LONG_TESTS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest test/test_doc_commands.py test/workspace/test_workspace_pictures.py \
+	    -k 'sessions or browser'
 
 # All anew each time: the notebooks run, and a page of a module that went would stay.
 docs: $(VENV)/with-ros,docs $(CORE)

@@ -9,13 +9,11 @@ from __future__ import annotations
 import atexit
 import contextlib
 import json
-import math
 import os
 import re
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
-from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -217,65 +215,27 @@ def finite(*arrays: Any) -> None:
         assert np.isfinite(np.asarray(array, dtype=float)).all(), array
 
 
-# Reading YAML once more: the tree of nodes only, every leaf its text; numbers by Decimal, units from their definitions.
+# Reading files once more: numbers by Decimal, units from their definitions.
 
-DEGREE = repr(math.pi / 180)
-FACTORS: dict[str, dict[str, str]] = {
-    "length": {"m": "1", "mm": "0.001", "um": "0.000001", "in": "0.0254"},
-    "angle": {"rad": "1", "mrad": "0.001", "urad": "0.000001", "deg": DEGREE, "arcsec": repr(math.pi / 648000)},
-    "ratio": {"ppm": "0.000001", "percent": "0.01"},
-    "expansion": {"ppm_per_K": "0.000001"},
-    "temperature": {"degC": "1"},
-    "speed": {"m_s": "1", "mm_s": "0.001", "m_min": repr(1 / 60)},
-    "time": {"s": "1", "ms": "0.001"},
+UNITS = {
+    **{unit: (factor, "m") for unit, factor in (("m", "1"), ("mm", "0.001"), ("um", "0.000001"), ("in", "0.0254"))},
+    **{unit: (factor, "rad") for unit, factor in (("rad", "1"), ("mrad", "0.001"), ("urad", "0.000001"))},
+    **{unit: (factor, "s") for unit, factor in (("s", "1"), ("ms", "0.001"))},
+    **{unit: (factor, "m_s") for unit, factor in (("m_s", "1"), ("mm_s", "0.001"))},
+    **{unit: ("1", unit) for unit in ("deg", "arcsec", "ppm", "percent", "ppm_per_K", "degC", "m_min")},
 }
+"""Factor to SI, and the SI unit, of each unit; those whose factor is no short decimal stay."""
+
 PLAIN = re.compile(r"[-+]?(?:(?:0|[1-9]\d*)(?:\.\d*)?|\.\d+|0+\.\d*)(?:[eE][-+]?\d+)?", re.ASCII)
 """What everybody reads as the same number."""
-
 
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
-def document(data: bytes) -> Any:
-    """Return a YAML file as mappings, lists and texts; check that it has no key twice, no reference, no tag."""
+def check_document(data: bytes) -> yaml.Node:
+    """Return a YAML file's tree of nodes; check that it has no reference and no tag."""
     text = data.decode("utf-8-sig")
     for event in yaml.parse(text, Loader=LOADER):
         assert not isinstance(event, yaml.AliasEvent)
         assert getattr(event, "tag", None) is None
-    return _plain(yaml.compose(text, Loader=LOADER))
-
-
-def _plain(node: Any) -> Any:
-    if isinstance(node, yaml.MappingNode):
-        keys = [key.value for key, _ in node.value]
-        assert len(set(keys)) == len(keys), keys
-        return {key.value: _plain(value) for key, value in node.value}
-    return [_plain(item) for item in node.value] if isinstance(node, yaml.SequenceNode) else node.value
-
-
-def number_of(text: str) -> Decimal:
-    """Return the number that a text is to everybody."""
-    assert PLAIN.fullmatch(text), f"{text!r} was taken for a number"
-    return Decimal(text)
-
-
-def numbers_of(tree: Any, factor: str = "1") -> np.ndarray:
-    """Return nested lists of texts as an array in SI."""
-    if isinstance(tree, list):
-        return np.array([numbers_of(item, factor) for item in tree])
-    return np.array(float(number_of(tree) * Decimal(factor)))
-
-
-def quantity(tree: dict[str, Any], name: str, kind: str, default: Any = None) -> np.ndarray:
-    """Return what stands under ``name_<unit>`` in SI, or the default; one unit only."""
-    found = [key for key in tree if key.startswith(f"{name}_") and key[len(name) + 1 :] in FACTORS[kind]]
-    if not found:
-        assert default is not None, f"{name} is missing, and was not missed"
-        return np.asarray(default, dtype=float)
-    assert len(found) == 1, found
-    return numbers_of(tree[found[0]], FACTORS[kind][found[0][len(name) + 1 :]])
-
-
-def same(read: Any, expected: Any) -> None:
-    """Check that what was read is what stands there: to three roundings, or a denormal's last digit."""
-    np.testing.assert_allclose(read, np.broadcast_to(expected, np.shape(read)), rtol=4e-16 * 3, atol=1e-322)
+    return yaml.compose(text, Loader=LOADER)

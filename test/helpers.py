@@ -7,6 +7,7 @@ import csv
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,9 @@ from hexapod_comp.machine.kinematics import Structure, strut_lengths
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.pose import Pose
 
-long_test = pytest.mark.skipif(not os.environ.get("ALL_TESTS"), reason="make test-all runs it (ALL_TESTS=1)")
-"""Decorator for tests that wait for nodes longer than ten seconds."""
+ALL_TESTS = bool(os.environ.get("ALL_TESTS"))
+long_test = pytest.mark.skipif(not ALL_TESTS, reason="make test-all runs it (ALL_TESTS=1)")
+"""Decorator for tests of seconds, and machines beyond two, that only `make test-all` runs."""
 
 DATA = Path(__file__).parent / "data"
 
@@ -70,6 +72,29 @@ def put(tree: Any, at: tuple, value: Any) -> Any:
     tree = copy.copy(tree)
     tree[at[0]] = put(tree[at[0]], at[1:], value)
     return tree
+
+
+def assert_equal(one: Any, other: Any, relative: float = 0.0, absolute: float = 0.0) -> None:
+    """Compare two records by the fields of which they are made, but for what tells from where each was read."""
+    assert type(one) is type(other)
+    if is_dataclass(one):
+        for entry in fields(one):
+            if entry.compare and entry.init:
+                assert_equal(getattr(one, entry.name), getattr(other, entry.name), relative, absolute)
+    elif isinstance(one, tuple | list):
+        assert len(one) == len(other)
+        for mine, its in zip(one, other, strict=True):
+            assert_equal(mine, its, relative, absolute)
+    elif isinstance(one, dict):
+        assert list(one) == list(other)
+        assert_equal(list(one.values()), list(other.values()), relative, absolute)
+    elif isinstance(one, np.ndarray):
+        assert one.shape == other.shape
+        np.testing.assert_allclose(one, other, rtol=relative, atol=absolute)
+    elif isinstance(one, float):
+        assert one == pytest.approx(other, rel=relative, abs=absolute, nan_ok=True)
+    else:
+        assert one == other
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calibration_helpers import SETTINGS, campaign, paper, tool_error, virtual_machine
+from helpers import long_test
 
 from hexapod_comp.calibration.blocks.load import as_loaded, refuse_half_stated
 from hexapod_comp.calibration.changes import PAYLOAD, TEMPERATURE, payload_changes, widened
@@ -167,7 +168,9 @@ def test_readings_carry_their_load_through_files(tmp_path: Path) -> None:
             read_tidy(tmp_path / "wrong.csv", truth().geometry)
 
 
-@pytest.mark.parametrize("settings", [BLIND, TOLD], ids=["no stiffness", "stiffness stated"])
+@pytest.mark.parametrize(
+    "settings", [pytest.param(BLIND, marks=long_test, id="no stiffness"), pytest.param(TOLD, id="stiffness stated")]
+)
 def test_verify_names_the_payload_and_no_temperature(settings: FitSettings) -> None:
     """Ten kilograms more that nobody tells of; then the same readings with what they carry, where stiffness is known.
 

@@ -85,12 +85,6 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
     return Done(folder, outcome, text)
 
 
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave the pictures out, which take longer than all the rest."""
-    monkeypatch.setattr("hexapod_comp.cli.classify._figures", lambda *arguments: {})
-
-
 def assert_refused(outcome: Run, folder: Path, complaint: str) -> None:
     """Exit 2, one line that names what is wrong, no traceback, no file."""
     code, out, err = outcome
@@ -106,32 +100,15 @@ def assert_refused(outcome: Run, folder: Path, complaint: str) -> None:
 
 
 def test_everything_is_written_and_nothing_else(done: Done) -> None:
-    code, out, err = done.outcome
+    code, report, err = done.outcome
     assert (code, err) == (0, "")
     assert {path.name for path in done.folder.iterdir()} == TABLE | PICTURES | PAGE
     for name in PICTURES | PAGE:
-        assert name in out
-
-
-def test_the_report_has_all_its_parts(done: Done) -> None:
-    report = done.outcome[1]
-    found = [
-        report.index(text)
-        for text in (
-            "machine positioning_unit: 48 single errors of 6 types at",
-            "limited by (share of the boundary)",
-            "transl. max µm",
-            "v. Daake et al., Table 1",
-            "tool in work: x, y, z mm",
-            "whole budget, worst pose",
-            "allowed 50 µm, root sum of squares",
-            "allowed 50 µm, worst case",
-            "methods,",
-        )
-    ]
-    assert found == sorted(found)
-    for title in ("screw pitch", "quantisation", "base-/platform joint (x/y)", "base-/platform joint (z)"):
-        assert title in report
+        assert name in report
+    for name in PICTURES:
+        assert (done.folder / name).read_bytes().startswith(PNG)
+    for part in ("48 single errors of 6 types", "v. Daake et al., Table 1", "allowed 50 µm, worst case", "methods,"):
+        assert part in report
     assert report.count("α -4°, β -4°") == report.count("α 4°, β -4°") == 1
 
 
@@ -209,22 +186,8 @@ def test_the_three_methods_agree(done: Done) -> None:
     assert 0.0 < agreement["linear"] <= 1e-3
 
 
-def test_pictures_are_pictures(done: Done) -> None:
-    for name in PICTURES:
-        content = (done.folder / name).read_bytes()
-        assert content.startswith(PNG)
-        assert len(content) > 10_000
-
-
-@pytest.mark.skipif(not PAGE, reason="plotly is not installed: pip install plotly")
-def test_the_page_is_one_whole_file(done: Done) -> None:
-    page = (done.folder / "page.html").read_text(encoding="utf-8")
-    assert page.startswith("<!DOCTYPE html>")
-    assert page.rstrip().endswith("</html>")
-    assert "positioning_unit" in page
-
-
-def test_without_plotly_the_rest_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undrawn: None) -> None:
+def test_without_plotly_the_rest_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hexapod_comp.cli.classify._figures", lambda *arguments: {})
     for name in ("plotly", "plotly.offline"):
         monkeypatch.setitem(sys.modules, name, None)
     out = ("--out", tmp_path / "ranking.csv", "--pictures", tmp_path)
@@ -293,19 +256,6 @@ def test_joints_that_coincide_are_one_unless_asked_for_apart(tmp_path: Path) -> 
     assert "v. Daake" not in classify(*machine)[1]
 
 
-def test_the_iteration_ranks_as_the_exact_effects_do(tmp_path: Path) -> None:
-    """v. Daake et al.: within 0.1 %."""
-    figures = []
-    for method in ("exact", "iteration"):
-        code, out, _ = classify(*QUICK, "--method", method, "--json")
-        assert code == 0
-        ranking = json.loads(out)["ranking"]
-        figures.append([[row["error_type"], row["translation_max_um"]] for row in ranking])
-    for one, other in zip(*figures, strict=True):
-        assert one[0] == other[0]
-        assert one[1] == pytest.approx(other[1], rel=1e-3)
-
-
 def test_an_allocation_says_of_every_type_what_it_may_be(tmp_path: Path) -> None:
     """Where the budget is more than is allowed, whatever one type becomes: all alike is a size for every one."""
     code, out, _ = classify(*QUICK, "--allow-um", 10, "--json")
@@ -360,24 +310,6 @@ def test_a_model_of_which_nobody_knows_how_good_it_is_leaves_nobody_knows_what()
 
 
 # What is refused: nothing is written, one line says what and where.
-
-
-@pytest.mark.parametrize("below", ["", "/deeper"])
-def test_a_file_is_no_folder_for_pictures(tmp_path: Path, below: str) -> None:
-    """And it stays as it is."""
-    out = tmp_path / "file"
-    out.write_text("mine", encoding="utf-8")
-    assert_refused(classify("--pictures", f"{out}{below}", *QUICK), tmp_path / "none", "it is a file")
-    assert out.read_text(encoding="utf-8") == "mine"
-    assert list(tmp_path.iterdir()) == [out]
-
-
-def test_without_options_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    code, out, err = classify("--cells", 4, "--tilt-deg", 0)
-    assert (code, err) == (0, "")
-    assert "transl. max µm" in out
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("when", ["survey", "report", "drawing"])

@@ -25,7 +25,7 @@ from strategies import paper_geometry, random_field, random_model
 from hexapod_comp import cli
 from hexapod_comp.cli import poses, results
 from hexapod_comp.cli.verbs import VERBS
-from hexapod_comp.compensation.checks import LIMITS, check
+from hexapod_comp.compensation.checks import check
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.errors import GeometryError, HexapodError
 from hexapod_comp.machine.field import GridField
@@ -72,51 +72,13 @@ def file_of(folder: Path, rows: Sequence[Sequence[object]], header: str = POSE_H
 # The program itself.
 
 
-def test_help_is_fast_and_needs_no_compiler() -> None:
-    """In a process of its own; 0.3 s is the bar on an idle machine, what it may not import says why it holds."""
-    code = (
-        "import sys, hexapod_comp.cli as cli; assert cli.main(['--help']) == 0; "
-        "heavy = {'numpy', 'scipy', 'yaml', 'matplotlib', 'rclpy', 'tqdm'} & set(sys.modules); "
-        "assert not heavy, heavy"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=20)
-    assert done.returncode == 0, done.stderr
-    listed = re.findall(r"^ +(\w+):$|^    (\w+)  ", done.stdout, re.MULTILINE)
-    assert " ".join(group + ":" if group else verb for group, verb in listed) == (
-        "kinematics: show ik fk check travel loop: run move adapt demo watch echo record replay "
-        "calibration: plan imagine outside simulate collect fit verify iso230 export analysis: assess classify"
-    )
-    assert all(len(line) <= 80 for line in done.stdout.splitlines() if line.startswith("    ")), "one line a verb"
-
-
-def test_no_help_loads_what_is_heavy() -> None:
-    """A verb's module is imported when it runs, and what it needs with it."""
-    code = (
-        "import sys, hexapod_comp.cli as cli\n"
-        f"for verb in {list(VERBS)}: assert cli.main([verb, '--help']) == 0\n"
-        "modules = (f'hexapod_comp.cli.{verb.module}' for verb in cli.app.VERBS.values())\n"
-        "heavy = {'numpy', 'scipy', 'matplotlib', *modules}\n"
-        "assert not heavy & set(sys.modules), heavy & set(sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.DEVNULL, timeout=20, check=True)
-
-
-@pytest.mark.parametrize("verb", VERBS)
-def test_each_verb_explains_itself(hexapod, verb: str) -> None:
-    """Its help has an example, and units where it shows numbers."""
-    code, out, _ = hexapod(verb, "--help")
-    assert code == 0
-    assert f"$ hexapod_comp {verb} " in out.partition("example:\n")[2] + " "
-    assert re.search(r"mm|um|µm|degrees", out)
-
-
-def test_every_rule_names_options_of_its_verb() -> None:
+def test_verbs_explain_themselves_and_rules_name_their_options(hexapod) -> None:
     """A rule about an option that a verb has not would never be broken."""
-    for verb in VERBS.values():
-        names = {option.name for option in verb.options}
+    for name, verb in VERBS.items():
+        assert f"$ hexapod_comp {name} " in hexapod(name, "--help")[1].partition("example:\n")[2] + " "
+        options = {option.name for option in verb.options}
         for rule in verb.rules:
-            parts = {part.split(" ")[0] for name in rule.options for part in re.split(" (?=--)", name)}
-            assert parts <= names
+            assert {part.split(" ")[0] for name in rule.options for part in re.split(" (?=--)", name)} <= options
 
 
 def test_an_old_name_works_and_says_the_new_one(hexapod, tmp_path: Path) -> None:
@@ -206,19 +168,22 @@ def test_control_c_and_a_closed_pipe(hexapod, monkeypatch: pytest.MonkeyPatch) -
     assert hexapod("ik", "--pose", "0,0,400") == (130, "", "")
 
 
-def test_a_closed_pipe_is_quiet(tmp_path: Path) -> None:
-    """``hexapod_comp ik long.csv | head -1`` in two real processes."""
-    path = file_of(tmp_path, [(n, 0, 0, 400, 0, 0, 0) for n in range(5000)])
-    command = f"{sys.executable} -m hexapod_comp ik {path} --machine paper | head -1"
+def test_lengths_from_a_pipe_and_a_pipe_that_is_closed_are_quiet(tmp_path: Path) -> None:
+    """``hexapod_comp ik long.csv | hexapod_comp fk - | head`` in real processes."""
+    path = file_of(tmp_path, [(n, 0, 0, 400, 0, 10, 0) for n in range(5000)])
+    program = f"{sys.executable} -m hexapod_comp"
+    command = f"{program} ik {path} --machine paper | {program} fk - --machine paper | head -2"
     done = subprocess.run(["sh", "-c", command], cwd=ROOT, capture_output=True, text=True, timeout=100)
-    assert done.stdout == "sequence,L1_mm,L2_mm,L3_mm,L4_mm,L5_mm,L6_mm\n"
+    assert parsed(done.stdout)[0]["beta_deg"] == "10.000000000"
     assert done.stderr == ""
 
 
-@pytest.mark.parametrize("verb", ["ik", "fk", "check", "assess"])
-def test_the_example_in_the_help_is_real(hexapod, monkeypatch: pytest.MonkeyPatch, verb: str) -> None:
+@pytest.mark.parametrize("verb", ["ik", "fk", "check", "assess", "simulate"])
+def test_the_example_in_the_help_is_real(hexapod, monkeypatch, tmp_path: Path, verb: str) -> None:
     """Every line of output shown under the first command of a help text comes out of that command."""
-    monkeypatch.chdir(ROOT)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "config").symlink_to(ROOT / "config")
+    monkeypatch.chdir(tmp_path)
     lines = VERBS[verb].text.partition("example:\n")[2].splitlines()
     first = lines[0].split()
     assert first[:2] == ["$", "hexapod_comp"]
@@ -226,9 +191,7 @@ def test_the_example_in_the_help_is_real(hexapod, monkeypatch: pytest.MonkeyPatc
     assert (code, err) == (0, DEFAULT_NOTE if verb == "check" else "")
     shown = [line[2:] for line in lines[1:] if line.strip(" …") and not line.startswith("  $")]
     assert shown
-    produced = out.splitlines()
-    for line in shown:
-        assert line in produced
+    assert set(shown) <= set(out.splitlines())
 
 
 # ik and fk.
@@ -259,29 +222,17 @@ def test_ik_then_fk_is_where_it_started(hexapod, tmp_path: Path, model: str, sta
     assert len(read_lengths(lengths)[1]) == 10
 
 
-def test_lengths_from_a_pipe(hexapod) -> None:
-    command = [sys.executable, "-m", "hexapod_comp", "fk", "-"]
-    lengths = hexapod("ik", TABLE_1)[1]
-    done = subprocess.run(command, cwd=ROOT, input=lengths, capture_output=True, text=True, timeout=100)
-    assert done.stderr == DEFAULT_NOTE
-    assert parsed(done.stdout)[4]["beta_deg"] == "10.000000000"
-
-
 def test_one_pose_by_options_by_list_and_by_json(hexapod) -> None:
-    """The same pose three ways; Table 2, row 2."""
+    """The same pose three ways; Table 2, row 2. Negative numbers need no equals sign."""
     by_list = hexapod("ik", "--pose", "0,0,400,5,0,0")
     assert by_list == hexapod("ik", "--x-mm", "0", "--y-mm", "0", "--z-mm", "400", "--alpha-deg", "5")
     printed = re.findall(r"strut_\d +([\d.]+)", by_list[1])
     assert [f"{float(value):.3f}" for value in printed] == [f"{length * 1e3:.3f}" for length in table_lengths()[1]]
     content = json.loads(hexapod("ik", "--pose", "0,0,400,5,0,0", "--json")[1])
     assert content["rows"][0]["L1_mm"] == pytest.approx(519.494, abs=5e-4)
-
-
-def test_negative_numbers_need_no_equals_sign(hexapod) -> None:
     spaced = hexapod("ik", "--pose", "-5,0,400,-1,0,0")
     assert spaced == hexapod("ik", "--pose=-5,0,400,-1,0,0")
     assert spaced == hexapod("ik", "--x-mm", "-5", "--y-mm", "0", "--z-mm", "400", "--alpha-deg", "-1e0")
-    assert spaced[0] == 0
 
 
 def test_ik_with_a_model_prints_commands_and_corrections(hexapod) -> None:
@@ -405,24 +356,6 @@ def test_ik_predicts_the_error_without_compensation_in_the_work_frame(hexapod, t
     assert "error_z_um" not in hexapod("ik", str(poses))[1]
 
 
-def test_ik_out_of_limits_answers_and_says_so(hexapod) -> None:
-    code, out, err = hexapod("ik", "--pose", "0,0,950")
-    assert code == 0
-    assert "strut_1  1000.887773" in out
-    assert "note: the pose: strut_1: nominal length 1000.8878 mm is outside the stroke" in err
-
-
-def test_fk_with_a_model_is_the_real_machine(hexapod) -> None:
-    """Nominal lengths on the real machine: not at the commanded pose, but within a millimetre of it."""
-    lengths = ",".join(repr(float(v) * 1e3) for v in table_lengths()[4])
-    ideal, real = (
-        json.loads(hexapod("fk", "--lengths", lengths, "--json", "--model", model)[1])["rows"][0]
-        for model in ("ideal", "paper_machine")
-    )
-    assert ideal["z_mm"] == pytest.approx(405.0, abs=2e-3)
-    assert 0.05 < abs(real["x_mm"] - ideal["x_mm"]) + abs(real["y_mm"] - ideal["y_mm"]) < 1.0
-
-
 def test_fk_names_the_row_without_a_pose(hexapod, tmp_path: Path) -> None:
     rows = [(500,) * 6, (500, 500, 500, 500, 500, 2000), (500,) * 6]
     path = file_of(tmp_path, rows, "L1_mm,L2_mm,L3_mm,L4_mm,L5_mm,L6_mm")
@@ -539,17 +472,6 @@ def test_check_names_a_correction_that_is_too_large() -> None:
     assert {(b.limit, b.error.strut) for b in result.breaches} == {("correction", 3)}  # type: ignore[attr-defined]
     assert [b.row for b in result.breaches] == list(range(10))
     assert result.limits["correction"].margin[:, 1] == pytest.approx(-0.5e-3, abs=1e-12)
-
-
-def test_check_lists_every_breach_not_the_first(hexapod, tmp_path: Path) -> None:
-    """At z = 950 mm all six struts are too long: six lines for each of the two rows, none for the good ones."""
-    rows = [(n, 0, 0, z, 0, 0, 0) for n, z in zip("abcde", (400, 950, 420, 950, 400), strict=True)]
-    code, out, _ = hexapod("check", file_of(tmp_path, rows))
-    assert code == 1
-    lines = [line for line in out.splitlines() if line.startswith("line ")]
-    assert [line.partition(":")[0] for line in lines] == ["line 3 (row b)"] * 6 + ["line 5 (row d)"] * 6
-    assert "LIMITS BROKEN: 12, on 2 of 5 poses" in out
-    assert "not checked: 4 moves" in out
 
 
 def test_check_finds_what_happens_on_the_way() -> None:
@@ -677,23 +599,6 @@ def test_check_writes_all_margins(hexapod, tmp_path: Path) -> None:
     )
 
 
-def test_check_json_has_every_limit(hexapod) -> None:
-    code, out, _ = hexapod("check", TABLE_1, "--json")
-    report = json.loads(out)
-    assert code == 0
-    assert report["within_limits"] is True
-    limited = [name for name in LIMITS if name != "clearance"]  # which the paper's machine does not limit
-    assert [entry["limit"] for entry in report["smallest_margins"]] == limited
-    assert report["rows"][0]["step_nominal_mm"] is None
-
-
-def test_check_cuts_long_tables(hexapod, tmp_path: Path) -> None:
-    path = file_of(tmp_path, [(n, 0, 0, 400 + 0.01 * n, 0, 0, 0) for n in range(150)])
-    code, out, _ = hexapod("check", path, "--stream")
-    assert code == 0
-    assert "… and 50 more rows; --out FILE writes all" in out
-
-
 def test_check_says_when_poses_leave_the_measured_box(hexapod, tmp_path: Path) -> None:
     """The shipped field reaches to z = 553 mm; the model of lines was measured in the same box."""
     path = file_of(tmp_path, [("in", 0, 0, 400, 0, 0, 0), ("out", 0, 0, 600, 0, 0, 0)])
@@ -741,18 +646,6 @@ def test_assess_statistics_follow_the_seed(hexapod) -> None:
     largest = max(row["displacement_um"][2] for row in first["statistics"])
     found = max(np.linalg.norm([r[f"error_{axis}_um"] for axis in "xyz"]) for r in first["records"])
     assert largest == pytest.approx(found, rel=1e-9)
-
-
-def test_assess_writes_every_machine(hexapod, tmp_path: Path) -> None:
-    out = tmp_path / "assessment.csv"
-    code, text, _ = hexapod("assess", TABLE_1, "--machines", "3", "--out", str(out))
-    assert code == 0
-    assert "over 3 machines" in text
-    rows = parsed(out.read_text())
-    assert [(row["seed"], row["sequence"]) for row in rows[::10]] == [("0", "1"), ("1", "1"), ("2", "1")]
-    assert float(rows[0]["real_L1_mm"]) - float(rows[0]["ideal_L1_mm"]) == pytest.approx(
-        float(rows[0]["change_L1_um"]) * 1e-3, abs=3e-9
-    )
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])

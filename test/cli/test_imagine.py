@@ -86,14 +86,6 @@ def test_every_bound_ends_where_it_belongs(tmp_path: Path, capsys: pytest.Captur
     assert told["tool_error"]["frame"] == "work"
 
 
-def test_without_errors_the_file_is_the_ideal_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "truth.yaml"
-    words = ["--joints-um", "0", "--struts-um", "0", "--pitch-ppm", "0", *PLAIN]
-    assert cli.main(["imagine", *words, "--out", str(out)]) == 0
-    assert "no errors" in capsys.readouterr().out
-    assert not load_model(out, load_geometry("paper")).base_deviation.any()
-
-
 CAMPAIGN = """format: hexapod_comp/campaign
 version: 1
 box_mm: [[-30, -30, 380], [30, 30, 420]]

@@ -50,16 +50,9 @@ def test_three_options_mean_the_same_in_all_verbs():
 
 COMMANDS = [
     ("ik {in}/table1.csv --out {in}/table1.csv", "table1.csv"),
-    ("ik {in}/table1.csv --json --out {in}/table1.csv", "table1.csv"),
-    ("classify --budget {in}/c.yaml --out {in}/c.yaml", "c.yaml"),
     ("ik --pose 0,0,400 --machine {in}/paper.yaml --out {in}/paper.yaml", "paper.yaml"),
-    ("fk {in}/table1.csv --out {in}/table1.csv", "table1.csv"),
-    ("check {in}/table1.csv --out {in}/table1.csv", "table1.csv"),
-    ("assess {in}/table1.csv --out {in}/table1.csv", "table1.csv"),
     ("run {in}/table1.csv --pictures {in}/table1.csv", "table1.csv"),
     ("demo --truth {in}/paper_machine.yaml --pictures {in}/paper_machine.yaml", "paper_machine.yaml"),
-    ("simulate --campaign {in}/campaign_5d.yaml --out {in}/campaign_5d.yaml", "campaign_5d.yaml"),
-    ("fit {in}/m.csv --out {in}/m.csv", "m.csv"),
     ("fit {in}/other.csv {in}/m.csv --out {in}/new --report {in}/m.csv", "m.csv"),
     ("fit {in}/m.csv --out {in}/new --columns {in}/c.yaml --report {in}/c.yaml", "c.yaml"),
     ("fit {in}/m.csv --truth {in}/paper_machine.yaml --out {in}/paper_machine.yaml", "paper_machine.yaml"),
@@ -128,12 +121,6 @@ def test_a_file_in_an_output_folder_that_is_read_is_not_replaced(folder: Path):
         write_text(folder / "other.csv", "new")
     write_text(folder / "c.yaml", "new")  # a program that uses the package may
     assert (folder / "c.yaml").read_text() == (folder / "other.csv").read_text() == "new"
-
-
-def test_existing_files_that_are_no_inputs_are_replaced_as_before(folder: Path):
-    out = folder / "m.csv"
-    assert cli.main(["ik", str(folder / "table1.csv"), "--out", str(out)]) == 0
-    assert out.read_text().startswith("sequence,L1_mm")
 
 
 def test_two_outputs_in_one_file_are_refused_at_once(folder: Path, capsys):

@@ -10,7 +10,6 @@ import pytest
 from strategies import paper_geometry
 
 from hexapod_comp import cli
-from hexapod_comp.cli.verbs import VERBS
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -178,25 +177,3 @@ def test_verb_writes_what_it_says(tmp_path: Path, capsys: pytest.CaptureFixture[
     stated = {kind: found.uncertainty[of_kind(found, kind)][0] for kind in ("linear", "rotation", "position")}
     assert stated == pytest.approx({"linear": 0.5e-6, "rotation": np.radians(0.2 / 3600.0), "position": 10e-6})
     assert np.isnan(found.uncertainty[of_kind(found, "straightness")]).all()
-
-
-def test_verb_measures_the_compensated_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """With the truth for a model only the instrument's noise of 1 µm is left; the file says what struts were told."""
-    path = str(tmp_path / "compensated.csv")
-    assert run("--campaign", "campaign_1d", "--model", "paper_machine", "--out", path) == 0
-    assert "moved by the strut lengths of paper_machine" in capsys.readouterr().out
-    geometry = paper_geometry()
-    found = read_tidy(path, geometry)
-    assert found.value.std() == pytest.approx(1e-6, rel=0.1)
-    model = load_model(config_file("paper_machine"), geometry)
-    plan = compensated(template(load_campaign(config_file("campaign_1d")), geometry), model)
-    np.testing.assert_array_equal(found.stations.commands, plan.stations.commands)
-
-
-def test_the_example_in_the_help_is_real(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    lines = VERBS["simulate"].text.partition("example:\n")[2].splitlines()
-    assert run(*lines[0].split()[3:]) == 0
-    assert capsys.readouterr().out.splitlines() == [line[2:] for line in lines[1:]]

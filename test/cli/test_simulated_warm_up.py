@@ -18,7 +18,6 @@ from hexapod_comp.errors import InputFileError, ModelError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
-from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.temperatures import PARTS
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import KINDS
@@ -92,11 +91,6 @@ def test_sensors_tell_what_they_have() -> None:
 def test_what_cannot_be_is_refused(change: dict, problem: str) -> None:
     with pytest.raises(ModelError, match=problem):
         replace(ALIKE, **change)
-
-
-def test_a_machine_that_states_its_growth_keeps_it() -> None:
-    own = MachineModel("paper", struts=StrutErrors(expansion=np.full(6, 1e-6)))
-    assert growing(own, np.full(3, STEEL)) is own
 
 
 def test_the_shipped_file_and_one_with_a_slip(tmp_path: Path) -> None:

@@ -38,26 +38,20 @@ def at_home(machine: Machine) -> tuple[str, Pose]:
     return ",".join(repr(float(value)) for value in values), pose
 
 
-def test_ik_and_fk_take_tool_and_work_frame(machine: Machine, file: str, capsys: Printed) -> None:
+def test_ik_fk_and_check_take_tool_and_work_frame(machine: Machine, file: str, tmp_path: Path, capsys: Printed) -> None:
     text, pose = at_home(machine)
-    frames = ["--machine", file, "--tool", "probe", "--work", "fixture", "--json"]
-    assert main(["ik", f"--pose={text}", *frames]) == 0
+    names = ["--machine", file, "--tool", "probe", "--work", "fixture"]
+    assert main(["ik", f"--pose={text}", *names, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert (said["tool"], said["frame"]) == ("probe", "fixture")
     lengths = [said["rows"][0][f"L{n}_mm"] for n in range(1, 7)]
     truth = machine.lengths(np.array([machine.home]), np.eye(3)[None])[0]
     np.testing.assert_allclose(lengths, truth * 1e3, rtol=0.0, atol=SHOWN)
-    assert main(["fk", "--lengths", ",".join(map(repr, lengths)), *frames]) == 0
+    assert main(["fk", "--lengths", ",".join(map(repr, lengths)), *names, "--json"]) == 0
     row = json.loads(capsys.readouterr().out)["rows"][0]
     np.testing.assert_allclose([row[f"{axis}_mm"] for axis in "xyz"], pose.position * 1e3, rtol=0.0, atol=1e-7)
-
-
-def test_check_knows_the_frame(machine: Machine, file: str, tmp_path: Path, capsys: Printed) -> None:
-    _, pose = at_home(machine)
-    values = [*(pose.position * 1e3), *np.degrees(angles_from_rotation(pose.rotation))]
-    poses = tmp_path / "poses.csv"
-    poses.write_text("x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg\n" + ",".join(map(repr, map(float, values))) + "\n")
-    assert main(["check", str(poses), "--machine", file, "--tool", "probe", "--work", "fixture"]) == 0
+    (tmp_path / "poses.csv").write_text(f"x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg\n{text}\n")
+    assert main(["check", str(tmp_path / "poses.csv"), *names]) == 0
     assert "1 pose of the probe in fixture" in capsys.readouterr().out
 
 

@@ -61,10 +61,6 @@ def test_a_valid_model_exits_0(folder: Path, capsys: pytest.CaptureFixture[str])
     assert "\nVALID: " in capsys.readouterr().out
 
 
-def test_files_may_follow_an_option(folder: Path) -> None:
-    assert run("verify", model_in(folder), "--machine", "paper", folder / "same.csv") == 0
-
-
 def test_proposed_readings_are_written_to_be_filled_in(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """They are of the model that is named; what is measured has its own files; and one of both is needed."""
     proposed = folder / "check.csv"
@@ -120,14 +116,6 @@ def test_update_never_replaces_what_it_reads(folder: Path, capsys: pytest.Captur
     assert "would be replaced" in capsys.readouterr().err
     assert run("fit", folder / "moved.csv", "--update", old, "--out", old.with_suffix(".yml")) == 2
     assert "would replace the fit's result" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("option", [["--scheme", "lines"], ["--lead-mm", "10"], ["--truth", "random"]])
-def test_options_of_a_whole_fit_are_refused(folder: Path, option: list[str], capsys: pytest.CaptureFixture) -> None:
-    arguments = ["fit", folder / "moved.csv", "--update", model_in(folder), "--out", folder / "no.yaml", *option]
-    assert run(*arguments) == 2
-    assert "cannot be combined with --update" in capsys.readouterr().err
-    assert not (folder / "no.yaml").exists()
 
 
 def test_a_model_without_its_posterior_cannot_be_checked(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,6 +6,7 @@ Truth: for lengths and poses, the closed form of the paper machine (node_helpers
 from __future__ import annotations
 
 import contextlib
+import csv
 import io
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,8 +19,7 @@ from hypothesis import strategies as st
 from node_helpers import closed_form_lengths
 from scipy.spatial.transform import Rotation
 from strategies import paper_geometry
-from test_fuzz_files import CONFIG, GEOMETRIES, models
-from test_fuzz_tables import LENGTHS, POSES, TIDY, column, rows_of, si
+from test_fuzz_files import BY_HAND, CONFIG, GEOMETRIES, LENGTHS, POSES, TIDY, plain_csv
 
 from hexapod_comp import cli
 from hexapod_comp.pose import Pose
@@ -39,7 +39,7 @@ poses: 2
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     made = tmp_path_factory.mktemp("commands")
-    (made / "model.yaml").write_bytes(models(made)[1])
+    (made / "model.yaml").write_bytes(BY_HAND)
     (made / "paper.yaml").write_bytes(GEOMETRIES[0])
     (made / "columns.yaml").write_bytes((CONFIG / "jugglebot_columns.yaml").read_bytes())
     (made / "poses.csv").write_bytes(POSES[0])
@@ -118,30 +118,38 @@ def test_mutated_files(folder: Path, number: int, changes: list) -> None:
         right_poses(out, data)
 
 
-def poses_in(rows: list[dict[str, str]]) -> list[Pose]:
-    """Return the poses of a CSV file's rows, by SciPy's Euler angles or quaternions."""
-    positions = np.transpose([column(rows, axis, "length") for axis in "xyz"])
-    if "qx" in rows[0]:
-        turns = Rotation.from_quat([[si(row[f"q{c}"], "1") for c in "xyzw"] for row in rows])
-    else:
-        angles = [column(rows, name, "angle") or [0.0] * len(rows) for name in ("beta", "alpha", "gamma")]
-        turns = Rotation.from_euler("YXZ", np.transpose(angles))
-    return [Pose(p, r) for p, r in zip(positions, turns.as_matrix(), strict=True)]
+def rows_of(data: bytes) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(plain_csv(data).decode())))
+
+
+def poses_in(data: bytes) -> list[Pose]:
+    """Return the poses of a CSV file, by SciPy's Euler angles or quaternions."""
+    poses = []
+    for row in rows_of(data):
+        if "qx" in row:
+            turn = Rotation.from_quat([float(row[f"q{c}"]) for c in "xyzw"])
+        else:
+            names = ("beta", "alpha", "gamma")
+            rad = [float(row.get(f"{name}_rad") or np.radians(float(row.get(f"{name}_deg", 0)))) for name in names]
+            turn = Rotation.from_euler("YXZ", rad)
+        poses.append(Pose([float(row[f"{axis}_m"]) for axis in "xyz"], turn.as_matrix()))
+    return poses
 
 
 def right_lengths(out: str, data: bytes) -> None:
     """Check the strut lengths that ik printed: a picometre, or what is left of that at 1e300 mm."""
-    printed = np.array([[float(row[f"L{i}_mm"]) for i in range(1, 7)] for row in rows_of(out.encode())])
-    expected = np.array([closed_form_lengths(pose) for pose in poses_in(rows_of(data))]) * 1e3
-    np.testing.assert_allclose(printed, expected, rtol=1e-12, atol=2e-9)
+    expected = np.array([closed_form_lengths(pose) for pose in poses_in(data)])
+    np.testing.assert_allclose(lengths_in(out.encode()), expected, rtol=1e-12, atol=2e-12)
 
 
 def right_poses(out: str, data: bytes) -> None:
     """Check the poses that fk printed: their lengths are those of the file."""
-    rows = rows_of(data)
-    given_lengths = np.transpose([column(rows, f"L{i}", "length") for i in range(1, 7)])
-    printed = np.array([closed_form_lengths(pose) for pose in poses_in(rows_of(out.encode()))])
-    np.testing.assert_allclose(printed, given_lengths, atol=1e-9)
+    printed = np.array([closed_form_lengths(pose) for pose in poses_in(out.encode())])
+    np.testing.assert_allclose(printed, lengths_in(data), atol=1e-9)
+
+
+def lengths_in(data: bytes) -> np.ndarray:
+    return np.array([[float(row[f"L{i}_m"]) for i in range(1, 7)] for row in rows_of(data)])
 
 
 OPTIONS = {

@@ -1,47 +1,63 @@
 """Mutated files: each is read as what stands in it, or refused in words for people; never anything else.
 
-Truth: for YAML, the tree of nodes with every leaf's text, read by Decimal and the units' definitions (fuzzing.py);
-for CSV and the laser's text, splitting by hand; for strut lengths, the closed form of the paper's machine.
+Truth: the same content written anew in the plainest way by another parser. Of YAML the tree of nodes, of CSV the cells
+split by hand; every number with a unit by Decimal and the units' definitions, in SI (fuzzing.py). What the reader makes
+of that must be what it made of the mutated file. That values go where they belong is shown by the readers' own tests.
 """
 
 from __future__ import annotations
 
+import csv
+import io
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import yaml
-from fuzzing import Refused, cases, document, edits, finite, mutated, number_of, numbers_of, quantity, reader_of, same
+from fuzzing import PLAIN, UNITS, Refused, cases, check_document, edits, finite, mutated, reader_of
+from helpers import assert_equal
 from hypothesis import example, given
-from scipy.spatial.transform import Rotation
+from hypothesis import strategies as st
 from strategies import paper_geometry, random_model, skewed_geometry
+from test_measurement_csv import STRUTS, WIDE, WIDE_COLUMNS
 
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.errors import HexapodError
+from hexapod_comp.export.linuxcnc import (
+    COMP_FILES,
+    HAL_FILE,
+    INI_FILE,
+    make_genhexkins,
+    read_genhexkins,
+    table_misfit,
+    write_genhexkins,
+)
+from hexapod_comp.export.table import make_table, read_table, write_table
+from hexapod_comp.formats.csv import Row
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.machine.model import MachineModel, ModelOrigin
-from hexapod_comp.machine.model_file import load_model, save_model
+from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
+from hexapod_comp.machine.model_file import load_model, model_text
+from hexapod_comp.machine.pose_files import read_lengths, read_poses
 from hexapod_comp.machine.region import Region
 from hexapod_comp.measurements.campaign import load_campaign
+from hexapod_comp.measurements.readings import FileLine, MeasurementSet
+from hexapod_comp.measurements.tidy import read_tidy
+from hexapod_comp.measurements.wide_csv import read_wide
 from hexapod_comp.workspace.budget import load_budget
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 PAPER = paper_geometry()
+BOX = np.array([[-0.04, -0.04, 0.38], [0.04, 0.04, 0.46]])
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("fuzz")
-
-
-def put(folder: Path, name: str, data: bytes) -> Path:
-    path = folder / name
-    path.write_bytes(data)
-    return path
-
-
-# Geometry.
+# Files.
 
 
 def general_geometry() -> bytes:
@@ -56,7 +72,11 @@ def general_geometry() -> bytes:
         "format": "hexapod_comp/geometry",
         "version": 1,
         "machine": "general",
-        "base": {"joints_mm": rows(machine.base_joints, 1e3), "joint_axes": rows(machine.base_axes)},
+        "base": {
+            "joints_mm": rows(machine.base_joints, 1e3),
+            "joint_axes": rows(machine.base_axes),
+            "cone_axes": [[0, 0, 2 + i] for i in range(6)],
+        },
         "platform": {"joints_in": rows(machine.platform_joints, 1 / 0.0254), "joint_axes": rows(machine.platform_axes)},
         "home": {"position_m": [0.01, -0.02, 0.42], "rotation_deg": [2, -3, 4]},
         "tool": {"position_mm": [1, 2, 30], "rotation_mrad": [10, 0, -20]},
@@ -72,57 +92,174 @@ def general_geometry() -> bytes:
             "speed_m_min": 15,
         },
     }
-    tree["base"]["cone_axes"] = [[0, 0, 2 + i] for i in range(6)]  # type: ignore[index]
     return yaml.safe_dump(tree, default_flow_style=None, sort_keys=False).encode()
 
 
+def full_model() -> bytes:
+    """Return the file of a model with everything."""
+    rng = np.random.default_rng(6)
+    full = random_model(rng, "paper")
+    grid = np.array([-0.2, 0.2])
+    lines = tuple(rng.uniform(-2e-5, 2e-5, (2, 2, 2, 6, 2)).round(9) for _ in range(3))
+    model = MachineModel(
+        "paper",
+        "full",
+        origin=ModelOrigin("2026-01-31", (("laser.csv", "0" * 64),), 4.2e-6, "a note"),
+        field=type(full.field)((grid, grid, grid + 0.5), lines, [0.01, 0.0, -0.1]),  # type: ignore[arg-type]
+        region=Region(
+            np.array([[-0.2, -0.2, 0.3], [0.2, 0.2, 0.6]]), np.array([0.01, 0.0, -0.1]), np.array([0.1, 0.0, 0.2]),
+            np.array([0.1, -0.2, 0.3]),
+        ),
+        base_expansion=11e-6,
+        **{name: getattr(full, name) for name in ("base_deviation", "platform_deviation", "struts")},
+    )  # fmt: skip
+    return model_text(model).encode()
+
+
+BY_HAND = b"""format: hexapod_comp/model
+version: 1
+machine: paper
+name: by hand
+date: 2026-01-31
+sources: []
+struts:
+  offset_um: [1, -2, 3, 4, 5, 6]
+  pitch_ppm: 20
+  reference_length_in: 20
+  backlash_um: 4
+  expansion_ppm_per_K: 11.7
+  wave:
+    cosine_um: 3
+    period_mm: 5
+  map:
+    knots_mm: [330, 600, 880]
+    values_um: [[0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2]]
+    backlash_um: [[0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2]]
+thermal:
+  platform_expansion_ppm_per_K: 23
+"""
+POSES = (
+    b"sequence,x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg\n1,0,0,400,5,0,0\n2,-12.5,3,410.25,-1.5,2,0.125\n",
+    b"# a comment\nname,x_in,y_in,z_m,qx,qy,qz,qw\nhome,0,0,0.4,0,0,0,1\n'tilted',1,-2,.41,0.0871557,0,0,0.9961947\n",
+    b"x_um,y_um,z_um\r\n1000,2.5e3,400000\r\n",
+)
+LENGTHS = b"name,L1_mm,L2_mm,L3_mm,L4_mm,L5_mm,L6_mm\na,519.494,519.808,509.192,509.192,499.282,498.955\n"
+TIDY = (
+    "run,cycle,direction,x_mm,y_mm,z_mm,channel,value,unit,uncertainty,temperature_degC\n"
+    + "".join(f"line,1,forward,{x},0,400,linear,{x * 0.03125},um,1,20\n" for x in (-60, -20, 20, 60))
+    + "".join(f"line,1,backward,{x},0,400,linear,{x * 0.03},um,,21\n" for x in (60, 20, -20, -60))
+    + "".join(f"line,1,forward,{x},0,400,yaw,{x * 0.25},urad,0.5,20\n" for x in (-60, -20, 20, 60))
+    + "t,1,,0,0,410,position_x,0.0125,mm,,20\nt,1,,0,0,410,attitude_z,3,arcsec,,20\n"
+).encode()
+WIDE_ROWS = (WIDE + "0,0,0,0,0,0,1,0,16,0,0,0,1,25.39,0,300,x\n1,1,1,1,1,1,1,0,16.1,0,0,0,1,25,0,302,\n").encode()
+FROM_STRUTS = WIDE_COLUMNS[: WIDE_COLUMNS.index("commanded")] + WIDE_COLUMNS[WIDE_COLUMNS.index("measured") :] + STRUTS
 GEOMETRIES = ((CONFIG / "paper.yaml").read_bytes(), (CONFIG / "positioning_unit.yaml").read_bytes(), general_geometry())
 
 
-def same_pose(pose: Any, tree: dict[str, Any] | None) -> None:
-    """Check a pose against its section: R = Ry(β)·Rx(α)·Rz(γ), from SciPy's intrinsic Euler angles."""
-    if tree is None:
-        tree = {"position_m": ["0"] * 3}
-    same(pose.position, quantity(tree, "position", "length"))
-    alpha, beta, gamma = quantity(tree, "rotation", "angle", np.zeros(3))
-    turn = Rotation.from_euler("YXZ", [beta, alpha, gamma]).as_matrix()
-    # Angles of many turns: SciPy and NumPy reduce them alike to within rounding of the angle itself.
-    np.testing.assert_allclose(pose.rotation, turn, atol=1e-12 + 4e-16 * max(abs(alpha), abs(beta), abs(gamma)))
+# The same, written plainly.
 
 
-def same_geometry(found: HexapodGeometry, tree: dict[str, Any]) -> None:
-    """Check a geometry against its file."""
-    assert found.name == tree["machine"]
-    if "paper_dimensions" in tree and "base" not in tree:
-        a, b, d = (quantity(tree["paper_dimensions"], key, "length") for key in "abd")
-        corners = np.linalg.norm(np.diff(found.base_joints[[5, 0, 1, 2]], axis=0), axis=1)
-        np.testing.assert_allclose(corners, [d, b, d], rtol=1e-12, atol=1e-15)
-        side = np.linalg.norm(found.platform_joints[0] - found.platform_joints[2])
-        np.testing.assert_allclose(side, a, rtol=1e-12, atol=1e-15)
-    for body, joints, axes, cones in (
-        ("base", found.base_joints, found.base_axes, found.base_cone_axes),
-        ("platform", found.platform_joints, found.platform_axes, found.platform_cone_axes),
-    ):
-        section = tree.get(body, {})
-        if "paper_dimensions" not in tree:
-            same(joints, quantity(section, "joints", "length"))
-        for key, vectors in (("joint_axes", axes), ("cone_axes", cones)):
-            if key in section:
-                given = numbers_of(section[key])
-                np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1.0, atol=1e-12)
-                sizes = np.linalg.norm(given, axis=1)[:, None]
-                np.testing.assert_allclose(vectors * sizes, given, rtol=1e-9, atol=1e-12)
-    for name in ("home", "tool", "work"):
-        same_pose(getattr(found, name), tree.get(name))
-    limits = tree["limits"]
-    same(found.limits.stroke, quantity(limits, "stroke", "length"))
-    same(found.limits.base_cone, quantity(limits, "base_cone", "angle"))
-    same(found.limits.platform_cone, quantity(limits, "platform_cone", "angle"))
-    same(found.limits.condition, numbers_of(limits["condition_number"]))
-    for name, kind in (("correction", "length"), ("step", "length"), ("speed", "speed")):
-        same(getattr(found.limits, name), quantity(limits, name, kind))
-    same(found.limits.clearance, quantity(limits, "clearance", "length", 0.0))
-    same(found.screw_lead, quantity(tree["screw"], "lead", "length") if "screw" in tree else 0.0)
+def plain_yaml(data: bytes) -> bytes:
+    """Return a YAML file in flow style, in which what has a unit is in SI."""
+    return _plain(check_document(data)).encode()
+
+
+def _plain(node: yaml.Node, factor: str | None = None) -> str:
+    if isinstance(node, yaml.MappingNode):
+        assert len({key.value for key, _ in node.value}) == len(node.value)
+        return "{" + ", ".join(_entry(key.value, value) for key, value in node.value) + "}"
+    if isinstance(node, yaml.SequenceNode):
+        return "[" + ", ".join(_plain(item, factor) for item in node.value) + "]"
+    bare = node.style not in ("'", '"', "|", ">") and re.fullmatch(r"[-+.\w:]*", node.value)
+    if bare and factor is not None and PLAIN.fullmatch(node.value):
+        return number(node.value, factor)
+    return node.value if bare else json.dumps(node.value)
+
+
+def _entry(key: str, value: yaml.Node) -> str:
+    name, si, factor = in_si(key)
+    return f"{json.dumps(name + si)}: {_plain(value, factor)}"
+
+
+def in_si(key: str) -> tuple[str, str, str | None]:
+    """Return a key's name, the ending that stands for SI, and the factor of its unit; None where it has none."""
+    key = re.sub("_[µμ](m|rad)$", r"_u\1", key)
+    unit = max((unit for unit in UNITS if key.endswith(f"_{unit}")), key=len, default=None)
+    if unit is None:
+        return key, "", None
+    factor, si = UNITS[unit]
+    return key.removesuffix(f"_{unit}"), f"_{si}", factor
+
+
+def number(text: str, factor: str) -> str:
+    """Return a number in SI, as a float is written; leading zeros of a cell mean nothing."""
+    shown = re.sub(r"^([-+]?)0+(?=[0-9])", r"\1", text.strip())
+    return f"{float(Decimal(shown) * Decimal(factor)):.17e}"
+
+
+def rows_of(data: bytes) -> list[dict[str, str]]:
+    """Return a CSV file's rows as a spreadsheet shows them: comments and empty lines left out, no spaces around.
+
+    The header tells what separates columns: commas, or else semicolons, or else tabs. Where it is not commas, numbers
+    with decimal commas get points.
+    """
+    try:
+        text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("cp1252", "replace")
+    assert "\0" not in text
+    top = next(line for line in io.StringIO(text, newline="") if re.match(r'(?!\s*"?#)\s*\S', line))
+    bare = re.sub(r'"[^"]*"', "", top)
+    separator = next((mark for mark in ",;\t" if mark in bare), ",")
+    lines = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True)
+    cells = [line for line in lines if line and not line[0].startswith("#")]
+    header = [name.strip() for name in cells[0]]
+    named = [name for name in header if name]
+    assert len(set(named)) == len(named)
+    assert all(len(line) == len(header) for line in cells)
+    rows = cells[1:] if separator == "," else with_points(cells[1:])
+    return [dict(zip(header, line, strict=True)) for line in rows]
+
+
+def with_points(rows: list[list[str]]) -> list[list[str]]:
+    """Return rows whose numbers with decimal commas have points; check that a comma can only be a decimal one."""
+    flat = [cell.strip() for line in rows for cell in line]
+    commas = [cell for cell in flat if re.fullmatch(r"[-+]?[0-9]+,[0-9]+([eE][-+]?[0-9]+)?", cell)]
+    if commas:
+        assert not [cell for cell in flat if "." in cell and PLAIN.fullmatch(cell)], "points and commas"
+        assert not all(re.fullmatch(r"[-+]?[1-9][0-9]{0,2},[0-9]{3}", cell) for cell in commas), "may be thousands"
+    return [[cell.replace(",", ".") if cell.strip() in commas else cell for cell in line] for line in rows]
+
+
+def plain_csv(data: bytes) -> bytes:
+    """Return a CSV file with commas and points, in SI where a column, or the row's ``unit``, has one."""
+    out = io.StringIO()
+    rows = [dict(plain_cell(name, cell, row) for name, cell in row.items()) for row in rows_of(data)]
+    writer = csv.DictWriter(out, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return out.getvalue().encode()
+
+
+def plain_cell(name: str, cell: str, row: dict[str, str]) -> tuple[str, str]:
+    key, si, factor = in_si(name)
+    of_row = name in ("value", "uncertainty") and "unit" in row
+    if of_row or name == "unit":
+        factor, unit = UNITS[row["unit"].strip()]
+        if name == "unit":
+            return name, unit
+    return key + si, number(cell, factor) if factor and cell.strip() else cell.strip()
+
+
+def plain_cells(data: bytes) -> bytes:
+    """Return a CSV file whose units stand elsewhere, with commas and points."""
+    out = io.StringIO()
+    rows = rows_of(data)
+    csv.writer(out, lineterminator="\n").writerows([list(rows[0]), *(list(row.values()) for row in rows)])
+    return out.getvalue().encode()
+
+
+# What is read must be of use.
 
 
 def works_or_refuses(geometry: HexapodGeometry, model: MachineModel) -> None:
@@ -150,192 +287,160 @@ def works_or_refuses(geometry: HexapodGeometry, model: MachineModel) -> None:
         np.testing.assert_allclose(found.command - found.correction, home_lengths, atol=1e-14 * size + 1e-12)
 
 
-@pytest.mark.parametrize("seed", range(len(GEOMETRIES)))
-@given(changes=edits)
-@example(changes=[])
-@cases(60, 0.07)
-def test_geometry(folder: Path, seed: int, changes: list) -> None:
-    data = mutated(GEOMETRIES[seed], changes)
-    path = put(folder, "geometry.yaml", data)
-    try:
-        with reader_of("geometry", path):
-            found = load_geometry(path)
-    except Refused:
-        assert changes
-        return
-    same_geometry(found, document(data))
-    works_or_refuses(found, MachineModel(found.name))
+def sound(found: MeasurementSet) -> None:
+    """Check what every set of readings must be."""
+    finite(found.value, found.stations.positions, found.stations.rotations, found.stations.commands)
+    finite(found.stations.temperatures, found.points(), found.directions())
+    assert len(found.sources) == len(found) > 0
 
 
-# Models.
+class Kind(NamedTuple):
+    """How a kind of file is read, written plainly and judged, and files of it."""
+
+    read: Callable[[Path], Any]
+    plain: Callable[[bytes], bytes]
+    seeds: tuple[bytes, ...]
+    judge: Callable[[Any], None] = lambda found: None
 
 
-def models(folder: Path) -> list[bytes]:
-    """Return the file of a model with everything, and one as people write it."""
-    rng = np.random.default_rng(6)
-    full = random_model(rng, "paper")
-    origin = ModelOrigin("2026-01-31", (("laser.csv", "0" * 64),), 4.2e-6, "a note")
-    grid = np.array([-0.2, 0.2])
-    lines = tuple(rng.uniform(-2e-5, 2e-5, (2, 2, 2, 6, 2)).round(9) for _ in range(3))
-    small = type(full.field)((grid, grid, grid + 0.5), lines, [0.01, 0.0, -0.1])  # type: ignore[arg-type]
-    box = np.array([[-0.2, -0.2, 0.3], [0.2, 0.2, 0.6]])
-    values = {name: getattr(full, name) for name in ("base_deviation", "platform_deviation", "struts")}
-    model = MachineModel(
-        "paper",
-        "full",
-        origin=origin,
-        field=small,
-        region=Region(box, np.array([0.01, 0.0, -0.1]), np.array([0.1, 0.0, 0.2]), np.array([0.1, -0.2, 0.3])),
-        base_expansion=11e-6,
-        **values,
-    )
-    save_model(model, folder / "full.yaml")
-    by_hand = """format: hexapod_comp/model
-version: 1
-machine: paper
-name: by hand
-date: 2026-01-31
-sources: []
-struts:
-  offset_um: [1, -2, 3, 4, 5, 6]
-  pitch_ppm: 20
-  reference_length_in: 20
-  backlash_um: 4
-  expansion_ppm_per_K: 11.7
-  wave:
-    cosine_um: 3
-    period_mm: 5
-  map:
-    knots_mm: [330, 600, 880]
-    values_um: [[0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2]]
-    backlash_um: [[0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2]]
-thermal:
-  platform_expansion_ppm_per_K: 23
-"""
-    return [(folder / "full.yaml").read_bytes(), by_hand.encode()]
+def labelled(read: tuple[list[Row], Any]) -> tuple[list[str], Any]:
+    """Return rows' labels and what they hold, without their lines."""
+    return [row.label for row in read[0]], read[1]
+
+
+def unplaced(found: MeasurementSet) -> MeasurementSet:
+    """Return readings without the lines where they stand."""
+    return replace(found, sources=(FileLine("", 0),) * len(found), files=(), notes=())
+
+
+def wide_by(columns: str) -> Callable[[Path], MeasurementSet]:
+    def read(path: Path) -> MeasurementSet:
+        path.with_name("w.yaml").write_text(columns)
+        return unplaced(read_wide(path, path.with_name("w.yaml"), PAPER))
+
+    return read
+
+
+def wide_rows(path: Path) -> MeasurementSet:
+    path.with_name("w.csv").write_bytes(WIDE_ROWS)
+    return unplaced(read_wide(path.with_name("w.csv"), path, PAPER))
+
+
+def grid_table() -> bytes:
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "table.csv")
+        write_table(make_table(PAPER, random_model(np.random.default_rng(3), "paper"), BOX, 0.08)[0], path, ["fuzz"])
+        return path.read_bytes()
+
+
+KINDS = {
+    "geometry": Kind(load_geometry, plain_yaml, GEOMETRIES, lambda g: works_or_refuses(g, MachineModel(g.name))),
+    "model": Kind(
+        lambda path: load_model(path, PAPER), plain_yaml, (full_model(), BY_HAND), lambda m: works_or_refuses(PAPER, m)
+    ),
+    "campaign": Kind(load_campaign, plain_yaml, ((CONFIG / "campaign_full.yaml").read_bytes(),)),
+    "budget": Kind(load_budget, plain_yaml, ((CONFIG / "error_budget.yaml").read_bytes(),)),
+    "poses": Kind(lambda path: labelled(read_poses(path)), plain_csv, POSES),
+    "lengths": Kind(lambda path: labelled(read_lengths(path)), plain_csv, (LENGTHS,)),
+    "tidy": Kind(lambda path: unplaced(read_tidy(path, PAPER)), plain_csv, (TIDY,), sound),
+    "wide": Kind(wide_by(WIDE_COLUMNS), plain_cells, (WIDE_ROWS,), sound),
+    "columns": Kind(wide_rows, plain_yaml, (WIDE_COLUMNS.encode(), FROM_STRUTS.encode()), sound),
+    "table": Kind(read_table, plain_csv, (grid_table(),)),
+}
+SEEDS = [(name, n) for name, kind in KINDS.items() for n in range(len(kind.seeds))]
 
 
 @pytest.fixture(scope="module")
-def model_seeds(folder: Path) -> list[bytes]:
-    return models(folder)
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("fuzz")
 
 
-def same_model(found: MachineModel, tree: dict[str, Any]) -> None:
-    """Check a model against its file."""
-    assert (found.machine, found.name) == (tree["machine"], tree["name"])
-    assert found.origin.date.replace("T", " ")[:10] == tree["date"][:10]
-    assert found.origin.sources == tuple((s["file"], s["sha256"]) for s in tree["sources"])
-    same(found.reversal_threshold, quantity(tree, "reversal_threshold", "length", 0.2e-6))
-    if found.region is not None:
-        region = tree["region"]
-        for name, value in (("box", found.region.box), ("point", found.region.point)):
-            same(value, quantity(region, name, "length", 0.0))
-        same(found.region.position, quantity(region, "position", "length", 0.0))
-    if found.origin.held_out_residual is not None:
-        same(found.origin.held_out_residual, quantity(tree, "held_out_residual", "length"))
-    for name in ("base_deviation", "platform_deviation"):
-        same(getattr(found, name), quantity(tree.get("structure", {}), name, "length", 0.0))
-    for name in ("base_expansion", "platform_expansion"):
-        same(getattr(found, name), quantity(tree.get("thermal", {}), name, "expansion", 0.0))
-    struts = tree.get("struts", {})
-    for name, kind in (("offset", "length"), ("pitch", "ratio"), ("backlash", "length"), ("expansion", "expansion")):
-        same(getattr(found.struts, name), quantity(struts, name, kind, 0.0))
-    same(found.struts.reference_length, quantity(struts, "reference_length", "length", 0.0))
-    wave = struts.get("wave", {"period_m": None})
-    for name in ("cosine", "sine"):
-        same(getattr(found.struts, name)[:, 0], quantity(wave, name, "length", 0.0))
-    if "wave" in struts:
-        same(found.struts.period, quantity(wave, "period", "length"))
-    if "map" in struts:
-        same(found.struts.map_knots, quantity(struts["map"], "knots", "length"))
-        same(found.struts.map_values, quantity(struts["map"], "values", "length"))
-        same(found.struts.map_backlash, quantity(struts["map"], "backlash", "length", 0.0))
-    if "field" in tree:
-        same_field(found.field, tree["field"])
-
-
-def same_field(found: Any, tree: dict[str, Any]) -> None:
-    """Check a field against its section: every coefficient of every line, and nothing else."""
-    for axis, nodes in zip("xyz", found.grid, strict=True):
-        same(nodes, quantity(tree, f"grid_{axis}", "length"))
-    same(found.probe, quantity(tree, "probe", "length", np.zeros(3)))
-    same(found.reversal_threshold, quantity(tree, "reversal_threshold", "length", 10e-6))
-    assert found.outside == tree.get("outside", "hold")
-    expected = [np.zeros(family.shape) for family in found.lines]
-    for line in tree["lines"]:
-        family = expected["xyz".index(line["axis"])]
-        ways = {"forward": [0], "backward": [1], "both": [0, 1]}[line["direction"]]
-        for component, name in enumerate(("dx", "dy", "dz", "rx", "ry", "rz")):
-            row = quantity(line, name, "length" if component < 3 else "angle", ())
-            for way in ways:
-                family[way, int(line["at"][0]), int(line["at"][1]), component, : len(row)] = row
-    for family, read in zip(expected, found.lines, strict=True):
-        same(read, family)
-
-
-@pytest.mark.parametrize("seed", range(2))
-@given(changes=edits)
-@example(changes=[])
-@cases(60, 0.06)
-def test_model(folder: Path, model_seeds: list[bytes], seed: int, changes: list) -> None:
-    data = mutated(model_seeds[seed], changes)
-    path = put(folder, "model.yaml", data)
-    try:
-        with reader_of("model", path):
-            found = load_model(path, PAPER)
-    except Refused:
-        assert changes
-        return
-    same_model(found, document(data))
-    works_or_refuses(PAPER, found)
-
-
-# Campaigns and budgets.
-
-
+@pytest.mark.parametrize(("name", "seed"), SEEDS)
 @given(changes=edits)
 @example(changes=[])
 @cases(60, 0.05)
-def test_campaign(folder: Path, changes: list) -> None:
-    data = mutated((CONFIG / "campaign_full.yaml").read_bytes(), changes)
-    path = put(folder, "campaign.yaml", data)
+def test_a_mutated_file_is_read_as_what_stands_in_it_or_refused(
+    folder: Path, name: str, seed: int, changes: list
+) -> None:
+    kind = KINDS[name]
+    data = mutated(kind.seeds[seed], changes)
+    path = folder / name
+    path.write_bytes(data)
     try:
-        with reader_of("campaign", path):
-            found = load_campaign(path)
+        with reader_of(name, path):
+            found = kind.read(path)
     except Refused:
         assert changes
         return
-    tree = document(data)
-    same(found.box, quantity(tree, "box", "length"))
-    for name, default in (("cell", None), ("step", None), ("repeatability", 0.0)):
-        same(getattr(found, name), quantity(tree, name, "length", default))
-    for name, default in (("tilt", 0.0), ("beam_slope", 100e-6)):
-        same(getattr(found, name), quantity(tree, name, "angle", default))
-    for name, default in (("diagonals", "0"), ("cycles", "1"), ("poses", "0")):
-        assert getattr(found, name) == number_of(tree.get(name, default))
-    assert (found.instrument or "none") == tree.get("instrument", "none")
-    noise = tree.get("noise", {"": None})
-    kinds = [("linear", 1e-6), ("straightness", 1e-6), ("rotation", 1e-6), ("position", 10e-6), ("attitude", 10e-6)]
-    kinds += [("length", 1e-6), ("displacement", 1e-6)]
-    for sigma, (name, default) in zip(found.noise, kinds, strict=True):
-        same(sigma, quantity(noise, name, "angle" if name in ("rotation", "attitude") else "length", default))
+    kind.judge(found)
+    path.write_bytes(kind.plain(data))
+    assert_equal(found, kind.read(path), relative=1e-13, absolute=1e-15)
 
 
-@given(changes=edits)
-@example(changes=[])
+# Exports read back.
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Give a folder with LinuxCNC's files of a machine."""
+    made = tmp_path_factory.mktemp("exported")
+    model = random_model(np.random.default_rng(3), "paper")
+    machine = RealMachine(PAPER, model)
+    told = make_genhexkins(machine, BOX)
+    write_genhexkins(told, made, "mm", ["fuzz"], table_misfit(machine, told, BOX))
+    return made
+
+
+SETP = re.compile(r"^setp\s+genhexkins\.(base|platform)\.(\d)\.([xyz])\s+(\S+)\s*$", re.MULTILINE | re.ASCII)
+
+
+@given(which=st.sampled_from((HAL_FILE, INI_FILE, *COMP_FILES[:2])), changes=edits)
+@example(which=HAL_FILE, changes=[])
 @cases(60, 0.04)
-def test_budget(folder: Path, changes: list) -> None:
-    data = mutated((CONFIG / "error_budget.yaml").read_bytes(), changes)
-    path = put(folder, "budget.yaml", data)
+def test_linuxcnc_files(exported: Path, which: str, changes: list) -> None:
+    path = exported / which
+    before = path.read_bytes()
+    data = mutated(before, changes)
     try:
-        with reader_of("budget", path):
-            found = load_budget(path)
+        path.write_bytes(data)
+        with reader_of("linuxcnc", path):
+            found = read_genhexkins(exported, "mm")
     except Refused:
         assert changes
         return
-    tree = document(data)
-    assert found.machine == tree["machine"]
-    assert len(found.sizes) == len(tree["errors"])
-    for name, size in found.sizes.items():
-        kind = "ratio" if name in ("screw_pitch_slope", "thermal_growth") else "length"
-        same(size, quantity(tree["errors"], name, kind))
+    finally:
+        path.write_bytes(before)
+    finite(found.base_joints, found.platform_joints, found.lead)
+    text = data.decode("utf-8-sig")
+    if which == HAL_FILE:
+        for body, joint, axis, value in SETP.findall(text.replace("\r", "\n")):
+            joints = found.base_joints if body == "base" else found.platform_joints
+            assert joints[int(joint), "xyz".index(axis)] == pytest.approx(number_in_c(value) * 1e-3, rel=1e-15)
+    for strut, table in enumerate(found.tables):
+        finite(table.nominal, table.trims)
+        assert (np.diff(table.nominal) > 0.0).all()
+        if which == COMP_FILES[strut]:
+            rows = leading_rows(text)
+            np.testing.assert_allclose(
+                np.column_stack([table.nominal, *table.trims]), np.array(rows) * 1e-3, rtol=1e-15
+            )
+
+
+def number_in_c(word: str) -> float:
+    """Return what C's strtod, and so LinuxCNC, reads: leading zeros mean nothing."""
+    return float(number(word, "1"))
+
+
+def leading_rows(text: str) -> list[list[float]]:
+    """Return what LinuxCNC reads of a compensation file: up to the first line without three numbers."""
+    rows: list[list[float]] = []
+    for line in re.split(r"\r\n|\r|\n", text):
+        words = line.split()[:3]
+        try:
+            rows.append([number_in_c(word) for word in words])
+        except (AssertionError, InvalidOperation):
+            break
+        if len(words) < 3:
+            rows.pop()
+            break
+    return rows

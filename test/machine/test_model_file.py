@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from helpers import assert_equal
 from hypothesis import given
 from strategies import UNEVEN_GRID, fixed, paper_geometry, random_field, random_model, seeds, skewed_geometry
 
@@ -74,27 +75,6 @@ def load(folder, text, geometry=PAPER):
     path = folder / "model.yaml"
     path.write_text(text, encoding="utf-8")
     return load_model(path, geometry)
-
-
-def assert_equal(one, other, relative=0.0):
-    """Compare two models, or any parts of them, field by field."""
-    assert type(one) is type(other)
-    if is_dataclass(one):
-        for entry in fields(one):
-            if not entry.compare:  # where it was read from, such as a file's hash
-                continue
-            assert_equal(getattr(one, entry.name), getattr(other, entry.name), relative)
-    elif isinstance(one, tuple):
-        assert len(one) == len(other)
-        for mine, its in zip(one, other, strict=True):
-            assert_equal(mine, its, relative)
-    elif isinstance(one, np.ndarray):
-        assert one.shape == other.shape
-        np.testing.assert_allclose(one, other, rtol=relative)
-    elif isinstance(one, float):
-        assert one == pytest.approx(other, rel=relative, abs=0.0)
-    else:
-        assert one == other
 
 
 def there_and_back(model, folder, geometry):

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foreign_machines import machines
+from helpers import ALL_TESTS, long_test
 from scipy.spatial.transform import Rotation
 from strategies import paper_geometry
 
@@ -18,6 +19,7 @@ from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.path import Motion, StrutRates, plan_motion, plan_program
 from hexapod_comp.pose import Pose
 
+LONG = [pytest.param(name, marks=long_test) for name in ("example_6_6", "hanging")]
 RATES = StrutRates(0.2, 2.0, 40.0)
 
 
@@ -83,10 +85,10 @@ def test_straight_up_all_struts_are_one_axis(rise: float, jerk: float) -> None:
     assert optimum * (1.0 - 1e-6) <= motion.duration <= optimum * (1.001 if math.isinf(jerk) else 1.01)
 
 
-@pytest.mark.parametrize("name", ["paper", "example_6_6", "hanging", "inches"])
+@pytest.mark.parametrize("name", ["paper", "inches", *LONG])
 def test_random_motions_keep_every_limit_and_go_straight(name: str, tmp_path: Path) -> None:
     geometry, rate = machine_of(name, tmp_path), 1000.0
-    rng, targets = np.random.default_rng(5), random_targets(geometry, 51, 4)
+    rng, targets = np.random.default_rng(5), random_targets(geometry, 51 if ALL_TESTS else 16, 4)
     for start, end in pairwise(targets):
         pivot = rng.uniform(-0.1, 0.1, 3)
         (motion,) = plan_motion(geometry, [start, end], RATES, pivot)
@@ -104,7 +106,7 @@ def test_random_motions_keep_every_limit_and_go_straight(name: str, tmp_path: Pa
         assert np.allclose(turns, share[:, None] * turns[-1], atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["paper", "hanging"])
+@pytest.mark.parametrize("name", ["paper", *LONG])
 def test_a_stop_keeps_every_limit_stays_on_the_way_and_is_never_later_than_the_end(name: str, tmp_path: Path) -> None:
     geometry, rate = machine_of(name, tmp_path), 500.0
     rng, targets = np.random.default_rng(6), random_targets(geometry, 13, 7)
