@@ -35,7 +35,7 @@ NO_CFFI = f"""cffi is missing in {sys.executable}, and hexapod_comp builds its c
 
 
 def core_module() -> dict[str, Any]:
-    """Return what setup() is told of the core; without cffi something that cannot be built, so that a build says so."""
+    """Return the arguments of setup() for the core; without cffi an extension whose build fails with the reason."""
     if importlib.util.find_spec("cffi"):
         return {"cffi_modules": ["hexapod_comp/core/build.py:ffi"]}
     return {"ext_modules": [Extension("hexapod_comp.core._core", sources=[])]}

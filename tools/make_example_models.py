@@ -93,7 +93,7 @@ def tidy(values: np.ndarray, decimals: int) -> np.ndarray:
 
 
 def make_lines_model(truth: RealMachine, truth_hash: str) -> tuple[MachineModel, ModelEvaluation]:
-    """Return the paper's 1-D model of a machine, and what it is worth."""
+    """Return the paper's 1-D model of a machine, and the error that it leaves."""
     measured = measure(template(CAMPAIGN, truth.geometry), CAMPAIGN, truth, SEED)
     model = fit_lines(measured, date=DATE, name="paper's 1-D lines").model
     x, y, z = (tidy(family, 4) for family in model.field.lines)

@@ -176,7 +176,7 @@ class ErrorLeft:
         return np.eye(part.stop - part.start) + self.known[part] @ self.rows[part].T
 
     def after_all(self, times: float = 1.0) -> np.ndarray:
-        """Return C after all candidates, each so many times."""
+        """Return C after all candidates, each measured `times` times."""
         return self._whole(np.linalg.inv(np.eye(self.basis.shape[1]) + times * self.rows.T @ self.rows))
 
 
@@ -347,7 +347,7 @@ class Aim:
 
 
 def seen_by(space: ParameterSpace, campaign: Campaign, measured: MeasurementSet) -> list[np.ndarray]:
-    """Return the derivatives of each run of a campaign's template (or part of it) by z, (k, size), over its noise."""
+    """Return each run's derivatives, (k, size): readings over their noise by parameters over their tolerances."""
     rows, cells = information(space, measured, np.zeros(space.size))
     rows *= space.spread(space.start_tolerances()) / noise_factors(campaign)[cells.kind][:, None]
     run_of_station = np.empty(len(measured.stations), dtype=int)

@@ -34,7 +34,7 @@ UNITS = {
     "length": (("µinch", 0.0254), ("0.1 µm", 0.1), ("0.01 mm", 10.0), ("mm", 1e3), ("nm", 1e-3)),
     "angle": (("arcsec", np.pi / 0.648), ("mrad", 1e3), ("mdeg", np.pi / 0.18)),
 }
-"""Units in which readings may stand that are said to be µm or µrad."""
+"""Units that readings may have though their file states µm or µrad."""
 
 TURNS = ((1, "by 90°"), (2, "by 180°"), (3, "by -90°"))
 

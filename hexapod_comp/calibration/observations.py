@@ -116,7 +116,7 @@ class Lengths:
         return (not self.known_zero) + (6 if self._arms().any() else 3)
 
     def _arms(self) -> np.ndarray:
-        """Return the centres from their mean, shape (n, 3), m; exactly zero where there is but one."""
+        """Return the centres minus their mean, shape (n, 3), m; exactly zero where all are one point."""
         arms = self.centres - self.centres.mean(axis=0)
         return arms if np.abs(arms).max() > LEAST_TRAVEL else np.zeros_like(arms)
 

@@ -58,7 +58,7 @@ class FitSettings:
     strut_moisture : float or None
         Growth of the struts by relative humidity, m/m from 0 to 1: as `strut_expansion`; None: they do not swell.
     thermometer : str
-        The part whose sensor stands for all; empty: the one that has readings of its own, if only one has.
+        The part whose sensor represents all parts; empty: the one that has readings of its own, if only one has.
     time_constants : tuple of float or None
         How late parts follow their thermometers, s; None: sought from the readings.
     load : tuple of float

@@ -218,7 +218,7 @@ class _PathCheck:
         progress: Callable[[int], object],
         senses: np.ndarray | None = None,
     ) -> None:
-        """Check the rows themselves, as consecutive commands or each for itself, then with given senses (N, 9)."""
+        """Check the rows as consecutive commands or one by one, then with given senses (N, 9)."""
         for start in range(0, self.count, CHUNK):
             rows = np.arange(start, min(start + CHUNK, self.count))
             alike = [rows]

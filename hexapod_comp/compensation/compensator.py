@@ -81,7 +81,7 @@ class Correction:
     correction : ndarray, shape (6,)
         command − nominal, m.
     command : ndarray, shape (6,)
-        What the struts are told, m.
+        Commanded strut lengths, m.
     predicted_error : ndarray, shape (6,)
         Displacement (m) and rotation (rad) of the tool along the axes of ``base`` that nominal lengths
         would leave, to first order in the corrections: J⁻¹ times minus the model's correction.

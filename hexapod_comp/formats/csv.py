@@ -336,7 +336,7 @@ class _Hashed(io.RawIOBase):
         return count
 
 
-# Digits by which a unit of such a size moves the decimal point
+# Digits by which each unit moves the decimal point
 SHIFTS = {10.0**digits: digits for digits in range(-9, 10)}
 
 

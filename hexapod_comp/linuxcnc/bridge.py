@@ -263,7 +263,7 @@ class CompensatorReset:
 
     @property
     def unanswered(self) -> bool:
-        """Whether it has been asked again, and still nothing was heard."""
+        """Whether a reset was requested, and no correction has arrived since."""
         return self._unanswered > 1
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
@@ -272,7 +272,7 @@ class CompensatorReset:
                 self._complained_at = time.monotonic()
 
     def ask(self, streaming_since: float, heard_at: float, now: float) -> None:
-        """Ask if nothing was heard for too long, though commands have been sent since a while; monotonic times, s."""
+        """Request a reset when commands are sent but no correction arrives for too long; monotonic times, s."""
         if heard_at > self._asked_at:
             self._unanswered = 0
         waited = now - max(streaming_since, heard_at)
@@ -298,7 +298,7 @@ class StopInput:
         node.subscribe(UInt64, "compensator/heartbeat", self._on_beat, EVENT_QOS)
 
     def stopped(self, now: float) -> bool:
-        """Return whether it refuses commands, or is not heard, at the monotonic time `now`, s."""
+        """Return whether the compensator refuses commands, or is silent, at the monotonic time `now`, s."""
         return self._stopped or now - self._beat_at > self._options["timeout"]
 
     def _on_stopped(self, message: Bool) -> None:

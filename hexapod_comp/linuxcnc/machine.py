@@ -48,7 +48,7 @@ HEARD_WITHIN = 0.1  # longest sleep, s: how soon a signal ends the component
 
 
 class WatchedMachine:
-    """A machine whose struts are told, and whose tool is seen."""
+    """A simulated machine: strut commands in, tool pose out."""
 
     def __init__(self, machine: RealMachine) -> None:
         self.machine = machine

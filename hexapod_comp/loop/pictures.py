@@ -62,7 +62,7 @@ def _key(result: SessionResult, rows: Sequence[ErrorRow], aligned: bool) -> Iter
 
 
 def _tracks(path: PathRecord) -> list[tuple[Track, str]]:
-    """Return the passes that were seen, with their colours."""
+    """Return the recorded passes, without and with compensation, each with its colour."""
     tracks = (path.without, path.compensated)
     return [(tracks[side], colour) for side, colour, _ in SIDES if tracks[side] is not None]  # type: ignore[misc]
 

@@ -46,7 +46,7 @@ class Limits:
         Largest strut acceleration, m/s²; 0: not limited. Of the speed smoothed over
         the core's SMOOTHED_OVER, 20 ms.
     jerk : float, optional
-        Largest strut jerk of planned motions, m/s³; 0: not limited. Commands are not held against it.
+        Largest strut jerk of planned motions, m/s³; 0: not limited. Commands are not checked against it.
     """
 
     stroke: Annotated[np.ndarray, Numbers("mm", PAIRS_PER_STRUT)]

@@ -106,7 +106,7 @@ class MachineModel:
     base_expansion, platform_expansion : float
         Thermal expansion of the two bodies about their origins, 1/K.
     late_growth : LateGrowth
-        How parts follow their thermometers late, and which thermometer stands for all.
+        How parts lag behind their thermometers, and which thermometer represents all parts.
     load : Load
         How struts give under weight and other forces.
     outside : OutsideTable

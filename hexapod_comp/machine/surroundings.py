@@ -1,4 +1,4 @@
-"""What acts on a machine from outside, place by place: temperatures, humidity and load, with one key."""
+"""Temperatures, humidity and load at each station, and a key by which stations with equal ones are grouped."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from .terms import term
 PARTS = (*STRUT_NAMES, "base", "platform")  # What has a temperature, in the order of every array of eight
 MOST_TIME_CONSTANTS = 2  # A machine that warms shows a fast and a slow one; more cannot be told apart
 TIME_CONSTANT_RANGE = (10.0, 1e6)  # Time constants outside this, s, are a sensor's noise, or a building's seasons
-REST = 3.0  # After so many time constants a twentieth is left of what a first reading did not know
+REST = 3.0  # time constants after which a twentieth of an unknown initial state is left
 
 
 EXPANSION = 1e-3  # Largest expansion that a machine's part may have, 1/K: five times that of soft plastics
@@ -32,7 +32,7 @@ class LateGrowth:
     expansion: np.ndarray = term(
         "thermal", "ppm_per_K", "what of a part's growth comes so late", (8, None), key="late", largest=EXPANSION
     )
-    thermometer: str = ""  # The part whose sensor stands for all; empty: each part has its own
+    thermometer: str = ""  # The part whose sensor represents all parts; empty: each part has its own
 
     def __post_init__(self) -> None:
         constants = tuple(float(value) for value in self.time_constants)
@@ -167,7 +167,7 @@ class Temperatures:
     def restored(
         cls, values: Mapping[str, float], lags: Mapping[str, Sequence[float]], time_constants: int
     ) -> Temperatures:
-        """Return what a :meth:`snapshot` holds, for a model with so many time constants."""
+        """Return the layout of a :meth:`snapshot` for a model with that number of time constants."""
         for name, numbers in lags.items():
             if name not in values or len(numbers) != 2 + time_constants:
                 raise ModelError(f"snapshot.lags.{name}", f"must be {2 + time_constants} numbers", list(numbers))

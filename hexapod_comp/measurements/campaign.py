@@ -134,7 +134,7 @@ class CampaignRun:
         return (2 if self.is_line or self.instrument == "ball_bar" else 1) * cycles
 
     def readings(self, cycles: int) -> Iterator[Reading]:
-        """Yield the readings, values of zero; a line's in so many passes forward and backward, each pose's once."""
+        """Yield the readings, values of zero: of a line in `cycles` passes forward and backward, of a pose once."""
         poses = [Pose(*pose) for pose in zip(self.positions, self.rotations, strict=True)]
         if self.is_line:
             for reading in line_readings(self.name, poses, self.channels, cycles, self.alternate):

@@ -3,7 +3,7 @@
 The machine is whatever can be sent to a pose and watched there by an instrument: one that reads poses of the tool, a
 tracker or motion capture, or one that reads single channels, a laser on a line or a ball bar. What they read is written
 as the campaign's channels, so that ``fit`` takes the file. A run that was interrupted goes on after the stations that
-its file has; one whose unknown zero was lost with that begins anew. First readings are held against what was commanded:
+its file has; one whose unknown zero was lost with that begins anew. First readings are compared with the commands:
 :mod:`.set_up` reports a mistake then, not when everything has been measured.
 """
 
@@ -410,7 +410,7 @@ class _Collecting:
         )
 
     def save(self) -> MeasurementSet | None:
-        """Write what was found, without lines of which only one point was; return it, None where nothing is left."""
+        """Write the readings, without lines of one point; return them, None where there are none."""
         places: dict[str, set[bytes]] = {}
         for reading in self.found.values():
             places.setdefault(reading.run, set()).add(reading.pose.position.tobytes())

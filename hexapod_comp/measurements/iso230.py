@@ -19,7 +19,7 @@ STANDARD_CYCLES = 5  # how often the standard has each target approached from ea
 TARGETS_PER_METRE = 5  # fewest targets per metre, and fewest at all, that the standard asks for
 LONGEST_TRAVEL = 2.0  # longest travel, m, for which the standard prescribes this test
 EVEN_SPACING = 1e-6  # targets whose spacings differ by less than this, m, count as evenly spaced
-SURE_REVERSAL = 3.0  # A mean reversal above so many of its standard errors is no chance
+SURE_REVERSAL = 3.0  # standard errors above which a mean reversal is no chance
 
 
 @dataclass(frozen=True, eq=False)

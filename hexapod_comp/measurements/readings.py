@@ -46,7 +46,7 @@ SAME_ATTITUDE = 1e-6  # attitudes that differ by less, rad, are one
 LEAST_SIDE = 1e-6  # A box of which a side is shorter, m, is a line or a plane
 # No instrument reads better, m or rad; also keeps readings without noise from having infinite weight
 LEAST_NOISE = 1e-9
-# Trackers and cameras apart, no instrument is so many times worse than its kind is assumed to be: a unit is wrong
+# Factor on the assumed noise of an instrument (trackers and cameras apart) above which a unit must be wrong
 COARSEST = 300.0
 LARGEST_READING = 1.0  # no machine errs by more, m or rad
 LEAST_TRAVEL = 1e-6  # components of a line shorter than this, m, are no travel along that axis
@@ -212,7 +212,7 @@ class MeasurementSet:
         return rms(members) if len(members) else 1.0
 
     def misfit(self, noise: Mapping[int, float], times: float) -> str:
-        """Return which kinds of reading are off, or stated to be, by more than they may: so many times their noise."""
+        """Return the kinds of reading whose residuals or stated σ exceed `times` their noise, with the factor."""
         far, coarse = [], []
         for kind, value in noise.items():
             stated, unit = self.stated_of(kind), "µrad" if KINDS[kind] in ANGULAR_KINDS else "µm"

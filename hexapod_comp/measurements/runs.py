@@ -38,7 +38,7 @@ from .readings import (
 # Machines whose readings may have been mixed up: the shipped ones
 GEOMETRIES = ("paper.yaml", "example_6_6.yaml", "jugglebot.yaml", "positioning_unit.yaml")
 ENOUGH = 10  # fewer poses than that are possible in many ways
-UNITS = (("inches", 25.4), ("m", 1e3))  # units in which coordinates may stand that are said to be mm
+UNITS = (("inches", 25.4), ("m", 1e3))  # units that coordinates may have though their file states mm
 # No compensation changes a strut's length by a larger share of what the nominal machine needs
 LARGEST_CORRECTION = 0.02
 
@@ -95,7 +95,7 @@ NUMBER_OF = {channel: number for number, channel in enumerate(CHANNELS)}  # inde
 OF_LINES = np.isin(np.array(KINDS)[KIND_OF], LINE_KINDS)  # whether each channel is read along a line
 # The channels across a line, by their axis of the work frame
 STRAIGHTNESS = np.array([NUMBER_OF[f"straightness_{axis}"] for axis in AXES])
-OWN_LINE = 0.99  # A line whose direction has such a share of an axis, or more, runs along it
+OWN_LINE = 0.99  # least component of a line's direction along an axis for the line to run along it
 NO_COMMANDS = (math.nan,) * 6  # commanded strut lengths of a reading without any
 LARGEST_READING = 10.0  # no machine errs by more, and no instrument's zero lies further off, m or rad
 SMALLEST_UNCERTAINTY = 1e-12  # no instrument reads better, m or rad; and the square of its inverse is still a number

@@ -1,4 +1,4 @@
-"""Is the instrument set up right? First readings are held against what was commanded, before hours are spent on them.
+"""Is the instrument set up right? First readings are compared with the commands, before hours are spent on more.
 
 No machine errs by what is allowed here: a reading beyond it is another unit, sign, channel, frame or target.
 """

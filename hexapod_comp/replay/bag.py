@@ -92,7 +92,7 @@ class Recording:
     sources : dict of str to Source
         Geometries and models by their hash.
     heard : int
-        Commands that the recorder heard; the compensator may have taken fewer.
+        Commands in the recording; the compensator may have received fewer.
     notes : list of str
         What was odd.
     """

@@ -119,7 +119,7 @@ class AdapterNode(MachineNode):
         return super().on_cleanup(state)
 
     def publish_last_status(self) -> None:
-        """Stop what the end of the node cuts short, and say so."""
+        """Stop a calibration or check that still runs, and publish `stopped` before the node ends."""
         if self._process is not None:
             self._interrupt()
             self._change("stopped", "the node ended")

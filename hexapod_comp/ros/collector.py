@@ -35,7 +35,7 @@ SET_UP_WITHIN = Duration(seconds=2)  # Who sets instruments up by topic hears of
 
 
 class WatchedMachine(Machine):
-    """A machine with a mover, and instruments that are heard on topics.
+    """A machine with a mover, and instruments that publish on topics.
 
     At each stop the median of `samples` readings that came after the tool had settled is taken, so that single wild
     ones count for nothing; fewer than half within `patience`, s, count as a broken beam.
@@ -156,7 +156,7 @@ class WatchedMachine(Machine):
             self._session.spin_once(0.02)
 
     def observe(self) -> Observation | None:
-        """Return the medians of what comes next; None where too little comes."""
+        """Return the medians of the next messages; None where too few arrive in time."""
         for heard in (self._poses, self._struts, self._read):
             heard.clear()
         self._problem = ""

@@ -96,7 +96,7 @@ class InstrumentNode(MachineNode):
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
         self.set_hardware_id(geometry.name)
-        self._seen: tuple[Pose, float] | None = None  # the tool, and when it was heard, monotonic
+        self._seen: tuple[Pose, float] | None = None  # the tool's pose, and when it arrived, monotonic
         self._broken_until, self._published, self._problem = -math.inf, 0, ""
         with self.rolled_back_on_error():
             tracker = options["kind"] == TRACKER

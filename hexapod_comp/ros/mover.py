@@ -122,7 +122,7 @@ class MoverNode(MachineNode):
         self._forget()
 
     def _forget(self) -> None:
-        """Forget machine, motion and everything that was heard."""
+        """Forget machine, motion and all messages received."""
         self._sources: dict[str, Source] = {}
         self._geometry: HexapodGeometry | None = None
         self._tool = TOOL

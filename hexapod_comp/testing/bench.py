@@ -259,13 +259,13 @@ class Bench:
         self._publishers[topic].publish(message)
 
     def send(self, pose: Pose | PoseStamped, frame_id: str = "base") -> PoseStamped:
-        """Send one command, stamped now, and return it; a message is sent as it is."""
+        """Send one command, stamped now, and return it; a message is sent unchanged."""
         message = self._stamped(pose, frame_id)
         self.publish("tool_pose_command", message)
         return message
 
     def _stamped(self, pose: Pose | PoseStamped, frame_id: str) -> PoseStamped:
-        """Return a pose as a message stamped now, a message as it is."""
+        """Return a pose as a message stamped now, a message unchanged."""
         if not isinstance(pose, Pose):
             return pose
         message = pose_message(pose, frame_id)
@@ -317,7 +317,7 @@ class Bench:
         return message_pose(self.seen["tool_pose_true"][-1])
 
     def feed(self, lengths: np.ndarray, names: tuple[str, ...] = STRUT_NAMES, later: float = 0.0) -> JointState:
-        """Publish measured struts, stamped now, or so many seconds from now, and return the message."""
+        """Publish measured struts, stamped now or `later` s from now, and return the message."""
         # By a later stamp struts may have moved further since the last reading.
         message = JointState(name=list(names), position=[float(v) for v in lengths], velocity=[0.0] * 6)
         message.header.stamp = self.stamp(later)

@@ -114,7 +114,7 @@ class State:
     doubts: tuple[str, ...] = ()  # check readings that contradict the candidate, or else the model in use
     spoilt: int = 0  # checks in a row of which a single reading is wrong
     changed: bool = False  # the machine, as two checks say
-    stuck: str = ""  # what has changed that nothing the loop may do by itself mends
+    stuck: str = ""  # a change that the loop may not repair by itself
     checks: int = 0  # of the model in use that have borne it out, or were repaired
     refused: str = ""  # why the loop has ended without a model
 
@@ -274,7 +274,7 @@ class Adaptation:
         return self._journal.events
 
     def calibrate(self, anew: bool = False) -> Outcome:
-        """Calibrate, or go on with what was begun, until a model is adopted or refused; anew: whatever was before."""
+        """Calibrate until a model is adopted or refused, continuing what the journal has begun unless `anew`."""
         if not self._task.measurable:
             raise CommandError("usage", "give a goal to plan for, or a campaign")
         state = self.state
@@ -522,7 +522,7 @@ class Adaptation:
         return verify_model(machine_model, fitted, measured), fitted
 
     def _adopt(self) -> None:
-        """Give the candidate the name of the model in use; the compensator takes it up when it is told to."""
+        """Give the candidate the name of the model in use; with `reload` the compensator loads it."""
         path = self._folder / self.state.candidate
         model = load_model(path, self._geometry)
         save_with_posterior(model, load_posterior(model, self._geometry, path)[0], self._folder / IN_USE)

@@ -39,7 +39,7 @@ from ..ros.status import ERROR, OK, WARN, status_prefix
 STREAM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 SILENT_AFTER = 2.0  # What nobody has said for this long is not known any more, s: diagnostics come once a second
-WINDOW = 5.0  # Latencies are those of the last so many seconds
+WINDOW = 5.0  # seconds whose latencies are shown
 MOST_DELAYS = 10_000  # commands of that time at 2 kHz
 UPDATE_PERIOD = 0.1  # How often what is seen is shown anew, s
 
@@ -58,7 +58,7 @@ class WatchedError:
 
 @dataclass(frozen=True)
 class Latency:
-    """How long commands took from their stamp to the struts' command as heard here, s; `count` of them."""
+    """Times from a command's stamp to the arrival of its strut command here, s; `count` of them."""
 
     median: float
     largest: float
@@ -203,7 +203,7 @@ def _predicted(data: bytes) -> WatchedError:
 # ---- the page ----
 
 GREY = (128, 128, 140)
-# Struts of a machine that is not heard; viser shows the ends' own colours lighter than a line's one colour
+# Struts of a machine from which no messages arrive; viser shows the ends' own colours lighter than a line's one colour
 UNKNOWN = (50, 50, 55)
 
 STEEL = (110, 150, 210)
@@ -257,7 +257,7 @@ class WatchPage:
             self._server.stop()
 
     def show(self, view: View) -> None:
-        """Show a view; the machine stays where it was last, in grey, while nothing is heard of it."""
+        """Show a view; while no messages arrive the machine stays where it was last, in grey."""
         server = self._server
         with server.atomic():
             if view.platform is not None:

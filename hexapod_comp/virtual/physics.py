@@ -125,7 +125,7 @@ class PhysicalMachine(RealMachine):
     def at(
         self, temperatures: Temperatures, payload: Payload | None = None, gravity: Sequence[float] | None = None
     ) -> RealMachine:
-        """Return the same machine at other temperatures and, where they are told, under another load."""
+        """Return the same machine at other temperatures and, where a load is given, under it."""
         physics = self.physics
         if payload is not None:
             physics = replace(physics, payload=payload)

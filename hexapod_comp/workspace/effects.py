@@ -397,7 +397,7 @@ def _path(
 def _walk(
     work_rotation: np.ndarray, state: _State, struts: np.ndarray, path: list[Waypoint], tolerance: float
 ) -> TangentialResult:
-    """Follow a path with the active legs and return the tool's end."""
+    """Move the active legs along a path step by step; return the tool pose that is reached."""
     start_tips, start_rotations = state.tips, state.rotations
     drift, travel = np.zeros((2, len(start_tips)))
     corrections = np.zeros(len(start_tips), dtype=int)
