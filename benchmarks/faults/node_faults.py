@@ -79,7 +79,7 @@ class Restart(Kill):
 
 
 class Reset(Fault):
-    """`~/reset` while the controller continues to stream, after 0.4 s in which neither it nor the drive sent anything."""
+    """`~/reset` while the controller continues to stream, after 0.4 s without a message from it or the drive."""
 
     shortest = longest = 0.4
 
