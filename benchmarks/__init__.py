@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import sys
 
-CANNOT_RUN = 2
-"""Exit code of a benchmark that lacks what it measures with; 1 says that a bar was missed."""
+CANNOT_RUN = 2  # Exit code of a benchmark that lacks what it measures with; 1 says that a bar was missed
 
 
 def cannot_run(reason: str) -> int:

@@ -31,12 +31,11 @@ from hexapod_comp.pose import Pose
 
 PAPER = Path(__file__).resolve().parents[1] / "config" / "paper.yaml"
 
+# m and rotation matrix entries; below, a mode is the pose: a pair of modes that are nearer to each other than
+# 1e-6 of a strut counts as one, which on the paper's machine is a turn of 3e-6
 FOUND = 1e-5
-"""m and rotation matrix entries; below, a mode is the pose: a pair of modes that are nearer to each other than
-1e-6 of a strut counts as one, which on the paper's machine is a turn of 3e-6."""
 
-NO_LIMIT = 1e9
-"""Largest condition number of a machine that has no limits: then nothing is picked either."""
+NO_LIMIT = 1e9  # Largest condition number of a machine that has no limits: then nothing is picked either
 
 DESCRIPTION = (__doc__ or "").splitlines()[0]
 

@@ -21,17 +21,13 @@ from hexapod_comp.machine.kinematics import solve_poses, strut_lengths_batch
 from .poses import WIDE, Poses, make_poses
 
 SIZES = (1_000, 10_000, 20_000, 100_000, 1_000_000, 10_000_000)
-DISTINCT = 20_000
-"""Different poses; larger batches repeat them."""
+DISTINCT = 20_000  # Different poses; larger batches repeat them
 
-SECONDS = {"inverse": 5e-8, WIDE: 5e-7}
-"""A pose's time, roughly, from which the number of rounds follows."""
+SECONDS = {"inverse": 5e-8, WIDE: 5e-7}  # A pose's time, roughly, from which the number of rounds follows
 
-FEWEST, MOST = 7, 201
-"""Rounds of a size. An odd number has a median that was measured."""
+FEWEST, MOST = 7, 201  # Rounds of a size. An odd number has a median that was measured.
 
-BAR = 1.05
-"""The default's median must not be above one thread's by more: that is how well equal runs repeat."""
+BAR = 1.05  # The default's median must not be above one thread's by more: that is how well equal runs repeat
 
 
 @dataclass(frozen=True)

@@ -33,14 +33,11 @@ from hexapod_comp.machine.outside import OutsideTable
 from hexapod_comp.machine.struts import StrutErrors
 
 COMMANDS = 500
-PERIOD = 1e-3
-"""Between two commands, s."""
+PERIOD = 1e-3  # Between two commands, s
 
-INNER = 1000
-"""Calls of a part between two looks at the clock."""
+INNER = 1000  # Calls of a part between two looks at the clock
 
-LEAD = 5e-3
-"""Of the screws where their rotation is looked at, m."""
+LEAD = 5e-3  # Of the screws where their rotation is looked at, m
 
 
 @dataclass(frozen=True)

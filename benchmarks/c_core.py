@@ -34,18 +34,17 @@ from .blocks import commands, compensators
 from .genhexkins import Genhexkins, NotHere, emc_poses
 
 FLAGS = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic"]
+# Compilers and emulators that Debian packages: gcc-i686-linux-gnu, gcc-arm-linux-gnueabihf, qemu-user
 TARGETS = {
     "32-bit x86": (["i686-linux-gnu-gcc", "-msse2", "-mfpmath=sse", "-static"], []),
     "ARM, 32 bits": (["arm-linux-gnueabihf-gcc", "-static"], ["qemu-arm"]),
 }
-"""Compilers and emulators that Debian packages: gcc-i686-linux-gnu, gcc-arm-linux-gnueabihf, qemu-user."""
 
+# Bars: of the whole model's command, beside genhexkins' inverse, of a warm estimate
 LARGEST_US, LARGEST_RATIO, LARGEST_ESTIMATE_US = 1.5, 8.0, 1.5
-"""Bars: of the whole model's command, beside genhexkins' inverse, of a warm estimate."""
 
 ROUNDS = 15
-INNER = 20
-"""Times that the poses are run through between two looks at the clock."""
+INNER = 20  # Times that the poses are run through between two looks at the clock
 
 
 @dataclass(frozen=True)

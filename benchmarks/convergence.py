@@ -22,40 +22,27 @@ from . import cannot_run
 from .genhexkins import Genhexkins, NotHere, emc_poses, si_poses
 from .poses import make_poses
 
-YAWS = np.arange(0.0, 86.0, 5.0)
-"""Where convergence is looked at, degrees."""
+YAWS = np.arange(0.0, 86.0, 5.0)  # Where convergence is looked at, degrees
 
 
 @dataclass(frozen=True)
 class Convergence:
-    """How many of `poses` poses at one yaw were solved, from guesses 1 mm and 1 mrad away.
-
-    Attributes
-    ----------
-    ours, theirs : int
-        Solved: the pose at which the lengths were taken, to 1 nm and 1e-8 rad.
-    """
+    """How many of `poses` poses at one yaw were solved, from guesses 1 mm and 1 mrad away."""
 
     yaw_deg: float
     poses: int
-    ours: int
+    ours: int  # Solved: the pose at which the lengths were taken, to 1 nm and 1e-8 rad
     theirs: int
 
 
 @dataclass(frozen=True)
 class Honesty:
-    """What answers to far guesses are worth; each pair is ours, then genhexkins'.
-
-    Attributes
-    ----------
-    solved : tuple of int
-        Said to be solved.
-    not_finite, open_loops, other_mode : tuple of int
-        … of these: not finite; struts of another length than asked for, by 1 nm; another assembly mode than home.
-    """
+    """What answers to far guesses are worth; each pair is ours, then genhexkins'."""
 
     poses: int
-    solved: tuple[int, int]
+    solved: tuple[int, int]  # Said to be solved
+    # … of these: not finite; struts of another length than asked for, by 1 nm; another assembly mode than
+    # home
     not_finite: tuple[int, int]
     open_loops: tuple[int, int]
     other_mode: tuple[int, int]
@@ -150,16 +137,10 @@ def _worth(structure: Structure, answers: _Answers, lengths: np.ndarray) -> tupl
 
 @dataclass(frozen=True)
 class Trap:
-    """A problem without a regular answer, started where the struts are as asked for, and what both say of it.
-
-    Attributes
-    ----------
-    ours, theirs : str
-        Outcome, and what it has done to the pose given as a guess: LinuxCNC starts its next call from that.
-    """
+    """A problem without a regular answer, started where the struts are as asked for, and what both say of it."""
 
     title: str
-    ours: str
+    ours: str  # Outcome, and what it has done to the pose given as a guess: LinuxCNC starts its next call from that
     theirs: str
 
 

@@ -22,8 +22,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 
+# Endings of counts that are not cases: how many were accepted, and what a case of a node consists of
 NOT_CASES = (" accepted", " messages")
-"""Endings of counts that are not cases: how many were accepted, and what a case of a node consists of."""
 
 
 def main() -> int:

@@ -26,19 +26,18 @@ from .poses import NEAR, WIDE, Contender, Poses, joined
 
 NAME = "LinuxCNC genhexkins"
 LOOSE, SECOND = f"{NAME}, to 1e-8 m", f"{NAME}: second solve"
+# Where Debian puts it; another one by the environment variable GENHEXKINS
 MODULE = Path("/usr/lib/linuxcnc/modules/genhexkins.so")
-"""Where Debian puts it; another one by the environment variable GENHEXKINS."""
 
 MM = 1e-3
+# Its own default: it ends when every strut was right to this, mm, before the last step. Its steps shrink by a
+# constant factor each, so its answers are about as good as this; ours converges quadratically.
 CRITERION = 1e-9
-"""Its own default: it ends when every strut was right to this, mm, before the last step. Its steps shrink by a constant
-factor each, so its answers are about as good as this; ours converges quadratically."""
 
+# What ours calls a last step, 1e-8 m, mm: genhexkins is quicker with it, and its answers are worse
 LOOSE_CRITERION = STEP_TOLERANCE / MM
-"""What ours calls a last step, 1e-8 m, mm: genhexkins is quicker with it, and its answers are worse."""
 
-ANY_ERROR = 1e9
-"""Its default refuses a guess whose struts are off by 500 mm altogether; here it may try."""
+ANY_ERROR = 1e9  # Its default refuses a guess whose struts are off by 500 mm altogether; here it may try
 
 POSE, STRUTS = 9, 6
 
@@ -89,18 +88,7 @@ def si_poses(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Genhexkins:
-    """The module with a machine's joints on its pins.
-
-    Parameters
-    ----------
-    structure : Structure
-        The machine.
-
-    Raises
-    ------
-    NotHere
-        It is not installed, or cannot be used; says why.
-    """
+    """The module with a machine's joints on its pins."""
 
     def __init__(self, structure: Structure) -> None:
         self.stand_in, self.module = _load()
@@ -158,13 +146,7 @@ def pointer(array: np.ndarray) -> ctypes.c_void_p:
 
 
 def contenders(single: Poses, batch: Poses, near_single: Poses, near: Poses) -> list[Contender]:
-    """Return genhexkins' runs: batches in C loops that time themselves, single calls from Python by ctypes.
-
-    Raises
-    ------
-    NotHere
-        As :class:`Genhexkins`.
-    """
+    """Return genhexkins' runs: batches in C loops that time themselves, single calls from Python by ctypes."""
     module = Genhexkins(batch.structure)
     return [
         _inverse_batch(module, batch),

@@ -28,8 +28,7 @@ from hexapod_comp.virtual.instruments import measure
 
 TILT = np.radians(10.0)
 
-CORNERS = np.array([[1, 1, 1], [-1, 1, -1], [-1, -1, 1], [1, -1, -1]])
-"""Four corners of a box of half sides 1."""
+CORNERS = np.array([[1, 1, 1], [-1, 1, -1], [-1, -1, 1], [1, -1, -1]])  # Four corners of a box of half sides 1
 
 
 def circles(box: np.ndarray, points: int = 37) -> list[CampaignRun]:

@@ -39,8 +39,7 @@ DATA = Path(__file__).parent / "data" / "jugglebot"
 FILES = ("108_calibration_poses.csv", "grid180.csv", "grid180_ff_correction.csv")
 FOLDS, SPLITS = 6, 5
 KNOWN = FitSettings(tracker_frame="known")  # the cameras were aligned with the machine; poses are judged as they are
-POSES_BAR, GRID_BAR = 1.08e-3, 0.96
-"""m: what an independent fit of 48 parameters reached; share of the error removed."""
+POSES_BAR, GRID_BAR = 1.08e-3, 0.96  # m: what an independent fit of 48 parameters reached; share of the error removed
 
 
 def read(folder: Path, name: str, columns: str) -> MeasurementSet:

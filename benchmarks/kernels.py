@@ -24,12 +24,11 @@ from hexapod_comp.pose import Pose
 from . import genhexkins, peers
 from .poses import NEAR, OURS, WIDE, Contender, Poses, joined, make_poses, near_poses
 
-TOLERANCE = 1e-9
-"""Peers whose numbers differ from ours by more, m or rotation matrix entries, compute something else."""
+TOLERANCE = 1e-9  # Peers whose numbers differ from ours by more, m or rotation matrix entries, compute something else
 
-LOOSE_TOLERANCE = 1e-6
-"""… and those that were told to end early."""
+LOOSE_TOLERANCE = 1e-6  # … and those that were told to end early
 
+# How many times faster than genhexkins ours must be, with any of its two criteria
 BARS = {
     ("inverse", "batch"): 4.0,
     (WIDE, "batch"): 4.0,
@@ -37,7 +36,6 @@ BARS = {
     (WIDE, "single"): 1.3,
     (NEAR, "single"): 1.3,
 }
-"""How many times faster than genhexkins ours must be, with any of its two criteria."""
 
 
 @dataclass(frozen=True)

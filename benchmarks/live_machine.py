@@ -14,8 +14,7 @@ from hexapod_comp.measurements.collect import Observation, RunSetUp
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.instruments import TRACKER, LiveInstrument
 
-SAMPLES = 9
-"""Readings of which an observation is the median."""
+SAMPLES = 9  # Readings of which an observation is the median
 
 
 class LiveMachine:

@@ -32,19 +32,16 @@ from hexapod_comp.pose import Pose
 from hexapod_comp.ros.base import COMMAND_QOS
 from hexapod_comp.ros.messages import nanoseconds_of, pose_message
 
+# Commands per second; 0 is flat out: the next one leaves when the last was answered
 RATES = (250.0, 500.0, 1000.0, 0.0)
-"""Commands per second; 0 is flat out: the next one leaves when the last was answered."""
 
 BAR_RATE, BAR_MEDIAN, BAR_P99 = 0.95, 1.10, 1.25
 
-GIVE_UP = 0.05
-"""An answer that takes longer, s, is not waited for."""
+GIVE_UP = 0.05  # An answer that takes longer, s, is not waited for
 
-START_WITHIN = 180.0
-"""The nodes may have to compile first, s."""
+START_WITHIN = 180.0  # The nodes may have to compile first, s
 
-BLIND = "start_without_feedback_after:=0.1"
-"""There are no struts here."""
+BLIND = "start_without_feedback_after:=0.1"  # There are no struts here
 
 OURS, RELAY = "ours", "relay"
 
@@ -87,18 +84,10 @@ class Line:
 
 @dataclass(frozen=True)
 class Figures:
-    """One node's answers in one bout.
+    """One node's answers in one bout."""
 
-    Attributes
-    ----------
-    rate : float
-        Answers per second.
-    median, p99 : float
-        Latency's median and 99th percentile, µs.
-    """
-
-    rate: float
-    median: float
+    rate: float  # Answers per second
+    median: float  # Latency's median and 99th percentile, µs
     p99: float
 
     @staticmethod

@@ -27,17 +27,15 @@ from hexapod_comp.ros.process import RosSession
 
 ROOT = Path(__file__).resolve().parents[1]
 
-BAR, LARGEST_BAR = 100.0, 200.0
-"""At rest and at most, MB."""
+BAR, LARGEST_BAR = 100.0, 200.0  # At rest and at most, MB
 
-LENGTH = 10_000_000
-"""Of a message, byte."""
+LENGTH = 10_000_000  # Of a message, byte
 
+# What each node hears
 HEARD = {
     "compensator": {"tool_pose_command": PoseStamped, "strut_states": JointState, "temperatures": Temperature},
     "strut_drive": {"strut_commands": JointState},
 }
-"""What each node hears."""
 
 BARE = """
 import rclpy, rclpy.lifecycle
@@ -46,8 +44,7 @@ node = rclpy.lifecycle.LifecycleNode("bare")
 rclpy.spin(node)
 """
 
-SETTLED = 3.0
-"""What does not change for so long stays, s."""
+SETTLED = 3.0  # What does not change for so long stays, s
 
 
 def kept(pid: int) -> tuple[float, float, float]:

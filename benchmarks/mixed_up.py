@@ -33,6 +33,7 @@ from hexapod_comp.calibration.mistakes import FAMILIES, family_of_run
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.measurements.readings import CHANNELS, MeasurementSet
 
+# What was done to readings, by the name that it should get; empty: nothing
 MADE = {
     "": lambda m: m,
     "rotation_x and rotation_y: exchanged": lambda m: exchanged(m, "rotation_x", "rotation_y"),
@@ -43,7 +44,6 @@ MADE = {
     "x lines, rotation_y: sign reversed": lambda m: reversed_sign(m, "rotation_y", "x lines"),
     "y lines, straightness_z: sign reversed": lambda m: reversed_sign(m, "straightness_z", "y lines"),
 }
-"""What was done to readings, by the name that it should get; empty: nothing."""
 
 
 def of_family(m: MeasurementSet, family: str) -> np.ndarray:

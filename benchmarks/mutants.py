@@ -36,9 +36,10 @@ import scipy.spatial.transform  # noqa: F401
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "hexapod_comp"
 FOLDER = ROOT / "out" / "mutants"
+# Files and folders of what is judged by eye, or not ours
 NOT_DRAWN = {"pictures.py", "page.py", "shell_page.py", "__main__.py", "stable_abi"}
-"""Files and folders of what is judged by eye, or not ours."""
 
+# Where a room's tests are, from near to far, where not in the folder of its name alone
 TESTS = {
     "pose.py": ["test_pose.py", "ros/test_wire.py", "machine"],
     "errors.py": ["test_errors.py", "formats"],
@@ -55,17 +56,13 @@ TESTS = {
     "viewer": ["ros"],
     "testing": ["test_testing.py", "ros"],
 }
-"""Where a room's tests are, from near to far, where not in the folder of its name alone."""
 
-LONGEST = 120
-"""Time of a test with a mutant that waits, s."""
+LONGEST = 120  # Time of a test with a mutant that waits, s
 
 BAR = 0.95
-LIMIT = 20.0
-"""Processor time of a test with a mutant, s."""
+LIMIT = 20.0  # Processor time of a test with a mutant, s
 
-FAILURES = ("FAILED", "ERROR")
-"""How the lines of pytest's summary begin that name a test."""
+FAILURES = ("FAILED", "ERROR")  # How the lines of pytest's summary begin that name a test
 
 SWAPS: dict[type, tuple[type, ...]] = {
     ast.Lt: (ast.LtE, ast.Gt), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.Lt), ast.GtE: (ast.Gt, ast.Lt),
@@ -75,24 +72,22 @@ SWAPS: dict[type, tuple[type, ...]] = {
     ast.BitAnd: (ast.BitOr,), ast.BitOr: (ast.BitAnd,), ast.USub: (ast.UAdd,),
 }  # fmt: skip
 
-Mutant = tuple[ast.AST, str, object]
-"""A node, the name of one of its fields, and what the field holds in the mutant."""
+Mutant = tuple[ast.AST, str, object]  # A node, the name of one of its fields, and what the field holds in the mutant
 
-CMutant = tuple[int, int, str]
-"""Beginning and end of what is replaced in a C file, and by what."""
+CMutant = tuple[int, int, str]  # Beginning and end of what is replaced in a C file, and by what
 
 C_SWAPS = {
     "<": ("<=", ">"), "<=": ("<", ">"), ">": (">=", "<"), ">=": (">", "<"), "==": ("!=",), "!=": ("==",),
     "&&": ("||",), "||": ("&&",), "+": ("-",), "-": ("+",), "*": ("/",), "/": ("*",), "+=": ("-=",), "-=": ("+=",),
 }  # fmt: skip
 
+# What changes in C: operators between spaces, numbers, and assignments on a line of their own
 C_PLACES = re.compile(
     r"(?<= )(?P<operator><=?|>=?|[=!]=|&&|\|\||[-+]=?|[*/])(?= )"
     r"|(?<![\w.\]])(?P<number>\d+\.\d+(?:e[-+]?\d+)?|\d+)(?![\w.])"
     r"|^ +(?P<statement>[\w.>\[\]-]+ [-+*/]?= [^;{}]+;)$",
     re.MULTILINE,
 )
-"""What changes in C: operators between spaces, numbers, and assignments on a line of their own."""
 
 
 def c_mutants(text: str) -> Iterator[CMutant]:

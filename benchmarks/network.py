@@ -29,8 +29,8 @@ from .faults.namespaces import OWN_NETWORK, make_host, refusal
 from .faults.record import Happened
 from .faults.rig import Rig
 
+# Set where this program runs again, in a namespace of its own: to ``cable``, or to the descriptor for orders
 INSIDE = "HEXAPOD_COMP_NETWORK_BENCHMARK"
-"""Set where this program runs again, in a namespace of its own: to ``cable``, or to the descriptor for orders."""
 
 
 class OnCable(Fault):

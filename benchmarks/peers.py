@@ -10,8 +10,7 @@ from hexapod_comp.machine.kinematics import Structure
 
 from .poses import WIDE, Contender, Poses, joined
 
-STEP_TOLERANCE = 1e-8
-"""Where the core's Newton stops, m and rad: the others get the same criterion."""
+STEP_TOLERANCE = 1e-8  # Where the core's Newton stops, m and rad: the others get the same criterion
 
 # --- NumPy and SciPy ---------------------------------------------------------------------------------------
 
@@ -137,5 +136,4 @@ def pinocchio_inverse(poses: Poses) -> Contender:
     return Contender("inverse", "Pinocchio frames", "single", len(commands), run)
 
 
-OPTIONAL = {"mujoco": mujoco_inverse, "pin": pinocchio_inverse}
-"""Peers by the name under which pip knows them."""
+OPTIONAL = {"mujoco": mujoco_inverse, "pin": pinocchio_inverse}  # Peers by the name under which pip knows them

@@ -41,29 +41,27 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
 from foreign_machines import machines
 
 LEAD = 0.01
-DEGREE = 4
-"""Of the field, which keeps twenty fits short."""
+DEGREE = 4  # Of the field, which keeps twenty fits short
 
-TILT = np.radians(5.0)
-"""All five machines tilt so far in most of their box."""
+TILT = np.radians(5.0)  # All five machines tilt so far in most of their box
 
 NAMES = ("paper", "framed", "hanging", "inches", "mirror")
 
+# Instruments, tilt, goal and readings; the last is more than anybody gets with so many
 GOALS = (
     ("linear", 0.0, 3e-6, 400),
     ("5-D", 0.0, 2.5e-6, 600),
     ("linear,tracker_6d", TILT, 5e-6, 500),
     ("6-D,tracker_6d", TILT, 1e-6, 600),
 )
-"""Instruments, tilt, goal and readings; the last is more than anybody gets with so many."""
 
 COUNTED = {"linear": Times(0.0, 0.0, 1.0), "5-D": Times(0.0, 0.0, 5.0), "6-D": Times(0.0, 0.0, 6.0)}
+# A reading counts a second, and nothing else takes any time: plans and what they are compared with pay the same
 COUNTED["tracker_6d"] = COUNTED["6-D"]
-"""A reading counts a second, and nothing else takes any time: plans and what they are compared with pay the same."""
 
+# Bars: less expected error than thinned on the mean; seconds of a plan; achieved over expected, root mean
+# square over all goals; share of machines within the 95 % intervals, of the plan and of the fit
 LESS, SECONDS, RATIO, INSIDE = 0.20, 30.0, (0.8, 1.25), 0.9
-"""Bars: less expected error than thinned on the mean; seconds of a plan; achieved over expected, root mean square over
-all goals; share of machines within the 95 % intervals, of the plan and of the fit."""
 
 DRAWS = 1000
 

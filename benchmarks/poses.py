@@ -23,21 +23,13 @@ WIDE, NEAR = "forward", "forward, near"
 
 @dataclass(frozen=True)
 class Poses:
-    """The poses that everybody gets, and the machine.
-
-    Attributes
-    ----------
-    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
-        ``pose_platform_in_base``, m.
-    lengths : ndarray, shape (N, 6)
-        Strut lengths there, m.
-    """
+    """The poses that everybody gets, and the machine."""
 
     structure: Structure
     home: Pose
-    positions: np.ndarray
+    positions: np.ndarray  # ``pose_platform_in_base``, m, shape (N, 3), (N, 3, 3)
     rotations: np.ndarray
-    lengths: np.ndarray
+    lengths: np.ndarray  # Strut lengths there, m, shape (N, 6)
 
     def first(self, count: int) -> Poses:
         """Return the same with the first `count` poses only."""
@@ -47,23 +39,16 @@ class Poses:
 
 @dataclass(frozen=True)
 class Contender:
-    """Somebody who does a task: one run over `poses` poses.
-
-    Attributes
-    ----------
-    run : callable
-        Does it, and returns what it has found, (N, 6) lengths in m or (N, 12) poses as of :func:`joined`. With
-        `numbers` it returns nothing or, when it knows better than its caller, the time it took, s.
-    numbers : callable, optional
-        Returns what the last run has found.
-    """
+    """Somebody who does a task: one run over `poses` poses."""
 
     task: str
     name: str
     shape: str
     poses: int
+    # Does it, and returns what it has found, (N, 6) lengths in m or (N, 12) poses as of :func:`joined`. With
+    # `numbers` it returns nothing or, when it knows better than its caller, the time it took, s
     run: Callable[[], Any]
-    numbers: Callable[[], np.ndarray] | None = None
+    numbers: Callable[[], np.ndarray] | None = None  # Returns what the last run has found
 
 
 def make_poses(count: int, shift: float = 0.05, turn: float = 30.0) -> Poses:

@@ -29,17 +29,15 @@ from hexapod_comp.pose import Pose
 from hexapod_comp.ros import keep_discovery_local
 from hexapod_comp.testing.bench import BEST_EFFORT, Bench
 
+# Where the machine stands: a step off home, where the simulated drive begins, so that all struts differ
 AT = Pose([0.0004, -0.0003, 0.4006], np.eye(3))
-"""Where the machine stands: a step off home, where the simulated drive begins, so that all struts differ."""
 
+# Truth and model. A machine with backlash hides steps of the motors that are smaller than its play.
 MACHINE = "ideal"
-"""Truth and model. A machine with backlash hides steps of the motors that are smaller than its play."""
 
-BAR = 60e-9
-"""Largest 95 % quantile, m: half the step of the encoders."""
+BAR = 60e-9  # Largest 95 % quantile, m: half the step of the encoders
 
-RATE, SETTLES_IN = 50.0, 0.6
-"""Commands per second; time in which drives and ramps come to rest, s."""
+RATE, SETTLES_IN = 50.0, 0.6  # Commands per second; time in which drives and ramps come to rest, s
 
 
 class Restarting:

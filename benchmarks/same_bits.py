@@ -70,13 +70,7 @@ def compiled(build: Build, folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 def printed(build: Build, folder: Path, commands: int) -> str:
-    """Return what the driver prints.
-
-    Raises
-    ------
-    RuntimeError
-        It was not compiled without a word, or did not run to its end: what was said.
-    """
+    """Return what the driver prints."""
     made = compiled(build, folder)
     if made.returncode or made.stderr:
         raise RuntimeError(made.stderr.strip())

@@ -14,11 +14,9 @@ from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.virtual.imperfections import seeded
 
-FIELD_WAVES = 6
-"""Waves added up in each component of a field."""
+FIELD_WAVES = 6  # Waves added up in each component of a field
 
-FIELD_NODES, FIELD_POWERS = 17, 12
-"""Lines of a wavy field along y and z, and coefficients along x."""
+FIELD_NODES, FIELD_POWERS = 17, 12  # Lines of a wavy field along y and z, and coefficients along x
 
 
 def with_wavy_field(
@@ -29,21 +27,7 @@ def with_wavy_field(
     rotation: float = 30e-6,
     waves: tuple[float, float] = (0.4, 0.8),
 ) -> MachineModel:
-    """Return a model with a smooth pose error in space, the same in both directions of motion.
-
-    Parameters
-    ----------
-    model : MachineModel
-        The machine so far; a field that it has is replaced.
-    box : ndarray, shape (2, 3)
-        Corners of the field, m in ``base``.
-    seed : int
-        0 or above.
-    displacement, rotation : float
-        Root mean square of each component in the box, m and rad.
-    waves : (float, float)
-        Shortest and longest wave, m.
-    """
+    """Return a model with a smooth pose error in space, the same in both directions of motion."""
     rng = seeded(seed, "field")
     vectors = rng.standard_normal((6, FIELD_WAVES, 3))
     vectors *= 2.0 * np.pi / (np.linalg.norm(vectors, axis=2) * rng.uniform(*waves, (6, FIELD_WAVES)))[..., None]

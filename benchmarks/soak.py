@@ -41,74 +41,49 @@ from hexapod_comp.ros.process import SPIN_PERIOD
 
 NODES = ("compensator", "strut_drive")
 
-RADIUS, TURN_TIME = 0.012, 4.0
-"""Circle about home, m, and time of one turn, s: 19 mm/s."""
+RADIUS, TURN_TIME = 0.012, 4.0  # Circle about home, m, and time of one turn, s: 19 mm/s
 
+# Commands are sent, and not counted, for this long first, s: until DDS has made everybody known to everybody
 RUN_IN = 3.0
-"""Commands are sent, and not counted, for this long first, s: until DDS has made everybody known to everybody."""
 
-WARM_UP = 0.1
-"""Share of the run after which memory should be flat; at least :data:`LEAST_WARM_UP`, s."""
+WARM_UP = 0.1  # Share of the run after which memory should be flat; at least :data:`LEAST_WARM_UP`, s
 
 LEAST_WARM_UP = 5.0
 
 WORST_KEPT = 8
 
+# Edges of the latency histogram, s: 0.23 % apart, so that the client's own memory stays flat
 BINS = np.geomspace(1e-5, 10.0, 6001)
-"""Edges of the latency histogram, s: 0.23 % apart, so that the client's own memory stays flat."""
 
-BAR_GROWTH = 1.0
-"""MB an hour."""
+BAR_GROWTH = 1.0  # MB an hour
 
 
 @dataclass
 class Gap:
-    """One late answer.
+    """One late answer."""
 
-    Attributes
-    ----------
-    at, elapsed : float
-        When the command left, s: CLOCK_MONOTONIC, and since the start of the run.
-    latency : float
-        s.
-    waiting : dict of str to float
-        How long each process waited for a processor in the second around it, s.
-    """
-
-    at: float
+    at: float  # When the command left, s: CLOCK_MONOTONIC, and since the start of the run
     elapsed: float
-    latency: float
+    latency: float  # s
+    # How long each process waited for a processor in the second around it, s
     waiting: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass
 class Soak:
-    """What a run found.
+    """What a run found."""
 
-    Attributes
-    ----------
-    commands, lost : int
-        Sent, and never answered.
-    heartbeats, heartbeats_lost : int
-        Of the compensator: heard, and missing between them.
-    histogram : ndarray
-        Answers by latency, in :data:`BINS`.
-    worst : list of Gap
-        Longest latencies, longest first.
-    memory : list of tuple of float
-        Time since the start, s, and resident memory of each node, byte.
-    waited : dict of str to float
-        How long the threads of each process, together, waited for a processor during the whole run, s.
-    """
-
-    commands: int = 0
+    commands: int = 0  # Sent, and never answered
     lost: int = 0
-    heartbeats: int = 0
+    heartbeats: int = 0  # Of the compensator: heard, and missing between them
     heartbeats_lost: int = 0
     longest: float = 0.0
+    # Answers by latency, in :data:`BINS`
     histogram: np.ndarray = field(default_factory=lambda: np.zeros(len(BINS) + 1, dtype=np.int64))
-    worst: list[Gap] = field(default_factory=list)
+    worst: list[Gap] = field(default_factory=list)  # Longest latencies, longest first
+    # Time since the start, s, and resident memory of each node, byte
     memory: list[tuple[float, ...]] = field(default_factory=list)
+    # How long the threads of each process, together, waited for a processor during the whole run, s
     waited: dict[str, float] = field(default_factory=dict)
     diagnostics: dict[str, dict[str, str]] = field(default_factory=dict)
     notes: dict[str, list[dict]] = field(default_factory=dict)

@@ -29,19 +29,9 @@ PACKAGES = ("numpy", "scipy", "mujoco", "mujoco-core", "pin", "ros-jazzy-rclpy")
 
 @dataclass
 class Speed:
-    """Everything that was measured.
+    """Everything that was measured."""
 
-    Attributes
-    ----------
-    where : dict of str to str
-        Processor, versions, load of the machine before the run.
-    missing : list of str
-        Who did not take part, and why.
-    problems : list of str
-        Bars that were missed.
-    """
-
-    where: dict[str, str]
+    where: dict[str, str]  # Processor, versions, load of the machine before the run
     kernels: list[kernels.Result]
     convergence: list[convergence.Convergence]
     honesty: convergence.Honesty | None
@@ -51,8 +41,8 @@ class Speed:
     loop: list[loop.Row]
     floor: list[loop.Row]
     batches: list[batches.Row]
-    missing: list[str] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)  # Who did not take part, and why
+    problems: list[str] = field(default_factory=list)  # Bars that were missed
 
 
 def surroundings() -> dict[str, str]:

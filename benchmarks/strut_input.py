@@ -36,32 +36,20 @@ from hexapod_comp.virtual.named import find_model
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
 from foreign_machines import Machine, machines
 
-BAR = 1e-9
-"""Largest difference, m."""
+BAR = 1e-9  # Largest difference, m
 
-TILT, PER_LINE = 3.0, 200
-"""Of a pose about each axis, degrees; poses from one random pose to the next."""
+TILT, PER_LINE = 3.0, 200  # Of a pose about each axis, degrees; poses from one random pose to the next
 
 
 @dataclass(frozen=True)
 class Difference:
-    """How far the answers to lengths and to poses are apart.
-
-    Attributes
-    ----------
-    taken, refused : int
-        Poses that both ways took, and that both refused for the same reason.
-    unlike : int
-        Poses that only one way took, or that were refused for different reasons.
-    largest, nominal : float
-        Largest difference of a strut command, and of a nominal length to the one that was sent, m.
-    """
+    """How far the answers to lengths and to poses are apart."""
 
     machine: str
-    taken: int
+    taken: int  # Poses that both ways took, and that both refused for the same reason
     refused: int
-    unlike: int
-    largest: float
+    unlike: int  # Poses that only one way took, or that were refused for different reasons
+    largest: float  # Largest difference of a strut command, and of a nominal length to the one that was sent, m
     nominal: float
 
     @property

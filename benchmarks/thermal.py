@@ -51,14 +51,12 @@ from hexapod_comp.machine.trial import Trial
 from hexapod_comp.measurements.campaign import load_campaign
 from hexapod_comp.virtual.imperfections import draw_model
 
-STEEL = 11.5e-6
-"""Expansion of struts, base and platform, 1/K."""
+STEEL = 11.5e-6  # Expansion of struts, base and platform, 1/K
 
+# How long the machine warms, and how long it then stays warm, s: readings of each phase, one a second
 HALF_HOUR = 1800
-"""How long the machine warms, and how long it then stays warm, s: readings of each phase, one a second."""
 
-MOMENTS = 40
-"""In how many groups the points of a phase are passed, evenly over it."""
+MOMENTS = 40  # In how many groups the points of a phase are passed, evenly over it
 
 BAR = 0.95
 

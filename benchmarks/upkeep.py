@@ -58,30 +58,29 @@ from hexapod_comp.virtual.imperfections import draw_model
 from hexapod_comp.virtual.instruments import measure
 
 ROOT = Path(__file__).resolve().parents[1]
+# Machines of test/foreign_machines.py: 6-6 with turned frames, hanging, in inches, wide struts from afar,
+# screws that turn
 FOREIGN = ("framed", "hanging", "inches", "mirror", "left-hand")
-"""Machines of test/foreign_machines.py: 6-6 with turned frames, hanging, in inches, wide struts from afar, screws that
-turn."""
 
 CRASH, POINTS = 20e-6, 200
 
 CHOSEN = "12 chosen"
+# Check readings: twelve that the package chooses, twelve and twenty-four by the rule of thumb above
 SETS = (CHOSEN, "12", "24")
-"""Check readings: twelve that the package chooses, twelve and twenty-four by the rule of thumb above."""
 BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])
 
 CHANGES = {"nothing": None, "strut": STRUT, "datum": DATUM, "temperature": TEMPERATURE, "ageing": AGEING,
            "two struts": STRUT}  # fmt: skip
+# What parameters can follow, and what is in no hypothesis that is named; with their kinds. Lines cannot see the
+# datum.
 UNKNOWN = dict.fromkeys(("platform joint", "base joint", "bend", "backlash"), OTHER)
-"""What parameters can follow, and what is in no hypothesis that is named; with their kinds. Lines cannot see the datum.
-"""
 
+# The probability of the likeliest kind falls between two of these; how often it is the right one?
 SHARES = (0.0, 0.5, 0.7, 0.9, 0.99, 1.0)
-"""The probability of the likeliest kind falls between two of these; how often it is the right one?"""
 
 FALSE_ALARMS, NAMED_RIGHTLY, REPAIRED, CONFIDENTLY_WRONG, RIGHT_OF_NAMED = 0.05, 0.95, 1.5, 0.10, 0.90
 
-DRIFT, CHECK_EVERY, CHECKS = 20e-6, 0.5, 6
-"""Struts that grow by so much an hour, m, checked so often, h."""
+DRIFT, CHECK_EVERY, CHECKS = 20e-6, 0.5, 6  # Struts that grow by so much an hour, m, checked so often, h
 
 
 def machine_of(name: str) -> tuple[HexapodGeometry, np.ndarray]:

@@ -48,17 +48,15 @@ INCH = 0.0254
 
 RISE = np.array([3.0] * 6 + [2.0, 2.5])
 TAU = np.array([1500.0] * 6 + [5400.0, 3000.0])
-APART = 0.1
-"""How much each strut differs in rise and time constant (standard deviation)."""
+APART = 0.1  # How much each strut differs in rise and time constant (standard deviation)
 
+# Mean expansion, and standard deviation between struts together, base and platform, 1/K; between struts a fifth
 STEEL, SPREAD = 11.5e-6, 1e-6
-"""Mean expansion, and standard deviation between struts together, base and platform, 1/K; between struts a fifth."""
 
+# Which thermometer stands for all, and the bar: share of the drift removed
 SENSORS = {"a sensor on each part": ("", 0.95), "one sensor in the base": ("base", 0.85)}
-"""Which thermometer stands for all, and the bar: share of the drift removed."""
 
-DAY, OFF = 9000, (3600, 6000)
-"""Length of the judged day, s, and from when to when the power is off."""
+DAY, OFF = 9000, (3600, 6000)  # Length of the judged day, s, and from when to when the power is off
 
 MOMENTS = 30
 
@@ -174,18 +172,18 @@ def fitted_shown(row: FittedRow) -> str:
 
 
 GEOMETRIES = ("paper", "framed", "hanging", "inches", "mirror", "offset")
+# Kinds of machines and readings; the last three carry what no parameter describes
 PULLED = ("B", "D", "G", "joints", "beams", "outliers")
-"""Kinds of machines and readings; the last three carry what no parameter describes."""
 
+# Rounds while the machine warms, s from one to the next, steps along the longest line of the campaign, and a
+# field's degree: enough for a fit of some seconds
 ROUNDS, EVERY, STEPS, DEGREE = 9, 1200, 6, 3
-"""Rounds while the machine warms, s from one to the next, steps along the longest line of the campaign, and a field's
-degree: enough for a fit of some seconds."""
 
+# Growth of the struts by humidity, m/m; the humidity before and in the end; and its time constant, s
 DAMP, DRY_TO_DAMP, DAMP_TAU = (1e-4, 4e-4), (0.45, 0.65), 2400.0
-"""Growth of the struts by humidity, m/m; the humidity before and in the end; and its time constant, s."""
 
+# Bars: RMS of the pulls, and share of them that is within so many standard deviations
 LARGEST_PULL, FAR, LEAST_WITHIN = 1.3, 2.6, 0.95
-"""Bars: RMS of the pulls, and share of them that is within so many standard deviations."""
 
 
 @dataclass(frozen=True)

@@ -33,17 +33,14 @@ INCH = 0.0254
 BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])
 LEAD = 0.01
 
+# Machine B of the calibration bars
 BOUNDS = ImperfectionBounds(joint=1e-4, strut_offset=1e-4, pitch=1e-4, wave=(4e-6, 4e-6), backlash=(3e-6, 5e-6))
-"""Machine B of the calibration bars."""
 
-SETTINGS = FitSettings(lead=LEAD, field_degree=3)
-"""Everything that there is, the field kept small."""
+SETTINGS = FitSettings(lead=LEAD, field_degree=3)  # Everything that there is, the field kept small
 
-FEW = replace(SETTINGS, blocks=("pitch", "wave", "backlash"))
-"""The blocks that machine B has."""
+FEW = replace(SETTINGS, blocks=("pitch", "wave", "backlash"))  # The blocks that machine B has
 
-NEUTRAL = (20.0,) * 8
-"""Temperatures that change nothing, °C."""
+NEUTRAL = (20.0,) * 8  # Temperatures that change nothing, °C
 
 
 @cache
@@ -103,15 +100,6 @@ def tool_error(
 
     Displacement of the platform's origin (m) and rotation (rad) at random level poses in the box, passed
     there and back in a random direction; shift and rotation of the datum aligned with Kabsch's method.
-
-    Parameters
-    ----------
-    truth : RealMachine
-        The machine.
-    model : MachineModel or None
-        What the compensator believes; None commands nominal lengths.
-    box : ndarray, shape (2, 3)
-        Corners of the box, m in ``base``.
     """
     rng = np.random.default_rng(seed)
     wanted = np.tile(rng.uniform(*box, (count, 3)), (2, 1))

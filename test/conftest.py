@@ -18,8 +18,8 @@ pytest_plugins = ("hexapod_comp.testing",)  # where the package is not installed
 
 OWN_NODE_FIXTURES = {"ros_context", "module_context", "client"}
 
+# Folders of tests that wait for nodes more than they compute, those of the longest tests first
 WAITING = ("test/loop/", "test/benchmarks/", "test/linuxcnc/", "test/ros/")
-"""Folders of tests that wait for nodes more than they compute, those of the longest tests first."""
 
 
 def pytest_configure() -> None:

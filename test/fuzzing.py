@@ -24,18 +24,17 @@ from hypothesis import strategies as st
 
 from hexapod_comp.errors import HexapodError
 
+# Cases of a nightly run, shared out among the tests; 0 for the bounded run
 NIGHTLY = int(os.environ.get("HEXAPOD_FUZZ_CASES", "0"))
-"""Cases of a nightly run, shared out among the tests; 0 for the bounded run."""
 
-COUNTS: Counter[str] = Counter()
-"""Cases run, and cases accepted (``… accepted``), by test."""
+COUNTS: Counter[str] = Counter()  # Cases run, and cases accepted (``… accepted``), by test
 
 if "HEXAPOD_FUZZ_COUNTS" in os.environ:
     KEPT = Path(os.environ["HEXAPOD_FUZZ_COUNTS"], f"{os.getpid()}.json")
     atexit.register(lambda: KEPT.write_text(json.dumps(COUNTS)))
 
+# Characters that a complaint may have: what is wrong must be readable, whatever stands in the file
 LONGEST_MESSAGE = 2500
-"""Characters that a complaint may have: what is wrong must be readable, whatever stands in the file."""
 
 
 def cases(bounded: int, share: float) -> settings:
@@ -51,6 +50,7 @@ def cases(bounded: int, share: float) -> settings:
     )
 
 
+# Numbers, and what looks like one to somebody
 NASTY_NUMBERS = (
     *("0", "-0", "1", "-1", "7", "400", "1e308", "-1e308", "1e-308", "5e-324", "1e400", "-1e400", "1e-400", "1.0e+308"),
     *("nan", ".nan", "inf", "-inf", ".inf", "-.INF", "1e3", "1.0e+3", "1.5E-3", ".5", "5.", "+3", "--3", "1-", "1e"),
@@ -58,8 +58,8 @@ NASTY_NUMBERS = (
     *("400mm", "'400'", '"400"', "true", "no", "~", "null", "", "[1]", "{a: 1}", "!!float 5", "2026-01-31"),
     *("9" * 20, "1" * 400, "0." + "3" * 60, "179769313486231580793e289", "4.35", "1.0000000000000002", "0.1"),
 )
-"""Numbers, and what looks like one to somebody."""
 
+# Pieces of text that some reader takes for something special
 NASTY_TEXTS = (
     *("\0", "\ufeff", "\r", "\r\n", "\n", "\t", " ", "\x85", "\u2028", "\x1b[2J", "é", "\u202e", "\ud800", "\x7f"),
     *(",", ";", '"', "'", '"\n"', ":", ": ", "#", " # ", "-", "- ", "---\n", "...\n", "?", "? ", "|", ">", "%", "@"),
@@ -68,7 +68,6 @@ NASTY_TEXTS = (
     *("EOF::", "Data:\r\n", "HEADER::\n", "RUNS::\n", "Targets :", "Sample no: ", "[JOINT_0]\n", "setp ", "# set "),
     *("_mm", "_um", "_in", "_deg", "forward", "backward", "linear", "roll", "mm", "um", "rad", "x", "both", "home"),
 )
-"""Pieces of text that some reader takes for something special."""
 
 UNIT_NAMES = ("_m", "_mm", "_um", "_in", "_rad", "_mrad", "_urad", "_deg", "_arcsec", "_ppm", "_percent", "_s", "")
 
@@ -139,6 +138,7 @@ def _swap(lines: list[str], i: int, j: int) -> None:
     lines[i], lines[j] = lines[j], lines[i]
 
 
+# What whole files suffer on their way: encodings, line ends, spreadsheets
 WHOLE: tuple[Callable[[bytes], bytes], ...] = (
     lambda data: b"\xef\xbb\xbf" + data,
     lambda data: data.decode("latin-1").encode("utf-16"),
@@ -155,7 +155,6 @@ WHOLE: tuple[Callable[[bytes], bytes], ...] = (
     lambda data: data.replace(b",", b";"),
     lambda data: data.upper(),
 )
-"""What whole files suffer on their way: encodings, line ends, spreadsheets."""
 
 EDITS: tuple[Callable[[str, int, int, str], str], ...] = (
     *(_number, _number, _number, _unit, _overwrite, _overwrite, _byte, _cut, _copy),
@@ -163,8 +162,8 @@ EDITS: tuple[Callable[[str, int, int, str], str], ...] = (
 )
 
 places = st.integers(0, 1 << 14)
+# What is done to a file: (which edit, place, span, token) each; see :func:`mutated`
 edits = st.lists(st.tuples(st.integers(0, len(EDITS)), places, places, tokens), min_size=1, max_size=3)
-"""What is done to a file: (which edit, place, span, token) each; see :func:`mutated`."""
 
 
 def mutated(data: bytes, changes: list[tuple[int, int, int, str]]) -> bytes:
@@ -184,13 +183,7 @@ class Refused(Exception):
 
 @contextlib.contextmanager
 def reader_of(test: str, *files: Path) -> Iterator[None]:
-    """Count a case, and check a refusal: a HexapodError in words for people; anything else comes through.
-
-    Raises
-    ------
-    Refused
-        Instead of the HexapodError.
-    """
+    """Count a case, and check a refusal: a HexapodError in words for people; anything else comes through."""
     COUNTS[test] += 1
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # overflows on numbers that are then refused; wrong results are looked for
@@ -217,6 +210,7 @@ def finite(*arrays: Any) -> None:
 
 # Reading files once more: numbers by Decimal, units from their definitions.
 
+# Factor to SI, and the SI unit, of each unit; those whose factor is no short decimal stay
 UNITS = {
     **{unit: (factor, "m") for unit, factor in (("m", "1"), ("mm", "0.001"), ("um", "0.000001"), ("in", "0.0254"))},
     **{unit: (factor, "rad") for unit, factor in (("rad", "1"), ("mrad", "0.001"), ("urad", "0.000001"))},
@@ -224,10 +218,9 @@ UNITS = {
     **{unit: (factor, "m_s") for unit, factor in (("m_s", "1"), ("mm_s", "0.001"))},
     **{unit: ("1", unit) for unit in ("deg", "arcsec", "ppm", "percent", "ppm_per_K", "degC", "m_min")},
 }
-"""Factor to SI, and the SI unit, of each unit; those whose factor is no short decimal stay."""
 
+# What everybody reads as the same number
 PLAIN = re.compile(r"[-+]?(?:(?:0|[1-9]\d*)(?:\.\d*)?|\.\d+|0+\.\d*)(?:[eE][-+]?\d+)?", re.ASCII)
-"""What everybody reads as the same number."""
 
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 

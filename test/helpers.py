@@ -22,13 +22,13 @@ from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.pose import Pose
 
 ALL_TESTS = bool(os.environ.get("ALL_TESTS"))
+# Decorator for tests of seconds, and machines beyond two, that only `make test-all` runs
 long_test = pytest.mark.skipif(not ALL_TESTS, reason="make test-all runs it (ALL_TESTS=1)")
-"""Decorator for tests of seconds, and machines beyond two, that only `make test-all` runs."""
 
 DATA = Path(__file__).parent / "data"
 
+# What one unit of a table column, named after its last underscore, is in SI
 FACTORS = {"mm": 1e-3, "deg": np.pi / 180.0}
-"""What one unit of a table column, named after its last underscore, is in SI."""
 
 
 def read_table(name: str) -> dict[str, np.ndarray]:
@@ -125,22 +125,7 @@ def segment_distance(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray)
 
 
 def central_difference(function: Callable[[np.ndarray], np.ndarray], at: np.ndarray, step: float = 1e-5) -> np.ndarray:
-    """Return the derivative of `function` at a point by central differences.
-
-    Parameters
-    ----------
-    function : callable
-        (n,) → (m,).
-    at : ndarray, shape (n,)
-        Where.
-    step : float
-        Half the distance of the two evaluations. The error is about step²·f‴/6 + 1e-16·f/step: with
-        lengths and radii below a metre and 1e-5, a few 1e-11.
-
-    Returns
-    -------
-    ndarray, shape (m, n)
-    """
+    """Return the derivative of `function` at a point by central differences."""
     columns = [(function(at + h) - function(at - h)) / (2.0 * step) for h in step * np.eye(len(at))]
     return np.stack(columns, axis=1)
 

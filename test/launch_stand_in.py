@@ -14,13 +14,7 @@ LAUNCH_FILE = Path(__file__).resolve().parents[1] / "launch" / "machine.launch.p
 
 
 class LaunchFile:
-    """The shipped launch file, run with stand-ins for launch and launch_ros.
-
-    Attributes
-    ----------
-    defaults : dict of str to str
-        Its arguments, with what they are unless given.
-    """
+    """The shipped launch file, run with stand-ins for launch and launch_ros."""
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         parts: dict[str, dict[str, Any]] = {

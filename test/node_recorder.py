@@ -17,14 +17,12 @@ from std_msgs.msg import String
 
 TYPES = {"PoseStamped": PoseStamped, "JointState": JointState, "String": String}
 
-BEST_EFFORT = ("tool_pose_estimate", "strut_states", "tool_pose_true")
-"""Topics that are offered so."""
+BEST_EFFORT = ("tool_pose_estimate", "strut_states", "tool_pose_true")  # Topics that are offered so
 
-OF_THE_DRIVE = ("strut_states", "tool_pose_true")
-"""Topics that a compensator alone does not have."""
+OF_THE_DRIVE = ("strut_states", "tool_pose_true")  # Topics that a compensator alone does not have
 
+# The least that ``ros2 bag record`` has ever given a topic; newer ones keep all where the depth is not known
 RECORDER_DEPTH = 10
-"""The least that ``ros2 bag record`` has ever given a topic; newer ones keep all where the depth is not known."""
 
 
 class Recorder:

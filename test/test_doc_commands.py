@@ -56,8 +56,8 @@ OTHERS |= {
 }
 """Programs of others, and the shell's own words: of these a page's reader sees at once when one is wrong."""
 
+# Topics that our nodes do not have
 OURS_ELSEWHERE = {"/compensation/status": "the controller of export --ros2-control"}
-"""Topics that our nodes do not have."""
 
 
 class Command(NamedTuple):
@@ -292,8 +292,8 @@ def prepare(page: Path, folder: Path) -> None:
             (folder / name[1]).write_text(block[3], encoding="utf-8")
 
 
+# Verbs whose sessions cannot be had by what the page shows before them
 IN_WORDS = {"verify": "of a machine that has changed, which its page describes in words"}
-"""Verbs whose sessions cannot be had by what the page shows before them."""
 
 
 def run_session(page: Path, folder: Path) -> list[str]:

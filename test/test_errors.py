@@ -16,8 +16,8 @@ import pytest
 from hexapod_comp.errors import HexapodError
 
 PACKAGE = Path(__file__).resolve().parents[1] / "hexapod_comp"
+# Arguments that are no text
 GIVEN = {"path": Path("mine.yaml"), "value": 0.25, "limit": 0.2, "strut": 3, "status": 1}
-"""Arguments that are no text."""
 
 
 def classes() -> list[type[HexapodError]]:

@@ -23,8 +23,7 @@ from hexapod_comp.pose import (
 turns = st.floats(-np.pi, np.pi)
 tilts = st.floats(-1.5, 1.5)
 metres = st.floats(-10.0, 10.0)
-EXACT = 4e-16
-"""A rotation matrix's elements are sums of two products of numbers up to 1."""
+EXACT = 4e-16  # A rotation matrix's elements are sums of two products of numbers up to 1
 
 
 def printed_matrix(alpha, beta, gamma):

@@ -48,14 +48,11 @@ from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.virtual.instruments import measure
 
-NOISE = 0.5 * UM
-"""Standard deviation of the laser."""
+NOISE = 0.5 * UM  # Standard deviation of the laser
 
-STEP = 0.1 * UM
-"""Motor step of the strut drive, its default."""
+STEP = 0.1 * UM  # Motor step of the strut drive, its default
 
-WRITTEN = 1e-11
-"""m; a picometre is the last digit of CSV files, and rounding takes some of them."""
+WRITTEN = 1e-11  # m; a picometre is the last digit of CSV files, and rounding takes some of them
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from hexapod_comp.calibration.sensitivity import predict
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.measurements.readings import FileLine
 
+# What a stranger might call a run
 HOSTILE = "</td><script>alert(1)</script><img src=https://example.org/x onerror=y>\u202e\n"
-"""What a stranger might call a run."""
 
 
 class Reader(HTMLParser):

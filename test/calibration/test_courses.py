@@ -15,13 +15,12 @@ from hexapod_comp.calibration.thermal import with_courses
 from hexapod_comp.measurements.campaign import template
 from hexapod_comp.measurements.readings import MeasurementSet
 
-NOISE = 0.0065
-"""What the compensator's filter of 30 s leaves of 0.05 K, K."""
+NOISE = 0.0065  # What the compensator's filter of 30 s leaves of 0.05 K, K
 
 PLAN = template(small.campaign("1-D"), small.paper())
 COUNT = len(PLAN.stations)
+# Fifty stations every ten minutes, one in four seconds
 BURSTS = 600.0 * (np.arange(COUNT) // 50) + 4.0 * (np.arange(COUNT) % 50)
-"""Fifty stations every ten minutes, one in four seconds."""
 
 
 def warmed(times: np.ndarray, wait: float = 0.0) -> np.ndarray:

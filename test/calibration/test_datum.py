@@ -32,8 +32,7 @@ from hexapod_comp.measurements.readings import KINDS
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.instruments import measure
 
-STILL = 1e-9
-"""m and rad: the bar; a model file keeps a hundredth of a nanometre."""
+STILL = 1e-9  # m and rad: the bar; a model file keeps a hundredth of a nanometre
 
 
 @pytest.fixture(scope="module", params=["framed", "hanging", "inches", "mirror", "left-hand"])

@@ -405,8 +405,8 @@ def fitted_clean(bounds: ImperfectionBounds) -> ModelFit:
     return fit_model(of_bounds(bounds), FEW)
 
 
+# Machine A: so good that Gauss–Newton settles in two steps, before any reading has been doubted
 SMALL_ERRORS = replace(small.BOUNDS, joint=1e-5, strut_offset=1e-5, pitch=5e-5)
-"""Machine A: so good that Gauss–Newton settles in two steps, before any reading has been doubted."""
 
 
 @pytest.mark.parametrize(

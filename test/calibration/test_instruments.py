@@ -213,8 +213,7 @@ def test_what_is_wrong_in_a_file_is_named(row: str, complaint: str, tmp_path: Pa
     assert "wrong.csv" in str(refused.value)
 
 
-FRAMES = ((0.5 * MM, 1e-3), (5.0 * MM, 10e-3), (1.0, 0.3))
-"""How far a tracker's frame is off, m and rad."""
+FRAMES = ((0.5 * MM, 1e-3), (5.0 * MM, 10e-3), (1.0, 0.3))  # How far a tracker's frame is off, m and rad
 
 
 def in_frame(m: MeasurementSet, shift: np.ndarray, turn: Rotation) -> MeasurementSet:

@@ -20,8 +20,8 @@ from hexapod_comp.virtual.imperfections import ImperfectionBounds
 pytestmark = pytest.mark.usefixtures("unsuspected")
 
 MM = 1e-3
+# What machine B has, and its waves' harmonics
 FEW = replace(small.SETTINGS, lead=None, blocks=("pitch", "wave", "wave 2", "wave 3", "wave 4", "backlash"))
-"""What machine B has, and its waves' harmonics."""
 
 B = small.BOUNDS
 

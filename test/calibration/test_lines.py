@@ -29,8 +29,7 @@ from hexapod_comp.virtual.instruments import compensated, measure
 INCH = 0.0254
 BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])
 GRID = tuple(np.round(np.linspace(low, high, n), 9) for low, high, n in zip(*BOX, (5, 5, 3), strict=True))
-POWERS = (5, 5, 3)
-"""A third of 17, 17 and 9 points."""
+POWERS = (5, 5, 3)  # A third of 17, 17 and 9 points
 
 QUIET = Campaign(BOX, 4 * INCH, INCH, instrument="1-D", diagonals=0, noise=(0.0,) * 7, beam_slope=1e-3)
 LASER = replace(QUIET, noise=(1e-6,) * 7)

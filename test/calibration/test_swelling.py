@@ -26,8 +26,7 @@ from hexapod_comp.measurements.readings import KINDS, MeasurementSet
 from hexapod_comp.measurements.tidy import read_tidy, write_measurements
 from hexapod_comp.virtual.instruments import measure
 
-MOISTURE = 3e-4
-"""3 ppm per %, m/m."""
+MOISTURE = 3e-4  # 3 ppm per %, m/m
 
 SETTINGS = FitSettings(blocks=("moisture",), strut_moisture=1e-4)
 

@@ -9,8 +9,7 @@ from strategies import paper_geometry, skewed_geometry
 
 from hexapod_comp.core import batch, ffi, lib
 
-JUDGED = 0.3, 0.0, np.inf
-"""Characteristic length, any assembly mode, any condition number."""
+JUDGED = 0.3, 0.0, np.inf  # Characteristic length, any assembly mode, any condition number
 
 
 def drawn_poses(geometry, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

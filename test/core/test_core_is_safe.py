@@ -29,13 +29,11 @@ from hexapod_comp.machine.kinematics import (
 from hexapod_comp.pose import Pose
 
 MACHINES = [paper_geometry(), general_machine(), three_two_one_machine()]
-fewer = settings(fixed, max_examples=40)
-"""For those that mostly end in the slow search for the closest pose."""
+fewer = settings(fixed, max_examples=40)  # For those that mostly end in the slow search for the closest pose
 
 machines = st.sampled_from(MACHINES)
 any_float = st.floats(allow_nan=True, allow_infinity=True)
-far = st.floats(-2.0, 2.0) | st.floats(-1e6, 1e6)
-"""Coordinates of poses, m."""
+far = st.floats(-2.0, 2.0) | st.floats(-1e6, 1e6)  # Coordinates of poses, m
 
 quaternions = st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: math.hypot(*q) > 1e-3)
 

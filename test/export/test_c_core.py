@@ -24,8 +24,8 @@ from hexapod_comp.machine.model import MachineModel, core_model
 
 COMPILER = shutil.which("gcc")
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic", "-O1"]
+# Exactly rounded, whoever made the C library: with others the answers' bits would depend on it
 MATHEMATICS = ["sqrt", "floor", "fmin", "fmax", "rint", "fmod", "frexp", "ldexp"]
-"""Exactly rounded, whoever made the C library: with others the answers' bits would depend on it."""
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no gcc here")
 

@@ -51,6 +51,9 @@ MACHINE_FILE = PAPER_FILE.with_name("paper_machine.yaml")
 PAPER_BOX = np.array([[-0.2032, -0.2032, 0.350], [0.2032, 0.2032, 0.5532]])
 SMALL_BOX = np.array([[-0.04, -0.06, 0.38], [0.06, 0.03, 0.46]])
 
+# LinuxCNC 2.9.0~pre1 (Debian 12), its genhexkins and motmod, given the files of ``cardanic_machine`` with the
+# tables of ``hand_made_table``: XYZ (mm) and ABC (degrees) reached in G-code, joint.N.pos-cmd (mm), and motor-
+# pos-cmd − motor-offset − pos-cmd (mm), come to along +X+Y+Z and along −X−Y−Z
 LINUXCNC = (
     (
         (-10.6, 19.0, 407.3, 4.6, 5.9, -1.7),
@@ -65,9 +68,6 @@ LINUXCNC = (
         (0.06000000, 0.01356625, 0.04458034, -0.02753744, 0.04116945, 0.04155772),
     ),
 )
-"""LinuxCNC 2.9.0~pre1 (Debian 12), its genhexkins and motmod, given the files of ``cardanic_machine`` with the
-tables of ``hand_made_table``: XYZ (mm) and ABC (degrees) reached in G-code, joint.N.pos-cmd (mm), and
-motor-pos-cmd − motor-offset − pos-cmd (mm), come to along +X+Y+Z and along −X−Y−Z."""
 
 
 def cardanic_machine(lead: float = 0.008) -> HexapodGeometry:

@@ -26,8 +26,7 @@ from hexapod_comp.virtual.physics import find_mujoco
 
 SHIPPED = ("paper", "example_6_6", "jugglebot", "positioning_unit")
 
-SAME = 1e-9
-"""m; angles of a URDF are rounded to doubles, on machines of half a metre 1e-16 m."""
+SAME = 1e-9  # m; angles of a URDF are rounded to doubles, on machines of half a metre 1e-16 m
 
 
 def poses(geometry: HexapodGeometry, count: int = 20, share: float = 0.2) -> list[Pose]:

@@ -32,13 +32,11 @@ HEADERS = (
 STRICT = ("-Wall", "-Wextra", "-Wconversion", "-Wno-sign-conversion", "-Werror")
 SHIPPED = ("paper.yaml", "example_6_6.yaml", "positioning_unit.yaml", "jugglebot.yaml")
 
-SAME = 1e-9
-"""What a command may be off its closed form, m: the core's iterations end below 1e-12."""
+SAME = 1e-9  # What a command may be off its closed form, m: the core's iterations end below 1e-12
 
 PERIOD = 0.004
 
-ERRORS = Errors.drawn(machines()["paper"], 3)
-"""Of the paper's machine."""
+ERRORS = Errors.drawn(machines()["paper"], 3)  # Of the paper's machine
 
 
 def run(*words: str | Path) -> None:

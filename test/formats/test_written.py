@@ -156,8 +156,8 @@ def test_no_name_is_a_formula(name, tmp_path):
     assert shown.count("$") == name.count("$")
 
 
+# Where an output goes that nobody takes, and the exit code then
 ENDS = (("> /dev/full", 2), ("| true", 141), (">&-", 0))
-"""Where an output goes that nobody takes, and the exit code then."""
 
 
 def run(command: str, **options: object) -> subprocess.CompletedProcess[str]:

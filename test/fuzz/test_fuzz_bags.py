@@ -17,8 +17,8 @@ pytest.importorskip("rosbags")
 from replay_helpers import RecordedMachine, write_bag
 from test_fuzz_commands import command
 
+# Bits that are turned: (place, bit)
 flips = st.lists(st.tuples(st.integers(0, 1 << 20), st.integers(0, 7)), min_size=1, max_size=3)
-"""Bits that are turned: (place, bit)."""
 
 
 @pytest.fixture(scope="module")

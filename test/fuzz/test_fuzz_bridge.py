@@ -36,8 +36,7 @@ MM = 1e-3
 LIMIT, RAMP = 500e-6, 10e-3
 ROUNDING = 1e-15
 
-NOW = 1e-9
-"""Stamp of a message that answers a command of just now, s from now; 0 would be none."""
+NOW = 1e-9  # Stamp of a message that answers a command of just now, s from now; 0 would be none
 
 corrections = st.one_of(
     st.lists(st.floats(-1.2 * LIMIT, 1.2 * LIMIT), min_size=6, max_size=6),

@@ -69,6 +69,7 @@ def command(*arguments: str) -> tuple[int, str, str]:
     return code, out.getvalue(), said
 
 
+# Verb, the file that is mutated, and the rest of the command; file names stand for files of the folder
 COMMANDS = (
     ("ik", "poses.csv", ()),
     ("ik", "model.yaml", ("poses.csv", "--model", "model.yaml")),
@@ -88,7 +89,6 @@ COMMANDS = (
     ("export", "model.yaml", ("--model", "model.yaml", "--table", "t.csv", "--box=-9000,-9000,0,9000,9000,1")),
     ("simulate", "model.yaml", ("--campaign", "campaign.yaml", "--truth", "model.yaml", "--out", "m.csv")),
 )
-"""Verb, the file that is mutated, and the rest of the command; file names stand for files of the folder."""
 
 
 @pytest.mark.parametrize("number", range(len(COMMANDS)))
@@ -152,6 +152,7 @@ def lengths_in(data: bytes) -> np.ndarray:
     return np.array([[float(row[f"L{i}_m"]) for i in range(1, 7)] for row in rows_of(data)])
 
 
+# Verbs and options that are given nonsense; a file that does not exist keeps the long ones from starting
 OPTIONS = {
     "ik": ("--pose", "--x-mm", "--y-mm", "--z-mm", "--alpha-deg", "--machine", "--model", "--out", "--json"),
     "fk": ("--lengths", "--guess", "--cold", "--all-modes", "--machine", "--model", "--json"),
@@ -167,7 +168,6 @@ OPTIONS = {
     "run": ("--rate-hz", "--machine", "--model", "--truth", "--pictures"),
     "demo": ("--rate-hz", "--machine", "--model", "--truth", "--seed", "--pictures"),
 }
-"""Verbs and options that are given nonsense; a file that does not exist keeps the long ones from starting."""
 
 words = st.one_of(
     st.sampled_from([word for word in (*NASTY_NUMBERS, *NASTY_TEXTS) if "\0" not in word and "\ud800" not in word]),

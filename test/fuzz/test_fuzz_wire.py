@@ -30,20 +30,18 @@ from hexapod_comp.loop.processes import NodeProcess
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.ros.messages import pose_message
 
-MESSAGES = max(600, NIGHTLY)
-"""To each of the nodes."""
+MESSAGES = max(600, NIGHTLY)  # To each of the nodes
 
-HUGE = 10_000_000
-"""Byte; one message in a hundred."""
+HUGE = 10_000_000  # Byte; one message in a hundred
 
+# Allowed growth during the second flood, MB: middleware keeps one longest message (10 MB) or two more or fewer,
+# and log and diagnostics have their share. Some six of them arrive: a node that kept them would grow by 60 MB.
 GROWTH = 35
-"""Allowed growth during the second flood, MB: middleware keeps one longest message (10 MB) or two more or fewer, and
-log and diagnostics have their share. Some six of them arrive: a node that kept them would grow by 60 MB."""
 
+# No node may ever have more than this, MB, or than it began with and six copies of the longest message: the
+# middleware's, rclpy's, the one that is looked at, and others that wait; 55 is the most in 200,000 messages. A
+# node begins with some 80.
 PEAK, COPIES = 200, 60
-"""No node may ever have more than this, MB, or than it began with and six copies of the longest message: the
-middleware's, rclpy's, the one that is looked at, and others that wait; 55 is the most in 200,000 messages. A node
-begins with some 80."""
 
 TOPICS = {
     "compensator": ("tool_pose_command", "strut_states", "temperatures", "humidity"),

@@ -29,11 +29,10 @@ from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import Structure
 from hexapod_comp.pose import Pose
 
-CLOSED = 2e-15
-"""m; the loops close to a few roundings of a 1 m strut."""
+CLOSED = 2e-15  # m; the loops close to a few roundings of a 1 m strut
 
+# m and rad; a pose of condition number up to 1e4 comes back to 1e4 roundings of the lengths, with margin
 REGULAR = 1e-10
-"""m and rad; a pose of condition number up to 1e4 comes back to 1e4 roundings of the lengths, with margin."""
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,7 @@ from hexapod_comp.machine.geometry import MOST, HexapodGeometry, load_geometry
 from hexapod_comp.pose import Pose
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "config" / "example_6_6.yaml"
-ROUNDING = 1e-14
-"""m; a few products of numbers below one."""
+ROUNDING = 1e-14  # m; a few products of numbers below one
 
 
 @pytest.mark.parametrize("name", ["framed", "hanging", "inches", "mirror"])

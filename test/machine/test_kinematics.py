@@ -47,8 +47,8 @@ PAPER = paper_geometry()
 IDEAL = Structure.of(PAPER)
 HOME = PAPER.home
 MACHINES = {"paper": PAPER, "general": general_machine(), "3-2-1": three_two_one_machine()}
+# ±10 µm on every coordinate of every joint, the tolerance that 000 works with
 DEVIATION = np.random.default_rng(10).uniform(-10e-6, 10e-6, (2, 6, 3))
-"""±10 µm on every coordinate of every joint, the tolerance that 000 works with."""
 
 REAL = IDEAL.moved(*DEVIATION)
 POSES = 100_000

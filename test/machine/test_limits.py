@@ -262,8 +262,7 @@ def test_compensated_steps_are_checked_too() -> None:
 
 TOOL = Pose.from_angles([0.01, -0.02, 0.08], np.deg2rad([20.0, -10.0, 40.0]))
 WORK = Pose.from_angles([0.1, 0.05, 0.2], np.deg2rad([3.0, 5.0, -70.0]))
-OVER = np.diag([1.0, -1.0, -1.0])
-"""Turns a machine upside down."""
+OVER = np.diag([1.0, -1.0, -1.0])  # Turns a machine upside down
 
 
 def tight(geometry: HexapodGeometry, clearance: float, **frames: object) -> HexapodGeometry:

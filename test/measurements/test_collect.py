@@ -24,11 +24,9 @@ from hexapod_comp.measurements.collect import Collected, Observation, SetUpError
 from hexapod_comp.measurements.tidy import read_tidy
 from hexapod_comp.pose import Pose
 
-SHIFT = np.array([30e-6, -20e-6, 10e-6])
-"""How far the stand-in's tool is off along x, y, z of the base, m."""
+SHIFT = np.array([30e-6, -20e-6, 10e-6])  # How far the stand-in's tool is off along x, y, z of the base, m
 
-TURN = np.array([40e-6, 10e-6, -25e-6])
-"""And turned, rad."""
+TURN = np.array([40e-6, 10e-6, -25e-6])  # And turned, rad
 
 
 def wrong(commanded: Pose) -> Pose:

@@ -16,11 +16,9 @@ from hexapod_comp.measurements.air import VACUUM_WAVELENGTH, Air, ciddor_index, 
 
 STANDARD_AIR = Air(20.0, 101_325.0, 0.5)
 
-AT_633 = 633e-9
-"""The wavelength of the papers' tables, m."""
+AT_633 = 633e-9  # The wavelength of the papers' tables, m
 
-PRINTED = 0.05
-"""Half a unit of the last digit of (n − 1)·10⁸ in Ciddor's tables."""
+PRINTED = 0.05  # Half a unit of the last digit of (n − 1)·10⁸ in Ciddor's tables
 
 
 def refractivity(air: Air, wavelength: float = AT_633, co2_ppm: float = 450.0) -> np.ndarray:

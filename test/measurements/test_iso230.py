@@ -15,8 +15,7 @@ from strategies import fixed, seeds
 from hexapod_comp.errors import ModelError
 from hexapod_comp.measurements.iso230 import PositioningTest, evaluate, report
 
-TARGETS = np.array([0.004, 0.103, 0.196, 0.305, 0.398, 0.501])
-"""Six targets, m, unevenly spaced."""
+TARGETS = np.array([0.004, 0.103, 0.196, 0.305, 0.398, 0.501])  # Six targets, m, unevenly spaced
 
 # Five readings of which two lie c below a mean, one on it, two c above it: their mean is that mean, and
 # s² = (c² + c² + 0 + c² + c²)/(5 − 1) = c², so s = c. Which cycle has which differs from target to target.
@@ -48,8 +47,7 @@ DOWN = np.array(
 )
 MICROMETRE = 1e-6
 
-EXACT = {"abs": 1e-18}
-"""The numbers are exact in decimal; what is left is rounding of 10 µm."""
+EXACT = {"abs": 1e-18}  # The numbers are exact in decimal; what is left is rounding of 10 µm
 
 
 @pytest.fixture(scope="module")

@@ -29,8 +29,7 @@ from hexapod_comp.virtual.named import find_model
 
 QUIET = LiveFlaws(length_noise=0.0, angle_noise=0.0, beam_slope=0.0, centre_off=0.0)
 
-STANDS = Pose.from_angles([2.0, -1.0, 0.5], [0.3, 1.0, 2.5])
-"""Where a tracker stands, in base, m and rad."""
+STANDS = Pose.from_angles([2.0, -1.0, 0.5], [0.3, 1.0, 2.5])  # Where a tracker stands, in base, m and rad
 
 LARGER = ["inches", "hanging", *(pytest.param(name, marks=long_test) for name in ("paper", "example_6_6"))]
 

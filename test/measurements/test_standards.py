@@ -23,14 +23,13 @@ from hexapod_comp.measurements.runs import assemble
 from hexapod_comp.pose import Pose
 
 RADIUS = 0.1
-EIGHTHS = np.radians(45.0 * np.arange(8))
-"""Where a circle is read: 0°, 45°, …, 315°."""
+EIGHTHS = np.radians(45.0 * np.arange(8))  # Where a circle is read: 0°, 45°, …, 315°
 
+# A circle in which one axis goes 2 µm too far on both sides, the other as much too little
 OVAL = np.array([2, 0, -2, 0, 2, 0, -2, 0]) * 1e-6
-"""A circle in which one axis goes 2 µm too far on both sides, the other as much too little."""
 
+# Shifting a centre by some µm changes radii by (µm)²/(0.1 m), about 0.01 nm, beside what the pencil has
 NEAR = {"abs": 1e-10}
-"""Shifting a centre by some µm changes radii by (µm)²/(0.1 m), about 0.01 nm, beside what the pencil has."""
 
 
 def both_ways(ccw: np.ndarray, cw: np.ndarray, **options: bool) -> CircularTest:
@@ -132,11 +131,11 @@ def measured(folder: Path, rows: str) -> Path:
     return path
 
 
+# Four body diagonals with E of 2·1 + 4, 2·2 + 3, 2·3 + 2 and 2·4 + 1 µm, and B of 4, 3, 2 and 1
 DIAGONALS = "".join(
     line(f"d{n}", (-50.0, y, z), (50.0, -y, 900.0 - z), n, 5 - n)
     for n, (y, z) in enumerate([(-50, 400), (50, 400), (-50, 500), (50, 500)], start=1)
 )
-"""Four body diagonals with E of 2·1 + 4, 2·2 + 3, 2·3 + 2 and 2·4 + 1 µm, and B of 4, 3, 2 and 1."""
 
 
 def test_each_standard_under_its_name(tmp_path: Path) -> None:

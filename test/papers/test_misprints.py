@@ -32,6 +32,7 @@ from examples.papers.misprints import (
 ROOT = Path(__file__).resolve().parents[2]
 CASES = cases()
 ROUNDING = 1e-11  # mm or degrees: some hundred roundings of squares of 600 mm, divided by lengths of 300 mm
+# How section 21 says it
 IN_THE_TEXT = {
     "Y_p2": "off by 172 mm",
     "Y_T3": "off by 595 mm",
@@ -42,7 +43,6 @@ IN_THE_TEXT = {
     "Z′_T2": "off by 93 mm",
     "α′": "off by 4.1°",
 }
-"""How section 21 says it."""
 
 
 @pytest.fixture(scope="module")
@@ -114,8 +114,7 @@ def test_heights_of_the_base_joints_are_lost_on_the_way_to_the_real_structure(se
 
 # The angles of Tables 3 and 5.
 
-TABLE_3 = {5.0: ("4.99998",), 10.0: ("9.99937", "9.99938")}
-"""As printed, by the right angle."""
+TABLE_3 = {5.0: ("4.99998",), 10.0: ("9.99937", "9.99938")}  # As printed, by the right angle
 
 
 def test_tanh_of_one_rotation_is_a_closed_form():

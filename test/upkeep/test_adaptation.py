@@ -34,11 +34,10 @@ from hexapod_comp.upkeep.loop import Adaptation, State, Task, begun_with, next_s
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
 from hexapod_comp.virtual.watched import Instrument, VirtualMachine
 
+# What is wrong with the machine, and all that is fitted: a fit takes half a second then
 BLOCKS = ("pitch", "backlash")
-"""What is wrong with the machine, and all that is fitted: a fit takes half a second then."""
 
-PROMISE = 1.0
-"""The drawn machines err by some ten µm, datum aligned; a fit to a hundred stops leaves a tenth of one."""
+PROMISE = 1.0  # The drawn machines err by some ten µm, datum aligned; a fit to a hundred stops leaves a tenth of one
 
 
 def drawn(geometry: HexapodGeometry, seed: int) -> Any:

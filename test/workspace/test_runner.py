@@ -19,8 +19,7 @@ from hexapod_comp.workspace.effects import EXACT, LINEAR, Extremes, extremes
 from hexapod_comp.workspace.reach import Reach, orientations, reach
 from hexapod_comp.workspace.study import survey
 
-PART = 17
-"""Poses per part in these tests: each orientation has some parts, and a last one that is not full."""
+PART = 17  # Poses per part in these tests: each orientation has some parts, and a last one that is not full
 
 
 @pytest.fixture(scope="module")
