@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,12 +11,13 @@ from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.workspace.budget import load_budget
 from hexapod_comp.workspace.effects import effects
 from hexapod_comp.workspace.pictures import shells_figure
-from hexapod_comp.workspace.ranking import PAPER_TABLE, QUANTITIES, RankingRow, paper_row
+from hexapod_comp.workspace.ranking import FACTORS, FIGURES, RankingRow
 from hexapod_comp.workspace.reach import orientations, reach, reaches
 from hexapod_comp.workspace.shells import TRANSLATION, Layer, shell
-from hexapod_comp.workspace.study import LAYERS, RINGS, SECTORS, Study, classify, compared
+from hexapod_comp.workspace.study import LAYERS, RINGS, SECTORS, Study, classify
 
 from .comparing import MET, MISSED, OPEN, SHOWN, Column, Exhibit, NumberTable, Paper, Statement, judged, within
+from .iteration import compared
 
 MACHINE, BUDGET = "positioning_unit", "error_budget"
 """Shipped files: a unit of the kind, and the sizes of its errors as the paper states them."""
@@ -34,7 +36,22 @@ COLUMNS = (
     Column("rot. max", "m°", "m°", 1.0, 2),
     Column("rot. min", "m°", "m°", 1.0, 2),
 )
-FACTORS = np.array([1e6, 1e6, 180e3 / np.pi, 180e3 / np.pi])
+
+
+class PaperRow(NamedTuple):
+    """A row of Table 1, as printed; zeros where they print "≈ 0"."""
+
+    title: str  # of the row here; they print "quantization"
+    size: float  # the error's size in the text, µm
+    figures: tuple[float, ...]  # translation max, min, µm; rotation max, min, m°
+
+
+TABLE_1 = (
+    PaperRow("screw pitch", 20.0, (34.4, 22.4, 15.41, 10.71)),
+    PaperRow("base-/platform joint (x/y)", 10.0, (13.68, 0.0, 6.16, 0.0)),
+    PaperRow("base-/platform joint (z)", 10.0, (11.2, 11.18, 5.36, 3.84)),
+    PaperRow("quantisation", 7.0, (10.85, 7.84, 4.39, 3.81)),
+)
 
 
 def study(cells: int = 30, progress: Callable[[int], object] = lambda poses: None) -> Study:
@@ -57,10 +74,9 @@ def paper(cells: int = 30) -> Paper:
 
 def ranking(case: Study) -> Exhibit:
     """Return Table 1 beside the unit's ranking, and what holds on any machine."""
-    rows = {str(row.title): row for row in PAPER_TABLE}
-    computed = {printed.title: row for row in case.rows if (printed := paper_row(row.title)) is not None}
-    names = tuple(rows)
-    digits = np.array([rows[name].figures * FACTORS for name in names])
+    computed = {row.title: row for row in case.rows}
+    names = tuple(row.title for row in TABLE_1)
+    digits = np.array([row.figures for row in TABLE_1])
     cells = tuple(tuple(f"{value:.2f}" if value else "≈ 0" for value in row) for row in digits)
     figures = np.array([computed[name].figures() * FACTORS for name in names])
     zero = digits == 0.0
@@ -70,13 +86,13 @@ def ranking(case: Study) -> Exhibit:
         "printed, and sixteen numbers do not fix it: only ≈ 0 can be met.",
         *(COLUMNS, names, cells, figures, judged(zero & (figures < 0.005), OPEN)),
     )
-    statements = (_order(rows, computed), *_scaling(computed))
+    statements = (_order({name: computed[name] for name in names}), *_scaling(computed))
     return Exhibit("Table 1: the ranking", f"{case.extremes.poses} poses.", (table,), statements)
 
 
-def _order(rows: dict, computed: dict[str, RankingRow]) -> Statement:
-    """Compare the order of the rows."""
-    here = sorted(computed, key=lambda name: -computed[name].translation_max.value)
+def _order(rows: dict[str, RankingRow]) -> Statement:
+    """Compare the printed order of the rows with the computed one."""
+    here = sorted(rows, key=lambda name: -rows[name].translation_max.value)
     first = here[0] == next(iter(rows))
     return Statement(
         "order by largest translation",
@@ -90,9 +106,9 @@ def _order(rows: dict, computed: dict[str, RankingRow]) -> Statement:
 
 def _scaling(computed: dict[str, RankingRow]) -> tuple[Statement, ...]:
     """Say how figures of two errors of the same kind, screw pitch of 20 µm and quantisation of 7 µm, compare."""
-    pitch, step = (next(row for row in PAPER_TABLE if row.title == name) for name in ("screw pitch", "quantization"))
+    pitch, step = TABLE_1[0], TABLE_1[-1]
     statements = []
-    for n, name in enumerate(QUANTITIES):
+    for n, name in enumerate(FIGURES):
         printed = pitch.figures[n] / step.figures[n]
         here = computed[pitch.title].figures()[n] / computed[step.title].figures()[n]
         wanted = pitch.size / step.size

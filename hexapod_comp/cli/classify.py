@@ -21,7 +21,7 @@ from ..machine.model import RealMachine
 from ..machine.model_file import load_model
 from ..workspace import study as studies
 from ..workspace.budget import load_budget
-from ..workspace.ranking import beside, ranking_rows
+from ..workspace.ranking import ranking_rows
 from ..workspace.reach import orientations, reaches
 from ..workspace.shells import TRANSLATION, Layer
 from ..workspace.study import COMBINED_POSES, Study, as_json, mesh_effects, random_poses, report, shells_of
@@ -58,14 +58,13 @@ def classify(args: argparse.Namespace) -> int | Result:
             reached,
             method=args.method,
             allowed=None if args.allow_um is None else args.allow_um * 1e-6,
-            compare=args.compare or 0,
             workers=args.workers,
             scheduler=args.scheduler,
             seed=args.seed,
             progress=bar.update,
             shared_platform_joints=not args.separate_joints,
         )
-    rows = ranking_rows(study.rows, beside(geometry, study.errors))
+    rows = ranking_rows(study.rows)
     bodies = cache(lambda: shells_of(reached))  # for pictures, page and shells alone
     Result(lambda: report(study, names), lambda: as_json(study), rows, lambda: _figures(study, bodies(), names)).finish(
         args
@@ -123,14 +122,13 @@ def _layers(study: Study, meshes: Meshes, names: tuple[str, ...], error: int) ->
 
 
 def _figures(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...]) -> dict[str, Figure]:
-    from ..workspace.pictures import RankedRow, causes_figure, ranking_figure, shells_figure
+    from ..workspace.pictures import causes_figure, ranking_figure, shells_figure
 
     middle, machine = len(bodies) // 2, study.geometry.name
     body, where = bodies[middle], names[middle]
-    ranked = [(row.title, [float(figure) for figure in row.figures()]) for row in study.rows]
-    bars = [RankedRow(title, (f[1], f[0]), (f[3], f[2])) for title, f in ranked]
+    ranking = [(row.title, row.figures()) for row in study.rows]
     figures = {
-        "ranking.png": ranking_figure(bars, f"{machine}: errors by effect"),
+        "ranking.png": ranking_figure(ranking, f"{machine}: errors by effect"),
         "causes.png": causes_figure(study.geometry, body.points, body.findings, f"{machine}, {where}"),
     }
     meshes = mesh_effects(study, body)

@@ -824,9 +824,8 @@ example:
                   "(default: the geometry's)"),
             value("--tilt-deg", tilts, "A,B,…", "tilts about the tool's x and y, from its attitude at home (default "
                   "-4,0,4)", default=tilts("-4,0,4")),
-            choice("--method", ("exact", "linear", "iteration"), "of the ranking: exact (default), linear, or "
-                                                                 "iteration, which is v. Daake et al.'s own", "exact"),
-            value("--compare", count, "N", "compare exact, linear and the iteration of v. Daake et al. at N poses"),
+            choice("--method", ("exact", "linear"), "of the ranking: exact (default), or to first order",
+                   "exact"),
             value("--allow-um", above_zero, "UM", "allowed error of the tool: gives the allowed size of each error"),
             value("--workers", whole(1, 256), "N", "processes (default 1, with all threads)", default=1),
             value("--scheduler", None, "tcp://…", "Dask scheduler that runs the work instead"),
@@ -836,7 +835,7 @@ example:
         ),
         """Computes the reach of the machine (stroke, joint cones, strut clearance, condition number), and the effect
 of every single error of the budget at every grid point of it, by forward kinematics of the machine with that error.
-Prints the ranked table of v. Daake et al. with their figures (µm, mdeg), the sum of the budget, and with --allow-um
+Prints the ranked table of v. Daake et al. (µm, mdeg), the sum of the budget, and with --allow-um
 the allowed size of each error. --out writes the ranking as CSV. --pictures writes pictures (ranking, causes, one of
 shells for each error type) and, with plotly installed, page.html, which shows every error from all sides.
 
@@ -850,7 +849,7 @@ example:
   $ hexapod_comp classify --machine mine.yaml --model model.yaml --tilt-deg 0,5
   $ hexapod_comp classify --tilt-deg 0 --allow-um 50 --out ranking.csv""",
         (
-            excluded_by("--model", "--budget", "--method", "--separate-joints", "--compare", "--allow-um", "--workers",
+            excluded_by("--model", "--budget", "--method", "--separate-joints", "--allow-um", "--workers",
                         "--scheduler", "--no-page", "--publish"),
         ),
     ),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -37,15 +36,6 @@ SHADOW = "#dbe4ee"  # colour of a reach that a machine stands in
 # Angle by which the outermost of several shells is cut open towards the viewer, degrees; inner ones less, the innermost
 # not
 WEDGE = 130.0
-
-
-@dataclass(frozen=True)
-class RankedRow:
-    """One bar pair of the ranked table."""
-
-    name: str  # Error type, with its size
-    translation: tuple[float, float]  # Smallest and largest effect over the workspace, m and rad
-    rotation: tuple[float, float]  # Smallest and largest effect over the workspace, m and rad
 
 
 def shades(shares: np.ndarray) -> np.ndarray:
@@ -169,23 +159,24 @@ def _box_edges(box: np.ndarray) -> np.ndarray:
     return corners[np.array(pairs)]
 
 
-def ranking_figure(rows: Sequence[RankedRow], title: str) -> Figure:
-    """Show a ranked table as bars from smallest to largest effect over the workspace (v. Daake et al., Table 1)."""
+def ranking_figure(rows: Sequence[tuple[str, np.ndarray]], title: str) -> Figure:
+    """Show names and figures of a ranking, as :meth:`.RankingRow.figures`, as bars from smallest to largest effect."""
     if not rows:
         raise GeometryError("rows", "of a ranking must be at least one")
     figure = Figure(figsize=(10.0, 1.9 + 0.42 * len(rows)), layout="constrained")
     figure.suptitle(picture_text(title))
     left, right = figure.subplots(1, 2, sharey=True)
-    _bars(left, [row.translation for row in rows], TRANSLATION, "#20639b")
-    _bars(right, [row.rotation for row in rows], ROTATION, "#3c8d5a")
-    left.set_yticks(np.arange(len(rows)), [row.name for row in rows])
+    figures = np.array([row for _, row in rows])
+    _bars(left, figures[:, 1], figures[:, 0], TRANSLATION, "#20639b")
+    _bars(right, figures[:, 3], figures[:, 2], ROTATION, "#3c8d5a")
+    left.set_yticks(np.arange(len(rows)), [name for name, _ in rows])
     left.set_ylim(len(rows) - 0.4, -0.6)
     return figure
 
 
-def _bars(axes: Axes, ranges: Sequence[tuple[float, float]], quantity: Quantity, colour: str) -> None:
+def _bars(axes: Axes, low: np.ndarray, high: np.ndarray, quantity: Quantity, colour: str) -> None:
     """Draw bars from minimum to maximum, with both numbers."""
-    low, high = np.array(ranges).T * quantity.factor
+    low, high = low * quantity.factor, high * quantity.factor
     number = np.arange(len(low))
     least = 0.004 * high.max()  # minimum and maximum may be the same
     axes.barh(number, np.maximum(high - low, least), left=low, height=0.55, color=colour)

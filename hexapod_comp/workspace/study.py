@@ -16,10 +16,10 @@ import numpy as np
 from ..errors import HexapodError
 from ..formats.texts import aligned, number
 from ..machine.geometry import HexapodGeometry
-from .budget import BY_NAME, LENGTH, TOOL, Budget, SingleErrors
+from .budget import BY_NAME, Budget, SingleErrors
 from .combined import RSS, WORST_CASE, Allocation, MonteCarlo, allocate, monte_carlo, root_sum_of_squares, worst_case
-from .effects import EXACT, LINEAR, Extremes, effect_vectors, effects, extremes, merged, tangential_effects
-from .ranking import RankingRow, beside, ranked, ranking_rows, ranking_text
+from .effects import EXACT, LINEAR, Extremes, effect_vectors, effects, extremes, merged
+from .ranking import RankingRow, ranked, ranking_rows, ranking_text
 from .reach import Reach, poses_at, reach
 from .shells import Shell, shell
 
@@ -37,16 +37,6 @@ class Combined:
     worst_case: np.ndarray  # (2,): largest over the poses
     root_sum_of_squares: np.ndarray  # (2,): largest over the poses
     monte_carlo: MonteCarlo  # Uniform errors within the budget's bounds
-
-
-@dataclass(frozen=True)
-class Agreement:
-    """How the three methods agree at random poses."""
-
-    effects: int  # How many were compared
-    linear: float  # Largest difference to the exact displacement, over the largest exact one of the same error type
-    tangential: float  # Largest difference to the exact displacement, over the largest exact one of the same error type
-    drift: float  # Largest length error of a passive leg over the travel of the active one, for legs of wrong length
 
 
 @dataclass(frozen=True)
@@ -71,8 +61,6 @@ class Study:
         The budget as a whole.
     allocations : tuple of Allocation
         What the errors may be, by both methods; empty when no tool error is given.
-    agreement : Agreement or None
-        How exact, linear and tangential effects compare; None when not asked for.
     """
 
     geometry: HexapodGeometry
@@ -83,7 +71,6 @@ class Study:
     rows: tuple[RankingRow, ...]
     combined: Combined
     allocations: tuple[Allocation, ...]
-    agreement: Agreement | None
 
 
 def classify(
@@ -92,7 +79,6 @@ def classify(
     reaches: tuple[Reach, ...] | None = None,
     method: str = EXACT,
     allowed: float | None = None,
-    compare: int = 0,
     workers: int = 1,
     scheduler: str | None = None,
     seed: int = 0,
@@ -108,9 +94,9 @@ def classify(
     reaches : tuple of Reach, optional
         From :func:`~hexapod_comp.workspace.reach.reaches`; by default what is reached with the tool as at home.
     method, allowed : str, float, optional
-        ``exact``, ``linear`` or ``iteration``, for the ranking; displacement of the tool to allocate tolerances for, m.
-    compare, seed : int
-        Poses at which exact, linear and tangential effects are compared, 0 for none; the seed picks them.
+        ``exact`` or ``linear``, for the ranking; displacement of the tool to allocate tolerances for, m.
+    seed : int
+        Of the poses at which errors are combined, and of the Monte Carlo.
     workers, scheduler, progress, shared_platform_joints
         As for :func:`~.study.survey`, and for :meth:`~.sources.Budget.single_errors`.
 
@@ -132,7 +118,6 @@ def classify(
             monte_carlo=monte_carlo(vectors, DRAWS, seed=seed),
         ),
         allocations=() if allowed is None else tuple(allocate(errors, vectors, allowed, way) for way in WAYS),
-        agreement=compared(geometry, errors, reaches, compare, seed) if compare else None,
     )
 
 
@@ -152,31 +137,6 @@ def random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np.
         poses.append(poses_at(one.geometry, one.points()[members], one.rotation))
     positions, rotations = (np.concatenate([pose[k] for pose in poses]) for k in range(2))
     return positions, rotations
-
-
-def compared(
-    geometry: HexapodGeometry, errors: SingleErrors, reaches: tuple[Reach, ...], count: int, seed: int
-) -> Agreement:
-    """Compare the three methods at random poses of the workspace, all errors but the tool's."""
-    moved = errors.select(errors.part != TOOL)
-    positions, rotations = random_poses(reaches, count, seed)
-    exact = effects(geometry, moved, positions, rotations, EXACT)[..., 0]
-    linear = effects(geometry, moved, positions, rotations, LINEAR)[..., 0]
-    walked, drift = np.empty_like(exact), 0.0
-    for e in range(len(moved)):
-        result = tangential_effects(geometry, moved, e, positions, rotations)
-        walked[:, e] = np.linalg.norm(result.vectors[:, :3], axis=1)
-        travelled = result.travel > 0.0
-        if moved.part[e] == LENGTH and travelled.any():
-            drift = max(drift, float((result.drift[travelled] / result.travel[travelled]).max()))
-    largest = np.array([exact[:, moved.kind == kind].max(initial=0.0) for kind in range(len(moved.kinds))])
-    scale = np.where(largest > 0.0, largest, np.inf)[moved.kind]
-    return Agreement(
-        effects=exact.size,
-        linear=float((np.abs(linear - exact) / scale).max()),
-        tangential=float((np.abs(walked - exact) / scale).max()),
-        drift=drift,
-    )
 
 
 def shells_of(reaches: tuple[Reach, ...]) -> tuple[Shell, ...]:
@@ -291,13 +251,11 @@ EACH = ("alone", "only", "without", "equal")  # What an allocation says of each 
 
 def report(study: Study, names: Sequence[str]) -> str:
     """Return the report of a study; `names` are those of its orientations."""
-    ranking = ranking_text(study.rows, beside(study.geometry, study.errors))
+    ranking = ranking_text(study.rows)
     counts = f"{len(study.errors)} single errors of {len(study.errors.kinds)} types at {study.extremes.poses} poses"
     headline = f"machine {study.geometry.name}: {counts}"
     parts = [headline, _reach_table(study, names), ranking, _combined_text(study)]
     parts += [_allocation_text(study, allocation) for allocation in study.allocations]
-    if study.agreement is not None:
-        parts.append(_agreement_text(study))
     return "\n\n".join(parts) + "\n"
 
 
@@ -356,17 +314,6 @@ def _may_be(now: float, factor: float, none: str = "") -> str:
     return none if np.isnan(factor) else "anything" if np.isinf(factor) else number(now * factor, 2)
 
 
-def _agreement_text(study: Study) -> str:
-    agreement = study.agreement
-    if agreement is None:
-        return ""
-    return (
-        f"methods, {agreement.effects} effects, difference to exact over the type's largest effect: "
-        f"linear {100.0 * agreement.linear:.3f} %, the paper's iteration {100.0 * agreement.tangential:.4f} % "
-        f"(its passive legs drift by {100.0 * agreement.drift:.3f} % of the active leg's travel)"
-    )
-
-
 def as_json(study: Study) -> dict[str, Any]:
     """Return a study as plain numbers; units are in the keys."""
     drawn = study.combined.monte_carlo
@@ -375,7 +322,7 @@ def as_json(study: Study) -> dict[str, Any]:
         "frame": "work",
         "budget_si": study.budget.sizes,
         "poses": study.extremes.poses,
-        "ranking": ranking_rows(study.rows, beside(study.geometry, study.errors)),
+        "ranking": ranking_rows(study.rows),
         "reach": [
             {"volume_m3": item.volume, "box_m": item.box, "limits": item.shares(), "regions": item.regions()}
             for item in study.reaches
@@ -389,5 +336,4 @@ def as_json(study: Study) -> dict[str, Any]:
             {**vars(item), **{name: dict(zip(study.errors.kinds, getattr(item, name), strict=True)) for name in EACH}}
             for item in study.allocations
         ],
-        "agreement": study.agreement,
     }

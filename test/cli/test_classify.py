@@ -69,9 +69,9 @@ class Done:
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
-    """The shipped machine and budget: four orientations tilted about x and y, allowed error, three methods."""
+    """The shipped machine and budget: four orientations tilted about x and y, allowed error."""
     folder = tmp_path_factory.mktemp("classified") / "deep" / "out"
-    options = ("--cells", "8", "--tilt-deg", "-4,4", "--allow-um", "50", "--compare", "2")
+    options = ("--cells", "8", "--tilt-deg", "-4,4", "--allow-um", "50")
     folder.mkdir(parents=True)
     written = ("--out", folder / "ranking.csv", "--pictures", folder)
     studies: list[study.Study] = []
@@ -107,7 +107,7 @@ def test_everything_is_written_and_nothing_else(done: Done) -> None:
         assert name in report
     for name in PICTURES:
         assert (done.folder / name).read_bytes().startswith(PNG)
-    for part in ("48 single errors of 6 types", "v. Daake et al., Table 1", "allowed 50 µm, worst case", "methods,"):
+    for part in ("48 single errors of 6 types", "transl. max µm", "allowed 50 µm, worst case"):
         assert part in report
     assert report.count("α -4°, β -4°") == report.count("α 4°, β -4°") == 1
 
@@ -115,15 +115,13 @@ def test_everything_is_written_and_nothing_else(done: Done) -> None:
 def test_screw_pitch_comes_first_by_two(done: Done) -> None:
     """004, Table 1: 34.4 µm to 13.68 µm, 2.5; "a factor of about two or more" on a machine of other geometry."""
     # Its size is 2 to 2.86 times the others' sizes, so that a factor near two is to be expected of any machine whose
-    # joints act about as their struts do. The others lie within the paper's order of magnitude.
+    # joints act about as their struts do.
     rows = done.rows
     assert [row["rank"] for row in rows] == ["1", "2", "3", "4"]
     assert rows[0]["error_type"] == "screw pitch"
     largest = np.array([float(row["translation_max_um"]) for row in rows])
     assert (np.diff(largest) < 0.0).all()
     assert largest[0] >= 2.0 * largest[1]
-    paper = np.array([float(row["translation_max_paper_um"]) for row in rows])
-    assert ((largest > paper / 3.0) & (largest < paper * 3.0)).all()
     turned = [float(row["rotation_max_mdeg"]) for row in rows]
     assert max(turned) == turned[0]
 
@@ -177,15 +175,6 @@ def test_json_says_the_same(done: Done) -> None:
     assert combined["root_sum_of_squares"][0] < drawn[2] < combined["worst_case"][0]
 
 
-def test_the_three_methods_agree(done: Done) -> None:
-    """004's iteration within 0.1 % of exact; its passive legs drift below 0.1 % of the active leg's travel."""
-    agreement = done.content["agreement"]
-    assert agreement["effects"] == 2 * 48
-    assert 0.0 < agreement["tangential"] <= 1e-3
-    assert 0.0 < agreement["drift"] < 1e-3
-    assert 0.0 < agreement["linear"] <= 1e-3
-
-
 def test_without_plotly_the_rest_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hexapod_comp.cli.classify._figures", lambda *arguments: {})
     for name in ("plotly", "plotly.offline"):
@@ -213,7 +202,7 @@ def test_options_reach_the_survey(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_budget_of_ones_own(tmp_path: Path) -> None:
-    """Types that 004 has no row for stand without brackets; the tool's error is as large as it is everywhere."""
+    """The tool's error is as large as it is everywhere."""
     budget = tmp_path / "mine.yaml"
     budget.write_text(
         "format: hexapod_comp/error_budget\nversion: 1\nmachine: positioning_unit\n"
@@ -228,7 +217,6 @@ def test_a_budget_of_ones_own(tmp_path: Path) -> None:
     assert float(tool["translation_max_um"]) == pytest.approx(5.0, abs=1e-6)
     assert float(tool["translation_min_um"]) == pytest.approx(5.0, abs=1e-6)
     assert float(tool["rotation_max_mdeg"]) == pytest.approx(0.0, abs=1e-9)
-    assert tool["translation_max_paper_um"] == ""
     assert done.rows[0]["error_type"] == "thermal growth"  # 60 ppm of 250 mm are 15 µm
 
 
@@ -242,7 +230,7 @@ def budget_of(folder: Path, machine: str) -> Path:
 
 
 def test_joints_that_coincide_are_one_unless_asked_for_apart(tmp_path: Path) -> None:
-    """A third of the error in z at the platform's middle. v. Daake et al.'s figures are not of this kind of machine."""
+    """A third of the error in z at the platform's middle."""
     machine = ("--machine", "paper", "--budget", budget_of(tmp_path, "paper"), "--tilt-deg", 0, "--cells", 6)
     largest = {}
     for options in ((), ("--separate-joints",)):
@@ -250,10 +238,8 @@ def test_joints_that_coincide_are_one_unless_asked_for_apart(tmp_path: Path) -> 
         assert code == 0
         rows = {row["error_type"]: row for row in json.loads(out)["ranking"]}
         largest[options] = rows["platform joint z"]["translation_max_um"]
-        assert rows["screw pitch"]["translation_max_paper_um"] is None
     assert largest[()] == pytest.approx(10.0 / 3.0, rel=1e-3)
     assert largest["--separate-joints",] > 1.2 * largest[()]
-    assert "v. Daake" not in classify(*machine)[1]
 
 
 def test_an_allocation_says_of_every_type_what_it_may_be(tmp_path: Path) -> None:

@@ -164,7 +164,7 @@ OPTIONS = {
     "simulate": ("--seed", "--truth", "--campaign", "--out", "--model"),
     "fit": ("--scheme", "--lead-mm", "--blocks", "--probe-mm", "--order", "--columns", "--out", "--truth"),
     "export": ("--units", "--box", "--step-mm", "--poses", "--tilt-deg", "--seed", "--table"),
-    "classify": ("--cells", "--clearance-mm", "--tilt-deg", "--compare", "--allow-um", "--workers", "--budget"),
+    "classify": ("--cells", "--clearance-mm", "--tilt-deg", "--allow-um", "--workers", "--budget"),
     "run": ("--rate-hz", "--machine", "--model", "--truth", "--pictures"),
     "demo": ("--rate-hz", "--machine", "--model", "--truth", "--seed", "--pictures"),
 }

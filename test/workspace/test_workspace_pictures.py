@@ -22,7 +22,6 @@ from hexapod_comp.workspace.pictures import (
     ROTATION,
     TRANSLATION,
     Layer,
-    RankedRow,
     causes_figure,
     outline,
     ranking_figure,
@@ -99,8 +98,8 @@ def test_causes_have_a_legend_with_their_share():
 def test_bars_from_minimum_to_maximum(tmp_path):
     """Truth: 004, Table 1, two of its rows; 15.41 m° are 268.95 µrad."""
     rows = [
-        RankedRow("screw pitch ±20 µm", (22.4e-6, 34.4e-6), (186.92e-6, 268.95e-6)),
-        RankedRow("base joint x/y ±10 µm", (1e-12, 13.68e-6), (0.0, 107.51e-6)),
+        ("screw pitch ±20 µm", np.array([34.4e-6, 22.4e-6, 268.95e-6, 186.92e-6])),
+        ("base joint x/y ±10 µm", np.array([13.68e-6, 1e-12, 107.51e-6, 0.0])),
     ]
     figure = ranking_figure(rows, "Table 1 of 004")
     left, right = figure.axes
