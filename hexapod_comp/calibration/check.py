@@ -471,7 +471,7 @@ def _visible_text(result: Verification) -> Iterator[str]:
         else:
             yield f"these readings surely show {name} from {1e6 * size:.2g} {unit} on"
     if result.visible.get(DATUM, math.inf) > most:
-        yield "where base and workpiece stand as a whole these readings do not show, or not in all directions"
+        yield "these readings do not show, or not in all directions, where base and workpiece stand as a whole"
 
 
 def update_report(update: Update, written: str) -> str:

@@ -52,7 +52,7 @@ class HeldDatum:
         return carried(np.tile(there[:, None], (len(arms), 1, 1)), arms)[:, :, 0]
 
     def report(self) -> str:
-        """Return the held ways and the reason, as text."""
+        """Return the number of directions in which the datum is held, and why, as text."""
         lengths = np.linalg.norm(self.given_up[:3]) * 1e6, np.linalg.norm(self.given_up[3:]) * 1e6
         moved = "{:.2f} µm and {:.2f} µrad".format(*lengths)
         of_six = f"Of six ways to shift and turn the whole machine the readings do not show {self.held}; in these the"

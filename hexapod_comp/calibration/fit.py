@@ -195,7 +195,7 @@ def _drop_outlier_runs(
             continue
         except HexapodError:
             break
-        doubt = f"with run {', '.join(names)} the fit does not settle: left out, for it pulls the parameters most"
+        doubt = f"with run {', '.join(names)} the fit does not converge: left out, as it changes the parameters most"
         return replace(fit, verdict=replace(fit.verdict, doubts=(doubt, *fit.verdict.doubts)))
     problem = f"{unsettled.problem}; the runs that pull most: {', '.join(names)}"
     fit = _fit(measurements, begun, progress, datum, settles=False)
@@ -424,7 +424,7 @@ def _about_loads(measurements: MeasurementSet, space: ParameterSpace) -> list[st
     if not load.bends:
         return [f"{text}, for no struts' stiffness is stated (--load)"]
     if space.block("compliance") is None:
-        return [f"{text}; elsewhere as far as the stated stiffness is right: readings at two loads show it"]
+        return [f"{text}; under other loads it depends on the stated stiffness; readings at two loads determine that"]
     return [f"{text}, and between them; the stiffness was refined by them"]
 
 

@@ -190,7 +190,7 @@ def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
         raise CalibrationError("grid lines", "must all be read at one attitude of the platform: the field has none")
     low, high = m.stations.temperatures[station].min(), m.stations.temperatures[station].max()
     if max(REFERENCE_TEMPERATURE - low, high - REFERENCE_TEMPERATURE) > ASSUMED.least_warming:
-        notes.append(f"read at {low:.1f} to {high:.1f} °C; scheme lines takes the growth for an error at 20 °C")
+        notes.append(f"read at {low:.1f} to {high:.1f} °C; scheme lines models this growth as an error at 20 °C")
     notes += _command_note(m, np.unique(station))
     direction = m.stations.sense[station, axis].astype(int)
     node = np.zeros((len(kept), 3), dtype=int)

@@ -197,7 +197,7 @@ class _Fitted:
         return np.hstack([rows[:, block.part] @ self._basis(n) for n, block in enumerate(self.space.blocks)])
 
     def _along(self, cells: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return the rows of some cells along other directions (n, 6), over their stated noise."""
+        """Return the derivatives of cells if they were read along `directions` (n, 6), over their stated noise."""
         rows = np.empty((len(cells), self.space.size))
         along = self._scale[cells, None] * directions
         self._slopes.write(rows, self.estimation.cells.station[cells], along, np.arange(6))
@@ -338,7 +338,7 @@ class _Fitted:
         return _Way(deviation**2 * h / grown, deviation, log_evidence(self.problem, plain) + gain)
 
     def other_directions(self) -> list[Alternative]:
-        """Return readings taken the other way than labelled, each by its own likelihood ratio, if any are.
+        """Return readings whose direction of motion is probably mislabelled, each by its own likelihood ratio.
 
         A strut's backlash moves a reading by Δ or, taken the other way, by −Δ. Readings that the other way explains
         better are relabelled and the model is fitted again, for wrong labels have hidden a part of the backlash. Which

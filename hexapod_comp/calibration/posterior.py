@@ -188,7 +188,7 @@ class ErrorPredictor:
         6).
         """
         if self._fitted is None or self._datum is None:
-            raise CalibrationError("model", "tells neither how well it is known, nor where it was measured")
+            raise CalibrationError("model", "states neither its uncertainty nor where it was measured")
         errors = self._errors(poses)
         return errors.places, errors.slopes, errors.aligned(self._datum).slopes, self._given_up(errors.places)
 

@@ -423,8 +423,7 @@ def _pairs(r: Residuals, kind: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _likeness(r: Residuals, there: np.ndarray, back: np.ndarray) -> tuple[float, float]:
-    """Return the variance common to pairs of cells, in their estimated noise's, and the share that fitting leaves of
-    it.
+    """Return the error variance common to both directions, over that of the noise, and its share that a fit leaves.
 
     Fitting makes the noise of a pair anticorrelated, by the contribution of both to the parameters and to the run's
     unknowns; and it absorbs the same share of their common error. Residuals are cut at 2 σ, for an instrument that

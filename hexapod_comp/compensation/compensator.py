@@ -146,7 +146,7 @@ def drifted(geometry: HexapodGeometry, model: MachineModel, drift: np.ndarray) -
     """Return the model of a machine that has drifted by this, m, since it was fitted.
 
     The drift, shape (12,): three displacements of the base in ``base``, three rotations of it about the platform's home
-    times the machine's characteristic length, and what six struts are longer than their encoders tell.
+    times the machine's characteristic length, and by how much each strut is longer than its encoder reads.
     """
     if not drift.any():
         return model

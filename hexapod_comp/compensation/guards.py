@@ -229,7 +229,7 @@ class StampClock:
         return clock
 
     def before(self) -> list[int]:
-        """Return the shifts in force before the newest steps, while messages stamped then may arrive."""
+        """Return the clock's shifts before its recent steps: messages stamped before a step may still arrive."""
         since = self.steady() - round(IN_FLIGHT * 1e9)
         self.steps = [entry for entry in self.steps if entry[0] >= since]
         return [shift for _, shift in self.steps]

@@ -101,7 +101,7 @@ def _constraints(geometry: HexapodGeometry, rate: int, joints: Sequence[str]) ->
     tolerance = TOLERANCE * step
     fastest = min(speed, step * rate, tolerance / (LAG + 1.0 / rate))
     lines = [
-        "# A goal ends, and the struts are held where they are, when one is this far from its setpoint, m: below the",
+        "# Abort a goal and hold the struts when one is this far from its setpoint, m: below the",
         f"# machine's step_mm, {step * 1e3:g}. Drives that lag by {LAG * 1e3:g} ms are so far behind at "
         f"{fastest * 1e3:.3g} mm/s: plan trajectories below",
         "# that speed, and with velocities: between positions alone the setpoint's speed jumps.",

@@ -177,7 +177,7 @@ def _pose_corrections(passes: Passes, corrections: np.ndarray) -> np.ndarray:
 
 
 def commands_by_struts(table: GridTable, passes: Passes) -> np.ndarray:
-    """Return strut commands, shape (N, 6), m: nominal lengths plus strut corrections, backlash by each strut."""
+    """Return strut commands, shape (N, 6), m: nominal lengths plus corrections, backlash by each strut's direction."""
     positions, _, directions = passes.of_the_tool()
     corrections = table.strut_corrections(positions, directions[:, 0] < 0.0, passes.senses()[:, 3:])
     return passes.nominal_commands() + corrections

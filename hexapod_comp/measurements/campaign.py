@@ -88,7 +88,7 @@ class CampaignRun:
         if not 1 <= len(self.positions) <= MOST_POINTS:
             raise ModelError(where, f"must have 1 to {MOST_POINTS} points", len(self.positions))
         if (self.instrument in LENGTH_INSTRUMENTS) != (self.centres is not None):
-            raise ModelError(where, "a length needs its centre, and nothing else has one", self.instrument)
+            raise ModelError(where, "must be with a centre for lengths, and without for all else", self.instrument)
         if self.is_line and np.linalg.norm(self.way) < LEAST_TRAVEL:
             raise ModelError(where, "starts and ends at the same place")
         if self.axis is None and self.instrument in ("straightness", "rotation"):

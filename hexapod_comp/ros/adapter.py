@@ -101,7 +101,7 @@ class AdapterNode(MachineNode):
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take requests from now on."""
+        """Accept requests."""
         self._active = True
         self.get_logger().info("ready")
         return super().on_activate(state)

@@ -51,7 +51,7 @@ class Job:
 
 
 class Worker:
-    """The node's end: a thread sends one job at a time to the process; `poll` calls back with the results."""
+    """The node's side: a thread sends one job at a time to the process; `poll` calls back with the results."""
 
     def __init__(self) -> None:
         self._process, self._thread = _Process(), ThreadPoolExecutor(1, "worker")

@@ -161,7 +161,7 @@ PART = 65_536  # Poses per part: some seconds of work, and a few megabytes to se
 
 @dataclass(frozen=True)
 class Part:
-    """Poses of one orientation that are looked at together."""
+    """Poses of one orientation that one job computes."""
 
     geometry: HexapodGeometry  # The machine
     errors: SingleErrors  # The errors
@@ -295,8 +295,8 @@ def _allocation_text(study: Study, allocation: Allocation) -> str:
     how = {"rss": "root sum of squares", "worst_case": "worst case"}[allocation.method]
     head = (
         f"allowed {allocation.allowed * 1e6:g} µm, {how}: the budget adds up to {allocation.combined * 1e6:.2f} µm; "
-        f"all errors may be {allocation.scale:.3g} times as large.\nWhat each type adds up to alone, and the others "
-        "without it; and what its size may be, when the others stay or when all use up equal parts:"
+        f"all errors may be {allocation.scale:.3g} times as large.\nFor each type: its sum alone, the "
+        "sum of the others, and its largest size with the others unchanged or with equal shares:"
     )
     header = ("type", "now ±", "alone µm", "the others µm", "may be, the others as now", "may be, equal parts", "")
     rows = []

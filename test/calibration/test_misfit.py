@@ -318,7 +318,7 @@ def test_a_fit_that_does_not_settle_names_the_runs_that_pull(readings, monkeypat
     if always:
         assert f"did not settle; the runs that pull most: {name}" in fit.misfit
     else:
-        assert fit.verdict.doubts[0].startswith(f"with run {name} the fit does not settle: left out")
+        assert fit.verdict.doubts[0].startswith(f"with run {name} the fit does not converge: left out")
         assert 3 not in fit.measurements.run
 
 
