@@ -1,7 +1,7 @@
 """Mistakes in how readings are taken: what may have been mixed up, and what readings are if it was.
 
-One table: a row is a mistake's name and the readings without it. Signs, units and labels of channels change readings alone;
-other frames, orders of angles and machines change the poses at which they were taken.
+One table: a row is a mistake's name and the readings without it. Signs, units and labels of channels change readings
+alone; other frames, orders of angles and machines change the poses at which they were taken.
 """
 
 from __future__ import annotations
