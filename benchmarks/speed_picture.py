@@ -96,4 +96,4 @@ def _latency(axes: Axes, rows: list[Row]) -> None:
     axes.axhline(1.0, color="black", linewidth=0.8)
     axes.set_xticks(places, [row.name if row.name == "flat out" else f"{row.name} Hz" for row in rows])
     axes.set(title="Latency: compensator ÷ idle relay (dashed: bar)", ylabel="ratio")
-    axes.legend(loc="upper right", ncols=2)
+    axes.legend(loc="upper center")

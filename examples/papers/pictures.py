@@ -17,20 +17,21 @@ BINS = np.arange(-40.5, 41.0, 1.0)  # Edges of a histogram of changes of length,
 
 def configuration_figure(geometry: HexapodGeometry) -> Figure:
     """Show the paper's machine with its three dimensions (Song et al., Figures 1 and 3)."""
-    figure = Figure(figsize=(12, 6), layout="constrained")
+    figure = Figure(figsize=(9, 4.4), layout="constrained")
     space: Any = figure.add_subplot(1, 2, 1, projection="3d")
     above = figure.add_subplot(1, 2, 2, title="from above")
     draw_in_space(space, geometry)
     space.set_box_aspect(None, zoom=1.15)
     space.set(aspect="equal")
+    space.locator_params(nbins=4)
     draw_flat(above, geometry, (0, 1))
     base, platform = geometry.base_joints * 1e3, geometry.platform_joints * 1e3
-    sides = ("b", base[2], base[3], 0.3), ("d", base[1], base[2], 0.5), ("a", platform[0], platform[4], 0.5)
-    for name, first, second, share in sides:  # of the way; the middle of b is where platform joint 3 has its name
-        x, y = (first + share * (second - first))[:2]
-        side = np.linalg.norm(first - second)
-        box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
-        above.text(x, y, f"{name} = {side:g} mm", ha="center", va="center", bbox=box)
+    for name, first, second in (("b", base[2], base[3]), ("d", base[1], base[2]), ("a", platform[0], platform[4])):
+        x, y = 0.5 * (first + second)[:2]
+        along = np.degrees(np.arctan2(*(first - second)[1::-1]))  # the text stands beside its side, along it
+        where = {"ha": "center", "va": "bottom", "rotation": along, "rotation_mode": "anchor", "size": "small"}
+        above.text(x, y, f"{name} = {np.linalg.norm(first - second):g} mm", **where)
+    above.margins(0.12)
     return figure
 
 
