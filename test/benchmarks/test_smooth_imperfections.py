@@ -60,27 +60,6 @@ def test_length_maps_are_of_the_size_and_within_the_lengths_asked(seed: int, wav
     assert (power[:, outside].sum(axis=1) < 1e-3 * power.sum(axis=1)).all()
 
 
-def test_between_the_knots_runs_the_wave_itself() -> None:
-    """Waves of 100 mm alone: second differences over ±h are 2·(cos(2πh/λ) − 1)·f. The natural spline's straight ends
-    (5 % of the stroke) are no wave; measured 0.2 % of the wave's size between."""
-    wave, h = 0.1, 40
-    values = strut_errors(3, waves=(wave, wave))
-    step = h * (COMMANDS[1] - COMMANDS[0])
-    second = values[:, 2 * h :] - 2.0 * values[:, h:-h] + values[:, : -2 * h]
-    wanted = 2.0 * (np.cos(2.0 * np.pi * step / wave) - 1.0) * values[:, h:-h]
-    inner = slice(len(COMMANDS) // 20, -len(COMMANDS) // 20)
-    assert np.abs(second - wanted)[:, inner].max() < 0.005 * 5e-6
-
-
-def test_struts_and_seeds_have_maps_of_their_own() -> None:
-    """Correlations of eight random waves over six wave lengths of stroke: 153 pairs of some 0.3 each, 0.025 in the
-    mean, four times that."""
-    maps = np.concatenate([strut_errors(seed) for seed in (0, 1, 2)])
-    pairs = np.corrcoef(maps)[np.triu_indices(len(maps), 1)]
-    assert np.abs(pairs).max() < 0.9
-    assert abs(pairs.mean()) < 0.1
-
-
 def test_waves_in_space_are_as_long_as_asked() -> None:
     """Helmholtz' equation for waves of 500 mm alone. Along x a polynomial stands for them: its second derivative
     is right, too. Differences of fourth order over 25 mm: (2π·25/500)⁴/90 = 1e-4; measured 1e-4."""

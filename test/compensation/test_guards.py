@@ -24,7 +24,7 @@ from hexapod_comp.compensation.guards import (
     Sample,
     StrutSteps,
 )
-from hexapod_comp.errors import CommandError, HexapodError, LimitError
+from hexapod_comp.errors import HexapodError, LimitError
 
 STEP, SPEED = 2e-3, 0.25
 """Of the paper's machine: m and m/s."""
@@ -228,16 +228,6 @@ def test_two_of_one_name_are_refused_where_the_middleware_does_not_count():
 
 
 # ---- what all have in common ----
-
-
-def test_a_problem_refuses_until_it_ends():
-    guard = Guard()
-    guard.reason = "because"
-    assert reason(guard, Sample(0.0)) == ""
-    guard.problem = "it is so"
-    with pytest.raises(CommandError, match="it is so") as caught:
-        guard.check(Sample(0.0))
-    assert caught.value.reason == "because"
 
 
 def test_what_happened_while_nobody_asked_holds_once():

@@ -51,24 +51,12 @@ def test_a_strut_that_has_swollen_is_commanded_shorter(name: str, tmp_path: Path
     assert damp.temperatures == {"humidity": 0.7}
 
 
-def test_without_the_coefficient_nothing_moves() -> None:
-    compensator = Compensator(paper_geometry(), MachineModel("paper"))
-    compensator.set_humidity(0.9)
-    assert not compensator.correct(compensator.geometry.home).correction.any()
-
-
 @pytest.mark.parametrize("value", [45.0, 0.0045, 0.0, -0.1, 1.0001, math.nan, math.inf])
 def test_percent_for_a_fraction_and_other_nonsense_are_refused(value: float) -> None:
     compensator = Compensator(paper_geometry(), swelling(paper_geometry()))
     with pytest.raises(ModelError, match=r"humidity: must lie within 0\.01…1, as a fraction"):
         compensator.set_humidity(value)
     assert compensator.temperatures.values == {}
-
-
-def test_a_humidity_is_no_temperature() -> None:
-    compensator = Compensator(paper_geometry(), swelling(paper_geometry()))
-    with pytest.raises(ModelError, match="must be of one of strut_1"):
-        compensator.set_temperature("humidity", 0.5)
 
 
 def test_a_jump_is_refused_until_it_may_have_come() -> None:

@@ -155,14 +155,6 @@ def test_a_rule_of_zero_is_none() -> None:
     assert made.stale(1e9) == ()
 
 
-@pytest.mark.parametrize(("name", "value"), [("spindle", 20.0), ("base", math.nan), ("base", 121.0)])
-def test_what_is_no_temperature_is_refused_before_all(name: str, value: float) -> None:
-    made = thermometers(0.0, 0.0, 0.0)
-    with pytest.raises(ModelError):
-        made.update(name, value, 0.0)
-    assert made.stale(0.0) == ()
-
-
 def late_model() -> MachineModel:
     """Return a model whose struts follow the base's thermometer with 600 s."""
     struts = StrutErrors(expansion=np.full(6, 12e-6))

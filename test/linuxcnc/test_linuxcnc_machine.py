@@ -12,10 +12,10 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from hal_stand_in import StandInHal
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.linuxcnc.hal import dead_components
@@ -137,54 +137,21 @@ def test_a_machine_that_is_off_as_a_whole(geometry: HexapodGeometry, tool_length
     np.testing.assert_allclose(error, moved - turn @ left, atol=1e-9)
 
 
-class Pins:
-    """LinuxCNC's module hal, as far as the component needs it."""
-
-    HAL_FLOAT, HAL_BIT, HAL_S32, HAL_U32, HAL_IN, HAL_OUT = range(6)
-    error = RuntimeError
-
-    def __init__(self) -> None:
-        self.values: dict[str, Any] = {}
-        self.is_ready = False
-
-    def component(self, name: str) -> Pins:
-        return self
-
-    def newpin(self, name: str, kind: int, direction: int) -> Any:
-        values = self.values
-        values[name] = 0.0
-
-        class One:
-            def get(self) -> Any:
-                return values[name]
-
-            def set(self, value: Any) -> None:
-                values[name] = value
-
-        return One()
-
-    def ready(self) -> None:
-        self.is_ready = True
-
-    def exit(self) -> None:
-        pass
-
-
 def test_pins_are_in_machine_units(geometry: HexapodGeometry) -> None:
     """Inches in, inches out; lengths without a pose only take `valid` away."""
-    hal, truth = Pins(), MachineModel("paper", base_deviation=np.tile([0.0, 0.0, 127e-6], (6, 1)))
+    hal, truth = StandInHal(), MachineModel("paper", base_deviation=np.tile([0.0, 0.0, 127e-6], (6, 1)))
     component = MachineComponent(RealMachine(geometry, truth), "inch", "hexapod_machine", hal)
     component.cycle()
-    assert hal.values["valid"] is False
+    assert hal["valid"] is False
     for name, value in zip("xyzabc", TILTED, strict=True):
-        hal.values[name] = value / 0.0254 if name in "xyz" else value
+        hal[name] = value / 0.0254 if name in "xyz" else value
     for n, length in enumerate(lengths(geometry, TILTED)):
-        hal.values[f"strut.{n}"] = length / 0.0254
+        hal[f"strut.{n}"] = length / 0.0254
     component.cycle()
-    assert hal.values["valid"] is True
-    assert hal.values["error"] == pytest.approx(0.005, abs=1e-7)  # 127 µm
-    assert hal.values["error-z"] == pytest.approx(0.005, abs=1e-7)
-    found = [hal.values[f"true-{axis}"] for axis in "xyzabc"]
+    assert hal["valid"] is True
+    assert hal["error"] == pytest.approx(0.005, abs=1e-7)  # 127 µm
+    assert hal["error-z"] == pytest.approx(0.005, abs=1e-7)
+    found = [hal[f"true-{axis}"] for axis in "xyzabc"]
     x, y, z = TILTED[:3]
     wanted = [x / 0.0254, y / 0.0254, (z + 127e-6) / 0.0254, *TILTED[3:]]
     np.testing.assert_allclose(found, wanted, atol=1e-6)

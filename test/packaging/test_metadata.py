@@ -213,30 +213,11 @@ def test_every_dependency_is_a_key_of_rosdep_or_a_package_of_jazzy():
     assert {dependency.name for dependency in package.build_depends} == {"g++-static", "python3-cffi"}
 
 
-def test_the_changelog_is_what_catkins_tools_read():
-    """Their grammar (REP 132): one section a version, underlined at full length, only the newest named Forthcoming."""
-    text = (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8")
-    sections = re.findall(r"^(\S.*)\n(-+)$", text, re.MULTILINE)
-    assert all(len(line) == len(name) for name, line in sections)
-    names = [name for name, _ in sections]
-    assert all(re.fullmatch(r"\d+\.\d+\.\d+ \(\d{4}-\d\d-\d\d\)", name) for name in names if name != "Forthcoming")
-    assert "Forthcoming" not in names[1:]
-
-
-def test_citation_and_changelog_name_the_version():
-    assert re.search(rf"^version: {_version()}$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
-    assert re.search(rf"^{_version()} \(", (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8"), re.MULTILINE)
-
-
 def _setup_arguments() -> dict:
     """Return what setup.py, run in the current folder, tells setuptools."""
     with mock.patch("setuptools.setup") as setup:
         runpy.run_path("setup.py")
     return setup.call_args.kwargs
-
-
-def _version() -> str:
-    return ElementTree.parse(ROOT / "package.xml").findtext("version") or ""
 
 
 def test_a_file_of_the_user_wins_over_a_shipped_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -319,11 +300,6 @@ def test_who_only_imports_a_node_without_a_core_goes_on():
     assert (run.returncode, run.stdout) == (0, "hexapod_comp.core._core\n"), run.stderr
 
 
-def test_package_xml_lists_what_the_tests_import():
-    listed = _package_xml("exec_depend") | _package_xml("test_depend")
-    assert {_rosdep_key(name) for name in _imports(ROOT / "test")} <= listed
-
-
 def test_setup_py_agrees_with_the_imports_and_package_xml(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(ROOT)
     metadata = _setup_arguments()
@@ -332,15 +308,6 @@ def test_setup_py_agrees_with_the_imports_and_package_xml(monkeypatch: pytest.Mo
     package_xml = ElementTree.parse(ROOT / "package.xml")
     for field in ("name", "version", "license", "maintainer"):
         assert package_xml.findtext(field) == metadata[field]
-
-
-def test_every_licence_that_a_file_has_is_there_in_full():
-    """As the REUSE specification wants it: LICENSES/<SPDX identifier>.txt. ``reuse lint`` says the rest."""
-    named = set(re.findall(r'^SPDX-License-Identifier = "(.*)"$', (ROOT / "REUSE.toml").read_text(), re.MULTILINE))
-    texts = {file.stem: file.read_text() for file in (ROOT / "LICENSES").iterdir()}
-    assert set(texts) == named == {"Apache-2.0", "MIT"}
-    assert "Apache License" in texts["Apache-2.0"]
-    assert texts["MIT"].startswith("MIT License\n\nCopyright (c) 2022 Jugleer")
 
 
 def _ros_dependencies() -> set[str]:

@@ -17,7 +17,6 @@ from foreign_machines import Errors, with_frames
 from replay_helpers import STORE, TYPES, Messages, RecordedMachine, serialized, wave_pose, write_bag
 
 from hexapod_comp.cli import main
-from hexapod_comp.compensation.journal import JournalError, read_page
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.pose import Pose
@@ -71,18 +70,6 @@ def test_tools_and_frames_come_back_bit_for_bit(name: str, tmp_path: Path, capsy
     out = capsys.readouterr().out
     assert "replayed 604 of 604 answers: identical bit for bit" in out
     assert "changes between commands: 4 × tool" in out
-
-
-def test_a_recorder_may_join_under_another_tool(tmp_path: Path) -> None:
-    """The first snapshot that it has is one with the tool in use."""
-    run = recorded(tmp_path)
-    pages = [n for n, message in enumerate(run.messages) if message[1] == "/compensator/journal"]
-    files = [message for message in run.messages if message[1] == "/compensator/files"][-1:]
-    late = [(run.messages[pages[14]][0], *files[0][1:]), *run.messages[pages[14] :]]
-    result = replayed(write_bag(tmp_path / "bag", late))
-    assert result.identical
-    assert not result.states_differ
-    assert result.compared > 250
 
 
 def test_commanded_positions_are_seen_from_the_base(tmp_path: Path) -> None:
@@ -140,8 +127,3 @@ def test_recordings_from_before_still_come_back(tmp_path: Path) -> None:
     result = replayed(write_bag(tmp_path / "bag", older(run.messages)))
     assert result.identical
     assert result.compared == 300
-
-
-def test_a_page_of_a_later_version_is_refused() -> None:
-    with pytest.raises(JournalError, match="must be of version 5, not 6"):
-        read_page('{"journal": 6}')
