@@ -301,7 +301,7 @@ def test_enable_ramps_in_and_out(bench, speak):
 
 
 def test_a_compensator_that_falls_silent(over_dds):
-    """Corrections return to zero (that they hold: test_correction_guard), never stepping, and come back when it speaks again."""
+    """Corrections return to zero, never stepping, and come back when it speaks (holding: test_correction_guard)."""
     machine = Machine(over_dds)
     over_dds.compensator()
     hal = machine.start().hal
