@@ -362,14 +362,19 @@ def _way(arrays: _Arrays, along: np.ndarray, direction: int) -> float:
     return float(first_pass[-1] - first_pass[0])
 
 
+def refuse_twice(files: Sequence[tuple[str, str]]) -> None:
+    """Raise on a file, (name, SHA-256), given twice: its readings would count twice."""
+    seen: dict[str, str] = {}
+    for name, digest in files:
+        if digest in seen:
+            raise InputFileError(name, "", f"is the same file as {seen[digest]}: its readings would count twice")
+        seen[digest] = name
+
+
 def joined(sets: Sequence[MeasurementSet]) -> MeasurementSet:
     """Return several sets of one machine as one; runs of equal names stay apart."""
     first = sets[0]
-    hashes = [sha for s in sets for _, sha in s.files]
-    for s in sets:
-        for name, sha in s.files:
-            if hashes.count(sha) > 1:
-                raise InputFileError(name, "", "is given twice: its readings would count twice")
+    refuse_twice([file for s in sets for file in s.files])
     if len(sets) == 1:
         return first
     if any(np.abs(other.probe - first.probe).max() > SAME for other in sets[1:]):
