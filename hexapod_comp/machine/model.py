@@ -217,10 +217,11 @@ class RealMachine:
         model: MachineModel,
         temperatures: Temperatures | None = None,
         loading: Loading = FREE,
+        constants: Struct | None = None,  # of another machine of this geometry and model, which does not change them
     ) -> None:
         self.geometry, self.model = geometry, model
         self.temperatures, self.loading = temperatures or Temperatures(), loading
-        self.constants, self.state = core_model(geometry, model), Struct("hc_state")
+        self.constants, self.state = constants or core_model(geometry, model), Struct("hc_state")
         lib.hc_init(self.state.at, self.constants.at, 0.0)
         self.state.keep(self.constants)
         write_temperatures(self.state, self.temperatures)
@@ -237,13 +238,21 @@ class RealMachine:
         """Whether weight and forces move the platform."""
         return self.model.load.bends
 
+    @property
+    def warms(self) -> bool:
+        """Whether temperatures move the tool."""
+        model = self.model
+        bodies = model.base_expansion or model.platform_expansion or model.late_growth.expansion.any()
+        return bool(bodies or model.struts.expansion.any())
+
     def at(
         self, temperatures: Temperatures, payload: Payload | None = None, gravity: Sequence[float] | None = None
     ) -> RealMachine:
         """Return the same machine at other temperatures and, if given, under another load."""
         geometry = self.geometry if payload is None else self.geometry.carrying(payload)
         loading = self.loading if gravity is None else Loading.of(gravity)
-        return RealMachine(geometry, self.model, temperatures, loading)
+        constants = self.constants if geometry is self.geometry else None
+        return RealMachine(geometry, self.model, temperatures, loading, constants)
 
     def advance(
         self,

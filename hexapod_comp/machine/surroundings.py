@@ -10,7 +10,7 @@ import numpy as np
 from .arrays import different_rows
 from .load import Payload
 from .model import RealMachine
-from .temperatures import HUMIDITY, PARTS, Lag, Temperatures, late
+from .temperatures import HUMIDITY, PARTS, REFERENCE_TEMPERATURE, Lag, Temperatures, late
 
 # What a load is where nobody tells: NaN, the mass and centre of the tool in use, and the model's gravity
 NO_LOAD = (math.nan,) * 7
@@ -33,6 +33,8 @@ class Surroundings(NamedTuple):
         """Return the machine at each place; places at which the same acts on it share one."""
         model, count = machine.model, len(self.times)
         around = self
+        if not machine.warms:
+            around = around._replace(temperatures=np.full_like(self.temperatures, REFERENCE_TEMPERATURE))
         if not model.struts.moisture.any():
             around = around._replace(humidity=np.full(count, np.nan))
         if not machine.bends:

@@ -165,13 +165,17 @@ def test_whatever_acts_on_the_machine_tells_places_apart():
     swelling = StrutErrors(expansion=np.full(6, 11e-6), moisture=np.full(6, 1e-4))
     load = Load(stiffness=np.full(6, 2e7), mass=20.0)
     bending = RealMachine(paper(), replace(warming_model(), struts=swelling, load=load))
-    rigid = RealMachine(paper(), MachineModel("paper", "rigid"))
+    rigid, growing = (
+        RealMachine(paper(), MachineModel("paper", name, base_expansion=expansion))
+        for name, expansion in (("rigid", 0.0), ("growing", 11e-6))
+    )
     usual = [20.0] * 8 + [0.5] + [3.0, 0.0, 0.0, 0.1] + [0.0, 0.0, -9.81]
     rows = np.tile(usual, (1 + len(usual), 1))
     rows[1 + np.arange(len(usual)), np.arange(len(usual))] += 0.25
     around = Surroundings(rows[:, :8], np.full(len(rows), np.nan), rows[:, 8], rows[:, 9:])
     assert len(set(around.machines(bending))) == len(rows)
-    assert len(set(around.machines(rigid))) == 9  # no strut gives or swells: temperatures alone
+    assert len(set(around.machines(growing))) == 9  # no strut gives or swells: temperatures alone
+    assert len(set(around.machines(rigid))) == 1
     again = Surroundings(*(np.concatenate([part, part]) for part in around))
     machines = again.machines(bending)
     assert all(a is b for a, b in zip(machines, machines[len(rows) :], strict=False))
