@@ -325,18 +325,6 @@ def test_too_large_a_correction_leaves_no_trace() -> None:
     compensator.correct(PAPER.home)
 
 
-@pytest.mark.parametrize("index", range(7))
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e200])
-def test_no_number_of_a_pose_may_be_absurd(index: int, value: float) -> None:
-    compensator = standing()
-    before = compensator.command.copy()
-    numbers = [*STANDING_STILL, 1.0]
-    numbers[index] = value
-    with pytest.raises(HexapodError):
-        compensator.step(tuple(numbers), 6.0 / RATE)
-    np.testing.assert_array_equal(compensator.command, before)
-
-
 # The first command after a reset.
 
 

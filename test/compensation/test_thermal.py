@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.compensation.thermal import DEFAULT_TIME_CONSTANT, Plausibility, TemperatureFilter, Thermometers
+from hexapod_comp.compensation.thermal import Plausibility, TemperatureFilter, Thermometers
 from hexapod_comp.errors import ModelError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import MachineModel
@@ -35,12 +35,6 @@ def test_it_is_the_mean_weighted_by_age(readings: list[tuple[float, float]]) -> 
     values, times = np.array(readings).T
     expected = np.average(values, weights=np.exp((times - times.max()) / 30.0))
     assert taken(TemperatureFilter(30.0), values, times)[-1] == pytest.approx(expected, abs=ROUNDING)
-
-
-def test_the_default_leaves_an_eighth_of_a_sensors_noise() -> None:
-    """One reading a second; a pole p leaves √((1 − p)/(1 + p)) of white noise."""
-    pole = math.exp(-1.0 / DEFAULT_TIME_CONSTANT)
-    assert math.sqrt((1.0 - pole) / (1.0 + pole)) == pytest.approx(1.0 / 8.0, rel=0.05)
 
 
 def test_after_a_long_gap_it_starts_anew() -> None:

@@ -151,14 +151,3 @@ def test_a_pose_that_is_not_allowed_has_no_travel() -> None:
     geometry = load_geometry("paper.yaml")
     with pytest.raises(LimitError, match="stroke"):
         travel(RealMachine(geometry, MachineModel("paper")), Pose([0.0, 0.0, 1.2], np.eye(3)))
-
-
-def test_the_table_names_way_unit_and_limit() -> None:
-    geometry = load_geometry("paper.yaml")
-    ways = travel(RealMachine(geometry, MachineModel("paper")), geometry.tool_pose(geometry.home))
-    lines = travel_text(ways).splitlines()
-    assert lines[0].split() == ["way", "travel", "unit"]
-    assert lines[5].split()[:3] == ["+z", f"{ways[4].distance * 1e3:.3f}", "mm"]
-    assert "stroke" in lines[5]
-    assert lines[7].split()[:3] == ["+alpha", f"{np.degrees(ways[6].distance):.3f}", "deg"]
-    assert travel_text(()) == ""

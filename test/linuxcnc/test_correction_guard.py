@@ -116,18 +116,6 @@ def test_a_rejected_correction_changes_nothing(correction):
 # ---- enabling, disabling, loss ----
 
 
-def test_starts_at_zero_and_waits():
-    """Enabled without a compensator it stays at zero and says what it waits for; not enabled it is off."""
-    loop = Loop()
-    loop.alive = False
-    assert loop.run(10) == [[0.0] * 6] * 10
-    assert loop.guard.status is GuardStatus.WAITING
-    assert loop.guard.age(loop.now) == math.inf
-    loop.enabled = False
-    loop.run(1)
-    assert loop.guard.status is GuardStatus.OFF
-
-
 def test_enabling_and_disabling_ramp():
     """100 µm at 1 µm per cycle: 100 cycles there and 100 back; the guard's first cycle has no time behind it."""
     loop = Loop()
@@ -210,11 +198,6 @@ def test_numbers_must_be_positive(name, value):
     arguments = {"limit": LIMIT, "ramp_rate": RAMP, "timeout": TIMEOUT, name: value}
     with pytest.raises(HexapodError, match=f"{name} must be positive and finite, not {value}"):
         CorrectionGuard(**arguments)
-
-
-def test_unknown_way_of_losing_is_refused():
-    with pytest.raises(HexapodError, match="on_loss must be zero or hold, not 'jump'"):
-        guard("jump")
 
 
 @pytest.mark.parametrize(

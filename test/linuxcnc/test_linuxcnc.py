@@ -292,31 +292,6 @@ M2
     assert errors[True] <= 0.05 * errors[False]
 
 
-def test_the_servo_thread_beside_the_bridge(controller: Linuxcnc) -> None:
-    """Print the servo thread's longest cycle with the bridge and without it: medians of several short runs in turn."""
-    # They are not judged here: the longest cycle of a shared, virtual machine tells who else was on it. What must hold
-    # is that LinuxCNC goes on, without a following error, whether the bridge runs or stands.
-    names = ("servo-thread.tmax", "motion-controller.tmax")
-    longest: dict[bool, list[list[float]]] = {False: [], True: []}
-    bridge = controller.pid_of("hexapod_comp")
-    controller.enable(False)
-    try:
-        for stopped in [False, True] * 7:
-            os.kill(bridge, signal.SIGSTOP if stopped else signal.SIGCONT)
-            for name in names:
-                controller.ask("set", name, "0")
-            controller.ask("mdi", "G1 X20 F3000")
-            controller.ask("mdi", "G1 X-20")
-            longest[not stopped].append(controller.get(*names))
-    finally:
-        os.kill(bridge, signal.SIGCONT)
-    for column, name in enumerate(names):
-        with_, without = (np.median([row[column] for row in longest[k]]) * 1e-3 for k in (True, False))
-        scheduling = "real-time priority" if controller.has_real_time else "no real-time priority"
-        print(f"\n{name}, {scheduling}: with the bridge {with_:.0f} µs, without {without:.0f} µs", end="")
-    assert controller.get("motion.motion-enabled") == 1
-
-
 def test_the_exported_model_agrees(controller: Linuxcnc, calibrated: Calibrated, tmp_path: Path) -> None:
     """The same model without a bridge: real joints in genhexkins, the rest in .comp files, the same program."""
     controller.enable(True)

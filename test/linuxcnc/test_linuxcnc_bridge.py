@@ -33,7 +33,7 @@ from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.parameters import ParameterError
 from hexapod_comp.ros.process import autostart
-from hexapod_comp.ros.status import ERROR, OK, WARN
+from hexapod_comp.ros.status import ERROR, OK
 
 NODE = "linuxcnc_bridge"
 
@@ -229,14 +229,6 @@ def test_an_axis_that_is_no_number_is_not_sent(bench, value):
     assert all(math.isfinite(m.pose.orientation.w) for m in machine.poses)
 
 
-def test_a_strut_that_is_no_number_is_not_sent(bench):
-    machine = Machine(bench)
-    machine.hal["joint-fb.3"] = math.nan
-    machine.start().until_sent(20)
-    bench.until_status(ERROR, "unusable pins: joint-fb.3", NODE)
-    assert bench.seen["strut_states"] == []
-
-
 # ---- back from a compensator ----
 
 
@@ -376,13 +368,6 @@ def test_asks_a_compensator_that_refuses_to_start_anew(over_dds):
     assert_never_steps(machine.hal)
 
 
-def test_asks_nobody_while_there_is_no_compensator(bench):
-    machine = Machine(bench).start()
-    machine.until_sent(round(RATE))
-    assert (machine.hal["resets"], machine.hal["status"]) == (0, GuardStatus.WAITING)
-    bench.until_status(WARN, "waiting for the first correction", NODE)
-
-
 # ---- life ----
 
 
@@ -440,25 +425,6 @@ def test_end_ramps_out_what_is_quick(bench, speak, ramp_rate, left):
     np.testing.assert_allclose(machine.hal.corrections, left, rtol=1e-9)
     assert bool(bench.logged("corrections stay as they are")) is bool(left)
     assert_never_steps(machine.hal)
-
-
-def test_what_guards_the_drives_is_taken_at_configure(bench, speak):
-    machine = Machine(bench).start()
-    refused = bench.set_parameter(NODE, "limit", 20e-6)
-    assert refused.reason == "parameter limit: is taken at configure, and the node is active; set it after a cleanup"
-    for transition in ("deactivate", "cleanup"):
-        assert bench.change(transition, NODE)
-    assert bench.set_parameter(NODE, "limit", 20e-6).successful
-    for transition in ("configure", "activate"):
-        assert bench.change(transition, NODE)
-    bench.until(lambda: speak.steadily([50e-6] * 6) or machine.hal["rejected"], "a correction that is too large")
-    assert not machine.hal.corrections.any()
-
-
-def test_leaves_hal_with_the_node(ros_context):
-    hal = StandInHal()
-    LinuxcncBridgeNode(hal=hal, context=ros_context).destroy_node()
-    assert hal.has_left
 
 
 @pytest.mark.parametrize(

@@ -25,8 +25,6 @@ from test_linuxcnc import (
     in_force,
     rms,
     run_program,
-    table,
-    table_1,
     tool_errors,
 )
 
@@ -73,17 +71,6 @@ def controller(calibrated: Calibrated, tmp_path_factory: pytest.TempPathFactory)
             yield linuxcnc
     finally:
         (MODULES / "hexapod_rt.so").unlink(missing_ok=True)
-
-
-def test_table_2(controller: Linuxcnc) -> None:
-    """Compensation off: the rows of Table 1 with one angle give Table 2's lengths, as without the component."""
-    controller.enable(False)
-    for row, lengths in zip(table_1(), table("table2_strut_lengths_ideal.csv"), strict=True):
-        alpha, beta, gamma, x, y, z = row
-        if np.count_nonzero([alpha, beta, gamma]) <= 1:
-            controller.ask("mdi", f"G0 X{x} Y{y} Z{z} A{alpha} B{beta} C{gamma}")
-            np.testing.assert_allclose(controller.struts(), lengths, rtol=0.0, atol=0.5e-3 + 1e-6)
-    assert controller.ask("errors") == []
 
 
 @pytest.mark.parametrize("speed", ["slow", "fast"])
@@ -167,14 +154,3 @@ def test_the_tool_is_where_the_struts_say(controller: Linuxcnc) -> None:
     assert controller.get("hexapod-rt.tool-valid")
     at = controller.get("hexapod-rt.tool-x", "hexapod-rt.tool-y", "hexapod-rt.tool-z")
     np.testing.assert_allclose(at, [10.0, -20.0, 410.0], rtol=0.0, atol=1e-5)
-
-
-def test_cost_in_the_servo_thread(controller: Linuxcnc) -> None:
-    """Print the component's longest cycle beside the motion controller's; a shared machine's longest is not judged."""
-    controller.enable(True)
-    for name in ("hexapod-rt.correct.tmax", "motion-controller.tmax"):
-        controller.ask("set", name, "0")
-    controller.ask("mdi", "G1 X20 F3000")
-    correct, motion = controller.get("hexapod-rt.correct.tmax", "motion-controller.tmax")
-    print(f"\nlongest cycle: hexapod-rt.correct {correct * 1e-3:.0f} µs, motion-controller {motion * 1e-3:.0f} µs")
-    assert controller.get("hexapod-rt.updates") > 0

@@ -396,13 +396,6 @@ def test_struts_without_stamps_stand_at_the_recorders_times(tmp_path):
         np.testing.assert_allclose(drawn["measured"] - drawn["command"], [[0.0, 7e-3]] * 60, rtol=0.0, atol=1e-9)
 
 
-def test_spare_bytes_behind_messages_do_no_harm(run, tmp_path):
-    """What rclpy's serialize_message makes may end in four bytes that belong to nothing."""
-    messages = [(*message[:3], message[3] + b"\xe0\0\0\0") for message in run.messages]
-    _, result = opened(write_bag(tmp_path / "run", messages))
-    assert counted(result) == {IDENTICAL: 1200}
-
-
 def test_folder_of_a_killed_recorder_is_read_without_metadata(run, tmp_path):
     """Only metadata.yaml is missing, and the bag is split in two files."""
     folder = tmp_path / "run"

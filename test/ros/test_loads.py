@@ -114,15 +114,6 @@ def test_gravity_that_falls_silent_is_said_and_stays(rig: Rig, tmp_path: Path) -
     np.testing.assert_array_equal(settled(rig), tilted)
 
 
-def test_a_timeout_of_zero_is_off(rig: Rig, tmp_path: Path) -> None:
-    started(rig, tmp_path, outside_timeout=0.0)
-    publish_gravity(rig, 0.0, 5.0, -8.4)
-    settled(rig)
-    rig.step(1.5)
-    assert rig.values()["gravity_m_s2"] == "0.000, 5.000, -8.400"
-    assert "stale" not in rig.message()
-
-
 # ---- outside numbers ----
 
 SAG = np.radians([0.0, 90.0, 0.0, 90.0]).reshape(2, 2), np.outer([10e-6, 15e-6, 40e-6, 50e-6], [0.2, 0.0, -1.0])

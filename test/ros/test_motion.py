@@ -16,7 +16,6 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from hexapod_comp.compensation import guards
-from hexapod_comp.ros.compensator import CHECK_PERIOD, CompensatorNode
 from hexapod_comp.ros.messages import nanoseconds_of, pose_message, stamp_of
 from hexapod_comp.ros.parameters import USE_SIM_TIME
 from hexapod_comp.ros.status import ERROR
@@ -144,17 +143,6 @@ def test_a_node_that_stood_still_blames_no_commands(bench):
     assert bench.values()["refused"] == "0"
 
 
-def test_what_a_busy_computer_hands_over_too_late_is_asked_once_more(rig, monkeypatch):
-    """The kit's ``ask``: a command is 1 s old when the node gets it, 0.5 s are allowed; the next is new."""
-    rig.compensator(command_timeout=0.0)
-    rig.ask(HOME)
-    stamps, now = [rig.stamp(-1.0)], rig.now
-    monkeypatch.setattr(rig, "now", lambda: stamps.pop() if stamps else now())
-    rig.ask(HOME)
-    rig.until(lambda: rig.values()["commands"] == "2", "the answer to be counted")
-    assert rig.values()["refused.stamp_past"] == "1"
-
-
 def test_where_a_parameter_says_so_only_the_newest_of_a_burst_waits(rig):
     """The first is taken, the newest is 10 mm away, further than a step: refused; the others are dropped."""
     rig.compensator(catch_up_within=0.0, command_timeout=0.0, max_command_age=0.0)
@@ -165,23 +153,6 @@ def test_where_a_parameter_says_so_only_the_newest_of_a_burst_waits(rig):
     assert int(rig.values()["commands_dropped"]) >= 10
     late = "catching up with commands that came late"
     rig.until(lambda: any(late in status.message for status in rig.statuses()), "that it is said")
-
-
-def test_what_is_checked_regularly_goes_on_while_commands_wait(rig, monkeypatch):
-    """Ninety commands wait for each other. Checks come every 50 ms: none twice, which would put off the next ones.
-
-    Where a timer took what waits, and was reset for each, a busy computer made a thousand checks, then none for
-    seconds.
-    """
-    checks, check = [], CompensatorNode._check_state
-    monkeypatch.setattr(CompensatorNode, "_check_state", lambda node: (checks.append(time.monotonic()), check(node)))
-    rig.compensator(catch_up_within=5.0, max_command_age=0.0)
-    began, before = time.monotonic(), len(checks)
-    burst(rig, 90)
-    rig.until(lambda: len(lengths(rig)) == 91, "all answers")
-    took, count = time.monotonic() - began, len(checks) - before
-    assert count <= took / CHECK_PERIOD + 5.0
-    rig.until(lambda: len(checks) > before + count, "the next check", 2.0)
 
 
 def test_acceleration_is_limited_where_the_geometry_says_so(rig, tmp_path):

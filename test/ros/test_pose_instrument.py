@@ -71,13 +71,6 @@ def off(rig: Rig) -> float:
     return rig.seen["tool_pose_estimate"][-1].pose.position.z - HOME.position[2]
 
 
-def test_without_fusion_nobody_hears_the_instrument(rig, tmp_path):
-    started(rig, tmp_path, **{"fusion.enabled": False})
-    measured(rig, instrument(rig).say, 3, 1e-5)
-    assert abs(off(rig)) < 1e-9
-    assert "fusion" not in rig.values()
-
-
 @pytest.mark.parametrize("kind", [PoseWithCovarianceStamped, PoseStamped])
 def test_the_estimate_weighs_struts_and_instrument(rig, tmp_path, kind):
     message = "pose" if kind is PoseStamped else "pose_with_covariance"
@@ -207,15 +200,3 @@ def test_nothing_steps_whatever_the_instrument_says(rig, tmp_path):
         rows.append(rig.seen["strut_corrections"][-1].position.tolist())
     assert np.abs(np.diff(rows, axis=0)).max() <= 1e-4 * 0.02 + 1e-12  # ramps count 20 ms of a pause at most
     assert int(rig.values()["rejected_poses"]) > 50
-
-
-def test_another_configuration_begins_without_drift(rig, tmp_path):
-    started(rig, tmp_path, **{"fusion.compensate": True})
-    say = instrument(rig).say
-    measured(rig, say, 30, 1e-5)
-    assert rig.nodes[0].compensator.drift.any()
-    for transition in ("deactivate", "cleanup", "configure", "activate"):
-        assert rig.change(transition)
-    assert not rig.nodes[0].compensator.drift.any()
-    measured(rig, say, 3)
-    assert abs(off(rig)) < 1e-7

@@ -108,26 +108,3 @@ def test_what_the_verb_records_is_replayed_and_a_folder_that_is_there_is_left_al
     assert recording.heard >= 40
     with pytest.raises(InputFileError, match="is there already"):
         BagRecorder(tmp_path / "run")
-
-
-def test_a_start_from_the_last_command_is_replayed_bit_for_bit(bench, tmp_path):
-    """A reset and an activation without feedback: the page says where the next command began."""
-    bench.compensator(model_file=model_file(tmp_path, struts={"offset_um": 30.0, "backlash_um": 8.0}))
-    recorder = Recorder(bench)
-    answers = [bench.ask(along(n)) for n in range(40)]
-    bench.until(lambda: bench.trigger("reset").success, "a machine that stands")
-    bench.send(near(HOME, (0.05, 0.0, 0.0)))  # further than a step from the last command
-    bench.barrier()
-    answers += [bench.ask(along(n)) for n in range(41, 60)]
-    assert bench.change("deactivate")
-    assert bench.change("activate")
-    answers += [bench.ask(along(n)) for n in range(60, 80)]
-    recorder.stop()
-    _, result = replayed(write_bag(tmp_path / "run", recorder.messages))
-    assert (result.outcome == IDENTICAL).all()
-    assert result.lengths[:, 0].tobytes() == np.array([answer.lengths for answer in answers]).tobytes()
-    assert [event.entry.values["reason"] for event in result.refused] == ["step"]
-    # A reset that forgets all comes before each of them, on a page of its own where a page was due in between.
-    resets = [event.entry.values["measured"] for event in result.changes if event.entry.what == "reset"]
-    resets = [measured for measured in resets if measured is not None]
-    assert resets[-2:] == [answers[39].lengths.tolist(), answers[58].lengths.tolist()]

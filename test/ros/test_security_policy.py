@@ -18,7 +18,7 @@ import rclpy
 from hal_stand_in import StandInHal
 from launch_stand_in import LaunchFile
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
-from node_helpers import Bench
+from node_helpers import Bench, Rig
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
@@ -31,7 +31,7 @@ from hexapod_comp.ros.adapter import AdapterNode
 from hexapod_comp.ros.client import LoopClient
 from hexapod_comp.ros.instrument import InstrumentNode
 from hexapod_comp.ros.mover import MoverNode
-from hexapod_comp.ros.process import QUIET, RosSession, autostart
+from hexapod_comp.ros.process import QUIET, RosSession
 from hexapod_comp.ros.recorder import BagRecorder
 from hexapod_comp.viewer.page import Watcher
 
@@ -124,28 +124,23 @@ def test_operators_and_thermometers_hear_and_ask_only_what_there_is() -> None:
 
 
 @pytest.mark.parametrize("name", ["compensator", "strut_drive", "mover", "instrument", "adapter", "linuxcnc_bridge"])
-def test_lifecycle_nodes_open_what_the_policy_allows(
-    name: str, ros_context: Context, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_lifecycle_nodes_open_what_the_policy_allows(name: str, rig: Rig) -> None:
     """Nothing more, nothing less, with every optional topic switched on."""
-    namespace = "/guarded"  # of its own: the graph still knows nodes of these names from other tests
-    with Bench(ros_context, capfd, namespace) as rig:
-        if name == "compensator":
-            rig.compensator(publish_array=True)
-        elif name == "strut_drive":
-            rig.drive()
-        elif name == "mover":
-            rig.remove_publisher("tool_pose_command")
-            rig.add(MoverNode, True, {})
-        elif name == "instrument":
-            rig.add(InstrumentNode, True, {"kind": "tracker"})
-        elif name == "adapter":
-            rig.add(AdapterNode, True, {})
-        else:
-            assert autostart(rig.add(LinuxcncBridgeNode, False, {}, hal=StandInHal()))
-        enclave = read_policy(namespace)[name]
-        enclave.allowed["publish"] -= {f"{namespace}/instrument/readings"}  # a laser's, in place of a tracker's pose
-        expect_equal(rig, name, enclave)
+    rig.namespace = "/guarded"  # of its own: the graph still knows nodes of these names from other tests
+    node = {
+        "compensator": lambda: rig.compensator(publish_array=True),
+        "strut_drive": rig.drive,
+        "mover": lambda: rig.add(MoverNode, True, {}),
+        "instrument": lambda: rig.add(InstrumentNode, True, {"kind": "tracker"}),
+        "adapter": lambda: rig.add(AdapterNode, True, {}),
+        "linuxcnc_bridge": lambda: rig.add(LinuxcncBridgeNode, True, {}, hal=StandInHal()),
+    }[name]()
+    enclave = read_policy(rig.namespace)[name]
+    assert enclave.node == name
+    enclave.allowed["publish"] -= {"/guarded/instrument/readings"}  # a laser's, in place of a tracker's pose
+    with contextlib.suppress(TimeoutError):  # the comparison says what is missing
+        rig.until(lambda: opened(node, name, rig.namespace) == enclave.allowed, "the graph to be complete", 1.0)
+    assert opened(node, name, rig.namespace) == enclave.allowed
 
 
 def test_the_client_opens_what_the_policy_allows() -> None:
@@ -239,16 +234,3 @@ def test_the_launch_file_names_the_enclaves_of_the_policy(monkeypatch: pytest.Mo
         asked = [words[words.index("--enclave") + 1] for words in arguments]
         assert asked == [f"{folder}/compensator", f"{folder}/strut_drive"]
         assert paths.issuperset(asked) is known
-
-
-def expect_equal(rig: Bench, node: str, enclave: Enclave) -> None:
-    """Wait until the graph is complete, then compare."""
-    assert enclave.node == node
-
-    def complete() -> bool:
-        found = opened(rig.witness, node, rig.namespace)
-        return all(enclave.allowed[right] <= found[right] for right in RIGHTS)
-
-    with contextlib.suppress(TimeoutError):  # the comparison says what is missing
-        rig.until(complete, "the rights of the policy in the graph", 5.0)
-    assert opened(rig.witness, node, rig.namespace) == enclave.allowed

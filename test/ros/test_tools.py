@@ -212,23 +212,3 @@ def test_travel_is_answered_and_published_with_names_and_units(rig: Bench, machi
         assert [way.way, f"{way.shown:.3f}", way.unit] in [line.split()[:3] for line in answer.message.splitlines()]
     assert reports[0].message == answer.message.partition("\n")[0]
     assert (reports[0].hardware_id, reports[0].name) == ("framed", "compensator: travel")
-
-
-def test_nothing_is_worked_out_while_nobody_listens(rig: Bench, machine: Machine, file: str) -> None:
-    started(rig, file)
-    rig.ask(at_home(machine), "work")
-    node = rig.nodes[0]
-    node._requests.update(1e12)
-    assert node._requests._worker.process is None
-
-
-def test_a_clean_up_answers_who_waits(bench: Bench, machine: Machine, file: str) -> None:
-    started(bench, file)
-    bench.ask(at_home(machine), "work")
-    client = bench.witness.create_client(Trigger, "compensator/get_travel")
-    bench.until(client.service_is_ready)
-    future = client.call_async(Trigger.Request())
-    assert bench.change("deactivate")
-    assert bench.change("cleanup")
-    bench.until(future.done)
-    assert future.result().success or "cleaned up" in future.result().message

@@ -72,15 +72,6 @@ def test_the_stop_output_is_repeated_for_who_has_missed_what_is_latched(rig):
     assert {stop.data for stop in stops[1:]} == {stops[-1].data}
 
 
-def test_without_a_timeout_commands_are_valid_for_ever_and_no_deadline_is_offered(rig):
-    node = rig.compensator(command_timeout=0.0)
-    validities, beats = hear(rig, TimeReference, "compensator/validity"), hear(rig, UInt64, "compensator/heartbeat")
-    rig.ask(HOME)
-    rig.until(lambda: len(beats) > 3, "heartbeats")
-    assert not validities
-    assert deadline(node, "/strut_commands") == 0
-
-
 def test_the_stop_output_says_when_commands_are_refused_and_to_who_comes_late_too(bench):
     node = bench.compensator(start_without_feedback_after=0.0)
     stops = hear(bench, Bool, "compensator/stopped", LATCHED_QOS)

@@ -110,18 +110,6 @@ def test_refusals_in_words(rig):
     assert "strut_drive" not in watcher.view().states
 
 
-def test_nothing_is_published(rig):
-    """Only what rclpy gives every node: its parameters' events."""
-    watcher = watched(rig)
-    name, namespace = watcher.node.get_name(), watcher.node.get_namespace()
-    rig.until(lambda: watcher.node.get_publisher_names_and_types_by_node(name, namespace), "the graph")
-    assert [topic for topic, _ in watcher.node.get_publisher_names_and_types_by_node(name, namespace)] == [
-        "/parameter_events"
-    ]
-    assert not list(watcher.node.services)
-    assert not list(watcher.node.clients)
-
-
 def test_what_is_old_or_no_machine_is_not_known(rig, monkeypatch):
     """Struts without names, NaN before a controller is active, bytes that are no message: nothing, and no error."""
     watcher = watched(rig)
