@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from foreign_machines import machines
 
+from benchmarks.watched_machine import Instrument, VirtualMachine
 from hexapod_comp.calibration import check
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.parameters import FitSettings
@@ -32,7 +33,6 @@ from hexapod_comp.upkeep import loop as upkeep
 from hexapod_comp.upkeep.journal import Journal
 from hexapod_comp.upkeep.loop import Adaptation, State, Task, begun_with, next_step
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
-from hexapod_comp.virtual.watched import Instrument, VirtualMachine
 
 # What is wrong with the machine, and all that is fitted: a fit takes half a second then
 BLOCKS = ("pitch", "backlash")

@@ -1,8 +1,8 @@
 """A virtual machine that is measured while it moves: it goes to poses, and a virtual tracker watches its tool.
 
 What :func:`~hexapod_comp.measurements.collect.collect` asks of a machine, without ROS: the compensator's core sends the
-struts of a :class:`~.machine.StrutDrive` along straight moves, and each stop is read with noise, wild readings and
-broken beams, as drawn from a seed.
+struts of a :class:`~hexapod_comp.virtual.machine.StrutDrive` along straight moves; each stop is read with noise, wild
+readings and broken beams, as drawn from a seed.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..compensation.compensator import Compensator
-from ..errors import LimitError
-from ..machine.geometry import HexapodGeometry
-from ..machine.model import MachineModel, RealMachine
-from ..machine.temperatures import Temperatures
-from ..machine.trajectory import commanded_in_base
-from ..measurements.collect import Observation
-from ..pose import Pose, attitude_error
-from .machine import DriveParameters, StrutDrive
+from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.errors import LimitError
+from hexapod_comp.machine.geometry import HexapodGeometry
+from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.machine.temperatures import Temperatures
+from hexapod_comp.machine.trajectory import commanded_in_base
+from hexapod_comp.measurements.collect import Observation
+from hexapod_comp.pose import Pose, attitude_error
+from hexapod_comp.virtual.machine import DriveParameters, StrutDrive
 
 PLACES = (0.5, 0.75, 0.875, 0.94, 0.97, 0.99, 1.0)  # of a move, as shares of it: struts turn back where they would
 FARTHEST = 1.0  # A move is a few commands, each further than a step of a stream may be, m
