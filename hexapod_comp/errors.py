@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-LONGEST_TEXT = 2000
-"""Longest message, log line or value in diagnostics, whatever was received."""
+LONGEST_TEXT = 2000  # longest message, log line or value in diagnostics, whatever was received
+LONGEST_PATH = 500  # a file's name is shown up to this length, so that the problem still fits into the message
 
 
 class HexapodError(Exception):
@@ -50,24 +50,13 @@ def _remade(kind: type[HexapodError], args: tuple[Any, ...]) -> HexapodError:
     return error
 
 
-LONGEST_PATH = 500
-"""A file's name is shown up to this length, so that the problem still fits into the message."""
+def _found(value: Any) -> str:
+    """Return the offending value, to append to a message."""
+    return "" if value is None else f" (found {shorten(value)})"
 
 
 class InputFileError(HexapodError):
-    """A file cannot be used: problem, key and value.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-    key : str
-        Key path or ``row 3, column x_mm``; empty when the whole file is meant.
-    problem : str
-        What is wrong and what is allowed.
-    value : object, optional
-        The value found there.
-    """
+    """A file cannot be used: file, key path or ``row 3, column x_mm`` (empty: the whole file), problem and value."""
 
     reason = "bad_file"
 
@@ -75,8 +64,7 @@ class InputFileError(HexapodError):
         self.path, self.key, self.value, self.problem = str(path), key, value, problem
         file = printable(str(path), LONGEST_PATH)
         where = f"{file}: {printable(key)}" if key else file
-        suffix = "" if value is None else f" (found {shorten(value)})"
-        super().__init__(f"{where}: {problem}{suffix}")
+        super().__init__(f"{where}: {problem}{_found(value)}")
 
 
 class GeometryError(HexapodError):
@@ -86,8 +74,7 @@ class GeometryError(HexapodError):
 
     def __init__(self, key: str, problem: str, value: Any = None):
         self.key, self.problem, self.value = key, problem, value
-        suffix = "" if value is None else f" (found {shorten(value)})"
-        super().__init__(f"{key}: {problem}{suffix}")
+        super().__init__(f"{key}: {problem}{_found(value)}")
 
 
 class FrameError(HexapodError):
@@ -103,15 +90,7 @@ class ModelError(GeometryError):
 
 
 class CalibrationError(HexapodError):
-    """Measurements from which no model can be fitted.
-
-    Parameters
-    ----------
-    what : str
-        Which part of them.
-    problem : str
-        What is wrong and what is needed.
-    """
+    """Measurements from which no model can be fitted: which part of them, and what is needed."""
 
     reason = "bad_measurements"
 
@@ -121,40 +100,25 @@ class CalibrationError(HexapodError):
 
 
 class PoseError(HexapodError):
-    """A pose that is invalid: not finite, or its rotation is not a rotation.
-
-    Parameters
-    ----------
-    problem : str
-        What is wrong and what is allowed.
-    value : object, optional
-        The numbers found.
-    reason : str
-        Name under which diagnostics count it.
-    """
+    """A pose that is invalid: not finite, or its rotation is not a rotation."""
 
     def __init__(self, problem: str, value: Any = None, reason: str = "bad_pose"):
         self.value, self.reason = value, reason
-        suffix = "" if value is None else f" (found {shorten(value)})"
-        super().__init__(f"{problem}{suffix}")
+        super().__init__(f"{problem}{_found(value)}")
 
 
-class KinematicsError(HexapodError):
-    """Forward or inverse kinematics has no usable answer.
-
-    Parameters
-    ----------
-    problem : str
-        What happened and what is allowed.
-    value, limit : optional
-        The offending quantity and the bound it broke.
-    """
-
-    reason = "kinematics"
+class BoundError(HexapodError):
+    """A quantity that breaks a bound; both are attributes, where they are known."""
 
     def __init__(self, problem: str, value: Any = None, limit: Any = None):
         self.value, self.limit = value, limit
         super().__init__(problem)
+
+
+class KinematicsError(BoundError):
+    """Forward or inverse kinematics has no usable answer."""
+
+    reason = "kinematics"
 
 
 class NotFiniteError(KinematicsError):
@@ -190,19 +154,9 @@ class OtherAssemblyModeError(KinematicsError):
 class LimitError(HexapodError):
     """A command breaks a machine limit; it is refused, never clamped.
 
-    Parameters
-    ----------
-    reason : str
-        Which limit: ``stroke``, ``base_cone``, ``platform_cone``, ``clearance``, ``condition``,
-        ``correction``, ``step``, ``speed``, ``acceleration`` or ``assembly``.
-    problem : str
-        Sentence with value, limit and units.
-    value, limit : float
-        In SI units.
-    strut : int or None
-        Index 0..5 of the strut concerned.
-    stage : str
-        ``nominal`` or ``compensated``: which of the two values broke it.
+    ``reason`` is ``stroke``, ``base_cone``, ``platform_cone``, ``clearance``, ``condition``, ``correction``, ``step``,
+    ``speed``, ``acceleration`` or ``assembly``; ``value`` and ``limit`` are in SI, ``strut`` is an index 0…5 or None,
+    ``stage`` ``nominal`` or ``compensated``: which of the two values broke the limit.
     """
 
     def __init__(self, reason: str, problem: str, value: float, limit: float, strut: int | None, stage: str):
@@ -211,33 +165,17 @@ class LimitError(HexapodError):
 
 
 class TooEarlyError(LimitError):
-    """A command is too early: the struts would exceed their largest speed. Later it may.
-
-    Parameters
-    ----------
-    problem : str
-        Sentence with value, limit and units.
-    wait : float
-        Time until it is allowed, s.
-    limit : float
-        Largest strut speed, m/s.
-    strut : int
-        Index 0..5 of the strut concerned.
-    """
+    """A command is too early: a strut would exceed its largest speed, m/s; it is allowed after ``wait``, s."""
 
     def __init__(self, problem: str, wait: float, limit: float, strut: int):
         self.wait = wait
         super().__init__("speed", problem, wait, limit, strut, "compensated")
 
 
-class OutsideFieldError(HexapodError):
+class OutsideFieldError(BoundError):
     """A pose lies outside the measured box of a field that refuses extrapolation."""
 
     reason = "outside_field"
-
-    def __init__(self, problem: str, value: Any = None, limit: Any = None):
-        self.value, self.limit = value, limit
-        super().__init__(problem)
 
 
 class OutsideTableError(OutsideFieldError):
@@ -247,15 +185,7 @@ class OutsideTableError(OutsideFieldError):
 
 
 class CommandError(HexapodError):
-    """A command message that is rejected; `reason` names the rule that it broke.
-
-    Parameters
-    ----------
-    reason : str
-        Name under which diagnostics count it.
-    problem : str
-        What was found and what is allowed.
-    """
+    """A command message that is rejected; `reason` names the rule that it broke, under which diagnostics count it."""
 
     def __init__(self, reason: str, problem: str):
         self.reason = reason

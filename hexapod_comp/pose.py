@@ -17,16 +17,10 @@ from .core import QUATERNION_NORM_TOLERANCE
 from .core.batch import quaternion_of, read_pose, rotation_flaw
 from .errors import PoseError
 
+# Larger angles, rad, are refused: no tool turns 159 times, and at 1e16 rounding makes the angle arbitrary
 LARGEST_ANGLE = 1000.0
-"""Larger angles, rad, are refused: no tool turns 159 times, and at 1e16 rounding makes the angle arbitrary."""
-
-
-ROTATION_TOLERANCE = 1e-9
-"""Largest deviation of RᵀR from the identity that is accepted as rounding."""
-
-
-IN_A_LINE = 1e-6
-"""Points whose width is below this share of their length lie in a line."""
+ROTATION_TOLERANCE = 1e-9  # largest deviation of RᵀR from the identity that is accepted as rounding
+IN_A_LINE = 1e-6  # points whose width is below this share of their length lie in a line
 
 
 @dataclass(frozen=True)
@@ -116,14 +110,7 @@ class Pose:
 
 
 def stacked(poses: Sequence[Pose] | tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions, shape (N, 3), and the rotations, shape (N, 3, 3), of N poses; arrays are returned
-    unchanged.
-
-    Raises
-    ------
-    PoseError
-        Arrays of another shape, or not finite.
-    """
+    """Return the positions (N, 3) and rotations (N, 3, 3) of N poses; such arrays are checked and returned."""
     listed = [pose for pose in poses if isinstance(pose, Pose)]
     if len(listed) == len(poses):
         positions, rotations = [pose.position for pose in listed], [pose.rotation for pose in listed]
@@ -135,22 +122,7 @@ def stacked(poses: Sequence[Pose] | tuple[np.ndarray, np.ndarray]) -> tuple[np.n
 
 
 def rotation_from_angles(angles: np.ndarray) -> np.ndarray:
-    """Return R = Ry(β)·Rx(α)·Rz(γ) (Song et al., T_BASE^TOP).
-
-    Parameters
-    ----------
-    angles : array_like, shape (..., 3)
-        α, β, γ in radians.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-
-    Raises
-    ------
-    PoseError
-        An angle above :data:`LARGEST_ANGLE`.
-    """
+    """Return R = Ry(β)·Rx(α)·Rz(γ), shape (..., 3, 3), of α, β, γ, rad, shape (..., 3) (Song et al., T_BASE^TOP)."""
     angles = np.asarray(angles, dtype=float)
     if (np.abs(angles) > LARGEST_ANGLE).any():
         raise PoseError(f"angles must lie within ±{LARGEST_ANGLE:g} rad", float(np.abs(angles).max()))
@@ -205,18 +177,9 @@ def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:
 
 
 def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
-    """Return the rigid motion that brings points closest to others: the datum aligned (Kabsch).
+    """Return the rigid motion T with T·points ≈ onto, least squares, of pairs (N, 3), m: the datum aligned (Kabsch).
 
-    Parameters
-    ----------
-    points, onto : ndarray, shape (N, 3)
-        Pairs of places, m.
-
-    Returns
-    -------
-    Pose or None
-        T with T·points ≈ onto, least squares; None for fewer than three points or points in a line, which do not
-        determine a turn.
+    None for fewer than three points or points in a line, which do not determine a turn.
     """
     from scipy.spatial.transform import Rotation  # As in attitude_error
 

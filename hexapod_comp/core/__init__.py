@@ -17,15 +17,12 @@ except ImportError as error:
         name="hexapod_comp.core._core",
     ) from error
 
+# Version of the arithmetic, which changes when a bit of an answer does, and SHA-256 of the sources that were built
 VERSION, SOURCES_HASH = ffi.string(lib.hc_version()).decode(), ffi.string(lib.hc_sources()).decode()
-"""Version of the arithmetic, which changes when a bit of an answer does, and SHA-256 of the sources that were built."""
-
+# A quaternion whose norm is further from 1 than this is refused: it was never a rotation
 QUATERNION_NORM_TOLERANCE = lib.QUATERNION_TOLERANCE
-"""A quaternion whose norm is further from 1 than this is refused: it was never a rotation."""
-
+# A pause between commands counts as no more than this in a ramp, s: a late command must not step
 LONGEST_RAMP_STEP = lib.LONGEST_RAMP_STEP
-"""A pause between commands counts as no more than this in a ramp, s: a late command must not step."""
-
 MOST_ITERATIONS, MOST_HARMONICS = lib.HC_MOST_ITERATIONS, lib.HC_MOST_HARMONICS
 
 
@@ -33,8 +30,7 @@ def _statuses() -> Any:
     return enum.IntEnum("Status", {name[3:]: value for name, value in ffi.typeof("hc_status").relements.items()})
 
 
-Status = _statuses()
-"""hc_status: what became of a command, a check or a solution; ``OK`` is 0."""
+Status = _statuses()  # hc_status: what became of a command, a check or a solution; ``OK`` is 0
 
 NUMBERS = {"double": "f8", "int": "i4", "long": "i8"}
 

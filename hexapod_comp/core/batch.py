@@ -15,9 +15,7 @@ import numpy as np
 
 from . import Struct, dtype_of, ffi, lib
 
-QUANTITIES = dtype_of("hc_quantities")
-"""The limited quantities of a pose, in one stage."""
-
+QUANTITIES = dtype_of("hc_quantities")  # The limited quantities of a pose, in one stage
 KINDS: dict[str | None, np.dtype] = {
     None: np.dtype(float),
     "int": np.dtype(np.intc),

@@ -27,12 +27,9 @@ from ..machine.trajectory import moves
 from ..pose import Pose, rotation_from_angles, stacked
 from .carried import refuse_unknown
 
+# Where the core lies, and what is written around it
 CORE, AROUND = Path(__file__).parents[1] / "core", Path(__file__).parent / "c"
-"""Where the core lies, and what is written around it."""
-
-PERIOD = 0.004
-"""Between two commands of the self-test, s."""
-
+PERIOD = 0.004  # Between two commands of the self-test, s
 MODEL_FILE, VECTORS_FILE = "hexapod_model.h", "hexapod_vectors.h"
 
 

@@ -16,7 +16,6 @@ from ..errors import ModelError
 from ..machine.model import MachineModel
 
 PROVENANCE = ("machine", "name", "origin", "region")  # Fields that move no tool
-
 CARRIED = frozenset(
     {
         *("base_deviation", "platform_deviation", "base_axes_turn", "reversal_threshold"),

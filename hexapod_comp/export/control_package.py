@@ -19,11 +19,9 @@ from ..machine.model import MachineModel
 from ..machine.robot_description import urdf
 from .c_code import write_c
 
+# The package's files; ``@NAME@`` stands for what differs from machine to machine
 TEMPLATES = Path(__file__).parent / "ros2_control"
-"""The package's files; ``@NAME@`` stands for what differs from machine to machine."""
-
 CHAINED = "compensation"  # Name of the controller in ``within.yaml``: ahead of the joints that it offers
-
 TOLERANCE = 0.75
 """Of the largest step between two commands: a goal that lags by more is aborted. What the controller then holds, where
 the struts are, must still be within a step of the last command that was not refused."""

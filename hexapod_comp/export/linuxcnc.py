@@ -50,16 +50,13 @@ MOST_POINTS = 256  # EMCMOT_COMP_SIZE
 OUTER_POINTS = 12  # Most points spent on each end of a stroke that level poses of the box do not need
 MARGIN = 0.003  # Fine points go this far beyond the lengths needed, m: there the coarse part's misfit has died away
 FOLD = np.deg2rad(5.0)  # Cardan axes this near to a right angle, rad, are refused together with a screw lead
+# Values of [TRAJ]LINEAR_UNITS, and their size in m
 MACHINE_UNITS = {"mm": UNITS["length"]["mm"], "inch": UNITS["length"]["in"]}
-"""Values of [TRAJ]LINEAR_UNITS, and their size in m."""
-
 HAL_FILE, INI_FILE = "genhexkins.hal", "comp.ini"
 COMP_FILES = tuple(f"{name}.comp" for name in STRUT_NAMES)
 COMP_TYPE = 1
-
 PINS = {"base": "base_joints", "platform": "platform_joints", "base-n": "base_axes", "platform-n": "platform_axes"}
 SETP = re.compile(r"setp\s+genhexkins\.(\S+)\s+(\S+)\s*")
-
 SAMPLES = 16  # Samples of the strut's errors between two points of its table
 
 

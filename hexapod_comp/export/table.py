@@ -36,7 +36,6 @@ CORRECTION = tuple(f"correction_L{i}" for i in range(1, 7))
 BACKLASH = tuple(f"backlash_L{i}" for i in range(1, 7))
 DISPLACEMENT = ("dx", "dy", "dz")
 ROTATION = ("rx", "ry", "rz")
-
 COLUMNS = (
     *(f"{name}_mm" for name in POSITION),
     "direction",
@@ -46,12 +45,10 @@ COLUMNS = (
 """Header of the file."""
 
 MOST_ROWS = 200_000  # A finer grid is refused: it would not be a table for a controller
-
+# A screw wave with fewer steps of the grid than this to its period is left out: the grid would see noise
 WAVE_STEPS = 4.0
-"""A screw wave with fewer steps of the grid than this to its period is left out: the grid would see noise."""
-
+# Nodes on the boundary of the field's box count as inside, though errors move the measured point out by µm
 EDGE = 0.1e-3
-"""Nodes on the boundary of the field's box count as inside, though errors move the measured point out by µm."""
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,8 @@ from ..machine.passes import Passes
 from ..machine.temperatures import HUMIDITY, PARTS, REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE, Temperatures
 from ..machine.trial import ToolErrors, Trial
 
+# Readings of a machine that is 1 K warmer, and of one in damper air
 WARMER, DAMPER = dict.fromkeys(PARTS, REFERENCE_TEMPERATURE + 1.0), {HUMIDITY: REFERENCE_HUMIDITY + 0.1}
-"""Readings of a machine that is 1 K warmer, and of one in damper air."""
-
 DIAGONAL = np.ones(3)  # Direction of travel, forward; backward is its opposite
 
 

@@ -13,12 +13,9 @@ from ..errors import GeometryError, KinematicsError, LimitError, NotFiniteError,
 from ..formats.schema import PAIRS_PER_STRUT, PER_STRUT, Numbers
 
 STRUT_NAMES = tuple(f"strut_{i}" for i in range(1, 7))  # Names of the six struts, in order, for messages
-
+# Names of the findings, by their number, as counted in diagnostics
 REASONS = tuple(ffi.string(lib.hc_reason(status)).decode() for status in range(Status.ACCELERATION + 1))
-"""Names of the findings, by their number, as counted in diagnostics."""
-
 STAGES = ("nominal", "compensated")
-
 TINY = np.finfo(float).tiny
 
 

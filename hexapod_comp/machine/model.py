@@ -170,8 +170,6 @@ class MachineModel:
 
 
 FOLLOWED = 9  # Three axes of the measured point, then six struts
-
-
 # Directions of all axes and struts approached in one direction; midway: not known
 DIRECTIONS = {"forward": 1.0, "midway": 0.0, "backward": -1.0}
 

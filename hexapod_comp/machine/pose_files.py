@@ -16,10 +16,8 @@ POSITION_COLUMNS = ("x", "y", "z")
 ANGLE_COLUMNS = ("alpha", "beta", "gamma")
 QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
 LENGTH_COLUMNS = tuple(f"L{i}" for i in range(1, 7))
-
 # The tool's errors of `ik --model`, each for x, y, z and rx, ry, rz
 PREDICTED_ERRORS = tuple(f"{error}_{{}}{known}" for error in ("error", "error_aligned") for known in ("", "_sd"))
-
 # Columns that `ik --model` and `ik --line` add to lengths and :func:`read_lengths` ignores, with their dimension
 BESIDE_LENGTHS = {
     tuple(f"nominal_{name}" for name in LENGTH_COLUMNS): "length",

@@ -18,13 +18,10 @@ from ..pose import Pose, roll_pitch_yaw
 from .geometry import BASE, STRUT_NAMES, HexapodGeometry
 from .kinematics import strut_lengths
 
+# In their order from base to platform: R = Ry(β)·Rx(α)·Rz(γ) (Song et al., T_BASE^TOP)
 PLATFORM_JOINTS = ("platform_x", "platform_y", "platform_z", "platform_beta", "platform_alpha", "platform_gamma")
-"""In their order from base to platform: R = Ry(β)·Rx(α)·Rz(γ) (Song et al., T_BASE^TOP)."""
-
 _AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 0], [1, 0, 0], [0, 0, 1]], dtype=float)
-
 STRUT_RADIUS, JOINT_RADIUS, PLATE = 0.01, 0.018, 0.01  # Drawn sizes, m: struts, joints, and the platform's thickness
-
 HARDWARE = (
     ("joint_commands_topic", "strut_setpoints"),
     ("joint_states_topic", "nominal_strut_states"),
@@ -32,18 +29,16 @@ HARDWARE = (
 )
 """Parameters of ros2_control's JointStateTopicSystem; the last one makes it send commands near the readings too."""
 
+# Density of the drawn bodies, kg/m³, in MJCF; a machine file has no masses. A platform of 0.35 m weighs 7 kg
 STEEL = 7850.0
-"""Density of the drawn bodies, kg/m³, in MJCF; a machine file has no masses. A platform of 0.35 m weighs 7 kg."""
-
 SCREW_INERTIA, HINGE_INERTIA = 200.0, 0.01
 """Armature of a strut's slide, kg, 1.3e-4 kg m² turning on a screw of 5 mm lead; and of a hinge at its foot, kg m².
 
 Light bodies with stiff drives need short steps: the armature gives the slides inertia without weight.
 """
 
+# Of a strut's drive: N/m, a steel rod of 20 mm over 0.6 m; N s/m, critical with :data:`SCREW_INERTIA`
 STIFFNESS, DAMPING = 1e8, 2.8e5
-"""Of a strut's drive: N/m, a steel rod of 20 mm over 0.6 m; N s/m, critical with :data:`SCREW_INERTIA`."""
-
 FASTEST = 1.0
 """Speed, m/s, to which the damping holds a strut under its drive's largest force, where the machine's limit is higher.
 

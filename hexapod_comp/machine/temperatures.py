@@ -18,8 +18,6 @@ PARTS = (*STRUT_NAMES, "base", "platform")  # What has a temperature, in the ord
 MOST_TIME_CONSTANTS = 2  # A machine that warms shows a fast and a slow one; more cannot be told apart
 TIME_CONSTANT_RANGE = (10.0, 1e6)  # Time constants outside this, s, are a sensor's noise, or a building's seasons
 REST = 3.0  # time constants after which a twentieth of an unknown initial state is left
-
-
 EXPANSION = 1e-3  # Largest expansion that a machine's part may have, 1/K: five times that of soft plastics
 
 

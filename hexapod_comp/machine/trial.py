@@ -22,8 +22,7 @@ from .model import MachineModel, RealMachine
 from .passes import Passes, Poses, at
 from .temperatures import Temperatures
 
-NameOf = Callable[[int], str]
-"""Adds the row to an error."""
+NameOf = Callable[[int], str]  # Adds the row to an error
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,8 @@ from ..errors import ModelError
 from ..machine.geometry import STRUT_NAMES
 from ..machine.model import MotionState, RealMachine
 
-LEAST_LAG = 1e-3
-"""Shortest nonzero lag of a drive, s: below, too many integration steps would be needed."""
-
-LONGEST_DELAY = 10.0
-"""Longest feedback delay, s."""
+LEAST_LAG = 1e-3  # Shortest nonzero lag of a drive, s: below, too many integration steps would be needed
+LONGEST_DELAY = 10.0  # Longest feedback delay, s
 
 
 @dataclass(frozen=True)

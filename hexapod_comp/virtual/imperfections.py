@@ -19,23 +19,16 @@ from ..machine.kinematics import Structure, strut_lengths
 from ..machine.model import MachineModel, ModelOrigin
 from ..machine.struts import StrutErrors
 
-FIELD_NODES = 3
-"""Nodes of a drawn field along each axis."""
-
-FIELD_POWERS = 4
-"""Coefficients of a drawn field's polynomials: cubic along each line."""
-
+FIELD_NODES = 3  # Nodes of a drawn field along each axis
+FIELD_POWERS = 4  # Coefficients of a drawn field's polynomials: cubic along each line
+# Waves added up in a smooth length error; its knots on the shortest one: the spline between them is then the wave
 MAP_WAVES, KNOTS_PER_WAVE = 8, 15
-"""Waves added up in a smooth length error; its knots on the shortest one: the spline between them is then the wave."""
-
+# Shortest and longest of them where bounds draw them: shares of the stroke, but no shorter than this, m
 WAVES_OF_STROKE, LEAST_WAVES = (0.1, 0.35), (0.06, 0.2)
-"""Shortest and longest of them where bounds draw them: shares of the stroke, but no shorter than this, m."""
-
+# Shortest and longest worn part of a screw, from its middle to the point with 61 % of the wear, in strokes
 WORN_PART = (0.1, 0.3)
-"""Shortest and longest worn part of a screw, from its middle to the point with 61 % of the wear, in strokes."""
-
+# Bounds that have a lowest and a highest value, and their units
 SPANS = {"wave": "m", "harmonics": "m", "backlash": "m", "strut_expansion": "1/K", "body_expansion": "1/K"}
-"""Bounds that have a lowest and a highest value, and their units."""
 
 
 @dataclass(frozen=True)

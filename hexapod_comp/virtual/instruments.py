@@ -32,8 +32,8 @@ from ..measurements.readings import (
 from ..measurements.runs import assemble
 from ..pose import Pose, attitude_error
 
+# Streams of random numbers, one per cause: changing one leaves the others' draws alone
 VISITS, SLOPES, NOISE, CENTRES = range(4)
-"""Streams of random numbers, one per cause: changing one leaves the others' draws alone."""
 
 
 def measure(

@@ -23,11 +23,8 @@ from .drives import DriveParameters, Faults, to_step
 
 __all__ = ["DriveParameters", "Faults", "StrutDrive"]
 
-LONGEST_ADVANCE = 60.0
-"""Longest time advanced in one call, s; more is a unit error."""
-
-LONGEST_TICK = 0.25e-3
-"""Integration step of the drives, s; shorter for a shorter lag."""
+LONGEST_ADVANCE = 60.0  # Longest time advanced in one call, s; more is a unit error
+LONGEST_TICK = 0.25e-3  # Integration step of the drives, s; shorter for a shorter lag
 
 
 class StrutDrive:

@@ -19,14 +19,10 @@ from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL, load_model
 from .imperfections import ImperfectionBounds, draw_model
 
-RANDOM = "random"
-"""A machine drawn with :data:`USUAL` bounds and seed 1; ``random:7`` has seed 7."""
-
+RANDOM = "random"  # A machine drawn with :data:`USUAL` bounds and seed 1; ``random:7`` has seed 7
 RANDOM_SEED = 1
-
+# Hidden errors that are shipped, by machine; every other machine's are drawn
 SHIPPED_TRUTH = {"paper": "paper_machine.yaml"}
-"""Hidden errors that are shipped, by machine; every other machine's are drawn."""
-
 USUAL: dict[str, Any] = {
     "joint": 50e-6,
     "strut_offset": 50e-6,

@@ -26,21 +26,12 @@ from ..measurements.readings import AXES, MeasurementSet, Stations
 from .instruments import compensated, measure
 
 WARM_UP_FORMAT, WARM_UP_VERSION = "hexapod_comp/warm_up", 1
-
-SENSED = (*PARTS, HUMIDITY)
-"""Quantities with a course, in the order of every array of nine."""
-
-POINTS = 9
-"""Of each line that is measured again."""
-
+SENSED = (*PARTS, HUMIDITY)  # Quantities with a course, in the order of every array of nine
+POINTS = 9  # Of each line that is measured again
+# Largest spread of the struts of one machine (standard deviation): beyond, one of them may run backwards in time
 MOST_APART = 0.2
-"""Largest spread of the struts of one machine (standard deviation): beyond, one of them may run backwards in time."""
-
-LONGEST = 1_000_000
-"""A warm-up of more seconds is a season."""
-
-APART, NOISE = 20, 17
-"""Streams of random numbers: how struts differ, and what the sensors add."""
+LONGEST = 1_000_000  # A warm-up of more seconds is a season
+APART, NOISE = 20, 17  # Streams of random numbers: how struts differ, and what the sensors add
 
 
 @dataclass(frozen=True)

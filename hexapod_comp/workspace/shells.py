@@ -41,8 +41,6 @@ class Quantity:
 
 TRANSLATION = Quantity("translation of the tool", "µm", 1e6)
 ROTATION = Quantity("rotation of the tool, largest of three", "m°", 1e3 * 180.0 / np.pi)
-
-
 # Points along a ray at which gaps are looked for: one smaller than a hundredth of the reach can stay unseen
 SAMPLES = 96
 LEAST_RINGS, LEAST_SECTORS = 5, 8  # A coarser mesh is no picture of a body
