@@ -46,7 +46,7 @@ def at_once(work: Callable[[Given], Result], items: Iterable[Given], rows: int) 
 
 
 class Alike(NamedTuple):
-    """Cells that the same parameters move."""
+    """Cells whose readings depend on the same parameters."""
 
     cells: np.ndarray  # (n,): Which
     columns: np.ndarray  # (m,): These parameters, ascending

@@ -302,7 +302,7 @@ def _datum_of(measurements: MeasurementSet, grid: Sequence[np.ndarray]) -> tuple
     beyond = [name for name, p, d in zip(AXES, point, datum, strict=True) if abs(p - d) > LEAST_TRAVEL]
     if not beyond:
         return datum, []
-    return datum, [f"home lies outside the box along {', '.join(beyond)}: lines are zero at the end next to it"]
+    return datum, [f"home lies outside the box along {', '.join(beyond)}: lines are zeroed at their end nearest to it"]
 
 
 # From readings to polynomials

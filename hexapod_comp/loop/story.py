@@ -52,10 +52,10 @@ DRIVES = 2.0
 
 EXACT = ((0.0, 0.0), (0.0, 0.0))  # prediction for the true model: no error but the drives'
 
-REMARK = """as it is: with where the machine stands as a whole. Laser lines cannot see that, and a workpiece zero set
-with the model on takes it up. Datum aligned: less the one rigid motion that such a zero makes."""
+REMARK = """as it is: includes the shift and turn of the whole machine, which laser lines do not show and a workpiece
+zero set with the model on removes. Datum aligned: without that rigid motion."""
 
-REST = 0.3  # the machine is given so long to come to rest, s: sixty of the drives' lags
+REST = 0.3  # time for the machine to come to rest, s: sixty of the drives' lags
 
 
 @dataclass(frozen=True)

@@ -97,11 +97,11 @@ class PoseCheck:
         return bool(np.linalg.norm(self._offset()) < LARGEST_OFFSET)
 
     def end(self) -> None:
-        """Raise a SetUpError where the tool reads beside where it was sent."""
+        """Raise a SetUpError where the measured place is far from the commanded one."""
         offset = self._offset()
         if np.linalg.norm(offset) > LARGEST_OFFSET:
             away = ", ".join(f"{value * 1e3:.1f}" for value in offset)
-            text = f"the tool reads {away} mm beside where it was sent"
+            text = f"the tool is measured {away} mm away from the commanded place"
             question = "is the target's place the tool's, and the instrument's origin the base's?"
             raise SetUpError(f"{text}: {question}{self._hint()}")
 
@@ -110,7 +110,7 @@ class PoseCheck:
         return np.asarray(np.array(places) - np.mean(places, axis=0))
 
     def _offset(self) -> np.ndarray:
-        """Return how far the tool reads beside where it was sent: on average, in a free frame at the last stop."""
+        """Return measured minus commanded place: the mean, in a free frame that of the last stop."""
         if not self._meant or (frame := self.frame()) is None:
             return np.zeros(3)
         off = [(frame @ seen).position - meant.position for meant, seen in zip(self._meant, self._seen, strict=True)]

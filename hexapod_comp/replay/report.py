@@ -154,7 +154,7 @@ def _compared(report: Report) -> Part:
         }
     elif replayed.states_differ:
         place = report.place(replayed.states_differ[0])
-        lines.append(f"answers agree, but the compensator's state is another first before {place}")
+        lines.append(f"answers agree, but the compensator's state differs, first before {place}")
     return lines, {
         "outcomes": {name: counts[outcome] for outcome, name in OUTCOMES.items()},
         "first_difference": first,

@@ -119,7 +119,7 @@ def _content(geometry: HexapodGeometry, data: PageData) -> dict[str, object]:
 
 
 def _coded(data: PageData) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values as steps of their scales, uint16, and the scales, (E, Q, 2) in shown units."""
+    """Return the values as 16-bit integers, and the least value and step of each scale, (E, Q, 2), in shown units."""
     factors = np.array([quantity.factor for quantity in data.quantities])
     low = data.values.min(axis=(0, 3, 4, 5)) * factors
     high = data.values.max(axis=(0, 3, 4, 5)) * factors
