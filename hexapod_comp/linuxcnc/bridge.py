@@ -15,8 +15,8 @@ import math
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -28,7 +28,6 @@ from std_srvs.srv import Trigger
 
 from ..compensation.guards import Sample, StampClock, StampGate
 from ..errors import CommandError, HexapodError
-from ..ros import keep_discovery_local
 from ..ros.base import CHECK_PERIOD, COMMAND_QOS, EVENT_QOS, LATCHED_QOS, STATE_QOS, MachineNode
 from ..ros.messages import StrutBytes, StrutReader, stamp_of
 from ..ros.parameters import Program, read_table
@@ -185,58 +184,6 @@ TEXTS = {
 }
 
 
-@dataclass
-class BridgeStatus:
-    """Counters of a bridge, and the status made of them."""
-
-    guard: CorrectionGuard  # between the compensator and the controller
-    cycles: Flow = field(default_factory=Flow)  # of the loop
-    sent: Flow = field(default_factory=Flow)  # commands published
-    states: Flow = field(default_factory=Flow)  # measured struts published
-    heard: Flow = field(default_factory=Flow)  # corrections that came
-    refusals: Refusals = field(default_factory=Refusals)  # corrections that were not used
-    bad_pins: Refusals = field(default_factory=Refusals)  # pins that were not used
-    machine_on: bool = False  # the controller's switches
-    enabled: bool = False
-    resets: int = 0  # how often the compensator was asked to start anew
-    latency: float = 0.0  # age of the last correction's command when it came, s
-
-    def judged(self, active: bool, now: float) -> tuple[bytes, str]:
-        status = self.guard.status
-        if not active:
-            return WARN, "not active"
-        if self.bad_pins.recent(now):
-            return ERROR, f"unusable pins: {self.bad_pins.last_reason}"
-        if self.refusals.recent(now):
-            return ERROR, f"refusing corrections: {self.refusals.last_reason}"
-        if not self.machine_on:
-            return OK, "machine off"
-        if self.enabled and self.guard.accepted and status is GuardStatus.WAITING:
-            return ERROR, "compensator lost, corrections are zero"
-        if self.enabled and status is GuardStatus.RETURNING:
-            return ERROR, "compensator lost, corrections are ramping out"
-        return TEXTS[status]
-
-    def values(self, compensated_by: str, now: float) -> dict[str, str]:
-        return {
-            "status": self.guard.status.name.lower(),
-            "machine_on": str(self.machine_on).lower(),
-            "enabled": str(self.enabled).lower(),
-            "cycle_rate_hz": f"{self.cycles.rate(now):.1f}",
-            "command_rate_hz": f"{self.sent.rate(now):.1f}",
-            "correction_rate_hz": f"{self.heard.rate(now):.1f}",
-            "correction_age_s": seconds(self.guard.age(now)),
-            "latency_s": f"{self.latency:.6f}",
-            "largest_correction_m": f"{max(map(abs, self.guard.output)):.9f}",
-            "accepted": str(self.guard.accepted),
-            "resets": str(self.resets),
-            "compensated_by": compensated_by,
-            "last_refusal": self.refusals.last_text,
-            "last_bad_pins": self.bad_pins.last_text,
-            **self.refusals.values(),
-        }
-
-
 # A compensator that has been lost for so long is asked to start anew, s: it has forgotten its feedback by then
 RESET_AFTER = 0.15
 
@@ -252,8 +199,8 @@ class CompensatorReset:
     # Only a compensator that complains is asked: requests to one that is stopped get lost, and DDS then keeps back
     # those that follow for seconds.
 
-    def __init__(self, node: MachineNode, status: BridgeStatus, options: dict[str, Any]) -> None:
-        self._node, self._status, self._options = node, status, options
+    def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:
+        self._node, self._options = node, options
         self._name = status_prefix(node.get_namespace(), "compensator")
         self._asked_at = self._complained_at = -math.inf
         self._unanswered = 0
@@ -271,24 +218,25 @@ class CompensatorReset:
             if status.level == ERROR and status.name.startswith(self._name):
                 self._complained_at = time.monotonic()
 
-    def ask(self, streaming_since: float, heard_at: float, now: float) -> None:
-        """Request a reset when commands are sent but no correction arrives for too long; monotonic times, s."""
+    def ask(self, streaming_since: float, heard_at: float, now: float) -> bool:
+        """Request a reset when commands are sent but no correction arrives for too long, monotonic times, s; return
+        whether it was requested."""
         if heard_at > self._asked_at:
             self._unanswered = 0
         waited = now - max(streaming_since, heard_at)
         if waited < self._options["timeout"] + RESET_AFTER or now - self._asked_at < RESET_PERIOD:
-            return
+            return False
         if self._complained_at < heard_at or now - self._complained_at > COMPLAINT_COUNTS_FOR:
-            return
+            return False
         self._asked_at = now
         if not self._client.service_is_ready():
-            return
+            return False
         if self._question is not None:
             self._client.remove_pending_request(self._question)
         self._question = self._client.call_async(Trigger.Request())
-        self._status.resets += 1
         self._unanswered += 1
         self._node.log_warning("reset", "the compensator refuses every command; asked it to start anew")
+        return True
 
 
 class StopInput:
@@ -325,7 +273,12 @@ class LinuxcncBridgeNode(MachineNode):
         super().__init__("linuxcnc_bridge", PARAMETERS, **options)
         self._metres = METRES[self._options["units"]]
         self._guard = CorrectionGuard(*(self._options[name] for name in GUARDED))
-        self._status = BridgeStatus(self._guard)
+        # cycles of the loop; published commands and measured struts; corrections that arrived
+        self._cycles, self._sent, self._states, self._heard = Flow(), Flow(), Flow(), Flow()
+        self._refusals, self._bad_pins = Refusals(), Refusals()  # corrections and pins that were not used
+        self._machine_on = self._enabled = False  # the controller's switches
+        self._resets = 0  # how often the compensator was asked to start anew
+        self._latency = 0.0  # age of the last correction's command when it came, s
         self._reader = StrutReader()
         self.clock = StampClock()  # the system's: what the bridge stamps with
         self._stamps = StampGate("correction", self.clock)
@@ -356,7 +309,7 @@ class LinuxcncBridgeNode(MachineNode):
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
         self.set_hardware_id(self._options["component"])
         self._source = self.subscribe_exclusive(JointState, "strut_corrections", self._on_correction, several)
-        self._reset = CompensatorReset(self, self._status, self._options)
+        self._reset = CompensatorReset(self, self._options)
         self.every(CHECK_PERIOD, self._check_state)
 
     def unconfigure(self) -> None:
@@ -387,14 +340,13 @@ class LinuxcncBridgeNode(MachineNode):
 
     def _cycle(self) -> None:
         now = time.monotonic()
-        status = self._status
-        status.machine_on, status.enabled = self._read_switches()
-        if self._active and status.machine_on:
+        self._machine_on, self._enabled = self._read_switches()
+        if self._active and self._machine_on:
             self._send(now)
             if self._reset is not None:
-                self._reset.ask(self._streaming_since, self._status.heard.last, now)
-        output = self._guard.update(now, self._active and status.machine_on and status.enabled)
-        status.cycles.tick(now)
+                self._resets += self._reset.ask(self._streaming_since, self._heard.last, now)
+        output = self._guard.update(now, self._active and self._machine_on and self._enabled)
+        self._cycles.tick(now)
         self._write_corrections([value / self._metres for value in output])
         self._beat = not self._beat
         self._write_state(
@@ -406,43 +358,43 @@ class LinuxcncBridgeNode(MachineNode):
                 self._beat,
                 self._stop.stopped(now),
                 self._guard.accepted % COUNTS,
-                sum(status.refusals.counts.values()) % COUNTS,
-                status.resets % COUNTS,
+                self._refusals.total % COUNTS,
+                self._resets % COUNTS,
             )
         )
 
     def _send(self, now: float) -> None:
         """Publish measured struts and commanded pose, each only if all its pins are usable."""
-        stamp, status = time.time_ns(), self._status
+        stamp = time.time_ns()
         p, q = self._pose_out.pose.position, self._pose_out.pose.orientation
         # Half a cycle less, since cycles come a little early or late.
-        if self._status.states.age(now) >= 1.0 / self._options["states_rate"] - 0.5 / self._options["rate"]:
+        if self._states.age(now) >= 1.0 / self._options["states_rate"] - 0.5 / self._options["rate"]:
             feedback = self._read_feedback()
             if self._usable(FEEDBACK, feedback, now):
                 self._send_states(feedback, stamp, now)
         axes = self._read_axes()
         if self._usable(AXES, axes, now):
-            if status.sent.age(now) > self._options["timeout"]:
+            if self._sent.age(now) > self._options["timeout"]:
                 self._streaming_since = now
             x, y, z, q.x, q.y, q.z, q.w = pose_from_axes(*axes)
             p.x, p.y, p.z = x * self._metres, y * self._metres, z * self._metres
             self._pose_out.header.stamp = stamp_of(stamp)
             self._pose_pub.publish(self._pose_out)
-            status.sent.tick(now)
+            self._sent.tick(now)
 
     def _send_states(self, feedback: Sequence[float], stamp: int, now: float) -> None:
         """Publish measured struts; while no corrections come, only when they stand."""
         # A compensator starts from the measured struts, and takes their way to its commands for a correction to be
         # ramped out. Moving struts lag: one that starts while they move is better left without them, unless it cannot
         # start where it was told to be last.
-        out, since = self._states_out, self._status.states.age(now)
-        self._status.states.tick(now)
+        out, since = self._states_out, self._states.age(now)
+        self._states.tick(now)
         followed = since < self._options["timeout"]
         message = out.made([value * self._metres for value in feedback], stamp, since if followed else 0.0)
         if not followed or max(map(abs, out.velocity.tolist())) > STANDING:
             self._moved_at = now
         unanswered = self._reset is not None and self._reset.unanswered
-        silent = self._status.heard.age(now) > self._options["timeout"]
+        silent = self._heard.age(now) > self._options["timeout"]
         if silent and now - self._moved_at < self._options["timeout"] and not unanswered:
             return
         self._states_pub.publish(message)
@@ -453,7 +405,7 @@ class LinuxcncBridgeNode(MachineNode):
             return True
         which, listed = ", ".join(bad), ", ".join(f"{name} = {value}" for name, value in bad.items())
         text = f"pins that are no numbers within ±{LARGEST_PIN:g}: {listed}"
-        self._status.bad_pins.add(which, text, now)
+        self._bad_pins.add(which, text, now)
         self.log_warning(which, text)
         return False
 
@@ -461,7 +413,7 @@ class LinuxcncBridgeNode(MachineNode):
         self._source.update(time.monotonic())
 
     def _on_correction(self, data: bytes, sample: Sample) -> None:
-        self._status.heard.tick(sample.now)
+        self._heard.tick(sample.now)
         try:
             self._source.check(sample)
             self._reader.sample(data, sample)
@@ -469,32 +421,63 @@ class LinuxcncBridgeNode(MachineNode):
                 raise CommandError("stamp_past", "it has no stamp, and answers no command of ours")
             self._stamps.max_age = self._options["timeout"]  # its stamp is ours, and comes from this clock
             self._stamps.check(sample)
-            self._status.latency = sample.age
+            self._latency = sample.age
             self._guard.offer(sample.values or (), sample.now)
             self._stamps.accept(sample)
         except CommandError as error:
-            self._status.refusals.add(error.reason, str(error), sample.now)
+            self._refusals.add(error.reason, str(error), sample.now)
             self.log_warning(error.reason, f"correction refused ({error.reason}): {error}")
 
     # ---- state ----
 
     def _check_state(self) -> None:
         now = time.monotonic()
-        self._source.update(now)
-        level, text = self._status.judged(self._active, now)
+        self.update_publishers()
+        level, text = self._judged(now) if self._active else (WARN, "not active")
         if text != self._last_text:
             self._last_text = text
             if level != OK:
                 self.log_warning(text, text)
             else:
                 self.note(text, text)
-        self.publish_status(level, text, lambda: self._status.values(", ".join(self._source.names), now))
+        self.publish_status(level, text, lambda: self.values(now))
+
+    def _judged(self, now: float) -> tuple[bytes, str]:
+        """Return level and message of an active node."""
+        status = self._guard.status
+        if self._bad_pins.recent(now):
+            return ERROR, f"unusable pins: {self._bad_pins.last_reason}"
+        if self._refusals.recent(now):
+            return ERROR, f"refusing corrections: {self._refusals.last_reason}"
+        if not self._machine_on:
+            return OK, "machine off"
+        if self._enabled and self._guard.accepted and status is GuardStatus.WAITING:
+            return ERROR, "compensator lost, corrections are zero"
+        if self._enabled and status is GuardStatus.RETURNING:
+            return ERROR, "compensator lost, corrections are ramping out"
+        return TEXTS[status]
+
+    def values(self, now: float) -> dict[str, str]:
+        return {
+            "status": self._guard.status.name.lower(),
+            "machine_on": str(self._machine_on).lower(),
+            "enabled": str(self._enabled).lower(),
+            "cycle_rate_hz": f"{self._cycles.rate(now):.1f}",
+            "command_rate_hz": f"{self._sent.rate(now):.1f}",
+            "correction_rate_hz": f"{self._heard.rate(now):.1f}",
+            "correction_age_s": seconds(self._guard.age(now)),
+            "latency_s": f"{self._latency:.6f}",
+            "largest_correction_m": f"{max(map(abs, self._guard.output)):.9f}",
+            "accepted": str(self._guard.accepted),
+            "resets": str(self._resets),
+            "compensated_by": ", ".join(self._source.names),
+            "last_refusal": self._refusals.last_text,
+            "last_bad_pins": self._bad_pins.last_text,
+            **self._refusals.values(),
+        }
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    keep_discovery_local()
-    return run(LinuxcncBridgeNode, PROGRAM, argv)
-
+main = partial(run, LinuxcncBridgeNode, PROGRAM)
 
 if __name__ == "__main__":
     sys.exit(main())

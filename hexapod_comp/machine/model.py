@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -161,7 +162,7 @@ class MachineModel:
         error = self.outside.evaluate(outside)
         return replace(self, outside=NO_TABLE, field=self.field.plus(error) if error.any() else self.field)
 
-    @property
+    @cached_property
     def measured(self) -> Region | None:
         """Region of the model's measurement, or else of its field; None if not known."""
         if self.region is None and any(family.shape[4] for family in self.field.lines):

@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from functools import partial
 from types import FrameType
 
 # Where Fast DDS looks for a user's profile: up to version 2 (ROS 2 Jazzy), and from version 3
@@ -91,26 +92,7 @@ def end_with_parent(number: signal.Signals = signal.SIGTERM) -> None:
     _LIBC.prctl(1, number)  # PR_SET_PDEATHSIG
 
 
-def start_compensator() -> int:
-    """Run the executable ``compensator``."""
-    return start("hexapod_comp.ros.compensator")
-
-
-def start_strut_drive() -> int:
-    """Run the executable ``strut_drive``."""
-    return start("hexapod_comp.ros.strut_drive")
-
-
-def start_mover() -> int:
-    """Run the executable ``mover``."""
-    return start("hexapod_comp.ros.mover")
-
-
-def start_instrument() -> int:
-    """Run the executable ``instrument``."""
-    return start("hexapod_comp.ros.instrument")
-
-
-def start_adapter() -> int:
-    """Run the executable ``adapter``."""
-    return start("hexapod_comp.ros.adapter")
+# The executables of setup.py
+start_compensator, start_strut_drive, start_mover, start_instrument, start_adapter = (
+    partial(start, f"{__name__}.{node}") for node in ("compensator", "strut_drive", "mover", "instrument", "adapter")
+)

@@ -12,7 +12,8 @@ import math
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
@@ -25,7 +26,6 @@ from ..compensation.thermal import Thermometers
 from ..core import Struct
 from ..errors import CommandError, HexapodError, LimitError, TooEarlyError
 from ..machine.temperatures import HUMIDITY, check_part
-from . import keep_discovery_local
 from .base import ACKNOWLEDGED_WITHIN, CHECK_PERIOD, COMMAND_QOS, NEWEST_QOS, MachineNode
 from .fusion import PoseInstrument
 from .interface import (
@@ -44,7 +44,7 @@ from .process import run
 from .rclpy_compat import Alarm
 from .requests import Requests
 from .sensors import SensorTopic
-from .status import ADVICE, OTHERWISE, WARN, CompensatorStatus, seconds
+from .status import ADVICE, OTHERWISE, WARN, CompensatorStatus, joined, seconds
 
 ESTIMATE_PERIOD = 0.02  # Period of pose estimates from the node's own commands without feedback, s
 JITTER = 0.02  # A command that waits no longer than this, s, is not late, nor is an alarm
@@ -216,7 +216,8 @@ class CompensatorNode(MachineNode):
         when, outputs = stamp or self.get_clock().now().nanoseconds, self._outputs  # zero means now
         speed_over, outputs.answered = period(outputs.answered, when), when
         self._commands.publish(self._command_out.made(compensator.command_at, when, speed_over, self._fastest))
-        self._corrections.publish(self._correction_out.made(compensator.correction_at, when))
+        if self._corrections.get_subscription_count():  # a publication takes longer than all the rest
+            self._corrections.publish(self._correction_out.made(compensator.correction_at, when))
         if self._array is not None:
             self._array_out.data = compensator.command.tolist()
             self._array.publish(self._array_out)
@@ -322,7 +323,7 @@ class CompensatorNode(MachineNode):
             self._instrument.update(now)
         self._journal.tick(now)
         self._outputs.stop(not self._active or status.stops(now))
-        level, text = status.judged(now) if self._active else (WARN, "not active")
+        level, text = joined(status.findings(now)) if self._active else (WARN, "not active")
         self.publish_status(level, text, lambda: status.values(now))
 
 
@@ -410,11 +411,7 @@ class Pacing:
             self._refuse(self.waiting.popleft()[1], error, now)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node; the entry of the executable ``compensator``."""
-    keep_discovery_local()
-    return run(CompensatorNode, PROGRAM, argv)
-
+main = partial(run, CompensatorNode, PROGRAM)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -369,8 +369,9 @@ class Outputs:
         node.at_rate("marker_rate", self._show)
 
     def estimate(self, pose: np.ndarray, stamp: int) -> None:
-        """Publish a tool pose, shape (12,): position, m, and rotation matrix, row by row."""
-        self._estimates.publish(self._estimate_out.made(pose, stamp))
+        """Publish a tool pose, shape (12,), position, m, and rotation matrix by rows, where somebody subscribes."""
+        if self._estimates.get_subscription_count():
+            self._estimates.publish(self._estimate_out.made(pose, stamp))
 
     def nominal(self, stamp: int, mean: Callable[[], np.ndarray]) -> None:
         """Publish the struts for a controller of nominal lengths; it starts from there and holds that: for struts at

@@ -13,7 +13,6 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from types import TracebackType
 from typing import Any, TextIO
 
 import rclpy
@@ -24,7 +23,7 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.signals import SignalHandlerOptions
 
 from ..errors import LONGEST_TEXT, HexapodError, printable
-from . import avoid_shared_memory, open_streams, received_signals
+from . import avoid_shared_memory, keep_discovery_local, open_streams, received_signals
 from .base import MachineNode
 from .parameters import Program
 
@@ -71,6 +70,7 @@ def run(
     Signals are only stored, since rclpy's own handling loses the last message and exits non-zero on a second Ctrl-C,
     which ``ros2 launch`` sends.
     """
+    keep_discovery_local()
     arguments = sys.argv[1:] if argv is None else list(argv)
     refusal = program.refusal(arguments)
     if refusal is not None:
@@ -173,9 +173,7 @@ class LogRelay:
             self._relays.append((stream, real, thread))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for stream, real, thread in self._relays:
             os.dup2(real, stream)
             thread.join(LEAVING_WITHIN)  # for messages still in the pipe
@@ -207,9 +205,7 @@ class RosSession:
     def __enter__(self) -> RosSession:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def spin_once(self, timeout: float) -> None:

@@ -236,9 +236,6 @@ class CompensatorStatus:
     def fed(self, now: float) -> bool:
         return self.feedback.age(now) <= float(self.options["feedback_timeout"])
 
-    def judged(self, now: float) -> tuple[bytes, str]:
-        return joined(self.findings(now))
-
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
         compensator, guard, fed = self.compensator, self.problem(), self.fed(now)
         if guard is not None:

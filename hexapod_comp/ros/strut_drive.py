@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,6 @@ from ..machine.load import Payload
 from ..machine.model import RealMachine
 from ..virtual.machine import DriveParameters, Faults, StrutDrive
 from ..virtual.named import RANDOM, find_model, is_word
-from . import keep_discovery_local
 from .base import CHECK_PERIOD, STATE_QOS, MachineNode
 from .messages import StrutBytes, StrutReader, stamp_of, write_pose
 from .parameters import Program, read_table
@@ -254,11 +254,7 @@ def bending(machine: RealMachine, options: Mapping[str, Any]) -> RealMachine:
     return PhysicalMachine(machine, Physics(payload=payload if payload.mass else None, **said))
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node; the entry of the executable ``strut_drive``."""
-    keep_discovery_local()
-    return run(StrutDriveNode, PROGRAM, argv)
-
+main = partial(run, StrutDriveNode, PROGRAM)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -120,7 +120,7 @@ class BridgeRig(Rig):
         updates = self.hal["updates"]
         self.deliver("strut_corrections", struts(("struts", list(STRUT_NAMES), [1e-4] * 6, [], NOW)))
         self.tick()
-        assert self.hal["updates"] == updates + 1, self.node._status.refusals.last_text
+        assert self.hal["updates"] == updates + 1, self.node._refusals.last_text
         assert self.hal["status"] in (GuardStatus.RAMPING, GuardStatus.COMPENSATING)
         assert self.took("tool_pose_command")
         self.check_pins()
