@@ -4,7 +4,7 @@ Every machine stands in a known pose; its strut lengths alone are given to ``ass
 ``working_mode``. A pose that is not among the modes is lost. Where the pose keeps the machine's own limits,
 another pose as the answer is a wrong pick; a refusal is counted beside, for it harms nobody.
 
-Usage: python -m benchmarks.assembly [--count 1000] [--seed 1] [--json]
+Usage: python -m benchmarks.assembly [--count 1000] [--seed 1]
 
 Exits 1 when any pose was lost (but on the row of real structures near a singular pose, where
 ``assembly_modes`` says that it may) or any pick was wrong.
@@ -13,11 +13,10 @@ Exits 1 when any pose was lost (but on the row of real structures near a singula
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +27,8 @@ from hexapod_comp.machine.assembly import assembly_modes, mode_objections, worki
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import Structure, strut_lengths
 from hexapod_comp.pose import Pose
+
+from . import table
 
 PAPER = Path(__file__).resolve().parents[1] / "config" / "paper.yaml"
 
@@ -54,9 +55,7 @@ class Result:
     workable: int
     wrong_picks: int
     refused: int
-    fewest_modes: int
-    mean_modes: float
-    most_modes: int
+    modes: str
     ms_median: float
     ms_worst: float
 
@@ -128,19 +127,18 @@ def measure(
         except OtherAssemblyModeError:
             refused += 1
     found, ms = np.array(modes_found), 1e3 * np.array(seconds)
-    numbers = int(found.min()), float(found.mean()), int(found.max()), float(np.median(ms)), float(ms.max())
-    return Result(kind, count, lost, workable, wrong, refused, *numbers)
+    modes = f"{found.min()}/{found.mean():.2f}/{found.max()}"
+    return Result(kind, count, lost, workable, wrong, refused, modes, float(np.median(ms)), float(ms.max()))
 
 
-def table(results: list[Result]) -> str:
-    """Return the results as text."""
-    head = f"{'kind':28} {'poses':>6} {'lost':>5} {'workable':>8} {'wrong':>5} {'refused':>7}"
-    lines = [f"{head} {'modes min/mean/max':>18} {'ms median/worst':>16}"]
-    for r in results:
-        counts = f"{r.kind:28} {r.poses:6} {r.lost:5} {r.workable:8} {r.wrong_picks:5} {r.refused:7}"
-        modes = f"{r.fewest_modes}/{r.mean_modes:.2f}/{r.most_modes}"
-        lines.append(f"{counts} {modes:>18} {f'{r.ms_median:.2f}/{r.ms_worst:.1f}':>16}")
-    return "\n".join(lines)
+def report(results: list[Result]) -> str:
+    """Return the table of results."""
+    columns = ["kind", "poses", "lost", "workable", "wrong", "refused", "modes min/mean/max", "ms median/worst"]
+    rows = (
+        (r.kind, r.poses, r.lost, r.workable, r.wrong_picks, r.refused, r.modes, f"{r.ms_median:.2f}/{r.ms_worst:.1f}")
+        for r in results
+    )
+    return table(columns, rows)
 
 
 def main() -> int:
@@ -148,7 +146,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.assembly", description=DESCRIPTION)
     parser.add_argument("--count", type=int, default=1000, help="poses per kind (default 1000)")
     parser.add_argument("--seed", type=int, default=1, help="of the machines and poses (default 1)")
-    parser.add_argument("--json", action="store_true", help="for programs")
     args = parser.parse_args()
     if args.count < 1:
         parser.error(f"--count must be at least 1, not {args.count}")
@@ -156,7 +153,7 @@ def main() -> int:
     structure = Structure.of(geometry)
     assembly_modes(structure, strut_lengths(structure, geometry.home))  # compiles, which is not measured
     results = [measure(kind, draw, geometry, args.count, args.seed) for kind, draw in cases(geometry).items()]
-    print(json.dumps([asdict(r) for r in results], ensure_ascii=False) if args.json else table(results))
+    print(report(results))
     return int(any(r.wrong_picks or (r.lost and r.kind != MAY_LOSE) for r in results))
 
 

@@ -1,23 +1,23 @@
 """Time batches of kinematics as users call them beside one thread: the clock's time and the processor's.
 
-Run ``python -m benchmarks.batches`` (``--json`` for programs). Both get the same poses in turn, so that a busy second
+Run ``python -m benchmarks.batches``. Both get the same poses in turn, so that a busy second
 hits both alike. Exits 1 when the default is slower than one thread.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
 from hexapod_comp.machine.kinematics import solve_poses, strut_lengths_batch
 
+from . import judged, table
 from .poses import WIDE, Poses, make_poses
 
 SIZES = (1_000, 10_000, 20_000, 100_000, 1_000_000, 10_000_000)
@@ -41,11 +41,6 @@ class Row:
     median: tuple[float, float]
     processor: tuple[float, float]
     ratio: float
-
-    @property
-    def kept(self) -> bool:
-        """Whether the default is not slower."""
-        return self.ratio <= BAR
 
 
 def timed(call: Callable[[int | None], object], threads: int | None) -> tuple[float, float]:
@@ -95,32 +90,29 @@ def measure(most: int = SIZES[-1], seconds: float = 4.0) -> list[Row]:
 
 
 def report(rows: list[Row]) -> str:
-    """Return the table that a person reads; ns per pose."""
-    pairs = ("best", "median", "processor")
-    lines = [f"{'ns per pose':25} " + " ".join(f"{f'{what}: one, default':>24}" for what in pairs) + "   ratio"]
-    for r in rows:
-        figures = " ".join(f"{getattr(r, what)[0]:12.1f} {getattr(r, what)[1]:11.1f}" for what in pairs)
-        lines.append(f"{r.task:8} {r.poses:>16,} {figures} {r.ratio:7.2f}")
-    return "\n".join(lines)
+    """Return the table of times; ns per pose."""
+    columns = ["task", "poses", "best: one", "default", "median: one", "default", "processor: one", "default", "ratio"]
+    pairs = ([f"{ns:.1f}" for pair in (r.best, r.median, r.processor) for ns in pair] for r in rows)
+    return table(
+        columns, ([r.task, f"{r.poses:,}", *six, f"{r.ratio:.2f}"] for r, six in zip(rows, pairs, strict=True))
+    )
 
 
 def problems(rows: list[Row]) -> list[str]:
     """Return where the default is slower than one thread."""
-    slow = (r for r in rows if not r.kept)
+    slow = (r for r in rows if r.ratio > BAR)
     return [f"{r.task}, {r.poses:,} poses: the default takes {r.ratio:.2f} × one thread's time" for r in slow]
 
 
 def main() -> int:
     """Print the table; exit 1 when the default is slower."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     parser.add_argument("--most", type=int, default=SIZES[-1], help="largest batch, 3 GB (default %(default)s)")
     parser.add_argument("--seconds", type=float, default=4.0, help="for each size, about (default %(default)s)")
     options = parser.parse_args()
     rows = measure(options.most, options.seconds)
-    print(json.dumps([asdict(row) for row in rows], indent=1) if options.json else report(rows))
-    print(*(problems(rows) or ["the default is never slower"]), sep="\n", file=sys.stderr)
-    return 1 if problems(rows) else 0
+    print(report(rows))
+    return judged(problems(rows))
 
 
 if __name__ == "__main__":

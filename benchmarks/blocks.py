@@ -5,18 +5,17 @@ take turns, and a block's cost is what it adds to a command, and to an estimate 
 the ideal machine: all called from Python, processor time of the thread, the least of the rounds, since others on
 the machine can only add. What the ideal machine's command is made of is timed part by part, each with its call.
 
-Run ``python -m benchmarks.blocks`` (``--json`` for programs).
+Run ``python -m benchmarks.blocks``.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -31,6 +30,8 @@ from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.outside import OutsideTable
 from hexapod_comp.machine.struts import StrutErrors
+
+from . import table
 
 COMMANDS = 500
 PERIOD = 1e-3  # Between two commands, s
@@ -187,25 +188,21 @@ def parts(rounds: int) -> list[Part]:
 
 
 def report(blocks: list[Block], pieces: list[Part]) -> str:
-    """Return both tables for a person."""
-    lines = [f"{'block':16} {'command, µs':>12} {'estimate, µs':>13}  what"]
-    for block in blocks:
-        sign = "" if block.name == "ideal" else "+"
-        lines.append(f"{block.name:16} {block.command_us:{sign}12.2f} {block.estimate_us:{sign}13.2f}  {block.what}")
-    return "\n".join([*lines, "", *(f"{part.name:30} {part.us:8.3f} µs" for part in pieces)])
+    """Return both tables."""
+    rows = []
+    for b in blocks:
+        sign = "" if b.name == "ideal" else "+"
+        rows.append([b.name, f"{b.command_us:{sign}.2f}", f"{b.estimate_us:{sign}.2f}", b.what])
+    parts = table(["part", "µs"], ([part.name, f"{part.us:.3f}"] for part in pieces))
+    return "\n\n".join([table(["block", "command, µs", "estimate, µs", ""], rows), parts])
 
 
 def main() -> int:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     parser.add_argument("--rounds", type=int, default=25, help="runs of everybody (default %(default)s)")
-    options = parser.parse_args()
-    blocks, pieces = measure(options.rounds), parts(options.rounds)
-    if options.json:
-        print(json.dumps({"blocks": [asdict(b) for b in blocks], "parts": [asdict(p) for p in pieces]}, indent=1))
-    else:
-        print(report(blocks, pieces))
+    rounds = parser.parse_args().rounds
+    print(report(measure(rounds), parts(rounds)))
     return 0
 
 

@@ -4,25 +4,25 @@ The self-test of an export runs on targets whose compiler is here (32-bit x86, A
 machine, to the last digit. Then one thread times commands and estimates, and LinuxCNC's genhexkins beside them, on the
 same poses in turn.
 
-Run ``python -m benchmarks.c_core`` (``--json`` for programs). Exits 1 when a bar is missed.
+Run ``python -m benchmarks.c_core``. Exits 1 when a bar is missed.
 """
 
 from __future__ import annotations
 
 import argparse
 import ctypes
-import json
 import shutil
 import subprocess
 import sys
 import tempfile
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks import judged
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.export.c_code import write_c
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
@@ -191,13 +191,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.c_core", description=__doc__.split("\n")[0])
     parser.add_argument("--single", type=int, default=10_000_000, help="single commands to time")
     parser.add_argument("--rounds", type=int, default=ROUNDS)
-    parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     said, cost, single = self_tests(), costs(args.rounds), spread(args.single)
-    if args.json:
-        print(json.dumps({"cost": [asdict(c) for c in cost], "self_tests": said, "single": asdict(single)}))
-    else:
-        print(report(said, cost, single))
+    print(report(said, cost, single))
     whole = cost[-1]
     kept = {
         "self-tests": all("as they should be" in text or "not tried" in text for text in said.values()),
@@ -205,9 +201,7 @@ def main() -> int:
         f"within {LARGEST_RATIO:g} × genhexkins": whole.ratio is None or whole.ratio <= LARGEST_RATIO,
         f"warm estimate within {LARGEST_ESTIMATE_US} µs": whole.estimate_us <= LARGEST_ESTIMATE_US,
     }
-    missed = [bar for bar, held in kept.items() if not held]
-    print(f"\nmissed: {'; '.join(missed)}" if missed else "\nbars kept", file=sys.stderr if args.json else sys.stdout)
-    return 1 if missed else 0
+    return judged([bar for bar, held in kept.items() if not held])
 
 
 if __name__ == "__main__":

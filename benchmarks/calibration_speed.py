@@ -2,10 +2,9 @@
 
 The campaign's lines with readings so many times as dense: 10,230 and 105,006. First the fit alone, then the
 whole command ``fit``, from the start of Python to the files that it writes. The processors' time is that of all
-threads, and a busy computer changes it little; the clock's is less where two threads work at once. Answers can be kept
-and compared with those of another version: the largest difference of a parameter, in its standard error.
+threads, and a busy computer changes it little; the clock's is less where two threads work at once.
 
-Usage: python -m benchmarks.calibration_speed [--dense 1.3 14] [--save FILE] [--against FILE] [--json]
+Usage: python -m benchmarks.calibration_speed [--dense 1.3 14]
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when NumPy is loaded, as by the command line
 
 import argparse
-import json
 import subprocess
 import sys
 import time
@@ -23,8 +21,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
-
+from benchmarks import table
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.machine.geometry import load_geometry
@@ -38,11 +35,8 @@ from hexapod_comp.virtual.named import find_model
 CONFIG = Path(__file__).resolve().parents[1] / "config"
 
 
-def timed(dense: float) -> tuple[dict[str, float], np.ndarray]:
-    """Return readings, seconds and what is promised of a fit with readings so many times as dense; and its answer.
-
-    The answer: parameters and their standard errors, shape (2, size).
-    """
+def timed(dense: float) -> list[str]:
+    """Return the row of a fit with readings so many times as dense."""
     geometry = load_geometry(CONFIG / "paper.yaml")
     campaign = load_campaign(CONFIG / "campaign_5d.yaml")
     campaign = replace(campaign, step=campaign.step / dense)
@@ -52,19 +46,12 @@ def timed(dense: float) -> tuple[dict[str, float], np.ndarray]:
     fit = fit_model(readings, FitSettings(lead=0.01))
     processor, clock = time.process_time() - processor, time.perf_counter() - clock
     expected = fit.level.after * 1e6 if fit.level is not None else float("nan")
-    row = {
-        "readings": len(readings),
-        "parameters": fit.space.size,
-        "steps": fit.solution.steps,
-        "processor_s": processor,
-        "clock_s": clock,
-        "expected_um": expected,
-        **command(readings),
-    }
-    return row, np.array([fit.solution.x, fit.standard_errors])
+    sizes = [f"{len(readings):,}", str(fit.space.size), str(fit.solution.steps)]
+    times = [f"{seconds:.1f}" for seconds in (processor, clock, *command(readings))]
+    return [*sizes, *times[:2], f"{expected:.3f}", *times[2:]]
 
 
-def command(readings: MeasurementSet) -> dict[str, float]:
+def command(readings: MeasurementSet) -> tuple[float, float]:
     """Return what the command ``fit`` takes of processors and by the clock, s."""
     with TemporaryDirectory() as folder:
         write_measurements(readings, f"{folder}/readings.csv")
@@ -74,7 +61,7 @@ def command(readings: MeasurementSet) -> dict[str, float]:
         subprocess.run(program, cwd=CONFIG.parent, check=True, stdout=subprocess.DEVNULL)
         after, clock = os.times(), time.perf_counter() - clock
     used = after.children_user + after.children_system - before.children_user - before.children_system
-    return {"command_processor_s": used, "command_clock_s": clock}
+    return used, clock
 
 
 def main() -> None:
@@ -82,29 +69,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     text = "times as many readings (default 1.3 14)"
     parser.add_argument("--dense", type=float, nargs="+", default=[1.3, 14], help=text)
-    parser.add_argument("--json", action="store_true", help="JSON instead of a table")
-    parser.add_argument("--save", type=Path, metavar="FILE", help="keep the answers (.npz)")
-    parser.add_argument("--against", type=Path, metavar="FILE", help="compare the answers with kept ones")
     args = parser.parse_args()
     timed(1)  # compiled and loaded
-    rows, answers = zip(*map(timed, args.dense), strict=True)
-    if args.save is not None:
-        np.savez(args.save, **{f"dense_{dense:g}": answer for dense, answer in zip(args.dense, answers, strict=True)})
-    if args.against is not None:
-        kept = np.load(args.against)
-        for dense, row, (x, error) in zip(args.dense, rows, answers, strict=True):
-            row["difference"] = float((np.abs(x - kept[f"dense_{dense:g}"][0]) / error).max())
-    if args.json:
-        print(json.dumps(rows, indent=1))
-        return
-    print("readings  parameters  steps  processor s  clock s  expected µm  command: processor s  clock s")
-    for row in rows:
-        print(
-            f"{row['readings']:8.0f}  {row['parameters']:10.0f}  {row['steps']:5.0f}  {row['processor_s']:11.1f}"
-            f"  {row['clock_s']:7.1f}  {row['expected_um']:11.3f}  {row['command_processor_s']:20.1f}"
-            f"  {row['command_clock_s']:7.1f}"
-            + (f"  differs by {row['difference']:.1g} standard errors" if "difference" in row else "")
-        )
+    columns = ["readings", "parameters", "steps", "fit: processors, s", "clock, s", "expected, µm"]
+    print(table([*columns, "command: processors, s", "clock, s"], map(timed, args.dense), texts=0))
 
 
 if __name__ == "__main__":

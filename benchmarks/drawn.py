@@ -12,6 +12,8 @@ from typing import TypeVar
 
 from tqdm import tqdm
 
+from . import table
+
 Case = TypeVar("Case")
 Result = TypeVar("Result")
 
@@ -42,7 +44,25 @@ def results(
             yield case, done
 
 
-def show(row: str) -> None:
-    """Print a row of a table above the progress."""
-    tqdm.write(row)
+class Table:
+    """A table in Markdown that is printed row by row, above the progress; `met`: whether all bars are."""
+
+    def __init__(self, columns: Sequence[str], texts: int = 1) -> None:
+        self.met = True
+        show(table(columns, [], texts))
+
+    def row(self, *cells: object, met: bool = True) -> None:
+        """Print a row."""
+        self.met &= met
+        show(f"| {' | '.join(map(str, cells))} |")
+
+
+def show(text: str) -> None:
+    """Print above the progress."""
+    tqdm.write(text)
     sys.stdout.flush()
+
+
+def verdict(bar: float, met: bool) -> str:
+    """Return a bar, a share, and whether it is met."""
+    return f"{bar:.0%} {'met' if met else 'MISSED'}"

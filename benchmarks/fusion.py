@@ -15,13 +15,14 @@ import argparse
 import sys
 import tempfile
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.calibration import CONFIG, LARGE
+from benchmarks.drawn import Table, verdict
 from benchmarks.warm_up import RISE, SPREAD, STEEL, TAU, zoo
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.compensation.fusion import Fusion, FusionRules, PoseReading
@@ -40,25 +41,6 @@ NOISE, TURN_NOISE = 2e-6, 1e-5  # of the instrument, m and rad
 WILD, WILD_BY = 0.01, (5e-5, 5e-3)  # share of wild readings, and by how much they are off, m
 REACH, TURNS = 0.06, np.radians(2.0)  # how far from home the tool is sent at most, m along each axis, and turned, rad
 LEFT = 0.25  # the bar
-
-
-@dataclass(frozen=True)
-class Row:
-    """What is left of the drift on machines of one geometry, m RMS."""
-
-    geometry: str
-    machines: int
-    blind: float
-    fused: float
-    worst: float  # largest share that is left on one machine
-    wild: int
-    passed: int  # wild readings that counted
-    refused: float  # share of true readings that were rejected
-
-    @property
-    def met(self) -> bool:
-        """Whether the bar is met, on each machine."""
-        return self.worst <= LEFT and not self.passed
 
 
 def geometry_of(name: str) -> HexapodGeometry:
@@ -128,15 +110,17 @@ def _measure(fusion: Fusion, tool: Pose, struts: np.ndarray, at: float, rng: np.
     return wild, wild and not rejected, rejected and not wild
 
 
-def row_of(name: str, machines: int) -> Row:
-    """Judge machines of a geometry."""
+def show(found: Table, name: str, machines: int) -> None:
+    """Judge machines of a geometry; the bar is met on each, and no wild reading counted."""
     geometry = geometry_of(name)
-    found = [warmed(geometry, 100 + seed) for seed in range(machines)]
-    blind, fused = (np.sqrt([squares.mean() for squares in one]) for one in list(zip(*found, strict=True))[:2])
-    wild, passed, refused = np.sum([one[2:] for one in found], axis=0).tolist()
-    share = refused / (READINGS * sum(len(one[0]) for one in found))
-    both = float(np.sqrt(np.mean(blind**2))), float(np.sqrt(np.mean(fused**2)))
-    return Row(name, machines, *both, float((fused / blind).max()), wild, passed, share)
+    judged = [warmed(geometry, 100 + seed) for seed in range(machines)]
+    blind, fused = (np.sqrt([squares.mean() for squares in one]) for one in list(zip(*judged, strict=True))[:2])
+    wild, passed, refused = np.sum([one[2:] for one in judged], axis=0).tolist()
+    share = refused / (READINGS * sum(len(one[0]) for one in judged))
+    before, after, worst = np.sqrt(np.mean(blind**2)), np.sqrt(np.mean(fused**2)), (fused / blind).max()
+    met = bool(worst <= LEFT and not passed)
+    cells = [machines, f"{1e6 * before:.2f}", f"{1e6 * after:.2f}", f"{after / before:.1%}", f"{worst:.1%}"]
+    found.row(name, *cells, f"{wild}, {passed}", f"{share:.2%}", verdict(LEFT, met), met=met)
 
 
 def cost() -> tuple[float, float]:
@@ -154,34 +138,19 @@ def cost() -> tuple[float, float]:
     return times[0], times[1]
 
 
-HEADER = (
-    "| warm-up of 5 K | machines | blind, µm | fused, µm | left | worst | wild, counted | true, rejected | bar |\n"
-    "|---|---:|---:|---:|---:|---:|---:|---:|---|"
-)
-
-
-def shown(row: Row) -> str:
-    """Return a row of the table."""
-    return (
-        f"| {row.geometry} | {row.machines} | {1e6 * row.blind:.2f} | {1e6 * row.fused:.2f} "
-        f"| {100.0 * row.fused / row.blind:.1f} % | {100.0 * row.worst:.1f} % | {row.wild}, {row.passed} "
-        f"| {100.0 * row.refused:.2f} % | {100.0 * LEFT:.0f} % {'met' if row.met else 'MISSED'} |"
-    )
+COLUMNS = ["warm-up of 5 K", "machines", "blind, µm", "fused, µm", "left", "worst", "wild, counted"]
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Print the table; 1 where a bar is missed."""
     parser = argparse.ArgumentParser(description="Drift of a warm-up with and without a pose instrument.")
     parser.add_argument("--machines", type=int, default=3, help="of each geometry")
-    chosen, missed = parser.parse_args(arguments), False
-    print(HEADER, flush=True)
+    chosen, found = parser.parse_args(arguments), Table([*COLUMNS, "true, rejected", "bar"])
     for name in GEOMETRIES:
-        row = row_of(name, chosen.machines)
-        missed |= not row.met
-        print(shown(row), flush=True)
+        show(found, name, chosen.machines)
     without, weighed = cost()
     print(f"\npose estimate: {1e6 * without:.1f} µs, weighed {1e6 * weighed:.1f} µs of processor time")
-    return int(missed)
+    return 0 if found.met else 1
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Time inverse and forward kinematics beside what else people use, on the same poses in one run.
 
-Run ``python -m benchmarks.kernels`` (``--json`` for programs). doc/benchmarks.md says what the columns mean.
+Run ``python -m benchmarks.kernels``. doc/benchmarks.md says what the columns mean.
 MuJoCo, Pinocchio and LinuxCNC are optional: a peer that is not installed is said to be missing. Exits 1 when a bar
 is missed, or somebody's numbers differ from ours.
 """
@@ -8,11 +8,10 @@ is missed, or somebody's numbers differ from ours.
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from hexapod_comp.core import batch, lib
 from hexapod_comp.machine.kinematics import solve_pose, solve_poses, strut_lengths, strut_lengths_batch
 from hexapod_comp.pose import Pose
 
-from . import genhexkins, peers
+from . import genhexkins, judged, peers, table
 from .poses import NEAR, OURS, WIDE, Contender, Poses, joined, make_poses, near_poses
 
 TOLERANCE = 1e-9  # Peers whose numbers differ from ours by more, m or rotation matrix entries, compute something else
@@ -208,13 +207,13 @@ def measure(everybody: list[Contender], repeats: int) -> list[Result]:
     return sorted(results, key=lambda result: (result.task, result.shape, result.times_ours))
 
 
-def report(results: list[Result], missing: list[str]) -> str:
-    """Return the table that a person reads."""
-    lines = [f"{'task':14} {'shape':7} {'who':33} {'µs/pose':>10} {'× ours':>8} {'max difference':>15}"]
-    for r in results:
-        figures = f"{r.us_per_pose:10.3f} {r.times_ours:8.2f} {r.max_difference:15.1e}"
-        lines.append(f"{r.task:14} {r.shape:7} {r.name:33} {figures}")
-    return "\n".join(lines + missing)
+def report(results: list[Result]) -> str:
+    """Return the table of times."""
+    rows = (
+        (r.task, r.shape, r.name, f"{r.us_per_pose:.3f}", f"{r.times_ours:.2f}", f"{r.max_difference:.1e}")
+        for r in results
+    )
+    return table(["task", "shape", "who", "µs/pose", "× ours", "max difference"], rows, texts=3)
 
 
 def problems(results: list[Result]) -> list[str]:
@@ -233,20 +232,14 @@ def problems(results: list[Result]) -> list[str]:
 def main() -> int:
     """Print the table; exit 1 when a bar is missed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     parser.add_argument("--batch", type=int, default=20_000, help="poses in a batch (default %(default)s)")
     parser.add_argument("--single", type=int, default=500, help="poses one by one (default %(default)s)")
     parser.add_argument("--repeats", type=int, default=15, help="runs of everybody (default %(default)s)")
     options = parser.parse_args()
     everybody, missing = contenders(options.single, options.batch)
     results = measure(everybody, options.repeats)
-    if options.json:
-        print(json.dumps({"results": [asdict(result) for result in results], "missing": missing}, indent=1))
-    else:
-        print(report(results, missing))
-    found = problems(results)
-    print(*(found or ["bars kept"]), sep="\n", file=sys.stderr)
-    return 1 if found else 0
+    print(report(results), *missing, sep="\n")
+    return judged(problems(results))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ of ``campaign_full`` with the same instruments, thinned to every n-th station or
 better. Then a machine drawn from the prior is measured by the proposed campaign and fitted, and its error with the
 model, the datum aligned, is laid beside the expected one and beside what the fit itself promises.
 
-Usage: python -m benchmarks.plan [--goals 20] [--no-fits] [--json]
+Usage: python -m benchmarks.plan [--goals 20] [--no-fits]
 
 Exits 1 when a bar is missed.
 """
@@ -13,18 +13,18 @@ Exits 1 when a bar is missed.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks import judged
 from hexapod_comp.calibration.candidates import MeasuringBox
-from hexapod_comp.calibration.design import Aim, Goal, Proposal, Times, propose, seen_by, verdict
+from hexapod_comp.calibration.design import Aim, Goal, Proposal, Times, propose, seen_by
 from hexapod_comp.calibration.estimator import physical_covariance
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
@@ -71,13 +71,8 @@ class Row:
     """One goal; errors in µm, RMS, of the worse of level and tilted."""
 
     machine: str
-    instruments: str
-    tilt_deg: float
-    goal: float
-    most: int
-    met: bool
-    verdict: str
-    readings: int
+    goal: Goal
+    plan: Proposal
     expected: float
     thinned: float
     low: float
@@ -203,13 +198,8 @@ def one_goal(name: str, geometry: HexapodGeometry, box: np.ndarray, number: int,
             after = np.inf
     return Row(
         machine=name,
-        instruments=instruments,
-        tilt_deg=float(np.degrees(tilt)),
-        goal=1e6 * error,
-        most=most,
-        met=plan.met,
-        verdict=verdict(plan),
-        readings=plan.readings,
+        goal=goal,
+        plan=plan,
         expected=1e6 * plan.worst,
         thinned=1e6 * thinned(geometry, goal, plan),
         low=1e6 * low,
@@ -226,11 +216,12 @@ HEADER = f"| {COLUMNS.replace('|', ' | ')} |\n{'|---' * 6}{'|---:' * 8}|"
 
 def shown(row: Row) -> str:
     """Return a row of the table."""
-    after, met = "" if row.achieved is None else f"{row.achieved:.2f}", "yes" if row.met else "no"
+    after, met = "" if row.achieved is None else f"{row.achieved:.2f}", "yes" if row.plan.met else "no"
+    goal = row.goal
     promised = "" if row.promised is None else "…".join(f"{end:.2f}" for end in row.promised)
     return (
-        f"| {row.machine} | {row.instruments} | {row.tilt_deg:.0f}° | {row.goal:g} | {row.most} | {met} "
-        f"| {row.readings} | {row.expected:.2f} | {row.thinned:.2f} | {100.0 * row.less:.0f} % "
+        f"| {row.machine} | {','.join(goal.instruments)} | {np.degrees(goal.tilt):.0f}° | {1e6 * goal.error:g} "
+        f"| {goal.seconds:g} | {met} | {row.plan.readings} | {row.expected:.2f} | {row.thinned:.2f} | {row.less:.0%} "
         f"| {row.low:.2f}…{row.high:.2f} | {after} | {promised} | {row.seconds:.0f} |"
     )
 
@@ -273,7 +264,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--goals", type=int, default=20, help="how many, machine by machine (default 20)")
     parser.add_argument("--no-fits", action="store_true", help="expected errors only")
-    parser.add_argument("--json", action="store_true", help="print JSON besides")
     args = parser.parse_args()
     rows: list[Row] = []
     print(HEADER, flush=True)
@@ -284,11 +274,7 @@ def main() -> int:
                 if len(rows) < args.goals:
                     rows.append(one_goal(machine, geometry, box, number, folder, not args.no_fits))
                     print(shown(rows[-1]), flush=True)
-    problems = missed(rows)
-    if args.json:
-        print(json.dumps([asdict(row) for row in rows], indent=1))
-    print(*(problems or ["all bars met"]), sep="\n")
-    return 1 if problems else 0
+    return judged(missed(rows))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ With ``--ablate``: what the promise would be with the covariance believed more o
 of freedom, with and without averaging over the blocks that were left out; and with how much it is most likely believed.
 The tool's error over its expectation, squared, is Fisher's F with the freedom of the covariance and of that belief.
 
-Usage: python -m benchmarks.promise [--machines 12] [--first 100] [--workers 2] [--kind NAME ...] [--json] [--ablate]
+Usage: python -m benchmarks.promise [--machines 12] [--first 100] [--workers 2] [--kind NAME ...] [--ablate]
 
 Exits 1 when a bar is missed: 95 % kept or refused, median upper end at most twice what is left, none of the own class
 refused.
@@ -20,10 +20,9 @@ refused.
 
 from __future__ import annotations
 
-import json
 import sys
 import tempfile
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -298,28 +297,18 @@ def show_ablation(outcomes: list[Outcome]) -> None:
     print(f"\nmost likely believed as {likely:.1f} degrees of freedom ({len(judged)} machines)")
 
 
-@dataclass(frozen=True)
-class Row:
-    """A kind of machine; lengths in µm, medians."""
-
-    kind: str
-    machines: int
-    kept: int
-    refused: int
-    broken: int
-    left_um: float
-    expected_um: float
-    high_um: float
-    width: float
+COLUMNS = ["kind", "machines", "kept", "refused", "broken", "left", "expected", "upper end", "upper end / left"]
 
 
-def summed_up(kind: str, outcomes: list[Outcome]) -> Row:
-    """Return the row of a kind."""
+def show(found: drawn.Table, kind: str, outcomes: list[Outcome]) -> None:
+    """Print the row of a kind, with medians."""
     refused = sum(bool(o.refused) for o in outcomes)
     kept = sum(o.kept and not o.refused for o in outcomes)
-    medians = (1e6 * float(np.nanmedian([getattr(o, name) for o in outcomes])) for name in ("left", "expected", "high"))
-    width = float(np.nanmedian([o.width for o in outcomes if not o.refused] or [np.nan]))
-    return Row(kind, len(outcomes), kept, refused, len(outcomes) - kept - refused, *medians, width)
+    medians = (1e6 * np.nanmedian([getattr(o, name) for o in outcomes]) for name in ("left", "expected", "high"))
+    width = np.nanmedian([o.width for o in outcomes if not o.refused] or [np.nan])
+    sizes = [f"{median:.2f} µm" for median in medians]
+    counts = [len(outcomes), kept, refused, len(outcomes) - kept - refused]
+    found.row(kind, *counts, *sizes, f"{width:.2f}", met=kind not in OWN or not refused)
 
 
 def main() -> int:
@@ -327,30 +316,19 @@ def main() -> int:
     parser = drawn.options(__doc__, 12, 100, "kind")
     parser.add_argument("--kind", action="append", choices=(*OWN, *FOREIGN), help="only this; may be repeated")
     parser.add_argument("--ablate", action="store_true", help="also other promises of the same fits")
-    parser.add_argument("--json", action="store_true", help="JSON instead of a table")
     args = parser.parse_args()
     kinds = [kind for kind in (*OWN, *FOREIGN) if not args.kind or kind in args.kind]
-    rows, every = [], []
-    if not args.json:
-        print("| kind | machines | kept | refused | broken | left | expected | upper end | upper end / left |")
-        print("|---" + "|---:" * 8 + "|", flush=True)
+    found, every = drawn.Table(COLUMNS), []
     for kind, outcomes in drawn.results(one_machine, kinds, args):
-        rows.append(summed_up(kind, outcomes))
+        show(found, kind, outcomes)
         every += outcomes
-        if not args.json:
-            r = rows[-1]
-            sizes = f"{r.left_um:.2f} µm | {r.expected_um:.2f} µm | {r.high_um:.2f} µm | {r.width:.2f}"
-            drawn.show(f"| {kind} | {r.machines} | {r.kept} | {r.refused} | {r.broken} | {sizes} |")
-    if args.json:
-        print(json.dumps([asdict(row) for row in rows], indent=1))
-    share = 1.0 - sum(row.broken for row in rows) / sum(row.machines for row in rows)
+    share = float(np.mean([o.kept or bool(o.refused) for o in every]))
     width = float(np.median([o.width for o in every if not o.refused]))
-    bars = f"kept or refused: {100.0 * share:.1f} % (bar {100.0 * BAR:.0f} %)"
+    bars = f"kept or refused: {share:.1%} (bar {BAR:.0%})"
     print(f"{bars}; upper end / left: {width:.2f} in the median (bar {WIDTH_BAR:g})", file=sys.stderr)
     if args.ablate:
         show_ablation(every)
-    own = [row for row in rows if row.kind in OWN]
-    return 0 if share >= BAR and width <= WIDTH_BAR and all(row.refused == 0 for row in own) else 1
+    return 0 if found.met and share >= BAR and width <= WIDTH_BAR else 1
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ told at its start: the noise of that reading stays in the tool's place. A contro
 pose. The simulated drive has encoders of 0.1 µm with 0.05 µm of noise, and motors with steps of 0.1 µm, or with none;
 the true pose is read without noise.
 
-Usage: python -m benchmarks.restart [--restarts 40] [--seed 0] [--json]
+Usage: python -m benchmarks.restart [--restarts 40] [--seed 0]
 
 Exits 1 when one restart in twenty moves the tool further than 60 nm.
 """
@@ -13,7 +13,6 @@ Exits 1 when one restart in twenty moves the tool further than 60 nm.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import time
@@ -113,7 +112,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--restarts", type=int, default=40)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     keep_discovery_local()
     results = {
@@ -121,12 +119,9 @@ def main() -> int:
         for name in ("struts", "poses")
         for motors, step in (("steps of 0.1 µm", 1e-7), ("no steps", 0.0))
     }
-    if options.json:
-        print(json.dumps(results))
-    else:
-        for name, result in results.items():
-            figures = ", ".join(f"{key} {value:.1f} nm" for key, value in result.items() if key != "restarts")
-            print(f"controller of {name}: the tool moved by {figures}, in {options.restarts} restarts")
+    for name, result in results.items():
+        figures = ", ".join(f"{key} {value:.1f} nm" for key, value in result.items() if key != "restarts")
+        print(f"controller of {name}: the tool moved by {figures}, in {options.restarts} restarts")
     return int(max(result["95 %"] for result in results.values()) > BAR * 1e9)
 
 

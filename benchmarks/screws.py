@@ -7,22 +7,22 @@ their lead unknown, and judged at points that nothing was fitted to. Last, what 
 the same machine without harmonics, for which none are tried and the lead is given; and a command of models with none,
 one and four harmonics.
 
-Run ``python -m benchmarks.screws`` (``--json`` for programs). Exits 1 when a bar is missed.
+Run ``python -m benchmarks.screws``. Exits 1 when a bar is missed.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is loaded: the fits' matrices are small
 
 import numpy as np
 
+from benchmarks import judged
 from hexapod_comp.calibration.blocks import HARMONICS
 from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.evaluation import held_out
@@ -249,15 +249,10 @@ def main() -> int:
     parser.add_argument("--machines", type=int, default=20, help="random machines to find the lead of (default 20)")
     parser.add_argument("--rounds", type=int, default=31, help="of commands timed in turn (default 31)")
     parser.add_argument("--only-leads", action="store_true", help="look for leads alone, without fits and times")
-    parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     shown = searches(args.machines)
     machines, costs = ([], {}) if args.only_leads else (fits(), command_costs(args.rounds))
-    if args.json:
-        rows = {"searches": [asdict(s) for s in shown], "fits": [asdict(m) for m in machines]}
-        print(json.dumps({**rows, "command_us": costs}))
-    else:
-        print(report(shown, machines, costs))
+    print(report(shown, machines, costs))
     kept = {
         "no lead is claimed wrongly": all(s.right for s in shown),
         "the shipped campaigns show theirs": all(s.shown is not None for s in shown[:2]),
@@ -271,9 +266,7 @@ def main() -> int:
             f"a command with one harmonic {LARGEST_COMMAND:g} times": costs["one harmonic"]
             <= LARGEST_COMMAND * costs["no wave"],
         }
-    missed = [bar for bar, held in kept.items() if not held]
-    print(f"\nmissed: {'; '.join(missed)}" if missed else "\nbars kept", file=sys.stderr if args.json else sys.stdout)
-    return 1 if missed else 0
+    return judged([bar for bar, held in kept.items() if not held])
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ with Ctrl-S. Latency is from just before a command is published to its strut com
 ones the system says how long each process had been waiting for a processor in the second around
 it (/proc/PID/task/*/schedstat), and the nodes say what Python's garbage collector did.
 
-Usage: python -m benchmarks.soak [--minutes 30] [--rate-hz 1000] [--json]
+Usage: python -m benchmarks.soak [--minutes 30] [--rate-hz 1000]
 """
 
 from __future__ import annotations
@@ -293,19 +293,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--rate-hz", type=float, default=1000.0)
-    parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     found = soak(args.minutes * 60.0, args.rate_hz)
-    if args.json:
-        values = {
-            "commands": found.commands,
-            "lost": found.lost,
-            "heartbeats_lost": found.heartbeats_lost,
-            "growth_mb_h": [found.growth(i)[0] for i in (0, 1)],
-        }
-        print(json.dumps(values | {"diagnostics": found.diagnostics}, indent=1))
-    else:
-        print("\n".join(report(found)))
+    print("\n".join(report(found)))
     grows = [found.growth(i)[0] > BAR_GROWTH for i in (0, 1)]
     verdict = "MISSED" if found.lost or found.heartbeats_lost or any(grows) else "kept"
     print(f"bars (nothing lost, memory grows by less than {BAR_GROWTH:g} MB/h): {verdict}", file=sys.stderr)

@@ -17,20 +17,19 @@ if TYPE_CHECKING:
     from .blocks import Block
     from .convergence import Convergence
     from .kernels import Result
-    from .speed import Speed
 
 OTHERS = "#8d99a6"
 
 
-def speed_picture(speed: Speed) -> Figure:
+def speed_picture(timed: list[Result], yaws: list[Convergence], costs: list[Block], beside: list[Row]) -> Figure:
     """Show kinematics, convergence, cost of blocks, and latency beside the relay."""
     figure = Figure(figsize=(12, 9.5), layout="constrained")
     left, right = figure.subfigures(1, 2)
-    _kernels(left.subplots(1, 1), speed.kernels)
+    _kernels(left.subplots(1, 1), timed)
     above, middle, below = right.subplots(3, 1)
-    _convergence(above, speed.convergence)
-    _blocks(middle, speed.blocks)
-    _latency(below, speed.loop)
+    _convergence(above, yaws)
+    _blocks(middle, costs)
+    _latency(below, beside)
     return figure
 
 
@@ -62,9 +61,6 @@ def _kernels(axes: Axes, results: list[Result]) -> None:
 
 def _convergence(axes: Axes, rows: list[Convergence]) -> None:
     axes.set(title="Solved from 1 mm and 1 mrad away", xlabel="yaw, °", ylabel="solved, %")
-    if not rows:
-        axes.text(0.5, 0.5, "LinuxCNC's genhexkins is not installed here", transform=axes.transAxes, ha="center")
-        return
     yaws = [row.yaw_deg for row in rows]
     axes.plot(yaws, [100.0 * row.ours / row.poses for row in rows], "o-", color=WITH, label="hexapod_comp")
     axes.plot(yaws, [100.0 * row.theirs / row.poses for row in rows], "s-", color=WITHOUT, label="genhexkins")

@@ -4,7 +4,7 @@ Machines of test/foreign_machines.py, with random errors, follow straight lines 
 boxes, tilted by up to 3°. One compensator gets the tool poses, another the messages with the strut lengths of the
 machine without errors, by the zoo's own kinematics, and works out the poses first.
 
-Usage: python -m benchmarks.strut_input [--poses 100000] [--json]
+Usage: python -m benchmarks.strut_input [--poses 100000]
 
 Exits 1 when any answer differs by more than 1 nm, or one way refuses what the other takes.
 """
@@ -12,11 +12,10 @@ Exits 1 when any answer differs by more than 1 nm, or one way refuses what the o
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -26,6 +25,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from sensor_msgs.msg import JointState
 from tqdm import tqdm
 
+from benchmarks import table
 from hexapod_comp.compensation.compensator import NO_SHIFT, Compensator
 from hexapod_comp.compensation.guards import Sample
 from hexapod_comp.errors import HexapodError
@@ -111,18 +111,13 @@ def main(argv: list[str] | None = None) -> int:
     """Print the differences of each machine; exit 1 when the bar is missed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--poses", type=int, default=100_000, help="of all machines (default 100000)")
-    parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args(argv)
     with TemporaryDirectory() as folder:
-        zoo = tqdm(machines().values(), disable=options.json)
+        zoo = tqdm(machines().values(), disable=None)
         each = -(-options.poses // len(zoo))
         rows = [difference(machine, each, 3, Path(folder)) for machine in zoo]
-    if options.json:
-        print(json.dumps([asdict(row) for row in rows]))
-    else:
-        print(f"{'machine':10} {'taken':>7} {'refused':>8} {'unlike':>7} {'commands, m':>12} {'nominal, m':>12}")
-        for r in rows:
-            print(f"{r.machine:10} {r.taken:7} {r.refused:8} {r.unlike:7} {r.largest:12.1e} {r.nominal:12.1e}")
+    lines = ((r.machine, r.taken, r.refused, r.unlike, f"{r.largest:.1e}", f"{r.nominal:.1e}") for r in rows)
+    print(table(["machine", "taken", "refused", "unlike", "commands, m", "nominal, m"], lines))
     return 0 if all(row.kept for row in rows) else 1
 
 

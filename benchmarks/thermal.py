@@ -9,7 +9,7 @@ is at 20 °C: the error in space as it is, since a drift moves the datum and no 
 Then expansions and time constants are fitted, and their stated deviations judged: see :mod:`benchmarks.warm_up`.
 
 Usage: python -m benchmarks.thermal [--only stated|fitted|pulls] [--machines 20] [--points 1000] [--noise 0.05]
-[--time-constant 30] [--json]
+[--time-constant 30]
 
 Exits 1 when a bar is missed.
 """
@@ -17,30 +17,15 @@ Exits 1 when a bar is missed.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks import drawn, warm_up
 from benchmarks.calibration import CONFIG, LARGE
-from benchmarks.warm_up import (
-    FITTED_HEADER,
-    PULL_HEADER,
-    PULLED,
-    SENSORS,
-    FittedRow,
-    Pull,
-    PullRow,
-    fitted_machine,
-    fitted_row,
-    fitted_shown,
-    pull_row,
-    pull_shown,
-    pulls_of,
-)
 from hexapod_comp.compensation.thermal import DEFAULT_TIME_CONSTANT, TemperatureFilter
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
@@ -102,7 +87,7 @@ def one_machine(drift: Drift, seed: int, settings: FitSettings) -> np.ndarray:
     box = load_campaign(CONFIG / "campaign_5d.yaml").box
     passes = random_passes(geometry, box, settings.points, 0.0, rng)
     cold = _tool(RealMachine(geometry, model), passes, model, None)
-    true, readings = warm_up(drift, settings, rng)
+    true, readings = read(drift, settings, rng)
     squares = np.empty((len(PHASES), len(COMPENSATIONS)))
     for phase in range(len(PHASES)):
         moved = np.empty((len(COMPENSATIONS), *cold.shape))
@@ -116,7 +101,7 @@ def one_machine(drift: Drift, seed: int, settings: FitSettings) -> np.ndarray:
     return squares
 
 
-def warm_up(
+def read(
     drift: Drift, settings: FitSettings, rng: np.random.Generator
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """Return true temperatures and readings, unfiltered and filtered, °C, each of shape (seconds, parts)."""
@@ -149,135 +134,66 @@ def _tool(truth: RealMachine, passes: Passes, model: MachineModel, sensed: Tempe
     return errors.points + errors.displacement
 
 
-@dataclass(frozen=True)
-class Row:
-    """RMS displacement of the tool by a drift, µm, and the shares removed."""
-
-    drift: str
-    phase: str
-    machines: int
-    blind: float
-    unfiltered: float
-    filtered: float
-    unfiltered_removed: float
-    removed: float
-    least_removed: float
-    met: bool
+COLUMNS = ["drift", "phase", "blind, µm", "unfiltered, µm", "removed", "filtered, µm", "removed", "least", "bar"]
 
 
-def summed_up(drift: Drift, phase: int, squares: np.ndarray) -> Row:
-    """Return the row of a drift from mean squares, shape (machine, phase, compensation), m²."""
-    blind, unfiltered, filtered = 1e6 * np.sqrt(squares[:, phase].mean(axis=0))
-    least = 1.0 - np.sqrt(squares[:, phase, 2] / squares[:, phase, 0]).max()
-    removed = 1.0 - filtered / blind
-    return Row(
-        drift=drift.name,
-        phase=PHASES[phase],
-        machines=len(squares),
-        blind=float(blind),
-        unfiltered=float(unfiltered),
-        filtered=float(filtered),
-        unfiltered_removed=float(1.0 - unfiltered / blind),
-        removed=float(removed),
-        least_removed=float(least),
-        met=bool(removed >= BAR),
-    )
+def stated(args: argparse.Namespace) -> bool:
+    """Print the rows of drifts whose expansions are stated; return whether all bars are met."""
+    found, settings = drawn.Table(COLUMNS, texts=2), FitSettings(args.points, args.noise, args.time_constant)
+    for drift in DRIFTS:
+        seeds = tqdm(range(1, args.machines + 1), disable=None)
+        squares = np.array([one_machine(drift, seed, settings) for seed in seeds])
+        for n, phase in enumerate(PHASES):
+            blind, unfiltered, filtered = 1e6 * np.sqrt(squares[:, n].mean(axis=0))
+            least = 1.0 - np.sqrt(squares[:, n, 2] / squares[:, n, 0]).max()
+            removed = 1.0 - filtered / blind
+            cells = [f"{blind:.2f}", f"{unfiltered:.3f}", f"{1.0 - unfiltered / blind:.1%}", f"{filtered:.3f}"]
+            met = bool(removed >= BAR)
+            found.row(drift.name, phase, *cells, f"{removed:.1%}", f"{least:.1%}", drawn.verdict(BAR, met), met=met)
+    return found.met
 
 
-HEADER = (
-    "| drift | phase | blind, µm | unfiltered, µm | removed | filtered, µm | removed | least | bar |\n"
-    "|---|---|---:|---:|---:|---:|---:|---:|---|"
-)
+def fitted(args: argparse.Namespace) -> bool:
+    """Print the rows of machines whose expansions are fitted; return whether all bars are met."""
+    found = drawn.Table(warm_up.FITTED)
+    for sensors in warm_up.SENSORS:
+        seeds = tqdm(range(1, args.machines + 1), disable=None)
+        squares = [warm_up.fitted_machine(sensors, seed, args.points, args.noise)[:2] for seed in seeds]
+        warm_up.show_fitted(found, sensors, np.array(squares))
+    return found.met
 
 
-def shown(row: Row) -> str:
-    """Return a row of the table."""
-    unfiltered, removed, least = (
-        f"{100.0 * share:.1f} %" for share in (row.unfiltered_removed, row.removed, row.least_removed)
-    )
-    return (
-        f"| {row.drift} | {row.phase} | {row.blind:.2f} | {row.unfiltered:.3f} | {unfiltered} "
-        f"| {row.filtered:.3f} | {removed} | {least} | {100.0 * BAR:.0f} % {'met' if row.met else 'MISSED'} |"
-    )
+def pulled(args: argparse.Namespace) -> bool:
+    """Print the rows of what was estimated beside its stated deviations; return whether all bars are met."""
+    pulls: list[warm_up.Pull] = []
+    kinds, thermometers = warm_up.PULLED, ("", "base")
+    for draw in tqdm(range(args.draws), disable=None):
+        kind, seed = kinds[draw % len(kinds)], 100 + draw
+        try:  # kinds, machines and thermometers in turn, each with each
+            pulls += warm_up.pulls_of(kind, thermometers[seed // len(kinds) % 2], seed + seed // len(kinds))
+        except CalibrationError as error:
+            tqdm.write(f"draw {draw}, {kind}: refused: {error}")
+    found = drawn.Table(warm_up.PULLS)
+    for name in (*dict.fromkeys(p.parameter for p in pulls), ""):
+        warm_up.show_pulls(found, name, pulls)
+    return found.met
 
 
-def stated(args: argparse.Namespace, settings: FitSettings) -> list[Row]:
-    """Return the rows of drifts whose expansions are stated, printed as they come."""
-    rows = []
-    if not args.json:
-        print(HEADER, flush=True)
-    with tqdm(total=len(DRIFTS) * args.machines, disable=None) as bar:
-        for drift in DRIFTS:
-            squares = []
-            for seed in range(1, args.machines + 1):
-                squares.append(one_machine(drift, seed, settings))
-                bar.update()
-            for phase in range(len(PHASES)):
-                rows.append(summed_up(drift, phase, np.array(squares)))
-                if not args.json:
-                    tqdm.write(shown(rows[-1]))
-    return rows
-
-
-def fitted(args: argparse.Namespace) -> list[FittedRow]:
-    """Return the rows of machines whose expansions are fitted, printed as they come."""
-    rows = []
-    if not args.json:
-        print("\n" + FITTED_HEADER, flush=True)
-    with tqdm(total=len(SENSORS) * args.machines, disable=None) as bar:
-        for sensors in SENSORS:
-            squares = []
-            for seed in range(1, args.machines + 1):
-                squares.append(fitted_machine(sensors, seed, args.points, args.noise)[:2])
-                bar.update()
-            rows.append(fitted_row(sensors, np.array(squares)))
-            if not args.json:
-                tqdm.write(fitted_shown(rows[-1]))
-    return rows
-
-
-def pulled(args: argparse.Namespace) -> list[PullRow]:
-    """Return the rows of what was estimated beside its stated deviations, printed as it comes."""
-    pulls: list[Pull] = []
-    thermometers = ("", "base")
-    with tqdm(total=args.draws, disable=None) as bar:
-        for draw in range(args.draws):
-            kind = PULLED[draw % len(PULLED)]
-            seed = 100 + draw
-            try:  # kinds, machines and thermometers in turn, each with each
-                pulls += pulls_of(kind, thermometers[seed // len(PULLED) % 2], seed + seed // len(PULLED))
-            except CalibrationError as error:
-                tqdm.write(f"draw {draw}, {kind}: refused: {error}")
-            bar.update()
-    names = list(dict.fromkeys(p.parameter for p in pulls))
-    rows = [pull_row(name, pulls) for name in (*names, "")]
-    if not args.json:
-        print("\n".join(["", PULL_HEADER, *map(pull_shown, rows)]), flush=True)
-    return rows
+PARTS = {"stated": stated, "fitted": fitted, "pulls": pulled}
 
 
 def main() -> int:
-    """Run the drifts and print the table."""
+    """Run the drifts and print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--machines", type=int, default=20, help="machines for each drift (default 20)")
     parser.add_argument("--points", type=int, default=1000, help="held-out points (default 1000)")
     parser.add_argument("--noise", type=float, default=0.05, help="standard deviation of a reading, K (default 0.05)")
     parser.add_argument("--time-constant", type=float, default=DEFAULT_TIME_CONSTANT, help="of the filter, s")
     parser.add_argument("--draws", type=int, default=48, help="machines of the zoo whose pulls are taken (default 48)")
-    parser.add_argument("--only", choices=("stated", "fitted", "pulls"), help="one part alone (default: all)")
-    parser.add_argument("--json", action="store_true", help="JSON instead of a table")
+    parser.add_argument("--only", choices=PARTS, help="one part alone (default: all)")
     args = parser.parse_args()
-    settings = FitSettings(args.points, args.noise, args.time_constant)
-    rows: list[Row | FittedRow | PullRow] = []
-    if args.only in (None, "stated"):
-        rows += stated(args, settings)
-    if args.only in (None, "fitted"):
-        rows += fitted(args)
-    if args.only in (None, "pulls"):
-        rows += pulled(args)
-    if args.json:
-        print(json.dumps([asdict(row) for row in rows], indent=1))
-    return 0 if all(row.met for row in rows) else 1
+    met = [run(args) for name, run in PARTS.items() if args.only in (None, name)]
+    return 0 if all(met) else 1
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ the check readings, each of 1 µm or 1 µrad: at both ends of three body diagona
 pitch and yaw), 12 readings, or of a line along x, y and z, 24; or the twelve that ``verify --propose`` chooses. What is
 left of the tool's error is judged at points that nothing was fitted to, the datum aligned.
 
-Usage: python -m benchmarks.upkeep [--machines 100] [--foreign 5] [--drifting 20] [--workers 2] [--save FILE] [--json]
+Usage: python -m benchmarks.upkeep [--machines 100] [--foreign 5] [--drifting 20] [--workers 2] [--save FILE]
 
 ``--save`` keeps each machine's results as they come, and goes on from those that are there; a run that is broken off
 prints what it has, and ``--machines 0 --foreign 0 --save FILE`` prints what a file has. Exits 1 when a bar is missed:
@@ -338,7 +338,6 @@ def main() -> int:
     parser.add_argument("--drifting", type=int, default=20, help="of the first, that drift as well (default 20)")
     parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
     parser.add_argument("--save", type=Path, metavar="FILE", help="keep results as they come; go on from those there")
-    parser.add_argument("--json", action="store_true", help="JSON instead of text")
     args = parser.parse_args()
     tasks = [("paper", seed, seed <= args.drifting) for seed in range(1, args.machines + 1)]
     tasks += [(name, seed, False) for name in FOREIGN for seed in range(1, args.foreign + 1)]
@@ -349,7 +348,7 @@ def main() -> int:
     run([task for task in tasks if task[:2] not in there], args.workers, results, args.save)
     names = [name for name in ("paper", *FOREIGN) if any(r["machine"] == name for r in results)]
     figures = {name: summed_up([r for r in results if r["machine"] == name]) for name in names}
-    print(json.dumps(figures, indent=1) if args.json else "\n".join(report(*pair) for pair in figures.items()))
+    print("\n".join(report(*pair) for pair in figures.items()))
     met = bars(figures["paper"]) if "paper" in figures else []
     for name, value, bar, good in met:
         print(f"{name}: {value:.3f}, bar {bar:g}: {'met' if good else 'MISSED'}", file=sys.stderr)

@@ -24,6 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks import drawn
 from benchmarks.calibration import CONFIG, LARGE, LEAD
 from benchmarks.promise import KNOWN, carelessness, hidden_of, truth_of
 from hexapod_comp.calibration.fit import ModelFit, fit_model
@@ -134,41 +135,17 @@ def fitted_machine(
     return (*judge(truth, fit, points, seed), fit)
 
 
-@dataclass(frozen=True)
-class FittedRow:
-    """RMS displacement of the tool by a day's drift, µm, without and with what was fitted, and the shares removed."""
-
-    sensors: str
-    machines: int
-    blind: float
-    compensated: float
-    removed: float
-    least_removed: float
-    bar: float
-    met: bool
+FITTED = ["expansion fitted; another day's drift of 3 K", "blind, µm", "compensated, µm", "removed", "least", "bar"]
 
 
-FITTED_HEADER = (
-    "| expansion fitted; another day's drift of 3 K | blind, µm | compensated, µm | removed | least | bar |\n"
-    "|---|---:|---:|---:|---:|---|"
-)
-
-
-def fitted_row(sensors: str, squares: np.ndarray) -> FittedRow:
-    """Return the row of mean squares, m², shape (machine, 2)."""
+def show_fitted(found: drawn.Table, sensors: str, squares: np.ndarray) -> None:
+    """Print the row of mean squares, m², shape (machine, 2)."""
     blind, compensated = 1e6 * np.sqrt(squares.mean(axis=0))
     least, bar = 1.0 - np.sqrt(squares[:, 1] / squares[:, 0]).max(), SENSORS[sensors][1]
     removed = 1.0 - compensated / blind
-    sizes = (float(blind), float(compensated), float(removed), float(least))
-    return FittedRow(sensors, len(squares), *sizes, bar, bool(removed >= bar))
-
-
-def fitted_shown(row: FittedRow) -> str:
-    """Return a row of the table."""
-    return (
-        f"| {row.sensors} | {row.blind:.2f} | {row.compensated:.3f} | {100.0 * row.removed:.1f} % "
-        f"| {100.0 * row.least_removed:.1f} % | {100.0 * row.bar:.0f} % {'met' if row.met else 'MISSED'} |"
-    )
+    met = bool(removed >= bar)
+    cells = [f"{blind:.2f}", f"{compensated:.3f}", f"{removed:.1%}", f"{least:.1%}", drawn.verdict(bar, met)]
+    found.row(sensors, *cells, met=met)
 
 
 GEOMETRIES = ("paper", "framed", "hanging", "inches", "mirror", "offset")
@@ -266,36 +243,14 @@ def _means(values: np.ndarray) -> list[float]:
     return [float(values[members].mean()) for members in MEMBERS.values()]
 
 
-@dataclass(frozen=True)
-class PullRow:
-    """The pulls of one parameter."""
-
-    parameter: str
-    draws: int
-    undetermined: int
-    rms: float
-    within: float
-    largest: float
-    met: bool
+PULLS = ["stated deviations", "determined", "said not to be", "RMS pull", f"within {FAR:g} σ", "largest", "bar"]
 
 
-PULL_HEADER = (
-    f"| stated deviations | determined | said not to be | RMS pull | within {FAR:g} σ | largest | bar |\n"
-    "|---|---:|---:|---:|---:|---:|---|"
-)
-
-
-def pull_row(parameter: str, pulls: list[Pull]) -> PullRow:
-    """Return the row of a parameter; of all where that is empty."""
+def show_pulls(found: drawn.Table, parameter: str, pulls: list[Pull]) -> None:
+    """Print the row of a parameter; of all where that is empty."""
     own = [p for p in pulls if parameter in ("", p.parameter)]
-    sizes = np.array([p.size for p in own if p.determined] or [0.0])
-    size, within = float(np.sqrt((sizes**2).mean())), float((np.abs(sizes) <= FAR).mean())
-    judged = sum(p.determined for p in own)
-    met = size <= LARGEST_PULL and within >= LEAST_WITHIN
-    return PullRow(parameter or "all", judged, len(own) - judged, size, within, float(np.abs(sizes).max()), met)
-
-
-def pull_shown(row: PullRow) -> str:
-    """Return a row of the table."""
-    sizes = f"{row.rms:.2f} | {100.0 * row.within:.0f} % | {row.largest:.1f}"
-    return f"| {row.parameter} | {row.draws} | {row.undetermined} | {sizes} | {'met' if row.met else 'MISSED'} |"
+    sizes = np.abs([p.size for p in own if p.determined] or [0.0])
+    rms, within = float(np.sqrt((sizes**2).mean())), float((sizes <= FAR).mean())
+    judged, met = sum(p.determined for p in own), rms <= LARGEST_PULL and within >= LEAST_WITHIN
+    cells = [judged, len(own) - judged, f"{rms:.2f}", f"{within:.0%}", f"{sizes.max():.1f}", "met" if met else "MISSED"]
+    found.row(parameter or "all", *cells, met=met)

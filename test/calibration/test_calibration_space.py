@@ -80,14 +80,6 @@ def test_degrees_count_for_more_along_short_sides():
     assert len({tuple(p) for p in slab.powers}) == len(slab.powers) == len(set(slab.terms))
 
 
-def test_terms_are_named_by_their_powers():
-    field = SmoothField(BOX, 2)
-    named = dict(zip(field.terms, field.powers.tolist(), strict=True))
-    assert named["1"] == [0, 0, 0]
-    assert named["x1y1"] == [1, 1, 0]
-    assert named["z1"] == [0, 0, 1]
-
-
 def test_outside_its_box_the_field_holds():
     field = SmoothField(BOX, 3)
     coefficients = random_field(field, np.random.default_rng(2))
@@ -136,16 +128,6 @@ def test_flat_boxes_carry_no_power_across(flat: list[int]):
     np.testing.assert_allclose(found, wanted, atol=2.0 * GRID_TOLERANCE)
 
 
-def test_boxes_flat_but_for_rounding_are_flat():
-    """Tilting the tool about its tip leaves the tip where it was, but for 1e-16 m."""
-    box = BOX.copy()
-    box[1, 2] = box[0, 2] + 2e-16
-    field = SmoothField(box, 3)
-    assert not field.powers[:, 2].any()
-    grid = field.as_grid(*random_field(field, np.random.default_rng(7)))
-    assert np.isfinite(grid.evaluate(box[0], np.zeros(3))[0]).all()
-
-
 def test_vector_names_and_sizes(space: ParameterSpace):
     """Twelve joints (three shared ones on the platform) and six offsets are 33; every parameter has a name."""
     sizes = {block.name: len(block.labels) for block in space.blocks}
@@ -159,11 +141,6 @@ def test_vector_names_and_sizes(space: ParameterSpace):
     labels = [label for block in space.blocks for label in block.labels]
     assert len(set(labels)) == space.size == sum(sizes.values())
     assert [block.part.start for block in space.blocks] == np.cumsum([0, *expected[:-1]]).tolist()
-
-
-def test_separate_platform_joints_are_42_parameters(readings: MeasurementSet):
-    separate = ParameterSpace(readings, replace(small.SETTINGS, shared_platform_joints=False))
-    assert len(separate.blocks[0].labels) == 42
 
 
 def test_a_machine_without_coinciding_joints_has_42_either_way():
@@ -211,13 +188,6 @@ def test_priors_drawn_have_their_size(space: ParameterSpace):
                   "field reversal": space.field.reversal_prior}  # fmt: skip
         relative = np.resize(priors.get(block.name, [1.0]), len(block.labels))
         np.testing.assert_allclose(drawn[block.part], tolerance * relative, rtol=0.055, atol=0)
-
-
-def test_whitening_is_the_chain_rule(space: ParameterSpace):
-    """rows·x is the same number whether x or y stands for the parameters."""
-    rng = np.random.default_rng(7)
-    rows, y = rng.standard_normal((5, space.size)), rng.standard_normal(space.size)
-    np.testing.assert_allclose(space.whitened(rows) @ y, rows @ space.physical(y), rtol=1e-11)
 
 
 def test_spline_weights_are_the_natural_spline(space: ParameterSpace):

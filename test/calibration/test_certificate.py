@@ -144,26 +144,7 @@ def test_figures_after_come_from_a_fit_without_the_line(fit: ModelFit) -> None:
     assert left.std() < 1.5e-6 < 0.2 * m.value[own].std(), "the line is predicted at all"
 
 
-@pytest.mark.usefixtures("unpictured")
-def test_readings_of_one_cycle_say_why_there_are_no_figures(filed: Filed) -> None:
-    once = fit_model(measured(virtual_machine(1), campaign("1-D"), 1), FEW)
-    assert "No figures of ISO 230: they need lines with two cycles or more" in certificate_text(once, filed)
-
-
 DETAILS = "format: hexapod_comp/certificate\nversion: 1\n"
-
-
-@pytest.mark.usefixtures("unpictured")
-def test_details_are_in_it(fit: ModelFit, filed: Filed, tmp_path: Path) -> None:
-    given = "number: 2026-014\ncustomer: Smith & Sons\ninstruments: [laser A, ball bar B]\nremarks: [warm]\n"
-    (tmp_path / "details.yaml").write_text(DETAILS + given)
-    rows = cells(certificate_text(fit, filed, load_details(tmp_path / "details.yaml")))
-    assert ["certificate number", "2026-014"] in rows
-    assert ["customer", "Smith &amp; Sons"] in rows
-    assert ["1", "laser A"] in rows
-    assert ["2", "ball bar B"] in rows
-    assert ["remarks", "warm"] in rows
-    assert ["place", ""] in rows, "to be written by hand"
 
 
 @pytest.mark.parametrize(

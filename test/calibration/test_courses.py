@@ -87,13 +87,6 @@ def test_what_is_rounded_is_no_staircase(step: float, every: float, share: float
     assert within[1] < share * within[0]
 
 
-def test_the_order_of_rows_does_not_matter() -> None:
-    order, disturbed = np.random.default_rng(1).permutation(COUNT), warmed(BURSTS)[:, None] + noise()
-    straight = with_courses(read(BURSTS, disturbed)).stations.temperatures
-    shuffled = with_courses(read(BURSTS[order], disturbed[order])).stations.temperatures
-    np.testing.assert_array_equal(shuffled, straight[order])
-
-
 def test_without_times_each_run_has_a_course() -> None:
     """A step from run to run, as of one temperature written beside each, is no slope within them."""
     run = np.zeros(COUNT, dtype=int)
@@ -101,8 +94,3 @@ def test_without_times_each_run_has_a_course() -> None:
     steps = np.tile(20.0 + 0.5 * (run[:, None] % 3), 8)
     unknown = np.full(COUNT, np.nan)
     np.testing.assert_allclose(with_courses(read(unknown, steps)).stations.temperatures, steps, atol=1e-9)
-
-
-def test_what_does_not_change_is_left_alone() -> None:
-    steady = read(BURSTS, np.full((COUNT, 8), 23.0), humidity=0.45)
-    assert with_courses(steady) is steady

@@ -13,13 +13,11 @@ from pathlib import Path
 import calibration_helpers as small
 import numpy as np
 import pytest
-from foreign_machines import Errors, commands, machines, rotation, tool_errors
-from foreign_machines import aligned_rms as rms_aligned
+from foreign_machines import Errors, commands, machines, rotation
 
 from hexapod_comp.calibration.datum import HeldDatum, unseen_part
 from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.fit import ModelFit, fit_model
-from hexapod_comp.calibration.lines import fit_lines
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import ErrorPredictor, FittedParameters
 from hexapod_comp.calibration.posterior_file import load_posterior, save_with_posterior
@@ -59,16 +57,6 @@ def test_switching_compensation_on_does_not_move_the_tool_at_home(foreign) -> No
     by_the_model, _, _ = RealMachine(geometry, fit.model).commands_for(geometry.home)
     np.testing.assert_allclose(by_the_model, nominal[0], rtol=0.0, atol=STILL / 10.0)
     assert fit.model.origin.datum == Datum(machine.home, (0.0, 0.0, 0.0), 6)
-
-
-def test_the_error_with_the_datum_aligned_is_as_good_as_before(foreign) -> None:
-    """A motion of the whole machine, its cardan axes too, is all that holding changes: second order remains."""
-    machine, truth, fit, believed = foreign
-    rng = np.random.default_rng(2)
-    tips = rng.uniform(*machine.box, (100, 3))
-    left = rms_aligned(tips, tool_errors(machine, truth, believed, tips))
-    assert left < 1.2 * fit.level.high
-    assert left < 0.1 * rms_aligned(tips, tool_errors(machine, truth, None, tips))
 
 
 @cache
@@ -119,14 +107,6 @@ def test_another_datum_can_be_given_and_one_out_of_reach_is_refused(unsuspected:
     assert np.abs(tool_move(small.paper(), model, small.paper().home)).max() > 1e-6
     with pytest.raises(CalibrationError, match="a pose that the machine cannot take"):
         fit_model(readings, replace(small.FEW, blocks=()), datum=Pose(np.array([0.0, 0.0, 2.0]), np.eye(3)))
-
-
-def test_scheme_lines_holds_it_too() -> None:
-    plan = Campaign(small.BOX, 0.2032, 0.0254, "5-D", 0)
-    readings = small.measured(small.virtual_machine(4), plan, 4)
-    at_home, pose = fit_lines(readings), Pose(np.array([0.05, 0.0, 0.42]), np.eye(3))
-    assert np.abs(tool_move(small.paper(), at_home.model, small.paper().home)).max() < STILL
-    assert np.abs(tool_move(small.paper(), fit_lines(readings, datum=pose).model, pose)).max() < STILL
 
 
 def test_holding_the_datum_leaves_the_deviations_as_they_were_but_for_what_it_moved(tmp_path: Path) -> None:

@@ -152,7 +152,7 @@ def test_instruments_mend_machines_of_all_kinds(name: str, what: str, tmp_path: 
     error = partial(tool_errors, machine, truth)
     before = aligned_rms(tips, error(None, tips))
     after = aligned_rms(tips, error(Errors.read(tmp_path / "model.yaml"), tips))
-    assert after < 0.25 * before  # some forty poses, for speed; what whole campaigns leave: benchmarks.instruments
+    assert after < 0.25 * before  # some forty poses, for speed; what whole campaigns leave: benchmarks.calibration
     assert all(0.7 < c.chi_square < 1.3 or c.stated == UM for c in fit.channels)
 
 

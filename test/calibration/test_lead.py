@@ -13,9 +13,7 @@ from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.lead import ScrewLead, detect_lead
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
-from hexapod_comp.errors import ModelError
 from hexapod_comp.measurements.readings import MeasurementSet
-from hexapod_comp.virtual.imperfections import ImperfectionBounds
 
 pytestmark = pytest.mark.usefixtures("unsuspected")
 
@@ -65,12 +63,6 @@ def test_what_is_not_there_is_not_shown(bounds: dict):
     assert str(lead) == "not known; the readings do not show it"
 
 
-def test_too_few_readings_show_nothing():
-    """Lines with five readings, on which 42 parameters and two zeros a line leave little to be had."""
-    lead = lead_of(small.measured(small.virtual_machine(1), replace(small.campaign("1-D", 0), step=0.1016), 1))
-    assert lead.shown is None
-
-
 def test_a_wave_twice_a_turn_alone_agrees_with_the_lead():
     """A cardan joint turns its screw unevenly twice a turn: 5 mm are shown, and 10 mm given explain it."""
     lead = lead_of(readings(3, wave_period=5.0 * MM), replace(FEW, lead=10.0 * MM))
@@ -111,23 +103,3 @@ def test_harmonics_are_fitted_and_only_those_that_are_there():
     assert np.abs(fit.model.struts.cosine - struts.cosine).max() < 0.5e-6
     after, _ = small.tool_error(truth, fit.model)
     assert after < 0.5e-6
-
-
-def test_drawn_machines_stay_as_they_are_without_harmonics():
-    """Seeds name machines: asking for harmonics changes nothing else."""
-    plain, rich = (small.virtual_machine(1, b).model for b in (B, replace(B, harmonics=(1e-6, 2e-6))))
-    assert plain.struts.cosine.shape == (6, 1)
-    assert rich.struts.cosine.shape == (6, 4)
-    np.testing.assert_array_equal(plain.struts.cosine, rich.struts.cosine[:, :1])
-    np.testing.assert_array_equal(plain.struts.backlash, rich.struts.backlash)
-    sizes = np.hypot(rich.struts.cosine, rich.struts.sine)[:, 1:]
-    assert sizes.min() >= 1e-6
-    assert sizes.max() <= 2e-6
-    with pytest.raises(ModelError, match=r"bounds\.harmonics"):
-        ImperfectionBounds(harmonics=(2e-6, 1e-6))
-
-
-def test_a_lead_that_differs_by_less_than_screws_do_agrees():
-    """Few readings a turn have shown 9.979 ± 0.0025 mm for a true 10 mm: no other screw has that lead."""
-    assert ScrewLead(given=10e-3, shown=9.979e-3, error=2.5e-6, odds=100.0).agrees
-    assert not ScrewLead(given=10.16e-3, shown=9.979e-3, error=2.5e-6, odds=100.0).agrees  # 0.4 inch

@@ -7,17 +7,15 @@ import pytest
 from foreign_machines import machines
 from scipy.stats import linregress
 
-from hexapod_comp.calibration.evaluation import PaperMetric, evaluate_model, evaluation_text, held_out, paper_metric
+from hexapod_comp.calibration.evaluation import PaperMetric, paper_metric
 from hexapod_comp.calibration.lines import LinesFit, _kind, fit_lines
 from hexapod_comp.calibration.pictures import fitted_lines_figure, strut_error_figure, strut_length_errors
-from hexapod_comp.calibration.report import lines_report
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.field import CROSS_AXES, GridField
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import Structure, jacobian
 from hexapod_comp.machine.model import MachineModel, RealMachine
-from hexapod_comp.machine.model_file import load_model, save_model
 from hexapod_comp.machine.region import Region
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import BACKWARD, CHANNELS, FORWARD, MeasurementSet, Reading
@@ -176,10 +174,6 @@ def test_cycles_are_averaged_and_their_spread_is_told(geometry, linear_truth):
     assert [line.repeat_std for line in fit.lines] == pytest.approx([0.7e-6 * np.sqrt(2.0)] * len(fit.lines), rel=1e-4)
 
 
-def test_without_cycles_there_is_no_spread(quiet):
-    assert all(np.isnan(line.repeat_std) for line in fit_lines(quiet).lines)
-
-
 def test_lines_that_share_a_polynomial_are_no_repeats_of_each_other(geometry, five, real, real_fit):
     """Parallel lines of a machine that twists differ by 10 µrad; each was read twice, with the campaign's noise.
 
@@ -317,13 +311,6 @@ def test_a_missing_line_is_named(quiet, drop, message):
         fit_lines(quiet.select(~runs_named(quiet, drop)))
 
 
-def test_a_missing_channel_is_named(five, real):
-    measured = measure(five, replace(QUIET, instrument="5-D"), real, 0)
-    lost = runs_named(measured, "y line at x 0.0, z 350.0") & (measured.channel == 1)
-    with pytest.raises(CalibrationError, match=r"dx on the y line at x 0.0, z 350.0 mm: is missing"):
-        fit_lines(measured.select(~lost))
-
-
 def test_a_line_that_ends_within_the_grid_is_refused(quiet):
     short = runs_named(quiet, "x line at y 0.0, z 350.0") & (quiet.points()[quiet.station][:, 0] > 0.19)
     with pytest.raises(CalibrationError, match=r"x line at y 0.0, z 350.0 mm: is read from -203.2 to 177.8 mm"):
@@ -346,23 +333,12 @@ def test_too_few_points(geometry):
         fit_lines(template(coarse, geometry))
 
 
-def test_one_plane_is_no_grid(quiet):
-    flat = quiet.select(runs_named(quiet, "x line") & (np.abs(quiet.points()[quiet.station][:, 2] - 0.35) < 1e-9))
-    with pytest.raises(CalibrationError, match="stand at one z only"):
-        fit_lines(flat)
-
-
 def test_diagonals_are_left_out_with_a_note(geometry, linear_truth, quiet):
     campaign = replace(QUIET, diagonals=16)
     fit = fit_lines(measure(template(campaign, geometry), campaign, linear_truth, 0))
     assert any("16 runs are not parallel" in note and "diagonal 1" in note for note in fit.notes)
     for found, plain in zip(fit.model.field.lines, fit_lines(quiet).model.field.lines, strict=True):
         assert found == pytest.approx(plain, abs=1e-15)
-
-
-def test_diagonals_alone_are_no_lines(geometry):
-    with pytest.raises(CalibrationError, match="no run is parallel"):
-        fit_lines(template(replace(QUIET, instrument=None, diagonals=4), geometry))
 
 
 def test_a_compensated_machine_is_refused(geometry, real, real_fit):
@@ -393,11 +369,6 @@ def reduction(found: PaperMetric) -> float:
     return 1.0 - found.after / found.before
 
 
-def test_warm_readings_are_mentioned(quiet):
-    warm = replace(quiet.stations, temperatures=np.full_like(quiet.stations.temperatures, 23.0))
-    assert any("23.0" in note for note in fit_lines(replace(quiet, stations=warm)).notes)
-
-
 def test_a_probe_off_the_platform(geometry, real):
     """The field belongs to the measured point, and the box to the platform under it."""
     tool = replace(geometry, tool=Pose([0.0, 0.0, 0.1], np.eye(3)))
@@ -418,36 +389,6 @@ def test_the_papers_claim_on_virtual_machines(geometry):
         truth = RealMachine(geometry, draw_model(geometry, BOUNDS, seed))
         found.append(reduction(paper_metric(truth, fit_lines(measure(blank, LASER, truth, seed)).model, BOX)))
     assert np.mean(found) > 0.7
-
-
-def test_five_components_are_worth_more_than_one(geometry, real, real_fit):
-    """In space, and in rotation; a roll channel then settles most of what is left there."""
-    one = fit_lines(measure(template(LASER, geometry), LASER, real, 3)).model
-    campaign = replace(LASER, instrument="6-D")
-    six = fit_lines(measure(template(campaign, geometry), campaign, real, 3)).model
-    bare, first, fifth, sixth = (held_out(real, m, BOX, 300) for m in (None, one, real_fit.model, six))
-    assert fifth.aligned.rms < first.aligned.rms < bare.aligned.rms
-    assert first.rotation.rms == pytest.approx(bare.rotation.rms, rel=0.01)
-    assert sixth.rotation.rms < 0.25 * bare.rotation.rms
-    assert sixth.rotation.rms < fifth.rotation.rms < 0.8 * bare.rotation.rms
-
-
-def test_the_model_goes_through_its_file(real_fit, geometry, tmp_path):
-    fit = replace(real_fit.model, origin=replace(real_fit.model.origin, sources=(("lines.csv", "0" * 64),)))
-    save_model(fit, tmp_path / "model.yaml")
-    again = load_model(tmp_path / "model.yaml", geometry)
-    assert again.origin == fit.origin
-    for written, read in zip(fit.field.lines, again.field.lines, strict=True):
-        assert read == pytest.approx(written, abs=1e-18)
-
-
-def test_report(real, real_fit):
-    found = evaluate_model(real, real_fit.model, BOX, 50)
-    text = lines_report(real_fit, every_line=True)
-    assert text.count("x line at y -203.2, z 350.0 mm\n") == 6  # dx, ry, rz, there and back
-    assert f"({100.0 * reduction(found.paper):.1f} % less)" in evaluation_text(found)
-    assert "σ repeated" in text
-    assert "σ repeated" not in lines_report(real_fit)
 
 
 def test_strut_errors_of_a_lifted_machine(geometry):

@@ -80,14 +80,6 @@ def test_level_lines_see_14_of_33_structure_parameters():
     assert rank(space, problem) == 14
 
 
-def test_tilted_poses_see_more():
-    """Forty poses tilted by up to 10° under a tracker of 10 µm show what a level tool hides."""
-    level = sight(*linearised("5-D", 4, STRUCTURE)).structure_rank
-    tilted = sight(*linearised("5-D", 4, STRUCTURE, 40, np.radians(10.0))).structure_rank
-    assert level < 20
-    assert tilted > level + 5
-
-
 @pytest.mark.parametrize(
     ("instrument", "diagonals", "unseen"),
     [
@@ -174,10 +166,6 @@ def test_an_unseen_error_really_changes_no_reading(name: str):
         assert is_seen or np.abs(left.target).max() < 1e-3
 
 
-def test_without_field_blocks_nothing_is_called_unseen():
-    assert without_trace(read("5-D", 0, STRUCTURE)) == ()
-
-
 # ---------------------------------------------------------------- definitions
 
 
@@ -217,13 +205,6 @@ def test_blocks_say_how_much_of_them_is_data():
     block = observe(*by_hand(singular)).blocks[0]
     assert block.determined == pytest.approx((singular**2 / (1.0 + singular**2)).sum(), rel=1e-9)
     assert (block.parameters, block.unit) == (33, "m")
-
-
-def test_readings_that_see_nothing_have_no_index():
-    seen = observe(*by_hand(np.full(33, 1e-3)))
-    assert (seen.rank, seen.structure_rank, seen.indices, seen.weak) == (0, 0, {}, ())
-    assert seen.condition == np.inf
-    assert len(seen.unseen) == 33
 
 
 # ---------------------------------------------------------------- the tool error to expect
@@ -274,12 +255,6 @@ def test_a_plan_counts_the_machine_s_repeatability():
     assert expected is not None
     assert 1.0 < expected.after / (5e-6 * np.sqrt(3.0)) < 1.1
     assert expected.high > expected.after
-
-
-def test_a_box_out_of_reach_promises_nothing():
-    space, _ = linearised("5-D", 4, STRUCTURE)
-    assert box_stations(space, np.radians(170.0)) is None
-    assert expected_error(space, np.zeros(space.size), np.eye(space.size), np.radians(170.0)) is None
 
 
 def test_stations_are_in_the_box_and_passed_both_ways():

@@ -17,7 +17,7 @@ from foreign_machines import UM, Errors, Machine, goes_to, machines
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
-from hexapod_comp.calibration.posterior import ErrorPredictor, FittedParameters, PredictedError
+from hexapod_comp.calibration.posterior import ErrorPredictor, FittedParameters
 from hexapod_comp.calibration.posterior_file import load_posterior, save_with_posterior
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.machine.geometry import load_geometry
@@ -151,24 +151,6 @@ def test_without_a_fit_errors_are_there_but_nobody_knows_how_well() -> None:
     assert standing.deviations is None
     # A base that stands aside by (d, d, d) takes all of the machine along.
     np.testing.assert_allclose(standing.values[0], [1e-5] * 3 + [0.0] * 3, rtol=0.0, atol=1e-14)
-
-
-def test_many_poses_are_as_each_alone(tmp_path: Path) -> None:
-    fitted = known(machines()["framed"], tmp_path)
-    predictor = ErrorPredictor(RealMachine(fitted.space.geometry, fitted.space.model(fitted.x)), fitted)
-    rng, home = np.random.default_rng(5), fitted.space.geometry.home
-    positions = home.position + 0.02 * rng.uniform(-1.0, 1.0, (600, 3))  # three parts
-    rotations = np.tile(home.rotation, (600, 1, 1))
-    whole = predictor.predict((positions, rotations))
-    for n in (0, 255, 256, 599):
-        for one, many in zip(predictor.predict((positions[n : n + 1], rotations[:1])), whole, strict=True):
-            assert isinstance(one, PredictedError)
-            assert isinstance(many, PredictedError)
-            np.testing.assert_allclose(one.values[0], many.values[n], rtol=1e-12)
-            np.testing.assert_allclose(one.covariance[0], many.covariance[n], rtol=1e-9, atol=1e-30)  # type: ignore[index]
-    for none in predictor.predict((positions[:0], rotations[:0])):
-        assert none is not None
-        assert none.values.shape == (0, 6)
 
 
 # The file beside the model.
@@ -316,22 +298,3 @@ def test_any_value_in_a_posteriors_head_is_read_or_refused_in_words(tmp_path: Pa
         rewritten(path, **changed)
         found, why = load_posterior(load_model(path, geometry), geometry, path)
         assert (found is None) == bool(why)
-
-
-def test_any_array_in_a_posterior_is_read_or_refused_in_words(tmp_path: Path) -> None:
-    fitted, path = saved(tmp_path)
-    geometry, text = fitted.space.geometry, path.read_text()
-    beside = path.with_name("after the crash.posterior.npz")
-    content = beside.read_bytes()
-    with np.load(beside) as archive:
-        arrays = {name: archive[name] for name in archive.files if name != "head"}
-    for name, array in arrays.items():
-        odd = [np.zeros(0), np.zeros((1,) * 20), np.array("x"), np.array(1e308), np.full(array.shape, -1e5)]
-        odd += [np.full(array.shape, np.nan), array.astype(complex) if name != "labels" else array[:-1]]
-        for other in odd:
-            path.write_text(text)
-            beside.write_bytes(content)
-            rewritten(path, arrays_now={name: other})
-            found, why = load_posterior(load_model(path, geometry), geometry, path)
-            assert (found is None) == bool(why)
-            assert found is None or name.startswith(("datum", "region", "x")), name

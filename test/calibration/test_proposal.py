@@ -20,10 +20,9 @@ from hexapod_comp.calibration.design import (
     verdict,
 )
 from hexapod_comp.calibration.parameters import FitSettings
-from hexapod_comp.cli.verbs import INSTRUMENTS
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.measurements.campaign import LISTED_INSTRUMENTS, Campaign, campaign_text, load_campaign, template
+from hexapod_comp.measurements.campaign import Campaign, campaign_text, load_campaign, template
 
 HOUR = 3600.0
 UM = 1e-6
@@ -145,12 +144,6 @@ def test_instruments_that_shops_own(instrument: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(after.stations.commands, before.stations.commands, rtol=0.0, atol=1e-11)
     assert len(after) == result.readings
     assert result.worst < 0.7 * max(result.before.values())
-
-
-def test_instruments_by_their_names() -> None:
-    """The command line lists what has its times; campaigns take it; of spheres to be touched nobody knows the place."""
-    assert tuple(TIMES) == INSTRUMENTS
-    assert set(LISTED_INSTRUMENTS) - set(TIMES) == {"probe"}
 
 
 @pytest.mark.parametrize(

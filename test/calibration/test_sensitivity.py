@@ -131,9 +131,3 @@ def test_prediction_is_the_machine_that_the_compensator_runs(settings: FitSettin
         np.testing.assert_allclose(found[n, :3], moved, atol=2.0 * GRID_TOLERANCE)
         turned = attitude_error(actual.rotation, commanded.rotation)
         np.testing.assert_allclose(found[n, 3:], turned, atol=2.0 * GRID_TOLERANCE + 0.5 * 1e-3 * 50e-6)
-
-
-def test_the_ideal_machine_has_no_error():
-    """Forward kinematics gives the commanded poses back to rounding, over the strut sensitivities."""
-    space, stations, _ = case(small.paper(), COLD)
-    np.testing.assert_allclose(predict(space, np.zeros(space.size), stations).errors, 0.0, atol=1e-13)

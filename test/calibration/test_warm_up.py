@@ -140,24 +140,12 @@ def test_without_a_warm_up_nothing_is_invented():
     assert "expansion is not determined" in warming_text(cold.warming)
 
 
-def test_readings_without_times_show_no_time_constants():
-    untimed = fit_model(measured(timed=False), SETTINGS)
-    assert untimed.warming.time_constants.values == ()
-    assert "no times (time_s)" in warming_text(untimed.warming)
-
-
 def test_a_part_that_stayed_cold_keeps_what_was_stated():
     """Struts alone warm, by sensors of their own: base and platform stay at 20 °C, and show nothing."""
     struts = fit_model(measured(parts=tuple(range(6))), replace(SETTINGS, base_expansion=11e-6))
     assert struts.model.base_expansion == pytest.approx(11e-6, abs=1e-12)
     assert "base: 11.00" in warming_text(struts.warming)
     assert warming_text(struts.warming).count("these readings do not determine it") == 2
-
-
-def test_given_time_constants_are_taken():
-    given = fit_model(measured(), replace(SETTINGS, time_constants=(1200.0,)))
-    assert given.model.late_growth.time_constants == (1200.0,)
-    assert "time constant 1200 s (given)" in warming_text(given.warming)
 
 
 @pytest.mark.parametrize(

@@ -93,21 +93,6 @@ def test_any_six_floats(machine: HexapodGeometry, lengths: list[float]) -> None:
         solve_and_judge(machine, lengths, machine.home)
 
 
-@fixed
-@given(machines, st.lists(st.floats(0.01, 2.0), min_size=6, max_size=6))
-def test_any_lengths_of_a_machine_s_size(machine: HexapodGeometry, lengths: list[float]) -> None:
-    """Mostly unreachable, which must be found out and said."""
-    solve_and_judge(machine, np.array(lengths), machine.home)
-
-
-@fixed
-@given(machines, st.lists(st.floats(-0.1, 0.1), min_size=6, max_size=6))
-def test_lengths_about_home(machine: HexapodGeometry, changes: list[float]) -> None:
-    """Near the border of what can be reached, where answers are singular."""
-    lengths = strut_lengths(Structure.of(machine), machine.home) + changes
-    solve_and_judge(machine, lengths, machine.home)
-
-
 @fewer
 @given(machines, any_poses())
 def test_any_guess(machine: HexapodGeometry, guess: Pose) -> None:

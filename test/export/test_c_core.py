@@ -18,7 +18,7 @@ from strategies import fixed, paper_geometry, random_model, random_pose, seeds, 
 
 from hexapod_comp.cli import main
 from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.core import Status, Struct, dtype_of, ffi, lib
+from hexapod_comp.core import Status, Struct, ffi, lib
 from hexapod_comp.export.c_code import CORE, model_header, write_c
 from hexapod_comp.machine.model import MachineModel, core_model
 
@@ -157,14 +157,3 @@ def test_a_hostile_name_stays_what_it_is(tmp_path):
     made = compiled(tmp_path, "name.c", "hexapod_comp.c", "-o", "name")
     assert made.returncode == 0, made.stderr
     assert subprocess.check_output([tmp_path / "name"], text=True).rstrip("\n") == name
-
-
-def test_the_library_s_state_is_as_large_as_it_says(tmp_path):
-    """For languages that call C but do not include headers."""
-    geometry = paper_geometry()
-    write_c(tmp_path, geometry, MachineModel(geometry.name), ("", ""))
-    made = compiled(tmp_path, "-fPIC", "-shared", "hexapod_comp.c", "hexapod_library.c", "-o", "libhexapod.so")
-    assert made.returncode == 0, made.stderr
-    library = ctypes.CDLL(str(tmp_path / "libhexapod.so"))
-    library.hc_state_size.restype = ctypes.c_size_t
-    assert library.hc_state_size() == dtype_of("hc_state").itemsize

@@ -282,19 +282,3 @@ def test_the_package_is_named_after_the_machine(tmp_path: Path) -> None:
     assert packages == set(re.search(r"set\(DEPENDENCIES ([\w ]+)\)", texts["CMakeLists.txt"])[1].split())
     used = set(re.findall(r'#include "(\w+)/\w+(?:/\w+)?\.hpp"', texts["compensation.cpp"]))
     assert used <= packages
-
-
-@pytest.mark.parametrize("names", ["a,b", "a,a,b,c,d,e", "a,b,c,d,e,f g", "a,b,c,d,e,1f"])
-def test_names_that_are_none_are_refused(capsys: pytest.CaptureFixture[str], names: str) -> None:
-    assert main(["export", "--ros2-control", "/nowhere", "--joint-names", names]) == 2
-    assert "--joint-names: " in capsys.readouterr().err
-
-
-def test_a_model_with_a_measured_box_is_exported(tmp_path: Path) -> None:
-    """As every fit writes one: the box says where the model holds, and moves no tool."""
-    machine = machines()["paper"]
-    files = machine.write(tmp_path / "machine.yaml"), ERRORS.write(tmp_path / "model.yaml", machine)
-    content = yaml.safe_load(files[1].read_text())
-    content["valid_box_mm"] = [[-50, -50, 380], [50, 50, 420]]
-    files[1].write_text(yaml.safe_dump(content))
-    assert main(["export", "--machine", str(files[0]), "--model", str(files[1]), "--c", str(tmp_path / "core")]) == 0

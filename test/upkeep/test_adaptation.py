@@ -21,7 +21,6 @@ from hexapod_comp.calibration import check
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.errors import CalibrationError, CommandError, InputFileError
-from hexapod_comp.formats.json import json_content
 from hexapod_comp.loop.story import demo_place
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import RealMachine
@@ -320,11 +319,6 @@ def test_a_fit_or_a_plan_ends_when_a_person_stops_it(again: Rig) -> None:
     assert next_step(again.loop().state, 0, True) == "fit"
 
 
-def test_a_folder_without_a_model_has_nothing_to_check(tmp_path: Path) -> None:
-    with pytest.raises(CommandError, match="calibrate first"):
-        Rig(tmp_path / "made").loop().guard(1)
-
-
 # ---- journal and task ----
 
 
@@ -339,20 +333,6 @@ def test_a_journal_of_another_machine_or_with_a_broken_line_is_refused(again: Ri
     path.write_text('{"event": "planned"}\n', encoding="utf-8")
     with pytest.raises(InputFileError, match="planned: lacks 'campaign'"):
         again.loop()
-
-
-def test_an_unfinished_last_line_is_dropped(tmp_path: Path) -> None:
-    journal = Journal(tmp_path / "j.jsonl")
-    journal.add("begun", machine="µ")
-    with journal.path.open("ab") as file:
-        file.write('{"event": "µ'.encode()[:-1])
-    read = Journal(journal.path)
-    assert [e["machine"] for e in read.events] == ["µ"]
-    read.add("planned")
-    assert [json_content(line)["event"] for line in journal.path.read_text(encoding="utf-8").splitlines()] == [
-        "begun",
-        "planned",
-    ]
 
 
 def test_a_task_has_a_goal_or_a_campaign_and_not_both() -> None:

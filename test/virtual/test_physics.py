@@ -21,7 +21,7 @@ from hexapod_comp.errors import HexapodError, ModelError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import solve_pose, strut_lengths
-from hexapod_comp.machine.load import Load, Payload
+from hexapod_comp.machine.load import Payload
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.measurements.campaign import load_campaign, template
@@ -228,12 +228,6 @@ def test_mujoco_s_warnings_are_logged_and_leave_no_file(
     mujoco.mj_step(model, data)
     assert "QVEL" in caplog.text
     assert not list(tmp_path.iterdir())
-
-
-def test_a_weight_counts_once():
-    model = MachineModel("paper", load=Load(stiffness=np.full(6, 2e7), mass=30.0))
-    with pytest.raises(ModelError, match="would count twice"):
-        PhysicalMachine(RealMachine(load_geometry("paper"), model))
 
 
 def test_without_mujoco_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch):

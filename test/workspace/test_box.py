@@ -80,14 +80,6 @@ def test_the_papers_own_box_fits_into_what_its_machine_reaches():
     assert (box[1] >= papers[1]).all()
 
 
-def test_another_work_frame_moves_the_box_along():
-    geometry = load_geometry("positioning_unit")
-    shift = np.array([0.03, -0.02, 0.1])
-    moved = replace(geometry, work=Pose(shift, np.eye(3)))
-    here, there = machine_box(geometry).box, machine_box(moved).box
-    np.testing.assert_allclose(there, here - shift, atol=2e-4)  # of rounding inwards, twice
-
-
 def test_a_tool_turned_by_90_degrees_is_measured_as_it_stands_at_home():
     geometry = load_geometry("positioning_unit")
     turned = replace(geometry, tool=Pose.from_angles(geometry.tool.position, [0.0, 0.0, np.pi / 2]))
@@ -133,12 +125,6 @@ def test_simulate_measures_any_machine_in_its_own_box(name: str, tmp_path: Path,
     with out.open(newline="", encoding="utf-8") as file:
         tips = np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in csv.DictReader(file)]) * 1e-3
     np.testing.assert_allclose([tips.min(axis=0), tips.max(axis=0)], box, atol=1e-9)
-
-
-def test_the_default_campaign_is_the_papers_for_the_papers_machine_alone(capsys):
-    asked = ["plan", "campaign", "--machine", "positioning_unit", "--blocks", "pitch", "--json"]
-    assert cli.main(asked) == 0
-    assert "campaign gives no box" in capsys.readouterr().err
 
 
 # As `show` shows it.

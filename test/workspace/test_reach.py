@@ -12,7 +12,7 @@ from strategies import PAPER_FILE, paper_geometry
 
 from hexapod_comp.core import Status
 from hexapod_comp.core.batch import segment_distance as closest
-from hexapod_comp.errors import GeometryError, PoseError
+from hexapod_comp.errors import GeometryError
 from hexapod_comp.machine import kinematics
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.pose import Pose
@@ -126,16 +126,6 @@ def test_distance_of_two_segments(first, second, distance):
     assert closest(*second[::-1], *first) == pytest.approx(distance, abs=1e-15)
 
 
-def test_distance_of_random_segments():
-    """Truth: bounded linear least squares (SciPy), exact to rounding; a third of the pairs is all but parallel."""
-    rng = np.random.default_rng(4)
-    for n, corners in enumerate(rng.normal(size=(300, 4, 3))):
-        if n % 3 == 0:
-            along, aside = rng.normal(), 10.0 ** rng.uniform(-17.0, -3.0)
-            corners[3] = corners[2] + along * (corners[1] - corners[0]) + aside * corners[3]
-        assert closest(*corners) == pytest.approx(segment_distance(*corners), abs=1e-9)
-
-
 def test_clearance_stops_the_closest_pair():
     """Truth: all distances by least squares, where a turn of 60° has crossed the struts; limits 1 µm off."""
     geometry = paper_geometry()
@@ -153,13 +143,6 @@ def test_clearance_stops_the_closest_pair():
         assert found[0] == finding
         if finding == Status.CLEARANCE:
             assert apart[tuple(struts[0].tolist())] == pytest.approx(least, abs=2e-6)
-
-
-def test_struts_that_share_a_joint_may_meet_there():
-    """Truth: on the paper's machine struts meet in pairs, at distance 0; other pairs are 100 mm apart and more."""
-    paper = paper_geometry()
-    found, _ = Examiner(limited(paper, clearance=0.05)).findings(paper.home.position[None], LEVEL[None])
-    assert found[0] == Status.OK
 
 
 def test_poses_of_their_own_orientation(monkeypatch):
@@ -267,14 +250,6 @@ def test_volume_and_box_of_a_ball():
     assert all(shares == {FINDINGS[Status.STROKE_LONG]: 1.0} for shares in regions.values())
 
 
-def test_a_reach_in_two_parts():
-    """Truth: two balls apart have twice the volume, and between them nothing: the centre lies in one of them."""
-    found = ball_reach((-0.2, 0.0, 0.5), (0.2, 0.0, 0.5))
-    assert found.parts == 2
-    assert found.volume == pytest.approx(8.0 / 3.0 * np.pi * 0.08**3, rel=0.02)
-    assert np.linalg.norm(np.abs(found.centre) - [0.2, 0.0, 0.5]) < 0.02
-
-
 def test_shares_and_regions():
     """Truth: counted by hand: two faces above, one below, one on the side at 200°."""
     cube = (np.array([-1.0, 1.0]),) * 3
@@ -324,14 +299,6 @@ def test_poses_to_study():
     np.testing.assert_allclose(positions + of_platform @ [0.0, 0.0, 0.025], turned.points(), atol=1e-15)
 
 
-def test_orientations_are_all_combinations():
-    """Truth: 2·3·1 of them; the angle of R is that of a rotation about one axis where only one is turned."""
-    found = turned_by(unit(), [0, 10], [-5, 0, 5], [0])
-    assert found.shape == (6, 3, 3)
-    angles = np.rad2deg(np.arccos((np.trace(found, axis1=1, axis2=2) - 1.0) / 2.0))
-    np.testing.assert_allclose(angles[[0, 1, 4]], [5.0, 0.0, 10.0], atol=1e-6)
-
-
 # Refused.
 
 
@@ -348,15 +315,3 @@ def test_no_point_near_enough_to_all_base_joints():
     geometry = limited(unit(), stroke=np.tile([0.187, 0.19], (6, 1)))
     with pytest.raises(GeometryError, match="no point is near enough"):
         possible_box(geometry, tilted(geometry, gamma=180.0))
-
-
-@pytest.mark.parametrize("rotation", [np.eye(2), 2.0 * np.eye(3), np.diag([1.0, 1.0, -1.0]), np.full((3, 3), np.nan)])
-def test_an_orientation_that_is_none(rotation):
-    with pytest.raises(PoseError):
-        reach(unit(), rotation)
-
-
-@pytest.mark.parametrize("cells", [0, 3, 1000])
-def test_a_number_of_cells_that_makes_no_sense(cells):
-    with pytest.raises(GeometryError, match="cells: must lie in 4…200"):
-        reach(unit(), cells=cells)

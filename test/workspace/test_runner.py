@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from strategies import PAPER_FILE
 
-from hexapod_comp.errors import HexapodError, KinematicsError
+from hexapod_comp.errors import HexapodError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.workspace import study as runner
@@ -56,16 +56,6 @@ def assert_same_bits(found: Extremes, expected: Extremes) -> None:
 
 
 @pytest.mark.usefixtures("parted")
-def test_in_this_process(small: list[Reach], errors: SingleErrors, whole: Extremes) -> None:
-    counts: list[int] = []
-    assert_same_bits(survey(small, errors, progress=counts.append), whole)
-    inside = [int(found.within.sum()) for found in small]
-    assert sum(counts) == whole.poses == sum(inside)
-    assert len(counts) == sum(-(-count // PART) for count in inside)
-    assert max(counts) == PART
-
-
-@pytest.mark.usefixtures("parted")
 def test_in_two_processes(small: list[Reach], errors: SingleErrors, whole: Extremes) -> None:
     """The extremes' poses and errors too, where equal values meet in different parts."""
     counts: list[int] = []
@@ -80,11 +70,6 @@ def test_the_method_reaches_the_parts(small: list[Reach], errors: SingleErrors, 
     np.testing.assert_allclose(linear.values[:, 0], whole.values[:, 0], rtol=1e-3)
     assert (linear.values[:, 0] != whole.values[:, 0]).all()
     assert_same_bits(survey(small, errors, EXACT), whole)
-
-
-def test_nowhere_to_look(errors: SingleErrors) -> None:
-    with pytest.raises(KinematicsError, match="the workspace is empty"):
-        survey([], errors)
 
 
 @pytest.mark.usefixtures("parted")

@@ -7,10 +7,9 @@ import pytest
 from test_reach import LEVEL, UNIT_FILE, tilted, unit
 
 from hexapod_comp.core import Status
-from hexapod_comp.errors import GeometryError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.workspace.reach import Examiner, Reach, reach
-from hexapod_comp.workspace.shells import Shell, mesh_volume, shell
+from hexapod_comp.workspace.shells import Shell, shell
 
 
 def unit_reach() -> Reach:
@@ -66,19 +65,6 @@ def test_poses_of_a_shell_put_the_tool_there():
     np.testing.assert_allclose(rotations, np.broadcast_to(rotation, rotations.shape), atol=1e-15)
 
 
-def test_volume_of_an_octahedron_and_of_a_ball():
-    """Truth: 4/3·r³; 4/3·π·r³, from below: the mesh of 1° lies within the ball, 10⁻⁴ short."""
-    corners = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [1, 0, 0]], dtype=float)
-    pole = np.array([0.0, 0.0, 1.0])
-    octahedron = np.stack([np.tile(-pole, (5, 1)), corners, np.tile(pole, (5, 1))])
-    assert mesh_volume(0.2 * octahedron + [3.0, -1.0, 0.5]) == pytest.approx(4.0 / 3.0 * 0.008, rel=1e-12)
-    up, around = np.deg2rad(np.arange(-90, 91))[:, None], np.deg2rad(np.arange(361))
-    ball = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up) + 0 * around], axis=-1)
-    volume = mesh_volume(ball)
-    assert volume < 4.0 / 3.0 * np.pi
-    assert volume == pytest.approx(4.0 / 3.0 * np.pi, rel=2e-4)
-
-
 def test_the_units_shell_holds_its_reach():
     """Truth: the volume by grid columns, which assumes nothing about the shape. The mesh's faces cut off what
     bulges beyond them, less the finer it is."""
@@ -103,15 +89,3 @@ def test_what_rays_do_not_see_is_said():
 
 
 # Refused.
-
-
-@pytest.mark.parametrize("fraction", [0.0, 1.01, np.nan])
-def test_a_fraction_that_is_none(fraction):
-    with pytest.raises(GeometryError, match=r"fraction: of the reach must lie in \(0, 1\]"):
-        small_shell().scaled(fraction)
-
-
-@pytest.mark.parametrize(("rings", "sectors", "said"), [(4, 36, "rings"), (19, 7, "sectors")])
-def test_a_mesh_that_is_no_picture(rings, sectors, said):
-    with pytest.raises(GeometryError, match=f"{said}: must be at least"):
-        shell(unit_reach(), rings, sectors)

@@ -123,22 +123,6 @@ def test_slopes_act_on_the_strut_and_on_its_way_from_home(name: str, relative_to
     assert found.max() > 1e-6  # not nothing beside nothing
 
 
-def test_a_slope_has_no_effect_at_home() -> None:
-    home = unit().home
-    found = effects(unit(), made(screw_pitch_slope=1e-3), home.position[None], home.rotation)
-    np.testing.assert_allclose(found, 0.0, atol=1e-12)
-
-
-def test_effects_scale_with_the_input_error() -> None:
-    """004: they are proportional, up to the second order: of the largest effects about size/length, some 1e-4."""
-    errors = load_budget(config_file("error_budget")).single_errors(unit())
-    home = unit().home
-    small, large = (
-        effects(unit(), errors.scaled(np.full(6, factor)), home.position[None], home.rotation) for factor in (0.1, 1.0)
-    )
-    assert (np.abs(large - 10.0 * small) <= 5e-4 * large.max(axis=(0, 1))).all()
-
-
 def test_selecting_and_scaling_keep_the_rest() -> None:
     errors = made(screw_pitch=20e-6, tool_offset=5e-6)
     tool = errors.select(errors.part == TOOL)
@@ -161,33 +145,6 @@ def test_units_are_read_from_the_keys(tmp_path: Path) -> None:
     np.testing.assert_allclose(list(budget.sizes.values()), [10.16e-6, 5e-3, 120e-6, 5e-6], rtol=1e-12)
 
 
-BAD = {
-    "unknown type": ("{wobble_um: 3}", r"errors\.wobble_um: .*3"),
-    "misspelt type": ("{screw_pich_um: 3}", r"errors\.screw_pich_um"),
-    "negative": ("{screw_pitch_um: -3}", r"errors\.screw_pitch.*above zero.*-3"),
-    "zero": ("{screw_pitch_um: 0}", r"errors\.screw_pitch.*above zero"),
-    "too large": ("{screw_pitch_mm: 200}", r"errors\.screw_pitch.*below 0\.1.*0\.2"),
-    "no unit": ("{screw_pitch: 3}", r"errors\.screw_pitch: has no unit; write one of .*screw_pitch_um"),
-    "no unit beside one": ("{screw_pitch: 3, backlash_um: 2}", r"errors\.screw_pitch: has no unit"),
-    "wrong unit": ("{thermal_growth_um: 3}", r"errors\.thermal_growth_um"),
-    "two units": ("{screw_pitch_um: 20, screw_pitch_mm: 0.02}", r"errors\.screw_pitch_mm: is given twice"),
-    "twice": ("{screw_pitch_um: 20, screw_pitch_um: 20}", r"'screw_pitch_um' is given twice"),
-    "not finite": ("{screw_pitch_um: .nan}", r"errors\.screw_pitch_um: must be finite"),
-    "infinite": ("{screw_pitch_um: .inf}", r"errors\.screw_pitch_um: must be finite"),
-    "text": ("{screw_pitch_um: much}", r"errors\.screw_pitch_um: must be a number .*'much'"),
-    "list": ("{screw_pitch_um: [1, 2]}", r"errors\.screw_pitch_um: must be"),
-    "yes": ("{screw_pitch_um: yes}", r"errors\.screw_pitch_um: must be a number"),
-    "no types": ("{}", r"errors: must name at least one error type"),
-    "nothing": ("", r"errors: must be a mapping"),
-}
-
-
-@pytest.mark.parametrize(("errors", "complaint"), BAD.values(), ids=BAD.keys())
-def test_a_bad_budget_is_refused_with_file_key_and_reason(tmp_path: Path, errors: str, complaint: str) -> None:
-    with pytest.raises(InputFileError, match=rf"budget\.yaml: .*{complaint}"):
-        read(tmp_path, f"{HEAD}errors: {errors}\n")
-
-
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
@@ -203,11 +160,6 @@ def test_a_bad_budget_is_refused_with_file_key_and_reason(tmp_path: Path, errors
 def test_a_file_that_is_no_budget_is_refused(tmp_path: Path, text: str, complaint: str) -> None:
     with pytest.raises(InputFileError, match=rf"budget\.yaml: .*{complaint}"):
         read(tmp_path, text)
-
-
-def test_another_machines_budget_is_refused() -> None:
-    with pytest.raises(ModelError, match=r"machine: .*'positioning_unit'.*'paper'"):
-        load_budget(config_file("error_budget")).single_errors(load_geometry(PAPER_FILE))
 
 
 @pytest.mark.parametrize(

@@ -15,14 +15,13 @@ import pytest
 from matplotlib.figure import Figure
 from test_reach import unit
 
-from hexapod_comp.errors import GeometryError, HexapodError, InputFileError
+from hexapod_comp.errors import GeometryError, HexapodError
 from hexapod_comp.formats.figures import save
 from hexapod_comp.workspace.page import MOST_BYTES, PageData, page_text, write_page
 from hexapod_comp.workspace.pictures import (
     ROTATION,
     TRANSLATION,
     Layer,
-    causes_figure,
     outline,
     ranking_figure,
     shells_figure,
@@ -66,15 +65,6 @@ def test_shells_say_what_they_show(tmp_path):
     assert (tmp_path / "shells.png").stat().st_size > 20_000
 
 
-def test_outer_shells_are_cut_open_and_the_innermost_is_whole():
-    """Truth: 3·8·16 faces, of which the outermost loses the 130° towards the eye, the middle one 65°."""
-    near = shells_figure(unit(), layers(), TRANSLATION, "").axes[1]
-    (body,) = near.collections
-    whole = (RINGS - 1) * SECTORS
-    lost = 3 * whole - len(body.get_facecolor())
-    assert lost == pytest.approx(whole * (130 + 65) / 360, abs=2 * (RINGS - 1))
-
-
 def test_the_outline_is_the_machine_at_home():
     """Truth: the file: base in z = 0, platform at 225 mm, tool 25 mm above it, struts between."""
     base, platform, *struts, tool = outline(unit())
@@ -84,15 +74,6 @@ def test_the_outline_is_the_machine_at_home():
     np.testing.assert_allclose(tool, [[0, 0, 0.16], [0, 0, 0.185]])
     assert len(struts) == 6
     np.testing.assert_allclose(struts[3], [base[3], platform[3]])
-
-
-def test_causes_have_a_legend_with_their_share():
-    """Truth: the upper half of a ball has half of its area."""
-    findings = np.where(np.arange(RINGS)[:, None] < RINGS // 2, 1, 2) * np.ones((1, SECTORS + 1), int)
-    written = texts(causes_figure(unit(), mesh(), findings, "what limits"))
-    for part in ("stroke, shortest: 50.0% of the area", "stroke, longest: 50.0% of the area", "from below"):
-        assert part in written
-    assert "cone" not in written
 
 
 def test_bars_from_minimum_to_maximum(tmp_path):
@@ -200,12 +181,6 @@ def test_without_plotly_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
     with pytest.raises(HexapodError, match=r"pip install plotly"):
         page_text(unit(), page_data())
-
-
-def test_a_page_that_cannot_be_written(tmp_path):
-    pytest.importorskip("plotly", reason="the page needs plotly")
-    with pytest.raises(InputFileError, match="cannot be written"):
-        write_page(tmp_path / "no folder" / "page.html", unit(), page_data())
 
 
 @pytest.mark.parametrize(
