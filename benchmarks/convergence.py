@@ -129,12 +129,7 @@ def _worth(structure: Structure, answers: _Answers, lengths: np.ndarray) -> tupl
     open_loops = np.abs(there - lengths[told]).max(axis=1) > 1e-9
     signs = np.sign(np.linalg.det(np.concatenate([struts, np.cross(arms, struts)], axis=2)))
     other = signs != structure.home_sign
-    return (
-        int(answers.ok.sum()),
-        int((answers.ok & ~finite).sum()),
-        int(open_loops.sum()),
-        int(other.sum()),
-    )
+    return (int(answers.ok.sum()), int((answers.ok & ~finite).sum()), int(open_loops.sum()), int(other.sum()))
 
 
 @dataclass(frozen=True)

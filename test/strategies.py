@@ -26,11 +26,7 @@ PAPER_FILE = Path(__file__).resolve().parents[1] / "config" / "paper.yaml"
 fixed = settings(derandomize=True, deadline=None, database=None, max_examples=50)
 
 # Nodes of different number and spacing along every axis, so that no two can be mixed up unnoticed, m
-UNEVEN_GRID = (
-    np.array([-0.2, -0.05, 0.02, 0.2]),
-    np.array([-0.15, 0.0, 0.2]),
-    np.array([0.35, 0.38, 0.55]),
-)
+UNEVEN_GRID = (np.array([-0.2, -0.05, 0.02, 0.2]), np.array([-0.15, 0.0, 0.2]), np.array([0.35, 0.38, 0.55]))
 
 seeds = st.integers(0, 2**32 - 1)  # Seeds for the random makers below
 

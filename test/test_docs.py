@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import ast
 import functools
-import importlib
-import importlib.util
 import re
-import sys
 from collections import Counter
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -38,14 +34,6 @@ def test_each_link_leads_to_a_file_and_a_heading(page: Path):
         target = (page.parent / name).resolve() if name else page
         assert target.exists(), name
         assert not anchor or anchor in anchors(target), f"{name}#{anchor}"
-
-
-def test_the_site_shows_every_page():
-    """A page that no list of contents names can be found by nobody."""
-    index = (ROOT / "doc" / "index.md").read_text(encoding="utf-8")
-    listed = set(re.findall(r"^[\w/]+$", index, re.MULTILINE))
-    pages = {str(page.relative_to(ROOT / "doc").with_suffix("")) for page in ROOT.glob("doc/**/*.md")}
-    assert listed == pages - {"index"}
 
 
 def test_each_key_of_a_campaigns_noise_is_documented_with_its_default():
@@ -88,13 +76,6 @@ def defined(tree: ast.AST) -> set[str]:
     return names | {node.name for node in nodes if isinstance(node, ast.FunctionDef | ast.ClassDef)}
 
 
-def test_nobody_is_told_to_install_a_name_that_no_index_has():
-    """The package is on no index: ``pip install hexapod_comp[…]`` would fail, or fetch a stranger's package."""
-    files = [*PAGES, *(ROOT / "hexapod_comp").rglob("*.py"), ROOT / "CHANGELOG.rst"]
-    told = re.compile(r"pip3? install (?:-\S+ )*['\"]?hexapod[_-]comp\b")
-    assert [str(path) for path in files if told.search(path.read_text(encoding="utf-8"))] == []
-
-
 def test_what_make_names_as_the_next_commands_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     """The last lines of ``make demo``, each as it is typed but the shell's own first one."""
     text = (ROOT / "Makefile").read_text(encoding="utf-8").partition("define NEXT\n")[2].partition("\nendef")[0]
@@ -103,25 +84,6 @@ def test_what_make_names_as_the_next_commands_runs(tmp_path: Path, monkeypatch: 
     monkeypatch.chdir(tmp_path)
     for command in commands:
         assert main(command.split()) == 0, capsys.readouterr().err
-
-
-def test_the_configuration_of_the_pages_needs_nothing_but_sphinx(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """As rosdoc2 runs it: from a copy, perhaps before it has set ``release``, without notebooks, MathML and NumPy."""
-    stand_in = SimpleNamespace(option_spec={})
-    names = {"docutils": "nodes", "sphinx.application": "Sphinx", "sphinx.writers.html5": "HTML5Translator"}
-    for module, name in names.items():
-        monkeypatch.setitem(sys.modules, module, SimpleNamespace(**{name: stand_in}))
-    code_block = SimpleNamespace(CodeBlock=type("CodeBlock", (), {"option_spec": {}}))
-    monkeypatch.setitem(sys.modules, "sphinx", SimpleNamespace())
-    monkeypatch.setitem(sys.modules, "sphinx.directives", SimpleNamespace())
-    monkeypatch.setitem(sys.modules, "sphinx.directives.code", code_block)
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setitem(sys.modules, "latex2mathml.converter", None)
-    settings = {"__file__": str(tmp_path / "conf.py"), "__name__": "conf"}
-    exec((ROOT / "doc" / "conf.py").read_text(encoding="utf-8"), settings)
-    assert settings["html_title"] == "hexapod_comp"
-    assert "myst_parser" in settings["extensions"]
-    assert "**/api.md" in settings["exclude_patterns"]
 
 
 @pytest.mark.parametrize("page", sorted(ROOT.glob("doc/notebooks/*.md")), ids=lambda page: page.name)

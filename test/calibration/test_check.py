@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calibration_helpers import BOX, campaign, fitted, measured, paper
+from helpers import long_test
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal, norm
 
@@ -90,7 +91,9 @@ def test_twelve_proposed_readings_name_the_strut() -> None:
         propose_check(fitted().known, 5)
 
 
-@pytest.mark.parametrize("instruments", [("straightness",), ("tracker",), ("tracker_6d",)])
+@pytest.mark.parametrize(
+    "instruments", [("straightness",), pytest.param(("tracker",), marks=long_test), ("tracker_6d",)]
+)
 def test_other_instruments_propose_what_shows_the_struts(instruments: tuple[str, ...]) -> None:
     """Straightnesses come by threes, for their slope is unknown; poses are whole. A change is seen where stated."""
     proposed = propose_check(fitted().known, 15, instruments)
@@ -184,7 +187,7 @@ def test_a_machine_that_has_not_changed_is_valid() -> None:
     assert verdicts == [VALID] * 5
 
 
-@pytest.mark.parametrize(("strut", "size"), [(0, 20e-6), (3, -20e-6)])
+@pytest.mark.parametrize(("strut", "size"), [(0, 20e-6), pytest.param(3, -20e-6, marks=long_test)])
 def test_a_crashed_strut_is_named_measured_and_repaired(strut: int, size: float) -> None:
     """The test has moved it; the renewed model leaves no more than half as much again as the fit had left."""
     truth = crashed(strut, size)

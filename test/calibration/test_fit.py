@@ -6,6 +6,7 @@ from functools import cache
 import calibration_helpers as small
 import numpy as np
 import pytest
+from helpers import long_test
 from scipy.stats import chi2, multivariate_normal
 
 from hexapod_comp.calibration.assumptions import ASSUMED
@@ -401,7 +402,12 @@ SMALL_ERRORS = replace(small.BOUNDS, joint=1e-5, strut_offset=1e-5, pitch=5e-5)
 
 
 @pytest.mark.parametrize(
-    ("bounds", "gross"), [(small.BOUNDS, 1e-3), (SMALL_ERRORS, 2e-5), (SMALL_ERRORS, 1e-3)], ids=["B", "A", "A, worse"]
+    ("bounds", "gross"),
+    [
+        pytest.param(small.BOUNDS, 1e-3, id="B", marks=long_test),
+        pytest.param(SMALL_ERRORS, 2e-5, id="A"),
+        pytest.param(SMALL_ERRORS, 1e-3, id="A, worse", marks=long_test),
+    ],
 )
 def test_gross_errors_are_named_and_do_no_harm(bounds: ImperfectionBounds, gross: float):
     """Three readings that are 20 standard deviations off, or a millimetre: listed, and the tool error stays.

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from calibration_helpers import FEW, campaign, measured, virtual_machine
 from foreign_machines import machines
+from helpers import long_test
 from scipy.stats import multivariate_normal
 
 from hexapod_comp.calibration.estimator import Estimation, log_evidence
@@ -107,7 +108,10 @@ def with_measured_struts(m: MeasurementSet) -> MeasurementSet:
     return stopped.with_values(m.value + (m.directions() * moved[m.station]).sum(axis=1))
 
 
-@pytest.mark.parametrize("struts", [lambda m: m, with_measured_struts], ids=["commanded", "measured"])
+@pytest.mark.parametrize(
+    "struts",
+    [pytest.param(lambda m: m, id="commanded"), pytest.param(with_measured_struts, id="measured", marks=long_test)],
+)
 @pytest.mark.parametrize(
     ("frame", "name"),
     [

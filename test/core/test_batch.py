@@ -121,11 +121,7 @@ def test_triangles_close_on_their_circles():
     np.testing.assert_allclose(points, np.tile(corners, (40, 1, 1)), atol=1e-13)
 
 
-WRONG = {
-    "shape": lambda a: a[:-1],
-    "type": lambda a: a.astype(np.float32),
-    "layout": lambda a: np.asfortranarray(a),
-}
+WRONG = {"shape": lambda a: a[:-1], "type": lambda a: a.astype(np.float32), "layout": lambda a: np.asfortranarray(a)}
 
 
 @pytest.mark.parametrize("wrong", WRONG)

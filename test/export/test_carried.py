@@ -12,7 +12,7 @@ from strategies import paper_geometry, random_model
 
 from hexapod_comp.errors import ModelError
 from hexapod_comp.export.c_code import model_header
-from hexapod_comp.export.carried import CARRIED, PROVENANCE, refuse_unknown, terms
+from hexapod_comp.export.carried import CARRIED, PROVENANCE, refuse_unknown
 from hexapod_comp.export.linuxcnc import make_genhexkins
 from hexapod_comp.export.table import make_table
 from hexapod_comp.machine.load import Load
@@ -65,13 +65,6 @@ def test_an_unknown_term_of_a_block_is_refused(export: Callable[[MachineModel], 
     assert export(MachineModel("paper", struts=StrutsWithWind()))
     with pytest.raises(ModelError, match=r"^struts\.wind: .*1e-09"):
         export(MachineModel("paper", struts=StrutsWithWind(wind=np.full(6, 1e-9))))
-
-
-def test_the_ideal_machine_has_no_terms_and_a_random_one_those_that_it_was_given():
-    assert list(terms(MachineModel("paper", name="other"))) == []
-    given = {name for name, _ in terms(random_model(np.random.default_rng(1), "paper"))}
-    assert {"base_deviation", "struts.offset", "struts.cosine", "field.lines", "base_expansion"} <= given
-    assert given <= CARRIED
 
 
 def test_the_lists_hold_todays_terms_and_no_others():

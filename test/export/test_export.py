@@ -209,14 +209,6 @@ def test_paper_machine_keeps_its_field_only(tmp_path: Path) -> None:
     assert ExportTrial(geometry, without, PAPER_BOX, 300).check(back.commands).level.after.rms < 0.5e-6
 
 
-def test_tilt_out_of_reach_is_not_driven() -> None:
-    geometry = paper_geometry()
-    trial = ExportTrial(geometry, paper_machine(), PAPER_BOX, 20, tilt=1.5)
-    check = trial.check(Passes.nominal_commands)
-    assert check.tilted is None
-    assert check.level.after == check.level.before
-
-
 def test_inches_and_millimetres_say_the_same(tmp_path: Path) -> None:
     """Numbers have 12 digits after the point (trims, joints) or 9 (nominal): below a tenth of a nanometre."""
     geometry, model = paper_geometry(), paper_machine()
@@ -309,16 +301,6 @@ def test_table_file_brings_trilinear_functions_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(corrections, wanted + 0.5 * senses * np.abs(wanted), atol=2e-12, rtol=0.0)
     with pytest.raises(ModelError, match="holds positions within"):
         back.pose_corrections(np.array([[0.0, 0.0, 0.51]]), np.array([False]))
-
-
-def test_table_rows_may_stand_in_any_order_and_unit(tmp_path: Path) -> None:
-    table, _ = trilinear_table()
-    write_table(table, tmp_path / "t.csv", [])
-    header, *rows = (tmp_path / "t.csv").read_text().splitlines()
-    in_metres = [",".join([f"{float(c) * 1e-3:.15f}" for c in row.split(",")[:3]] + row.split(",")[3:]) for row in rows]
-    shuffled = np.random.default_rng(3).permutation(in_metres)
-    (tmp_path / "t.csv").write_text("\n".join([header.replace("_mm", "_m"), *shuffled]) + "\n")
-    np.testing.assert_allclose(read_table(tmp_path / "t.csv").struts, table.struts, atol=1e-12, rtol=0.0)
 
 
 @pytest.mark.parametrize(
@@ -466,15 +448,6 @@ def test_verb_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments
     monkeypatch.chdir(tmp_path)
     with pytest.raises(HexapodError, match=error):
         run_verb(*arguments)
-
-
-@pytest.mark.parametrize(
-    "argument", ["--box=0,0,400,9,9,399", "--step-mm=0", "--poses=999", "--units=cm", "--tilt-deg=-1"]
-)
-def test_verb_refuses_options(argument: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        run_verb("--linuxcnc", "x", argument)
-    assert argument.split("=")[0] in capsys.readouterr().err
 
 
 def test_box_comes_from_the_model_and_follows_the_frames() -> None:

@@ -215,8 +215,3 @@ def test_export_writes_both_without_a_model(tmp_path: Path, capsys: pytest.Captu
     for joint in robot.find("ros2_control").findall("joint"):  # JointStateTopicSystem ends at what has no interface
         assert [state.get("name") for state in joint.findall("state_interface")] == ["position", "velocity"]
     assert [connect.get("name") for connect in mujoco.find("equality")] == [f"{strut}_end" for strut in STRUT_NAMES]
-
-
-def test_a_machine_that_is_drawn_becomes_c_too(tmp_path: Path):
-    assert main(["export", "--model", "random:7", "--c", str(tmp_path)]) == 0
-    assert "hexapod_model.h" in {path.name for path in tmp_path.iterdir()}

@@ -176,8 +176,7 @@ def run(command: str, **options: object) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize(
-    ("verb", "to", "code"),
-    [("--help", "> /dev/full", 2), *(("ik poses.csv --machine paper", *end) for end in ENDS)],
+    ("verb", "to", "code"), [("--help", "> /dev/full", 2), *(("ik poses.csv --machine paper", *end) for end in ENDS)]
 )
 def test_an_output_that_nobody_takes_is_no_traceback(verb, to, code, tmp_path):
     """Before: tracebacks from `print`, and "Exception ignored" with exit code 120 from the end of Python."""

@@ -57,14 +57,6 @@ def test_nothing_else_changes_by_a_bit() -> None:
         assert getattr(other, name) is getattr(geometry, name)
 
 
-def test_old_files_have_one_of_each(tmp_path: Path) -> None:
-    content = yaml.safe_load(EXAMPLE.read_text(encoding="utf-8"))
-    for key in ("tools", "work_frames"):
-        content.pop(key)
-    geometry = loaded(content, tmp_path)
-    assert (list(geometry.tools), list(geometry.work_frames)) == (["tool"], ["base", "work"])
-
-
 def test_a_geometry_with_tools_can_be_copied_replaced_and_sent_elsewhere() -> None:
     geometry = load_geometry(EXAMPLE).using("probe", "fixture")
     for other in (pickle.loads(pickle.dumps(geometry)), copy.deepcopy(geometry), replace(geometry)):

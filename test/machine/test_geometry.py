@@ -130,10 +130,7 @@ FIFTH_JOINT = ", [20, -2, 0]]"
     [
         pytest.param(FIFTH_JOINT, "]", ["base.joints_in", "6×3", "5×3"], id="five joints"),
         pytest.param("[5, 8, 0]", "[5, 8, .nan]", ["platform.joints_in[0][2]", "finite", "nan"], id="NaN"),
-        pytest.param("[5, 8, 0]", "[5, .inf, 0]", ["platform.joints_in[0][1]", "finite", "inf"], id="infinite"),
-        pytest.param("[5, 8, 0]", "[5, 8]", ["platform.joints_in", "6×3"], id="a joint of two numbers"),
         pytest.param("[5, 8, 0]", "[5, eight, 0]", ["platform.joints_in[0][1]", "number", "eight"], id="a word"),
-        pytest.param("[5, 8, 0]", "[5, yes, 0]", ["platform.joints_in[0][1]", "number", "True"], id="yes"),
         pytest.param(
             "[-8, 18, 0.5]",
             "[20, 2, 0]",
@@ -142,7 +139,6 @@ FIFTH_JOINT = ", [20, -2, 0]]"
         ),
         pytest.param("[11, 41]", "[41, 11]", ["limits.stroke[4]", "below the longest", "1.041"], id="stroke reversed"),
         pytest.param("[11, 41]", "[-11, 41]", ["limits.stroke[4]", "positive", "-0.2794"], id="negative length"),
-        pytest.param("[11, 41], ", "", ["limits.stroke_in", "6×2", "5×2"], id="five stroke pairs"),
         pytest.param("60, 50]", "60, 0]", ["limits.base_cone[5]", "(0, π]", "0.0"], id="cone of nothing"),
         pytest.param("cone_deg: 80", "cone_deg: 200", ["limits.platform_cone[0]", "(0, π]", "3.49"], id="cone"),
         pytest.param("number: 20", "number: 0.5", ["limits.condition", "above 1", "0.5"], id="condition"),
@@ -150,18 +146,14 @@ FIFTH_JOINT = ", [20, -2, 0]]"
         pytest.param("step_mm: 2", "step: 2", ["limits.step", "no unit", "step_mm", "2"], id="unit missing"),
         pytest.param("step_mm: 2", "step_kg: 2", ["limits.step", "missing", "step_mm"], id="wrong unit"),
         pytest.param("step_mm: 2", "step_mm: 2\n  step_um: 2000", ["limits.step_", "given twice"], id="two units"),
-        pytest.param("  step_mm: 2\n", "", ["limits.step", "missing", "step_mm"], id="limit missing"),
         pytest.param(
             "speed_m_min: 12", "speed_m_min: 12\n  warp: 9", ["limits.warp", "not a known key", "9"], id="unknown key"
         ),
         pytest.param("screw:", "screws:", ["screws", "not a known key"], id="unknown block"),
         pytest.param("  platform_cone", "  base_cone_deg: 3\n  platform_cone", ["base_cone_deg", "twice"], id="twice"),
         pytest.param("version: 1", "version: 2", ["version", "only version 1", "2"], id="version"),
-        pytest.param("version: 1", "version: '1'", ["version", "only version 1", "'1'"], id="version as text"),
-        pytest.param("version: 1", "version: true", ["version", "only version 1", "True"], id="version true"),
         pytest.param("hexapod_comp/geometry", "hexapod_comp/model", ["format", "geometry", "model"], id="format"),
         pytest.param("machine: general", "machine: 12", ["machine", "text", "12"], id="name not text"),
-        pytest.param("machine: general\n", "", ["machine", "missing"], id="no name"),
         pytest.param("[0, 2, 0]", "[0, 0, 0]", ["base.joint_axes[0]", "zero vector"], id="axis of no direction"),
         pytest.param("position_in: [0, 0, 20]", "position_in: [0, 0, 90]", ["home", "stroke"], id="home too high"),
         pytest.param("home:\n  position_in: [0, 0, 20]", "home:", ["home", "mapping"], id="empty block"),

@@ -21,13 +21,7 @@ from scipy.spatial.transform import Rotation
 from strategies import paper_geometry
 
 from hexapod_comp.core import Status, batch
-from hexapod_comp.errors import (
-    KinematicsError,
-    NotFiniteError,
-    OtherAssemblyModeError,
-    SingularError,
-    UnreachableError,
-)
+from hexapod_comp.errors import KinematicsError, NotFiniteError, OtherAssemblyModeError, SingularError, UnreachableError
 from hexapod_comp.machine import kinematics
 from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.kinematics import (

@@ -108,16 +108,6 @@ def test_stations_driven_together_go_where_each_goes_alone():
         drive(machines, (positions, rotations), senses, commands, lambda n: f"row {n}")
 
 
-def test_a_file_brings_the_same_model_back(tmp_path: Path):
-    model = warming_model()
-    save_model(model, tmp_path / "warm.yaml")
-    back = load_model(tmp_path / "warm.yaml", paper()).late_growth
-    assert (back.time_constants, back.thermometer) == ((600.0, 7200.0), "base")
-    np.testing.assert_allclose(
-        back.expansion, model.late_growth.expansion, rtol=3e-16
-    )  # one rounding, as the file says
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

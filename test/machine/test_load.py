@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 from strategies import fixed, paper_geometry, random_model, random_pose, seeds, skewed_geometry
 
 from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.core import Status, lib
 from hexapod_comp.errors import InputFileError, ModelError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.load import STANDARD_GRAVITY, Load, Loading, Payload
@@ -152,13 +151,6 @@ def test_a_tool_weighs_like_a_wrench_in_its_centre() -> None:
     np.testing.assert_allclose(heavier, by_wrench, rtol=0.0, atol=1e-15)
 
 
-def test_without_a_block_nothing_bends() -> None:
-    geometry = skewed_geometry()
-    free = RealMachine(geometry, MachineModel("skewed"), loading=Loading.of([0.0, 9.0, 0.0], [100.0] * 6))
-    ideal = RealMachine(geometry, MachineModel("skewed"))
-    np.testing.assert_array_equal(free.commands_for(geometry.home)[0], ideal.commands_for(geometry.home)[0])
-
-
 # ---- the compensator ----
 
 
@@ -206,13 +198,6 @@ def test_what_acts_ramps_in_and_no_direction_turns() -> None:
 
 def loaded_commands(geometry: HexapodGeometry, model: MachineModel, loading: Loading) -> np.ndarray:
     return RealMachine(geometry, model, loading=loading).commands_for(geometry.home)[0]
-
-
-def test_the_core_refuses_what_is_not_finite() -> None:
-    compensator = Compensator(paper_geometry(), MachineModel("paper"))
-    state, infinite = compensator._at, float("inf")
-    assert lib.hc_set_load(state, [0.0, 0.0, infinite], [0.0] * 6) == Status.LOAD
-    assert lib.hc_set_load(state, [0.0] * 3, [0.0, infinite, 0.0, 0.0, 0.0, 0.0]) == Status.LOAD
 
 
 # ---- files ----

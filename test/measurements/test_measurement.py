@@ -8,15 +8,7 @@ from scipy.spatial.transform import Rotation
 from strategies import paper_geometry
 
 from hexapod_comp.machine.geometry import HexapodGeometry
-from hexapod_comp.measurements.readings import (
-    AXES,
-    BACKWARD,
-    CHANNELS,
-    FORWARD,
-    UNKNOWN,
-    FileLine,
-    Reading,
-)
+from hexapod_comp.measurements.readings import AXES, BACKWARD, CHANNELS, FORWARD, UNKNOWN, FileLine, Reading
 from hexapod_comp.measurements.runs import assemble
 from hexapod_comp.pose import Pose, attitude_error
 

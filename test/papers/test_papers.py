@@ -6,7 +6,6 @@ Truth: the papers' tables (test/data has Tables 1 and 2 from another copy), clos
 from __future__ import annotations
 
 import csv
-import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -28,12 +27,9 @@ from examples.papers.comparing import (
     Paper,
     Statement,
     records,
-    report,
-    roundings,
     values,
 )
 from examples.papers.page import page_text
-from hexapod_comp import cli
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.virtual.assessment import assess
@@ -73,11 +69,6 @@ def test_shipped_tables_are_those_of_the_other_copy():
         np.testing.assert_allclose(np.radians(row[:3]), pose.angles(), atol=1e-15)
     changes = values(4) - values(2)  # the seeds' README: within −6…+2 µm
     np.testing.assert_allclose([changes.min(), changes.max()], [-6e-3, 2e-3], atol=1e-9)
-
-
-def test_rounding_is_half_of_the_last_digit_with_zeros_at_the_end_left_out():
-    printed = (("519.494", "519.11", "5"), ("0.000137", "9.77E-06", "-0.00083"))
-    np.testing.assert_allclose(roundings(printed), [[5e-4, 5e-4, 5e-6], [5e-7, 5e-9, 5e-6]], rtol=1e-12)
 
 
 # Song, Mou & King.
@@ -199,12 +190,6 @@ def test_the_1_d_scheme_does_what_the_paper_says(one_d, truth):
     assert [one.what for one in curves.statements] == [f"strut_{n}" for n in range(1, 7)]
 
 
-def test_a_scheme_that_removes_nothing_is_noticed(one_d):
-    nothing = replace(one_d.worth.paper, after=one_d.worth.paper.before)
-    idle = replace(one_d, worth=replace(one_d.worth, paper=nothing))
-    assert verdict(mou_king.seventy((idle,)), "removed") == MISSED
-
-
 # V. Daake, Vetter, Böhm & Zirn.
 
 
@@ -252,13 +237,6 @@ def test_the_page_holds_everything_and_loads_nothing(run):
         assert f"<b>{cell}</b>" in text
 
 
-def test_the_report_names_papers_by_their_authors(run):
-    text = report([Paper("Song, Mou & King", "Title", (song_mou_king.table_2(run), song_mou_king.wrong()))])
-    assert "60 of 60 met" in text
-    assert "second combined equation: wrong in print" in text
-    assert not re.search(r"(?<![\d.,])00[014](?![\d.])", text)
-
-
 @pytest.mark.parametrize(("given", "code"), [(MET, 0), (WRONG, 0), (OPEN, 0), (MISSED, 1)])
 def test_the_program(given: str, code: int, run, tmp_path: Path, monkeypatch, capsys):
     """The exit code is about what can be met; the three modules themselves are tried above."""
@@ -276,16 +254,3 @@ def test_the_program(given: str, code: int, run, tmp_path: Path, monkeypatch, ca
         "printed": "509.192", "computed": "", "difference": "-0.000156651", "verdict": MET, "why": "",
     }  # fmt: skip
     assert (folder / "papers.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
-
-
-def test_a_file_in_the_way_is_named_before_the_work(tmp_path: Path, capsys):
-    taken = tmp_path / "taken"
-    taken.write_text("mine")
-    assert program.main(["--out", str(taken)]) == 2
-    assert f"{taken}: this folder cannot be made" in capsys.readouterr().err
-    assert taken.read_text() == "mine"
-
-
-def test_the_verb_says_where_it_went(capsys):
-    assert cli.main(["paper", "--out", "out"]) == 2
-    assert "paper is `make papers` in the source tree now (python -m examples.papers)" in capsys.readouterr().err
