@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import copy
 import csv
+import io
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -95,6 +96,15 @@ def assert_equal(one: Any, other: Any, relative: float = 0.0, absolute: float = 
         assert one == pytest.approx(other, rel=relative, abs=absolute, nan_ok=True)
     else:
         assert one == other
+
+
+def hexapod(*words: object) -> tuple[int, str, str]:
+    """Run the command in this process; return exit code, standard output, standard error."""
+    from hexapod_comp import cli
+
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
+        code = cli.main([str(word) for word in words])
+    return code, out.getvalue(), err.getvalue()
 
 
 @contextmanager

@@ -6,28 +6,21 @@ report gets a smaller one.
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import importlib.util
-import io
 import json
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from calibration_helpers import fitted_model
-from helpers import quick_pictures
-from scipy.spatial.transform import Rotation
+from helpers import hexapod, quick_pictures
 
-from hexapod_comp import cli
 from hexapod_comp.calibration import remaining
 from hexapod_comp.cli import classify as verb
-from hexapod_comp.formats.paths import config_file
-from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.machine.kinematics import Structure, solve_pose, strut_lengths
-from hexapod_comp.pose import Pose
 from hexapod_comp.workspace import study
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -41,12 +34,7 @@ QUICK = ("--cells", "4", "--tilt-deg", "0", "--no-page")
 Run = tuple[int, str, str]
 
 
-def classify(*arguments: object) -> Run:
-    """Run the verb; return exit code, standard output, standard error."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = cli.main(["classify", *map(str, arguments)])
-    return code, out.getvalue(), err.getvalue()
+classify = partial(hexapod, "classify")
 
 
 @dataclass(frozen=True)
@@ -124,33 +112,6 @@ def test_screw_pitch_comes_first_by_two(done: Done) -> None:
     assert largest[0] >= 2.0 * largest[1]
     turned = [float(row["rotation_max_mdeg"]) for row in rows]
     assert max(turned) == turned[0]
-
-
-def test_effects_scale_with_the_input_error(done: Done) -> None:
-    """Quantisation is a length error of 7 µm where screw pitch is one of 20 µm: the same legs, the same poses."""
-    # The effects are linear within size/length, about 1e-4.
-    by_type = {row["error_type"]: row for row in done.rows}
-    pitch, quantum = by_type["screw pitch"], by_type["quantisation"]
-    for name in ("translation_max_um", "translation_min_um", "rotation_max_mdeg", "rotation_min_mdeg"):
-        assert float(pitch[name]) / float(quantum[name]) == pytest.approx(20.0 / 7.0, rel=1e-3)
-    assert pitch["translation_max_error"] == quantum["translation_max_error"]
-
-
-def test_the_first_row_is_what_forward_kinematics_says(done: Done) -> None:
-    """The strut named, 20 µm too long, at the pose named. The CSV's digits are a picometre and a nanodegree."""
-    row = done.rows[0]
-    geometry = load_geometry(config_file("positioning_unit"))
-    place = np.array([float(row[f"translation_max_{axis}_mm"]) for axis in "xyz"]) * 1e-3
-    angles = np.deg2rad([float(row[f"translation_max_{name}_deg"]) for name in ("alpha", "beta", "gamma")])
-    platform = geometry.work @ Pose.from_angles(place, angles) @ geometry.tool.inverse()
-    structure = Structure.of(geometry)
-    lengths = strut_lengths(structure, platform)
-    lengths[int(row["translation_max_error"].removeprefix("strut_")) - 1] += 20e-6
-    actual = solve_pose(structure, lengths, platform)
-    moved = np.linalg.norm((actual @ geometry.tool).position - (platform @ geometry.tool).position)
-    assert float(row["translation_max_um"]) == pytest.approx(moved * 1e6, abs=1e-5)
-    turn = Rotation.from_matrix(actual.rotation @ platform.rotation.T).as_rotvec(degrees=True)
-    assert np.abs(turn).max() * 1e3 <= float(row["rotation_max_mdeg"])
 
 
 def test_json_says_the_same(done: Done) -> None:

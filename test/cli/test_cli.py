@@ -18,11 +18,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import table_lengths, table_poses
+from helpers import hexapod, table_lengths, table_poses
 from scipy.spatial.transform import Rotation
 from strategies import paper_geometry, random_field, random_model
 
-from hexapod_comp import cli
 from hexapod_comp.cli import poses, results
 from hexapod_comp.cli.verbs import VERBS
 from hexapod_comp.compensation.checks import check
@@ -45,19 +44,6 @@ POSE_HEADER = "name,x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg"
 
 DEFAULT_NOTE = "hexapod_comp: note: no --machine was given: this is machine paper, the default\n"
 
-Run = tuple[int, str, str]
-
-
-@pytest.fixture
-def hexapod(capsys: pytest.CaptureFixture[str]):
-    """Give a function that runs the command and returns exit code, output and error output."""
-
-    def run(*arguments: str) -> Run:
-        code = cli.main(arguments)
-        return code, *capsys.readouterr()
-
-    return run
-
 
 def parsed(text: str) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(text)))
@@ -72,7 +58,7 @@ def file_of(folder: Path, rows: Sequence[Sequence[object]], header: str = POSE_H
 # The program itself.
 
 
-def test_verbs_explain_themselves_and_rules_name_their_options(hexapod) -> None:
+def test_verbs_explain_themselves_and_rules_name_their_options() -> None:
     """A rule about an option that a verb has not would never be broken."""
     for name, verb in VERBS.items():
         assert f"$ hexapod_comp {name} " in hexapod(name, "--help")[1].partition("example:\n")[2] + " "
@@ -81,7 +67,7 @@ def test_verbs_explain_themselves_and_rules_name_their_options(hexapod) -> None:
             assert {part.split(" ")[0] for name in rule.options for part in re.split(" (?=--)", name)} <= options
 
 
-def test_an_old_name_works_and_says_the_new_one(hexapod, tmp_path: Path) -> None:
+def test_an_old_name_works_and_says_the_new_one(tmp_path: Path) -> None:
     code, out, err = hexapod("measure", "--out", str(tmp_path / "none" / "m.csv"))
     assert (code, out) == (2, "")
     note, error = err.splitlines()
@@ -90,7 +76,7 @@ def test_an_old_name_works_and_says_the_new_one(hexapod, tmp_path: Path) -> None
     assert hexapod("measure", "--help")[1].startswith("usage: hexapod_comp simulate")
 
 
-def test_json_is_printed_and_out_stays_csv(hexapod, tmp_path: Path) -> None:
+def test_json_is_printed_and_out_stays_csv(tmp_path: Path) -> None:
     """Both at once: the file is the one that is written without --json."""
     one, two = str(tmp_path / "one.csv"), str(tmp_path / "two.csv")
     for verb, given in (("ik", TABLE_1), ("check", TABLE_1), ("assess", TABLE_1)):
@@ -144,13 +130,13 @@ def test_the_marks_by_which_the_shell_finds_out_are_at_the_top() -> None:
         assert "PYTHON_ARGCOMPLETE_OK" in (ROOT / "hexapod_comp" / name).read_text(encoding="utf-8")[:1024]
 
 
-def test_version_is_the_packages(hexapod) -> None:
+def test_version_is_the_packages() -> None:
     version = re.search(r"<version>(.*)</version>", (ROOT / "package.xml").read_text())
     assert version
     assert hexapod("--version") == (0, f"hexapod_comp {version.group(1)}\n", "")
 
 
-def test_errors_name_row_and_column(hexapod, tmp_path: Path) -> None:
+def test_errors_name_row_and_column(tmp_path: Path) -> None:
     path = file_of(tmp_path, [("a", 0, 0, 400, 0, 0, 0), ("b", 0, 0, "four", 0, 0, 0)])
     for verb in ("ik", "check", "assess"):
         assert hexapod(verb, path) == (
@@ -160,7 +146,7 @@ def test_errors_name_row_and_column(hexapod, tmp_path: Path) -> None:
         )
 
 
-def test_control_c_and_a_closed_pipe(hexapod, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_control_c_and_a_closed_pipe(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(args: object) -> int:
         raise KeyboardInterrupt
 
@@ -179,7 +165,7 @@ def test_lengths_from_a_pipe_and_a_pipe_that_is_closed_are_quiet(tmp_path: Path)
 
 
 @pytest.mark.parametrize("verb", ["ik", "fk", "check", "assess", "simulate"])
-def test_the_example_in_the_help_is_real(hexapod, monkeypatch, tmp_path: Path, verb: str) -> None:
+def test_the_example_in_the_help_is_real(monkeypatch, tmp_path: Path, verb: str) -> None:
     """Every line of output shown under the first command of a help text comes out of that command."""
     (tmp_path / "out").mkdir()
     (tmp_path / "config").symlink_to(ROOT / "config")
@@ -197,7 +183,7 @@ def test_the_example_in_the_help_is_real(hexapod, monkeypatch, tmp_path: Path, v
 # ik and fk.
 
 
-def test_table_1_gives_table_2_at_the_printed_digits(hexapod) -> None:
+def test_table_1_gives_table_2_at_the_printed_digits() -> None:
     """000, Tables 1 and 2."""
     code, out, err = hexapod("ik", TABLE_1)
     assert (code, err) == (0, DEFAULT_NOTE)
@@ -209,7 +195,7 @@ def test_table_1_gives_table_2_at_the_printed_digits(hexapod) -> None:
 
 @pytest.mark.parametrize("model", ["ideal", "paper_machine", "paper_lines_model"])
 @pytest.mark.parametrize("start", [(), ("--guess", "-5,3,390,2,-2,1"), ("--cold",)], ids=["home", "guess", "cold"])
-def test_ik_then_fk_is_where_it_started(hexapod, tmp_path: Path, model: str, start: tuple[str, ...]) -> None:
+def test_ik_then_fk_is_where_it_started(tmp_path: Path, model: str, start: tuple[str, ...]) -> None:
     """CSV carries 1e-9 mm and degrees; the pose moves by less than ten times the lengths' rounding."""
     lengths, poses = str(tmp_path / "lengths.csv"), str(tmp_path / "poses.csv")
     assert hexapod("ik", TABLE_1, "--model", model, "--out", lengths) == (0, "", DEFAULT_NOTE)
@@ -222,7 +208,7 @@ def test_ik_then_fk_is_where_it_started(hexapod, tmp_path: Path, model: str, sta
     assert len(read_lengths(lengths)[1]) == 10
 
 
-def test_one_pose_by_options_by_list_and_by_json(hexapod) -> None:
+def test_one_pose_by_options_by_list_and_by_json() -> None:
     """The same pose three ways; Table 2, row 2. Negative numbers need no equals sign."""
     by_list = hexapod("ik", "--pose", "0,0,400,5,0,0")
     assert by_list == hexapod("ik", "--x-mm", "0", "--y-mm", "0", "--z-mm", "400", "--alpha-deg", "5")
@@ -235,7 +221,7 @@ def test_one_pose_by_options_by_list_and_by_json(hexapod) -> None:
     assert spaced == hexapod("ik", "--x-mm", "-5", "--y-mm", "0", "--z-mm", "400", "--alpha-deg", "-1e0")
 
 
-def test_ik_with_a_model_prints_commands_and_corrections(hexapod) -> None:
+def test_ik_with_a_model_prints_commands_and_corrections() -> None:
     """command = nominal + correction, in mm and µm; the correction is the compensator's first one."""
     code, out, _ = hexapod("ik", "--pose", "1,2,410,3,4,5", "--model", "paper_machine", "--json")
     row = json.loads(out)["rows"][0]
@@ -255,7 +241,7 @@ def only_backlash(folder: Path, lost: list[float], machine: str = "paper") -> st
     return str(path)
 
 
-def test_forward_and_backward_differ_by_the_backlash_and_midway_is_between(hexapod, tmp_path: Path) -> None:
+def test_forward_and_backward_differ_by_the_backlash_and_midway_is_between(tmp_path: Path) -> None:
     """A backlash is what a command must go further after a reversal: forward − backward = b, by definition."""
     lost = [1.0, 2.0, 3.0, 4.0, 5.0, 8.0]
     given = ("ik", "--pose", "70,-30,420,3,-2,5", "--model", only_backlash(tmp_path, lost))
@@ -280,7 +266,7 @@ def test_forward_and_backward_differ_by_the_backlash_and_midway_is_between(hexap
 
 
 @pytest.mark.parametrize("machine", ["paper", "example_6_6"])
-def test_a_line_has_both_ways_of_every_strut(hexapod, tmp_path: Path, machine: str) -> None:
+def test_a_line_has_both_ways_of_every_strut(tmp_path: Path, machine: str) -> None:
     """Commands differ by +b where the nominal length, by finite differences, rises on the way, by −b where it falls."""
     geometry = load_geometry(f"{machine}.yaml")
     x, y, z = geometry.tool_pose(geometry.home).position * 1e3
@@ -311,7 +297,7 @@ def test_a_line_has_both_ways_of_every_strut(hexapod, tmp_path: Path, machine: s
     assert len(read_lengths(str(out))[1]) == 2 * half  # fk reads it
 
 
-def test_a_line_is_what_the_compensator_commands_on_the_way(hexapod) -> None:
+def test_a_line_is_what_the_compensator_commands_on_the_way() -> None:
     """The compensator follows the motion from pose to pose; with all errors of the model, a field that reverses too."""
     line, step = ((-30.0, 20.0, 410.0), (30.0, 10.0, 415.0)), "10"
     given = ("ik", "--line", ",".join(map(str, sum(line, ()))), "--step-mm", step, "--model", "paper_machine", "--json")
@@ -328,7 +314,7 @@ def test_a_line_is_what_the_compensator_commands_on_the_way(hexapod) -> None:
                 assert [row[f"L{i}_mm"] for i in range(1, 7)] == pytest.approx(commands * 1e3, abs=1e-9)
 
 
-def test_ik_predicts_the_error_without_compensation_in_the_work_frame(hexapod, tmp_path: Path) -> None:
+def test_ik_predicts_the_error_without_compensation_in_the_work_frame(tmp_path: Path) -> None:
     """Told nominal lengths, the machine is where ``fk`` says. The shipped model carries no covariance: never a zero."""
     pose = "10,20,420,2,-3,4"
     lengths = json.loads(hexapod("ik", "--pose", pose, "--json")[1])["rows"][0]
@@ -356,7 +342,7 @@ def test_ik_predicts_the_error_without_compensation_in_the_work_frame(hexapod, t
     assert "error_z_um" not in hexapod("ik", str(poses))[1]
 
 
-def test_fk_names_the_row_without_a_pose(hexapod, tmp_path: Path) -> None:
+def test_fk_names_the_row_without_a_pose(tmp_path: Path) -> None:
     rows = [(500,) * 6, (500, 500, 500, 500, 500, 2000), (500,) * 6]
     path = file_of(tmp_path, rows, "L1_mm,L2_mm,L3_mm,L4_mm,L5_mm,L6_mm")
     code, out, err = hexapod("fk", path)
@@ -364,7 +350,7 @@ def test_fk_names_the_row_without_a_pose(hexapod, tmp_path: Path) -> None:
     assert err.startswith("hexapod_comp: error: line 3 (row 2): no pose has these strut lengths")
 
 
-def test_all_modes_lists_each_once_and_marks_the_working_one(hexapod) -> None:
+def test_all_modes_lists_each_once_and_marks_the_working_one() -> None:
     """Every mode's pose has the lengths asked for, by NumPy; the working one is Table 1, row 2."""
     values = table_lengths()[1]
     lengths = ",".join(repr(float(v) * 1e3) for v in values)
@@ -404,7 +390,7 @@ def test_a_terminal_shows_what_is_done() -> None:
     assert out.startswith(b"machine paper: 1670 readings")
 
 
-def test_lists_of_broken_limits_are_capped(hexapod, tmp_path: Path) -> None:
+def test_lists_of_broken_limits_are_capped(tmp_path: Path) -> None:
     """However many targets are out of reach: twenty lines in check, ten notes of ik, and how many more there are."""
     path = file_of(tmp_path, [(n, 0, 0, 950, 0, 0, 0) for n in range(30)])
     code, out, _ = hexapod("check", path, "--stream", "--rate-hz", "1")
@@ -431,7 +417,7 @@ LINES = {
 
 
 @pytest.mark.parametrize("limit", LINES)
-def test_check_names_row_and_limit(hexapod, tmp_path: Path, limit: str) -> None:
+def test_check_names_row_and_limit(tmp_path: Path, limit: str) -> None:
     """Poses made to break one limit each; the machine is the paper's, opened wide but for the limit meant."""
     options, rows, line, text = LINES[limit]
     wide = {"stroke": "[200, 2000]", "base_cone": "89", "platform_cone": "120", "condition": "1000"}
@@ -585,7 +571,7 @@ def test_check_long_streams_in_pieces() -> None:
     np.testing.assert_allclose(np.abs(result.limits["step"].value[1:, 0]), steps, atol=1e-15)
 
 
-def test_check_writes_all_margins(hexapod, tmp_path: Path) -> None:
+def test_check_writes_all_margins(tmp_path: Path) -> None:
     out = tmp_path / "margins.csv"
     code, text, err = hexapod("check", TABLE_1, "--model", "paper_machine", "--out", str(out))
     assert (code, err) == (0, DEFAULT_NOTE)
@@ -599,7 +585,7 @@ def test_check_writes_all_margins(hexapod, tmp_path: Path) -> None:
     )
 
 
-def test_check_says_when_poses_leave_the_measured_box(hexapod, tmp_path: Path) -> None:
+def test_check_says_when_poses_leave_the_measured_box(tmp_path: Path) -> None:
     """The shipped field reaches to z = 553 mm; the model of lines was measured in the same box."""
     path = file_of(tmp_path, [("in", 0, 0, 400, 0, 0, 0), ("out", 0, 0, 600, 0, 0, 0)])
     _, out, _ = hexapod("check", path, "--model", "paper_machine")
@@ -617,7 +603,7 @@ def test_check_refuses_what_makes_no_sense(mode: str, rate: float) -> None:
 # assess.
 
 
-def test_assess_prints_the_papers_tables(hexapod) -> None:
+def test_assess_prints_the_papers_tables() -> None:
     """Table 2 to the printed digits; Table 4 − Table 2 is what it says."""
     code, out, err = hexapod("assess", "--seed", "3")
     assert (code, err) == (0, "")
@@ -634,7 +620,7 @@ def test_assess_prints_the_papers_tables(hexapod) -> None:
     assert "round trip of the real structure" in blocks[-1]
 
 
-def test_assess_statistics_follow_the_seed(hexapod) -> None:
+def test_assess_statistics_follow_the_seed() -> None:
     first, again, other = (
         json.loads(hexapod("assess", "--machines", "20", "--seed", seed, "--json")[1]) for seed in ("5", "5", "6")
     )

@@ -6,19 +6,16 @@ what is written get that fit again instead of a new one.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import io
 import json
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 from calibration_helpers import paper, scattered
-from helpers import quick_pictures
+from helpers import hexapod, quick_pictures
 
 from hexapod_comp import cli
 from hexapod_comp.calibration.estimator import physical_covariance
@@ -55,7 +52,6 @@ JOINT = ("--lead-mm", "10", "--blocks", "pitch,wave,backlash")
 PNG = b"\x89PNG\r\n\x1a\n"
 
 Run = tuple[int, str, str]
-Program = Callable[..., Run]
 
 
 @dataclass(frozen=True)
@@ -71,24 +67,6 @@ class Calibration:
 
     def file(self, name: str) -> Path:
         return self.folder / name
-
-
-@pytest.fixture
-def hexapod(capsys: pytest.CaptureFixture[str]) -> Program:
-    """Give a function that runs the command and returns exit code, output and error output."""
-
-    def run(*arguments: object) -> Run:
-        code = cli.main([str(argument) for argument in arguments])
-        return code, *capsys.readouterr()
-
-    return run
-
-
-def said_by(*arguments: object) -> str:
-    """Run the command in a fixture of the module, where capsys does not reach, and return what it prints."""
-    with contextlib.redirect_stdout(io.StringIO()) as out:
-        assert cli.main([str(argument) for argument in arguments]) == 0
-    return out.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +96,12 @@ def fitted(done: Calibration, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     monkeypatch.setattr(fit_module, "fit_model", lambda *arguments: done.fit)
     monkeypatch.chdir(tmp_path)
     return done
+
+
+def said_by(*words: object) -> str:
+    code, out, err = hexapod(*words)
+    assert code == 0, err
+    return out
 
 
 def assert_refused(outcome: Run, complaint: str) -> None:
@@ -225,9 +209,7 @@ def test_covariance_is_one(done: Calibration) -> None:
     np.testing.assert_allclose(values, [p["value"] for p in parameters], rtol=1e-12)
 
 
-def test_without_options_only_the_model_and_what_is_known_of_it_are_written(
-    hexapod: Program, fitted: Calibration
-) -> None:
+def test_without_options_only_the_model_and_what_is_known_of_it_are_written(fitted: Calibration) -> None:
     code, out, err = hexapod("fit", fitted.measured, "--out", "model.yaml")
     assert (code, err) == (0, "")
     assert {path.name for path in Path.cwd().iterdir()} == {"model.yaml", "model.posterior.npz"}
@@ -235,9 +217,7 @@ def test_without_options_only_the_model_and_what_is_known_of_it_are_written(
     assert load_model("model.yaml", load_geometry(config_file("paper"))).name == "joint calibration"
 
 
-def test_options_reach_the_fit(
-    hexapod: Program, done: Calibration, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_options_reach_the_fit(done: Calibration, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """In SI, and the field's three blocks under one word."""
     given: list[FitSettings] = []
 
@@ -262,7 +242,7 @@ def test_options_reach_the_fit(
 # Certificate.
 
 
-def test_certificate(hexapod: Program, fitted: Calibration) -> None:
+def test_certificate(fitted: Calibration) -> None:
     """After the model: its hash is that of the file as it was written, details are in it, and the whole report."""
     Path("details.yaml").write_text("format: hexapod_comp/certificate\nversion: 1\noperator: <Jo>\n")
     options = ("--certificate", "out.html", "--details", "details.yaml", "--name", "Tuesday's")
@@ -281,7 +261,7 @@ def test_certificate(hexapod: Program, fitted: Calibration) -> None:
 # Scheme lines.
 
 
-def test_scheme_lines(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
+def test_scheme_lines(done: Calibration, tmp_path: Path) -> None:
     """Polynomials, a model whose field is the measured box, no covariance; JSON alone on stdout."""
     written = ("--order", "aicc", "--out", tmp_path / "lines.yaml", "--pictures", tmp_path / "pictures")
     with quick_pictures():
@@ -344,7 +324,7 @@ def fitted_once(noisy_fits: dict[FitSettings, ModelFit], monkeypatch: pytest.Mon
 
 
 def test_noise_far_above_the_stated_writes_nothing(
-    hexapod: Program, noisy: Path, fitted_once: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    noisy: Path, fitted_once: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Exit code 1, what is wrong at the top of the report, no file of any kind."""
     monkeypatch.chdir(tmp_path)
@@ -365,7 +345,7 @@ def test_noise_far_above_the_stated_writes_nothing(
 
 
 def test_a_forced_model_says_so(
-    hexapod: Program, noisy: Path, fitted_once: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    noisy: Path, fitted_once: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """At the top of the report, in its file, and in the model for whoever runs it."""
     monkeypatch.chdir(tmp_path)
@@ -380,7 +360,7 @@ def test_a_forced_model_says_so(
     assert {path.name for path in tmp_path.iterdir()} == {"m.yaml", "m.posterior.npz", "r.txt", "c.html"}
 
 
-def test_noise_that_is_stated_is_welcome(hexapod: Program, stated: Path, tmp_path: Path) -> None:
+def test_noise_that_is_stated_is_welcome(stated: Path, tmp_path: Path) -> None:
     """The same readings with the uncertainty that they have: nothing is noted of it."""
     code, out, err = hexapod("fit", stated, "--blocks", "pitch", "--out", tmp_path / "m.yaml")
     assert (code, err) == (0, "")
@@ -388,7 +368,7 @@ def test_noise_that_is_stated_is_welcome(hexapod: Program, stated: Path, tmp_pat
     assert "uncertainty" not in out
 
 
-def test_micrometres_called_millimetres_write_nothing(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
+def test_micrometres_called_millimetres_write_nothing(done: Calibration, tmp_path: Path) -> None:
     """By either scheme, whether the file states no noise, or noise that is in millimetres then, too."""
     # Scheme lines leaves the screws' waves, a few micrometres, which now are millimetres.
     wrong, text = tmp_path / "mm.csv", done.measured.read_text().replace(",um,", ",mm,")
@@ -407,7 +387,7 @@ def test_micrometres_called_millimetres_write_nothing(hexapod: Program, done: Ca
 
 
 @pytest.mark.parametrize("scheme", ["joint", "lines"])
-def test_a_dead_instrument_is_refused(hexapod: Program, done: Calibration, tmp_path: Path, scheme: str) -> None:
+def test_a_dead_instrument_is_refused(done: Calibration, tmp_path: Path, scheme: str) -> None:
     header, *rows = done.measured.read_text().splitlines()
     dead = tmp_path / "dead.csv"
     column = header.split(",").index("value") - len(header.split(","))  # the run's name may hold commas
@@ -420,7 +400,7 @@ def test_a_dead_instrument_is_refused(hexapod: Program, done: Calibration, tmp_p
     assert list(tmp_path.iterdir()) == [dead]
 
 
-def test_fit_of_too_short_lines_says_which_and_what_is_needed(hexapod: Program, tmp_path: Path) -> None:
+def test_fit_of_too_short_lines_says_which_and_what_is_needed(tmp_path: Path) -> None:
     """Five readings on a line of 8 inches, every two inches: the paper's third of the points is no polynomial."""
     (tmp_path / "c.yaml").write_text(CAMPAIGN.replace("1.6", "2").replace("cycles: 2", "cycles: 1"))
     measured = tmp_path / "m.csv"
@@ -432,7 +412,7 @@ def test_fit_of_too_short_lines_says_which_and_what_is_needed(hexapod: Program, 
 # plan.
 
 
-def test_plan_says_what_will_be_determined(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
+def test_plan_says_what_will_be_determined(done: Calibration, tmp_path: Path) -> None:
     """Level 5-D lines show 14 of 33 structure parameters, says issue 3, and no roll; a 1-D laser shows less."""
     five = tmp_path / "five.yaml"
     five.write_text(CAMPAIGN.replace("1-D", "5-D"))
@@ -451,7 +431,7 @@ def test_plan_says_what_will_be_determined(hexapod: Program, done: Calibration, 
     assert error["low_m"] < error["after_m"] < error["high_m"] < error["before_m"]
 
 
-def test_plan_and_fit_agree(done: Calibration, hexapod: Program) -> None:
+def test_plan_and_fit_agree(done: Calibration) -> None:
     """The plan's readings are the file's, and its expectation is that of the fit with the same blocks: the noise is
     the campaign's, the machine within the same tolerances; a factor of two covers one machine's luck. What these
     blocks do not explain of the readings no plan can know: it only widens the fit's promise."""
@@ -465,7 +445,7 @@ def test_plan_and_fit_agree(done: Calibration, hexapod: Program) -> None:
     assert fit.level.after > explained.after
 
 
-def test_plan_proposes_a_campaign(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
+def test_plan_proposes_a_campaign(done: Calibration, tmp_path: Path) -> None:
     """The proposed file is one that plan judges; what it says beforehand is what plan says of it, draws aside."""
     path = tmp_path / "mine.yaml"
     goal = ("--goal-um", "2", "--instruments", "linear", "--hours", "3", "--time", "linear=5,2,1")
@@ -484,7 +464,7 @@ def test_plan_proposes_a_campaign(hexapod: Program, done: Calibration, tmp_path:
 # iso230.
 
 
-def test_iso230_judges_every_line(hexapod: Program, done: Calibration) -> None:
+def test_iso230_judges_every_line(done: Calibration) -> None:
     code, out, err = hexapod("iso230", done.measured)
     assert (code, err) == (0, "")
     rows = out.splitlines()
@@ -496,7 +476,7 @@ def test_iso230_judges_every_line(hexapod: Program, done: Calibration) -> None:
     assert out.strip() in done.fit_said, "the same table is part of the fit's report"
 
 
-def test_iso230_figures_follow_from_the_readings(hexapod: Program, done: Calibration) -> None:
+def test_iso230_figures_follow_from_the_readings(done: Calibration) -> None:
     """The standard's M and B of one line by hand, from the readings themselves: M is the range of the means of both
     directions, B the largest difference of the two means of a target. Numbers in the table have 1 nm."""
     measured = read_measurements([done.measured], load_geometry(config_file("paper")))

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import long_test
 from hypothesis import given
 from replay_helpers import CONFIG
 from strategies import fixed, paper_geometry, random_model, random_pose, seeds, skewed_geometry
@@ -29,7 +30,11 @@ MATHEMATICS = ["sqrt", "floor", "fmin", "fmax", "rint", "fmod", "frexp", "ldexp"
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no gcc here")
 
-MACHINES = [("paper", "paper_machine"), ("paper", "paper_lines_model"), ("positioning_unit", "ideal")]
+MACHINES = [
+    ("paper", "paper_machine"),
+    pytest.param("paper", "paper_lines_model", marks=long_test),
+    ("positioning_unit", "ideal"),
+]
 
 
 def compiled(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
