@@ -11,19 +11,12 @@ Exits 1 when a cause is named of readings that were taken rightly.
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import sys
 import tempfile
-from collections import Counter
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from benchmarks import drawn
 from benchmarks.calibration import LEAD
@@ -64,12 +57,12 @@ def reversed_sign(m: MeasurementSet, channel: str, family: str) -> MeasurementSe
     return m.with_values(np.where(where, -m.value, m.value))
 
 
-def first_named(kind: str, seed: int, made: str) -> str:
-    """Return the first cause that is named of a machine's readings, empty if none is."""
+def first_named(kind: str, seed: int) -> list[str]:
+    """Return the first cause that is named of a machine's readings, for each of what was done to them."""
     with tempfile.TemporaryDirectory() as folder:
         readings = setting(kind, seed, Path(folder), ("5-D", 4))[-1]
-    change: Callable[[MeasurementSet], MeasurementSet] = MADE[made]
-    return next(iter(mixed_up(change(readings), FitSettings(blocks=KNOWN, lead=LEAD))), "")
+    settings = FitSettings(blocks=KNOWN, lead=LEAD)
+    return [next(iter(mixed_up(change(readings), settings)), "") for change in MADE.values()]
 
 
 def main() -> int:
@@ -77,20 +70,13 @@ def main() -> int:
     parser = drawn.options(__doc__, 4, 600, "kind")
     parser.add_argument("--kind", action="append", choices=(*OWN, *FOREIGN), help="only this; may be repeated")
     args = parser.parse_args()
-    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-    seeds = range(args.first, args.first + args.machines)
-    cases = list(product(args.kind or (*OWN, *FOREIGN), seeds, MADE))
-    named, otherwise = Counter[str](), Counter[str]()
-    with ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        causes = pool.map(first_named, *zip(*cases, strict=True))
-        for (_, _, made), cause in tqdm(zip(cases, causes, strict=True), total=len(cases), disable=None):
-            named[made] += bool(made) and cause.startswith(made)
-            otherwise[made] += bool(cause) and not (made and cause.startswith(made))
-    print("| made | machines | named | another named |")
-    print("|---|---:|---:|---:|")
-    for made in MADE:
-        print(f"| {made or 'nothing'} | {len(cases) // len(MADE)} | {named[made]} | {otherwise[made]} |")
-    return 1 if otherwise[""] else 0
+    causes = [found for _, done in drawn.results(first_named, args.kind or (*OWN, *FOREIGN), args) for found in done]
+    table = drawn.Table(["made", "machines", "named", "another named"])
+    for made, named in zip(MADE, zip(*causes, strict=True), strict=True):
+        right = sum(bool(made) and cause.startswith(made) for cause in named)
+        other = sum(map(bool, named)) - right
+        table.row(made or "nothing", len(named), right, other, met=bool(made) or not other)
+    return 0 if table.met else 1
 
 
 if __name__ == "__main__":

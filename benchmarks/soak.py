@@ -4,7 +4,7 @@ Compensator and simulated drive run as processes of their own, the drive's readi
 and the tool goes round a circle. Their stderr goes into a pipe that nobody reads, as when a terminal was stopped
 with Ctrl-S. Latency is from just before a command is published to its strut commands' arrival here. For the longest
 ones the system says how long each process had been waiting for a processor in the second around
-it (/proc/PID/task/*/schedstat), and the nodes say what Python's garbage collector did.
+it (/proc/PID/task/*/schedstat).
 
 Usage: python -m benchmarks.soak [--minutes 30] [--rate-hz 1000]
 """
@@ -12,11 +12,9 @@ Usage: python -m benchmarks.soak [--minutes 30] [--rate-hz 1000]
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -86,7 +84,6 @@ class Soak:
     # How long the threads of each process, together, waited for a processor during the whole run, s
     waited: dict[str, float] = field(default_factory=dict)
     diagnostics: dict[str, dict[str, str]] = field(default_factory=dict)
-    notes: dict[str, list[dict]] = field(default_factory=dict)
 
     def quantile(self, share: float) -> float:
         """Return the latency, s, below which a share of the answers lies, to the width of a bin."""
@@ -220,15 +217,15 @@ def _resident(pid: int) -> int:
 
 
 @contextmanager
-def nodes(folder: Path) -> Iterator[dict[str, int]]:
+def nodes() -> Iterator[dict[str, int]]:
     """Run both nodes in a private domain, their log into a pipe that nobody reads; give their process ids."""
     unread, sink = os.pipe()
     children = {}
     with PrivateDomain():
         try:
             for name in NODES:
-                command = [sys.executable, "-m", "benchmarks.soak_node", str(folder / f"{name}.jsonl"), name]
-                command += ["--ros-args", "-p", "compensator:model_file:=paper_machine.yaml"]
+                command = [sys.executable, "-m", f"hexapod_comp.ros.{name}", "--ros-args"]
+                command += ["-p", "compensator:model_file:=paper_machine.yaml"]
                 children[name] = subprocess.Popen(command, stderr=sink, stdin=subprocess.DEVNULL)
             yield {name: child.pid for name, child in children.items()}
         finally:
@@ -242,19 +239,14 @@ def nodes(folder: Path) -> Iterator[dict[str, int]]:
 
 def soak(seconds: float, rate: float) -> Soak:
     """Run everything for some seconds."""
-    with tempfile.TemporaryDirectory() as name, nodes(Path(name)) as pids:
+    with nodes() as pids:
         commander = Commander(rate, pids)
         try:
             commander.wait_until_ready()
             commander.run(RUN_IN)
-            began = time.monotonic()
-            found = commander.run(seconds)
+            return commander.run(seconds)
         finally:
             commander.close()
-        for node in NODES:
-            lines = (Path(name) / f"{node}.jsonl").read_text(encoding="utf-8").splitlines()
-            found.notes[node] = [note for note in map(json.loads, lines) if note["at"] >= began]
-    return found
 
 
 def report(found: Soak) -> list[str]:
@@ -268,23 +260,15 @@ def report(found: Soak) -> list[str]:
     ]
     for index, node in enumerate(NODES):
         slope, error = found.growth(index)
-        collections = [note["seconds"] for note in found.notes[node] if note["kind"] == "gc"]
         lines.append(
             f"{node}: {found.memory[-1][1 + index] * 1e-6:.1f} MB, "
             f"{slope:+.2f} ± {2 * error:.2f} MB/h after warming up; "
-            f"{len(collections)} garbage collections, longest {max(collections, default=0.0) * 1e6:.0f} µs; "
             f"waited {found.waited[node]:.2f} s for a processor"
         )
     lines.append("longest latencies, ms, and how long each process waited for a processor in the second around them:")
     for gap in found.worst:
         waiting = ", ".join(f"{name} {seconds * 1e3:.0f}" for name, seconds in gap.waiting.items())
-        busy = [
-            f"{node}'s collector {note['seconds'] * 1e3:.2f}"
-            for node in NODES
-            for note in found.notes[node]
-            if note["kind"] == "gc" and gap.at - 1e-3 <= note["at"] <= gap.at + gap.latency
-        ]
-        lines.append(f"  {gap.latency * 1e3:7.2f} at {gap.elapsed:.1f} s: {', '.join([waiting, *busy])}")
+        lines.append(f"  {gap.latency * 1e3:7.2f} at {gap.elapsed:.1f} s: {waiting}")
     return lines
 
 
