@@ -52,96 +52,64 @@ class Result:
 # --- ours --------------------------------------------------------------------------------------------------
 
 
-def _pointers(row: int, *arrays: np.ndarray) -> list[Any]:
-    """Return what the core takes of one row of each array: checked before the clock runs."""
-    parts = [array[row : row + 1] for array in arrays]
-    return [batch.written("row", part, *part.shape, kind=part.dtype) for part in parts]
+def _rows(shape: str, *arrays: np.ndarray) -> list[list[Any]]:
+    """Return what the core takes of each pose alone, or of all at once: their number, and checked places."""
+    count = len(arrays[0])
+    parts = [slice(n, n + 1) for n in range(count)] if shape == "single" else [slice(count)]
+    return [[len(arrays[0][part]), *(_place(array[part]) for array in arrays)] for part in parts]
 
 
-def our_inverse(poses: Poses) -> list[Contender]:
-    """Kernel and checked call, one by one."""
-    joints = poses.structure.base_joints, poses.structure.platform_joints
+def _place(array: np.ndarray) -> Any:
+    return batch.written("row", array, *array.shape, kind=array.dtype)
+
+
+def our_inverse(poses: Poses, shape: str) -> list[Contender]:
+    """Kernel and checked call, on one thread; on all of them: :mod:`.batches`."""
+    structure, count = poses.structure, len(poses.positions)
+    joints = [batch.given("joints", part, 6, 3) for part in (structure.base_joints, structure.platform_joints)]
     as_poses = [Pose(p, r) for p, r in zip(poses.positions, poses.rotations, strict=True)]
-    count, lengths = len(as_poses), np.empty((len(as_poses), 6))
-    given = [batch.given("joints", part, 6, 3) for part in joints]
-    rows = [(*_pointers(n, poses.positions, poses.rotations), *_pointers(n, lengths)) for n in range(count)]
+    lengths = np.empty((count, 6))
+    rows = _rows(shape, poses.positions, poses.rotations, lengths)
 
     def kernel() -> None:
         for row in rows:
-            lib.hc_strut_lengths_many(*given, 1, *row)
+            lib.hc_strut_lengths_many(*joints, *row)
 
     def checked() -> np.ndarray:
-        return np.array([strut_lengths(poses.structure, pose) for pose in as_poses])
+        if shape == "single":
+            return np.array([strut_lengths(structure, pose) for pose in as_poses])
+        return strut_lengths_batch(structure, poses.positions, poses.rotations, threads=1)
 
     return [
-        Contender("inverse", OURS, "single", count, kernel, lambda: lengths),
-        Contender("inverse", f"{OURS}, checked", "single", count, checked),
+        Contender("inverse", OURS, shape, count, kernel, lambda: lengths),
+        Contender("inverse", f"{OURS}, checked", shape, count, checked),
     ]
 
 
-def our_inverse_batch(poses: Poses) -> list[Contender]:
-    """Kernel and checked call on one thread; on all of them: :mod:`.batches`."""
-    count = len(poses.positions)
-    joints = poses.structure.base_joints, poses.structure.platform_joints
-    lengths = np.empty((count, 6))
-
-    def kernel() -> None:
-        batch.strut_lengths(*joints, poses.positions, poses.rotations, lengths)
-
-    def checked() -> np.ndarray:
-        return strut_lengths_batch(poses.structure, poses.positions, poses.rotations, threads=1)
-
-    return [
-        Contender("inverse", OURS, "batch", count, kernel, lambda: lengths),
-        Contender("inverse", f"{OURS}, checked", "batch", count, checked),
-    ]
-
-
-def our_forward(task: str, poses: Poses) -> list[Contender]:
-    """Kernel and checked call, every pose from home."""
+def our_forward(task: str, poses: Poses, shape: str) -> list[Contender]:
+    """Kernel and checked call, on one thread, every pose from home."""
     structure, home, count = poses.structure, poses.home, len(poses.positions)
-    joints = structure.base_joints, structure.platform_joints
+    joints = [batch.given("joints", part, 6, 3) for part in (structure.base_joints, structure.platform_joints)]
     limits = structure.characteristic_length, structure.home_sign, structure.max_condition
     positions, rotations = np.empty((count, 3)), np.empty((count, 3, 3))
-    outcomes, iterations, conditions = np.empty(count, np.intc), np.empty(count, np.intc), np.empty(count)
-    given = [batch.given("joints", part, 6, 3) for part in joints]
-    rows = [_pointers(n, poses.lengths, positions, rotations) for n in range(count)]
-    results = [_pointers(n, outcomes, iterations, conditions) for n in range(count)]
+    rows = _rows(shape, poses.lengths, positions, rotations)
+    results = _rows(shape, np.empty(count, np.intc), np.empty(count, np.intc), np.empty(count))
 
     def kernel() -> None:
         positions[:], rotations[:] = home.position, home.rotation
-        for row, result in zip(rows, results, strict=True):
-            lib.hc_solve_pose_many(*given, 1, *row, *limits, *result)
+        for row, (_, *result) in zip(rows, results, strict=True):
+            lib.hc_solve_pose_many(*joints, *row, *limits, *result)
 
     def checked() -> np.ndarray:
-        found = [solve_pose(structure, lengths, home) for lengths in poses.lengths]
-        return joined(np.array([p.position for p in found]), np.array([p.rotation for p in found]))
+        if shape == "single":
+            found = [solve_pose(structure, lengths, home) for lengths in poses.lengths]
+            return joined(np.array([p.position for p in found]), np.array([p.rotation for p in found]))
+        many = solve_poses(structure, poses.lengths, home, threads=1)
+        return joined(many.positions, many.rotations)
 
     return [
-        Contender(task, OURS, "single", count, kernel, lambda: joined(positions, rotations)),
-        Contender(task, f"{OURS}, checked", "single", count, checked),
-    ]
-
-
-def our_forward_batch(task: str, poses: Poses) -> list[Contender]:
-    """Kernel and checked call on one thread; every pose from home."""
-    structure, home, count = poses.structure, poses.home, len(poses.positions)
-    limits = structure.characteristic_length, structure.home_sign, structure.max_condition
-    positions, rotations = np.empty((count, 3)), np.empty((count, 3, 3))
-    outcomes, iterations, conditions = np.empty(count, np.intc), np.empty(count, np.intc), np.empty(count)
-
-    def kernel() -> None:
-        positions[:], rotations[:] = home.position, home.rotation
-        problem = structure.base_joints, structure.platform_joints, poses.lengths, positions, rotations
-        batch.solve_poses(*problem, *limits, outcomes, iterations, conditions)
-
-    def checked() -> np.ndarray:
-        found = solve_poses(structure, poses.lengths, home, threads=1)
-        return joined(found.positions, found.rotations)
-
-    return [
-        Contender(task, OURS, "batch", count, kernel, lambda: joined(positions, rotations)),
-        Contender(task, f"{OURS}, checked", "batch", count, checked),
+        Contender(task, OURS, shape, count, kernel, lambda: joined(positions, rotations)),
+        Contender(task, f"{OURS}, checked", shape, count, checked),
     ]
 
 
@@ -153,17 +121,17 @@ def contenders(singles: int, batch: int) -> tuple[list[Contender], list[str]]:
     wide, near = make_poses(max(singles, batch)), near_poses(max(singles, batch))
     single, near_single, wide, near = wide.first(singles), near.first(singles), wide.first(batch), near.first(batch)
     found = [
-        *our_inverse(single),
+        *our_inverse(single, "single"),
         peers.numpy_inverse(single, "single"),
-        *our_inverse_batch(wide),
+        *our_inverse(wide, "batch"),
         peers.numpy_inverse(wide, "batch"),
-        *our_forward(WIDE, single),
+        *our_forward(WIDE, single, "single"),
         peers.numpy_forward(single, "single"),
         peers.scipy_forward(single),
-        *our_forward_batch(WIDE, wide),
+        *our_forward(WIDE, wide, "batch"),
         peers.numpy_forward(wide, "batch"),
-        *our_forward(NEAR, near_single)[:1],
-        *our_forward_batch(NEAR, near)[:1],
+        *our_forward(NEAR, near_single, "single")[:1],
+        *our_forward(NEAR, near, "batch")[:1],
     ]
     missing = []
     for package, make in peers.OPTIONAL.items():
