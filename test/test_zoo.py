@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import io
 import json
-import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import helpers
 import numpy as np
 import pytest
 import yaml
@@ -38,6 +37,7 @@ from foreign_machines import (
 from helpers import quick_pictures
 from scipy.spatial.transform import Rotation
 
+from hexapod_comp import cli
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import ErrorPredictor, FittedParameters
@@ -90,10 +90,10 @@ class Animal:
 
 def hexapod(*words: object, code: int = 0) -> str:
     """Run the command in this process, and return what it prints."""
-    found, out, err = helpers.hexapod(*words)
-    print(err, file=sys.stderr, end="")
-    assert found == code, f"{words}: {found}\n{out}{err}"
-    return out
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        found = cli.main([str(word) for word in words])
+    assert found == code, f"{words}: {found}\n{out.getvalue()}"
+    return out.getvalue()
 
 
 @pytest.fixture(scope="module", params=machine_names())
