@@ -7,16 +7,14 @@ the compensator node is its hardware, *before* it the node commands a forward_co
 from __future__ import annotations
 
 import re
-import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import InputFileError
 from ..formats.outputs import write_text
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
-from ..machine.kinematics import strut_lengths
 from ..machine.model import MachineModel
-from ..machine.robot_description import urdf
+from ..machine.robot_description import HEAD, MOCK, urdf
 from .c_code import write_c
 
 # The package's files; ``@NAME@`` stands for what differs from machine to machine
@@ -41,7 +39,7 @@ def write_ros2_control(
     folder = Path(folder)
     written = write_c(folder / "core", geometry, model, hashes)
     values = _values(geometry, model, rate, joint_names)
-    files = {folder / "urdf" / "machine.urdf": drives_urdf(geometry, joint_names)}
+    files = {folder / "urdf" / "machine.urdf": urdf(geometry, joint_names, hardware=MOCK).removeprefix(HEAD)}
     for template in sorted(TEMPLATES.iterdir()):
         place = folder / "config" if template.suffix == ".yaml" else folder
         files[place / template.name] = filled(template.read_text(encoding="utf-8"), values)
@@ -62,20 +60,6 @@ def package_name(machine: str) -> str:
 def filled(template: str, values: dict[str, str]) -> str:
     """Return a template with its values."""
     return re.sub(r"@([A-Z_]+)@", lambda name: values[name[1]], template)
-
-
-def drives_urdf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) -> str:
-    """Return the machine as URDF with drives that ros2_control simulates, at home: name your own in their place."""
-    robot = ET.fromstring(urdf(geometry, joint_names, ros2_control=False))
-    control = ET.SubElement(robot, "ros2_control", name=geometry.name, type="system")
-    ET.SubElement(ET.SubElement(control, "hardware"), "plugin").text = "mock_components/GenericSystem"
-    for name, length in zip(joint_names, strut_lengths(geometry, geometry.home), strict=True):
-        joint = ET.SubElement(control, "joint", name=name)
-        ET.SubElement(joint, "command_interface", name="position")
-        state = ET.SubElement(joint, "state_interface", name="position")
-        ET.SubElement(state, "param", name="initial_value").text = repr(float(length))
-    ET.indent(robot)
-    return ET.tostring(robot, encoding="unicode") + "\n"
 
 
 def _values(geometry: HexapodGeometry, model: MachineModel, rate: int, joint_names: Sequence[str]) -> dict[str, str]:

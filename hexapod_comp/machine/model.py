@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from ..core import Status, Struct, batch, lib
 from ..core.batch import backwards, rotate
 from ..errors import ModelError, NotConvergedError
-from ..pose import Pose
+from ..pose import Pose, attitude_error
 from .field import GridField, no_field
 from .geometry import HexapodGeometry
 from .kinematics import Structure, forward_error, over_chunks, strut_lengths
@@ -477,20 +477,17 @@ SETTLED = 1e-12  # Smaller motions of the tool count as none, m and rad
 
 def tool_move(geometry: HexapodGeometry, model: MachineModel, pose: Pose) -> np.ndarray:
     """Return the tool's motion at a pose with the struts commanded to nominal lengths."""
-    from scipy.spatial.transform import Rotation  # 14 MB that a running node does not need
-
     machine = RealMachine(geometry, model)
     actual, _ = machine.pose_for(strut_lengths(Structure.of(geometry), pose), guess=pose)
     displacement = (actual @ geometry.tool).position - (pose @ geometry.tool).position
-    turn = Rotation.from_matrix(actual.rotation @ pose.rotation.T).as_rotvec()
-    return np.concatenate([displacement, turn])
+    return np.concatenate([displacement, attitude_error(actual.rotation, pose.rotation)])
 
 
 def with_datum_held(
     geometry: HexapodGeometry, model: MachineModel, pose: Pose, part: np.ndarray | None = None
 ) -> MachineModel:
     """Return a model whose whole machine is shifted and turned so that it does not move the tool at a pose."""
-    from scipy.spatial.transform import Rotation
+    from scipy.spatial.transform import Rotation  # 14 MB that a running node does not need
 
     part = np.eye(6) if part is None else part
     tip = (pose @ geometry.tool).position

@@ -22,7 +22,7 @@ from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from ..errors import GeometryError, PoseError
-from ..pose import Pose
+from ..pose import Pose, attitude_error
 from .geometry import HexapodGeometry
 from .trajectory import SHARE_OF_LIMIT, Path
 
@@ -96,7 +96,7 @@ class Leg:
 
     def __init__(self, geometry: HexapodGeometry, start: Pose, end: Pose, pivot: np.ndarray) -> None:
         self.start, self.end, self.pivot = start, end, pivot
-        self.turn = Rotation.from_matrix(end.rotation @ start.rotation.T).as_rotvec()  # In ``work``
+        self.turn = attitude_error(end.rotation, start.rotation)  # In ``work``
         if np.linalg.norm(self.turn) > np.pi - HALF_TURN:
             raise PoseError("a turn by 180° has two shortest ways: give a way point between", np.degrees(self.turn))
         self.origin = start.position + start.rotation @ pivot

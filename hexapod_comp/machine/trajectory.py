@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..pose import Pose, best_motion, rotation_angle
+from ..pose import Pose, attitude_error, best_motion, rotation_angle
 from .geometry import HexapodGeometry
 from .kinematics import Structure, strut_lengths_batch
 
@@ -144,6 +144,6 @@ def _interpolate(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the poses at the given shares, (K,), of the given legs, (K,): straight, shortest arc."""
     travel = np.diff(positions, axis=0)
-    turn = Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1)).as_rotvec()
+    turn = attitude_error(rotations[1:], rotations[:-1])
     turned = Rotation.from_rotvec(share[:, None] * turn[leg]).as_matrix() @ rotations[leg]
     return positions[leg] + share[:, None] * travel[leg], turned
