@@ -272,14 +272,6 @@ def test_a_core_that_was_not_built_is_named_in_one_line_that_tells_how(program: 
     assert "pip install --editable ." in line
 
 
-def test_who_only_imports_a_node_without_a_core_goes_on():
-    script = (
-        f"{NO_CORE}try:\n    import hexapod_comp.ros.compensator\nexcept ImportError as error:\n    print(error.name)"
-    )
-    run = _run_script(script)
-    assert (run.returncode, run.stdout) == (0, "hexapod_comp.core._core\n"), run.stderr
-
-
 def test_setup_py_agrees_with_the_imports_and_package_xml(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(ROOT)
     metadata = _setup_arguments()
