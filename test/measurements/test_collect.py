@@ -201,7 +201,7 @@ MIRRORED = np.diag([-1.0, -1.0, 1.0])
         (lambda p: Pose(p.position * 1.1 - 0.1 * HOME, p.rotation), "1.1 times as long as commanded"),
         (lambda p: Pose(MIRRORED @ p.position, p.rotation), "ways read reversed"),
         (lambda p: Pose(p.position[[1, 0, 2]], p.rotation), "ways read turned by about 90.0°"),
-        (lambda p: Pose(p.position + np.array([0.0, 0.03, 0.0]), p.rotation), "reads 0.0, 30.0, 0.0 mm beside"),
+        (lambda p: Pose(p.position + np.array([0.0, 0.03, 0.0]), p.rotation), "is measured 0.0, 30.0, 0.0 mm away"),
         (lambda p: Pose(p.position, p.rotation @ Rotation.from_rotvec([0, 0, 0.1]).as_matrix()), "turned by 5.7°"),
     ],
 )
