@@ -50,7 +50,7 @@ TESTS = {
     "measurements": ["measurements", "cli", "calibration"],
     "formats": ["formats", "measurements", "machine", "cli", "fuzz/test_fuzz_files.py"],
     "virtual": ["calibration/test_instruments.py", "cli/test_simulate.py", "measurements", "loop"],
-    "replay": ["replay", "ros/test_replay_node.py"],
+    "replay": ["replay", "ros/test_recorder.py"],
     "cli": ["cli", "test_doc_commands.py", "test_zoo.py"],
     "ros": ["ros", "loop/test_processes.py"],
     "viewer": ["ros"],

@@ -1,11 +1,15 @@
-"""The mover: straight, within the struts' limits, and honest about how a move ended.
+"""The mover and its clients: straight, within the struts' limits, and honest about how a move ended.
 
-Truth: what the compensator is sent, differentiated here; targets by closed form; the drive's true tool.
-"""
+Truth: what the compensator is sent, differentiated here; targets by closed form; the drive's true tool; what measure()
+makes of the errors that the drive hides; for a client in lock-step a stand-in that refuses as the compensator does."""
 
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -13,21 +17,35 @@ import pytest
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseStamped, Quaternion, Transform, Vector3
-from node_helpers import HOME, Bench, Rig, Voice, closed_form_lengths, near
+from helpers import long_test
+from node_helpers import HOME, Bench, Rig, Voice, closed_form_lengths, model_file, near
+from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
+from hexapod_comp.errors import CommandError, NoAnswerError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import strut_lengths
-from hexapod_comp.pose import Pose
-from hexapod_comp.ros.client import Machine, MoveError
+from hexapod_comp.machine.model import RealMachine
+from hexapod_comp.measurements.campaign import Campaign, line_run, template
+from hexapod_comp.measurements.collect import Collected, collect
+from hexapod_comp.measurements.readings import KINDS
+from hexapod_comp.pose import Pose, best_motion
+from hexapod_comp.ros.adapter import AdapterNode
+from hexapod_comp.ros.adapting import AdaptedMachine
+from hexapod_comp.ros.client import LoopClient, Machine, MoveError, Sent
+from hexapod_comp.ros.collector import WatchedMachine
+from hexapod_comp.ros.instrument import InstrumentNode
 from hexapod_comp.ros.messages import message_pose, nanoseconds_of, pose_message
 from hexapod_comp.ros.mover import MoverNode
+from hexapod_comp.ros.status import ADVICE, OTHERWISE
+from hexapod_comp.virtual.instruments import measure
+from hexapod_comp.virtual.named import find_model
 
 RATE = 250.0
 """Tool poses sent per second, the mover's default."""
 
-KINDS = {"move_to": PoseStamped, "move_by": PoseStamped, "pivot": PointStamped, "program": MultiDOFJointTrajectory}
+TOPICS = {"move_to": PoseStamped, "move_by": PoseStamped, "pivot": PointStamped, "program": MultiDOFJointTrajectory}
 
 
 class Moved:
@@ -40,7 +58,7 @@ class Moved:
         self.node: MoverNode = rig.add(MoverNode, True, dict(parameters))
         rig.drive(geometry_file=geometry, truth_file="random:3")
         rig.compensator(geometry_file=geometry, model_file="ideal")
-        self.voices = {topic: Voice(rig, topic, kind, "/client") for topic, kind in KINDS.items()}
+        self.voices = {topic: Voice(rig, topic, kind, "/client") for topic, kind in TOPICS.items()}
         rig.step(0.2)
 
     def ask(self, topic: str, message: Any, frame_id: str = "base") -> int:
@@ -297,3 +315,302 @@ def test_a_client_moves_a_machine_and_learns_how_it_ended(bench: Bench) -> None:
     assert ended[1].reason == "limit"
     told = np.array(bench.seen["strut_commands"][-1].position)
     assert np.abs(told - closed_form_lengths(near(HOME, (0.0, 0.0, 0.01)))).max() < 1e-9, "the model is ideal"
+
+
+# ---- a client in lock-step ----
+
+
+class StandIn(LoopClient):
+    """A client whose poses are answered, or refused for a reason, as a list says."""
+
+    def __init__(self, outcomes: list[str]) -> None:
+        self._outcomes, self.sent, self.diagnostics = list(outcomes), {}, {"refused": "0", "last_refusal": ""}
+        self.poses: list[float] = []
+
+    def _send(self, message) -> Sent:
+        self.poses.append(message.pose.position.z)
+        self._entry = Sent(0.0, *self._refused(), message)
+        self._entry.sent_at = 1e12  # never overdue
+        return self._entry
+
+    def _spin_once(self, timeout: float) -> None:
+        outcome = self._outcomes.pop(0)
+        if outcome == "answered":
+            self._entry.command[:] = self._entry.correction[:] = 0.0
+            return
+        count, key = int(self.diagnostics["refused"]) + 1, f"refused.{outcome}"
+        self.diagnostics |= {"refused": str(count), key: str(int(self.diagnostics.get(key, "0")) + 1)}
+        self.diagnostics |= {"last_refusal": f"it is {outcome}", "what_to_do": ADVICE.get(outcome, OTHERWISE)}
+
+
+def at(height: float):
+    message = pose_message(HOME, "base")
+    message.pose.position.z = height
+    return message
+
+
+def test_a_pose_that_came_too_late_is_sent_again_before_the_next():
+    client = StandIn(["answered", "stamp_past", "stamp_past", "answered", "answered"])
+    for height in (0.400, 0.401, 0.402):
+        entry = client.wait_for_answer(client._send(at(height)))
+        assert np.isfinite(entry.command).all()
+    assert client.poses == [0.400, 0.401, 0.401, 0.401, 0.402]
+
+
+def test_another_refusal_ends_it_and_says_what_to_do():
+    client = StandIn(["stamp_past", "step"])
+    with pytest.raises(NoAnswerError, match=r"a command was refused: it is step; go on from the last answered command"):
+        client.wait_for_answer(client._send(at(0.400)))
+    assert client.poses == [0.400, 0.400]
+
+
+# ---- instruments and collect ----
+
+
+EXACT = {"length_noise": 0.0, "angle_noise": 0.0, "beam_slope": 0.0, "centre_off": 0.0}
+
+
+class Seen:
+    """A rig with an instrument, and the true tool that it watches."""
+
+    def __init__(self, rig: Rig, kind: str, **parameters: object) -> None:
+        rig.add(InstrumentNode, True, {"kind": kind, **EXACT, **parameters})
+        self.rig, self.heard = rig, list[Any]()
+        topic = "/instrument/pose" if kind == "tracker" else "/instrument/readings"
+        rig.listeners.append((topic, self.heard.append))
+        self.tool = Voice(rig, "tool_pose_true", PoseStamped, "/strut_drive")
+        self.line = Voice(rig, "instrument_set_up", PoseStamped, "/collect")
+
+    def read(self, *offset: float) -> Any:
+        """Return the newest message, with the tool beside home, m."""
+        self.heard.clear()
+        for _ in range(5):
+            self.tool.publish(pose_message(near(HOME, offset or (0.0, 0.0, 0.0)), "base"))
+            self.rig.step(0.02)
+        return self.heard[-1]
+
+    def channels(self, *offset: float) -> dict[str, float]:
+        message: JointState = self.read(*offset)
+        return dict(zip(message.name, message.position, strict=True))
+
+
+def test_a_laser_counts_from_where_it_was_set_up_and_anew_after_a_broken_beam(rig: Rig) -> None:
+    seen = Seen(rig, "laser")
+    seen.line.publish(pose_message(HOME, "base"))
+    assert set(seen.channels().values()) == {0.0}
+    moved = seen.channels(1e-3, 2e-4, 0.0)
+    assert moved["linear"] == pytest.approx(1e-3, abs=1e-12)
+    assert moved["straightness_y"] == pytest.approx(2e-4, abs=1e-12)
+    assert set(moved) == {"linear", "straightness_y", "straightness_z", "rotation_y", "rotation_z"}
+    assert rig.set_parameter("instrument", "fault_break", 3600.0).successful
+    assert np.isnan(list(seen.channels(1e-3, 2e-4, 0.0).values())).all()
+    assert rig.set_parameter("instrument", "fault_break", 0.0).successful
+    assert set(seen.channels(1e-3, 2e-4, 0.0).values()) == {0.0}
+    assert rig.set_parameter("instrument", "fault_silent", True).successful
+    seen.heard.clear()
+    rig.step(0.2)
+    assert seen.heard == []
+    rig.until(lambda: "nobody publishes tool_pose_true" in rig.message("instrument"), "diagnostics", 5.0)
+
+
+def test_a_ball_bar_reads_distances_and_wild_ones(rig: Rig) -> None:
+    """A 3-4-5 triangle: 4 mm to the side of a centre that is 3 mm away is 2 mm further."""
+    seen = Seen(rig, "ball_bar", wild_size=0.5)
+    seen.line.publish(pose_message(near(HOME, (0.0, 0.0, -0.003)), "base"))
+    assert seen.channels() == {"length": 0.0}
+    assert seen.channels(0.004, 0.0, 0.0)["length"] == pytest.approx(0.002, abs=1e-12)
+    assert rig.set_parameter("instrument", "wild_share", 1.0).successful
+    assert abs(seen.channels(0.004, 0.0, 0.0)["length"]) > 0.49
+
+
+def test_a_tracker_reads_in_its_own_frame(rig: Rig) -> None:
+    """It stands 1 m along x of the base, turned by 90° about z (the paper's γ): its x is the base's y."""
+    seen = Seen(rig, "tracker", stands_at=[1.0, 0.0, 0.0], stands_turned=[0.0, 0.0, np.pi / 2.0], frame_id="tracker")
+    message = seen.read(0.0, 0.002, 0.0)
+    assert message.header.frame_id == "tracker"
+    x, y, z = HOME.position
+    assert message_pose(message).position == pytest.approx([y + 0.002, 1.0 - x, z], abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("reasons", "ends"), [(["refusal"] * 2, ""), (["refusal"] * 3, "refusal"), (["limit"], "limit")]
+)
+def test_a_move_that_a_busy_computer_had_refused_is_asked_for_again(
+    reasons: list[str], ends: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine, left = object.__new__(WatchedMachine), list(reasons)
+
+    def move(*_: object) -> str:
+        if left:
+            raise MoveError(left.pop(), "command is stamped 0.501 s old")
+        return "arrived"
+
+    monkeypatch.setattr(Machine, "move", move)
+    monkeypatch.setattr(WatchedMachine, "_spin", lambda *_: None)
+    if not ends:
+        assert machine.move(HOME) == "arrived"
+        return
+    with pytest.raises(MoveError) as caught:
+        machine.move(HOME)
+    assert (caught.value.reason, left) == (ends, [])
+
+
+def collected(bench: Bench, path: Path, campaign: Campaign, kind: str, frame: str = "known", **options: Any) -> Any:
+    """Run collect on a bench's machine; return what it returned or raised."""
+    ended: list[Any] = []
+    topics = (
+        {"topic": "instrument/pose"}
+        if kind == "tracker"
+        else {"topic": "tool_pose_true", "readings": "instrument/readings"}
+    )
+
+    def client() -> None:
+        try:
+            with WatchedMachine(samples=9, tracker_frame=frame, **topics) as machine:
+                geometry = load_geometry("paper")
+                ended.append(collect(campaign, geometry, machine, path, tracker_frame=frame, **options))
+        except Exception as error:
+            ended.append(error)
+
+    thread = Thread(target=client)
+    thread.start()
+    bench.until(lambda: not thread.is_alive(), "the campaign", timeout=120.0)
+    return ended[0]
+
+
+def machine(bench: Bench, kind: str, **parameters: object) -> Callable[[Campaign], np.ndarray]:
+    """Add a machine with hidden errors, a mover and an instrument; return what that should read of a campaign."""
+    bench.machine(truth="random:3")
+    bench.add(MoverNode, True, {})
+    bench.add(InstrumentNode, True, {"kind": kind, **EXACT, **parameters})
+    geometry = load_geometry("paper")
+    truth = RealMachine(geometry, find_model("random:3", geometry))
+    return lambda campaign: measure(template(campaign, geometry), campaign, truth, 0).value
+
+
+def small(**more: Any) -> Campaign:
+    box = load_geometry("paper").home.position + np.array([[-0.01, -0.01, -0.01], [0.01, 0.01, 0.01]])
+    kept = {"cell": 0.02, "step": 0.01, "instrument": None, "diagonals": 0, "noise": (0.0,) * len(KINDS), **more}
+    return Campaign(box, **kept)
+
+
+def broken_at(bench: Bench, stop: int) -> Callable[[int, int, str], None]:
+    """Return a progress that breaks the instrument's beam for 0.3 s on the way to a stop, once."""
+    node = next(node for node in bench.nodes if isinstance(node, InstrumentNode))
+    visited: list[int] = []
+
+    def progress(done: int, of: int, where: str) -> None:
+        visited.append(done)
+        if len(visited) == stop:
+            node._broken_until = time.monotonic() + 0.3
+
+    return progress
+
+
+@long_test
+def test_a_laser_that_reads_wildly_and_whose_beam_breaks_is_collected(bench: Bench, tmp_path: Path) -> None:
+    """A line there and back; the beam is broken on the way to the third stop: the run begins anew."""
+    known, box = machine(bench, "laser", wild_share=0.1), small(poses=1).box
+    campaign = small(runs=(line_run("diagonal", "linear", box, 4, np.eye(3)),))
+    done = collected(bench, tmp_path / "out.csv", campaign, "laser", progress=broken_at(bench, 3))
+    assert isinstance(done, Collected), done
+    off = np.abs(done.measurements.value - known(campaign))
+    assert done.missing == ()
+    assert off.max() < 6e-6, "half of a backlash of 4 µm, steps of the drives, and wild ones within a median"
+
+
+def test_a_tracker_that_stands_anywhere_is_collected_in_two_calls(bench: Bench, tmp_path: Path) -> None:
+    """Up to one rigid motion, which six poses leave open, the file is that of a tracker in base."""
+    known = machine(bench, "tracker", stands_at=[2.0, -1.0, 0.5], stands_turned=[0.3, 1.0, 2.5], frame_id="tracker")
+    campaign, path, left = small(poses=6, tilt=0.05), tmp_path / "out.csv", [True] * 6
+    collected(bench, path, campaign, "tracker", "free", going_on=lambda: left.pop() if left else False)
+    done = collected(bench, path, campaign, "tracker", "free")
+    assert isinstance(done, Collected), done
+    assert done.resumed > 3
+    assert len(done.measurements) == 36
+    points = done.measurements.points()
+    places = [points + value.reshape(-1, 2, 3)[:, 0] for value in (done.measurements.value, known(campaign))]
+    motion = best_motion(*places)
+    assert motion is not None
+    assert np.abs(places[0] @ motion.rotation.T + motion.position - places[1]).max() < 6e-6
+
+
+# ---- a machine that calibrates itself (its loop: test/upkeep) ----
+
+
+def asked(bench: Bench, what: Callable[[AdaptedMachine], object], going_on: Callable[[], bool] = lambda: True) -> Any:
+    """Return what a client makes of the machine, or the error that it ended with."""
+    ended: list[Any] = []
+
+    def client() -> None:
+        with AdaptedMachine("tool_pose_true", going_on=going_on) as machine:
+            try:
+                ended.append(what(machine))
+            except Exception as error:  # it is the thread's result
+                ended.append(error)
+
+    thread = Thread(target=client)
+    thread.start()
+    bench.until(lambda: not thread.is_alive(), "the client", timeout=60.0)
+    return ended[0]
+
+
+def test_a_model_is_named_to_the_compensator_and_runs_by_its_ramp_or_the_old_one_stays(
+    bench: Bench, tmp_path: Path
+) -> None:
+    bench.machine(truth="ideal", model=model_file(tmp_path, "old.yaml", struts={"offset_um": 10.0}))
+    bench.add(MoverNode, True, {})
+    for name, offset in (("new.yaml", 50.0), ("far.yaml", 5000.0)):
+        model_file(tmp_path, name, struts={"offset_um": offset})
+    assert asked(bench, lambda machine: machine.reload(tmp_path / "new.yaml")) is None
+
+    def named() -> str:
+        node = next(node for node in bench.nodes if node.get_name() == "compensator")
+        return str(node.get_parameter("model_file").value)
+
+    assert named() == str(tmp_path / "new.yaml")
+    asked(bench, lambda machine: machine.move(near(HOME, (0.0, 0.0, 0.001)), "base"))
+    bench.until(lambda: abs(bench.seen["strut_corrections"][-1].position[0] + 50e-6) < 1e-9, "the ramp's end")
+    error = asked(bench, lambda machine: machine.reload(tmp_path / "far.yaml"))
+    assert isinstance(error, CommandError)
+    assert "did not take" in str(error)
+    assert "the old model stays" in str(error)
+    assert named() == str(tmp_path / "new.yaml"), "a restart would else begin with what was refused"
+    assert np.allclose(bench.seen["strut_corrections"][-1].position, -50e-6, rtol=0.0, atol=1e-9)
+    below, elsewhere = tmp_path / "adapted" / "model.yaml", tmp_path.parent / "model.yaml"
+    assert asked(bench, lambda machine: machine.refuse_unreadable(below)) is None
+    error = asked(bench, lambda machine: machine.refuse_unreadable(elsewhere))
+    assert f"compensator reads models in {tmp_path} alone: start it with -p model_folder:=FOLDER" in str(error)
+
+
+def test_a_loop_that_shall_not_go_on_brakes_the_move(bench: Bench) -> None:
+    bench.machine(truth="ideal")
+    bench.add(MoverNode, True, {"limit_share": 0.05})
+    error = asked(bench, lambda machine: machine.move(near(HOME, (0.0, 0.0, 0.02)), "base"), lambda: False)
+    assert isinstance(error, MoveError)
+    assert error.reason == "person"
+
+
+def test_the_node_starts_reports_and_stops_a_calibration(bench: Bench, tmp_path: Path) -> None:
+    """No machine is there: the process waits for one. The journal is the test's."""
+    node = bench.add(AdapterNode, True, {"folder": str(tmp_path)})
+    assert bench.call(Trigger, "adapter/stop").message == "nothing was running"
+    (tmp_path / "journal.jsonl").write_text('{"event": "stopped"}\n', encoding="utf-8")
+    assert bench.call(Trigger, "adapter/calibrate").success
+    refused = bench.call(Trigger, "adapter/verify")
+    assert (refused.success, refused.message) == (False, "calibrating already: ~/stop ends it")
+    bench.until(lambda: node._check_state() is None, "a look at the journal")
+    assert (node._step, node._text) == ("", "starting"), "the step of the run before is none of this one"
+    journal = '{"event": "begun", "machine": "paper", "goal_m": 3e-06}\n{"event": "pla'
+    (tmp_path / "journal.jsonl").write_text(journal, encoding="utf-8")
+    bench.until(lambda: node._step == "begun", "the step")
+    assert bench.call(Trigger, "adapter/stop").message == "the machine brakes"
+    bench.until(lambda: node._state == "stopped", "its end", timeout=60.0)
+    assert bench.call(Trigger, "adapter/stop").message == "nothing was running"
+
+
+def test_a_process_that_ends_without_a_result_is_reported(bench: Bench, tmp_path: Path) -> None:
+    node = bench.add(AdapterNode, True, {"folder": str(tmp_path), "geometry_file": "not_there.yaml"})
+    assert bench.call(Trigger, "adapter/verify").success
+    bench.until(lambda: node._state == "failed", "its end", timeout=60.0)
+    assert node._text.startswith("the process ended with 2")

@@ -1,0 +1,193 @@
+"""Benchmarks that cannot run say so and fail; short runs of those that take hours."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import long_test
+
+from benchmarks import convergence, jugglebot, network, rubin
+from benchmarks.faults.cable import without_udp_checksum
+from benchmarks.faults.namespaces import refusal
+from benchmarks.genhexkins import Genhexkins, NotHere, emc_poses, si_poses
+from benchmarks.poses import make_poses, near_poses
+from benchmarks.soak import BINS, Soak, soak
+
+
+def test_without_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "grid180.csv").write_text("")
+    assert jugglebot.main(["--data", str(tmp_path)]) == 2
+    said = capsys.readouterr()
+    missing = "108_calibration_poses.csv, grid180_ff_correction.csv"
+    assert said.err == f"cannot run: {tmp_path} has no {missing}; name the folder of the data by --data\n"
+    assert said.out == ""
+
+
+def test_rubins_tables_are_fetched_by_who_runs_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Without them exit 2; with files of their form, here a cosine in five rows, the nodes are judged."""
+    assert rubin.main([str(tmp_path)]) == 2
+    assert f"cannot run: there is no {tmp_path}/fitter/zd_m2.txt" in capsys.readouterr().err
+    angles = np.arange(90.0, -1.0, -22.5)
+    rows = np.outer(np.cos(np.radians(angles)), [1.0, 400.0, -300.0, 0.01, 1e-6, 1e-5])
+    (tmp_path / "fitter").mkdir()
+    for file in rubin.TABLES.values():
+        np.savetxt(tmp_path / file, np.column_stack([angles, rows]), header="Camera")
+    assert rubin.main([str(tmp_path)]) == 0
+    assert capsys.readouterr().out.count("PASSED") == 2
+
+
+def test_the_data_are_in_the_repository():
+    assert all((jugglebot.DATA / name).is_file() for name in (*jugglebot.FILES, "LICENSE.MIT"))
+
+
+def test_without_linuxcnc(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    def honesty() -> None:
+        raise NotHere("genhexkins: no /usr/lib/linuxcnc")
+
+    monkeypatch.setattr(convergence, "honesty", honesty)
+    monkeypatch.setattr(convergence, "convergence", lambda yaws: [])
+    assert convergence.main() == 2
+    assert capsys.readouterr().err == "cannot run: genhexkins: no /usr/lib/linuxcnc\n"
+
+
+def test_without_network_namespaces(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.setattr("sys.argv", ["network"])
+    monkeypatch.delenv(network.INSIDE, raising=False)
+    monkeypatch.setattr(network, "refusal", lambda: "Operation not permitted")
+    assert network.main() == 2
+    assert "no network namespaces here: Operation not permitted" in capsys.readouterr().err
+
+
+# ---- two hosts and a cable ----
+
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def frame(kind: int, protocol: int, options: int, fragment: int, payload: bytes) -> bytes:
+    """Return an Ethernet frame with an IPv4 packet, made from RFC 791: version and length, …, protocol at byte 9."""
+    length = 20 + options + len(payload)
+    version_and_length = 0x40 | (5 + options // 4)
+    addresses = socket.inet_aton("10.99.0.1") + socket.inet_aton("10.99.0.2")
+    head = struct.pack("!BBHHHBBH", version_and_length, 0, length, 7, fragment, 64, protocol, 0) + addresses
+    return b"\1" * 12 + struct.pack("!H", kind) + head + b"\0" * options + payload
+
+
+DATAGRAM = struct.pack("!HHHH", 7400, 7410, 8 + 5, 0xBEEF) + b"hello"
+"""RFC 768: ports, length, checksum, data."""
+
+
+@pytest.mark.parametrize("options", [0, 8])
+def test_the_cable_takes_udp_checksums_off_and_nothing_else(options):
+    found = without_udp_checksum(frame(0x0800, 17, options, 0, DATAGRAM))
+    assert found == frame(0x0800, 17, options, 0, DATAGRAM.replace(b"\xbe\xef", b"\0\0"))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        frame(0x0800, 6, 0, 0, DATAGRAM * 3),  # TCP
+        frame(0x0800, 17, 0, 185, DATAGRAM),  # a later fragment: no UDP header in it
+        frame(0x86DD, 17, 0, 0, DATAGRAM),  # IPv6
+        b"\xff" * 12 + b"\x08\x06" + b"\0" * 28,  # ARP
+    ],
+)
+def test_the_cable_leaves_other_frames_alone(other):
+    assert without_udp_checksum(other) == other
+
+
+@long_test
+def test_two_hosts_and_a_cable_that_is_cut():
+    """The machine goes on, the loss is said, nothing is breached; the bars on time are the benchmark's."""
+    why_not = refusal()
+    if why_not:
+        pytest.skip(f"no network namespaces here: {why_not}")
+    command = [sys.executable, "-m", "benchmarks.network", "--rounds", "1", "--only", "cut,delay", "--seconds", "1"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode in (0, 1), done.stderr
+    assert "Traceback" not in done.stderr, done.stderr
+    rows = {line.split()[0]: line.split() for line in done.stdout.splitlines()[-2:]}
+    assert rows.keys() == {"cut", "delay"}, done.stdout + done.stderr
+    assert float(rows["cut"][2]) < 2000.0, "the loss of feedback is said"
+    for row in rows.values():
+        assert row[-1] == "0", "no breach"
+
+
+# ---- soak: no latency is judged here, other jobs decide it on a shared machine ----
+
+
+SECONDS = 5.0
+
+
+@long_test
+def test_five_seconds_at_1_khz():
+    found = soak(SECONDS, 1000.0)
+    counted = sum(int(found.diagnostics["compensator"][name]) for name in ("commands_missed", "refused"))
+    assert found.commands > 100.0 * SECONDS, "a machine too busy for 100 Hz shows nothing"
+    assert found.lost <= counted
+    assert found.heartbeats > 10.0 * SECONDS  # of 50 a second
+    assert found.histogram.sum() == found.commands - found.lost
+    memory = np.array(found.memory)[:, 1:]
+    assert (memory[-1] - memory[len(memory) // 2]).max() < 1e6, "an hour of that would be more than 1.4 GB"
+
+
+def test_quantiles_and_growth_of_a_known_run():
+    """999 answers after 1 ms and one after 20 ms; 3 MB an hour in one node, nothing in the other."""
+    found = Soak(longest=0.02)
+    found.histogram[np.searchsorted(BINS, [1e-3, 20e-3])] = [999, 1]
+    assert found.quantile(0.5) == pytest.approx(1e-3, rel=0.0024)
+    assert found.quantile(0.99) == pytest.approx(1e-3, rel=0.0024)
+    assert found.quantile(1.0) == 0.02
+    found.memory = [(float(second), 2e8 + 3e6 * second / 3600.0, 2e8) for second in range(600)]
+    assert found.growth(0)[0] == pytest.approx(3.0, rel=1e-9)
+    assert found.growth(1)[0] == pytest.approx(0.0, abs=1e-9)
+
+
+# ---- LinuxCNC's own compiled kinematics ----
+
+
+@pytest.fixture
+def genhexkins():
+    try:
+        return Genhexkins(make_poses(1).structure)
+    except NotHere as reason:
+        pytest.skip(str(reason))
+
+
+def test_lengths_are_linuxcncs(genhexkins):
+    """Both add some ten products of lengths up to 1 m: 1e-15 m each."""
+    poses = make_poses(200)
+    lengths, codes = np.empty((200, 6)), np.empty(200, np.int32)
+    genhexkins.inverse(emc_poses(poses.positions, poses.rotations), lengths, codes)
+    assert not codes.any()
+    np.testing.assert_allclose(lengths * 1e-3, poses.lengths, rtol=0.0, atol=1e-14)
+
+
+def test_poses_are_linuxcncs(genhexkins):
+    """It ends when the struts are right to 1e-12 m, and leaves about as much."""
+    poses = near_poses(200)
+    home = emc_poses(poses.home.position[None], poses.home.rotation[None])
+    codes, found = genhexkins.solved(poses.lengths, np.repeat(home, 200, axis=0))
+    assert not codes.any()
+    positions, rotations = si_poses(found)
+    np.testing.assert_allclose(positions, poses.positions, rtol=0.0, atol=1e-11)
+    np.testing.assert_allclose(rotations, poses.rotations, rtol=0.0, atol=1e-10)
+
+
+def test_ours_converges_at_yaws_where_theirs_cannot(genhexkins):
+    """From 60° on the step error of genhexkins is 2·sin(ψ/2) ≥ 1 times the last one."""
+    for row in convergence.convergence(np.array([0.0, 60.0, 70.0, 80.0]), 50):
+        assert row.ours == row.poses
+        assert row.theirs == (row.poses if row.yaw_deg == 0.0 else 0)
+
+
+def test_nothing_that_is_not_so_is_called_solved(genhexkins):
+    worth = convergence.honesty(2000)
+    assert worth.solved[0] > 500
+    assert worth.not_finite[0] == worth.open_loops[0] == worth.other_mode[0] == 0

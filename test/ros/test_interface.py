@@ -1,0 +1,494 @@
+"""What the nodes offer: parameters, quality of service, and the security policy against what they really open.
+
+Truth: the tables of parameters and what rcl makes of the files; the request-and-offer rule of DDS; the ROS graph of
+nodes with everything switched on. The policy's form is that of sros2's policy.xsd, version 0.2.0."""
+
+from __future__ import annotations
+
+import contextlib
+import runpy
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+import yaml
+from hal_stand_in import StandInHal
+from launch_stand_in import LaunchFile
+from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
+from node_helpers import CONFIG, HOME, Bench, Rig, closed_form_lengths, model_file
+from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.srv import DescribeParameters
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy, qos_check_compatible
+from std_msgs.msg import UInt64
+from std_srvs.srv import SetBool, Trigger
+
+from hexapod_comp.formats.paths import config_file
+from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.ros.adapter import AdapterNode
+from hexapod_comp.ros.client import LoopClient
+from hexapod_comp.ros.compensator import CompensatorNode
+from hexapod_comp.ros.instrument import InstrumentNode
+from hexapod_comp.ros.mover import MoverNode
+from hexapod_comp.ros.parameters import Taken
+from hexapod_comp.ros.process import QUIET, RosSession
+from hexapod_comp.ros.recorder import BagRecorder
+from hexapod_comp.ros.strut_drive import StrutDriveNode
+from hexapod_comp.viewer.page import Watcher
+
+MAKER = runpy.run_path(str(CONFIG.parent / "tools" / "make_parameter_files.py"))
+TABLES = MAKER["TABLES"]
+KINDS = {
+    "compensator": CompensatorNode,
+    "strut_drive": StrutDriveNode,
+    "mover": MoverNode,
+    "instrument": InstrumentNode,
+    "adapter": AdapterNode,
+}
+
+COMPENSATOR = "compensator"
+
+
+def test_what_is_taken_at_configure_is_refused_until_a_cleanup(rig):
+    rig.compensator()
+    refused = rig.set_parameter(COMPENSATOR, "work_frame", "table")
+    assert not refused.successful
+    said = "parameter work_frame: is taken at configure, and the node is active; set it after a cleanup"
+    assert refused.reason == said
+    assert rig.set_parameter(COMPENSATOR, "work_frame", "work").successful, "it is so already"
+    assert rig.change("deactivate")
+    assert "the node is inactive" in rig.set_parameter(COMPENSATOR, "work_frame", "table").reason
+    assert rig.change("cleanup")
+    assert rig.set_parameter(COMPENSATOR, "work_frame", "table").successful
+    assert rig.change("configure")
+    assert rig.change("activate")
+    rig.until(rig.matched, "discovery")
+    rig.ask(HOME, "table")
+
+
+def test_frames_are_held_against_each_other_whichever_is_set(rig):
+    rig.compensator(start=False)
+    for name, value in (("base_frame", "work"), ("work_frame", "base")):
+        result = rig.set_parameter(COMPENSATOR, name, value)
+        assert not result.successful
+        assert "work_frame: must differ from base_frame" in result.reason
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("ramp_rate", 2.0, "Min: 1e-06, Max: 1.0, value: 2.0"),
+        ("ramp_rate", 2, "must lie in 1e-06 to 1 m/s, not 2"),
+        ("ramp_rate", "fast", "must be float, not 'fast'"),
+        ("ramp_rate", None, "must be float, not None"),
+        ("autostart", False, "read-only"),
+    ],
+)
+def test_a_value_that_is_not_allowed_is_refused_and_changes_nothing(rig, name, value, reason):
+    """None is how ``ros2 param delete`` asks."""
+    node = rig.compensator(start=False)
+    before = node.get_parameter(name).value
+    result = rig.set_parameter(COMPENSATOR, name, value)
+    assert not result.successful
+    assert reason in result.reason
+    assert node.get_parameter(name).value == before
+
+
+def test_rates_and_timeouts_change_at_once(rig):
+    rig.compensator(heartbeat_rate=0.0, command_timeout=0.0)
+    beats: list[UInt64] = []
+    rig.witness.create_subscription(UInt64, "compensator/heartbeat", beats.append, 10)
+    rig.until(rig.matched, "discovery")
+    rig.ask(HOME)
+    rig.barrier()
+    assert not beats
+    assert rig.set_parameter(COMPENSATOR, "heartbeat_rate", 200.0).successful
+    rig.until(lambda: len(beats) > 5, "heartbeats")
+    assert rig.set_parameter(COMPENSATOR, "command_timeout", 0.01).successful
+    rig.until(lambda: "no new command" in rig.message(), "the command to be stale")
+
+
+def test_a_ramp_goes_on_at_the_rate_that_is_set(rig):
+    """164 µm at 1 µm/s would take minutes; stamps 20 ms apart may ramp 0.2 µm each at 10 µm/s."""
+    rig.compensator(ramp_rate=1e-6, enable_compensation=False)
+    rig.feed(closed_form_lengths(HOME))
+    rig.settle(HOME)
+    rig.enable(True)
+    slow = rig.ask(HOME).corrections
+    assert rig.set_parameter(COMPENSATOR, "ramp_rate", 1.0).successful
+    rig.settle(HOME)
+    assert np.abs(slow).max() < 1e-6 < 100e-6 < np.abs(rig.ask(HOME).corrections).max()
+
+
+def test_another_model_is_taken_by_reload(rig, tmp_path):
+    """Within the folder that was fixed at the start: a parameter must not open the rest of the disk."""
+    node = rig.compensator(model_file=model_file(tmp_path))
+    other = tmp_path / "other.yaml"
+    other.write_text((tmp_path / "model.yaml").read_text().replace("written by a test", "the other"))
+    assert rig.set_parameter(COMPENSATOR, "model_file", str(other)).successful
+    assert node.compensator.model.name == "written by a test"
+    assert rig.trigger("reload_model").success
+    assert node.compensator.model.name == "the other"
+    secret = model_file(tmp_path.parent, "secret.yaml")
+    assert rig.set_parameter(COMPENSATOR, "model_file", secret).successful
+    answer = rig.trigger("reload_model")
+    assert not answer.success
+    assert "files are only read from" in answer.message
+    assert node.compensator.model.name == "the other"
+
+
+def test_descriptors_say_range_and_when(rig):
+    rig.compensator(start=False)
+    rig.drive(start=False)
+    rig.add(MoverNode, False, {})
+    rig.add(InstrumentNode, False, {})
+    rig.add(AdapterNode, False, {})
+    for name in KINDS:
+        table = TABLES[name]
+        request = DescribeParameters.Request(names=[p.name for p in table])
+        told = rig.call(DescribeParameters, f"{name}/describe_parameters", request).descriptors
+        for parameter, descriptor in zip(table, told, strict=True):
+            assert descriptor.description
+            assert descriptor.additional_constraints.endswith(f"taken {parameter.taken.value}")
+            assert descriptor.read_only == (parameter.taken is Taken.START)
+            ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
+            number = descriptor.type in (ParameterType.PARAMETER_DOUBLE, ParameterType.PARAMETER_INTEGER)
+            assert len(ranges) == number
+            assert all(r.from_value <= parameter.default <= r.to_value for r in ranges)
+
+
+def test_page_and_file_are_those_of_the_tables():
+    """``python tools/make_parameter_files.py`` makes them so."""
+    for path, made in ((MAKER["PAGE"], MAKER["page"](MAKER["PAGE"].read_text())), (MAKER["FILE"], MAKER["file"]())):
+        assert path.read_text(encoding="utf-8") == made, path
+
+
+def in_force(node: Any) -> dict[str, Any]:
+    """Return a node's parameters as ROS has them."""
+    return {p.name: node.get_parameter(p.name).value for p in TABLES[node.get_name()]}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_the_shipped_file_gives_the_defaults_in_any_namespace(rig, name):
+    rig.namespace = "/left/cell"
+    node = rig.add(KINDS[name], False, {}, cli_args=["--ros-args", "--params-file", str(MAKER["FILE"])])
+    assert in_force(node) == {p.name: p.default for p in TABLES[name]}
+    assert not rig.logged("there is no parameter")
+
+
+def other_value(parameter: Any) -> Any:
+    """Return an allowed value that is not the default."""
+    if isinstance(parameter.default, list) and isinstance(parameter.default[0], float):
+        return [0.1 * parameter.range[1]] * len(parameter.default)
+    if parameter.range:
+        low, high = (type(parameter.default)(end) for end in parameter.range)
+        return high if parameter.default != high else low
+    if parameter.choices:
+        return parameter.choices[-1]
+    if isinstance(parameter.default, list):
+        return parameter.default[::-1]
+    return not parameter.default if isinstance(parameter.default, bool) else f"{parameter.default}x"
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_file_of_other_values_is_loaded_also_through_the_launch_file(rig, monkeypatch, tmp_path, name):
+    """The launch file gives its own arguments after the file; launch_ros writes them into files, as here."""
+    others = {p.name: other_value(p) for p in TABLES[name] if p.name != "model_folder"}
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump({f"/**/{name}": {"ros__parameters": others}}))
+    node = rig.add(KINDS[name], False, {}, cli_args=["--ros-args", "--params-file", str(path)])
+    assert {key: value for key, value in in_force(node).items() if key in others} == others
+    arguments = f"params_file:={path}", "model:=table.yaml", "mover:=true", "instrument:=laser", "adapter:=true"
+    given = LaunchFile(monkeypatch).start(*arguments)[name]
+    arguments, given = ["--ros-args"], given["parameters"]
+    for number, part in enumerate(given):
+        if isinstance(part, dict):
+            (tmp_path / f"{number}.yaml").write_text(yaml.safe_dump({"/**": {"ros__parameters": part}}))
+            part = str(tmp_path / f"{number}.yaml")
+        arguments += ["--params-file", part]
+    values = in_force(rig.add(KINDS[name], False, {}, cli_args=arguments))
+    assert values == in_force(node) | {k: v for k, v in given[-1].items() if k in others}
+    assert values.get("command_timeout", 3600.0) == 3600.0
+    assert values.get("model_file", "table.yaml") == "table.yaml"
+
+
+# ---- quality of service ----
+
+
+BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+RELIABLE = ReliabilityPolicy.RELIABLE
+
+NODES = {
+    "compensator": (CompensatorNode, {"command_input": "struts", "publish_array": True}),
+    "strut_drive": (StrutDriveNode, {}),
+    "linuxcnc_bridge": (LinuxcncBridgeNode, {}),
+}
+COMMANDS = {"/strut_setpoints", "/strut_commands", "/strut_corrections", "/strut_commands_array"}
+LATCHED = {
+    "compensator": {
+        *(f"/compensator/{name}" for name in ("files", "journal", "stopped", "tool")),
+        "/robot_description",
+    },
+    "strut_drive": set(),
+    "linuxcnc_bridge": set(),
+}
+"""For late subscribers."""
+STATES = {"/strut_states", "/tool_pose_estimate", "/nominal_strut_states", "/tool_pose_true"}
+
+
+def made(rig: Rig, name: str, **overrides: object) -> Any:
+    """Return a node whose topics are open."""
+    kind, parameters = NODES[name]
+    hal = {"hal": StandInHal()} if kind is LinuxcncBridgeNode else {}
+    node = rig.add(kind, False, parameters | overrides, **hal)
+    node.trigger_configure()
+    return node
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_default_subscribers_hear_all_that_is_published(rig: Rig, name: str) -> None:
+    """Commands reliable, in a queue of a hundred; of states the newest only."""
+    node = made(rig, name)
+    for end in node.publishers:
+        for wanted in (QoSProfile(depth=10), BEST_EFFORT):
+            assert "ERROR" not in str(qos_check_compatible(end.qos_profile, wanted)[0]), end.topic_name
+        assert end.qos_profile.reliability == RELIABLE, end.topic_name
+    for end in (*node.publishers, *node.subscriptions):
+        if end.topic_name in COMMANDS | STATES:
+            queue = 100 if end.topic_name in COMMANDS else 1
+            assert (end.qos_profile.depth, end.qos_profile.history) == (queue, HistoryPolicy.KEEP_LAST), end.topic_name
+            reading = name == "compensator" and end.topic_name == "/strut_states"
+            assert end.qos_profile.reliability == (ReliabilityPolicy.BEST_EFFORT if reading else RELIABLE)
+    kept = {end.topic_name for end in node.publishers if end.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL}
+    assert kept == LATCHED[name]
+
+
+def test_readings_are_heard_from_best_effort_publishers_too(rig: Rig) -> None:
+    heard = {end.topic_name: end.qos_profile for end in made(rig, "compensator").subscriptions}
+    for topic in ("/strut_states", "/temperatures", "/humidity", "/gravity", "/wrench", "/outside"):
+        assert "ERROR" not in str(qos_check_compatible(BEST_EFFORT, heard[topic])[0]), topic
+
+
+def test_what_is_named_can_be_overridden_and_nothing_else(rig: Rig) -> None:
+    overrides = {
+        "qos_overrides./strut_states.subscription.reliability": "reliable",
+        "qos_overrides./strut_commands.publisher.depth": 7,
+    }
+    node = made(rig, "compensator", **overrides)
+    ends = {end.topic_name: end.qos_profile for end in (*node.publishers, *node.subscriptions)}
+    assert ends["/strut_states"].reliability == RELIABLE
+    assert ends["/strut_commands"].depth == 7
+    assert ends["/strut_corrections"].depth == 100
+
+
+# ---- the security policy ----
+
+
+POLICY = Path(__file__).resolve().parents[2] / "config" / "security" / "policy.xml"
+
+RIGHTS = ("publish", "subscribe", "reply", "request")
+
+TOOLS = "_ros2cli_*"
+"""Names of the nodes that the ``ros2`` tools make; permissions of DDS take patterns (POSIX fnmatch)."""
+
+MAY_COMMAND = {
+    "/tool_pose_command": {"commander", "linuxcnc_bridge", "mover"},
+    "/select_tool": {"commander"},
+    "/strut_commands": {"compensator"},
+}
+"""Who alone may move the machine."""
+
+
+@dataclass
+class Enclave:
+    """What one enclave may do, as absolute names by right."""
+
+    node: str
+    allowed: dict[str, set[str]] = field(default_factory=lambda: {right: set() for right in RIGHTS})
+
+
+def read_policy(namespace: str = "") -> dict[str, Enclave]:
+    """Return the enclaves of the shipped policy by the last part of their path, for a machine in a namespace."""
+    builder = ET.TreeBuilder(insert_comments=True)
+    root = ET.parse(POLICY, ET.XMLParser(target=builder)).getroot()
+    found = {}
+    for enclave in root.find("enclaves"):
+        profiles = enclave.findall("profiles/profile")
+        entry = Enclave(profiles[0].get("node"))
+        for profile in profiles:
+            node = profile.get("node")
+            place = "" if node == TOOLS else namespace
+            for group in profile:
+                rights = [right for right in group.attrib if group.get(right) == "ALLOW"]
+                for name, right in product(group, rights):
+                    entry.allowed[right].add(absolute(name.text, node, place))
+        found[enclave.get("path").rpartition("/")[2]] = entry
+    return found
+
+
+def absolute(name: str, node: str, namespace: str) -> str:
+    """Return a policy's name as the graph shows it, for a profile whose ns is `namespace`."""
+    return name if name.startswith("/") else f"{namespace}/{name.replace('~', node, 1)}"
+
+
+def opened(witness: Node, node: str, namespace: str) -> dict[str, set[str]]:
+    """Return what the graph says that a node has opened."""
+    asked = {
+        "publish": witness.get_publisher_names_and_types_by_node,
+        "subscribe": witness.get_subscriber_names_and_types_by_node,
+        "reply": witness.get_service_names_and_types_by_node,
+        "request": witness.get_client_names_and_types_by_node,
+    }
+    return {right: {name for name, _ in ask(node, namespace or "/")} for right, ask in asked.items()}
+
+
+def test_form() -> None:
+    """What sros2 wants: its version, enclaves only, and every right an ALLOW."""
+    root = ET.parse(POLICY, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True))).getroot()
+    assert root.tag == "policy"
+    assert root.get("version") == "0.2.0"
+    assert [child.tag for child in root] == ["enclaves"]
+    assert {child.tag for child in root.find("enclaves")} == {"enclave"}
+    groups = root.findall(".//topics") + root.findall(".//services")
+    assert {value for group in groups for value in group.attrib.values()} == {"ALLOW"}
+
+
+def test_nobody_else_may_move_the_machine() -> None:
+    for topic, allowed in MAY_COMMAND.items():
+        may = {name for name, enclave in read_policy().items() if topic in enclave.allowed["publish"]}
+        assert may == allowed, topic
+
+
+def test_operators_and_thermometers_hear_and_ask_only_what_there_is() -> None:
+    """A misspelt name in a policy is a right that nobody has, or a refusal that nobody understands."""
+    policy = read_policy()
+    nodes = [policy[name].allowed for name in ("compensator", "strut_drive", "linuxcnc_bridge", "commander")]
+    heard = {name for allowed in nodes for right in ("publish", "subscribe") for name in allowed[right]}
+    answered = {name for allowed in nodes for name in allowed["reply"]}
+    for name in ("operator", "thermometers"):
+        allowed = policy[name].allowed
+        assert allowed["publish"] | allowed["subscribe"] <= heard
+        assert allowed["request"] <= answered
+        assert all(reply.startswith(f"/{TOOLS}/") for reply in allowed["reply"])
+
+
+@pytest.mark.parametrize("name", ["compensator", "strut_drive", "mover", "instrument", "adapter", "linuxcnc_bridge"])
+def test_lifecycle_nodes_open_what_the_policy_allows(name: str, rig: Rig) -> None:
+    """Nothing more, nothing less, with every optional topic switched on."""
+    rig.namespace = "/guarded"  # of its own: the graph still knows nodes of these names from other tests
+    node = {
+        "compensator": lambda: rig.compensator(publish_array=True),
+        "strut_drive": rig.drive,
+        "mover": lambda: rig.add(MoverNode, True, {}),
+        "instrument": lambda: rig.add(InstrumentNode, True, {"kind": "tracker"}),
+        "adapter": lambda: rig.add(AdapterNode, True, {}),
+        "linuxcnc_bridge": lambda: rig.add(LinuxcncBridgeNode, True, {}, hal=StandInHal()),
+    }[name]()
+    enclave = read_policy(rig.namespace)[name]
+    assert enclave.node == name
+    enclave.allowed["publish"] -= {"/guarded/instrument/readings"}  # a laser's, in place of a tracker's pose
+    with contextlib.suppress(TimeoutError):  # the comparison says what is missing
+        rig.until(lambda: opened(node, name, rig.namespace) == enclave.allowed, "the graph to be complete", 1.0)
+    assert opened(node, name, rig.namespace) == enclave.allowed
+
+
+def test_the_client_opens_what_the_policy_allows() -> None:
+    client = LoopClient()
+    try:
+        enclave = read_policy()["commander"]
+        assert client.node.get_name() == enclave.node
+        found = opened(client.node, enclave.node, "")
+        found["publish"] |= {"/select_tool"}  # for controllers that change tools
+        assert found == enclave.allowed
+    finally:
+        client.close()
+
+
+def test_who_only_listens_may_and_opens_nothing_more(tmp_path: Path) -> None:
+    """``record`` and ``watch``, as they run; of ``echo`` its node, and that every topic of the nodes is there."""
+    policy = read_policy()
+    opens: dict[str, set[str]] = {right: set() for right in RIGHTS}
+
+    def look(node: Node) -> None:
+        for right, names in opened(node, node.get_name(), "").items():
+            opens[right] |= names
+
+    with BagRecorder(tmp_path / "bag") as recorder:
+        look(recorder._session.node)
+    with RosSession("hexapod_comp_watch", **QUIET) as session:
+        Watcher(load_geometry(config_file("paper.yaml")), session.node)
+        look(session.node)
+    with RosSession("hexapod_comp_echo", **QUIET) as session:
+        look(session.node)
+    witness = policy["witness"].allowed
+    assert opens["subscribe"] <= witness["subscribe"]
+    assert {right: opens[right] for right in RIGHTS[:1] + RIGHTS[2:]} == {
+        right: witness[right] for right in RIGHTS[:1] + RIGHTS[2:]
+    }
+    said = {
+        name for name in policy["compensator"].allowed["publish"] if not name.endswith(("_event", "_events", "rosout"))
+    }
+    others = {"/strut_states", "/tool_pose_true", "/tool_pose_command", "/select_tool", "/temperatures", "/humidity"}
+    others |= {"/gravity", "/wrench", "/outside"}
+    by_input = {"/strut_setpoints", "/nominal_strut_states"}  # with command_input: struts
+    assert witness["subscribe"] == said | others | by_input
+
+
+LIFECYCLE = ("change_state", "get_state", "get_available_transitions", "get_transition_graph")
+"""What ``ros2 lifecycle`` (ros2cli 0.32, Jazzy) asks nodes for: ``list`` the third, with -a the last; ``set`` the
+third, then the first; ``get`` the second."""
+
+
+def tool_nodes(context: Context, machines: tuple[str, ...]) -> Iterator[Node]:
+    """Make what the tools of Jazzy make: its name, its services, and its clients.
+
+    ``ros2 topic``, ``node``, ``lifecycle`` and ``param``: ros2cli/node/direct.py; ``ros2 param``'s client is rclpy's
+    own. ``ros2 service call``: ros2service/verb/call.py, named after the service's type.
+    """
+    direct = rclpy.create_node(TOOLS.replace("*", "4711"), context=context, start_parameter_services=False)
+    for machine in machines:
+        AsyncParameterClient(direct, machine)
+        for name in LIFECYCLE:
+            kind = {"change_state": ChangeState, "get_state": GetState}.get(name, GetAvailableTransitions)
+            direct.create_client(kind, f"{machine}/{name}")
+    yield direct
+    for kind in (SetBool, Trigger):
+        yield rclpy.create_node(TOOLS.replace("*", f"requester_std_srvs_{kind.__name__}"), context=context)
+
+
+def test_the_operator_may_all_that_the_ros2_tools_open(ros_context: Context, capfd: pytest.CaptureFixture[str]) -> None:
+    """Nothing less: a tool ends when one of its clients cannot be made. Nothing more: what else nobody asks for."""
+    operator = read_policy()["operator"].allowed
+    machines = ("compensator", "strut_drive", "linuxcnc_bridge")
+    wanted: dict[str, set[str]] = {right: set() for right in RIGHTS}
+    with Bench(ros_context, capfd) as rig:
+        for node in tool_nodes(ros_context, machines):
+            rig.until(lambda node=node: "/rosout" in opened(rig.witness, node.get_name(), "")["publish"], "a tool")
+            for right, names in opened(rig.witness, node.get_name(), "").items():
+                wanted[right] |= {name.replace(f"/{node.get_name()}/", f"/{TOOLS}/") for name in names}
+            node.destroy_node()
+    own = {f"/compensator/{name}" for name in ("enable_compensation", "reload_model", "reset", "get_travel")}
+    assert wanted["request"] == operator["request"] - own
+    assert wanted["publish"] == operator["publish"]
+    assert wanted["reply"] == operator["reply"]
+
+
+def test_the_launch_file_names_the_enclaves_of_the_policy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each node's ``--enclave`` is in the policy, by default."""
+    launch_file = LaunchFile(monkeypatch)
+    root = ET.parse(POLICY).getroot()
+    paths = {enclave.get("path") for enclave in root.iter("enclave")}
+    for folder, known in ((launch_file.defaults["enclaves"], True), ("/mine", False)):
+        arguments = [node["ros_arguments"] for node in launch_file.start(f"enclaves:={folder}").values()]
+        asked = [words[words.index("--enclave") + 1] for words in arguments]
+        assert asked == [f"{folder}/compensator", f"{folder}/strut_drive"]
+        assert paths.issuperset(asked) is known
