@@ -350,26 +350,6 @@ def test_fk_names_the_row_without_a_pose(tmp_path: Path) -> None:
     assert err.startswith("hexapod_comp: error: line 3 (row 2): no pose has these strut lengths")
 
 
-def test_all_modes_lists_each_once_and_marks_the_working_one() -> None:
-    """Every mode's pose has the lengths asked for, by NumPy; the working one is Table 1, row 2."""
-    values = table_lengths()[1]
-    lengths = ",".join(repr(float(v) * 1e3) for v in values)
-    modes = json.loads(hexapod("fk", "--lengths", lengths, "--all-modes", "--json")[1])["modes"]
-    assert sum(mode["working"] for mode in modes) == 1
-    for mode in modes:
-        alpha, beta, gamma = (mode[f"{name}_deg"] for name in ("alpha", "beta", "gamma"))
-        rotation = Rotation.from_euler("YXZ", [beta, alpha, gamma], degrees=True).as_matrix()
-        position = np.array([mode["x_mm"], mode["y_mm"], mode["z_mm"]]) * 1e-3
-        found = np.linalg.norm(position + PAPER.platform_joints @ rotation.T - PAPER.base_joints, axis=1)
-        np.testing.assert_allclose(found, values, atol=1e-12)
-        assert mode["working"] or mode["objections"]
-    working = next(mode for mode in modes if mode["working"])
-    assert working["alpha_deg"] == pytest.approx(5.0, abs=1e-3)
-    text = hexapod("fk", "--lengths", lengths, "--all-modes")[1]
-    assert text.splitlines()[0] == f"machine paper: {len(modes)} assembly modes, tool in work"
-    assert text.count("working mode") == 1
-
-
 # check.
 
 

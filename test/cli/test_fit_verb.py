@@ -30,7 +30,6 @@ from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.struts import StrutErrors
-from hexapod_comp.measurements.files import read_measurements
 from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.pose import Pose
 
@@ -474,28 +473,6 @@ def test_iso230_judges_every_line(done: Calibration) -> None:
     assert [row.split()[:2] for row in rows[26:30]] == [["diagonal", str(n)] for n in (1, 2, 3, 4)]
     assert rows[30].startswith("largest of the 4: E_d ")
     assert out.strip() in done.fit_said, "the same table is part of the fit's report"
-
-
-def test_iso230_figures_follow_from_the_readings(done: Calibration) -> None:
-    """The standard's M and B of one line by hand, from the readings themselves: M is the range of the means of both
-    directions, B the largest difference of the two means of a target. Numbers in the table have 1 nm."""
-    measured = read_measurements([done.measured], load_geometry(config_file("paper")))
-    name = "x line at y 0.0, z 350.0"
-    number = [run.name for run in measured.runs].index(name)
-    along = measured.along().round(9)
-    means = np.array(
-        [
-            [measured.value[(measured.run == number) & (measured.direction == way) & (along == place)].mean()
-             for place in np.unique(along[measured.run == number])]
-            for way in (1, -1)
-        ]
-    )  # fmt: skip
-    assert means.shape == (2, 11)
-    figures = json.loads(hexapod("iso230", done.measured, "--json")[1])["iso230_2"][name]
-    assert figures["M_m"] == pytest.approx(np.ptp(means.mean(axis=0)), abs=1e-12)
-    assert figures["B_m"] == pytest.approx(np.abs(means[0] - means[1]).max(), abs=1e-12)
-    assert figures["E_m"] == pytest.approx(np.ptp(means), abs=1e-12)
-    assert figures["A_m"] > figures["E_m"] > figures["M_m"]
 
 
 def test_a_trackers_export_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,9 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from strategies import paper_geometry, skewed_geometry
 
-from hexapod_comp.core import batch, ffi, lib
-
-JUDGED = 0.3, 0.0, np.inf  # Characteristic length, any assembly mode, any condition number
+from hexapod_comp.core import batch, ffi
 
 
 def drawn_poses(geometry, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -29,14 +27,6 @@ def lengths_at(geometry, positions, rotations) -> np.ndarray:
     return lengths
 
 
-def solved(geometry, lengths, positions, rotations, judged=JUDGED):
-    """Outcomes, iterations and conditions; the poses are overwritten."""
-    count = len(lengths)
-    found = np.empty(count, np.intc), np.empty(count, np.intc), np.empty(count)
-    batch.solve_poses(*joints(geometry), lengths, positions, rotations, *judged, *found)
-    return found
-
-
 @pytest.mark.parametrize("geometry", [paper_geometry(), skewed_geometry()], ids=["6-3", "6-6"])
 @pytest.mark.parametrize("count", [1, 7, 8, 21])
 def test_lengths_are_numpy_s_distances(geometry, count):
@@ -45,53 +35,6 @@ def test_lengths_are_numpy_s_distances(geometry, count):
     base, platform = joints(geometry)
     expected = np.linalg.norm(positions[:, None] + platform @ np.swapaxes(rotations, 1, 2) - base, axis=2)
     np.testing.assert_allclose(lengths_at(geometry, positions, rotations), expected, rtol=0.0, atol=1e-15)
-
-
-@pytest.mark.parametrize("geometry", [paper_geometry(), skewed_geometry()], ids=["6-3", "6-6"])
-def test_a_pose_among_others_has_the_bits_of_a_pose_alone(geometry):
-    """Eight go through the vector registers at once, whatever their neighbours: one of them has no solution."""
-    positions, rotations = drawn_poses(geometry, 21, 2)
-    lengths = lengths_at(geometry, positions, rotations)
-    lengths[4, 1] = 3.0
-    starts = np.tile(geometry.home.position, (21, 1)), np.tile(geometry.home.rotation, (21, 1, 1))
-    together = [part.copy() for part in starts]
-    outcomes, iterations, conditions = solved(geometry, lengths, *together)
-    assert outcomes[4] == lib.HC_UNREACHABLE
-    assert (np.delete(outcomes, 4) == lib.HC_OK).all()
-    for n in range(21):
-        alone = [part[n : n + 1].copy() for part in starts]
-        found = solved(geometry, lengths[n : n + 1], *alone)
-        assert [part[0] for part in found[:2]] == [outcomes[n], iterations[n]]
-        np.testing.assert_array_equal(found[2], conditions[n : n + 1])
-        np.testing.assert_array_equal(alone[0][0], together[0][n])
-        np.testing.assert_array_equal(alone[1][0], together[1][n])
-
-
-def test_solutions_are_the_poses_that_the_lengths_came_from():
-    """1e-13 m and rad: rounding of the lengths, 1e-16, times a condition of some hundred."""
-    geometry = skewed_geometry()
-    positions, rotations = drawn_poses(geometry, 100, 3)
-    found = np.tile(geometry.home.position, (100, 1)), np.tile(geometry.home.rotation, (100, 1, 1))
-    outcomes, _, _ = solved(geometry, lengths_at(geometry, positions, rotations), *found)
-    assert (outcomes == lib.HC_OK).all()
-    np.testing.assert_allclose(found[0], positions, rtol=0.0, atol=1e-13)
-    np.testing.assert_allclose(found[1], rotations, rtol=0.0, atol=1e-13)
-
-
-def test_jacobians_are_differences_of_lengths():
-    """Central differences over 1 µm and 1 µrad leave 1e-12 of curvature and 1e-10 of rounding."""
-    geometry, step = skewed_geometry(), 1e-6
-    positions, rotations = drawn_poses(geometry, 5, 4)
-    matrices = np.empty((5, 6, 6))
-    batch.jacobians(*joints(geometry), positions, rotations, matrices)
-    for k in range(6):
-        ends = []
-        for way in (step, -step):
-            shift, turn = np.zeros(3), np.zeros(3)
-            (shift if k < 3 else turn)[k % 3] = way
-            turned = np.ascontiguousarray(Rotation.from_rotvec(turn).as_matrix() @ rotations)
-            ends.append(lengths_at(geometry, positions + shift, turned))
-        np.testing.assert_allclose(matrices[:, :, k], (ends[0] - ends[1]) / (2.0 * step), rtol=0.0, atol=1e-9)
 
 
 def test_a_window_follows_with_play():

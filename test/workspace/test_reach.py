@@ -126,25 +126,6 @@ def test_distance_of_two_segments(first, second, distance):
     assert closest(*second[::-1], *first) == pytest.approx(distance, abs=1e-15)
 
 
-def test_clearance_stops_the_closest_pair():
-    """Truth: all distances by least squares, where a turn of 60° has crossed the struts; limits 1 µm off."""
-    geometry = paper_geometry()
-    turned = Pose.from_angles(np.zeros(3), np.deg2rad([0.0, 0.0, 60.0])).rotation
-    tip = geometry.home.position
-    end = ends(geometry, tip[None], turned)[0]
-    apart = {
-        pair: segment_distance(*(part[i] for i in pair for part in (geometry.base_joints, end)))
-        for pair in combinations(range(6), 2)
-        if pair not in ((0, 1), (2, 3), (4, 5))  # these share a joint of the platform
-    }
-    least = min(apart.values())
-    for shift, finding in ((1e-6, Status.CLEARANCE), (-1e-6, Status.OK)):
-        found, struts = Examiner(limited(geometry, clearance=least + shift)).findings(tip[None], turned[None])
-        assert found[0] == finding
-        if finding == Status.CLEARANCE:
-            assert apart[tuple(struts[0].tolist())] == pytest.approx(least, abs=2e-6)
-
-
 def test_poses_of_their_own_orientation(monkeypatch):
     """Truth: the same poses asked one by one; and the same on one thread and on three, more than one slice."""
     monkeypatch.setattr(kinematics, "ALONE", -1.0)  # others help from the second slice on
