@@ -29,10 +29,9 @@ from benchmarks.calibration import CONFIG, LARGE
 from hexapod_comp.compensation.thermal import DEFAULT_TIME_CONSTANT, TemperatureFilter
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
-from hexapod_comp.machine.model import MachineModel, RealMachine
-from hexapod_comp.machine.passes import Passes, random_passes
+from hexapod_comp.machine.model import RealMachine
+from hexapod_comp.machine.passes import random_passes
 from hexapod_comp.machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
-from hexapod_comp.machine.trial import Trial
 from hexapod_comp.measurements.campaign import load_campaign
 from hexapod_comp.virtual.imperfections import draw_model
 
@@ -86,7 +85,7 @@ def one_machine(drift: Drift, seed: int, settings: FitSettings) -> np.ndarray:
     model = replace(model, struts=struts, base_expansion=STEEL, platform_expansion=STEEL)
     box = load_campaign(CONFIG / "campaign_5d.yaml").box
     passes = random_passes(geometry, box, settings.points, 0.0, rng)
-    cold = _tool(RealMachine(geometry, model), passes, model, None)
+    cold = warm_up.tool_at(RealMachine(geometry, model), passes, model, None)
     true, readings = read(drift, settings, rng)
     squares = np.empty((len(PHASES), len(COMPENSATIONS)))
     for phase in range(len(PHASES)):
@@ -96,7 +95,7 @@ def one_machine(drift: Drift, seed: int, settings: FitSettings) -> np.ndarray:
             truth = RealMachine(geometry, model, _temperatures(drift, true[second]))
             for n, seen in enumerate((None, *readings)):
                 sensed = None if seen is None else _temperatures(drift, seen[second])
-                moved[n, group] = _tool(truth, at, model, sensed) - cold[group]
+                moved[n, group] = warm_up.tool_at(truth, at, model, sensed) - cold[group]
         squares[phase] = np.mean(np.sum(moved**2, axis=2), axis=1)
     return squares
 
@@ -125,13 +124,6 @@ def _groups(points: int, phase: int) -> list[tuple[np.ndarray, int]]:
 
 def _temperatures(drift: Drift, values: np.ndarray) -> Temperatures:
     return Temperatures(dict(zip(drift.parts, values, strict=True)))
-
-
-def _tool(truth: RealMachine, passes: Passes, model: MachineModel, sensed: Temperatures | None) -> np.ndarray:
-    """Return where the tool goes, shape (N, 3), m in ``base``."""
-    trial = Trial(truth, passes)
-    errors = trial.errors(trial.commands(model, sensed))
-    return errors.points + errors.displacement
 
 
 COLUMNS = ["drift", "phase", "blind, µm", "unfiltered, µm", "removed", "filtered, µm", "removed", "least", "bar"]

@@ -96,7 +96,7 @@ def judge(truth: Truth, fit: ModelFit, points: int, seed: int) -> tuple[float, f
     passes = random_passes(geometry, BOX, points, 0.0, rng)
     true = truth.warm_up.course(DAY, OFF)
     sensed, heard = truth.warm_up.sensed(true, rng), Temperatures()
-    cold = _tool(RealMachine(geometry, truth.model), passes, fit.model, None)
+    cold = tool_at(RealMachine(geometry, truth.model), passes, fit.model, None)
     moments = np.linspace(0, DAY, MOMENTS + 1)[1:].astype(int)
     groups = np.array_split(np.arange(points), MOMENTS)
     squares: list[list[np.ndarray]] = [[], []]
@@ -110,14 +110,14 @@ def judge(truth: Truth, fit: ModelFit, points: int, seed: int) -> tuple[float, f
                 geometry, truth.model, Temperatures(dict(zip(PARTS, true[second, : len(PARTS)], strict=True)))
             )
             for kept, believed in zip(squares, (None, heard), strict=True):
-                moved = _tool(warm, passes.select(group), fit.model, believed) - cold[group]
+                moved = tool_at(warm, passes.select(group), fit.model, believed) - cold[group]
                 kept.append((moved**2).sum(axis=1))
             at += 1
     blind, compensated = (float(np.concatenate(kept).mean()) for kept in squares)
     return blind, compensated
 
 
-def _tool(truth: RealMachine, passes: Passes, model: MachineModel, sensed: Temperatures | None) -> np.ndarray:
+def tool_at(truth: RealMachine, passes: Passes, model: MachineModel, sensed: Temperatures | None) -> np.ndarray:
     """Return where the tool goes, shape (N, 3), m in ``base``."""
     trial = Trial(truth, passes)
     errors = trial.errors(trial.commands(model, sensed))
