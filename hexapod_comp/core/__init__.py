@@ -59,7 +59,7 @@ class Struct:
     Attributes
     ----------
     at : cdata
-        Pointer to it, for C; whoever holds it alone must hold the struct.
+        Pointer to it, for C; valid while the struct is referenced.
     view : ndarray of shape ()
         It by name: ``view["last"]["nominal"]`` is an array in it.
     """
@@ -82,7 +82,7 @@ class Struct:
         self._kept[:] = [other]
 
     def copy_from(self, other: Struct) -> None:
-        """Take over another one, with what it points to."""
+        """Copy another one, with what it points to."""
         self.view[...] = other.view
         self._kept[:] = other._kept
 

@@ -79,7 +79,7 @@ class ScrewTable:
 
 @dataclass(frozen=True)
 class Genhexkins:
-    """What LinuxCNC has been told of a machine, in SI."""
+    """A machine as LinuxCNC is configured for it, in SI."""
 
     # (6, 3): joints in LinuxCNC's world (our ``work``) and in the moving frame (our ``tool``), m
     base_joints: np.ndarray

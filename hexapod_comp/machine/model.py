@@ -74,13 +74,11 @@ class ModelOrigin:
     # RMS residual tool error on data that were not used in the fit, m; None if not measured
     held_out_residual: float | None = None
     note: str = ""  # One line for people
-    # Name, beside the model file, and SHA-256 of the file with the fit's posterior; None if
-    # nobody says
+    # Name, beside the model file, and SHA-256 of the file with the fit's posterior; None if not known
     posterior: tuple[str, str] | None = None
     # Pose at which the tool is held, and how many ways; None if not known
     datum: Datum | None = None
-    # Loads of its measurement, each payload, kg, its centre in platform, m, and gravity in base, m/s²; none
-    # where nobody says
+    # Loads during its measurement, if known: each payload, kg, its centre in platform, m, gravity in base, m/s²
     loads: tuple[tuple[float, ...], ...] = ()
     # Of what a fit has made of the file that the model was read from; empty when it was not read
     text_sha256: str = dataclasses.field(default="", compare=False)
@@ -175,6 +173,9 @@ FOLLOWED = 9  # Three axes of the measured point, then six struts
 DIRECTIONS = {"forward": 1.0, "midway": 0.0, "backward": -1.0}
 
 
+PoseArrays = tuple[np.ndarray, np.ndarray]  # position (3,), m, and rotation (3, 3)
+
+
 class MotionState:
     """Directions of motion with a reversal threshold, so that noise at standstill does not flip a backlash."""
 
@@ -254,17 +255,10 @@ class RealMachine:
         return RealMachine(geometry, self.model, temperatures, loading, constants)
 
     def advance(
-        self,
-        seconds: float,
-        commands: np.ndarray,
-        sense: np.ndarray,
-        position: np.ndarray,
-        rotation: np.ndarray,
-        actual_position: np.ndarray,
-        actual_rotation: np.ndarray,
+        self, seconds: float, commands: np.ndarray, sense: np.ndarray, pose: PoseArrays, actual: PoseArrays
     ) -> tuple[int, float]:
         """Run :meth:`forward` after a time, s, in which the struts moved to their commands: without inertia at once."""
-        return self.forward(commands, sense, position, rotation, actual_position, actual_rotation)
+        return self.forward(commands, sense, pose, actual)
 
     @property
     def body(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -334,36 +328,23 @@ class RealMachine:
         """
         guess = self.geometry.home if guess is None else guess
         sense = MotionState().sense if sense is None else sense
-        position, rotation = guess.position.copy(), guess.rotation.copy()
-        actual_position, actual_rotation = np.empty(3), np.empty((3, 3))
-        outcome, condition = self.forward(
-            np.ascontiguousarray(commands, dtype=float),
-            np.ascontiguousarray(sense, dtype=float),
-            position,
-            rotation,
-            actual_position,
-            actual_rotation,
-        )
+        pose, actual = (guess.position.copy(), guess.rotation.copy()), (np.empty(3), np.empty((3, 3)))
+        lengths, senses = (np.ascontiguousarray(values, dtype=float) for values in (commands, sense))
+        outcome, condition = self.forward(lengths, senses, pose, actual)
         if outcome != Status.OK:
             raise forward_error(outcome, condition, self.structure.max_condition)
-        return Pose(actual_position, actual_rotation), Pose(position, rotation)
+        return Pose(*actual), Pose(*pose)
 
     def forward(
-        self,
-        commands: np.ndarray,
-        sense: np.ndarray,
-        position: np.ndarray,
-        rotation: np.ndarray,
-        actual_position: np.ndarray,
-        actual_rotation: np.ndarray,
+        self, commands: np.ndarray, sense: np.ndarray, pose: PoseArrays, actual: PoseArrays
     ) -> tuple[int, float]:
         """Run the model forwards on arrays of the caller; return (outcome, condition number).
 
         The model pose is the guess, and the solution where the outcome is OK; only then is the actual pose written.
         """
         outcome, condition = np.empty(1, np.intc), np.empty(1)
-        guess, actual = (position[None], rotation[None]), (actual_position[None], actual_rotation[None])
-        batch.forwards(self.state.at, commands[None], sense[None], *guess, *actual, outcome, condition)
+        rows = (array[None] for array in (commands, sense, *pose, *actual))
+        batch.forwards(self.state.at, *rows, outcome, condition)
         return int(outcome[0]), float(condition[0])
 
     def forward_many(self, *arrays: np.ndarray) -> None:

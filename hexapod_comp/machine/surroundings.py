@@ -12,7 +12,7 @@ from .load import Payload
 from .model import RealMachine
 from .temperatures import HUMIDITY, PARTS, REFERENCE_TEMPERATURE, Lag, Temperatures, late
 
-# What a load is where nobody tells: NaN, the mass and centre of the tool in use, and the model's gravity
+# Load that is not known: NaN, the mass and centre of the tool in use, and the model's gravity
 NO_LOAD = (math.nan,) * 7
 
 

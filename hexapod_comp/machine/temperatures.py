@@ -15,7 +15,7 @@ from .limits import STRUT_NAMES
 from .terms import term
 
 PARTS = (*STRUT_NAMES, "base", "platform")  # What has a temperature, in the order of every array of eight
-MOST_TIME_CONSTANTS = 2  # A machine that warms shows a fast and a slow one; more cannot be told apart
+MOST_TIME_CONSTANTS = 2  # A machine that warms shows a fast and a slow one; more cannot be distinguished
 TIME_CONSTANT_RANGE = (10.0, 1e6)  # Time constants outside this, s, are a sensor's noise, or a building's seasons
 REST = 3.0  # time constants after which a twentieth of an unknown initial state is left
 EXPANSION = 1e-3  # Largest expansion that a machine's part may have, 1/K: five times that of soft plastics
@@ -66,7 +66,7 @@ class Lag:
     behind: list[float]  # d_k, K
 
     def add(self, change: float, time: float, time_constants: Sequence[float]) -> None:
-        """Take a reading that differs from the last one by a `change`, K, at a time, s."""
+        """Add a reading that differs from the last one by a `change`, K, at a time, s."""
         elapsed = max(0.0, time - self.newest)
         self.newest = max(self.newest, time)
         for k, constant in enumerate(time_constants):
@@ -111,7 +111,7 @@ class Sensed:
     """What a sensor reads."""
 
     title: str  # For messages; ``{}`` stands for the sensor's name
-    reference: float  # What counts while nobody has told
+    reference: float  # value before the first reading
     range: tuple[float, float]  # Readings outside are refused
     allowed: str  # The same for people
     unit: str = ""  # Unit of a reading, and of a difference of two, after a space
@@ -143,7 +143,7 @@ def check_part(name: str) -> None:
 
 
 class Temperatures:
-    """Temperatures of struts, base and platform, °C, and the air's humidity; of what nobody has told: 20 °C, 50 %.
+    """Temperatures of struts, base and platform, °C, and the air's humidity; without a reading 20 °C, 50 %.
 
     Attributes
     ----------
@@ -177,9 +177,9 @@ class Temperatures:
         return {"temperatures": dict(self.values), "lags": lags}
 
     def follow(self, name: str, value: float, time: float, time_constants: tuple[float, ...]) -> None:
-        """Take a reading made at a time, s, on a clock that is never set; late parts follow.
+        """Set a reading made at a time, s, on a monotonic clock; late parts follow.
 
-        The first reading finds its followers at rest: what was before nobody knows.
+        At the first reading late parts are assumed at rest.
         """
         before = self.at(name)
         late_parts = bool(time_constants) and name != HUMIDITY
@@ -202,7 +202,7 @@ class Temperatures:
         return max(0.0, max(begun) + REST * late_growth.time_constants[-1] - time)
 
     def set(self, name: str, value: float) -> None:
-        """Take a reading, whenever it was made: late parts stay as far behind as they are."""
+        """Set a reading without a time: late parts keep their lag."""
         if name != HUMIDITY:
             check_part(name)
         quantity = quantity_of(name)

@@ -24,8 +24,8 @@ class Row:
     key: str  # there, without its unit; empty: the field's name
     numbers: Numbers  # unit and shape in the file
     checked: bool  # the shape is the file's too; else the dataclass checks it
-    least: float  # SI; what is smaller is no such quantity
-    largest: float  # SI; what is larger, no machine has
+    least: float  # smallest allowed value, SI
+    largest: float  # largest allowed value, SI: no machine exceeds it
     meaning: str
 
     def where(self, name: str) -> str:

@@ -31,7 +31,7 @@ class Assessment:
     ideal_lengths: np.ndarray
     # (M, P, 6): strut commands that bring each real machine exactly to the poses (Song et al., Table 4)
     real_lengths: np.ndarray
-    # (M, P, 3), (M, P, 3, 3): ``pose_tool_in_work`` that each real machine takes when told the ideal lengths
+    # (M, P, 3), (M, P, 3, 3): ``pose_tool_in_work`` that each real machine reaches by the ideal lengths
     taken_positions: np.ndarray
     taken_rotations: np.ndarray  # (M, P, 3), (M, P, 3, 3)
     # (M, P, 6): the same as displacement, m, and rotation vector, rad, along the work frame's axes

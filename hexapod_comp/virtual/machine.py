@@ -141,7 +141,7 @@ class StrutDrive:
     def _run(self, ticks: int, seconds: float) -> None:
         """Run the drives for some ticks, then compute the platform's pose."""
         run_drives(self._drives, self._commands, ticks, self._motion.sense)
-        went = self._motor, self._motion.sense, *self._model_pose, *self._true_pose
+        went = self._motor, self._motion.sense, self._model_pose, self._true_pose
         self._outcome, self._condition = self.machine.advance(seconds, *went)
 
     def _follow_commanded_point(self) -> None:
@@ -151,13 +151,13 @@ class StrutDrive:
         taken up also move the tool along axes at rest; they have no direction.
         """
         model, motion, nowhere = self.machine.model, self._motion, (np.empty(3), np.empty((3, 3)))
-        outcome, _ = self._rigid.forward(self._commands, motion.sense, *self._commanded_pose, *nowhere)
+        outcome, _ = self._rigid.forward(self._commands, motion.sense, self._commanded_pose, nowhere)
         if outcome == Status.OK:
             threshold, probe = model.field.reversal_threshold, model.field.probe
             follow_point(*self._commanded_pose, probe, threshold, motion.low, motion.sense)
 
     def _read_encoders(self, dt: float) -> None:
-        """Take a reading and deliver those that have arrived."""
+        """Read the encoders; deliver the readings whose delay has passed."""
         p, faults = self.parameters, self._faults
         reading = self._motor
         if p.encoder_noise:

@@ -24,7 +24,7 @@ from ..core.batch import quaternion_of
 from ..errors import HexapodError, ModelError
 from ..machine.kinematics import strut_lengths, strut_lengths_batch
 from ..machine.load import LARGEST_GRAVITY, LARGEST_MASS, LEAST_STIFFNESS, STANDARD_GRAVITY, Payload
-from ..machine.model import RealMachine
+from ..machine.model import PoseArrays, RealMachine
 from ..machine.robot_description import HINGE_INERTIA, foot_frames, mjcf
 from ..machine.temperatures import Temperatures
 from ..pose import rotation_from_angles
@@ -192,18 +192,11 @@ class PhysicalMachine(RealMachine):
             self._add_field(rigid, settled, (actual_positions[n], actual_rotations[n]))
 
     def forward(
-        self,
-        commands: np.ndarray,
-        sense: np.ndarray,
-        position: np.ndarray,
-        rotation: np.ndarray,
-        actual_position: np.ndarray,
-        actual_rotation: np.ndarray,
+        self, commands: np.ndarray, sense: np.ndarray, pose: PoseArrays, actual: PoseArrays
     ) -> tuple[int, float]:
         """Run the model forwards on arrays of the caller, to where the platform settles."""
         outcomes, conditions = np.empty(1, np.intc), np.empty(1)
-        rows = commands, sense, position, rotation, actual_position, actual_rotation
-        self.forward_many(*(array[None] for array in rows), outcomes, conditions)
+        self.forward_many(*(array[None] for array in (commands, sense, *pose, *actual)), outcomes, conditions)
         return int(outcomes[0]), float(conditions[0])
 
     @staticmethod
@@ -309,18 +302,11 @@ class PhysicalMachine(RealMachine):
     # ---- in motion ----
 
     def advance(
-        self,
-        seconds: float,
-        commands: np.ndarray,
-        sense: np.ndarray,
-        position: np.ndarray,
-        rotation: np.ndarray,
-        actual_position: np.ndarray,
-        actual_rotation: np.ndarray,
+        self, seconds: float, commands: np.ndarray, sense: np.ndarray, pose: PoseArrays, actual: PoseArrays
     ) -> tuple[int, float]:
         """Simulate time in MuJoCo, while the struts move from their last lengths to those of new commands."""
-        rigid, rows = (self._rigid[0].copy(), self._rigid[1].copy()), (actual_position, actual_rotation)
-        outcome, condition = super().forward(commands, sense, *rigid, *rows)
+        rigid = self._rigid[0].copy(), self._rigid[1].copy()
+        outcome, condition = super().forward(commands, sense, rigid, actual)
         if outcome != Status.OK:
             return outcome, condition
         self._rigid = rigid
@@ -329,8 +315,8 @@ class PhysicalMachine(RealMachine):
             self.start(rigid, sense)
         self._run(lengths, max(1, round(seconds / self._mj.opt.timestep)) if seconds > 0.0 else 0)
         body = self._moving.body("platform")
-        position[:], rotation[:] = body.xpos, body.xmat.reshape(3, 3)
-        self._add_field(rigid, (position, rotation), rows)
+        pose[0][:], pose[1][:] = body.xpos, body.xmat.reshape(3, 3)
+        self._add_field(rigid, pose, actual)
         return outcome, condition
 
     def start(self, rigid: tuple[np.ndarray, np.ndarray], sense: np.ndarray) -> None:

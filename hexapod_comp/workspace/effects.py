@@ -149,7 +149,7 @@ def merged(parts: Iterable[Extremes]) -> Extremes:
             poses=a.poses + b.poses,
         )
     if result is None:
-        raise KinematicsError("no poses to look at: the workspace is empty", 0)
+        raise KinematicsError("no poses: the workspace is empty", 0)
     return result
 
 

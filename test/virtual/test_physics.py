@@ -148,7 +148,7 @@ def test_mujoco_s_steps_end_where_the_forces_balance(given: dict[str, Any], allo
         rows = goal.position.copy(), goal.rotation.copy(), goal.position.copy(), goal.rotation.copy()
         for short, seconds in ((2e-4, 0.1), (2e-5, 0.1), (0.0, 0.4), (0.0, 0.1)):
             commands = strut_lengths(geometry, Pose(goal.position - short * way, goal.rotation))
-            machine.advance(seconds, commands, sense, *rows)
+            machine.advance(seconds, commands, sense, rows[:2], rows[2:])
         at_rest, _ = machine.pose_for(commands, sense, goal)
         place, turn = off(Pose(rows[2], rows[3]), at_rest)
         assert place < allowed
