@@ -176,6 +176,16 @@ def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:
     return Rotation.from_matrix(actual @ np.swapaxes(commanded, -1, -2)).as_rotvec()
 
 
+def middle_pose(poses: Sequence[Pose]) -> tuple[Pose, np.ndarray]:
+    """Return the median of poses near each other, and how far each lies from it, (n, 6), m and rad, in their frame."""
+    from scipy.spatial.transform import Rotation  # As in attitude_error
+
+    first = poses[0].rotation
+    numbers = np.array([[*pose.position, *attitude_error(pose.rotation, first)] for pose in poses])
+    middle = np.median(numbers, axis=0)
+    return Pose(middle[:3], Rotation.from_rotvec(middle[3:]).as_matrix() @ first), numbers - middle
+
+
 def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
     """Return the rigid motion T with T·points ≈ onto, least squares, of pairs (N, 3), m: the datum aligned (Kabsch).
 

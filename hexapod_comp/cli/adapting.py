@@ -82,6 +82,8 @@ def adapt(args: argparse.Namespace) -> Result:
 def told(events: list[dict[str, Any]]) -> Iterator[str]:
     """Yield a line for each event of a journal."""
 
+    from ..upkeep.loop import moved_text
+
     def um(value: float | None) -> str:
         return "–" if value is None else f"{number(value * 1e6, 2)} µm"
 
@@ -98,7 +100,7 @@ def told(events: list[dict[str, Any]]) -> Iterator[str]:
                 text = promised if e["enough"] else f"not enough: {e['short']}"
             case "checked":
                 found = f"shows {um(e['found_m'])}, {um(e['promised_m'])} promised"
-                text = f"{e['readings']} {found}; {'borne out' if e['good'] else e['text']}"
+                text = f"{e['readings']} {found}; {'borne out' if e['good'] else e['text']}{moved_text(e)}"
             case "repaired":
                 text = f"{e['text']}; {e['model']} renews {e['of']}"
             case "begun" | "adopted" | "reloaded":

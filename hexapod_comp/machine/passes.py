@@ -13,6 +13,9 @@ from .kinematics import Structure, strut_lengths_batch
 
 LEAST_SPEED = 1e-9  # Below this share of the speed of travel an axis or a strut counts as at rest
 BOTH_WAYS = (1.0, -1.0)  # Forward, backward
+# A pose is approached over this distance at least, m. A strut that turns back where it arrives still has the direction
+# in which it came: its nut has not crossed the backlash yet
+APPROACH = 2e-3
 
 # Positions, shape (N, 3), m, and rotations, shape (N, 3, 3), of ``pose_platform_in_base``
 Poses = tuple[np.ndarray, np.ndarray]
@@ -59,13 +62,10 @@ class Passes:
         return self.positions + self.rotations @ point
 
     def senses(self) -> np.ndarray:
-        """Return the directions of motion of axes and struts, shape (N, 9), each −1, 0 or 1."""
-        struts = self.positions[:, None] + self.geometry.platform_joints @ np.swapaxes(self.rotations, 1, 2)
-        struts -= self.geometry.base_joints
-        struts /= np.linalg.norm(struts, axis=2, keepdims=True)
-        speeds = np.einsum("nij,nj->ni", struts, self.directions)
-        moving = np.concatenate([self.directions, speeds], axis=1)
-        return np.sign(moving) * (np.abs(moving) > LEAST_SPEED)
+        """Return in which direction axes and struts arrive at the poses, shape (N, 9), each −1, 0 or 1."""
+        lengths = np.linalg.norm(self.directions, axis=1, keepdims=True)
+        ways = APPROACH * self.directions / np.where(lengths > 0.0, lengths, 1.0)
+        return arrivals(self.geometry, self.poses, (self.positions - ways, self.rotations))
 
     def select(self, mask: np.ndarray) -> Passes:
         """Return those in a mask or at indices."""
@@ -90,6 +90,14 @@ class Passes:
             if refusal is not None:
                 refusal.args = (f"{at(position)}: {refusal}",)
                 raise refusal
+
+
+def arrivals(geometry: HexapodGeometry, poses: Poses, before: Poses) -> np.ndarray:
+    """Return in which direction axes and struts arrive at poses from those shortly before, shape (N, 9), −1, 0 or 1."""
+    structure = Structure.of(geometry)
+    changes = strut_lengths_batch(structure, *poses) - strut_lengths_batch(structure, *before)
+    moving = np.concatenate([poses[0] - before[0], changes], axis=1) / APPROACH
+    return np.sign(moving) * (np.abs(moving) > LEAST_SPEED)
 
 
 def at(position: np.ndarray) -> str:

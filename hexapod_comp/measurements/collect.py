@@ -22,9 +22,22 @@ import numpy as np
 from ..core.batch import quaternion_of
 from ..errors import HexapodError, InputFileError
 from ..machine.geometry import HexapodGeometry
+from ..machine.passes import APPROACH
 from ..pose import Pose, attitude_error
 from .campaign import Campaign, campaign_readings
-from .readings import ANGULAR_KINDS, LINE_KINDS, NO_LOAD, FileLine, MeasurementSet, Reading, Run
+from .readings import (
+    ANGULAR_KINDS,
+    BACKWARD,
+    FORWARD,
+    FROM_PREVIOUS,
+    LINE_KINDS,
+    NO_LOAD,
+    UNKNOWN,
+    FileLine,
+    MeasurementSet,
+    Reading,
+    Run,
+)
 from .runs import assemble
 from .set_up import (
     FREE,
@@ -43,7 +56,7 @@ from .tidy import tidy_readings, write_measurements
 __all__ = ["Collected", "InstrumentMachine", "MeasuredMachine", "Observation", "RunSetUp", "SetUpError", "collect"]
 
 SAVE_EVERY = 5.0  # Period at which the file is rewritten, s, also at the end of each run
-OVERRUN = 2e-3  # A pass over a line begins this far before it, m, so that every strut arrives in the pass's direction
+PASSES = (FORWARD, BACKWARD)  # Directions of a pass over a line
 MOVED = 2.0 * LARGEST_ERROR  # Frames from two sets of stations differ by less, m, if the tracker stood
 BROKEN = "a broken beam"
 FRAME_REMARK = "tracker frame in base, mm and quaternion: "  # of a file whose poses came from a tracker anywhere
@@ -414,6 +427,7 @@ class _Collecting:
         places: dict[str, set[bytes]] = {}
         for reading in self.found.values():
             places.setdefault(reading.run, set()).add(reading.pose.position.tobytes())
+        self._tell_directions()
         kept = [
             self.found[n]
             for n in sorted(self.found)
@@ -425,6 +439,14 @@ class _Collecting:
         whole = assemble(self._geometry, kept)
         write_measurements(whole, self._path, self._frame_remark())
         return whole
+
+    def _tell_directions(self) -> None:
+        """State of poses that the machine has visited one after the other that each was reached from the one before."""
+        for before, visit in zip([None, *self.visits], self.visits, strict=False):
+            if visit.direction not in PASSES:
+                read = before is not None and before.run == visit.run and before.readings[0] in self.found
+                for n in filter(self.found.__contains__, visit.readings):
+                    self.found[n] = self.found[n]._replace(direction=FROM_PREVIOUS if read else UNKNOWN)
 
     def _frame_remark(self) -> str:
         """Return the note for the file about a tracker whose frame is unknown."""
@@ -449,12 +471,16 @@ def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
         r = listed[members[0]]
         this = r.run, r.cycle, r.direction
         approach = None
+        if r.direction not in PASSES:  # poses one after the other, each reached from the one before
+            approach = last.pose if k and (last := listed[stops[k - 1][0]]).run == r.run else None
+            yield Visit(*this, r.pose, members, False, approach)
+            continue
         for other, sign in ((k + 1, -1.0), (k - 1, 1.0)):  # the way from here to the next stop, or from the last one
             there = listed[stops[other][0]] if 0 <= other < len(stops) else None
-            if approach is None and r.direction and there and (there.run, there.cycle, there.direction) == this:
+            if approach is None and there and (there.run, there.cycle, there.direction) == this:
                 way = sign * (there.pose.position - r.pose.position)
                 if (length := float(np.linalg.norm(way))) > 0.0:
-                    approach = Pose(r.pose.position + way * (OVERRUN / length), r.pose.rotation)
+                    approach = Pose(r.pose.position + way * (APPROACH / length), r.pose.rotation)
         yield Visit(*this, r.pose, members, this != before, approach)
         before = this
 
@@ -464,7 +490,7 @@ def _resumed(path: str | Path, geometry: HexapodGeometry, listed: Sequence[Readi
 
     def key(run: str, cycle: int, direction: int, pose: Pose, channel: str) -> tuple[object, ...]:
         place = np.concatenate([pose.position * 1e6, pose.rotation.ravel() * 1e6]).round().astype(int)
-        return run, cycle, direction, tuple(place.tolist()), channel
+        return run, cycle, direction if direction in PASSES else UNKNOWN, tuple(place.tolist()), channel
 
     number = {key(r.run, r.cycle, r.direction, r.pose, r.channel): n for n, r in enumerate(listed)}
     found: dict[int, Reading] = {}

@@ -10,13 +10,14 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..errors import InputFileError
 from ..formats.paths import config_file
 from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.kinematics import Structure, strut_lengths_batch
-from ..machine.passes import Passes, Poses
-from ..pose import Pose, stacked
+from ..machine.passes import APPROACH, Passes, Poses, arrivals
+from ..pose import Pose, attitude_error, stacked
 from .readings import (
     ANGULAR_KINDS,
     AXES,
@@ -284,6 +285,7 @@ def _collect_stations(
     """Return the distinct stations and each reading's index among them; readings with the numbers of their poses."""
     known: dict[tuple, int] = {}
     rows: list[tuple] = []
+    known_by: list[int | None] = []  # the station from which the machine came, where that is known
     ways: list[np.ndarray] = []  # of travel, where a run is a line that is passed forward or backward
     index: list[int] = []
     lengths = strut_lengths_batch(Structure.of(geometry), *poses)
@@ -305,13 +307,16 @@ def _collect_stations(
             own = poses[0][pose], poses[1][pose], lengths[pose]
             commands = own[2] if r.commands is None else np.array(r.commands, dtype=float)
             known[key] = len(rows)
-            sense = _sense(own[0], commands, None if came_from is None else rows[came_from])
-            rows.append((*own[:2], commands, sense, *around))
+            known_by.append(came_from)
+            rows.append((*own[:2], commands, np.zeros(9), *around))
             ways.append(r.direction * run.axis if r.direction in (FORWARD, BACKWARD) else np.zeros(3))
         index.append(known[key])
     columns = [np.array(column, dtype=float) for column in zip(*rows, strict=True)]
     along = np.array(ways).any(axis=1)
     columns[3][along] = Passes(geometry, *(part[along] for part in (*columns[:2], np.array(ways)))).senses()
+    if len(there := np.array([n for n, start in enumerate(known_by) if start is not None], dtype=int)):
+        start = np.array([n for n in known_by if n is not None])
+        columns[3][there] = _arrival(geometry, *([part[n] for part in columns[:3]] for n in (there, start)))
     return Stations(*columns), np.array(index)
 
 
@@ -333,12 +338,16 @@ def _check_possible(geometry: HexapodGeometry, readings: Sequence[Reading], plac
     raise InputFileError(where.source.file, _line(where), problem)
 
 
-def _sense(position: np.ndarray, commands: np.ndarray, came_from: tuple | None) -> np.ndarray:
-    """Return the directions of motion at a station that is reached from the one before, shape (9,)."""
-    if came_from is not None:
-        change = np.concatenate([position - came_from[0], commands - came_from[2]])
-        return np.sign(change) * (np.abs(change) > SAME)
-    return np.zeros(9)
+def _arrival(geometry: HexapodGeometry, here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the directions in which stations are reached on a straight way from others, shape (n, 9); both have
+    positions, rotations and commands. At a pose where the machine stood already the commands tell them."""
+    way, turn = there[0] - here[0], attitude_error(there[1], here[1])
+    length = np.linalg.norm(np.concatenate([way, geometry.characteristic_length * turn], axis=1), axis=1)
+    share = np.minimum(1.0, APPROACH / np.maximum(length, SAME))[:, None]
+    before = here[0] + share * way, Rotation.from_rotvec(share * turn).as_matrix() @ here[1]
+    change = np.concatenate([np.zeros_like(way), here[2] - there[2]], axis=1)
+    standing = np.sign(change) * (np.abs(change) > SAME)
+    return np.where(length[:, None] > SAME, arrivals(geometry, (here[0], here[1]), before), standing)
 
 
 def _swapped_note(run: Run, readings: list[Reading], arrays: _Arrays, points: np.ndarray) -> str:

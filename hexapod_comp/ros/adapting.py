@@ -13,8 +13,9 @@ from std_srvs.srv import Trigger
 
 from ..errors import CommandError, NoAnswerError
 from ..formats.paths import folder_of
+from ..measurements.collect import Observation
 from ..pose import Pose
-from .client import MoveState
+from .client import MoveError, MoveState
 from .collector import WatchedMachine
 
 ANSWERED_WITHIN = 60.0  # A model is read within 30 s, or refused
@@ -34,13 +35,18 @@ class AdaptedMachine(WatchedMachine):
     ) -> None:
         super().__init__(topic, namespace, mover, samples)
         self._going_on, self._compensator = going_on, compensator
+        self._arrived: MoveState | None = None  # at the target of the newest move,
+        self._target: tuple[Pose, tuple[Any, ...], dict[str, Any]]  # which was asked for so
         node = self._session.node
         self._reload_model = node.create_client(Trigger, f"{compensator}/reload_model")
         self._set = node.create_client(SetParameters, f"{compensator}/set_parameters")
         self._get = node.create_client(GetParameters, f"{compensator}/get_parameters")
 
     def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
-        """Move the tool and return when it has arrived; brake when it shall not go on: a MoveError, ``person``."""
+        """Move the tool and return when it has arrived; brake when it shall not go on: a MoveError, ``person``.
+
+        Where another client has the tool moved, wait until that has ended, and ask again.
+        """
         braked = False
 
         def watch(state: MoveState) -> None:
@@ -49,7 +55,33 @@ class AdaptedMachine(WatchedMachine):
                 braked = True
                 self._stop.call_async(Trigger.Request())
 
-        return super().move(pose, *arguments, **{"progress": watch, **options})
+        while True:
+            try:
+                self._arrived = super().move(pose, *arguments, **{"progress": watch, **options})
+            except MoveError as error:
+                if error.reason != "replaced":
+                    raise
+                self._wait_for_others()
+            else:
+                self._target = pose, arguments, options
+                return self._arrived
+
+    def _wait_for_others(self) -> None:
+        self._session.node.get_logger().warning("another client moves the tool: waiting until it stands")
+        while self.last.state not in ("idle", "arrived", "stopped"):
+            if not self._going_on():
+                raise MoveError("person", "stopped while another client moved the tool")
+            self._session.spin_once(0.02)
+
+    def observe(self) -> Observation | None:
+        """Observe as a watched machine; anew where another client has moved the tool meanwhile."""
+        while True:
+            seen = super().observe()
+            if self._arrived is None or self.last.request == self._arrived.request:
+                return seen
+            self._wait_for_others()
+            pose, arguments, options = self._target
+            self.move(pose, *arguments, **options)
 
     def reload(self, path: Path) -> None:
         """Have the compensator run a model file, by its ramp; where it refuses, the old model and its name stay."""

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, Vector3Stamped
 from rclpy.duration import Duration
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState, Temperature
 
 from ..errors import CommandError, HexapodError, NoAnswerError, shorten
@@ -21,7 +20,7 @@ from ..machine.temperatures import TEMPERATURE_RANGE, Temperatures
 from ..measurements.collect import Observation, RunSetUp
 from ..measurements.readings import ABSOLUTE_KINDS, LEAST_NOISE
 from ..measurements.set_up import KNOWN
-from ..pose import Pose, attitude_error
+from ..pose import Pose, middle_pose
 from .base import LATCHED_QOS, NEWEST_QOS, SENSOR_QOS
 from .client import Machine, MoveError, MoveState
 from .instrument import SET_UP_TOPIC
@@ -174,7 +173,8 @@ class WatchedMachine(Machine):
             return None
         pose, uncertainty, channels = None, np.full(6, math.nan), {}
         if self._wants_pose:
-            pose, uncertainty = self._middle_pose()
+            pose, off = middle_pose([pose for pose, _ in self._poses])
+            uncertainty = _median(off)[1]
         if self._own:
             middle, deviation = _median(np.array([read for read, _ in self._read]))
             channels = dict(zip(self._own, zip(middle.tolist(), deviation.tolist(), strict=True), strict=True))
@@ -193,15 +193,6 @@ class WatchedMachine(Machine):
     def _enough(self, count: int) -> bool:
         """Return whether everything that this run needs has been read so often."""
         return (not self._wants_pose or len(self._poses) >= count) and (not self._own or len(self._read) >= count)
-
-    def _middle_pose(self) -> tuple[Pose, np.ndarray]:
-        """Return the median of the poses, and its standard deviation (6,)."""
-        first = self._poses[0][0]
-        numbers = np.array(
-            [np.concatenate([p.position, attitude_error(p.rotation, first.rotation)]) for p, _ in self._poses]
-        )
-        middle, deviation = _median(numbers)
-        return Pose(middle[:3], Rotation.from_rotvec(middle[3:]).as_matrix() @ first.rotation), deviation
 
 
 def _median(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

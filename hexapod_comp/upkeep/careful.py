@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..measurements.collect import MeasuredMachine, Observation
-from ..pose import Pose, attitude_error
+from ..pose import Pose, middle_pose
 
 LOOKS = 3  # that read something, at each stop, at least; more where no majority of them agrees
 MOST = 8  # looks at a stop: a beam that is broken more often is broken
@@ -26,20 +25,17 @@ class Careful:
 
     def observe(self) -> Observation | None:
         """Return the median of three observations or more; None where fewer read anything."""
-        seen = list[tuple[Observation, Pose]]()
+        seen, poses = list[Observation](), list[Pose]()
         for _ in range(MOST):
             if (o := self._machine.observe()) is None or o.pose is None:
                 continue
-            seen.append((o, o.pose))
-            first = seen[0][1]
-            turns = [attitude_error(pose.rotation, first.rotation) for _, pose in seen]
-            numbers = np.array([[*pose.position, *turn] for (_, pose), turn in zip(seen, turns, strict=True)])
-            middle = np.median(numbers, axis=0)
-            stated = np.nanmax([np.median([o.uncertainty for o, _ in seen], axis=0), np.full(6, FINEST)], axis=0)
-            agree = (np.abs(numbers - middle) <= AGREE * stated).all(axis=1)
+            seen.append(o)
+            poses.append(o.pose)
+            middle, off = middle_pose(poses)
+            stated = np.nanmax([np.median([o.uncertainty for o in seen], axis=0), np.full(6, FINEST)], axis=0)
+            agree = (np.abs(off) <= AGREE * stated).all(axis=1)
             if len(seen) >= LOOKS and 2 * agree.sum() > len(seen):
                 break
         if len(seen) < LOOKS:
             return None
-        turned = Rotation.from_rotvec(middle[3:]).as_matrix() @ first.rotation
-        return seen[-1][0]._replace(pose=Pose(middle[:3], turned), uncertainty=stated)
+        return seen[-1]._replace(pose=middle, uncertainty=stated)

@@ -7,35 +7,53 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
+from ..calibration.assumptions import ASSUMED
+from ..calibration.parameters import ParameterSpace
 from ..calibration.posterior import FittedParameters
 from ..calibration.sensitivity import predict
-from ..measurements.campaign import Campaign, CampaignRun, line_run
-from ..measurements.readings import AXES, KINDS, MeasurementSet
+from ..machine.geometry import HexapodGeometry
+from ..machine.kinematics import Structure, strut_lengths_batch
+from ..measurements.campaign import Campaign, CampaignRun
+from ..measurements.readings import CHANNELS, KINDS, MeasurementSet
 
-POINTS = 3  # of a check line: two for what changes along it, a third for what bends
-INWARDS = 0.1  # Check lines lie inwards by a share of the box's sides up to this: no middle is where a strut turns back
+PLACES = 16  # of a check: each shows six numbers, and a strut's backlash in the direction in which it was reached
+CLEAR = max(ASSUMED.worn_backlash)  # A strut that has come further since it turned back has a direction, m
+SAMPLES, TRIES = 101, 32  # of a way at which struts are looked at; places that are tried, before the best is used
 BEYOND = 0.01  # A promise is broken where readings of a model that keeps it err so much in this share of checks
 DISPLACEMENTS = ("linear", "straightness", "position")
 
 
-def check_campaign(box: np.ndarray, level: np.ndarray, seed: int, lines: int = 1, name: str = "check") -> Campaign:
-    """Return the check readings of a box: lines along x, y and z through random places of it, and its body diagonals.
+def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, seed: int, name: str) -> CampaignRun:
+    """Return check readings of a box: the tool's pose at random places, each reached from the one before.
 
-    Each line along an axis is read in six channels, a diagonal in its length; both ways, so that backlash is known.
+    So every strut is read in both directions of its motion, on ways that no campaign has along its lines. On its way to
+    a place each strut goes further than its backlash after it has turned back: else it is in neither direction there.
     """
-    rng, low, size = np.random.default_rng([seed, 30]), box[0], np.ptp(box, axis=0)
-    runs: list[CampaignRun] = []
-    for axis, number in np.ndindex(3, lines):
-        place = low + size * rng.uniform(0.0, 1.0, 3)
-        ends = np.tile(place, (2, 1))
-        ends[:, axis] = low[axis] + size[axis] * np.array([0.0, 1.0] + rng.uniform(0.0, INWARDS, 2) * (1.0, -1.0))
-        runs.append(line_run(f"{name}: {AXES[axis]} line {number + 1}", "6-D", ends.round(6), POINTS, level))
-    for number, (x, y) in enumerate(((0, 0), (1, 0), (0, 1), (1, 1)), start=1):
-        corner = np.array([x, y, 0])
-        ends = low + size * np.array([corner, 1 - corner])
-        runs.append(line_run(f"{name}: diagonal {number}", "linear", ends.round(6), 2, level))
-    side = float(size.min())
-    return Campaign(box, side, side, instrument=None, diagonals=0, level=level, runs=tuple(runs))
+    rng, places = np.random.default_rng([seed, 30]), list[np.ndarray]()
+    while len(places) < PLACES:
+        drawn = rng.uniform(box[0], box[1], (TRIES, 3)).round(6)
+        clear = [_since_turning(geometry, places[-1], place, level) for place in drawn] if places else [np.inf]
+        places.append(drawn[next((n for n, way in enumerate(clear) if way >= CLEAR), int(np.argmax(clear)))])
+    return CampaignRun(name, "tracker_6d", np.array(places), np.tile(level, (PLACES, 1, 1)))
+
+
+def _since_turning(geometry: HexapodGeometry, start: np.ndarray, end: np.ndarray, level: np.ndarray) -> float:
+    """Return the least change of a strut's length on a straight way since it has turned back, m."""
+    way = np.linspace(start, end, SAMPLES)
+    lengths = strut_lengths_batch(
+        Structure.of(geometry), *geometry.platform_poses(way, np.tile(level, (SAMPLES, 1, 1))), threads=1
+    )
+    outwards = lengths[-1] > lengths[-2]
+    return float(np.where(outwards, lengths[-1] - lengths.min(axis=0), lengths.max(axis=0) - lengths[-1]).min())
+
+
+def check_campaign(
+    geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, seed: int, name: str = "check"
+) -> Campaign:
+    """Return the campaign that has check readings alone."""
+    side = float(np.ptp(box, axis=0).min())
+    runs = (check_run(geometry, box, level, seed, name),)
+    return Campaign(box, side, side, instrument=None, diagonals=0, level=level, runs=runs)
 
 
 @dataclass(frozen=True)
@@ -55,20 +73,20 @@ class Judgement:
 def judge_promise(fitted: FittedParameters, readings: MeasurementSet, promised: float) -> Judgement:
     """Return whether readings that a fit has not seen err by no more than it has promised, m, beside its model.
 
-    A displacement read along a line leaves its zero open, straightness its slope too. What is left after these has
-    variance promised²/3 + noise² where the promise is just kept: its sum has a χ² distribution.
+    What a promise does not include is free: where the machine stands as a whole, the zero of a displacement read along
+    a line, the slope of a straightness. What is left after these has variance promised²/3 + noise² where the promise is
+    just kept: its sum has a χ² distribution.
     """
-    kinds = np.array(KINDS)[readings.kind]
-    chosen = readings.select(np.isin(kinds, DISPLACEMENTS))
-    errors = predict(fitted.space, fitted.x, chosen.stations).errors[chosen.station]
-    left = chosen.value - (chosen.directions() * errors).sum(axis=1)
-    noise, along, squares, freedom, expected = chosen.stated * fitted.noise[chosen.kind], chosen.along(), 0.0, 0, 0.0
-    for run, channel in np.unique(np.column_stack([chosen.run, chosen.channel]), axis=0):
-        members = (chosen.run == run) & (chosen.channel == channel)
-        kind = KINDS[int(chosen.kind[members][0])]
-        unknown = np.zeros((int(members.sum()), 0))
-        if kind != "position":
-            unknown = np.vander(along[members], 1 + (kind == "straightness"), increasing=True)
+    chosen, directions, left, noise = _differences(fitted, readings, DISPLACEMENTS)
+    absolute, along, squares, freedom, expected = _of_kind(chosen, "position"), chosen.along(), 0.0, 0, 0.0
+    group = np.where(absolute, -1, len(CHANNELS) * chosen.run + chosen.channel)
+    for number in np.unique(group):
+        members = group == number
+        if number < 0:
+            unknown = _rigid(fitted.space, chosen, directions)[members]
+        else:
+            slope = KINDS[int(chosen.kind[members][0])] == "straightness"
+            unknown = np.vander(along[members], 1 + slope, increasing=True)
         rest = left[members] - unknown @ np.linalg.lstsq(unknown, left[members], rcond=None)[0]
         free = max(int(members.sum()) - unknown.shape[1], 0)
         squares += float(rest @ rest)
@@ -78,3 +96,55 @@ def judge_promise(fitted: FittedParameters, readings: MeasurementSet, promised: 
     most = float(chi2.ppf(1.0 - BEYOND, max(freedom, 1))) * allowed
     found = np.sqrt(max(3.0 * (squares - expected) / max(freedom, 1), 0.0))
     return Judgement(promised, float(found), squares / most)
+
+
+@dataclass(frozen=True)
+class Whole:
+    """Where base, workpiece and instrument stand to each other, by check readings."""
+
+    motion: np.ndarray  # (6,): of everything beside the model, m; turns by how far they move the farthest corner
+    error: float  # standard error of each, m
+
+    def moved(self, before: Whole) -> float:
+        """Return by how much everything has moved as a whole since other readings, m; 0 where noise explains it."""
+        way, error = float(np.linalg.norm(self.motion - before.motion)), np.hypot(self.error, before.error)
+        return way if way > ASSUMED.surely * np.sqrt(len(self.motion)) * error else 0.0
+
+
+def stands(fitted: FittedParameters, readings: MeasurementSet) -> Whole | None:
+    """Return where everything stands as a whole, which no model of the machine contains; None: no position was read."""
+    chosen, directions, left, noise = _differences(fitted, readings, ("position",))
+    if not len(left):
+        return None
+    unknown, size = (
+        _rigid(fitted.space, chosen, directions),
+        0.5 * float(np.linalg.norm(np.ptp(fitted.space.work_box, axis=0))),
+    )
+    unknown[:, 3:] /= size
+    motion, *_ = np.linalg.lstsq(unknown, left, rcond=None)
+    variance = max(float(np.mean(noise**2)), float(np.mean((left - unknown @ motion) ** 2)))
+    return Whole(motion, float(np.sqrt(variance * np.linalg.inv(unknown.T @ unknown).diagonal().max())))
+
+
+def _of_kind(readings: MeasurementSet, *kinds: str) -> np.ndarray:
+    return np.isin(np.array(KINDS)[readings.kind], kinds)
+
+
+def _differences(
+    fitted: FittedParameters, readings: MeasurementSet, kinds: tuple[str, ...]
+) -> tuple[MeasurementSet, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the readings of some kinds, their directions, and by how much they differ from the fit, beside noise."""
+    chosen = readings.select(_of_kind(readings, *kinds))
+    errors, directions = predict(fitted.space, fitted.x, chosen.stations).errors[chosen.station], chosen.directions()
+    return (
+        chosen,
+        directions,
+        chosen.value - (directions * errors).sum(axis=1),
+        chosen.stated * fitted.noise[chosen.kind],
+    )
+
+
+def _rigid(space: ParameterSpace, readings: MeasurementSet, directions: np.ndarray) -> np.ndarray:
+    """Return what a shift, m, and a turn about the box's centre, rad, do to each of some readings, (n, 6)."""
+    arms = readings.points()[readings.station] - space.places(space.work_box.mean(axis=0))
+    return np.concatenate([directions[:, :3], np.cross(arms, directions[:, :3])], axis=1)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,7 +31,7 @@ from ..calibration.check import (
     verification_report,
     verify_model,
 )
-from ..calibration.design import Goal, Proposal, propose, remarks
+from ..calibration.design import Goal, Proposal, Times, propose, remarks
 from ..calibration.fit import fit_model
 from ..calibration.parameters import FitSettings
 from ..calibration.posterior import FittedParameters
@@ -44,13 +44,14 @@ from ..machine.model_file import load_model
 from ..measurements.campaign import Campaign, campaign_text, load_campaign
 from ..measurements.collect import MeasuredMachine, SetUpError, collect
 from ..measurements.files import read_measurements
-from ..measurements.readings import MeasurementSet
+from ..measurements.readings import UNKNOWN, MeasurementSet
 from .careful import Careful
-from .checks import check_campaign, judge_promise
+from .checks import Whole, check_campaign, check_run, judge_promise, stands
 from .journal import JOURNAL, Event, Journal
 
 GIVEN = "given"  # in place of the name of a planned campaign
 IN_USE = "model.yaml"  # the adopted model, always under this name, its posterior beside it
+PROPOSED = "proposed.yaml"  # a later one, until somebody permits that it is run
 
 CAMPAIGNS = (
     3  # of a calibration, each planned where the fit of those before does not reach the goal; then it is refused
@@ -58,6 +59,7 @@ CAMPAIGNS = (
 PASSES = 3  # over a campaign, for stops at which the instrument read nothing
 PLANNED_SHARE = 0.7  # of the goal is planned for: a plan expects the RMS error, and the goal is the end of its interval
 FURTHER = 0.5  # of what was planned for before, where the readings have not been enough
+STOP = 5.0  # A stop takes it, s: a move, its settling and three looks; whatever it reads, nothing is put up for it
 CHECKS_OF_A_READING = 3  # checks in a row that a single wrong reading spoils: then the instrument is to be looked after
 
 # Changes that count though the promise is kept: something has happened. What else readings show (ageing, a bend,
@@ -335,14 +337,16 @@ class Adaptation:
         if state.stuck:
             return Outcome("changed", state.stuck, path)
         name = "in use" if state.reloaded else "proposed"
-        return Outcome(name, f"{self._promise(state.kept)}; borne out by {state.checks} later checks", path)
+        promise = f"{self._promise(state.kept)}; borne out by {state.checks} later checks"
+        last = next((e for e in reversed(self.events) if e["event"] == "checked"), {})
+        return Outcome(name, promise + moved_text(last), path)
 
     @staticmethod
     def _promise(size: float) -> str:
         return "no promise" if np.isnan(size) else f"tool error up to {size * 1e6:.2f} µm RMS (95 %), datum aligned"
 
     def _model_path(self) -> Path | None:
-        return self._folder / IN_USE if self.state.in_use else None
+        return self._folder / (PROPOSED if self._has(PROPOSED) else IN_USE) if self.state.in_use else None
 
     def _note(self, event: str, **content: Any) -> None:
         self.state = self.state.after(self._journal.add(event, **content))
@@ -393,13 +397,17 @@ class Adaptation:
             return
         self._say("planning a campaign")
         plan = self._proposal(PLANNED_SHARE * FURTHER**state.rounds)
-        write_text(self._folder / name, campaign_text(plan.campaign, remarks(plan)))
+        # At poses like a check's the fit learns where the machine stands, and what struts do on any way
+        poses = check_run(self._geometry, task.box, task.level, number, f"{len(plan.campaign.runs) + 1}: poses")
+        campaign = replace(plan.campaign, runs=(*plan.campaign.runs, poses))
+        write_text(self._folder / name, campaign_text(campaign, remarks(plan)))
         self._note("planned", number=number, campaign=name, expected_m=plan.worst)
 
     def _proposal(self, share: float) -> Proposal:
         """Return the plan for a share of the goal."""
         task = self._task
-        goal = Goal(share * (task.goal or 0.0), seconds=task.seconds, instruments=task.instruments)
+        times = dict.fromkeys(task.instruments, Times(0.0, 0.0, STOP))
+        goal = Goal(share * (task.goal or 0.0), seconds=task.seconds, instruments=task.instruments, times=times)
         place = MeasuringBox(self._geometry, task.box, task.level, 0.0)
         return propose(place, goal, task.settings, progress=self._say_or_stop)
 
@@ -440,7 +448,7 @@ class Adaptation:
         """Fit a model to all campaigns of this calibration."""
         state, task = self.state, self._task
         number, name = self._name("model", ".yaml")
-        measured = read_measurements([self._folder / part for part in state.readings], self._geometry)
+        measured = self._readings(state.readings)
         promised, short, report = None, "", ""
         try:
             fit = fit_model(measured, task.settings, self._say_or_stop)
@@ -466,16 +474,20 @@ class Adaptation:
         # A check that was stopped begins anew: whatever stopped it may have changed the machine
         (self._folder / name).unlink(missing_ok=True)
         self._say(f"checking {model}")
-        campaign = check_campaign(self._task.box, self._task.level, number, name=f"check {number}")
-        readings, missing = self._measured(campaign, name)
+        campaign = check_campaign(self._geometry, self._task.box, self._task.level, number, name=f"check {number}")
+        _, missing = self._measured(campaign, name)
         verification, fitted = self._verified(model, [name])
-        judged = None if np.isnan(promised) else judge_promise(fitted, readings, promised)
+        judged = None if np.isnan(promised) else judge_promise(fitted, verification.measurements, promised)
         kept = verification.verdict == VALID if judged is None else judged.kept
         spoilt = not kept and verification.verdict != VALID and verification.candidates[0].family == READING
         good = kept and not (verification.verdict == NAMED and verification.candidates[0].family in EVENTS)
+        whole = stands(fitted, verification.measurements)
         write_text(self._folder / f"{name}.report.txt", verification_report(verification))
         self._note(
             "checked",
+            stands_m=None if whole is None else whole.motion.tolist(),
+            stands_error_m=None if whole is None else whole.error,
+            moved_m=self._moved(model, whole),
             number=number,
             readings=name,
             model=model,
@@ -492,6 +504,14 @@ class Adaptation:
             ],
             text=happened(verification),
         )
+
+    def _moved(self, model: str, whole: Whole | None) -> float:
+        """Return by how much everything stands elsewhere as a whole than at the first check of a model, m."""
+        checks = (e for e in self.events if e["event"] == "checked" and e["model"] == model and e.get("stands_m"))
+        first = next(checks, None)
+        if whole is None or first is None:
+            return 0.0
+        return whole.moved(Whole(np.array(first["stands_m"]), first["stands_error_m"]))
 
     def _give_up(self) -> None:
         """End with a candidate that two checks contradict, or where an instrument spoils check after check."""
@@ -511,6 +531,11 @@ class Adaptation:
             reason = f"two sets of check readings that the fit has not seen contradict its model: {why}"
             self._note("refused", reason=reason)
 
+    def _readings(self, names: Sequence[str]) -> MeasurementSet:
+        """Return the readings of files, without stops that were reached from an unknown side: a run's first pose."""
+        measured = read_measurements([self._folder / name for name in names], self._geometry)
+        return measured.select(measured.direction != UNKNOWN)
+
     def _verified(self, model: str, readings: list[str]) -> tuple[Verification, FittedParameters]:
         """Return what readings say of a model, and what its fit knows."""
         path = self._folder / model
@@ -518,26 +543,34 @@ class Adaptation:
         fitted, unknown = load_posterior(machine_model, self._geometry, path)
         if fitted is None:
             raise CalibrationError("model", f"{path} cannot be checked: {unknown}")
-        measured = read_measurements([self._folder / name for name in readings], self._geometry)
+        measured = self._readings(readings)
         return verify_model(machine_model, fitted, measured), fitted
 
     def _adopt(self) -> None:
-        """Give the candidate the name of the model in use; with `reload` the compensator loads it."""
-        path = self._folder / self.state.candidate
-        model = load_model(path, self._geometry)
-        save_with_posterior(model, load_posterior(model, self._geometry, path)[0], self._folder / IN_USE)
-        self._note(
-            "adopted",
-            model=self.state.candidate,
-            promised_m=None if np.isnan(self.state.promised) else self.state.promised,
-        )
+        """Name the candidate as the model in use; where one is there already it is only proposed without permission."""
+        first = not self._has(IN_USE)
+        self._copy(self.state.candidate, IN_USE if first or self._reload is not None else PROPOSED)
+        promised = None if np.isnan(self.state.promised) else self.state.promised
+        self._note("adopted", model=self.state.candidate, promised_m=promised)
 
     def _bring_in(self) -> None:
         """Have the compensator run the model in use."""
         assert self._reload is not None
         self._say("reloading")
+        if self._has(PROPOSED):
+            self._copy(self.state.in_use, IN_USE)
+            (self._folder / PROPOSED).unlink()
         self._reload(self._folder / IN_USE)
         self._note("reloaded", model=self.state.in_use)
+
+    def _has(self, name: str) -> bool:
+        return (self._folder / name).exists()
+
+    def _copy(self, name: str, to: str) -> None:
+        """Write a model and its posterior under another name."""
+        path = self._folder / name
+        model = load_model(path, self._geometry)
+        save_with_posterior(model, load_posterior(model, self._geometry, path)[0], self._folder / to)
 
     def _repair(self) -> None:
         """Renew the model in use from the checks that contradict it, or begin a calibration where they cannot."""
@@ -580,6 +613,14 @@ class Adaptation:
             self._say(f"next check in {left:.0f} s")
             self._stop_if_asked("stopped between two checks")
             self._wait(min(left, 0.2))
+
+
+def moved_text(check: Event) -> str:
+    """Return what a check says of base, workpiece and instrument, after its other results; empty: nothing."""
+    if not check.get("moved_m") or not check["good"]:  # a changed strut moves everything too
+        return ""
+    size = f"{check['moved_m'] * 1e6:.1f} µm"
+    return f"; everything stands elsewhere as a whole, by {size}: base, workpiece or instrument has moved"
 
 
 def happened(verification: Verification) -> str:

@@ -97,7 +97,7 @@ def test_each_pass_begins_before_its_first_point(tmp_path: Path) -> None:
     collect(small(geometry, poses=0), geometry, machine, tmp_path / "out.csv")
     places = np.array([pose.position for pose in machine.went])
     first, second, third = places[:3]
-    assert np.linalg.norm(first - second) == pytest.approx(collecting.OVERRUN)
+    assert np.linalg.norm(first - second) == pytest.approx(collecting.APPROACH)
     assert (second - first) @ (third - second) > 0.0
     assert np.abs(np.cross(second - first, third - second)).max() < 1e-15
 

@@ -17,6 +17,7 @@ from strategies import paper_geometry
 
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.passes import Passes
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.files import read_measurements
 from hexapod_comp.measurements.readings import (
@@ -189,6 +190,26 @@ def test_directions_of_a_sequence_follow_from_the_row_before() -> None:
     moved = np.concatenate([np.diff(points, axis=0), np.diff(lengths_at(points), axis=0)], axis=1)
     assert (np.abs(moved[:, 3:]) > 1e-5).all(), "no strut stands still here: signs are no rounding"
     np.testing.assert_array_equal(found.stations.sense[1:], np.sign(moved.round(12)))
+
+
+def test_a_strut_that_turns_on_the_way_has_the_direction_in_which_it_arrives() -> None:
+    """From one side of the point below its base joint to the other it becomes shorter, then longer by less."""
+    joint = PAPER.base_joints[0, :2] - PAPER.platform_joints[0, :2]
+    across = np.array([-joint[1], joint[0]]) / np.linalg.norm(joint)
+    first, last = ((share * joint + way * across) * 1e3 for share, way in ((0.2, -0.06), (0.2, 0.03)))
+    found = tracked(at((*first, 420.0), (*last, 420.0)))
+    lengths = lengths_at(np.array([[*first, 420.0], [*last, 420.0]]) * 1e-3)[:, 0]
+    assert lengths[1] < lengths[0] - 1e-5, "shorter in all"
+    assert found.stations.sense[1, 3] == 1.0
+
+
+def test_at_the_point_where_it_turns_a_strut_has_the_direction_in_which_it_came() -> None:
+    """Both ways across the middle of a line that is at right angles to it: shorter and shorter until there."""
+    joint = PAPER.base_joints[0] - PAPER.platform_joints[0]
+    across = np.array([-joint[1], joint[0], 0.0]) / np.linalg.norm(joint[:2])
+    middle = np.array([[0.2 * joint[0], 0.2 * joint[1], 0.42]])
+    passes = Passes(PAPER, np.repeat(middle, 2, axis=0), np.tile(np.eye(3), (2, 1, 1)), np.array([across, -across]))
+    np.testing.assert_array_equal(passes.senses()[:, 3], [-1.0, -1.0])
 
 
 def test_a_place_reached_from_both_sides_is_two_stations() -> None:

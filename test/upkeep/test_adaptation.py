@@ -6,10 +6,13 @@ at points to which nothing was fitted (``held_out``). No ROS runs.
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,6 +32,7 @@ from hexapod_comp.measurements.campaign import Campaign
 from hexapod_comp.measurements.collect import Observation
 from hexapod_comp.pose import Pose
 from hexapod_comp.upkeep import loop as upkeep
+from hexapod_comp.upkeep.checks import CLEAR, check_run
 from hexapod_comp.upkeep.journal import Journal
 from hexapod_comp.upkeep.loop import Adaptation, State, Task, begun_with, next_step
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
@@ -57,7 +61,8 @@ class Rig:
         self.geometry = geometry or load_geometry("paper")
         self.folder, place = folder, demo_place(self.geometry)
         side = float(np.ptp(place.box, axis=0).min())
-        campaign = Campaign(place.box, side, side, "6-D", 4, level=place.attitude)
+        poses = check_run(self.geometry, place.box, place.attitude, 0, "poses")
+        campaign = Campaign(place.box, side, side, "6-D", 4, level=place.attitude, runs=(poses,))
         self.machine = VirtualMachine(self.geometry, drawn(self.geometry, seed), Instrument(), seed)
         self.task = Task(place.box, place.attitude, campaign=campaign, settings=FitSettings(blocks=BLOCKS), every=0.0)
         self.reloaded: list[Path] = []
@@ -215,23 +220,22 @@ def test_a_model_that_its_check_readings_contradict_is_refused(again: Rig) -> No
 def test_a_goal_that_three_campaigns_do_not_reach_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each further campaign is planned for less; nothing is measured here."""
     rig = Rig(tmp_path / "made")
-    rig.task = replace(rig.task, goal=1e-6, campaign=None)
     planned: list[float] = []
+    plan = SimpleNamespace(campaign=rig.task.campaign, worst=1e-6)
+    rig.task = replace(rig.task, goal=1e-6, campaign=None)
 
-    class Plan:
-        campaign, worst = None, 1e-6
-
-    def propose(place: object, goal: Any, settings: object, progress: object) -> Plan:
+    def propose(place: object, goal: Any, settings: object, progress: object) -> Any:
         planned.append(goal.error)
-        return Plan()
+        return plan
 
     def too_few(*_: object) -> None:
         raise CalibrationError("measurements", "are too few")
 
     for name, stand_in in (("propose", propose), ("fit_model", too_few)):
         monkeypatch.setattr(upkeep, name, stand_in)
-    for name in ("remarks", "load_campaign", "read_measurements"):
+    for name in ("remarks", "load_campaign"):
         monkeypatch.setattr(upkeep, name, lambda *_: None)
+    monkeypatch.setattr(Adaptation, "_readings", lambda *_: None)
     monkeypatch.setattr(upkeep, "campaign_text", lambda *_: "")
     monkeypatch.setattr(Adaptation, "_measured", lambda *_: ((), ()))
     outcome = rig.loop().calibrate()
@@ -260,6 +264,53 @@ def test_a_knocked_strut_is_named_and_repaired(again: Rig) -> None:
     cut(again, names.index("adopted", 8), b"{")  # killed when the repair had been checked
     assert again.loop().guard(0).state == "in use"
     assert (again.names(), again.left()) == (names, pytest.approx(after))
+
+
+def test_a_moved_instrument_is_reported_and_no_machine_follows_it(again: Rig, monkeypatch: Any) -> None:
+    """A tracker pushed by 30 µm: everything moves as a whole, which is no error of the machine. Put back, it is not."""
+    pushed = Pose([20e-6, -10e-6, 20e-6], np.eye(3))
+    observe, files = again.machine.observe, (again.folder / "model.yaml").read_bytes()
+
+    def moved() -> Observation | None:
+        seen = observe()
+        return None if seen is None or seen.pose is None else seen._replace(pose=pushed @ seen.pose)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(again.machine, "observe", moved)
+        outcome = again.loop().guard(1)
+    assert outcome.state == "in use"
+    said = r"everything stands elsewhere as a whole, by ([\d.]+) µm: base, workpiece or instrument has moved"
+    found = re.search(said, outcome.text)
+    assert found is not None
+    assert float(found.group(1)) == pytest.approx(30.0, abs=0.5)
+    assert (again.folder / "model.yaml").read_bytes() == files
+    assert "elsewhere" not in again.loop().guard(1).text
+
+
+def test_a_repair_without_permission_leaves_the_model_that_the_machine_runs(again: Rig) -> None:
+    """Its file is what a restarted compensator reads; whoever permits it gets the repaired one there."""
+    before, path = again.left(), again.folder / "model.yaml"
+    running = path.read_bytes()
+    again.machine.knock(4, 20e-6)
+    outcome = again.loop(may_reload=False).guard(1)
+    assert (outcome.state, outcome.model) == ("proposed", again.folder / "proposed.yaml")
+    assert path.read_bytes() == running
+    assert again.loop().guard(0).model == path
+    assert not (again.folder / "proposed.yaml").exists()
+    assert again.left() <= 1.5 * before
+
+
+def test_struts_arrive_at_check_places_in_a_clear_direction(tmp_path: Path) -> None:
+    """By the machine's own closed-form lengths: on the last of each way no strut is nearer to where it turned."""
+    for machine in machines().values():
+        geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
+        place = demo_place(geometry)
+        run = check_run(geometry, place.box, place.attitude, 3, "check")
+        for start, end in pairwise(run.positions):
+            way = start + np.linspace(0.0, 1.0, 400)[:, None] * (end - start)
+            lengths = machine.lengths(machine.platforms(way), np.tile(machine.level(), (400, 1, 1)))
+            extreme = np.where(lengths[-1] > lengths[-2], lengths.min(axis=0), lengths.max(axis=0))
+            assert np.abs(lengths[-1] - extreme).min() >= 0.99 * CLEAR
 
 
 def test_a_machine_that_few_readings_cannot_repair_is_calibrated_anew_by_a_person(again: Rig) -> None:
