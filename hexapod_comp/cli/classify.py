@@ -74,7 +74,7 @@ def classify(args: argparse.Namespace) -> int | Result:
 
         page = Path(args.pictures) / "page.html"
         try:
-            write_page(page, geometry, page_data(study, bodies(), names, "orientation"))
+            write_page(page, geometry, page_data(study, bodies(), names))
             results.mention(args, f"page: {page}")
         except InputFileError:
             raise

@@ -34,9 +34,9 @@ class Comparison:
 
     passes: int  # Poses times directions that were driven
     before: Size  # 3-D displacement error, m
-    after: Size  # 3-D displacement error, m
+    after: Size
     before_rotation: Size  # Rotation error, rad
-    after_rotation: Size  # Rotation error, rad
+    after_rotation: Size
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,8 @@ def different_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 class Size:
     """Size of a set of vectors."""
 
-    rms: float  # Root mean square and largest length of the vectors
-    largest: float  # Root mean square and largest length of the vectors
+    rms: float  # root mean square length
+    largest: float
 
     @staticmethod
     def of(vectors: np.ndarray) -> Size:

@@ -37,7 +37,7 @@ class Structure:
     """Places of the twelve joints: the nominal machine's, or the real one's."""
 
     base_joints: np.ndarray  # (6, 3): joint centres in ``base`` and in ``platform``, m
-    platform_joints: np.ndarray  # (6, 3): joint centres in ``base`` and in ``platform``, m
+    platform_joints: np.ndarray  # (6, 3)
     characteristic_length: float  # Length that makes the condition number unit-free, m
     home_sign: float  # Sign of det J in the working assembly mode
     max_condition: float  # Largest condition number accepted as a solution

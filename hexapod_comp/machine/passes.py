@@ -27,7 +27,7 @@ class Passes:
 
     geometry: HexapodGeometry  # The nominal machine
     positions: np.ndarray  # (N, 3): commanded ``pose_platform_in_base``, m
-    rotations: np.ndarray  # (N, 3, 3): commanded ``pose_platform_in_base``, m
+    rotations: np.ndarray  # (N, 3, 3)
     directions: np.ndarray  # (N, 3): directions of travel in ``base``; length does not matter
 
     def __len__(self) -> int:

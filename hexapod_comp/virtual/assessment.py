@@ -101,7 +101,7 @@ def _run_machine(
     real, modelled = model_commands(machines, passes.poses, unknown, name_of)
     driven = drive(machines, passes.poses, unknown, ideal, name_of)
     taken = machine.geometry.tool_poses(*driven.actual)
-    # The start is 1 mm off, so that Newton has something to do.
+    # The start is 1 mm off: the solution itself would be no test.
     back = drive(machines, (modelled[0] + 1e-3, modelled[1]), unknown, real, name_of)
     trip = back.errors(passes.poses, np.zeros(3)).as_array().reshape(-1, 2, 3)
     errors = np.hstack([taken[0] - tool[0], attitude_error(taken[1], tool[1])])

@@ -62,7 +62,7 @@ class ImperfectionBounds:
     # true: platform joints that coincide nominally are one ball joint and move together. False: each strut has a joint
     # of its own.
     shared_platform_joints: bool = True
-    harmonics: tuple[float, float] = (0.0, 0.0)  # the same of the errors that repeat two, three and four times a turn
+    harmonics: tuple[float, float] = (0.0, 0.0)  # amplitudes of the second to fourth harmonic, m
     wear: float = 0.0  # largest additional lost motion of a strut, m, where its screw is worn most
 
     def __post_init__(self) -> None:

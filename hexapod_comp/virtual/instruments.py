@@ -43,7 +43,7 @@ def measure(
     seed: int,
     advance: Callable[[int], object] = lambda stations: None,
 ) -> MeasurementSet:
-    """Return a template's readings as instruments would take them on the real machine.
+    """Return the readings of a template that instruments would give on the real machine.
 
     value = w · (e + where the machine happened to stop) − the same at the run's first reading of that channel
     + slope of the straightness beam × way along the line + noise of the instrument. Positions and attitudes are
@@ -91,7 +91,7 @@ def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet
 
 
 def _station_name(measurements: MeasurementSet, station: int) -> str:
-    """Return the index of each station's first reading."""
+    """Return a station's name for messages: the run, the number of its first reading, and its place."""
     reading = int((measurements.station == station).argmax())
     position = (measurements.stations.positions[station] * 1e3).round(3).tolist()
     run = measurements.runs[measurements.run[reading]].name
@@ -137,7 +137,7 @@ def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
 
 
 def _beams(template: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
-    """Return the contribution of misaligned beams, each by a draw, to straightness, per rad, shape (N,), m.
+    """Return what beams that are misaligned by a random slope add to straightness, per rad, shape (N,), m.
 
     A square is turned by one draw about each axis of the work frame, for all runs that share its slope.
     """
@@ -161,20 +161,20 @@ PARALLEL = 1.0 - 1e-9  # cosine from which a line is parallel to an axis of the 
 
 @dataclass(frozen=True)
 class LiveFlaws:
-    """How a live instrument errs."""
+    """Errors of a live instrument."""
 
-    length_noise: float = 1e-6  # standard deviation of what it reads, m
-    angle_noise: float = 1e-6  # rad
+    length_noise: float = 1e-6  # standard deviation of a length, m
+    angle_noise: float = 1e-6  # standard deviation of an angle, rad
     beam_slope: float = Campaign.beam_slope  # 1 σ of a straightness beam's unknown slope, rad
-    centre_off: float = Campaign.centre_off  # 1 σ of a centre of lengths beside its place, each axis, m
-    wild_share: float = 0.0  # share of readings that are wild
-    wild_size: float = 1e-3  # by so much, m or rad
-    scale: float = 1.0  # of what it reads: −1 reverses its sign, 1000 has it read mm
-    exchanged: bool = False  # its first two channels are
+    centre_off: float = Campaign.centre_off  # 1 σ of the offset of a centre of lengths along each axis, m
+    wild_share: float = 0.0  # share of readings that are outliers
+    wild_size: float = 1e-3  # size of an outlier, m or rad
+    scale: float = 1.0  # factor of every reading: −1 reverses its sign, 1000 gives mm in place of m
+    exchanged: bool = False  # whether its first two channels are exchanged
 
 
 class LiveInstrument:
-    """What an instrument reads of a tool that is seen moment by moment, with the signs and zeros of :func:`measure`.
+    """An instrument that reads the pose of a moving tool, with the signs and zeros of :func:`measure`.
 
     A laser and a ball bar are set up for each run and count from where they are then; a tracker stands at a place.
     """
@@ -214,11 +214,11 @@ class LiveInstrument:
         self.zero()
 
     def zero(self) -> None:
-        """Count from where the tool is seen next."""
+        """Set the zero to the next pose that is read."""
         self._start: Pose | None = None
 
     def read(self, tool: Pose) -> dict[str, float]:
-        """Return what is read of the tool's pose in ``base`` by a laser or ball bar; nothing before it is set up."""
+        """Return the channels of a laser or ball bar at a tool pose in ``base``; none before it is set up."""
         if self._place is None or self.kind == TRACKER:
             return {}
         self._start = start = self._start or tool
@@ -235,7 +235,7 @@ class LiveInstrument:
         return dict(zip(self.channels, values.tolist(), strict=True))
 
     def pose(self, tool: Pose) -> Pose:
-        """Return where a tracker sees the tool, in its own frame."""
+        """Return the tool pose that a tracker reads, in the tracker's frame."""
         own = self._to_own @ tool
         away = np.array([self._noise("position") for _ in AXES])
         turn = np.array([self._noise("attitude") for _ in AXES])
@@ -245,7 +245,7 @@ class LiveInstrument:
         return Pose(position, Rotation.from_rotvec(turn).as_matrix() @ own.rotation)
 
     def _noise(self, channel: str) -> float:
-        """Return by how much a reading is off."""
+        """Return the error of one reading: noise and, at times, an outlier."""
         angular = channel.partition("_")[0] in ANGULAR_KINDS
         noise = (self.flaws.angle_noise if angular else self.flaws.length_noise) * self._rng.standard_normal()
         wild = self._rng.random() < self.flaws.wild_share

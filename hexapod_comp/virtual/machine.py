@@ -124,7 +124,7 @@ class StrutDrive:
         self._follow_commanded_point()
 
     def advance(self, dt: float) -> None:
-        """Let time pass and read the encoders once at its end."""
+        """Advance time by dt, s, and read the encoders once at its end."""
         if not 0.0 <= dt <= LONGEST_ADVANCE:
             raise ModelError("dt", f"must lie within 0…{LONGEST_ADVANCE:g} s", dt)
         self._left_over += dt
@@ -187,7 +187,7 @@ class StrutDrive:
         return self._blanked(self._lengths)
 
     def encoder_speeds(self) -> np.ndarray:
-        """Return the difference quotient of the last two readings, m/s, shape (6,), as old as they are."""
+        """Return the difference quotient of the last two readings, m/s, shape (6,)."""
         return self._blanked(self._speeds)
 
     def motor_lengths(self) -> np.ndarray:

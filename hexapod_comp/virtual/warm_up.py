@@ -27,7 +27,7 @@ from .instruments import compensated, measure
 
 WARM_UP_FORMAT, WARM_UP_VERSION = "hexapod_comp/warm_up", 1
 SENSED = (*PARTS, HUMIDITY)  # Quantities with a course, in the order of every array of nine
-POINTS = 9  # Of each line that is measured again
+POINTS = 9  # points of each line that is measured again
 # Largest spread of the struts of one machine (standard deviation): beyond, one of them may run backwards in time
 MOST_APART = 0.2
 LONGEST = 1_000_000  # A warm-up of more seconds is a season
@@ -36,7 +36,7 @@ APART, NOISE = 20, 17  # Streams of random numbers: how struts differ, and what 
 
 @dataclass(frozen=True)
 class WarmUp:
-    """How a machine warms, and the readings meanwhile."""
+    """How a machine warms up, and how it is measured meanwhile."""
 
     rise: np.ndarray  # (9,): final rise of each part, K, and the humidity, a fraction
     time_constants: np.ndarray  # (9,): s
@@ -44,11 +44,9 @@ class WarmUp:
     # parts that have a thermometer, and ``humidity`` for a hygrometer. Others are read as at 20 °C, or not at all.
     sensors: tuple[str, ...] = PARTS
     noise: tuple[float, float] = (0.05, 0.01)  # standard deviation of a reading once a second, K, and of the humidity
-    # how often the three lines are measured before the power is on: without, growth takes up whatever a model of the
-    # campaign gets wrong on them
+    # rounds of the three lines before the power is on: without them, errors of a model on these lines count as growth
     cold_rounds: int = 1
-    # how often the three lines are measured; how long after each other, s, and how long a reading takes, s. A round
-    # begins when half of its time is over.
+    # rounds of the three lines; time from one to the next, s, and of one reading, s. A round begins at half of its time
     rounds: int = 18
     every: int = 600
     pace: int = 4

@@ -59,9 +59,9 @@ Row = tuple[int, np.ndarray, tuple[float, ...], str]  # Part, struts (6,), vecto
 class SourceType:
     """A type of error that a budget may contain."""
 
-    name: str  # Key in the budget file, without its unit
+    name: str  # key in the budget file, without its unit
     dimension: str  # Kind of unit of its size
-    title: str  # What people read
+    title: str  # in reports
     # From a size in SI and the struts that end in each platform joint, shape (joints, 6), to the single errors
     make: Callable[[float, np.ndarray], Iterable[Row]]
 

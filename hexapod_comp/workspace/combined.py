@@ -114,8 +114,8 @@ class Allocation:
 
     method: str  # ``rss`` or ``worst_case``
     allowed: float  # Allowed error of the tool at the worst pose, m
-    combined: float  # The sum of the unchanged budget there
-    pose: int  # The worst pose's number
+    combined: float  # combined error of the unchanged budget there, m
+    pose: int  # number of the worst pose
     scale: float  # Largest factor that all sizes may be multiplied by
     # (K,): largest factor of each type with the others unchanged: ∞ if it has no effect, NaN if the others alone are
     # too much

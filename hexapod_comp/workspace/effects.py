@@ -35,7 +35,7 @@ class Extremes:
     at_pose: np.ndarray  # (K, 4): number of the pose; −1 for none
     at_error: np.ndarray  # (K, 4): which single error
     positions: np.ndarray  # (K, 4, 3): that pose, ``pose_platform_in_base``, m
-    rotations: np.ndarray  # (K, 4, 3, 3): that pose, ``pose_platform_in_base``, m
+    rotations: np.ndarray  # (K, 4, 3, 3)
     failed: np.ndarray  # (K,): number of effects without a certified solution, which are left out
     poses: int  # Number of poses
 

@@ -27,12 +27,12 @@ from .reach import (
 
 MOST_TILT = np.radians(90.0)  # Largest tilt that is searched, rad
 TILT_STEPS = 361  # Steps from zero to there
-TURN = np.radians(5.0)  # By which a tool turns about x, y or z, rad
+TURN = np.radians(5.0)  # turn of the tool for which missing axes of cardan joints are assessed, rad
 
 
 @dataclass(frozen=True)
 class Overview:
-    """Overview of a machine."""
+    """Frames, reach and boxes of a machine."""
 
     geometry: HexapodGeometry  # The machine
     reach: Reach  # Its reach with the tool as at home

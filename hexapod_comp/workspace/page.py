@@ -15,11 +15,12 @@ from ..formats.outputs import write_text
 from ..formats.pages import render
 from ..machine.geometry import HexapodGeometry
 from .pictures import VIEW_AZIMUTH, VIEW_ELEVATION, WEDGE, outline
-from .shells import ROTATION, TRANSLATION, Quantity, Shell
+from .shells import ROTATION, TRANSLATION, Shell
 from .study import LAYERS, Study, mesh_effects
 
 # Of values, two each, and coordinates, four each; as text a third more: with plotly's 5 MB the page stays below 15
 MOST_BYTES = 7_000_000
+QUANTITIES = (TRANSLATION, ROTATION)
 LEVELS = 65535  # Steps of a stored value between the ends of its colour scale
 
 
@@ -28,18 +29,15 @@ class PageData:
     """Content of the page."""
 
     title: str  # Headline: the machine
-    note: str  # Description of the page and of the method; one paragraph
     # Each error's type and part, such as ("screw pitch ±20 µm", "strut 1"); errors of a type share a colour scale
     errors: Sequence[tuple[str, str]]
-    quantities: Sequence[Quantity]  # Such as translation and rotation
-    frame_title: str  # Parameters of the slider, such as "tilt about x"
-    frames: Sequence[str]  # Its positions
+    frames: Sequence[str]  # Orientations, the positions of the slider
     layers: Sequence[str]  # Names of the nested shells, inside to outside
     points: np.ndarray  # (F, S, H, A, 3): their meshes per frame, m in the work frame
     values: np.ndarray  # (F, E, Q, S, H, A): SI
 
     def __post_init__(self) -> None:
-        counts = tuple(len(part) for part in (self.frames, self.errors, self.quantities, self.layers))
+        counts = tuple(len(part) for part in (self.frames, self.errors, QUANTITIES, self.layers))
         wanted = (*counts, *self.points.shape[2:4])
         if 0 in counts or self.points.shape != (counts[0], counts[3], *wanted[4:], 3) or self.values.shape != wanted:
             shapes = f"points {self.points.shape}, values {self.values.shape}"
@@ -53,18 +51,12 @@ class PageData:
                 raise GeometryError(f"page.{name}", "must be finite")
 
 
-def page_data(study: Study, bodies: tuple[Shell, ...], frames: tuple[str, ...], frame_title: str) -> PageData:
+def page_data(study: Study, bodies: tuple[Shell, ...], frames: tuple[str, ...]) -> PageData:
     """Return the content of the interactive page: one frame for each orientation."""
     meshes, errors = [mesh_effects(study, body) for body in bodies], study.errors
     return PageData(
         title=f"{study.geometry.name}: effect of single errors on the tool",
-        note=(
-            "Each shell is the boundary of the workspace at one orientation of the tool, or a smaller one inside it, "
-            "coloured by how far one error alone moves or turns the tool there (exact, not to first order)."
-        ),
         errors=[(errors.kinds[kind], label) for kind, label in zip(errors.kind, errors.labels, strict=True)],
-        quantities=(TRANSLATION, ROTATION),
-        frame_title=frame_title,
         frames=frames,
         layers=tuple(f"{100 * fraction:.0f} %" for fraction in LAYERS),
         points=np.stack([points for points, _ in meshes]),
@@ -85,8 +77,6 @@ def page_text(geometry: HexapodGeometry, data: PageData) -> str:
     return render(
         "shells.html",
         title=data.title,
-        note=data.note,
-        frame_title=data.frame_title,
         data=Markup(content.replace("<", "\\u003c")),  # no text of the data can end the script
         plotly=Markup(_plotly_script()),
     )
@@ -105,7 +95,7 @@ def _content(geometry: HexapodGeometry, data: PageData) -> dict[str, object]:
     codes, scales = _coded(data)
     return {
         "errors": [list(error) for error in data.errors],
-        "quantities": [[quantity.name, quantity.unit] for quantity in data.quantities],
+        "quantities": [[quantity.name, quantity.unit] for quantity in QUANTITIES],
         "frames": list(data.frames),
         "layers": list(data.layers),
         "mesh": list(data.points.shape[2:4]),
@@ -120,7 +110,7 @@ def _content(geometry: HexapodGeometry, data: PageData) -> dict[str, object]:
 
 def _coded(data: PageData) -> tuple[np.ndarray, np.ndarray]:
     """Return the values as 16-bit integers, and the least value and step of each scale, (E, Q, 2), in shown units."""
-    factors = np.array([quantity.factor for quantity in data.quantities])
+    factors = np.array([quantity.factor for quantity in QUANTITIES])
     low = data.values.min(axis=(0, 3, 4, 5)) * factors
     high = data.values.max(axis=(0, 3, 4, 5)) * factors
     types = np.array([kind for kind, _ in data.errors])

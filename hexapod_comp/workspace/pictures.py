@@ -28,13 +28,12 @@ from .shells import ROTATION, TRANSLATION, Layer, Quantity, shell
 from .study import RINGS, SECTORS
 
 COLOURS = "viridis"  # Colour map of effects: perceptually uniform, also in grey and for the colour-blind
-# Of the findings, in their order
+# colours of the findings, in their order
 CAUSE_COLOURS = ("#ffffff", "#20639b", "#c1432e", "#e3a72f", "#3c8d5a", "#7b4ea3", "#444444", "#d77fb3", "#000000")
 VIEW_AZIMUTH, VIEW_ELEVATION = -60.0, 20.0  # Direction of view, degrees
 BOX = "#d77f00"  # colour of the largest box
-SHADOW = "#dbe4ee"  # colour of a reach that a machine stands in
-# Angle by which the outermost of several shells is cut open towards the viewer, degrees; inner ones less, the innermost
-# not
+SHADOW = "#dbe4ee"  # colour of the reach behind the machine
+# Wedge that is cut out of the outermost shell towards the viewer, degrees; inner shells have less, the innermost none
 WEDGE = 130.0
 
 

@@ -127,7 +127,7 @@ def _finite(vectors: np.ndarray) -> np.ndarray:
 
 
 def random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return platform poses picked from all reaches alike, (n, 3), m, and (n, 3, 3); all where there are few."""
+    """Return platform poses drawn from all reaches, (n, 3), m, and (n, 3, 3); all of them where there are fewer."""
     sizes = np.array([int(one.within.sum()) for one in reaches])
     first = np.cumsum([0, *sizes])
     chosen = np.random.default_rng(seed).choice(first[-1], min(count, first[-1]), replace=False)
@@ -246,7 +246,7 @@ def _on_cluster(parts: Iterable[Part], scheduler: str) -> Iterator[Extremes]:
 
 # What a classification prints.
 
-EACH = ("alone", "only", "without", "equal")  # What an allocation says of each type
+EACH = ("alone", "only", "without", "equal")  # figures of an allocation for each type
 
 
 def report(study: Study, names: Sequence[str]) -> str:
@@ -271,7 +271,7 @@ def _reach_table(study: Study, names: Sequence[str]) -> str:
 
 
 def _combined_text(study: Study) -> str:
-    """Return what the whole budget adds up to."""
+    """Return the combined errors of the whole budget."""
     combined, drawn = study.combined, study.combined.monte_carlo
     rows = [
         ("worst case", *_both(combined.worst_case), ""),
@@ -310,7 +310,7 @@ def _allocation_text(study: Study, allocation: Allocation) -> str:
 
 
 def _may_be(now: float, factor: float, none: str = "") -> str:
-    """Return what a size may grow or must shrink to."""
+    """Return the allowed size, by its factor."""
     return none if np.isnan(factor) else "anything" if np.isinf(factor) else number(now * factor, 2)
 
 

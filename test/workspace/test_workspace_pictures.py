@@ -19,7 +19,6 @@ from hexapod_comp.errors import GeometryError, HexapodError
 from hexapod_comp.formats.figures import save
 from hexapod_comp.workspace.page import MOST_BYTES, PageData, page_text, write_page
 from hexapod_comp.workspace.pictures import (
-    ROTATION,
     TRANSLATION,
     Layer,
     outline,
@@ -122,10 +121,7 @@ def page_data(title: str = "unit & errors @NOTE@", **other: object) -> PageData:
     values = np.linspace(1e-6, 9e-6, 2 * 3 * 2 * 2 * RINGS * (SECTORS + 1)).reshape(2, 3, 2, 2, RINGS, SECTORS + 1)
     given = {
         "title": title,
-        "note": "</script> is no end",
         "errors": TYPES,
-        "quantities": (TRANSLATION, ROTATION),
-        "frame_title": "tilt about x",
         "frames": ("−5°", "</script>5°"),
         "layers": ("60 %", "100 %"),
         "points": points,
