@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,8 @@ from ..machine.trajectory import join
 from ..pose import Pose
 
 NICENESS = 10  # Commands come first
+
+Situation = tuple[str, Temperatures, Loading, dict[str, float]]  # tool, temperatures, load, outside numbers
 
 
 def load_model(name: str, place: str, folder: str | None, machine: str) -> tuple[MachineModel, Source]:
@@ -55,24 +56,21 @@ class Machine:
         self._fitted: Any = None
         self._at: Any = None
 
-    def predict(
-        self,
-        platform: Pose,
-        sense: np.ndarray,
-        tool: str,
-        warmth: Temperatures,
-        loading: Loading,
-        outside: dict[str, float],
-    ) -> dict[str, Any]:
+    def real(self, now: Situation, work: str | None = None) -> RealMachine:
+        """Return the machine in a situation."""
+        tool, warmth, loading, outside = now
+        return RealMachine(self.geometry.using(tool, work), self.model.at(outside), warmth, loading)
+
+    def predict(self, platform: Pose, sense: np.ndarray, now: Situation) -> dict[str, Any]:
         """Return the errors ``standing`` and ``aligned`` at a pose: values and covariance, None if not known."""
         from ..calibration.posterior import ErrorPredictor  # an import of one second that only this job needs
         from ..calibration.posterior_file import load_posterior
 
         if self._fitted is None:
             self._fitted = load_posterior(self.model, self.geometry, self._source.name, self._opener)
-        if self._at != (at := (tool, warmth.snapshot(), loading, outside)):
-            machine = RealMachine(self.geometry.using(tool=tool), self.model.at(outside), warmth, loading)
-            self._predictor, self._at = ErrorPredictor(machine, self._fitted[0]), at
+        tool, warmth, *others = now
+        if self._at != (at := (tool, warmth.snapshot(), *others)):
+            self._predictor, self._at = ErrorPredictor(self.real(now), self._fitted[0]), at
         errors = self._predictor.predict((platform.position[None], platform.rotation[None]), sense[None])
         found: dict[str, Any] = dict.fromkeys(("standing", "aligned"))
         for name, error in zip(found, errors, strict=True):
@@ -80,19 +78,10 @@ class Machine:
                 found[name] = error.values[0], None if error.covariance is None else error.covariance[0]
         return found
 
-    def travel(
-        self,
-        pose: Pose,
-        tool: str,
-        work: str,
-        warmth: Temperatures,
-        loading: Loading,
-        outside: dict[str, float],
-        enabled: bool,
-    ) -> tuple[str, dict]:
+    def travel(self, pose: Pose, work: str, enabled: bool, now: Situation) -> tuple[str, dict]:
         """Return the travel of a tool from a pose in a frame: a text, and values by their keys."""
-        geometry = self.geometry.using(tool, work)
-        ways = travel(RealMachine(geometry, self.model.at(outside), warmth, loading), pose, geometry.work, enabled)
+        machine = self.real(now, work)
+        ways = travel(machine, pose, machine.geometry.work, enabled)
         stops = {f"{one.way} stops at": str(one.error or "") for one in ways}
         return travel_text(ways), {**{one.key: f"{one.shown:.6f}" for one in ways}, **stops}
 
@@ -143,12 +132,7 @@ class Jobs:
             if task == "load_model":
                 return "", load_model(**arguments)
             self._machine = self._machine or Machine(**self._made_of)
-            tasks: dict[str, Callable[..., Any]] = {
-                "predict": self._machine.predict,
-                "travel": self._machine.travel,
-                "plan_move": self._machine.plan_move,
-            }
-            return "", tasks[task](**arguments)
+            return "", getattr(self._machine, task)(**arguments)  # predict, travel or plan_move
         except (HexapodError, OSError) as error:
             return str(error), None
         except Exception as error:  # otherwise the process would end without a message

@@ -266,15 +266,14 @@ def file_errors(path: str | Path) -> Iterator[None]:
 
 
 class Kind:
-    """How a key's value is taken from a section."""
+    """How a key's value is taken from a section; `take` gets the section and the key's name."""
+
+    def __init__(self, take: Callable[[Section, str], Any]) -> None:
+        self.take = take
 
     def read(self, section: Section, name: str, default: Any) -> Any:
         """Return the value of a key; the default if it is absent, unless that is MISSING."""
-        return default if default is not MISSING and name not in section else self.parse(section, name)
-
-    def parse(self, section: Section, name: str) -> Any:
-        """Return the value of a required key."""
-        raise NotImplementedError
+        return default if default is not MISSING and name not in section else self.take(section, name)
 
 
 @dataclass(frozen=True)
@@ -291,7 +290,7 @@ class Numbers(Kind):
             return default
         return super().read(section, name, MISSING if self.unit else default)
 
-    def parse(self, section: Section, name: str) -> Any:
+    def take(self, section: Section, name: str) -> Any:  # type: ignore[override]
         if isinstance(self.shape, str):
             read_in = section.per_strut if self.shape == PER_STRUT else section.pairs_per_strut
             return read_in(name, DIMENSIONS[self.unit])
@@ -306,66 +305,49 @@ class Numbers(Kind):
         return (f"{name}_{self.unit}", in_unit(value, self.unit)) if self.unit else (name, np.asarray(value).tolist())
 
 
-@dataclass(frozen=True)
-class Integer(Kind):
-    """A whole number within bounds."""
+def Integer(low: int, high: int) -> Kind:
+    """Return the kind of whole numbers within bounds."""
 
-    low: int
-    high: int
-
-    def parse(self, section: Section, name: str) -> int:
+    def take(section: Section, name: str) -> int:
         value = section.integer(name)
-        if not self.low <= value <= self.high:
-            raise section.error(name, f"must be {self.low} to {self.high}", value)
+        if not low <= value <= high:
+            raise section.error(name, f"must be {low} to {high}", value)
         return value
 
-
-class Choice(Kind):
-    def __init__(self, *words: Any) -> None:
-        self.words = words
-
-    def parse(self, section: Section, name: str) -> Any:
-        return section.choice(name, self.words)
+    return Kind(take)
 
 
-class Text(Kind):
-    def parse(self, section: Section, name: str) -> str:
-        return section.text(name)
+def Choice(*words: Any) -> Kind:
+    """Return the kind of what must be one of the listed words or numbers."""
+    return Kind(lambda section, name: section.choice(name, words))
 
 
-class Names(Kind):
-    """A list of names, as of columns; where counts are given, of one of these lengths."""
+def Text() -> Kind:
+    """Return the kind of texts that are not empty."""
+    return Kind(Section.text)
 
-    def __init__(self, *counts: int, what: str = "column names") -> None:
-        self.counts, self.what = counts, what
 
-    def parse(self, section: Section, name: str) -> tuple[str, ...]:
+def Names(*counts: int, what: str = "column names") -> Kind:
+    """Return the kind of lists of names, as of columns; where counts are given, of one of these lengths."""
+
+    def take(section: Section, name: str) -> tuple[str, ...]:
         given = section.require(name)
         well = isinstance(given, list) and given and all(isinstance(text, str) and text.strip() for text in given)
-        if not well or (self.counts and len(given) not in self.counts):
-            count = f"{' or '.join(map(str, self.counts))} " if self.counts else ""
-            raise section.error(name, f"must be a list of {count}{self.what}", given)
+        if not well or (counts and len(given) not in counts):
+            count = f"{' or '.join(map(str, counts))} " if counts else ""
+            raise section.error(name, f"must be a list of {count}{what}", given)
         return tuple(given)
 
-
-@dataclass(frozen=True)
-class Unit(Kind):
-    """The name of a unit; its size in SI is stored."""
-
-    dimension: str
-
-    def parse(self, section: Section, name: str) -> float:
-        return section.unit(name, self.dimension)
+    return Kind(take)
 
 
-@dataclass(frozen=True)
-class Nested(Kind):
-    """A section with a schema of its own."""
+def Unit(dimension: str) -> Kind:
+    """Return the kind of names of units; a unit's size in SI is stored."""
+    return Kind(lambda section, name: section.unit(name, dimension))
 
-    schema: Any
 
-    def parse(self, section: Section, name: str) -> Any:
-        return read_whole(self.schema, section.section(name))
+def _nested(schema: Any) -> Kind:
+    return Kind(lambda section, name: read_whole(schema, section.section(name)))
 
 
 @cache
@@ -384,7 +366,7 @@ def _kind(hint: Any) -> Any:
         return next((kind for kind in get_args(hint)[1:] if isinstance(kind, Kind)), None)
     if get_origin(hint) in (Union, UnionType):
         return next((kind for part in get_args(hint) if (kind := _kind(part)) is not None), None)
-    return Nested(hint) if is_dataclass(hint) and keys_of(hint) else None  # type: ignore[arg-type]
+    return _nested(hint) if is_dataclass(hint) and keys_of(hint) else None  # type: ignore[arg-type]
 
 
 T = TypeVar("T")

@@ -58,7 +58,7 @@ class UncertaintyColumns:
         if name not in section:
             return float(section.quantity(name, dimension, default=np.nan))
         part, (low, high) = section.section(name), COVERAGE_FACTORS
-        columns, unit = Names(1, 3).parse(part, "columns"), part.unit("unit", dimension)
+        columns, unit = Names(1, 3).take(part, "columns"), part.unit("unit", dimension)
         factor = float(part.array("coverage_factor"))
         if not low <= factor <= high:
             raise part.error("coverage_factor", f"must be {low:g}…{high:g}; 1 where the column is a deviation", factor)

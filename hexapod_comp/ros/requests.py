@@ -17,11 +17,14 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
+from ..compensation.compensator import Compensator
 from ..compensation.guards import Sample
 from ..compensation.journal import IDEAL_SOURCE
 from ..errors import CommandError, HexapodError
 from ..machine.geometry import WORK, pose_text
+from ..machine.load import Loading
 from ..machine.model import MachineModel
+from ..machine.temperatures import Temperatures
 from ..pose import Pose
 from .base import EVENT_QOS, LATCHED_QOS, MachineNode
 from .interface import MachineFiles
@@ -197,6 +200,11 @@ class ToolChoice:
         self._publisher.publish(String(data=self._compensator.geometry.tool_name))
 
 
+def situation(compensator: Compensator) -> tuple[str, Temperatures, Loading, dict[str, float]]:
+    """Return what the worker's process needs beside geometry and model: tool, temperatures, load, outside numbers."""
+    return compensator.geometry.tool_name, compensator.temperatures, compensator.loading, dict(compensator.outside)
+
+
 class TravelReports:
     """``~/travel``, once a second while there are subscribers, and ``~/get_travel``: the tool's travel from the last
     commanded pose, or before the first command from the last measured one."""
@@ -242,12 +250,9 @@ class TravelReports:
         where = f"tool {geometry.tool_name} in {status.frame_ids[work]} at {pose_text(pose)}"
         asked = {
             "pose": pose,
-            "tool": geometry.tool_name,
             "work": work,
-            "warmth": compensator.temperatures,
-            "loading": compensator.loading,
-            "outside": dict(compensator.outside),
             "enabled": compensator.enabled,
+            "now": situation(compensator),
         }
         self._busy = True
         self._worker.ask(
@@ -296,10 +301,7 @@ class PredictedError:
         asked = {
             "platform": compensator.platform,
             "sense": compensator.motion.sense.copy(),
-            "tool": compensator.geometry.tool_name,
-            "warmth": compensator.temperatures,
-            "loading": compensator.loading,
-            "outside": dict(compensator.outside),
+            "now": situation(compensator),
         }
         self._worker.ask(Job("predict", asked, self._publish, self._failed, self._files.made_of()))
 
