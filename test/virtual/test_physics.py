@@ -26,10 +26,9 @@ from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.measurements.campaign import load_campaign, template
 from hexapod_comp.pose import Pose
-from hexapod_comp.virtual.drives import DriveParameters
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
 from hexapod_comp.virtual.instruments import measure
-from hexapod_comp.virtual.machine import StrutDrive
+from hexapod_comp.virtual.machine import DriveParameters, StrutDrive
 from hexapod_comp.virtual.named import imagine
 from hexapod_comp.virtual.physics import PhysicalMachine, Physics, find_mujoco
 
