@@ -147,43 +147,44 @@ def pointer(array: np.ndarray) -> ctypes.c_void_p:
 
 def contenders(single: Poses, batch: Poses, near_single: Poses, near: Poses) -> list[Contender]:
     """Return genhexkins' runs: batches in C loops that time themselves, single calls from Python by ctypes."""
-    module = Genhexkins(batch.structure)
-    return [
-        _inverse_batch(module, batch),
-        _forward_batch(module, WIDE, batch),
-        _forward_batch(module, NEAR, near),
-        _forward_batch(module, WIDE, batch, LOOSE_CRITERION),
-        _forward_batch(module, NEAR, near, LOOSE_CRITERION),
-        _second_solve(module, near),
-        _inverse_single(module, single),
-        _forward_single(module, WIDE, single),
-        _forward_single(module, NEAR, near_single),
-        _forward_single(module, WIDE, single, LOOSE_CRITERION),
-        _forward_single(module, NEAR, near_single, LOOSE_CRITERION),
-    ]
+    module, found = Genhexkins(batch.structure), []
+    for shape, wide, close in (("batch", batch, near), ("single", single, near_single)):
+        found.append(_inverse(module, wide, shape))
+        for criterion in (CRITERION, LOOSE_CRITERION):
+            found += [_forward(module, WIDE, wide, shape, criterion), _forward(module, NEAR, close, shape, criterion)]
+    return [*found, _second_solve(module, near)]
 
 
-def _inverse_batch(module: Genhexkins, poses: Poses) -> Contender:
+def _inverse(module: Genhexkins, poses: Poses, shape: str) -> Contender:
     told, count = emc_poses(poses.positions, poses.rotations), len(poses.positions)
-    lengths, codes = np.empty((count, STRUTS)), np.empty(count, np.int32)
-    run = functools.partial(module.inverse, told, lengths, codes)
-    return Contender("inverse", NAME, "batch", count, run, lambda: lengths * MM)
+    lengths, codes, flags = np.empty((count, STRUTS)), np.empty(count, np.int32), np.zeros(2, np.uint64)
+    inverse, calls = _caller(module.module.kinematicsInverse), _addresses(told, lengths, flags)
+
+    def one_by_one(kept: tuple = (told, flags)) -> None:  # whose addresses are used
+        for call in calls:
+            inverse(*call)
+
+    run = one_by_one if shape == "single" else functools.partial(module.inverse, told, lengths, codes)
+    return Contender("inverse", NAME, shape, count, run, lambda: lengths * MM)
 
 
-def _forward_batch(module: Genhexkins, task: str, poses: Poses, criterion: float = CRITERION) -> Contender:
+def _forward(module: Genhexkins, task: str, poses: Poses, shape: str, criterion: float) -> Contender:
     count, lengths = len(poses.lengths), poses.lengths / MM
     home = emc_poses(poses.home.position[None], poses.home.rotation[None])
-    found, codes = np.empty((count, POSE)), np.empty(count, np.int32)
+    found, codes, flags = np.empty((count, POSE)), np.empty(count, np.int32), np.zeros(2, np.uint64)
+    forward, calls = _caller(module.module.kinematicsForward), _addresses(lengths, found, flags)
 
-    def run() -> float:
+    def many() -> float:
         module.criterion(criterion)
         return module.forward(lengths, home, found, codes)
 
-    return Contender(task, _named(criterion), "batch", count, run, lambda: _checked(found, codes))
+    def one_by_one(kept: tuple = (lengths, flags)) -> None:  # whose addresses are used
+        module.criterion(criterion)
+        found[:] = home
+        codes[:] = [forward(*call) for call in calls]
 
-
-def _named(criterion: float) -> str:
-    return NAME if criterion == CRITERION else LOOSE
+    name, run = NAME if criterion == CRITERION else LOOSE, one_by_one if shape == "single" else many
+    return Contender(task, name, shape, count, run, lambda: _checked(found, codes))
 
 
 def _second_solve(module: Genhexkins, poses: Poses) -> Contender:
@@ -210,34 +211,6 @@ def _caller(function: Callable[..., int]) -> Callable[..., int]:
     """Return a function of the module for calls from Python with addresses."""
     function.argtypes = [ctypes.c_void_p] * 4  # type: ignore[attr-defined]
     return function
-
-
-def _inverse_single(module: Genhexkins, poses: Poses) -> Contender:
-    told, count = emc_poses(poses.positions, poses.rotations), len(poses.positions)
-    lengths, flags = np.empty((count, STRUTS)), np.zeros(2, np.uint64)
-    inverse = _caller(module.module.kinematicsInverse)
-    calls = _addresses(told, lengths, flags)
-
-    def run(kept: tuple = (told, flags)) -> None:  # whose addresses are used
-        for call in calls:
-            inverse(*call)
-
-    return Contender("inverse", NAME, "single", count, run, lambda: lengths * MM)
-
-
-def _forward_single(module: Genhexkins, task: str, poses: Poses, criterion: float = CRITERION) -> Contender:
-    count, lengths = len(poses.lengths), poses.lengths / MM
-    home = emc_poses(poses.home.position[None], poses.home.rotation[None])
-    found, flags, codes = np.empty((count, POSE)), np.zeros(2, np.uint64), np.empty(count, np.int32)
-    forward = _caller(module.module.kinematicsForward)
-    calls = _addresses(lengths, found, flags)
-
-    def run(kept: tuple = (lengths, flags)) -> None:  # whose addresses are used
-        module.criterion(criterion)
-        found[:] = home
-        codes[:] = [forward(*call) for call in calls]
-
-    return Contender(task, _named(criterion), "single", count, run, lambda: _checked(found, codes))
 
 
 def _addresses(given: np.ndarray, found: np.ndarray, flags: np.ndarray) -> list[tuple[int, int, int, int]]:
