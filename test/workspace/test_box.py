@@ -136,7 +136,7 @@ def test_show_draws_and_says_in_which_frame(tmp_path: Path, capsys):
     assert (tmp_path / "new" / "machine.png").stat().st_size > 50_000
     assert printed.count("work frame x ") == 3  # reach, largest box, box for campaigns
     assert "look again" not in printed
-    assert cli.main(["show", "paper", "--pictures", str(tmp_path), "--json"]) == 0
+    assert cli.main(["show", "paper", "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["largest_box"]["frame"] == shown["campaign_box"]["frame"] == "work"
     assert any("joint_axes are missing" in text for text in shown["look_again"])
