@@ -28,7 +28,7 @@ from hexapod_comp.calibration.design import Aim, Goal, Proposal, Times, propose,
 from hexapod_comp.calibration.estimator import physical_covariance
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
-from hexapod_comp.calibration.posterior import box_stations, expected_error
+from hexapod_comp.calibration.posterior import box_errors, box_stations, expected_error
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -157,7 +157,8 @@ def achieved(campaign: Campaign, plan: Proposal, settings: FitSettings, seed: in
         poses, count = (stations.positions, stations.rotations), len(stations)
         commands, _ = model_commands([believed] * count, poses, stations.sense)
         left = drive([truth] * count, poses, stations.sense, commands).errors(poses, space.probe).aligned()
-        promise = expected_error(fit.space, fit.solution.x, covariance, tilt, beyond=fit.verdict.unexplained)
+        box = box_errors(fit.space, fit.solution.x, tilt)
+        promise = expected_error(box, covariance, beyond=fit.verdict.unexplained)
         assert promise is not None
         errors.append((float(np.sqrt((left.displacement**2).sum(axis=1).mean())), (promise.low, promise.high)))
     return max(errors)

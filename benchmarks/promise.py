@@ -265,11 +265,11 @@ def other_promises(fit: ModelFit) -> tuple[float, tuple[tuple[float, float], ...
     errors = box_errors(fit.space, fit.solution.x)
     if errors is None:
         return np.nan, ()
-    product = errors.mean_squares()[0] @ covariance
+    product = errors.mean_squares[0] @ covariance
 
     def high(believed: float, averaged: float) -> float:
         other = replace(beyond, believed=min(believed, 1e9), averaged=averaged)
-        error = expected_error(fit.space, fit.solution.x, covariance, beyond=other)
+        error = expected_error(errors, covariance, beyond=other)
         return np.nan if error is None else error.high
 
     highs = tuple((high(believed, beyond.averaged), high(believed, 1.0)) for believed in BELIEVED)

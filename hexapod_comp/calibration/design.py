@@ -205,7 +205,8 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
     posterior = solve(space, problem, tolerances, noise_factors(campaign), rounds=0)
     covariance, prior = physical_covariance(space, posterior), space.prior_covariance(tolerances)
     beyond = Unexplained(displacement=Scatter(stops=campaign.stops, most_stops=campaign.stops))
-    level, tilted = (expected_error(space, x, covariance, tilt, prior, beyond) for tilt in (0.0, TILT))
+    boxes = (box_errors(space, x, tilt) for tilt in (0.0, TILT))
+    level, tilted = (expected_error(errors, covariance, prior, beyond) for errors in boxes)
     sight = observe(space, problem, posterior, measurements.tilt())
     unseen = unseen_errors(measurements, settings)
     return Plan(measurements, space, sight, unseen, level, tilted, campaign.stops)
@@ -338,7 +339,7 @@ class Aim:
             problem = f"{np.degrees(tilt):g}° is within the limits at {100.0 * reached:.0f} % of the box only"
             raise CalibrationError("tilt", f"{problem}, {100.0 * LEAST_REACHED:g} % are needed")
         spread = space.spread(space.start_tolerances())
-        return np.asarray(spread[:, None] * space.whitened(space.whitened(errors.mean_squares()[0]).T) * spread)
+        return np.asarray(spread[:, None] * space.whitened(space.whitened(errors.mean_squares[0]).T) * spread)
 
     def errors(self, covariance: np.ndarray) -> dict[str, float]:
         """Return the RMS tool error for a covariance, level and tilted, m."""

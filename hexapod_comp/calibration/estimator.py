@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -41,8 +42,13 @@ def at_once(work: Callable[[Given], Result], items: Iterable[Given], rows: int) 
     """
     if rows < THREADED:
         return list(map(work, items))
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        return list(pool.map(work, items))
+    return list(_workers(os.getpid()).map(work, items))
+
+
+@cache
+def _workers(process: int) -> ThreadPoolExecutor:
+    """Return the threads of a process; one that was forked has its own."""
+    return ThreadPoolExecutor(len(os.sched_getaffinity(process)))
 
 
 class Alike(NamedTuple):
@@ -413,6 +419,11 @@ class Estimation:
             return Alike(group.cells, columns, rows)
 
         return DesignMatrix((len(moved), space.size), at_once(rows_of, self._groups, len(moved))), moved
+
+    @property
+    def fixed_unknowns(self) -> bool:
+        """Whether the instruments' unknowns move the same cells whatever was read: no lengths, no tracker's frame."""
+        return not self._lengths and not self._frames
 
     def free_of_nuisance(self, rows: np.ndarray) -> np.ndarray:
         """Return cells' derivatives (C, K) free of the instruments' unknowns, over their noise.

@@ -230,8 +230,8 @@ def _fit(
     settings = everything.space.settings
     decisions, possible, estimation, solution = _choose(everything, nominal, progress, settles)
     space = estimation.space
-    solution, drift = with_drift(estimation, solution)
-    residuals = Residuals(estimation, solution, drift)
+    residuals = with_drift(estimation, solution)
+    solution = residuals.solution
     channels = tuple(_channels(residuals))
     notes = [
         *_about_loads(measurements, space),
@@ -371,7 +371,7 @@ def _averaged(
     errors = box_errors(everything, everything.physical(x))
     if errors is None:
         return LeftOut()
-    metric, shift = errors.mean_squares()[0], everything.physical(way)
+    metric, shift = errors.mean_squares[0], everything.physical(way)
     square = np.vdot(metric, physical_covariance(everything, possible)) + shift @ metric @ shift
     return LeftOut(1.0 - float(absent), float(square))
 

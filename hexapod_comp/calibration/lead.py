@@ -18,7 +18,7 @@ from .blocks import WAVES
 from .estimator import MEDIAN_TO_SIGMA, Estimation, LinearProblem, Posterior, at_once, solve
 
 LEAST_FREEDOM = 200.0  # fewest readings beyond the parameters that determine a period
-MOST_READINGS = 5000  # first range of the search
+MOST_READINGS = 2500  # first range of the search
 WAVE_AMPLITUDE = 10e-6  # prior of amplitudes while periods are compared, m: loose
 AGREES, CLOSE = 6.0, 5e-3  # a given or a round lead agrees within, σ, and as a share
 

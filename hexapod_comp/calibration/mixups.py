@@ -14,7 +14,7 @@ of a run) are quadratic forms of one Gram matrix; coordinate descent finds the m
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise, product
@@ -214,27 +214,33 @@ class _Fitted:
             part.project_out(target)
         return directions, target, unknowns
 
-    def _undone(self, mistake: Mistake) -> LinearProblem | None:
-        """Return the problem of corrected readings, with the machine at its place in the file; None where there can be
-        none.
+    def _undone(self, wrong: Sequence[Mistake]) -> Iterator[tuple[Mistake, LinearProblem]]:
+        """Yield mistakes with the problem of the corrected readings, the machine at its place in the file, if any.
 
-        Only rows of which the channel was another are new.
+        Where only values differ, all targets are cleared of the instruments' unknowns at once; of other channels, only
+        their rows are new.
         """
-        other = mistake.undone()
-        assert other is not None  # mypy: they leave the machine where it stood
-        try:
-            directions, target, unknowns = self._seen(other)
-        except HexapodError:
-            return None
-        as_read, raw = self._read
-        changed = np.flatnonzero((directions != as_read).any(axis=1))
-        if not len(changed):
-            return _with(self.problem, target, mistake.factor)
-        rows = raw.copy()
-        rows[changed] = self._along(changed, directions[changed])
-        for unknown in unknowns:
-            unknown.project_out(rows)
-        return _with(self.problem, target, mistake.factor, rows)
+        m, read = self.estimation.measurements, self._cell_values(self.estimation.measurements.value)
+        others = [mistake.undone() for mistake in wrong]
+        alone = [o is not None and o.channel is m.channel and self.estimation.fixed_unknowns for o in others]
+        changes = [self._cell_values(o.value) - read for o, only in zip(others, alone, strict=True) if o and only]
+        cleared = self.estimation.free_of_nuisance(np.column_stack(changes)) if changes else np.zeros((len(read), 0))
+        targets = iter((self.problem.target[:, None] + cleared).T)
+        for mistake, other, only in zip(wrong, others, alone, strict=True):
+            if only:
+                yield mistake, _with(self.problem, next(targets), mistake.factor)
+            elif other is not None:
+                try:
+                    directions, target, unknowns = self._seen(other)
+                except HexapodError:
+                    continue
+                as_read, raw = self._read
+                rows, changed = raw.copy(), np.flatnonzero((directions != as_read).any(axis=1))
+                if len(changed):
+                    rows[changed] = self._along(changed, directions[changed])
+                for unknown in unknowns:
+                    unknown.project_out(rows)
+                yield mistake, _with(self.problem, target, mistake.factor, rows if len(changed) else None)
 
     def _weighed(
         self, mistake: Mistake, problem: LinearProblem, components: Components, early: bool = False
@@ -255,10 +261,9 @@ class _Fitted:
     def mistakes(self) -> list[Alternative]:
         """Return the mistakes of the table, and of runs as they come out, that are most probable."""
         tried = self._elsewhere()
-        for mistake in (*mistakes(self.estimation.measurements), *self._runs_reversed()):
-            if (problem := self._undone(mistake)) is not None:
-                gain = self._weighed(mistake, problem, self.components, early=True).gain
-                tried.append((gain, mistake, problem, self.components))
+        for mistake, problem in self._undone([*mistakes(self.estimation.measurements), *self._runs_reversed()]):
+            gain = self._weighed(mistake, problem, self.components, early=True).gain
+            tried.append((gain, mistake, problem, self.components))
         best = sorted((t for t in tried if t[0] > 0.0), key=lambda t: -t[0])[:FINALISTS]
         return [self._weighed(mistake, problem, components) for _, mistake, problem, components in best]
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -78,7 +79,8 @@ class Datum(NamedTuple):
     rotation: np.ndarray  # (3, 1 + size)
 
 
-class FirstOrder(NamedTuple):
+@dataclass(frozen=True)
+class FirstOrder:
     """The tool's errors at N places and their derivatives by the parameters, along and about the same axes, m and
     rad."""
 
@@ -121,8 +123,9 @@ class FirstOrder(NamedTuple):
         whole[:, 3:] = datum.rotation
         return FirstOrder(self.places, self.columns - whole)
 
+    @cached_property
     def mean_squares(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return M of displacement and of rotation, (size, size): δxᵀ·M·δx is the mean square for a change δx."""
+        """M of displacement and of rotation, (size, size): δxᵀ·M·δx is the mean square for a change δx."""
         count, size = len(self.places), self.slopes.shape[2]
         parts = (self.slopes[:, rows].reshape(-1, size) for rows in (slice(3), slice(3, 6)))
         return tuple(part.T @ part / count for part in parts)  # type: ignore[return-value]
@@ -308,30 +311,25 @@ def box_errors(space: ParameterSpace, x: np.ndarray, tilt: float = 0.0) -> First
 
 
 def expected_error(
-    space: ParameterSpace,
-    x: np.ndarray,
+    errors: FirstOrder | None,
     covariance: np.ndarray,
-    tilt: float = 0.0,
     prior: np.ndarray | None = None,
     beyond: Unexplained | None = None,
 ) -> ToolError | None:
-    """Return the tool error that drawn machines of a covariance leave over the measured box, both directions.
+    """Return the tool error that drawn machines of a covariance leave, by the :func:`box_errors` of the fitted one.
 
-    The error before is that of x, or of machines of a `prior` covariance. The part `beyond` all parameters widens the
-    interval upwards. None if no pose is within reach.
+    The error before is that of the fitted machine, or of machines of a `prior` covariance. The part `beyond` all
+    parameters widens the interval upwards.
     """
-    stations = box_stations(space, tilt)
-    if stations is None:
+    if errors is None:
         return None
-    prediction, beyond = predict(space, x, stations), beyond or Unexplained()
-    errors = FirstOrder.of(space, prediction, stations).aligned()
-    squares = errors.mean_squares()
+    beyond, squares, drawn = beyond or Unexplained(), errors.mean_squares, _drawn(covariance)
     if prior is None:
         parts = errors.values[:, :3], errors.values[:, 3:]
         before = [float(np.sqrt((part**2).sum(axis=1).mean())) for part in parts]
     else:
         before = [rms(_sizes(square, _drawn(prior))) for square in squares]
-    sizes = [_sizes(square, _drawn(covariance)) for square in squares]
+    sizes = [_sizes(square, drawn) for square in squares]
     return ToolError(
         float(np.hypot(before[0], beyond.displacement.stops)),
         *beyond.promised(sizes[0], errors.places),

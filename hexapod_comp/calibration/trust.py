@@ -43,7 +43,7 @@ from .estimator import (
 )
 from .mistakes import FAMILIES, family_of_run
 from .parameters import FitSettings, ParameterSpace
-from .posterior import ToolError, box_errors, expected_error
+from .posterior import FirstOrder, ToolError, box_errors, expected_error
 from .promise import Scatter, Unexplained
 
 TILT = np.radians(10.0)
@@ -140,13 +140,17 @@ class Residuals:
         return self.shared(every, every) + self.estimation.shares_of_nuisance()
 
     @cached_property
+    def level(self) -> FirstOrder | None:
+        """The tool's errors in the measured box, with a level tool."""
+        return box_errors(self.estimation.space, self.solution.x)
+
+    @cached_property
     def metrics(self) -> tuple[np.ndarray, np.ndarray]:
         """M of displacement and rotation: yᵀ·M·y is the tool's mean squared error in the box; zero without a box."""
         space, used = self.estimation.space, self.solution.posterior.used
-        errors = box_errors(space, self.solution.x)
-        if errors is None:
+        if self.level is None:
             return np.zeros((len(used),) * 2), np.zeros((len(used),) * 2)
-        displacement, rotation = (space.whitened(space.whitened(m).T) for m in errors.mean_squares())
+        displacement, rotation = (space.whitened(space.whitened(m).T) for m in self.level.mean_squares)
         return displacement[np.ix_(used, used)], rotation[np.ix_(used, used)]
 
     @property
@@ -197,10 +201,8 @@ def judge(
     covariance = physical_covariance(space, solution.posterior)
     # A field that was measured with a level tool has no information on a tilted one.
     level_only = space.block(FIELDS[0]) is not None and measurements.tilt() < 0.5 * TILT
-    level, tilted = (
-        None if level_only and tilt else expected_error(space, solution.x, covariance, tilt, beyond=beyond)
-        for tilt in (0.0, TILT)
-    )
+    boxes = residuals.level, None if level_only else box_errors(space, solution.x, TILT)
+    level, tilted = (expected_error(errors, covariance, beyond=beyond) for errors in boxes)
     families, runs = chi_squares(residuals)
     far_off, doubtful = (measurements.misfit(noise, n) for n in ASSUMED.misfit[:0:-1])
     refusals, doubts, remarks = [far_off], ["" if far_off else doubtful, *beyond.doubts()], [*beyond.remarks()]
@@ -277,19 +279,18 @@ def variance_ratio(r: Residuals) -> tuple[float, float]:
     return float(shown / expected), float(min(expected**2 / squares, len(r.omitted) - 1))
 
 
-def with_drift(estimation: Estimation, solution: Solution) -> tuple[Solution, Drift]:
-    """Return a fit with a drift of the scale as additional parameters, if the evidence supports it.
+def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
+    """Return what a fit leaves, with a drift of the scale as additional parameters if the evidence supports it.
 
     A machine that warms, or a laser's air that changes: over the campaign all lengths from the middle of the box grow
     by a polynomial in time. Exact for the linear problem, with fixed priors of the blocks and fixed noise.
     """
     m, cells = estimation.measurements, estimation.cells
     posterior, problem = solution.posterior, solution.problem
-    none = Drift(np.zeros((len(cells.kind), 0)), np.zeros(0), np.zeros((0, 0)))
-    r = Residuals(estimation, solution, none)
+    r = Residuals(estimation, solution, Drift(np.zeros((len(cells.kind), 0)), np.zeros(0), np.zeros((0, 0))))
     lengths = ~np.isin(cells.kind, [KINDS.index(kind) for kind in (*ANGULAR_KINDS, "straightness")])
     if len(np.unique(r.run[lengths])) < DRIFT_RUNS:
-        return solution, none
+        return r
     count = np.bincount(cells.of_reading)
     place = np.bincount(cells.of_reading, np.arange(len(m))) / count
     time = 2.0 * place / max(len(m) - 1, 1) - 1.0
@@ -306,7 +307,7 @@ def with_drift(estimation: Estimation, solution: Solution) -> tuple[Solution, Dr
     shown = columns.T @ r.residual
     values = covariance @ shown
     if shown @ values < np.linalg.slogdet(precision)[1]:
-        return solution, none
+        return r
     moved = -gain @ values
     change = r.rows.times(moved / posterior.spread) + columns @ values
     y, x = posterior.y + moved, np.zeros(estimation.space.size)
@@ -323,7 +324,7 @@ def with_drift(estimation: Estimation, solution: Solution) -> tuple[Solution, Dr
         x=estimation.space.physical(x),
         residuals=residuals,
     )
-    return settled, Drift(columns, values, covariance)
+    return Residuals(estimation, settled, Drift(columns, values, covariance))
 
 
 # The discrepancy
@@ -448,7 +449,7 @@ def _unread_backlash(r: Residuals) -> float:
     errors, block = box_errors(alone, np.zeros(alone.size)), alone.block("backlash")
     if errors is None or block is None:
         return 0.0
-    sizes = np.diag(errors.mean_squares()[0])[block.part] * block.tolerance**2
+    sizes = np.diag(errors.mean_squares[0])[block.part] * block.tolerance**2
     return float(np.sqrt(sizes.sum()))
 
 

@@ -18,7 +18,7 @@ from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.mistakes import family_of_run
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
-from hexapod_comp.calibration.posterior import expected_error, stations_of
+from hexapod_comp.calibration.posterior import box_errors, expected_error, stations_of
 from hexapod_comp.calibration.promise import Scatter, Unexplained
 from hexapod_comp.calibration.report import as_json, fit_report
 from hexapod_comp.calibration.trust import stated_scale
@@ -50,7 +50,7 @@ def test_what_is_described_is_promised_as_before(readings):
     assert (beyond.factor, beyond.drift) == (1.0, 0.0)
     assert beyond.displacement == beyond.rotation == Scatter()
     assert (fit.misfit, fit.verdict.doubts) == ("", ())
-    before = expected_error(fit.space, fit.solution.x, fit.covariance)
+    before = expected_error(box_errors(fit.space, fit.solution.x), fit.covariance)
     assert beyond.prior < 1e-3
     assert fit.level.low == pytest.approx(before.low, rel=1e-4)
     assert before.high < fit.level.high < 1.6 * before.high
@@ -262,7 +262,7 @@ def test_lines_that_differ_from_each_other_widen_the_promise(readings):
     fit = fit_model(readings.with_values(spoilt), FEW)
     assert fit.verdict.unexplained.factor > 1.5
     covariance = fit.covariance / fit.verdict.unexplained.factor**2
-    assert fit.level.high > 1.5 * expected_error(fit.space, fit.solution.x, covariance).high
+    assert fit.level.high > 1.5 * expected_error(box_errors(fit.space, fit.solution.x), covariance).high
     np.testing.assert_allclose(np.sqrt(np.diag(fit.covariance)), fit.standard_errors)
 
 

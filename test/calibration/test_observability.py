@@ -16,6 +16,7 @@ from hexapod_comp.calibration.posterior import (
     MACHINE_ERRORS,
     Observability,
     ToolError,
+    box_errors,
     box_stations,
     expected_error,
     observe,
@@ -220,7 +221,7 @@ def test_expected_error_of_one_known_parameter():
     offset, sigma = list(space.blocks[0].labels).index("strut_3 offset"), 2e-6
     covariance = np.zeros((space.size, space.size))
     covariance[offset, offset] = sigma**2
-    found = expected_error(space, np.zeros(space.size), covariance)
+    found = expected_error(box_errors(space, np.zeros(space.size)), covariance)
     stations, x = box_stations(space), np.zeros(space.size)
     x[offset] = sigma
     moved = predict(space, x, stations).errors
@@ -244,7 +245,8 @@ def test_level_campaigns_are_not_trusted_with_a_tilted_tool():
     """What 5-D lines of a level tool leave open shows as soon as it tilts by 10°."""
     space, problem = linearised("5-D", 4, STRUCTURE)
     answer = solve(space, problem, space.start_tolerances(), ONES, 0)
-    level, tilted = (expected_error(space, np.zeros(space.size), answer.covariance, t) for t in (0.0, np.radians(10.0)))
+    boxes = (box_errors(space, np.zeros(space.size), tilt) for tilt in (0.0, np.radians(10.0)))
+    level, tilted = (expected_error(errors, answer.covariance) for errors in boxes)
     assert tilted.after > 10.0 * level.after
 
 
