@@ -18,6 +18,7 @@ from ..measurements.campaign import (
     Campaign,
     CampaignRun,
     circle_run,
+    diagonals,
     line_run,
     template,
     tilts,
@@ -28,15 +29,9 @@ from ..workspace.reach import Examiner
 from .parameters import ParameterSpace
 
 TILTS = (10.0, 5.0, 2.0)  # of scattered poses, °: the first within reach
-
-
 FEW_POINTS, USUAL_POINTS = (5, 13), (13,)
-
-
 # Points of a line, by instrument: few at little cost, or enough to resolve the screws' waves
 LINE_POINTS = {"linear": (8, 21), "5-D": FEW_POINTS, "6-D": FEW_POINTS}
-
-
 # The same with each point read once, in alternating directions: more places for as many readings
 ALTERNATE_POINTS = {"linear": (4, 6, 10), "5-D": (4, 8), "6-D": (4, 8)}
 
@@ -103,15 +98,9 @@ def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
             level.append((f"{AXES[axis]} at {where}", ends))
             if (first == 1) == (second == 1):  # no middle of a face
                 tilted.append(level[-1])
-    corners = [(np.array(c), 1 - np.array(c)) for c in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0))]
-    for a, b in CROSS_AXES:
-        for side, turned in np.ndindex(2, 2):
-            start, stop = np.full((2, 3), side)
-            start[[a, b]], stop[[a, b]] = (0, turned), (1, 1 - turned)
-            corners.append((start, stop))
-    diagonals = [(f"diagonal {n}", low + np.array(pair) * size) for n, pair in enumerate(corners, start=1)]
-    level += diagonals
-    tilted += diagonals[:4]
+    of_box = [(f"diagonal {n}", ends) for n, ends in enumerate(diagonals(place.box), start=1)]
+    level += of_box
+    tilted += of_box[:4]
 
     share = np.linspace(0.0, 1.0, 41)  # points that are checked
     least = 0.4  # lines of which a smaller share is within the limits are omitted

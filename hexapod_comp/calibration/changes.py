@@ -28,17 +28,9 @@ from .sensitivity import derivatives, predict
 from .trust import TILT
 
 MOST_READINGS = 500  # of a check; more are a calibration
-
-
 UNCHANGED_DRAWS = 4000  # machines drawn to find the false alarms: 1 % to ± 0.16 %
-
-
 DATUM, STRUT, TEMPERATURE, PAYLOAD = "datum", "strut", "temperature", "payload"
-
-
 AGEING, READING, OTHER = "ageing", "reading", "other"
-
-
 # Kinds of change with their names. Few readings can repair all but payload and the last two.
 FAMILIES = {
     DATUM: "the datum has moved",
@@ -50,14 +42,9 @@ FAMILIES = {
     OTHER: "it has changed in a way that none of these explains",
 }
 
-
 HEAVIER = "heavier or lighter"  # the name of a change of the payload in its centre
-
-
 # weight relative to the trace: parameters that represent a payload then stay small at the corners of the box too
 RIDGE = 1e-8
-
-
 ROUNDING = 1e-9  # directions of readings or effects that are smaller, relative to the largest, are rounding
 
 

@@ -52,8 +52,6 @@ from .promise import Scatter, Unexplained
 from .trust import TILT
 
 FAINT = 0.05  # directions with a smaller effect on readings are omitted, σ
-
-
 LEAST_REACHED = 0.3  # share of the box in which the tool must reach the wanted tilt
 
 
@@ -455,11 +453,7 @@ def propose(
 # What a proposed check must detect: a light collision, m; a kelvin of steel, m/m; another tool, kg, where a stiffness
 # is stated
 CRASH, WARMTH, TOOL_CHANGED = 20e-6, 12e-6, 10.0
-
-
 CHECK_READINGS = 12  # of a proposed check: 20 µm are named in 95 % (benchmarks.upkeep)
-
-
 # Channels of each instrument of a check: on diagonals the displacement alone; of rotations pitch and yaw, no roll
 READ_BY = {
     "linear": ("linear",),

@@ -70,35 +70,23 @@ class Outlier:
 
 @dataclass(frozen=True)
 class ModelFit:
-    """A model with everything that is known about it.
+    """A model with everything that is known about it."""
 
-    Attributes ---------- model : MachineModel The machine as fitted. measurements : MeasurementSet Its readings. space
-    : ParameterSpace Names, blocks and priors of the parameters. solution : Solution Parameters, covariance, residuals.
-    decisions : tuple of Decision Which blocks stay, and why. channels : tuple of ChannelFit χ² and held-out error of
-    each kind of channel. observability : Observability What the data determine. unseen_errors : tuple of UnseenError
-    Machine errors that the readings do not show (:data:`~.posterior.MACHINE_ERRORS`). verdict : Verdict Predicted tool
-    error, and doubts. outliers : tuple of Outlier Largest first. notes : tuple of str Notes for the reader. held :
-    HeldDatum Where the tool is held: the model is the solution's machine, shifted and turned as a whole. warming :
-    ThermalEvidence Evidence on heat. lead : ScrewLead or None The screws' lead; None if it was not searched for.
-    held_out : ndarray, shape (C,) Leave-one-out errors of the cells, whose line or pose a fit did not use, over their
-    stated standard deviation.
-    """
-
-    model: MachineModel
-    measurements: MeasurementSet
-    space: ParameterSpace
-    solution: Solution
-    decisions: tuple[Decision, ...]
-    channels: tuple[ChannelFit, ...]
-    observability: Observability
-    unseen_errors: tuple[UnseenError, ...]
-    verdict: Verdict
-    outliers: tuple[Outlier, ...]
-    notes: tuple[str, ...]
-    held: HeldDatum
-    warming: ThermalEvidence
-    lead: ScrewLead | None
-    held_out: np.ndarray
+    model: MachineModel  # the machine as fitted
+    measurements: MeasurementSet  # its readings
+    space: ParameterSpace  # names, blocks and priors of the parameters
+    solution: Solution  # parameters, covariance, residuals
+    decisions: tuple[Decision, ...]  # which blocks stay, and why
+    channels: tuple[ChannelFit, ...]  # χ² and held-out error of each kind of channel
+    observability: Observability  # what the data determine
+    unseen_errors: tuple[UnseenError, ...]  # machine errors that the readings do not show (posterior.MACHINE_ERRORS)
+    verdict: Verdict  # predicted tool error, and doubts
+    outliers: tuple[Outlier, ...]  # largest first
+    notes: tuple[str, ...]  # for the reader
+    held: HeldDatum  # where the tool is held: the model is the solution's machine, shifted and turned as a whole
+    warming: ThermalEvidence  # evidence on heat
+    lead: ScrewLead | None  # the screws' lead; None if it was not searched for
+    held_out: np.ndarray  # (C,): leave-one-out errors of the cells, over their stated standard deviation
 
     @property
     def misfit(self) -> str:
@@ -360,18 +348,12 @@ def _averaged(
     By the blocks' Bayes factors, with even prior odds; at the same answer.
     """
     absent = np.prod([expit(-d.evidence) for d in decisions if not d.kept])
-    way, x = np.zeros(everything.size), np.zeros(everything.size)
-    way[possible.used] = possible.y
-    own = np.zeros(space.size)
-    own[solution.posterior.used] = solution.posterior.y
-    for block in everything.blocks:
-        if (kept := space.block(block.name)) is not None:
-            x[block.part] = own[kept.part]
-            way[block.part] -= own[kept.part]
-    errors = box_errors(everything, everything.physical(x))
+    x, _, _ = _carried_over((space, solution.x, solution.posterior.tolerances, solution.posterior.noise), everything)
+    errors, y = box_errors(everything, x), np.zeros(everything.size)
     if errors is None:
         return LeftOut()
-    metric, shift = errors.mean_squares[0], everything.physical(way)
+    y[possible.used] = possible.y
+    metric, shift = errors.mean_squares[0], everything.physical(y) - x
     square = np.vdot(metric, physical_covariance(everything, possible)) + shift @ metric @ shift
     return LeftOut(1.0 - float(absent), float(square))
 

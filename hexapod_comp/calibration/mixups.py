@@ -89,14 +89,8 @@ def mixups(
 ) -> list[str]:
     """Return by name how the readings must have been taken; the best and those that nothing tells from it; or none.
 
-    Parameters
-    ----------
-    everything
-        The readings against all parameters that may be used.
-    blocks
-        Names of the blocks that the fit uses beside the structure.
-    progress
-        Called with what is tried.
+    `everything` are the readings against all parameters that may be used, `blocks` those that the fit uses beside the
+    structure.
     """
     progress("are the readings more probable, taken another way?")
     try:

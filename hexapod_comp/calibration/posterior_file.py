@@ -50,21 +50,9 @@ NOT_ONE = "is no file of a fit's posterior"
 
 
 def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, path: str | Path) -> list[Path]:
-    """Write a model file, and beside it its fit's posterior; return the other file's name.
+    """Write a model file, and beside it its fit's posterior, where it is known; return the other file's name.
 
-    Parameters
-    ----------
-    model : MachineModel
-        The model.
-    fitted : FittedParameters or None
-        What the fit knows; None where nobody knows, as after scheme lines.
-    path : str or Path
-        The model file. Into a pipe only the model is written.
-
-    Raises
-    ------
-    InputFileError
-        A file cannot be written.
+    Into a pipe only the model is written.
     """
     file = Path(path)
     if fitted is None or (file.exists() and not file.is_file()):

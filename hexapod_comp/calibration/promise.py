@@ -19,16 +19,11 @@ STEEL = 11.5e-6
 
 
 class Scatter(NamedTuple):
-    """Tool error that no parameter describes, RMS over all three axes: displacement, m, or rotation, rad.
+    """Tool error that no parameter describes, RMS over all three axes: displacement, m, or rotation, rad."""
 
-    Attributes ---------- lack : float Of an error that no parameter describes: the discrepancy. stops, most_stops :
-    float Of the machine's stops from visit to visit, by repeated readings, if the instruments scatter as stated; and
-    its upper bound.
-    """
-
-    lack: float = 0.0
-    stops: float = 0.0
-    most_stops: float = 0.0
+    lack: float = 0.0  # of an error that no parameter describes: the discrepancy
+    stops: float = 0.0  # of the stops from visit to visit, by repeats, if the instruments scatter as stated
+    most_stops: float = 0.0  # its upper bound
 
 
 NO_SCATTER = Scatter()
@@ -62,12 +57,7 @@ class Unexplained:
     def promised(self, left: np.ndarray, points: np.ndarray) -> Promise:
         """Return the predicted interval of the tool's displacement; unexplained errors raise the upper end.
 
-        Parameters
-        ----------
-        left : ndarray, shape (D,)
-            RMS errors of draws by the fit's covariance, m.
-        points : ndarray, shape (n, 3)
-            The places, m: a scale that is off acts on their distances.
+        `left`, (D,), are RMS errors of draws by the fit's covariance, m; a scale acts on distances of `points` (n, 3).
         """
         after, low, high = self._interval(left, self.prior, self.displacement)
         radius = rms(np.linalg.norm(points - points.mean(axis=0), axis=1))

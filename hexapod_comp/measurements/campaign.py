@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -479,55 +480,41 @@ def template(campaign: Campaign, geometry: HexapodGeometry, seed: int = 0, name:
 
 def campaign_readings(campaign: Campaign, seed: int = 0) -> Iterator[Reading]:
     """Yield a campaign's readings in measuring order, with values of zero."""
-    yield from _lines(campaign)
-    yield from _diagonals(campaign)
+    for run in _grid_runs(campaign):
+        yield from run.readings(campaign.cycles)
     yield from _scattered(campaign, seed)
     for run in campaign.runs:
         yield from run.readings(campaign.cycles)
 
 
-def _lines(campaign: Campaign) -> Iterator[Reading]:
-    """Yield the readings on the grid's lines."""
-    if campaign.instrument is None:
-        return
-    for axis in range(3):
-        across = CROSS_AXES[axis]
-        first, second = (campaign.nodes(a) for a in across)
-        for a in first:
-            for b in second:
+def _grid_runs(campaign: Campaign) -> Iterator[CampaignRun]:
+    """Yield the lines of the grid, and the diagonals."""
+
+    def run(name: str, instrument: str, ends: np.ndarray) -> CampaignRun:
+        points = max(2, round(float(np.linalg.norm(ends[1] - ends[0])) / campaign.step) + 1)
+        return line_run(name, instrument, ends, points, campaign.level)
+
+    if campaign.instrument is not None:
+        instrument = "linear" if campaign.instrument == "1-D" else campaign.instrument
+        for axis, across in enumerate(CROSS_AXES):
+            for a, b in product(*(campaign.nodes(other) for other in across)):
                 ends = campaign.box.copy()
                 ends[:, across] = a, b
-                name = f"{AXES[axis]} line at {AXES[across[0]]} {a * 1e3:.1f}, {AXES[across[1]]} {b * 1e3:.1f}"
-                yield from _line(campaign, name, ends, campaign.channels(axis))
+                where = ", ".join(f"{AXES[other]} {at * 1e3:.1f}" for other, at in zip(across, (a, b), strict=True))
+                yield run(f"{AXES[axis]} line at {where}", instrument, ends)
+    for number, ends in enumerate(diagonals(campaign.box)[: campaign.diagonals], start=1):
+        yield run(f"diagonal {number}", "linear", ends)
 
 
-def _diagonals(campaign: Campaign) -> Iterator[Reading]:
-    """Yield the readings on body diagonals and face diagonals."""
-    low, high = campaign.box
-    ends: list[tuple[np.ndarray, np.ndarray]] = []
-    if campaign.diagonals:
-        for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):
-            start = np.array([*np.where(corner, high[:2], low[:2]), low[2]])
-            ends.append((start, low + high - start))
-    if campaign.diagonals == 16:
-        for axis in range(3):
-            v = CROSS_AXES[axis][1]
-            for face in (low, high):
-                for turned in (False, True):
-                    start, stop = low.copy(), high.copy()
-                    start[axis] = stop[axis] = face[axis]
-                    if turned:
-                        start[v], stop[v] = high[v], low[v]
-                    ends.append((start, stop))
-    for number, pair in enumerate(ends, start=1):
-        yield from _line(campaign, f"diagonal {number}", np.array(pair), ("linear",))
-
-
-def _line(campaign: Campaign, name: str, ends: np.ndarray, channels: tuple[str, ...]) -> Iterator[Reading]:
-    """Yield the readings of all passes over the line between two points, shape (2, 3)."""
-    count = max(2, round(float(np.linalg.norm(ends[1] - ends[0])) / campaign.step) + 1)
-    poses = [Pose(p, campaign.level) for p in np.linspace(ends[0], ends[1], count).round(12)]
-    return line_readings(name, poses, channels, campaign.cycles)
+def diagonals(box: np.ndarray) -> list[np.ndarray]:
+    """Return the ends (2, 3) of a box's four body diagonals, and of the two diagonals of each of its six faces."""
+    corners = [(np.array(c), 1 - np.array(c)) for c in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0))]
+    for a, b in CROSS_AXES:
+        for side, turned in np.ndindex(2, 2):
+            start, stop = np.full((2, 3), side)
+            start[[a, b]], stop[[a, b]] = (0, turned), (1, 1 - turned)
+            corners.append((start, stop))
+    return [np.where(np.array(pair) == 1, box[1], box[0]) for pair in corners]
 
 
 def _scattered(campaign: Campaign, seed: int) -> Iterator[Reading]:
