@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import fields
-from itertools import combinations
-from typing import NamedTuple
+from dataclasses import fields, replace
+from itertools import chain, combinations
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -113,18 +113,14 @@ def assemble(
     """Return the set of some readings: runs recognised as lines, stations made unique, reach checked."""
     probe = np.array(geometry.tool.position if probe is None else probe, dtype=float)
     _check_channels(readings)
-    arrays = _Arrays(
-        cycle=np.array([r.cycle for r in readings]),
-        direction=np.array([r.direction for r in readings]),
-        channel=np.array([NUMBER_OF[r.channel] for r in readings]),
-        value=np.array([r.value for r in readings], dtype=float),
-        uncertainty=np.array([r.uncertainty for r in readings], dtype=float),
-    )
-    _check_values(readings, arrays)
+    cycle, direction = (np.array([getattr(r, name) for r in readings]) for name in ("cycle", "direction"))
+    channel = np.array([NUMBER_OF[r.channel] for r in readings])
+    value, uncertainty = (np.array([getattr(r, name) for r in readings], float) for name in ("value", "uncertainty"))
+    _check_values(readings, value, uncertainty)
     poses, place = _platform_poses(geometry, readings)
     points = (poses[0] + poses[1] @ probe)[place]
     centre = _centres(geometry, readings, points)
-    runs, run_of, swapped = _runs(readings, arrays, points, geometry.work.rotation.T)
+    runs, run_of, swapped = _runs(readings, (direction, cycle, channel), points, geometry.work.rotation.T)
     of_readings = zip(readings, place.tolist(), [runs[i] for i in run_of.tolist()], strict=True)
     if in_reach:
         _check_possible(geometry, readings, place, poses)
@@ -136,7 +132,11 @@ def assemble(
         stations=stations,
         station=station,
         run=run_of,
-        **arrays._asdict(),
+        cycle=cycle,
+        direction=direction,
+        channel=channel,
+        value=value,
+        uncertainty=uncertainty,
         centre=centre,
         sources=tuple(r.source for r in readings),
         files=tuple(files),
@@ -144,32 +144,36 @@ def assemble(
     )
 
 
-class _Arrays(NamedTuple):
-    """What a set has of each reading as it stands there, shape (N,) each; or a part of that."""
-
-    cycle: np.ndarray
-    direction: np.ndarray
-    channel: np.ndarray
-    value: np.ndarray
-    uncertainty: np.ndarray
-
-    def select(self, rows: list[int]) -> _Arrays:
-        """Return those of some readings."""
-        return _Arrays(*(array[rows] for array in self))
-
-
 def _runs(
-    readings: Sequence[Reading], arrays: _Arrays, points: np.ndarray, along: np.ndarray
+    readings: Sequence[Reading], passes: tuple[np.ndarray, ...], points: np.ndarray, along: np.ndarray
 ) -> tuple[tuple[Run, ...], np.ndarray, list[str]]:
-    """Return the runs, each reading's run, and remarks on runs whose directions look swapped."""
+    """Return the runs, each reading's run, and remarks on runs whose directions look swapped.
+
+    `passes` are direction, cycle and channel of each reading.
+    """
     members: dict[str, list[int]] = {}
     for index, reading in enumerate(readings):
         members.setdefault(reading.run, []).append(index)
-    parts = [([readings[i] for i in rows], arrays.select(rows), points[rows]) for rows in members.values()]
-    runs = tuple(_recognise(*part, along) for part in parts)
+    runs, notes = [], []
+    for name, rows in members.items():
+        run = _recognise([readings[i] for i in rows], passes[2][rows], points[rows], along)
+        runs.append(run)
+        if run.is_line and _swapped(points[rows] @ run.axis, *(part[rows] for part in passes)):
+            problem = "rows called forward run backward and vice versa; swapped?"
+            notes.append(f"{readings[rows[0]].source}: run {name}: {problem}")
     number = {name: index for index, name in enumerate(members)}
-    notes = [_swapped_note(run, *part) for run, part in zip(runs, parts, strict=True)]
-    return runs, np.array([number[r.run] for r in readings]), [note for note in notes if note]
+    return tuple(runs), np.array([number[r.run] for r in readings]), notes
+
+
+def _swapped(along: np.ndarray, direction: np.ndarray, cycle: np.ndarray, channel: np.ndarray) -> bool:
+    """Return whether the rows of a line run against both their directions, by the first pass in each."""
+    way = {FORWARD: 0.0, BACKWARD: 0.0}
+    for each in way:
+        chosen = np.flatnonzero(direction == each)
+        if len(chosen):
+            first = (cycle[chosen] == cycle[chosen[0]]) & (channel[chosen] == channel[chosen[0]])
+            way[each] = along[chosen[first][-1]] - along[chosen[0]]
+    return bool(way[FORWARD] < 0.0 < way[BACKWARD])
 
 
 def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> tuple[Poses, np.ndarray]:
@@ -218,9 +222,8 @@ def _check_channels(readings: Sequence[Reading]) -> None:
             raise InputFileError(r.source.file, _line(r), f"channel must be one of {', '.join(CHANNELS)}", r.channel)
 
 
-def _check_values(readings: Sequence[Reading], arrays: _Arrays) -> None:
+def _check_values(readings: Sequence[Reading], value: np.ndarray, uncertainty: np.ndarray) -> None:
     """Refuse values and uncertainties that no instrument has."""
-    value, uncertainty = arrays.value, arrays.uncertainty
     possible = (uncertainty >= SMALLEST_UNCERTAINTY) & (uncertainty <= LARGEST_READING)
     wrong = np.flatnonzero(~((np.abs(value) <= LARGEST_READING) & (np.isnan(uncertainty) | possible)))
     if not len(wrong):
@@ -242,13 +245,13 @@ def _line(reading: Reading) -> str:
     return f"line {reading.source.line}" if reading.source.line else f"run {reading.run}"
 
 
-def _recognise(readings: list[Reading], arrays: _Arrays, points: np.ndarray, work_axes: np.ndarray) -> Run:
+def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray, work_axes: np.ndarray) -> Run:
     """Return a run from its readings and their commanded points (n, 3), with its line if it has line channels."""
     first, name = readings[0], readings[0].run
-    of_line = OF_LINES[arrays.channel]
+    of_line = OF_LINES[channel]
     if of_line.any() and not of_line.all():
         raise InputFileError(first.source.file, f"run {name}", "mixes channels of a line with others")
-    if first.slope and not np.isin(arrays.channel, STRAIGHTNESS).any():
+    if first.slope and not np.isin(channel, STRAIGHTNESS).any():
         raise InputFileError(first.source.file, f"run {name}", "has a slope, but no straightness", first.slope)
     if not of_line.any():
         return Run(name, np.zeros(3), points[0], first.known_zero)
@@ -263,20 +266,15 @@ def _recognise(readings: list[Reading], arrays: _Arrays, points: np.ndarray, wor
         problem = f"run {name}: the commanded point is {off.max() * 1e3:.4f} mm off the run's line"
         raise InputFileError(where.source.file, _line(where), problem)
     in_work = work_axes @ far
-    _check_straightness(readings, arrays, in_work / np.linalg.norm(far))
+    wrong = np.flatnonzero(np.isin(channel, STRAIGHTNESS[np.abs(in_work) > OWN_LINE * np.linalg.norm(far)]))
+    if len(wrong):
+        r = readings[wrong[0]]
+        problem = f"run {name}: {r.channel} is along the line itself; straightness is read across it"
+        raise InputFileError(r.source.file, _line(r), problem)
     if len({r.slope for r in readings}) > 1:
         raise InputFileError(first.source.file, f"run {name}", "has more than one slope; call them two runs")
     leading = in_work[np.abs(in_work) > LEAST_TRAVEL][0]
     return Run(name, axis * np.sign(leading), points[0], slope=first.slope)
-
-
-def _check_straightness(readings: list[Reading], arrays: _Arrays, along: np.ndarray) -> None:
-    """Refuse a straightness along its own line, whose direction in the work frame is `along`."""
-    wrong = np.flatnonzero(np.isin(arrays.channel, STRAIGHTNESS[np.abs(along) > OWN_LINE]))
-    if len(wrong):
-        r = readings[wrong[0]]
-        problem = f"run {r.run}: {r.channel} is along the line itself; straightness is read across it"
-        raise InputFileError(r.source.file, _line(r), problem)
 
 
 def _collect_stations(
@@ -350,27 +348,6 @@ def _arrival(geometry: HexapodGeometry, here: Sequence[np.ndarray], there: Seque
     return np.where(length[:, None] > SAME, arrivals(geometry, (here[0], here[1]), before), standing)
 
 
-def _swapped_note(run: Run, readings: list[Reading], arrays: _Arrays, points: np.ndarray) -> str:
-    """Return a remark on a line whose rows run against both their directions, else nothing."""
-    if not run.is_line:
-        return ""
-    along = points @ run.axis
-    way = {direction: _way(arrays, along, direction) for direction in (FORWARD, BACKWARD)}
-    if not way[FORWARD] < 0.0 < way[BACKWARD]:
-        return ""
-    return f"{readings[0].source}: run {run.name}: rows called forward run backward and vice versa; swapped?"
-
-
-def _way(arrays: _Arrays, along: np.ndarray, direction: int) -> float:
-    """Return the way from the first to the last row of the first pass in a direction, m."""
-    chosen = np.flatnonzero(arrays.direction == direction)
-    if not len(chosen):
-        return 0.0
-    alike = (each[chosen] == each[chosen[0]] for each in (arrays.cycle, arrays.channel))
-    first_pass = along[chosen[np.logical_and(*alike)]]
-    return float(first_pass[-1] - first_pass[0])
-
-
 def refuse_twice(files: Sequence[tuple[str, str]]) -> None:
     """Raise on a file, (name, SHA-256), given twice: its readings would count twice."""
     seen: dict[str, str] = {}
@@ -391,23 +368,14 @@ def joined(sets: Sequence[MeasurementSet]) -> MeasurementSet:
     stations_before = np.cumsum([0, *(len(s.stations) for s in sets)])[:-1]
     runs_before = np.cumsum([0, *(len(s.runs) for s in sets)])[:-1]
 
-    def together(name: str) -> np.ndarray:
-        return np.concatenate([getattr(s, name) for s in sets])
-
-    return MeasurementSet(
-        geometry=first.geometry,
-        probe=first.probe,
-        runs=tuple(run for s in sets for run in s.runs),
+    names = "cycle", "direction", "channel", "value", "uncertainty", "centre"
+    parts: dict[str, Any] = {name: np.concatenate([getattr(s, name) for s in sets]) for name in names}
+    for name in ("runs", "sources", "files", "notes"):
+        parts[name] = tuple(chain(*(getattr(s, name) for s in sets)))
+    return replace(
+        first,
         stations=Stations(*(np.concatenate([getattr(s.stations, c.name) for s in sets]) for c in fields(Stations))),
         station=np.concatenate([s.station + n for s, n in zip(sets, stations_before, strict=True)]),
         run=np.concatenate([s.run + n for s, n in zip(sets, runs_before, strict=True)]),
-        cycle=together("cycle"),
-        direction=together("direction"),
-        channel=together("channel"),
-        value=together("value"),
-        uncertainty=together("uncertainty"),
-        centre=together("centre"),
-        sources=tuple(source for s in sets for source in s.sources),
-        files=tuple(file for s in sets for file in s.files),
-        notes=tuple(note for s in sets for note in s.notes),
+        **parts,
     )

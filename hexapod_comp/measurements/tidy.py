@@ -59,21 +59,18 @@ LATEST = 1e11  # largest time, s: seconds since 1970 of the next three thousand 
 FURTHEST_CENTRE = 100.0  # no instrument stands further away, m
 
 
-class _Optional(NamedTuple):
-    """An optional column of numbers."""
+class Range(NamedTuple):
+    """The numbers that a column may hold."""
 
-    dimension: str | None  # None: a pure number
     low: float  # SI; °C
     high: float
-    allowed: str = ""  # the range as text
+    allowed: str  # as text
+    dimension: str | None = None  # None: a pure number
     blank: bool = True  # whether a cell may be empty
 
-    def read(self, table: Table, name: str) -> np.ndarray:
-        """Return the column's numbers in SI, (rows,); NaN where it is missing, or a cell blank."""
-        column, known = table.column(name, self.dimension), dict[str, float]()
-        if column is None:
-            return np.full(len(table.rows), np.nan)
-        index, unit = column
+    def of(self, table: Table, index: int, unit: float) -> np.ndarray:
+        """Return a column's numbers in SI, (rows,); NaN where a cell is blank."""
+        known: dict[str, float] = {}
         for line, cells in table.rows:
             text = cells[index]
             if text in known:
@@ -87,23 +84,28 @@ class _Optional(NamedTuple):
                 raise InputFileError(table.path, where, f"must be within {self.allowed}", text)
         return np.array([known[cells[index]] for _, cells in table.rows])
 
+    def read(self, table: Table, name: str) -> np.ndarray:
+        """Return the same of an optional column with its unit in its name; NaN where it is missing."""
+        column = table.column(name, self.dimension)
+        return np.full(len(table.rows), np.nan) if column is None else self.of(table, *column)
 
-WARMTH = _Optional("temperature", *TEMPERATURE_RANGE, "{:g}…{:g} °C".format(*TEMPERATURE_RANGE), blank=False)
-# Columns with numbers of a row's surroundings and instrument
-TIME = _Optional("time", -LATEST, LATEST, f"±{LATEST:g} s")
-INDEX = _Optional(None, 1.0, LARGEST_INDEX, f"1…{LARGEST_INDEX:g}")
-AIR = {
-    name: _Optional(dimension, *AIR_RANGES[name])
-    for name, dimension in (("temperature", "temperature"), ("pressure", "pressure"), ("humidity", "ratio"))
-}
-PLACE = _Optional("length", -FURTHEST_CENTRE, FURTHEST_CENTRE, f"±{FURTHEST_CENTRE:g} m")
+
+WARMTH = Range(*TEMPERATURE_RANGE, "{:g}…{:g} °C".format(*TEMPERATURE_RANGE), "temperature", blank=False)
+TIME = Range(-LATEST, LATEST, f"±{LATEST:g} s", "time")
+INDEX = Range(1.0, LARGEST_INDEX, f"1…{LARGEST_INDEX:g}")
+PRESSURE = Range(*AIR_RANGES["pressure"], "pressure")
+HUMIDITY = Range(*AIR_RANGES["humidity"][:2], "0…100 %", "ratio")
+AIR_TEMPERATURE = Range(*AIR_RANGES["temperature"], "temperature")
+PLACE = Range(-FURTHEST_CENTRE, FURTHEST_CENTRE, f"±{FURTHEST_CENTRE:g} m", "length")
+MASS = Range(0.0, LARGEST_MASS, f"0…{LARGEST_MASS:g} kg", "mass")
+PULL = Range(-EARTH[1], EARTH[1], f"±{EARTH[1]:g} m/s²", "acceleration")
+# Columns of which a row has all or none
 CENTRE = {f"centre_{axis}": PLACE for axis in AXES}
-PAYLOAD = {"payload": _Optional("mass", 0.0, LARGEST_MASS, f"0…{LARGEST_MASS:g}, in SI")}
-PAYLOAD |= {f"payload_{axis}": PLACE for axis in AXES}
-GRAVITY = {f"gravity_{axis}": _Optional("acceleration", -EARTH[1], EARTH[1], f"±{EARTH[1]:g}, in SI") for axis in AXES}
+PAYLOAD = {"payload": MASS} | {f"payload_{axis}": PLACE for axis in AXES}
+GRAVITY = {f"gravity_{axis}": PULL for axis in AXES}
 
 
-def _together(table: Table, what: str, columns: dict[str, _Optional]) -> np.ndarray:
+def _together(table: Table, what: str, columns: Mapping[str, Range]) -> np.ndarray:
     """Return columns of which a row has all or none, (rows, columns)."""
     values = np.stack([column.read(table, name) for name, column in columns.items()], axis=1)
     blank = np.isnan(values)
@@ -147,7 +149,7 @@ def _read_rows(table: Table) -> _Rows:
     poses, temperatures, air = _poses(table), _temperatures(table), _air(table)
     centres = [None if math.isnan(row[0]) else tuple(row) for row in _together(table, "centre", CENTRE).tolist()]
     known = _meanings(table, "zero", _texts(table, "zero"), {"known": True, "": False}, "known or empty")
-    times, humidities = TIME.read(table, "time").tolist(), AIR["humidity"].read(table, "humidity").tolist()
+    times, humidities = TIME.read(table, "time").tolist(), HUMIDITY.read(table, "humidity").tolist()
     loads, slopes = _loads(table), _texts(table, "slope")
     (value_column, _), uncertain = table.required(("value",), None)[0], table.column("uncertainty", None)
     table.refuse_unknown()
@@ -205,17 +207,16 @@ def _temperatures(table: Table) -> list[tuple[float, ...]]:
 
 def _air(table: Table) -> np.ndarray:
     """Return :attr:`_Rows.air`."""
-    index, pressure = INDEX.read(table, "instrument_index"), AIR["pressure"].read(table, "pressure")
+    index, pressure = INDEX.read(table, "instrument_index"), PRESSURE.read(table, "pressure")
     wanted = np.isfinite(index)
     if not wanted.any():
         return np.full((len(index), 4), np.nan)
-    temperature, humidity = (AIR[name].read(table, name) for name in ("temperature", "humidity"))
-    air = np.column_stack([index, temperature, pressure, humidity])
-    lacking = wanted & np.isnan(air).any(axis=1)
+    air = [index, AIR_TEMPERATURE.read(table, "temperature"), pressure, HUMIDITY.read(table, "humidity")]
+    lacking = wanted & np.isnan(air).any(axis=0)
     if lacking.any():
         problem = "has an instrument_index, so it needs temperature_degC, pressure_kPa and humidity_percent too"
         raise InputFileError(table.path, f"line {table.rows[int(lacking.argmax())][0]}", problem)
-    return air
+    return np.column_stack(air)
 
 
 def _loads(table: Table) -> list[tuple[float, ...]]:

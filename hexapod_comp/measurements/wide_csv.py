@@ -28,12 +28,13 @@ from ..formats.schema import (
 from ..formats.yaml import read_yaml
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, solve_poses, strut_lengths_batch
+from ..machine.passes import Poses
 from ..machine.pose_files import read_pose_arrays, rotations_of
-from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
+from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
 from ..pose import Pose, attitude_error
 from .readings import AXES, FROM_PREVIOUS, UNKNOWN, FileLine, MeasurementSet, Reading
 from .runs import assemble
-from .tidy import LATEST
+from .tidy import HUMIDITY, TIME, WARMTH, Range
 
 COLUMNS_FORMAT = "hexapod_comp/columns"
 COLUMNS_VERSION = 1
@@ -192,14 +193,6 @@ def load_columns(path: str | Path) -> Columns:
     return read_whole(Columns, top, **given, measured=PoseColumns.read(top.section("measured")))
 
 
-@dataclass(frozen=True)
-class _Poses:
-    """Poses of the tool in the work frame, (N, 3) m and (N, 3, 3)."""
-
-    positions: np.ndarray
-    rotations: np.ndarray
-
-
 def read_wide(
     path: str | Path, columns_path: str | Path, geometry: HexapodGeometry, in_reach: bool = True
 ) -> MeasurementSet:
@@ -231,14 +224,14 @@ def _read_numbers(table: Table, names: tuple[str, ...], unit: float, used: set[s
     return table.numbers([(index, unit) for index, _ in table.required(names, None)])
 
 
-def _read_poses(table: Table, columns: PoseColumns, used: set[str]) -> _Poses:
+def _read_poses(table: Table, columns: PoseColumns, used: set[str]) -> Poses:
     """Return the poses in some columns; level where the file has no orientation."""
     positions = _read_numbers(table, columns.position, columns.unit, used) + columns.offset
     if not columns.turn:
-        return _Poses(positions, np.tile(np.eye(3), (len(positions), 1, 1)))
+        return positions, np.tile(np.eye(3), (len(positions), 1, 1))
     turns = _read_numbers(table, columns.turn, columns.angle_unit or 1.0, used)
     if len(columns.turn) == 3:
-        return _Poses(positions, rotations_of(table, turns))
+        return positions, rotations_of(table, turns)
     rotations = np.empty((len(turns), 3, 3))
     for n, ((line, _), quaternion) in enumerate(zip(table.rows, turns, strict=True)):
         try:
@@ -246,10 +239,10 @@ def _read_poses(table: Table, columns: PoseColumns, used: set[str]) -> _Poses:
         except PoseError as error:
             where = f"line {line}, columns {', '.join(columns.turn)}"
             raise InputFileError(table.path, where, str(error)) from error
-    return _Poses(positions, rotations)
+    return positions, rotations
 
 
-def _poses_of_file(table: Table, file: PoseFile, columns_path: Path, used: set[str]) -> _Poses:
+def _poses_of_file(table: Table, file: PoseFile, columns_path: Path, used: set[str]) -> Poses:
     """Return the commanded pose of each row from a file of poses."""
     path = columns_path.with_name(file.file)
     labels, positions, rotations = read_pose_arrays(path)
@@ -257,7 +250,7 @@ def _poses_of_file(table: Table, file: PoseFile, columns_path: Path, used: set[s
         if len(labels) != len(table.rows):
             problem = f"has {len(table.rows)} rows, and {path.name} {len(labels)} poses; without commanded.name"
             raise InputFileError(table.path, "", f"{problem} they go row by row")
-        return _Poses(positions, rotations)
+        return positions, rotations
     used.add(file.name)
     rows = {one.label: n for n, one in enumerate(labels)}
     if len(rows) != len(labels):
@@ -269,7 +262,7 @@ def _poses_of_file(table: Table, file: PoseFile, columns_path: Path, used: set[s
             problem = f"has no pose in {path.name}" + (f"; did you mean {near[0]!r}?" if near else "")
             raise InputFileError(table.path, f"line {line}, column {file.name}", problem, name)
         numbers.append(rows[name])
-    return _Poses(positions[numbers], rotations[numbers])
+    return positions[numbers], rotations[numbers]
 
 
 def _deviations(table: Table, given: float | UncertaintyColumns, used: set[str]) -> np.ndarray:
@@ -293,31 +286,22 @@ class _Conditions(NamedTuple):
 
 
 def _conditions(table: Table, columns: Columns, used: set[str]) -> _Conditions:
-    count = len(table.rows)
+    unknown, named, damp = np.full(len(table.rows), np.nan), columns.temperature, columns.humidity
 
-    def read(name: str | None, unit: float, otherwise: np.ndarray, low: float, high: float, allowed: str) -> np.ndarray:
+    def read(name: str | None, unit: float, within: Range, otherwise: np.ndarray) -> np.ndarray:
         if name is None:
             return otherwise
-        values = _read_numbers(table, (name,), unit, used)[:, 0]
-        wrong = ~((values >= low) & (values <= high))
-        if wrong.any():
-            line, cells = table.rows[int(wrong.argmax())]
-            problem = f"must be within {allowed}"
-            raise InputFileError(table.path, f"line {line}, column {name}", problem, cells[table.header.index(name)])
-        return values
+        used.add(name)
+        return within._replace(blank=False).of(table, table.required((name,), None)[0][0], unit)
 
-    named, (low, high) = columns.temperature, TEMPERATURE_RANGE
-    bounds = low, high, f"{low:g}…{high:g} °C"
-    everywhere = read(named.get(EVERYWHERE), 1.0, np.full(count, REFERENCE_TEMPERATURE), *bounds)
-    parts = [read(named.get(part), 1.0, everywhere, *bounds) for part in Temperatures.NAMES]
-    unknown = np.full(count, np.nan)
-    damp = columns.humidity
-    humidities = unknown if damp is None else read(damp.column, damp.unit, unknown, 0.0, 1.0, "0…100 %")
+    everywhere = read(named.get(EVERYWHERE), 1.0, WARMTH, np.full_like(unknown, REFERENCE_TEMPERATURE))
+    parts = [read(named.get(part), 1.0, WARMTH, everywhere) for part in Temperatures.NAMES]
+    humidities = unknown if damp is None else read(damp.column, damp.unit, HUMIDITY, unknown)
+    times = unknown
     if columns.time is not None and columns.time.format:
         times = _clock_times(table, columns.time, used)
-    else:
-        name, size = (None, 1.0) if columns.time is None else (columns.time.columns[0], columns.time.unit or 1.0)
-        times = read(name, size, unknown, -LATEST, LATEST, f"±{LATEST:g} s")
+    elif columns.time is not None:
+        times = read(columns.time.columns[0], columns.time.unit or 1.0, TIME, unknown)
     return _Conditions(np.stack(parts, axis=1), times, humidities)
 
 
@@ -340,7 +324,7 @@ def _clock_times(table: Table, time: Times, used: set[str]) -> np.ndarray:
 
 
 def _lengths(
-    table: Table, struts: StrutColumns, measured: _Poses, geometry: HexapodGeometry, used: set[str], notes: list[str]
+    table: Table, struts: StrutColumns, measured: Poses, geometry: HexapodGeometry, used: set[str], notes: list[str]
 ) -> np.ndarray:
     """Return the strut lengths that the readings say, shape (rows, 6), m."""
     travel = _read_numbers(table, struts.readings, 1.0, used) * struts.length_per_unit
@@ -348,14 +332,14 @@ def _lengths(
     home = strut_lengths_batch(structure, geometry.home.position[None], geometry.home.rotation[None])[0]
     zero = {"home": home, "given": struts.zero_length}.get(struts.zero)
     if zero is None:
-        platform = geometry.platform_poses(measured.positions, measured.rotations)
+        platform = geometry.platform_poses(measured[0], measured[1])
         zero = (strut_lengths_batch(structure, *platform) - travel).mean(axis=0)
         shift = ", ".join(f"{name} {value * 1e3:+.3f}" for name, value in zip(STRUT_NAMES, zero - home, strict=True))
         notes.append(f"{table.path}: lengths at reading zero from the measured poses, mm from home: {shift}")
     return zero + travel
 
 
-def _nominal_poses(table: Table, geometry: HexapodGeometry, lengths: np.ndarray) -> _Poses:
+def _nominal_poses(table: Table, geometry: HexapodGeometry, lengths: np.ndarray) -> Poses:
     """Return the poses that the machine as designed takes under some strut lengths."""
     usable = (lengths > 0.0).all(axis=1)
     if not usable.all():
@@ -367,26 +351,26 @@ def _nominal_poses(table: Table, geometry: HexapodGeometry, lengths: np.ndarray)
         row = int(solved.ok.argmin())
         problem = "no pose of the machine as designed has these strut lengths, mm"
         raise InputFileError(table.path, f"line {table.rows[row][0]}", problem, (lengths[row] * 1e3).round(3).tolist())
-    return _Poses(*geometry.tool_poses(solved.positions, solved.rotations))
+    return geometry.tool_poses(solved.positions, solved.rotations)
 
 
 def _readings(
     table: Table,
     columns: Columns,
-    commanded: _Poses,
-    measured: _Poses,
+    commanded: Poses,
+    measured: Poses,
     commands: np.ndarray | None,
     deviations: list[np.ndarray],
     conditions: _Conditions,
 ) -> list[Reading]:
     """Return position and attitude readings of every row."""
-    errors = [("position", measured.positions - commanded.positions, deviations[0])]
+    errors = [("position", measured[0] - commanded[0], deviations[0])]
     if columns.measured.turn:
-        errors.append(("attitude", attitude_error(measured.rotations, commanded.rotations), deviations[1]))
+        errors.append(("attitude", attitude_error(measured[1], commanded[1]), deviations[1]))
     run = columns.run or Path(table.path).stem
     readings = []
     for n, (line, _) in enumerate(table.rows):
-        pose = Pose(commanded.positions[n], commanded.rotations[n])
+        pose = Pose(commanded[0][n], commanded[1][n])
         lengths = None if commands is None else tuple(commands[n].tolist())
         temperatures, source = tuple(conditions.temperatures[n].tolist()), FileLine(str(table.path), line)
         state = temperatures, lengths, source, float(conditions.times[n])
