@@ -23,7 +23,8 @@ from ..machine.arrays import rms
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import FOLLOWED, RealMachine
 from ..machine.passes import Passes, Poses, random_directions
-from ..machine.temperatures import HUMIDITY, REFERENCE_TEMPERATURE, Temperatures
+from ..machine.surroundings import Surroundings
+from ..machine.temperatures import HUMIDITY, Temperatures
 from ..measurements.readings import AXES, Stations
 from ..pose import attitude_error, rotation_from_angles
 from .assumptions import ASSUMED
@@ -218,7 +219,7 @@ class ErrorPredictor:
             tool = machine.geometry.payload
             loads[:, :4] = tool.mass, *tool.centre
             at = positions[solved], rotations[solved], nominal[solved], senses[solved]
-            stations = Stations(*at, warmth, *air, loads)
+            stations = Stations(warmth, *air, loads, *at)
             there = modelled[0][solved], modelled[1][solved]
             joints = (np.tile(j, (reached, 1, 1)) for j in (structure.base_joints, structure.platform_joints))
             rows = derivatives(space, Prediction(np.zeros((reached, 6)), *there, *joints), stations)
@@ -292,15 +293,12 @@ def box_stations(space: ParameterSpace, tilt: float = 0.0) -> Stations | None:
 
 def stations_of(passes: Passes) -> Stations:
     """Return the stations of some passes, commanded with nominal lengths, at 20 °C."""
-    count = len(passes)
     return Stations(
+        **vars(Surroundings.usual(len(passes))),
         positions=passes.positions,
         rotations=passes.rotations,
         commands=passes.nominal_commands(),
         sense=passes.senses(),
-        temperatures=np.full((count, len(Temperatures.NAMES)), REFERENCE_TEMPERATURE),
-        times=np.full(count, np.nan),
-        humidity=np.full(count, np.nan),
     )
 
 

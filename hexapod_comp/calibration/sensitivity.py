@@ -19,7 +19,7 @@ def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Predict
     """Return where the machine of a parameter vector goes at each station."""
     positive, sense = without_negative(space.blocks, x, stations.sense)
     model = space.model(positive, with_field=False)
-    machines = stations.surroundings.machines(RealMachine(space.geometry, model))
+    machines = stations.machines(RealMachine(space.geometry, model))
     commanded = stations.positions, stations.rotations
     driven = drive(machines, commanded, sense, stations.commands)
     errors = driven.errors(commanded, space.probe).as_array()

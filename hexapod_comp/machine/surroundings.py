@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,7 +16,8 @@ from .temperatures import HUMIDITY, PARTS, REFERENCE_TEMPERATURE, Lag, Temperatu
 NO_LOAD = (math.nan,) * 7
 
 
-class Surroundings(NamedTuple):
+@dataclass(frozen=True)
+class Surroundings:
     """What acted on the machine at N places. Whatever is added here tells places apart by itself."""
 
     temperatures: np.ndarray  # (N, 8): struts 1–6, base, platform, °C
@@ -24,21 +25,28 @@ class Surroundings(NamedTuple):
     humidity: np.ndarray  # (N,): relative humidity of the air, a fraction; NaN where that is not known
     loads: np.ndarray  # (N, 7): mass, kg, its centre in platform, m, and gravity in base, m/s²; NaN: as usual
 
+    @staticmethod
+    def usual(count: int) -> Surroundings:
+        """Return 20 °C, and everything else not known, at a number of places."""
+        unknown = np.full(count, np.nan)
+        warmth = np.full((count, len(PARTS)), REFERENCE_TEMPERATURE)
+        return Surroundings(warmth, unknown, unknown, np.tile(NO_LOAD, (count, 1)))
+
     def numbers(self) -> np.ndarray:
         """Return all of them but the times as the bits of a row a place: NaN is equal to NaN."""
-        rows = np.column_stack([value for name, value in self._asdict().items() if name != "times"])
+        rows = np.column_stack([value for name, value in vars(self).items() if name != "times"])
         return np.ascontiguousarray(rows, dtype=float).view(np.int64)
 
     def machines(self, machine: RealMachine) -> list[RealMachine]:
         """Return the machine at each place; places at which the same acts on it share one."""
         model, count = machine.model, len(self.times)
-        around = self
-        if not machine.warms:
-            around = around._replace(temperatures=np.full_like(self.temperatures, REFERENCE_TEMPERATURE))
-        if not model.struts.moisture.any():
-            around = around._replace(humidity=np.full(count, np.nan))
-        if not machine.bends:
-            around = around._replace(loads=np.full((count, 7), np.nan))
+        usual = Surroundings.usual(count)
+        around = Surroundings(
+            temperatures=self.temperatures if machine.warms else usual.temperatures,
+            times=self.times,
+            humidity=self.humidity if model.struts.moisture.any() else usual.humidity,
+            loads=self.loads if machine.bends else usual.loads,
+        )
         constants, lags = model.late_growth.time_constants, np.zeros((count, len(PARTS), 0))
         if constants and np.isfinite(self.times).all():
             lags = late(self.times, self.temperatures, constants)

@@ -110,21 +110,13 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Stations:
-    """Where the machine stood: commands and what it felt."""
+class Stations(Surroundings):
+    """Where the machine stood, M times: commands, and what acted on it."""
 
     positions: np.ndarray  # (M, 3): commanded ``pose_platform_in_base``, m
     rotations: np.ndarray  # (M, 3, 3)
     commands: np.ndarray  # (M, 6): strut commands, or encoder readings, m
     sense: np.ndarray  # (M, 9): directions of motion as in :class:`hexapod_comp.machine.model.MotionState`
-    temperatures: np.ndarray  # (M, 8): struts 1–6, base, platform, °C
-    times: np.ndarray  # (M,): when these were read, s; NaN where that is not known
-    humidity: np.ndarray  # (M,): relative humidity of the air, a fraction; NaN where that is not known
-    loads: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))  # (M, 7): as Reading.load; by default NO_LOAD
-
-    def __post_init__(self) -> None:
-        if not len(self.loads):
-            object.__setattr__(self, "loads", np.tile(NO_LOAD, (len(self.positions), 1)))
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -132,11 +124,6 @@ class Stations:
     def select(self, chosen: np.ndarray | slice) -> Stations:
         """Return those in a mask, at indices or of a slice."""
         return Stations(**{entry.name: getattr(self, entry.name)[chosen] for entry in fields(self)})
-
-    @property
-    def surroundings(self) -> Surroundings:
-        """What acted on the machine there."""
-        return Surroundings(**{name: getattr(self, name) for name in Surroundings._fields})
 
     def pose(self, index: int) -> Pose:
         """Return a commanded ``pose_platform_in_base``."""

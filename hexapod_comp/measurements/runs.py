@@ -315,7 +315,7 @@ def _collect_stations(
     if len(there := np.array([n for n, start in enumerate(known_by) if start is not None], dtype=int)):
         start = np.array([n for n in known_by if n is not None])
         columns[3][there] = _arrival(geometry, *([part[n] for part in columns[:3]] for n in (there, start)))
-    return Stations(*columns), np.array(index)
+    return Stations(*columns[4:], *columns[:4]), np.array(index)
 
 
 def _check_possible(geometry: HexapodGeometry, readings: Sequence[Reading], place: np.ndarray, poses: Poses) -> None:

@@ -75,7 +75,7 @@ def station_errors(
     commands, directions of motion, temperatures and humidity.
     """
     stations, name_of = measurements.stations, partial(_station_name, measurements)
-    machines = stations.surroundings.machines(truth)
+    machines = stations.machines(truth)
     commanded = stations.positions, stations.rotations
     driven = drive(machines, commanded, stations.sense, stations.commands, name_of, advance)
     return driven.errors(commanded, measurements.probe).as_array()
@@ -84,7 +84,7 @@ def station_errors(
 def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet:
     """Return a template with the commands of a model's compensation."""
     stations = template.stations
-    machines = stations.surroundings.machines(RealMachine(template.geometry, model))
+    machines = stations.machines(RealMachine(template.geometry, model))
     targets, name_of = (stations.positions, stations.rotations), partial(_station_name, template)
     commands, _ = model_commands(machines, targets, stations.sense, name_of)
     return replace(template, stations=replace(stations, commands=commands))

@@ -166,6 +166,6 @@ def test_whatever_acts_on_the_machine_tells_places_apart():
     assert len(set(around.machines(bending))) == len(rows)
     assert len(set(around.machines(growing))) == 9  # no strut gives or swells: temperatures alone
     assert len(set(around.machines(rigid))) == 1
-    again = Surroundings(*(np.concatenate([part, part]) for part in around))
+    again = Surroundings(*(np.concatenate([part, part]) for part in vars(around).values()))
     machines = again.machines(bending)
     assert all(a is b for a, b in zip(machines, machines[len(rows) :], strict=False))
