@@ -129,11 +129,7 @@ class MachineModel:
     base_deviation: np.ndarray = term("structure", "um", "real − nominal joints, in base", (6, 3), largest=0.05)
     platform_deviation: np.ndarray = term("structure", "um", "the same, in platform", (6, 3), largest=0.05)
     base_axes_turn: np.ndarray = term(
-        "structure",
-        "urad",
-        "rotation vector of the base's cardan axes, which turn with the whole base",
-        (3,),
-        largest=0.1,
+        "structure", "urad", "rotation vector of the base's cardan axes, which turn with it", (3,), largest=0.1
     )
     struts: StrutErrors = dataclasses.field(default_factory=StrutErrors)
     field: GridField = dataclasses.field(default_factory=no_field)

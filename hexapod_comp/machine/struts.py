@@ -10,7 +10,6 @@ import numpy as np
 from ..core import MOST_HARMONICS
 from ..core.batch import screw_twists
 from ..errors import ModelError
-from ..formats.schema import PER_STRUT
 from .geometry import HexapodGeometry
 from .temperatures import EXPANSION
 from .terms import settle, term
@@ -25,6 +24,9 @@ STRUT_LENGTH = 0.1  # Largest error of a strut's length, m: an encoder's zero is
 MOISTURE = 0.1
 TINY = float(np.finfo(float).tiny)
 WAVE_PARTS, MAP_PARTS = ("cosine", "sine"), ("map_knots", "map_values", "map_backlash")
+# Errors of a strut's length whose shape the dataclass checks: one column a harmonic, or one a knot
+WAVE: dict[str, Any] = {"default": np.zeros((6, 1)), "largest": STRUT_LENGTH, "checked": False}
+MAP: dict[str, Any] = {"shape": (6, None), "largest": STRUT_LENGTH, "checked": False}
 
 
 @dataclass(frozen=True)
@@ -39,35 +41,15 @@ class StrutErrors:
     moisture: np.ndarray = term(
         "struts", "ppm_per_percent", "growth by relative humidity above 50 %: struts of carbon fibre", largest=MOISTURE
     )
-    cosine: np.ndarray = term(
-        *("struts.wave", "um", "screw wave: cosine·cos(2πc/period)", PER_STRUT, np.zeros((6, 1))),
-        largest=STRUT_LENGTH,
-        checked=False,
-    )
-    sine: np.ndarray = term(
-        *("struts.wave", "um", "and sine·sin(2πc/period)", PER_STRUT, np.zeros((6, 1))),
-        largest=STRUT_LENGTH,
-        checked=False,
-    )
+    cosine: np.ndarray = term("struts.wave", "um", "screw wave: cosine·cos(2πc/period)", **WAVE)
+    sine: np.ndarray = term("struts.wave", "um", "and sine·sin(2πc/period)", **WAVE)
     period: np.ndarray = term("struts.wave", "mm", "one turn of the screw", default=0.01, least=TINY)
     map_knots: np.ndarray = term("struts.map", "mm", "commands, increasing", (None,), key="knots", checked=False)
     map_values: np.ndarray = term(
-        "struts.map",
-        "um",
-        "length error there: a natural cubic spline, end values held outside",
-        (6, None),
-        key="values",
-        largest=STRUT_LENGTH,
-        checked=False,
+        "struts.map", "um", "length error there: a natural cubic spline, end values held outside", key="values", **MAP
     )
     map_backlash: np.ndarray = term(
-        "struts.map",
-        "um",
-        "by how much the lost motion is larger there than `backlash_um`",
-        (6, None),
-        key="backlash",
-        largest=STRUT_LENGTH,
-        checked=False,
+        "struts.map", "um", "by how much the lost motion is larger there than `backlash_um`", key="backlash", **MAP
     )
 
     def __post_init__(self) -> None:
