@@ -87,7 +87,7 @@ def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineM
         values: dict[str, Any] = {"name": top.text("name"), "origin": origin}
         values |= {"region": _read_region(top)} | read_terms(MachineModel, top, "")
         blocks = {
-            "structure": _read_structure,
+            "structure": lambda section: read_terms(MachineModel, section, "structure"),
             "thermal": _read_thermal,
             "struts": _read_struts,
             "field": _read_field,
@@ -279,11 +279,7 @@ def _read_region(top: Section) -> Region | None:
     return region
 
 
-# Structure, thermal, struts
-
-
-def _read_structure(section: Section) -> dict[str, Any]:
-    return read_terms(MachineModel, section, "structure")
+# Thermal, struts
 
 
 def _read_thermal(section: Section) -> dict[str, Any]:
