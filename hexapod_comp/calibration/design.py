@@ -217,9 +217,6 @@ def noise_factors(campaign: Campaign) -> np.ndarray:
     return np.maximum(np.hypot(campaign.noise, stops), 1e-3 * default) / default
 
 
-FEW_POINTS, USUAL_POINTS = (5, 13), (13,)
-
-
 # A campaign for a goal
 
 
