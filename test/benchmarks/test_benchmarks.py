@@ -42,20 +42,6 @@ def test_rubins_tables_are_fetched_by_who_runs_it(tmp_path: Path, capsys: pytest
     assert capsys.readouterr().out.count("PASSED") == 2
 
 
-def test_the_data_are_in_the_repository():
-    assert all((jugglebot.DATA / name).is_file() for name in (*jugglebot.FILES, "LICENSE.MIT"))
-
-
-def test_without_linuxcnc(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    def honesty() -> None:
-        raise NotHere("genhexkins: no /usr/lib/linuxcnc")
-
-    monkeypatch.setattr(convergence, "honesty", honesty)
-    monkeypatch.setattr(convergence, "convergence", lambda yaws: [])
-    assert convergence.main() == 2
-    assert capsys.readouterr().err == "cannot run: genhexkins: no /usr/lib/linuxcnc\n"
-
-
 def test_without_network_namespaces(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     monkeypatch.setattr("sys.argv", ["network"])
     monkeypatch.delenv(network.INSIDE, raising=False)

@@ -60,24 +60,6 @@ def test_length_maps_are_of_the_size_and_within_the_lengths_asked(seed: int, wav
     assert (power[:, outside].sum(axis=1) < 1e-3 * power.sum(axis=1)).all()
 
 
-def test_waves_in_space_are_as_long_as_asked() -> None:
-    """Helmholtz' equation for waves of 500 mm alone. Along x a polynomial stands for them: its second derivative
-    is right, too. Differences of fourth order over 25 mm: (2π·25/500)⁴/90 = 1e-4; measured 1e-4."""
-    wave, inner = 0.5, slice(2, -2)
-    model = with_wavy_field(PLAIN, BOX, 2, waves=(wave, wave))
-    places = (np.linspace(BOX[0, 0], BOX[1, 0], 65), *model.field.grid[1:])
-    values = field_errors(model, *places)
-    laplacian = np.zeros_like(values[inner, inner, inner])
-    for axis, place in enumerate(places):
-        moved = np.moveaxis(values, axis, 0)
-        parts = [w * moved[n : len(moved) - 4 + n] for n, w in enumerate((-1.0, 16.0, -30.0, 16.0, -1.0))]
-        second = np.moveaxis(np.sum(parts, axis=0), 0, axis) / (12.0 * (place[1] - place[0]) ** 2)
-        laplacian += second[tuple(slice(None) if a == axis else inner for a in range(3))]
-    number = (2.0 * np.pi / wave) ** 2
-    left = np.abs(laplacian + number * values[inner, inner, inner]).max(axis=(0, 1, 2))
-    assert (left < 1e-3 * number * rms(values, (0, 1, 2))).all()
-
-
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_field_is_of_the_size_asked_and_smooth_between_its_lines(seed: int) -> None:
     """Size: 512 even points, 3 %, and 1 % of bilinear: 5 %. Lines stand 25 and 13 mm apart: h²/8·(2π/λ)² of a wave's

@@ -19,7 +19,7 @@ from strategies import (
     skewed_geometry,
 )
 
-from hexapod_comp.compensation.compensator import Compensator, Correction, pack_pose
+from hexapod_comp.compensation.compensator import Compensator, Correction
 from hexapod_comp.core import LONGEST_RAMP_STEP
 from hexapod_comp.errors import HexapodError, LimitError, ModelError, NotFiniteError, OutsideFieldError
 from hexapod_comp.machine.field import GridField
@@ -138,14 +138,6 @@ def test_tool_and_work_offsets_against_scipy() -> None:
         np.testing.assert_allclose(OFFSET.platform_pose(pose).position, position, atol=1e-15)
         back = OFFSET.tool_pose(record.platform_pose)
         np.testing.assert_allclose(back.position, pose.position, atol=1e-15)
-
-
-def test_a_frame_given_with_the_command_replaces_the_work_frame() -> None:
-    pose = tool_poses(OFFSET, 1, 6)[0]
-    in_base = WORK @ pose
-    by_work = Compensator(OFFSET, IDEAL).step(numbers_of(pose), 0.0)
-    by_frame = Compensator(OFFSET, IDEAL).step(numbers_of(in_base), 0.0, pack_pose(Pose.identity()))
-    np.testing.assert_allclose(by_frame, by_work, atol=1e-15)
 
 
 def test_both_entries_give_the_same_commands() -> None:

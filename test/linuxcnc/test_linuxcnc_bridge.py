@@ -537,8 +537,3 @@ def test_a_refused_component_is_named():
     HalComponent("twice", pins("in", "float", "x"), hal)
     with pytest.raises(HalError, match="HAL refuses the component 'twice': Invalid component name twice"):
         HalComponent("twice", (), hal)
-
-
-def test_bridge_without_linuxcnc_ends_with_a_message(packages, ros_context):
-    with pytest.raises(HalError, match="install LinuxCNC"):
-        LinuxcncBridgeNode(context=ros_context)

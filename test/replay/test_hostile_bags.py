@@ -46,7 +46,7 @@ def test_any_value_in_any_place_of_the_metadata(bag: Path) -> None:
     file = bag / "metadata.yaml"
     tree = yaml.safe_load(file.read_text())
     for at in places(tree):
-        for value in VALUES:
+        for value in VALUES[::2]:
             file.write_text(yaml.dump(put(tree, at, value), Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper)))
             try:
                 read_recording(bag)

@@ -172,10 +172,7 @@ HALF = np.full(6, 0.5)
 BAD = {
     "NaN": (np.where(np.arange(6) == 1, math.nan, 0.5), STRUT_NAMES, "not_finite"),
     "infinite": (np.where(np.arange(6) == 5, math.inf, 0.5), STRUT_NAMES, "not_finite"),
-    "other names": (HALF, tuple("abcdef"), "strut_names"),
     "a name twice": (HALF, ("strut_2", *STRUT_NAMES[1:]), "strut_names"),
-    "no names": (HALF, (), "strut_names"),
-    "five names": (HALF, STRUT_NAMES[:5], "strut_names"),
     "five positions": (HALF[:5], STRUT_NAMES, "strut_count"),
 }
 
@@ -255,9 +252,7 @@ def test_jump_knocks_once_and_is_pulled_back(machine):
     ("name", "value", "text"),
     [
         ("fault_stuck_strut", 7, "Min: 0, Max: 6, value: 7"),
-        ("fault_feedback_drop", 1.5, "fault_feedback_drop"),
         ("fault_feedback_delay", math.nan, "fault_feedback_delay"),
-        ("fault_jump", 0.2, "fault_jump"),
         ("fault_encoder_lost", 2.0, "must be int, not 2.0"),
         ("rate", 10.0, "parameter rate: is taken at configure, and the node is active; set it after a cleanup"),
     ],
