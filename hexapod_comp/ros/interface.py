@@ -395,9 +395,10 @@ class Outputs:
 
     def _beats(self) -> None:
         self._beat.data = (self._beat.data + 1) % 2**64
-        self._heartbeats.publish(self._beat)
+        if self._heartbeats.get_subscription_count():
+            self._heartbeats.publish(self._beat)
         lasting = round(self._options["command_timeout"] * 1e9)
-        if self.answered and lasting:
+        if self.answered and lasting and self._validities.get_subscription_count():
             self._validity.header.stamp = stamp_of(self.answered)
             self._validity.time_ref = stamp_of(min(self.answered + lasting, LAST_STAMP))
             self._validities.publish(self._validity)
