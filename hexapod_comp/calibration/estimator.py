@@ -551,14 +551,17 @@ def iterate(
     """Run Gauss–Newton steps until the parameters converge, from the nominal machine or from an answer."""
     space, weights = estimation.space, np.ones(len(estimation.measurements))
     robust = space.settings.robust
+    share, before = 1.0, np.inf  # of a step that is made: less where steps grow, as where a force changes its sign
     all_alike = 0 if x.any() else 1  # steps whose residuals are the machine's errors: no reading is downweighted
     for step in range(1, STEPS + 1):
         problem, residuals = estimation.linearise(x, weights)
         posterior = solve(space, problem, tolerances, noise)
         tolerances, noise = posterior.tolerances, posterior.noise
-        moved, x = space.physical(posterior.y) - x, space.physical(posterior.y)
+        moved = space.physical(posterior.y) - x
         sizes = np.abs(moved) / np.sqrt(np.diag(physical_covariance(space, posterior)))
         change = float(sizes.max())
+        share *= 0.5 if step > 3 and change > before else 1.0
+        x, before = space.physical(posterior.y) - (1.0 - share) * moved, change
         progress(f"step {step}: largest change {change:.2g} standard deviations")
         if (change < SETTLED and (step > all_alike + 1 or not robust)) or step == STEPS:
             break

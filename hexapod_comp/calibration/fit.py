@@ -22,6 +22,7 @@ from .blocks.block import DIGITS
 from .blocks.load import measured_loads, refuse_half_stated, stated_load
 from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
 from .estimator import (
+    ROUNDS,
     Estimation,
     LinearProblem,
     NotSettled,
@@ -30,11 +31,21 @@ from .estimator import (
     influence,
     iterate,
     physical_covariance,
+    solve,
 )
 from .lead import ScrewLead, detect_lead
 from .mixups import SWAPPED, mixups, swapped_directions
 from .parameters import FitSettings, ParameterSpace
-from .posterior import Observability, ToolError, UnseenError, box_errors, listed, observe, without_trace
+from .posterior import (
+    Observability,
+    ToolError,
+    UnseenError,
+    about_stiffness,
+    box_errors,
+    listed,
+    observe,
+    without_trace,
+)
 from .selection import Decision, select
 from .thermal import ThermalEvidence, TimeConstants, estimate_time_constants, with_courses
 from .trust import LeftOut, Residuals, Verdict, judge, with_drift
@@ -222,7 +233,7 @@ def _fit(
     solution = residuals.solution
     channels = tuple(_channels(residuals))
     notes = [
-        *_about_loads(measurements, space),
+        *_about_loads(measurements, space, solution),
         *_about_lead(lead),
         *_ignored(measurements, space),
         *_check_backlash(space, solution),
@@ -287,7 +298,13 @@ def _choose(
     everything: Estimation, problem: LinearProblem, progress: Callable[[str], object], settles: bool
 ) -> tuple[list[Decision], Posterior, Estimation, Solution]:
     """Return the decisions on blocks, the posterior with all blocks, and the fit with those kept."""
-    space = everything.space
+    space, trust = everything.space, np.ones(len(everything.measurements))
+    if space.block("friction") is not None:  # the sign of a strut's force depends on it
+        for _ in range(2):
+            first = solve(space, problem, space.start_tolerances(), np.ones(len(KINDS)), ROUNDS)
+            y = np.zeros(space.size)
+            y[first.used] = first.y
+            problem, _ = everything.linearise(space.physical(y), trust)
     decisions, possible, kept = select(space, problem, np.ones(len(KINDS)), progress)
     y = np.zeros(space.size)
     y[kept.used] = kept.y
@@ -392,7 +409,7 @@ def _about_lead(lead: ScrewLead | None) -> list[str]:
     return []
 
 
-def _about_loads(measurements: MeasurementSet, space: ParameterSpace) -> list[str]:
+def _about_loads(measurements: MeasurementSet, space: ParameterSpace, solution: Solution) -> list[str]:
     """Return the loads for which the predicted error holds, if any is stated."""
     load = stated_load(space.settings)
     loads = np.array(measured_loads(load, space.geometry, measurements.stations))
@@ -406,7 +423,7 @@ def _about_loads(measurements: MeasurementSet, space: ParameterSpace) -> list[st
     if not load.bends:
         return [f"{text}, for no struts' stiffness is stated (--load)"]
     if space.block("compliance") is None:
-        return [f"{text}; under other loads it depends on the stated stiffness; readings at two loads determine that"]
+        return ["; ".join(filter(None, (text, about_stiffness(space, solution.x))))]
     return [f"{text}, and between them; the stiffness was refined by them"]
 
 

@@ -274,8 +274,7 @@ class ParameterSpace:
             struts={**struts, **waves},
             growth=self.stated_expansion,
             late=np.zeros((len(PARTS), 0)),
-            compliance=np.zeros(6),
-            lost_motion=np.zeros(6),
+            load={},
             field=np.zeros((6, len(self.field.terms))),
             reversal=np.zeros((3, 6, len(self.field.reversal_terms))),
         )
@@ -309,13 +308,14 @@ class ParameterSpace:
         )
 
     def _load(self, draft: Draft) -> Load:
-        """Return the load block as stated, with compliances and lost motions that differ from it by a draft's."""
-        stated = stated_load(self.settings)
-        if draft.compliance.any():
+        """Return the load block as stated, with terms that differ from it by a draft's."""
+        stated, beyond = stated_load(self.settings), dict(draft.load)
+        known = {name: getattr(stated, name) + beyond.get(name, 0.0) for name in ("lost_motion", "friction")}
+        if "compliance" in beyond:
             # A step on the way may overshoot: no strut is stiffer than ten times the stated value
-            compliance = np.maximum(stated.compliance + draft.compliance, 0.1 * stated.compliance)
-            stated = replace(stated, stiffness=reciprocal(compliance))
-        return replace(stated, lost_motion=stated.lost_motion + draft.lost_motion)
+            compliance = np.maximum(stated.compliance + beyond["compliance"], 0.1 * stated.compliance)
+            known["stiffness"] = reciprocal(compliance)
+        return replace(stated, **known)
 
     def field_errors(self, x: np.ndarray, points: np.ndarray, sense: np.ndarray) -> np.ndarray:
         """Return the field at points (n, 3), m, passed in directions (n, 3), shape (n, 6), m and rad."""

@@ -10,6 +10,7 @@ Mou & King (1998): "predict the linear displacement errors of any point within d
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,6 +29,8 @@ from ..machine.temperatures import HUMIDITY, Temperatures
 from ..measurements.readings import AXES, Stations
 from ..pose import attitude_error, rotation_from_angles
 from .assumptions import ASSUMED
+from .blocks.block import Linkage
+from .blocks.load import stated_load
 from .datum import HeldDatum
 from .estimator import Estimation, LinearProblem, physical_covariance
 from .estimator import Posterior as Estimate
@@ -221,8 +224,9 @@ class ErrorPredictor:
             at = positions[solved], rotations[solved], nominal[solved], senses[solved]
             stations = Stations(warmth, *air, loads, *at)
             there = modelled[0][solved], modelled[1][solved]
-            joints = (np.tile(j, (reached, 1, 1)) for j in (structure.base_joints, structure.platform_joints))
-            rows = derivatives(space, Prediction(np.zeros((reached, 6)), *there, *joints), stations)
+            base, platform = (np.tile(j, (reached, 1, 1)) for j in (structure.base_joints, structure.platform_joints))
+            found = Prediction(np.zeros((reached, 6)), *there, base, platform, machine.model.load)
+            rows = derivatives(space, found, stations)
             rows = carried(rows, there[1] @ (geometry.tool.position - space.probe))
             columns[solved, :, 1:] = np.concatenate([work.T @ rows[:, :3], work.T @ rows[:, 3:]], axis=1)
         return FirstOrder(geometry.tool_poses(positions, rotations)[0], columns)
@@ -306,6 +310,26 @@ def box_errors(space: ParameterSpace, x: np.ndarray, tilt: float = 0.0) -> First
     """Return the errors at :func:`box_stations`, the datum aligned; None where no machine takes such poses."""
     stations = box_stations(space, tilt)
     return None if stations is None else FirstOrder.of(space, predict(space, x, stations), stations).aligned()
+
+
+def about_stiffness(space: ParameterSpace, x: np.ndarray) -> str:
+    """Return by how much a stated stiffness that no reading refines adds to the tool's error under other weights.
+
+    RMS in the box, datum aligned, with the stiffness off by one standard deviation, in the worst direction of weight.
+    """
+    stations = box_stations(space)
+    if stations is None or space.block("compliance") is not None or not stated_load(space.settings).stiffness.all():
+        return ""
+    linkage, sizes = Linkage(predict(space, x, stations), space.probe, stations), []
+    for force in 10.0 * np.eye(6)[:3]:
+        tension = linkage.tensions(np.tile(force, (len(stations), 1)))
+        moved = linkage.per_length @ (ASSUMED.stated_stiffness * linkage.load.compliance * tension)[..., None]
+        sizes.append(math.sqrt(3.0) * rms(FirstOrder(linkage.points, moved).aligned().values[:, :3]))
+    return (
+        f"elsewhere as far as the stated stiffness is right: off by {100.0 * ASSUMED.stated_stiffness:.0f} %, it adds "
+        f"{1e6 * max(sizes):.2g} µm for each 10 N by which the weight differs in size or direction; the same readings "
+        "at a second load, which should differ most, such as without the tool, refine it"
+    )
 
 
 def expected_error(

@@ -16,7 +16,7 @@ from .estimator import SETTLED
 from .fit import ChannelFit, ModelFit, Outlier
 from .lead import ScrewLead
 from .lines import LineFit, LinesFit
-from .posterior import BlockSight, Observability, ToolError, UnseenError, listed
+from .posterior import BlockSight, Observability, ToolError, UnseenError, about_stiffness, listed
 from .thermal import warming_json, warming_text
 from .trust import TILT
 
@@ -279,7 +279,9 @@ def plan_report(plan: Plan) -> str:
         f"{part}\n  {stops_text(plan.stops)}" for part in _expected(plan.level, plan.tilted, plan.observability)
     ]
     seen = observability_text(plan.observability, plan.unseen_errors)
-    return "\n\n".join([head, *expected, seen]) + "\n"
+    stiffness = about_stiffness(plan.space, np.zeros(plan.space.size))
+    parts = [head, *expected, seen, *([f"holds for the load of the readings; {stiffness}"] if stiffness else [])]
+    return "\n\n".join(parts) + "\n"
 
 
 def plan_json(plan: Plan) -> dict:

@@ -378,7 +378,7 @@ ESTIMATION = under(
     value("--lead-mm", scaled(bound, 1e-3), "MM", "period of the screws' errors (default: the geometry's; else "
                                                   "estimated from the readings)", dest="lead"),
     value("--blocks", None, "A,B,…", "what may be fitted: pitch, wave, harmonics, backlash, map, field, expansion, "
-          "moisture, late, compliance, lost motion (default all)"),
+          "moisture, late, compliance, lost motion, friction (default all)"),
     SEPARATE,
     value("--tolerance-um", bound, "UM", "initial tolerance of the joints, µm (default 100)"),
     choice("--tracker-frame", ("free", "known"), "free: the tracker's frame is unknown, six unknowns a run (default); "

@@ -4,14 +4,38 @@
  */
 #include "core.h"
 
-/* By how much each strut is longer under the load at a pose, m */
-static void load_stretch(const hc_state *state, const hc_pose *pose, const six_struts *now, double stretch[6])
+/* Force of a strut's bearings on the platform by its direction, of size 1, while the platform moves: each bearing that turns
+ * resists by `friction`, N m. With a cardan joint, `axis` fixed in the base, two bearings turn; else it is a ball joint. */
+static vec bearing_force(vec along, double length, vec motion, const double axis[3], double friction)
+{
+    const vec across = subtract(motion, scale(dot(motion, along), along)), yoke = cross(row_of(axis), along);
+    const double turning = norm(across), share = norm(yoke), slow = SLIDING * norm(motion);
+    if (share > SLIDING) {
+        const vec first = scale(1.0 / share, yoke), second = cross(first, along);
+        const double by_first = fmax(-1.0, fmin(1.0, dot(motion, first) / slow)) / share;
+        const double by_second = fmax(-1.0, fmin(1.0, dot(motion, second) / slow));
+        return scale(-friction / length, add(scale(by_first, first), scale(by_second, second)));
+    }
+    return scale(-friction / (length * fmax(turning, slow)), across);
+}
+
+/* By how much each strut is longer under the load at a pose that is passed in a direction, m */
+static void load_stretch(const hc_state *state, const hc_pose *pose, const six_struts *now, const double sense[9],
+                         double stretch[6])
 {
     const hc_load *load = &state->model->load;
     const mat r = three_rows(pose->rotation);
     const vec g = row_of(finite_number(state->gravity[0]) ? state->gravity : load->gravity);
-    const vec force = add(scale(load->mass, g), times(r.row, row_of(state->external)));
-    const vec torque = add(cross(times(r.row, row_of(load->moment)), g), times(r.row, row_of(state->external + 3)));
+    vec force = add(scale(load->mass, g), times(r.row, row_of(state->external)));
+    vec torque = add(cross(times(r.row, row_of(load->moment)), g), times(r.row, row_of(state->external + 3)));
+    for (int i = 0; i < 6; i++) {
+        if (load->friction[i] != 0.0 && dot(row_of(sense), row_of(sense)) > 0.0) {
+            const vec along = scale(1.0 / now->length[i], now->strut[i]);
+            const vec held = bearing_force(along, now->length[i], row_of(sense), state->model->base.axes[i], load->friction[i]);
+            force = add(force, held);
+            torque = add(torque, cross(times(r.row, row_of(state->platform_joints[i])), held));
+        }
+    }
     const blocks f = eliminate(now->strut, now->moment);
     double per_length[6];
     substitute_transposed(now->moment, &f, force, torque, per_length);
@@ -48,7 +72,7 @@ static int run_backwards(const hc_state *state, const hc_pose *platform, double 
     double stretch[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
     *now = struts_of(state->base_joints, state->platform_joints, q);
     if (model->load.bends) {
-        load_stretch(state, q, now, stretch);
+        load_stretch(state, q, now, sense, stretch);
     }
     for (int i = 0; i < 6; i++) {
         const double direction = follow(now->length[i], model->strut_threshold, low, sense, 3 + i);
@@ -325,7 +349,7 @@ static solution run_forwards(const hc_state *state, const double commands[6], co
             now = struts_of(state->base_joints, state->platform_joints, q);
         }
         if (model->load.bends) {
-            load_stretch(state, q, &now, stretch);
+            load_stretch(state, q, &now, sense, stretch);
         }
         for (int i = 0; i < 6; i++) {
             const double shift = screw_shift(model, q, &now, i);

@@ -37,6 +37,7 @@
 #define FIELD_ITERATIONS 50
 #define COMMAND_ITERATIONS 8
 #define SMALL_ANGLE (1.0 / 64.0) /* rad */
+#define SLIDING 0.02 /* share of the motion below which a bearing turns too little to resist in full */
 #define TURN_ITERATIONS 20 /* of lengths against what depends on the pose: turning screws, load */
 
 /* What loops over lanes (lanes.c) call, and a loop of six in it: calls and loops would keep them from becoming vector code. */

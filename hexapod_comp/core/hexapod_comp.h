@@ -109,6 +109,7 @@ typedef struct {
     int bends;             /* 0: nothing does, and none of the rest counts */
     double compliance[6];  /* m/N */
     double play[6];        /* m: lost motion when the strut's force changes its sign */
+    double friction[6];    /* N m: torque of each of its bearings against its turning, by the direction of motion */
     double take_up;        /* N: below this force the play is taken up in proportion, so that nothing jumps */
     double mass;           /* kg, of platform and tool */
     double moment[3];      /* kg m: mass times centre of mass, in `platform` */

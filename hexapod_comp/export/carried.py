@@ -24,7 +24,7 @@ CARRIED = frozenset(
         *(f"field.{name}" for name in ("grid", "lines", "probe", "outside", "reversal_threshold")),
         *("base_expansion", "platform_expansion"),
         *(f"late_growth.{name}" for name in ("time_constants", "expansion", "thermometer")),
-        *(f"load.{name}" for name in ("stiffness", "lost_motion", "take_up", "mass", "centre", "gravity")),
+        *(f"load.{name}" for name in ("stiffness", "lost_motion", "friction", "take_up", "mass", "centre", "gravity")),
     }
 )
 """What the C core holds. LinuxCNC's files and the table hold it or report it: field or tilt, growth, swelling."""

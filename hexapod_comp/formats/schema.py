@@ -52,6 +52,7 @@ UNITS: dict[str, dict[str, float]] = {
     "jerk": {"m_s3": 1.0, "mm_s3": 1e-3},
     "time": {"s": 1.0, "ms": 1e-3},
     "force": {"N": 1.0, "kN": 1e3},
+    "torque": {"N_m": 1.0},
     "mass": {"kg": 1.0, "g": 1e-3},
     "stiffness": {"N_per_um": 1e6, "N_per_mm": 1e3},
     "pressure": {"Pa": 1.0, "hPa": 1e2, "kPa": 1e3},

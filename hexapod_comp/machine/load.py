@@ -156,6 +156,13 @@ class Load:
     gravity: np.ndarray = term(
         "load", "m_s2", "in `base`, if no other is given", (3,), np.array(DOWN), largest=EARTH[1]
     )
+    friction: np.ndarray = term(
+        "load",
+        "N_m",
+        "torque of each bearing of a strut against its turning",
+        PER_STRUT,
+        largest=1e3,
+    )
 
     def __post_init__(self) -> None:
         settle(self)
@@ -172,23 +179,23 @@ class Load:
 
     @property
     def bends(self) -> bool:
-        """Whether any strut's length depends on its force."""
+        """Whether any strut's length depends on its force, which friction alone does not make it do."""
         return bool(self.stiffness.any() or self.lost_motion.any())
 
     def numbers(self) -> tuple[float, ...]:
-        """Return it as twenty numbers, SI, the compliance in place of the stiffness: for the settings of a fit."""
+        """Return it as 26 numbers, SI, the compliance in place of the stiffness: for the settings of a fit."""
         return (
             *(*self.compliance.tolist(), *self.lost_motion.tolist(), self.take_up, self.mass),
-            *(*self.centre.tolist(), *self.gravity.tolist()),
+            *(*self.centre.tolist(), *self.gravity.tolist(), *self.friction.tolist()),
         )
 
     @classmethod
     def from_numbers(cls, numbers: Sequence[float]) -> Load:
         """Return the loading of :meth:`numbers`."""
-        if len(numbers) != 20:
-            raise ModelError("load", "must be twenty numbers", list(numbers))
-        n = np.array(numbers, dtype=float)
-        return cls(reciprocal(n[:6]), n[6:12], float(n[12]), float(n[13]), n[14:17], n[17:])
+        if len(numbers) not in (20, 26):  # a fit of 0.2 had no friction
+            raise ModelError("load", "must be 26 numbers", list(numbers))
+        n = np.array([*numbers, *[0.0] * 6][:26], dtype=float)
+        return cls(reciprocal(n[:6]), n[6:12], float(n[12]), float(n[13]), n[14:17], n[17:20], n[20:])
 
     def members(self, geometry: HexapodGeometry) -> dict[str, Any]:
         """Return the values of hc_load: platform and tool together."""
@@ -197,6 +204,7 @@ class Load:
             "bends": int(self.bends),
             "compliance": self.compliance,
             "play": self.lost_motion,
+            "friction": self.friction,
             "take_up": self.take_up,
             "mass": self.mass + tool.mass,
             "moment": self.mass * self.centre + tool.mass * np.array(tool.centre),

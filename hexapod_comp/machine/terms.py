@@ -13,7 +13,12 @@ from ..errors import ModelError
 from ..formats.schema import DIMENSIONS, PER_STRUT, UNITS, Numbers, Section, Shape
 
 # Units in which bounds are shown, and their number in an SI unit, where it is not the file's own
-SHOWN = {"um": ("mm", 1e3), "urad": ("mrad", 1e3), "ppm_per_percent": ("ppm per % of relative humidity", 1e4)}
+SHOWN = {
+    "um": ("mm", 1e3),
+    "urad": ("mrad", 1e3),
+    "N_m": ("N m", 1.0),
+    "ppm_per_percent": ("ppm per % of relative humidity", 1e4),
+}
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from hexapod_comp.calibration.changes import PAYLOAD, TEMPERATURE, payload_chang
 from hexapod_comp.calibration.check import NAMED, VALID, refusal, verification_report, verify_model
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
-from hexapod_comp.calibration.posterior import FittedParameters
+from hexapod_comp.calibration.posterior import FirstOrder, FittedParameters, about_stiffness, box_stations
 from hexapod_comp.calibration.posterior_file import load_posterior, save_with_posterior
 from hexapod_comp.calibration.sensitivity import derivatives, predict
 from hexapod_comp.cli import main
@@ -89,6 +89,26 @@ def test_a_stated_stiffness_holds_for_tools_that_no_reading_has_seen() -> None:
     assert any("no struts' stiffness is stated" in note for note in blind.notes)
 
 
+def test_a_fit_says_what_a_stiffness_that_is_off_adds_under_another_load() -> None:
+    """Against the core: 10 N more along each axis on struts that are a tenth softer, as gravity of 50 kg more."""
+    space = fit(TOLD).space
+    stated = float(re.findall(r"it adds ([\d.]+) µm for each 10 N", about_stiffness(space, np.zeros(space.size)))[0])
+    stations, errors = box_stations(space), []
+    assert stations is not None
+    for axis in np.eye(3):
+        row = [*[np.nan] * 4, *(DOWN + 10.0 / STATED.mass * axis)]
+        shifts = []
+        for soft in (1.0, 1.1):
+            told = replace(TOLD, load=replace(STATED, stiffness=STATED.stiffness / soft).numbers())
+            one = ParameterSpace((space.geometry, space.region), replace(told, blocks=()))
+            at = [replace(stations, loads=np.tile(r, (len(stations), 1))) for r in (row, [*[np.nan] * 4, *DOWN])]
+            shifts.append(np.subtract(*(predict(one, np.zeros(one.size), each).errors for each in at)))
+        columns = (shifts[1] - shifts[0])[..., None]
+        aligned = FirstOrder(stations.positions + stations.rotations @ space.probe, columns).aligned()
+        errors.append(1e6 * np.sqrt((aligned.values[:, :3] ** 2).sum(axis=1).mean()))
+    assert max(errors) == pytest.approx(stated, rel=0.05)
+
+
 def test_readings_at_two_loads_refine_the_stiffness() -> None:
     """Six numbers, stated to ±10 %, come nearer to the truth in the mean, within what the fit says of each."""
     fitted = fit(TOLD, two=True)
@@ -101,18 +121,29 @@ def test_readings_at_two_loads_refine_the_stiffness() -> None:
     assert any("between them; the stiffness was refined" in note for note in fitted.notes)
 
 
-def test_compliance_has_the_slopes_that_the_core_has() -> None:
-    """Finite differences of the prediction, which the core makes; tilted gravity, a payload off the middle."""
+@pytest.mark.parametrize("axes", [None, np.roll(np.eye(3), 1, 0)[[0, 1, 0, 1, 0, 1]]], ids=["ball", "cardan"])
+def test_the_blocks_of_load_have_the_slopes_that_the_core_has(axes: np.ndarray | None) -> None:
+    """Finite differences of the prediction, which the core makes; tilted gravity, a payload off the middle, friction.
+
+    A lost motion is taken up within 30 N, so that many readings are on its slope, and few at its ends.
+    """
     readings = joined([under(SPINDLE, 1), under(HEAVY, 2, (1.0, -2.0, -9.5))])
-    space, x = ParameterSpace(readings, TOLD), None
-    block, stations = space.block("compliance"), readings.stations
-    assert block is not None
+    readings = replace(readings, geometry=replace(readings.geometry, base_axes=axes))
+    stated = replace(STATED, friction=np.full(6, 0.5), lost_motion=np.full(6, 4e-6), take_up=30.0)
+    told = replace(TOLD, load=stated.numbers(), blocks=("compliance", "lost motion", "friction"))
+    space, stations = ParameterSpace(readings, told), readings.stations
     x = np.zeros(space.size)
-    rows = derivatives(space, predict(space, x, stations), stations)[:, :, block.part]
-    for n, row in enumerate(range(block.part.start, block.part.stop)):
-        step = 1e-9 * (np.arange(space.size) == row)
-        ahead, behind = (predict(space, x + way * step, stations).errors for way in (1.0, -1.0))
-        np.testing.assert_allclose(rows[:, :, n], (ahead - behind) / 2e-9, rtol=2e-3, atol=2e-3 * np.abs(rows).max())
+    rows = derivatives(space, predict(space, x, stations), stations)
+    for name, step in (("compliance", 1e-9), ("lost motion", 1e-7), ("friction", 1e-3)):
+        block = space.block(name)
+        assert block is not None
+        size = np.abs(rows[:, :, block.part]).max()
+        for n in range(block.part.start, block.part.stop):
+            ahead, behind = (
+                predict(space, x + way * step * (np.arange(space.size) == n), stations).errors for way in (1.0, -1.0)
+            )
+            slopes = (ahead - behind) / (2.0 * step)
+            np.testing.assert_allclose(rows[:, :, n], slopes, rtol=2e-3, atol=2e-3 * size, err_msg=name)
 
 
 def test_the_model_says_for_which_loads_and_the_compensator_warns_outside(tmp_path: Path) -> None:
@@ -257,22 +288,25 @@ def test_readings_of_which_half_state_a_payload_are_refused() -> None:
     refuse_half_stated(under(SPINDLE, 1))
 
 
-def test_lost_motion_by_the_force_s_sign_is_fitted_where_forces_change_their_sign() -> None:
-    """Truth: six clearances that no reading's direction shows. At the box's sides struts pull that push in its middle.
+def test_lost_motion_and_friction_are_fitted_where_forces_change_their_sign() -> None:
+    """Truth: six clearances and frictions. At the box's sides struts pull that push in its middle.
 
-    Without the block they look like a field; where all struts push nothing shows it, and it is left out.
+    Without the blocks they look like a field; where all struts push nothing shows a clearance, and it is left out.
     """
-    clearance = 1e-6 * np.array([3.0, 5.0, 2.0, 6.0, 4.0, 1.0])
-    loose = RealMachine(paper(), replace(truth().model, load=replace(TRUE, lost_motion=clearance)))
+    clearance, friction = 1e-6 * np.array([3.0, 5.0, 2.0, 6.0, 4.0, 1.0]), np.array([0.4, 1.0, 0.6, 0.8, 0.3, 0.7])
+    loose = RealMachine(paper(), replace(truth().model, load=replace(TRUE, lost_motion=clearance, friction=friction)))
     plan, laid = campaign(), under(SPINDLE, 1)
     readings = measure(laid, plan, loose, 4)
-    told = replace(TOLD, blocks=(*BLOCKS, "lost motion"))
+    told = replace(TOLD, blocks=(*BLOCKS, "lost motion", "friction"))
     fitted, without = fit_model(readings, told), fit_model(readings, replace(told, blocks=BLOCKS))
-    block = fitted.space.block("lost motion")
-    assert block is not None
-    error = fitted.model.load.lost_motion - clearance
-    assert (np.abs(error) < 4.0 * fitted.standard_errors[block.part]).all()
-    assert np.abs(error).max() < 1e-6
+    for name, error, most in (
+        ("lost motion", fitted.model.load.lost_motion - clearance, 1e-6),
+        ("friction", fitted.model.load.friction - friction, 0.5),
+    ):
+        block = fitted.space.block(name)
+        assert block is not None
+        assert (np.abs(error) < 4.0 * fitted.standard_errors[block.part]).all()
+        assert np.abs(error).max() < most
     before, after = (
         tool_error(RealMachine(loose.geometry.carrying(SPINDLE), loose.model), each.model)[0]
         for each in (without, fitted)

@@ -119,13 +119,13 @@ def test_a_hanging_machine_is_commanded_shorter() -> None:
 @fixed
 @given(seeds)
 def test_forwards_undoes_backwards_under_any_load(seed: int) -> None:
-    """Closure within 1e-13 m and 1e-12 rad, with all other blocks, lost motion, gravity from anywhere and a wrench."""
+    """Closure within 1e-13 m and 1e-12 rad, with all other blocks and terms of load, any gravity and a wrench."""
     rng = np.random.default_rng(seed)
     geometry = skewed_geometry(lead=0.01 * float(rng.integers(2)))
     geometry = replace(geometry, payloads={"tool": Payload(rng.uniform(0.0, 20.0), tuple(rng.uniform(-0.1, 0.1, 3)))})
     load = Load(
         stiffness=rng.uniform(5e6, 100e6, 6), lost_motion=rng.uniform(0.0, 10e-6, 6), mass=rng.uniform(0.0, 50.0),
-        centre=rng.uniform(-0.1, 0.1, 3),
+        centre=rng.uniform(-0.1, 0.1, 3), friction=rng.uniform(0.0, 2.0, 6),
     )  # fmt: skip
     down = rng.normal(size=3)
     loading = Loading.of(G * down / np.linalg.norm(down), rng.uniform(-100.0, 100.0, 6))
@@ -205,13 +205,16 @@ def loaded_commands(geometry: HexapodGeometry, model: MachineModel, loading: Loa
 
 def test_the_model_file_has_the_block() -> None:
     """Written and read again it is the same; engineers write N/µm, µm, kg and mm."""
-    load = Load(SOFT, np.full(6, 3e-6), 5.0, 12.5, np.array([0.01, 0.0, 0.02]), np.array([0.0, G, 0.0]))
+    load = Load(
+        SOFT, np.full(6, 3e-6), 5.0, 12.5, np.array([0.01, 0.0, 0.02]), np.array([0.0, G, 0.0]), np.arange(1.0, 7.0)
+    )
     text = model_text(MachineModel("paper", load=load, origin=ModelOrigin("2026-11-24")))
     assert "stiffness_N_per_um: 20.0\n" in text
     assert "mass_kg: 12.5\n" in text
+    assert "friction_N_m: [1.0, 2.0, " in text
     assert "gravity_m_s2: [" in text
     again = parse_model(text, "paper").load
-    for name in ("stiffness", "lost_motion", "take_up", "mass", "centre", "gravity"):
+    for name in ("stiffness", "lost_motion", "take_up", "mass", "centre", "gravity", "friction"):
         np.testing.assert_array_equal(getattr(again, name), getattr(load, name))
     assert "load" not in model_text(MachineModel("paper", origin=ModelOrigin("2026-11-24")))
 

@@ -15,6 +15,7 @@ from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.sensitivity import Prediction, derivatives
 from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.load import Load
 from hexapod_comp.pose import Pose
 from hexapod_comp.workspace.budget import Budget, SingleErrors
 from hexapod_comp.workspace.combined import (
@@ -272,8 +273,8 @@ def test_calibrations_derivatives_are_effects_of_single_errors():
     poses = [Pose(p, r) for p, r in zip(positions, rotations, strict=True)]
     readings = small.scattered(small.paper(), poses, None, probe)
     space = ParameterSpace(readings, FitSettings(lead=small.LEAD, field_degree=2))
-    joints = (np.tile(array, (len(poses), 1, 1)) for array in (geometry.base_joints, geometry.platform_joints))
-    nominal = Prediction(np.zeros((len(poses), 6)), positions, rotations, *joints)
+    base, platform = (np.tile(each, (len(poses), 1, 1)) for each in (geometry.base_joints, geometry.platform_joints))
+    nominal = Prediction(np.zeros((len(poses), 6)), positions, rotations, base, platform, Load())
     rows = derivatives(space, nominal, readings.stations)[:, :, space.block("structure").part][:, :, :18]
     found = root_sum_of_squares(covariance_vectors(rows, 10e-6**2 * np.eye(18)))
     budget = Budget(geometry.name, {"base_joint_xy": 10e-6, "base_joint_z": 10e-6})

@@ -5,8 +5,7 @@ from .block import Block
 from .field import FieldDisplacement, FieldReversal, FieldRotation
 from .growth import Expansion, Late, Moisture
 from .length_map import LengthMap
-from .load import Compliance
-from .lost_motion import LostMotion
+from .load import Compliance, Friction, LostMotion
 from .pitch import Pitch
 from .structure import Structure
 from .waves import Wave, Wave2, Wave3, Wave4
@@ -29,6 +28,7 @@ ERRORS: tuple[type[Block], ...] = (
     Late,
     Compliance,
     LostMotion,
+    Friction,
 )
 """The registry: all blocks, in the order of the parameter vector."""
 
@@ -37,5 +37,5 @@ WAVES = {wave.name: wave.times for wave in (Wave, Wave2, Wave3, Wave4)}
 
 HARMONICS = tuple(name for name, times in WAVES.items() if times > 1)
 
-EXPECTED = ("pitch", "wave", "backlash", "expansion", "moisture", "late", "compliance", "lost motion")
+EXPECTED = ("pitch", "wave", "backlash", "expansion", "moisture", "late", "compliance", "lost motion", "friction")
 """Errors that every screw has, and growth; a length map, wear or a field need not exist."""

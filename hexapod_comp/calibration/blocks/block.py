@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 
 from ...machine.geometry import STRUT_NAMES, HexapodGeometry
+from ...machine.load import Load
 from ...measurements.readings import Stations
 
 if TYPE_CHECKING:
@@ -46,8 +47,7 @@ class Draft:
     field: np.ndarray  # (6, terms), mean of both directions, m and rad
     reversal: np.ndarray  # (3, 6, reversal terms): forward minus backward along x, y, z, m and rad
     late: np.ndarray  # (8, time constants), 1/K
-    compliance: np.ndarray  # (6,): of the struts beyond the stated, m/N
-    lost_motion: np.ndarray  # (6,): by the sign of the struts' forces, beyond the stated, m
+    load: dict[str, np.ndarray]  # terms of the load block beyond the stated, by name, SI; compliance for stiffness
 
 
 class Errors(NamedTuple):
@@ -68,10 +68,7 @@ class Prediction:
     rotations: np.ndarray  # (M, 3, 3)
     base_joints: np.ndarray  # (M, 6, 3): real joints at each station's temperatures, m
     platform_joints: np.ndarray
-
-    def select(self, chosen: np.ndarray | slice) -> Prediction:
-        """Return the machine at some of the stations."""
-        return Prediction(**{name: array[chosen] for name, array in vars(self).items()})
+    load: Load
 
 
 class Linkage:
@@ -79,6 +76,7 @@ class Linkage:
 
     def __init__(self, prediction: Prediction, probe: np.ndarray, stations: Stations) -> None:
         self.stations, self.rotations, self.base_joints = stations, prediction.rotations, prediction.base_joints
+        self.load = prediction.load
         self.arms = np.einsum("nij,nkj->nki", self.rotations, prediction.platform_joints)  # from the platform's origin
         struts = prediction.positions[:, None] + self.arms - self.base_joints
         self.lengths = np.linalg.norm(struts, axis=2)

@@ -1,20 +1,23 @@
-"""Compliance: the stretch of a strut with its joints under its force, beyond the stated one."""
+"""What struts give under load, beyond what is stated: compliance, lost motion by force, friction of their bearings."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from abc import abstractmethod
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from ...errors import CalibrationError
-from ...machine.geometry import HexapodGeometry
+from ...machine.geometry import STRUT_NAMES, HexapodGeometry
 from ...machine.load import MOST_LOADS, Load
 from ...measurements.readings import MeasurementSet, Stations
 from ..assumptions import ASSUMED
-from .block import Draft, Facts, Linkage, Prediction, StrutBlock
+from .block import Block, Columns, Draft, Facts, Linkage, Prediction
 
 if TYPE_CHECKING:
     from ..parameters import FitSettings
+
+SLIDING = 0.02  # share of the motion below which a bearing turns too little to resist in full; as in the core
 
 
 def stated_load(settings: FitSettings) -> Load:
@@ -60,11 +63,36 @@ def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) ->
     return tuple(map(tuple, different[kept].tolist()))
 
 
-def tensions(load: Load, geometry: HexapodGeometry, linkage: Linkage) -> np.ndarray:
-    """Return what the struts pull with under the weight at a linkage's stations, (M, 6), N."""
+def bearing_forces(geometry: HexapodGeometry, linkage: Linkage) -> np.ndarray:
+    """Return the forces on the platform of bearings that resist with 1 N m, by each strut's, (M, 6, 3), N."""
+    u, motion = linkage.directions, linkage.stations.sense[:, None, :3]
+    slow = SLIDING * np.maximum(np.linalg.norm(motion, axis=2), 1.0)
+    if geometry.base_axes is not None:  # two bearings of a cardan joint turn
+        yoke = np.cross(geometry.base_axes, u)
+        share = np.linalg.norm(yoke, axis=2, keepdims=True)
+        first = yoke / np.maximum(share, SLIDING)
+        sides = (first, first / np.maximum(share, SLIDING)), (np.cross(first, u),) * 2
+        force = sum(np.clip((motion * n).sum(axis=2) / slow, -1.0, 1.0)[..., None] * along for n, along in sides)
+    else:
+        across = motion - (motion * u).sum(axis=2, keepdims=True) * u
+        force = across / np.maximum(np.linalg.norm(across, axis=2), slow)[..., None]
+    return -force / linkage.lengths[..., None]
+
+
+def by_friction(geometry: HexapodGeometry, linkage: Linkage) -> np.ndarray:
+    """Return the struts' tensions by 1 N m in the bearings of each strut, (M, 6, 6), N."""
+    forces = bearing_forces(geometry, linkage)
+    wrenches = np.concatenate([forces, np.cross(linkage.arms, forces)], axis=2)
+    return np.stack([linkage.tensions(wrenches[:, n]) for n in range(6)], axis=2)
+
+
+def tensions(geometry: HexapodGeometry, linkage: Linkage) -> np.ndarray:
+    """Return what the struts pull with under weight and friction at a linkage's stations, (M, 6), N."""
+    load = linkage.load
     mass, moment, gravity = weights(load, geometry, linkage.stations)
     torque = np.cross(np.einsum("mij,mj->mi", linkage.rotations, moment), gravity)
-    return linkage.tensions(np.concatenate([mass[:, None] * gravity, torque], axis=1))
+    pulled = linkage.tensions(np.concatenate([mass[:, None] * gravity, torque], axis=1))
+    return pulled + by_friction(geometry, linkage) @ load.friction if load.friction.any() else pulled
 
 
 def as_loaded(settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> set[str]:
@@ -72,40 +100,94 @@ def as_loaded(settings: FitSettings, geometry: HexapodGeometry, stations: Statio
 
     Forces are those of the nominal machine.
     """
-    load, hidden = stated_load(settings), {"compliance", "lost motion"}
+    load, hidden = stated_load(settings), {"compliance", "lost motion", "friction"}
     if not settings.load or not len(stations):
         return hidden
     mass, _, gravity = weights(load, geometry, stations)
     forces = mass[:, None] * gravity
-    if load.stiffness.all() and np.linalg.norm(np.ptp(forces, axis=0)) >= ASSUMED.least_load:
-        hidden.remove("compliance")
-    joints = (np.tile(each, (len(stations), 1, 1)) for each in (geometry.base_joints, geometry.platform_joints))
-    nominal = Prediction(np.zeros((len(stations), 6)), stations.positions, stations.rotations, *joints)
-    pulled = tensions(load, geometry, Linkage(nominal, np.zeros(3), stations))
+    if load.stiffness.all():
+        if np.linalg.norm(np.ptp(forces, axis=0)) >= ASSUMED.least_load:
+            hidden.remove("compliance")
+        if stations.sense[:, :3].any():
+            hidden.remove("friction")
+    base, platform = (np.tile(each, (len(stations), 1, 1)) for each in (geometry.base_joints, geometry.platform_joints))
+    errors = np.zeros((len(stations), 6))
+    nominal = Prediction(errors, stations.positions, stations.rotations, base, platform, load)
+    pulled = tensions(geometry, Linkage(nominal, np.zeros(3), stations))
     if ((pulled.min(axis=0) < -load.take_up) & (pulled.max(axis=0) > load.take_up)).any():
         hidden.remove("lost motion")
     return hidden
 
 
-class Compliance(StrutBlock):
-    """c of each strut, m/N, beyond the stated: δl = c · its tension under weight."""
+class LoadBlock(Block):
+    """A term of the load block, one number a strut, beyond what is stated; those of one machine's struts are alike."""
 
-    name, unit, tolerance = "compliance", "m/N", 15e-9
+    term: ClassVar[str]  # its name in Draft.load
+    alike: ClassVar[float] = 0.0  # correlation of the struts' numbers
 
-    def __init__(self, load: Load, geometry: HexapodGeometry) -> None:
-        super().__init__()
-        self._load, self._geometry = load, geometry
+    def __init__(self, geometry: HexapodGeometry) -> None:
+        self._geometry = geometry
+        self.labels = tuple(f"{strut} {self.name}" for strut in STRUT_NAMES)
+        self.root = np.linalg.cholesky(self.alike + (1.0 - self.alike) * np.eye(6))
 
     @classmethod
-    def of(cls, facts: Facts) -> Compliance | None:
-        """If a stiffness is stated; the settings' blocks report whether there were several loads."""
-        load = stated_load(facts.settings)
-        return cls(load, facts.geometry) if load.stiffness.all() else None
+    def of(cls, facts: Facts) -> LoadBlock | None:
+        """If a stiffness is stated; the settings' blocks report whether readings show it."""
+        return cls(facts.geometry) if stated_load(facts.settings).stiffness.all() else None
 
-    def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """The struts' tensions."""
-        return tensions(self._load, self._geometry, linkage)[..., None]
+    @abstractmethod
+    def stretched(self, linkage: Linkage) -> np.ndarray:
+        """Return by how much each number lengthens the struts, (M, 6, 6)."""
+
+    def design(self, linkage: Linkage, whitened: bool) -> Columns:
+        """Every strut that a number lengthens moves the point by that strut's gain."""
+        factors = self.stretched(linkage) @ (self.root if whitened else np.eye(6))
+        return lambda errors: np.einsum("ns,nsp->np", errors.gains, factors[errors.at])
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """It adds to what is stated."""
-        draft.compliance = draft.compliance + x
+        """It adds to what is stated; a small negative one is noise, and stays."""
+        draft.load[self.term] = x
+
+
+class Compliance(LoadBlock):
+    """c of each strut, m/N: δl = c · its tension."""
+
+    name, unit, tolerance, term = "compliance", "m/N", 15e-9, "compliance"
+
+    def stretched(self, linkage: Linkage) -> np.ndarray:
+        """The struts' tensions."""
+        return tensions(self._geometry, linkage)[..., None] * np.eye(6)
+
+
+class LostMotion(LoadBlock):
+    """By how much a strut is longer when it is pulled than when it is pushed, c: δl = c/2 · the sign of its tension.
+
+    In proportion where that is nearly none.
+    """
+
+    name, unit, tolerance, term = "lost motion", "m", 3e-6, "lost_motion"
+    alike = ASSUMED.alike
+
+    @classmethod
+    def of(cls, facts: Facts) -> LoadBlock | None:
+        """Where it is stated what the struts carry, be they rigid."""
+        return cls(facts.geometry) if facts.settings.load else None
+
+    def stretched(self, linkage: Linkage) -> np.ndarray:
+        """Half the sign of the struts' tensions."""
+        taken_up = np.clip(tensions(self._geometry, linkage) / linkage.load.take_up, -1.0, 1.0)
+        return 0.5 * taken_up[..., None] * np.eye(6)
+
+
+class Friction(LoadBlock):
+    """Torque of each bearing of a strut against its turning, N m: it changes all tensions by the motion's direction."""
+
+    name, unit, tolerance, term = "friction", "N m", 0.5, "friction"
+    alike = ASSUMED.alike
+
+    def stretched(self, linkage: Linkage) -> np.ndarray:
+        """Stretch by the struts' tensions, and the reversal of lost motions."""
+        load = linkage.load
+        turning = np.abs(tensions(self._geometry, linkage)) < load.take_up
+        per_newton = load.compliance + 0.5 * load.lost_motion / load.take_up * turning
+        return per_newton[..., None] * by_friction(self._geometry, linkage)
