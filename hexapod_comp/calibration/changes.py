@@ -6,9 +6,10 @@ by A·θ, θ ~ N(0, s²), with several scales s, equally likely: under it they a
 
 from __future__ import annotations
 
+import copy
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from scipy.special import chdtr, chdtrc
 
 from ..errors import CalibrationError
 from ..machine.geometry import STRUT_NAMES
+from ..machine.load import Load
 from ..measurements.readings import AXES, CHANNELS, KINDS, MeasurementSet
 from .assumptions import ASSUMED
 from .blocks.block import Linkage
@@ -45,6 +47,10 @@ FAMILIES = {
 HEAVIER = "heavier or lighter"  # the name of a change of the payload in its centre
 # weight relative to the trace: parameters that represent a payload then stay small at the corners of the box too
 RIDGE = 1e-8
+SECANTS = 5  # updates of the effect of a payload that reverses lost motions
+
+
+LEAST_MASS = 1e-3  # kg, of a platform after a change of the payload
 ROUNDING = 1e-9  # directions of readings or effects that are smaller, relative to the largest, are rounding
 
 
@@ -146,7 +152,7 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
     load, zero, parts = stated_load(space.settings), np.zeros(space.size), []
     known = bool(load.stiffness.all())
     compliance = load.compliance if known else np.full(6, 1.0 / ASSUMED.stiffness)
-    aside = space.geometry.characteristic_length * np.linalg.svd(load.gravity[None])[2][1:]  # lie across gravity
+    aside = across(space, load)
     for at in filter(None, stations):
         prediction = predict(space, zero, at)
         linkage = Linkage(prediction, space.probe, at)
@@ -175,6 +181,22 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
     ]
 
 
+def heavier(space: ParameterSpace, change: np.ndarray) -> ParameterSpace:
+    """Return the same parameters of a machine that carries more, by a change of :func:`payload_changes`, (1 or 3,)."""
+    load, aside = stated_load(space.settings), np.append(change[1:], np.zeros(3 - len(change)))
+    mass = max(load.mass + change[0], LEAST_MASS)
+    moment = load.mass * load.centre + space.level.T @ (across(space, load).T @ aside)
+    other = copy.copy(space)
+    other.settings = replace(space.settings, load=replace(load, mass=mass, centre=moment / mass).numbers())
+    return other
+
+
+def across(space: ParameterSpace, load: Load) -> np.ndarray:
+    """Return the two arms across gravity in base, of the machine's size, beside which a payload may sit, (2, 3), m."""
+    arms: np.ndarray = space.geometry.characteristic_length * np.linalg.svd(load.gravity[None])[2][1:]
+    return arms
+
+
 def consistency(cut: float) -> float:
     """Return E[min(|z|, cut)²] of a standard normal z: the variance that Huber's proposal 2 finds of good readings."""
     return float(chdtr(3, cut**2) + cut**2 * chdtrc(1, cut**2))
@@ -197,6 +219,8 @@ class CheckReadings:
     seen: np.ndarray = field(repr=False)  # (n, places): the numbers, as orthonormal combinations of the places
     kind: np.ndarray  # (places,): kind of channel
     weights: csr_array = field(repr=False)  # (places, N): of readings in the value of their place, in its deviations
+    # What a change of the payload, (1 or 3,), does to the numbers, where a lost motion makes that no straight line
+    loaded: Callable[[np.ndarray], np.ndarray] | None = field(default=None, repr=False)
 
     @staticmethod
     def of(fitted: FittedParameters, measurements: MeasurementSet, x: np.ndarray | None = None) -> CheckReadings:
@@ -225,8 +249,24 @@ class CheckReadings:
         entries = precision / scale[cells.of_reading], (cells.of_reading, np.arange(len(m)))
         weights = csr_array(entries, shape=(len(scale), len(m)))
         residuals = seen @ linear.target - rows @ fitted.x
+
+        def loaded(change: np.ndarray) -> np.ndarray:
+            moved = predict(heavier(space, change), fitted.x, m.stations).errors - before
+            of_cells = (cells.directions * moved[cells.station]).sum(axis=1)
+            return seen @ estimation.free_of_nuisance(of_cells[:, None])[:, 0]
+
+        bends = space.model(fitted.x).load.lost_motion.any()
+        before = predict(space, fitted.x, m.stations).errors if bends else np.zeros(0)
         return CheckReadings(
-            residuals, rows, (seen * sigma**2) @ seen.T, seen * sigma, names, seen, cells.kind, weights
+            residuals,
+            rows,
+            (seen * sigma**2) @ seen.T,
+            seen * sigma,
+            names,
+            seen,
+            cells.kind,
+            weights,
+            loaded if bends else None,
         )
 
     def changed_by(self, values: np.ndarray) -> CheckReadings:
@@ -253,12 +293,31 @@ class CheckReadings:
         """How many of the numbers are of each kind of channel, (kinds,)."""
         return np.bincount(self.kind, (self.seen**2).sum(axis=0), len(KINDS))
 
-    def effects(self, changes: Sequence[Change]) -> Iterator[tuple[Change, np.ndarray]]:
+    def effects(self, changes: Sequence[Change], of_parameters: np.ndarray) -> Iterator[tuple[Change, np.ndarray]]:
         """Yield the possible explanations with their effects (n, k): changes, one wrong reading, or more scatter in
         all."""
         for change in changes:
-            yield change, self.rows @ change.columns
+            effect = self.rows @ change.columns
+            if change.family == PAYLOAD and self.loaded is not None:
+                effect = self._secant(change, effect, self.covariance(of_parameters), self.loaded)
+            yield change, effect
         yield from wrong_readings(self.single, self.names)
+
+    def _secant(
+        self, change: Change, slope: np.ndarray, covariance: np.ndarray, exact: Callable[[np.ndarray], np.ndarray]
+    ) -> np.ndarray:
+        """Return an effect that is exact at its own most probable change: Broyden's update of its slope."""
+        effect = slope
+        for _ in range(SECANTS):
+            likely, theta = -np.inf, np.zeros(slope.shape[1])
+            for scale in change.scales:
+                total = covariance + scale**2 * effect @ effect.T
+                solved = np.linalg.solve(total, self.residuals)
+                evidence = -0.5 * float(self.residuals @ solved + np.linalg.slogdet(total)[1])
+                if evidence > likely:
+                    likely, theta = evidence, scale**2 * effect.T @ solved
+            effect = slope + np.outer(exact(theta) - slope @ theta, theta) / (theta @ theta)
+        return effect
 
 
 def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
@@ -302,11 +361,11 @@ class Evidence:
 
     def __init__(self, covariance: np.ndarray, effects: Iterable[tuple[Change, np.ndarray]]) -> None:
         self._whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-        self.hypotheses, effects = [], list(effects)
-        groups = Counter((change.family, change.group) for change, _ in effects)
+        self.hypotheses, self.effects = [], list(effects)
+        groups = Counter((change.family, change.group) for change, _ in self.effects)
         in_kind = Counter(family for family, _ in groups)
         odds = dict(zip(FAMILIES, ASSUMED.prior_odds, strict=True))
-        for change, effect in effects:
+        for change, effect in self.effects:
             alike = in_kind[change.family] * groups[change.family, change.group] * len(change.scales)
             log_prior = float(np.log(odds[change.family] / sum(odds.values()) / alike))
             self.hypotheses.append(Hypothesis.of(change, self._whitening @ effect, log_prior))

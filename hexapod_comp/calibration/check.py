@@ -163,7 +163,7 @@ def verify_model(
     measurements = replace(measurements, notes=(*measurements.notes, *_beyond_loads(model, measurements)))
     check = CheckReadings.of(wide, measurements)
     changes = possible_changes(wide.space, [block.name for block in fitted.space.blocks])
-    evidence = Evidence(check.covariance(wide.covariance), check.effects(changes))
+    evidence = Evidence(check.covariance(wide.covariance), check.effects(changes, wide.covariance))
     families, candidates = _candidates(check, wide, evidence)
     chi_square = check.chi_square(wide.covariance)
     result = Verification(
@@ -241,7 +241,7 @@ def _candidates(
         change, scale = changes[best], float(changes[best].scales[weights[best].argmax()])
         coefficients, deviations = np.zeros((2, 0))
         if change.shown:
-            effect = check.rows @ change.columns
+            effect = evidence.effects[best][1]
             covariance = check.covariance(fitted.covariance) + scale**2 * effect @ effect.T
             solved = scale**2 * np.linalg.solve(covariance, effect)
             coefficients = solved.T @ check.residuals
@@ -370,7 +370,7 @@ def _mixture(check: CheckReadings, prior: FittedParameters, changes: list[Change
     """Return mean and covariance of the parameters over all changes by their probabilities; none: nothing changed."""
     if not changes:
         return Explanation.of(check, prior, None)
-    evidence = Evidence(check.covariance(prior.covariance), check.effects(changes))
+    evidence = Evidence(check.covariance(prior.covariance), check.effects(changes, prior.covariance))
     weights = [logs[0] for logs in evidence.log_weights(check.residuals[None])[: len(changes)]]
     whole = np.logaddexp.reduce(np.concatenate(weights))
     weighed = [
