@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.optimize import minimize
 from scipy.sparse import csr_array
 from scipy.special import chdtr, chdtrc
 
@@ -47,9 +48,6 @@ FAMILIES = {
 HEAVIER = "heavier or lighter"  # the name of a change of the payload in its centre
 # weight relative to the trace: parameters that represent a payload then stay small at the corners of the box too
 RIDGE = 1e-8
-SECANTS = 5  # updates of the effect of a payload that reverses lost motions
-
-
 LEAST_MASS = 1e-3  # kg, of a platform after a change of the payload
 ROUNDING = 1e-9  # directions of readings or effects that are smaller, relative to the largest, are rounding
 
@@ -306,18 +304,28 @@ class CheckReadings:
     def _secant(
         self, change: Change, slope: np.ndarray, covariance: np.ndarray, exact: Callable[[np.ndarray], np.ndarray]
     ) -> np.ndarray:
-        """Return an effect that is exact at its own most probable change: Broyden's update of its slope."""
-        effect = slope
-        for _ in range(SECANTS):
-            likely, theta = -np.inf, np.zeros(slope.shape[1])
-            for scale in change.scales:
-                total = covariance + scale**2 * effect @ effect.T
-                solved = np.linalg.solve(total, self.residuals)
-                evidence = -0.5 * float(self.residuals @ solved + np.linalg.slogdet(total)[1])
-                if evidence > likely:
-                    likely, theta = evidence, scale**2 * effect.T @ solved
-            effect = slope + np.outer(exact(theta) - slope @ theta, theta) / (theta @ theta)
-        return effect
+        """Return an effect that is exact at the most probable change: Broyden's update of its slope.
+
+        Signs of forces give the likelihood steps and several maxima: Nelder and Mead's search, from the best of some.
+        """
+        inverse, most = np.linalg.inv(covariance), float(change.scales.max())
+
+        def unlikely(theta: np.ndarray) -> float:
+            left = self.residuals - exact(theta)
+            return float(left @ inverse @ left + theta @ theta / most**2)
+
+        weighted = slope.T @ inverse
+        starts = [np.linalg.solve(weighted @ slope + np.eye(len(weighted)) / most**2, weighted @ self.residuals)]
+        starts += [
+            way * size * np.eye(len(weighted))[0] for size in (*change.scales, 0.5 * most) for way in (-1.0, 1.0)
+        ]
+        best = min(starts, key=unlikely)
+        simplex = best + np.vstack([np.zeros(len(best)), np.eye(len(best))])
+        theta = minimize(
+            unlikely, best, method="Nelder-Mead",
+            options={"initial_simplex": simplex, "xatol": 0.05, "fatol": 0.5, "maxfev": 150},
+        ).x  # fmt: skip
+        return slope + np.outer(exact(theta) - slope @ theta, theta) / (theta @ theta)
 
 
 def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
