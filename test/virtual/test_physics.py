@@ -21,7 +21,7 @@ from hexapod_comp.errors import HexapodError, ModelError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import solve_pose, strut_lengths
-from hexapod_comp.machine.load import Payload
+from hexapod_comp.machine.load import Load, Payload
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.robot_description import foot_frames
