@@ -326,9 +326,9 @@ def about_stiffness(space: ParameterSpace, x: np.ndarray) -> str:
         moved = linkage.per_length @ (ASSUMED.stated_stiffness * linkage.load.compliance * tension)[..., None]
         sizes.append(math.sqrt(3.0) * rms(FirstOrder(linkage.points, moved).aligned().values[:, :3]))
     return (
-        f"elsewhere as far as the stated stiffness is right: off by {100.0 * ASSUMED.stated_stiffness:.0f} %, it adds "
-        f"{1e6 * max(sizes):.2g} µm for each 10 N by which the weight differs in size or direction; the same readings "
-        "at a second load, which should differ most, such as without the tool, refine it"
+        f"under other loads it depends on the stated stiffness: off by {100.0 * ASSUMED.stated_stiffness:.0f} %, "
+        f"that adds {1e6 * max(sizes):.2g} µm for each 10 N by which the weight differs in size or direction; the same "
+        "readings at a second load, which should differ most, such as without the tool, determine it"
     )
 
 

@@ -92,7 +92,7 @@ def test_a_stated_stiffness_holds_for_tools_that_no_reading_has_seen() -> None:
 def test_a_fit_says_what_a_stiffness_that_is_off_adds_under_another_load() -> None:
     """Against the core: 10 N more along each axis on struts that are a tenth softer, as gravity of 50 kg more."""
     space = fit(TOLD).space
-    stated = float(re.findall(r"it adds ([\d.]+) µm for each 10 N", about_stiffness(space, np.zeros(space.size)))[0])
+    stated = float(re.findall(r"that adds ([\d.]+) µm for each 10 N", about_stiffness(space, np.zeros(space.size)))[0])
     stations, errors = box_stations(space), []
     assert stations is not None
     for axis in np.eye(3):
