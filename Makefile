@@ -36,7 +36,7 @@ VERSIONS ?= 3.10 3.11 3.12 3.13 3.14
 .NOTPARALLEL:
 
 help:
-	@echo 'make demo    measure, fit and run a machine with hidden errors; figures, out/demo.png'
+	@echo 'make demo    a machine calibrates itself, is warmed, knocked and repaired; figures, out/demo.png'
 	@echo 'make test    ruff, mypy, import-linter, codespell and the tests, in three processes for two cores'
 	@echo 'make test-all     the same and the long tests (ALL_TESTS=1) with every Python found here, each in .venv-3.x; VERSIONS="3.10 3.13" for some'
 	@echo 'make test-packaging  build wheel, source archive and colcon workspace, and hold them to the source'

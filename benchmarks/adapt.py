@@ -39,7 +39,6 @@ from tqdm import tqdm
 
 from benchmarks import fusion
 from benchmarks.warm_up import zoo
-from benchmarks.watched_machine import Instrument, VirtualMachine
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.compensation.checks import check
 from hexapod_comp.loop.story import demo_place
@@ -50,6 +49,7 @@ from hexapod_comp.machine.path import Motion, StrutRates, plan_motion
 from hexapod_comp.pose import Pose
 from hexapod_comp.upkeep.loop import Adaptation, Task
 from hexapod_comp.virtual.named import imagine
+from hexapod_comp.virtual.watched import Instrument, VirtualMachine
 
 RATE = 1000.0  # at which what is sent is differentiated, Hz
 RATES = StrutRates(0.1, 1.0, 20.0)  # of every strut

@@ -30,7 +30,7 @@ from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.lead import ScrewLead, detect_lead
 from hexapod_comp.calibration.parameters import BLOCKS, FitSettings, ParameterSpace
 from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.loop.story import demo_campaign, demo_place
+from hexapod_comp.loop.story import Place, demo_place
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
@@ -137,6 +137,13 @@ def _right(true: float | None, lead: ScrewLead) -> bool:
     if lead.shown is None:
         return True
     return true is not None and min(abs(true / n - lead.shown) for n in HARMONICS_OF_LEAD) < AGREE * lead.error
+
+
+def demo_campaign(place: Place, instrument: str = "5-D", diagonals: int = 16) -> Campaign:
+    """Return lines along the sides of a box, a quarter of the longest apart, and its diagonals."""
+    longest, shortest = (float(end(np.ptp(place.box, axis=0))) for end in (np.max, np.min))
+    apart, step = min(0.25 * longest, shortest), min(0.0625 * longest, shortest / 8)  # polynomials need nine points
+    return Campaign(place.box, apart, step, instrument, diagonals, level=place.attitude)
 
 
 def pull_of(found: list[Search]) -> tuple[int, float]:

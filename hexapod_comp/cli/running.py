@@ -7,12 +7,10 @@ import math
 import os
 import sys
 import time
-from collections.abc import Sequence
 from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 from ..errors import InputFileError
-from ..formats.csv import Row
 from ..formats.json import json_text
 from ..formats.paths import input_file
 from ..machine.geometry import HexapodGeometry, load_geometry
@@ -20,17 +18,15 @@ from ..machine.model import MachineModel
 from ..machine.pose_files import read_poses
 from ..virtual.named import find_model, is_random, is_word, truth_name
 from . import results
+from .adapting import told as adapted
 from .results import Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from ..loop.report import ErrorRow, SessionResult
-    from ..loop.story import Calibration
     from ..ros.echo import EchoedMessage
 
 TRUE = "truth"  # the model that is not a file: the machine's own errors
-FITTED = "fit"  # the model of demo that is fitted to readings
 HZ_PERIOD = 1.0  # how often echo --hz prints a line, s
 
 
@@ -46,13 +42,19 @@ def run(args: argparse.Namespace) -> Result:
     started = nullcontext(()) if args.attach else session.simulated(args.machine, model, truth)
     compare = not (args.attach or args.no_compare)  # a real machine's compensation is not switched off as a side effect
     with results.ended_in_order(), started as nodes:
-        result = session.run_poses(geometry, nodes, poses, None, rate, compare, args.namespace)
+        result = session.run_poses(geometry, nodes, poses, rate, compare, args.namespace)
     errors, unanswered = report.error_rows(result), result.lost + result.refused
+
+    def pictures() -> dict[str, Figure]:
+        from ..loop.pictures import session_figure
+
+        return {"run.png": session_figure(result, f"{geometry.name}: {args.poses}, model {result.model}")}
+
     blocks = [report.pose_block(f"pose {row.label}", record) for row, record in zip(rows, result.poses, strict=True)]
     return Result(
         lambda: "\n".join([*blocks, report.summary(result, errors)]),
         lambda: report.as_json(rows, result, errors),
-        pictures=lambda: _drawn(args, result, errors, f"{geometry.name}: {args.poses}"),
+        pictures=pictures,
         code=1 if unanswered else 0,
         notes=filter(None, [report.busy_text(result.answering)]) if unanswered else (),
     )
@@ -68,52 +70,27 @@ def _chosen_model(args: argparse.Namespace, geometry: HexapodGeometry, truth: Ma
     return truth if args.model == TRUE else find_model(args.model, geometry)
 
 
-def _drawn(
-    args: argparse.Namespace,
-    result: SessionResult,
-    rows: Sequence[ErrorRow],
-    title: str,
-    calibration: Calibration | None = None,
-) -> dict[str, Figure]:
-    from ..loop.pictures import session_figure
-
-    return {f"{args.verb}.png": session_figure(result, rows, f"{title}, model {result.model}", calibration)}
-
-
 def demo(args: argparse.Namespace) -> Result:
-    """Measure, fit and run a machine with hidden errors; 0 when the loop's error is within the fit's interval."""
-    from ..loop import report, session, story
+    """Have a machine calibrate itself, warm it, knock it; 0 when the loop has found and repaired both."""
+    from ..loop import story
 
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as for fit: its matrices are small
-    rate = session.checked_rate(args.rate_hz)
     geometry = load_geometry(args.machine)
-    truth, calibration = _hidden_errors(args, geometry), None
-    place = story.demo_place(geometry)
-    poses, path = story.demo_poses(place, args.seed), story.demo_path(geometry, place, rate)
-    if args.model == FITTED:
-        with results.stage_line() as say:
-            calibration = story.calibrate(geometry, truth, place, args.seed, say)
-        if not args.json:
-            begun = f"machine {geometry.name}, hidden errors: {args.truth}"
-            print(f"{begun}\n{story.calibration_text(calibration)}", flush=True)
-    model = _chosen_model(args, geometry, truth) if calibration is None else calibration.fit.model
-    with results.ended_in_order(), session.simulated(args.machine, model, truth) as nodes:
-        result = session.run_poses(geometry, nodes, poses, path, rate, compare=True)
-    rows = report.error_rows(result)
-    if args.model in (TRUE, FITTED):
-        promised = story.EXACT if calibration is None else story.promises(calibration.fit, poses, path)
-        rows = story.with_promises(rows, promised, story.left_by_drives(geometry, truth, poses, path))
-    complaints = report.complaints(result, rows)
-    named = [Row(0, str(n + 1)) for n in range(len(poses))]
-    measured = None if calibration is None else story.as_json(calibration)
-    known = {"machine": geometry.name, "truth": args.truth, "calibration": measured}
-    verdict = "\n".join(f"NOT AS IT SHOULD BE: {complaint}" for complaint in complaints) or "all as it should be"
-    title = f"{geometry.name}, hidden errors {args.truth}"
+    truth = _hidden_errors(args, geometry)
+    with results.stage_line() as say:
+        told = story.tell(geometry, truth, args.seed, say)
+    title = f"{geometry.name}, hidden errors {args.truth}, calibrates itself"
+
+    def pictures() -> dict[str, Figure]:
+        from ..loop.pictures import story_figure
+
+        return {"demo.png": story_figure(told, title)}
+
     return Result(
-        lambda: f"\n{report.summary(result, rows)}\n{story.REMARK}\n{verdict}",
-        lambda: {**known, **report.as_json(named, result, rows), "complaints": complaints},
-        pictures=lambda: _drawn(args, result, rows, title, calibration),
-        code=1 if complaints else 0,
+        lambda: "\n".join([f"machine {title}", *adapted(told.events), "", told.text()]),
+        lambda: {"machine": geometry.name, "truth": args.truth, **told.as_json()},
+        pictures=pictures,
+        code=1 if told.complaints else 0,
     )
 
 

@@ -1,4 +1,4 @@
-"""The records of an observed run, and its report: poses, a table of errors, the loop's answers, problems."""
+"""The records of an observed run, and its report: poses, a table of errors, the loop's answers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from ..formats.csv import Row
 from ..formats.texts import aligned, number
 from ..machine.arrays import rms
 from ..machine.pose_files import length_values
-from ..machine.trajectory import Path, feet_on
 from ..pose import Pose, best_motion, rotation_angle
 
 FEWEST_ALIGNED = 6  # a datum removes six numbers, two poses' worth: fewer poses would hardly leave any error
@@ -60,49 +59,6 @@ class PoseRecord:
 
 
 @dataclass
-class Track:
-    """True positions of the tool along a path."""
-
-    positions: np.ndarray  # (n, 3): true tool positions on the way, m
-    sent: np.ndarray  # (n,) int: number of poses of the path sent when each was received
-    feet: np.ndarray  # (n, 3): the nearest point of the commanded path to each, m: a late tool is no contour error
-
-    @staticmethod
-    def along(path: Path, positions: np.ndarray, sent: np.ndarray) -> Track | None:
-        """Return the track of true positions, shape (n, 3), m, along a path; None when there are none."""
-        return Track(positions, sent, feet_on(path.positions, positions, sent)) if len(positions) else None
-
-    @property
-    def deviation(self) -> np.ndarray:
-        """Distances to the path, shape (n,), m."""
-        return np.linalg.norm(self.positions - self.feet, axis=1)
-
-
-@dataclass
-class PathRecord:
-    """Record of a path."""
-
-    path: Path  # commanded poses, in ``base`` at first
-    without: Track | None  # the pass without compensation; None if there was none, or the tool was not measured
-    compensated: Track | None  # the pass with it
-    corrections: np.ndarray  # (N, 6): corrections sent, m
-
-    def moved(self, motions: Motions) -> PathRecord:
-        """Return the same moved."""
-
-        def points(motion: Pose, positions: np.ndarray) -> np.ndarray:
-            return motion.position + positions @ motion.rotation.T
-
-        commanded = motions[0]
-        path = Path(points(commanded, self.path.positions), commanded.rotation @ self.path.rotations, self.path.rate)
-        without, compensated = (
-            None if track is None or motion is None else Track.along(path, points(motion, track.positions), track.sent)
-            for track, motion in zip((self.without, self.compensated), motions[1:], strict=True)
-        )
-        return replace(self, path=path, without=without, compensated=compensated)
-
-
-@dataclass
 class Answering:
     """Latency of the loop, and delays of its processes."""
 
@@ -124,7 +80,6 @@ class SessionResult:
     """All records of a session."""
 
     poses: list[PoseRecord] = field(default_factory=list)  # the single poses
-    path: PathRecord | None = None
     answering: Answering = field(default_factory=Answering)
     sent: int = 0  # commands of the whole session
     lost: int = 0  # of these neither answered nor refused
@@ -133,8 +88,7 @@ class SessionResult:
     model: str = ""  # model that the compensator ran
 
     def _moved(self, motions: Motions) -> SessionResult:
-        path = None if self.path is None else self.path.moved(motions)
-        return replace(self, poses=[record.moved(motions) for record in self.poses], path=path)
+        return replace(self, poses=[record.moved(motions) for record in self.poses])
 
     def seen_from(self, frame: Pose) -> SessionResult:
         """Return the same in another frame, whose own pose is given in the present one."""
@@ -143,8 +97,7 @@ class SessionResult:
 
     def aligned(self) -> SessionResult | None:
         """Return the same with the datum aligned: each pass by the rigid motion that fits its poses best."""
-        # A path is moved by its pass's poses, as a workpiece whose zero was set by them. None with fewer than
-        # FEWEST_ALIGNED poses, with poses in a line, or when the tool was not measured.
+        # None with fewer than FEWEST_ALIGNED poses, with poses in a line, or when the tool was not measured
         targets = np.array([record.target.position for record in self.poses])
 
         def datum(actual: list[Pose | None]) -> Pose | None:
@@ -162,42 +115,23 @@ AS_IT_IS, ALIGNED = "as it is", "datum aligned"
 
 @dataclass(frozen=True)
 class ErrorRow:
-    """The tool's error at rest or along a path, by one definition."""
+    """The tool's error at rest, by one definition."""
 
-    what: str  # ``at rest`` or ``path``
     datum: str  # :data:`AS_IT_IS` or :data:`ALIGNED`
     count: int  # poses
-    without: np.ndarray | None  # errors of the pass without compensation, m: distances to the pose, or to the path
+    without: np.ndarray | None  # errors of the pass without compensation, m: distances to the pose
     compensated: np.ndarray  # errors of the pass with it, m
-    promised: tuple[float, float] | None = None  # expected interval of the RMS, m, with 95 %
-
-    @property
-    def name(self) -> str:
-        """Its name in tables."""
-        return f"{self.what}, {self.datum}"
-
-    @property
-    def complaint(self) -> str:
-        """Problem of the residual error; empty if there is none."""
-        left = rms(self.compensated)
-        if self.without is not None and left >= rms(self.without):
-            return f"{self.name}: compensation does not reduce the error"
-        if self.promised is None or left <= self.promised[1]:
-            return ""
-        return f"{self.name}: {left * 1e6:.3f} µm RMS are left; at most {self.promised[1] * 1e6:.3f} were promised"
 
     def cells(self) -> list[str]:
-        """Return the row of a table as text: name, RMS without and with, largest, removed share, predicted interval."""
+        """Return the row of a table as text: datum, RMS without and with, largest, removed share, poses."""
         before, left = None if self.without is None else rms(self.without), rms(self.compensated)
-        of = "RMS of" if self.what == "at rest" else "RMS distance to a path of"
         return [
-            self.name,
+            f"at rest, {self.datum}",
             "–" if before is None else number(before * 1e6, 2),
             number(left * 1e6, 3),
             number(float(self.compensated.max()) * 1e6, 3),
             "–" if before is None else f"{100.0 * (1.0 - left / before):.2f} %",
-            "–" if self.promised is None else "…".join(number(v * 1e6, 3) for v in self.promised),
-            f"{of} {self.count} poses",
+            f"RMS of {self.count} poses",
         ]
 
     def record(self) -> dict[str, object]:
@@ -206,36 +140,25 @@ class ErrorRow:
             None if errors is None else {"rms_um": rms(errors) * 1e6, "max_um": float(errors.max()) * 1e6}
             for errors in (self.without, self.compensated)
         )
-        promised = None if self.promised is None else [v * 1e6 for v in self.promised]
-        about = {"what": self.what, "datum": self.datum}
-        return {**about, "without": without, "with": compensated, "promised_rms_um": promised}
+        return {"what": "at rest", "datum": self.datum, "without": without, "with": compensated}
 
 
 def error_rows(result: SessionResult) -> list[ErrorRow]:
-    """Return the tool's errors at rest and along the path, first with the datum aligned where that is possible."""
+    """Return the tool's errors, first with the datum aligned where that is possible."""
     taken = [(datum, one) for datum, one in ((ALIGNED, result.aligned()), (AS_IT_IS, result)) if one is not None]
     rows = []
     for datum, one in taken:
         pairs = [record.errors() for record in one.poses]
         before, after = (np.array([error[0] for pair in pairs if (error := pair[n]) is not None]) for n in (0, 1))
         if len(after):
-            rows.append(ErrorRow("at rest", datum, len(pairs), before if len(before) else None, after))
-    for datum, one in taken:
-        if one.path is not None and one.path.compensated is not None:
-            without = None if one.path.without is None else one.path.without.deviation
-            rows.append(ErrorRow("path", datum, len(one.path.path), without, one.path.compensated.deviation))
+            rows.append(ErrorRow(datum, len(pairs), before if len(before) else None, after))
     return rows
 
 
 def error_table(rows: Sequence[ErrorRow]) -> str:
     """Return the table of errors: RMS without and with compensation, removed share, largest residual; µm."""
-    table = [
-        ["tool error, µm", "without", "with", "largest", "removed", "promised", ""],
-        *(row.cells() for row in rows),
-    ]
-    if not any(row.promised for row in rows):
-        table = [[*cells[:5], cells[6]] for cells in table]
-    return aligned(table[0], table[1:])
+    header = ["tool error, µm", "without", "with", "largest", "removed", ""]
+    return aligned(header, [row.cells() for row in rows])
 
 
 def pose_block(title: str, record: PoseRecord) -> str:
@@ -284,19 +207,6 @@ def busy_text(answering: Answering) -> str:
     )
 
 
-def complaints(result: SessionResult, rows: Sequence[ErrorRow]) -> list[str]:
-    """Return the problems, and whether a busy computer may be the cause; empty if there are none."""
-    judged = [row for row in rows if row.datum == ALIGNED] or rows
-    listed = [
-        f"{result.lost} commands were lost" if result.lost else "",
-        f"{result.refused} commands were refused: {result.refusals}" if result.refused else "",
-        "" if rows else "the true tool pose was not received",
-        *(row.complaint for row in judged),
-    ]
-    listed = [text for text in listed if text]
-    return [*listed, busy] if listed and (busy := busy_text(result.answering)) else listed
-
-
 def as_json(rows: list[Row], result: SessionResult, errors: Sequence[ErrorRow]) -> dict[str, object]:
     """Return a session for programs: tool poses in ``work``, and its :func:`~.report.error_rows`."""
     answering, poses = result.answering, list[dict[str, object]]()
@@ -327,5 +237,4 @@ def as_json(rows: list[Row], result: SessionResult, errors: Sequence[ErrorRow]) 
         "waited_for_processor_s": answering.waited,
         "errors": [row.record() for row in errors],
         "poses": poses,
-        "path": None if result.path is None else {"poses": len(result.path.path), "rate_hz": result.path.path.rate},
     }

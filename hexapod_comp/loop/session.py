@@ -1,4 +1,4 @@
-"""An observed run: poses and a path through the running loop, without and with compensation."""
+"""An observed run: poses through the running loop, without and with compensation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ..machine.model_file import save_model
 from ..machine.trajectory import Path, commanded_in_base, move
 from ..pose import Pose
 from .processes import NodeProcess, PrivateDomain, processor_wait
-from .report import Answering, PathRecord, PoseRecord, SessionResult, Track, busy_text
+from .report import Answering, PoseRecord, SessionResult, busy_text
 
 if TYPE_CHECKING:
     from ..ros.client import LoopClient, Sent
@@ -39,7 +39,7 @@ MOVE_FEED = 0.25  # largest tool speed between poses, m/s; on most machines the 
 
 
 class Session:
-    """Drives a machine through poses and a path, and records it."""
+    """Drives a machine through poses, and records it."""
 
     def __init__(
         self, client: LoopClient, geometry: HexapodGeometry, rate: float, progress: Callable[[int], None] | None = None
@@ -79,14 +79,6 @@ class Session:
                 record.estimate, record.true_with = self._client.estimate, true
             else:
                 record.true_without = true
-
-    def mill(self, path: Path) -> tuple[Track | None, np.ndarray]:
-        """Run a path; return the true track and the corrections sent, shape (N, 6)."""
-        self.go(path.pose(0))
-        streamed = self._stream(path)
-        self._at = path.pose(len(path) - 1)
-        positions, sent = (np.array([entry[n] for entry in self._client.track]) for n in (0, 1))
-        return Track.along(path, positions, sent), np.array([entry.correction for entry in streamed])
 
     def _stream(self, path: Path) -> list[Sent]:
         progress = self._progress
@@ -138,27 +130,22 @@ def run_session(
     client: LoopClient,
     geometry: HexapodGeometry,
     targets: Sequence[Pose],
-    path: Path | None,
     rate: float,
     compare: bool,
     progress: Callable[[int], None] | None = None,
     announce: Callable[[str], None] = lambda _: None,
 ) -> SessionResult:
-    """Visit poses, then mill a path; first without compensation when `compare`, then with it."""
-    session, result, without = Session(client, geometry, rate, progress), SessionResult(), None
+    """Visit poses; first without compensation when `compare`, then with it."""
+    session, result = Session(client, geometry, rate, progress), SessionResult()
     result.poses = [PoseRecord(target) for target in targets]
     if compare:
         announce("pass without compensation …")
         session.enable(False)
         session.visit(result.poses, compensated=False)
-        if path is not None:
-            without, _ = session.mill(path)
         session.enable(True)
         session.sent = []
     announce("pass with compensation …")
     session.visit(result.poses, compensated=True)
-    if path is not None:
-        result.path = PathRecord(path, without, *session.mill(path))
     result.answering.latencies = _latencies(session.sent)
     accepted, result.refused = client.counted()
     result.sent = len(client.sent)
@@ -227,12 +214,11 @@ def run_poses(
     geometry: HexapodGeometry,
     nodes: Sequence[NodeProcess],
     poses: list[Pose],
-    path: Path | None,
     rate: float,
     compare: bool,
     namespace: str = "",
 ) -> SessionResult:
-    """Run poses of the work frame and a path in ``base`` through the loop, with a progress bar on a terminal."""
+    """Run poses of the work frame through the loop, with a progress bar on a terminal."""
     # The result is in the work frame, as in the user's file; the nodes receive and publish `base`.
 
     def announce(text: str) -> None:  # without tearing the progress bar
@@ -244,7 +230,7 @@ def run_poses(
         watch, targets = Watch(nodes), [geometry.work @ pose for pose in poses]
         with tqdm(unit=" commands", disable=None, leave=False, mininterval=0.5) as bar:
             try:
-                result = run_session(client, geometry, targets, path, rate, compare, bar.update, announce)
+                result = run_session(client, geometry, targets, rate, compare, bar.update, announce)
             except NoAnswerError as error:
                 busy = busy_text(watch.answering(client, rate))
                 raise NoAnswerError(f"{error}; {busy}" if busy else str(error)) from error

@@ -1,70 +1,35 @@
-"""The demonstration's steps: hidden errors, a laser campaign, a fit, and its prediction for the poses to come."""
+"""The demonstration: a machine calibrates itself, warms up, is knocked and repaired; its true error at each stop."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..calibration.estimator import physical_covariance
-from ..calibration.evaluation import PaperMetric, paper_metric
-from ..calibration.fit import ModelFit, fit_model
-from ..calibration.lines import fit_lines
-from ..calibration.parameters import FitSettings
-from ..calibration.posterior import left_errors, stations_of
-from ..calibration.report import tool_error_text
-from ..calibration.sensitivity import predict
-from ..compensation.compensator import Compensator
-from ..formats.texts import number
+from ..calibration.evaluation import held_out
+from ..errors import CalibrationError
+from ..formats.texts import aligned, number
 from ..machine.arrays import rms
-from ..machine.geometry import HexapodGeometry
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry
+from ..machine.kinematics import Structure, strut_lengths
 from ..machine.model import MachineModel, RealMachine
-from ..machine.passes import Passes
-from ..machine.trajectory import Path, circle, commanded_in_base, join, move, pocket
-from ..machine.trial import without_datum
-from ..measurements.campaign import Campaign, template
-from ..measurements.readings import ANGULAR_KINDS
-from ..pose import Pose
-from ..virtual.instruments import measure
-from ..virtual.machine import StrutDrive
+from ..machine.model_file import load_model
+from ..pose import Pose, best_motion
+from ..upkeep.loop import STOP, Adaptation, Task
+from ..virtual.watched import Instrument, VirtualMachine
 from ..workspace.reach import machine_box
-from .report import ALIGNED, ErrorRow, PathRecord, PoseRecord, SessionResult, Track, error_rows
-from .session import MOVE_FEED
 
-LONGEST_SIDE = 0.2  # longest side of the measured box, m: what the demonstration crosses in two seconds
+LONGEST_SIDE = 0.2  # longest side of the measured box, m
 PROPORTIONS = np.array([1.0, 1.0, 0.5])  # sides of that box to each other, along x, y and z of the work frame
 
-# Distances of the grid's lines, and of the readings along them, as shares of the longest side
-LINES_APART, READINGS_APART = 0.25, 0.0625
-
-FEWEST_STEPS = 8  # spacing of the readings, so that the shortest side has as many steps: polynomials along it need nine
-POSES = 12  # held-out poses of the measured box
-
-# Largest side of the milled figure, m, and the time for a side at full speed, s: as slow as the drives need
-PATH_SIDE, PATH_TIME = 0.018, 0.9
-
-ON_PATH = 150  # places of a path at which a prediction is computed
-
-# Ratio of the drives' error over DDS, where no command is on time to the millisecond, to that without
-DRIVES = 2.0
-
-EXACT = ((0.0, 0.0), (0.0, 0.0))  # prediction for the true model: no error but the drives'
-
-REMARK = """as it is: includes the shift and turn of the whole machine, which laser lines do not show and a workpiece
-zero set with the model on removes. Datum aligned: without that rigid motion."""
-
-REST = 0.3  # time for the machine to come to rest, s: sixty of the drives' lags
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """A machine measured and fitted."""
-
-    fit: ModelFit  # scheme joint on 5-D lines and diagonals
-    lines: PaperMetric  # Mou & King's own metric of their 1-D scheme
-    joint: PaperMetric  # and of `fit`
+GOAL = 3e-6  # RMS tool error that may be left, the datum aligned, m
+WARMTH, STEEL = 5.0, 11.5e-6  # K, and by how much steel grows, 1/K
+KNOCK = 20e-6  # by which a strut becomes longer for good, m
+WILD, BROKEN = 0.01, 0.02  # shares of observations that are wild by 0.2 mm, or find the beam broken
 
 
 @dataclass(frozen=True)
@@ -84,170 +49,125 @@ def demo_place(geometry: HexapodGeometry) -> Place:
     return Place(np.array([centre - half, centre + half]).round(9), largest.rotation)
 
 
-def demo_campaign(place: Place, instrument: str = "5-D", diagonals: int = 16) -> Campaign:
-    """Return the campaign there: lines along the box's sides, and its diagonals, read with the default noise."""
-    sides = np.ptp(place.box, axis=0)
-    longest, shortest = float(sides.max()), float(sides.min())
-    apart, step = min(LINES_APART * longest, shortest), min(READINGS_APART * longest, shortest / FEWEST_STEPS)
-    return Campaign(place.box, apart, step, instrument, diagonals, level=place.attitude)
+@dataclass
+class Chapter:
+    """What the machine does between two events: its stops, and the tool's true place at each."""
+
+    title: str
+    times: list[float] = field(default_factory=list)  # s
+    targets: list[np.ndarray] = field(default_factory=list)  # commanded and true tool positions in ``base``, m
+    actual: list[np.ndarray] = field(default_factory=list)
+
+    def errors(self) -> np.ndarray:
+        """Return the tool's error at each stop, with the zero that a workpiece would have been given, (n,), m."""
+        targets, actual = np.array(self.targets), np.array(self.actual)
+        datum = best_motion(actual, targets) or Pose.identity()
+        return np.linalg.norm(datum.position + actual @ datum.rotation.T - targets, axis=1)
 
 
-def calibrate(
-    geometry: HexapodGeometry,
-    truth: MachineModel,
-    place: Place,
-    seed: int,
-    say: Callable[[str], object] = lambda text: None,
-) -> Calibration:
-    """Measure a machine with virtual lasers, noise included, and fit it by both schemes."""
-    real, campaign = RealMachine(geometry, truth), demo_campaign(place)
-    say("measuring with 5-D lasers")
-    measured = measure(template(campaign, geometry, seed), campaign, real, seed)
-    measured = replace(measured, uncertainty=np.array(campaign.noise)[measured.kind])
-    # the data sheet gives the screws' lead: it is used where they err and the geometry does not have it
-    struts = truth.struts
-    waves = (struts.cosine.any() or struts.sine.any()) and not geometry.screw_lead.any()
-    fit = fit_model(measured, FitSettings(lead=float(struts.period[0]) if waves else None), say)
-    say("the 1-D scheme of Mou & King")
-    # Their lines run along the base's axes, and the platform is as level as above, whatever the work frame is.
-    level = geometry.work.rotation @ place.attitude @ geometry.tool.rotation.T
-    straight = replace(geometry, work=Pose.identity(), tool=Pose(geometry.tool.position, level.T))
-    real, place = RealMachine(straight, truth), demo_place(straight)
-    campaign = demo_campaign(place, "1-D", 0)
-    lines = fit_lines(measure(template(campaign, straight, seed), campaign, real, seed)).model
-    metric = partial(paper_metric, real, box=place.box, step=campaign.step, seed=seed)
-    return Calibration(fit, metric(lines), metric(fit.model))
+class Recorded(VirtualMachine):
+    """A virtual machine whose true error is recorded at each stop."""
+
+    chapters: list[Chapter]
+    time = 0.0  # s
+
+    def begin(self, title: str) -> None:
+        """Begin a chapter."""
+        self.chapters.append(Chapter(title))
+
+    def move(self, pose: Pose) -> None:
+        """Move, and record where the tool has come to."""
+        super().move(pose)
+        self.time, chapter = self.time + STOP, self.chapters[-1]
+        chapter.times.append(self.time)
+        chapter.targets.append((self.geometry.work @ pose).position)
+        chapter.actual.append(self._drive.true_tool_pose().position)
 
 
-def calibration_text(calibration: Calibration) -> str:
-    """Return measurement, fit and prediction as lines of text."""
-    fit, lines, joint = calibration.fit, calibration.lines, calibration.joint
-    sides = " × ".join(number(side * 1e3, 1) for side in np.ptp(fit.space.work_box, axis=0))
-    noise = [f"{c.stated * 1e6:g} {'µrad' if c.kind in ANGULAR_KINDS else 'µm'} {c.kind}" for c in fit.channels]
-    count = f"{len(fit.measurements)} readings of {len(fit.measurements.runs)} lines"
-    parts = [
-        f"measured: {count} by 5-D lasers, box of {sides} mm",
-        f"noise:    {', '.join(noise)}",
-        f"fitted:   {', '.join(block.name for block in fit.space.blocks)}",
-    ]
-    if fit.level is not None:
-        parts.append(f"promised: {tool_error_text(fit.level)}; datum aligned, in the whole box")
-    parts.append(
-        f"Mou & King's measure, mean |error| along {lines.lines} lines: {lines.before * 1e6:.2f} µm; "
-        f"their 1-D scheme leaves {lines.after * 1e6:.3f}, this fit {joint.after * 1e6:.3f}"
-    )
-    return "\n".join([*parts, *(f"note: {note}" for note in (*fit.notes, *filter(None, [fit.misfit])))])
+@dataclass(frozen=True)
+class Told:
+    """What has happened."""
+
+    chapters: list[Chapter]
+    events: list[dict[str, Any]]  # of the loop's journal
+    promised: float  # m
+    left: dict[str, float]  # RMS error at points that nothing was fitted to, the datum aligned, m, by chapter
+    complaints: list[str]
+
+    def text(self) -> str:
+        """Return the table of chapters, and the verdict."""
+        rows = [
+            [c.title, str(len(c.times)), number(rms(c.errors()) * 1e6, 3), number(self.left[c.title] * 1e6, 3)]
+            for c in self.chapters
+        ]
+        table = aligned(["tool error, µm RMS, datum aligned", "stops", "at the stops", "in the whole box"], rows)
+        promised = f"promised after the calibration: up to {self.promised * 1e6:.3f} µm (95 %)"
+        verdict = "\n".join(f"NOT AS IT SHOULD BE: {text}" for text in self.complaints) or "all as it should be"
+        return f"{table}\n{promised}\n{verdict}"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the same for programs."""
+        chapters = [
+            {"title": c.title, "stops": len(c.times), "rms_m": rms(c.errors()), "box_rms_m": self.left[c.title]}
+            for c in self.chapters
+        ]
+        return {
+            "promised_m": self.promised, "chapters": chapters, "events": self.events, "complaints": self.complaints,
+        }  # fmt: skip
 
 
-def as_json(calibration: Calibration) -> dict[str, object]:
-    """Return the same for programs; SI units are in the keys."""
-    fit, lines, joint = calibration.fit, calibration.lines, calibration.joint
-    level = fit.level and {f"{name}_m": getattr(fit.level, name) for name in ("before", "after", "low", "high")}
-    return {
-        "readings": len(fit.measurements),
-        "frame": "work",
-        "box_m": fit.space.work_box,
-        "blocks": [block.name for block in fit.space.blocks],
-        "expected_tool_error": level,
-        "mean_displacement_error_along_lines": {
-            "without_m": lines.before,
-            "scheme_lines_1d_m": lines.after,
-            "scheme_joint_m": joint.after,
-        },
-        "notes": fit.notes,
-        "misfit": fit.misfit,
-    }
+def warmed(geometry: HexapodGeometry, truth: MachineModel, kelvins: float) -> MachineModel:
+    """Return a machine whose steel struts are warmer than when it was measured, and nobody reads a thermometer."""
+    growth, struts = kelvins * STEEL, truth.struts
+    home = strut_lengths(Structure.of(geometry), geometry.home)
+    return replace(truth, struts=replace(struts, offset=struts.offset + growth * home, pitch=struts.pitch + growth))
 
 
-def demo_poses(place: Place, seed: int) -> list[Pose]:
-    """Return random poses of the tool in the measured box, in ``work``, each the next nearest."""
-    box = place.box
-    left = list(np.random.default_rng(seed).uniform(box[0], box[1], (POSES, 3)).round(6))
-    ordered = [box.mean(axis=0)]
-    while left:
-        distances = [float(np.linalg.norm(point - ordered[-1])) for point in left]
-        ordered.append(left.pop(int(np.argmin(distances))))
-    return [Pose(point, place.attitude) for point in ordered[1:]]
+def tell(
+    geometry: HexapodGeometry, truth: MachineModel, seed: int, say: Callable[[str], object] = lambda text: None
+) -> Told:
+    """Have a machine calibrate itself, warm it, knock a strut, and let the loop find and repair both."""
+    place, strut = demo_place(geometry), int(np.random.default_rng(seed).integers(6))
+    machine = Recorded(geometry, truth, Instrument(wild=WILD, broken=BROKEN), seed)
+    machine.chapters, left = [], dict[str, float]()
+    task = Task(place.box, place.attitude, goal=GOAL, every=0.0)
+    with tempfile.TemporaryDirectory(prefix="hexapod_comp_") as folder:
+        model = [MachineModel(geometry.name)]
+
+        def begin(title: str) -> None:
+            machine.begin(title)
+            error = held_out(RealMachine(geometry, machine.truth), model[0], place.box, level=place.attitude)
+            left[title] = error.aligned.rms
+
+        def reload(path: Path) -> None:
+            model[0] = load_model(path, geometry)
+            machine.reload(model[0])
+            begin(("calibrated", "renewed", "repaired")[min(len(machine.chapters) // 2, 2)])
+
+        loop = Adaptation(geometry, machine, task, folder, reload, say=say)
+        begin("as built")
+        outcome = loop.calibrate()
+        if not outcome.good:
+            raise CalibrationError("demo", f"{outcome.state}: {outcome.text}")
+        promised = loop.state.kept
+        loop.guard(1)
+        machine.become(warmed(geometry, truth, WARMTH))
+        begin(f"warmer by {WARMTH:g} K")
+        loop.guard(1)
+        loop.guard(1)
+        machine.knock(strut, KNOCK)
+        begin(f"{STRUT_NAMES[strut]} knocked")
+        loop.guard(1)
+        loop.guard(1)
+    return Told(machine.chapters, loop.events, promised, left, list(_complaints(loop.events, promised, left, strut)))
 
 
-def demo_path(geometry: HexapodGeometry, place: Place, rate: float) -> Path:
-    """Return a milled circle, then a zigzag pocket, in the middle of the measured box, across the tool, in ``base``."""
-    box, in_base = place.box, commanded_in_base(geometry)
-    side = min(PATH_SIDE, 0.25 * float(np.ptp(box, axis=0)[:2].min()))
-    feed, centre = side / PATH_TIME, geometry.work @ Pose(box.mean(axis=0), place.attitude)
-    ring = circle(centre, radius=0.5 * side, feed=feed, rate=rate)
-    corner = centre @ Pose(np.array([-0.5 * side, -side / 6.0, 0.0]), np.eye(3))
-    rows = pocket(in_base, corner, (side, side / 3.0), pitch=side / 6.0, feed=feed, rate=rate)
-    return join([ring, move(in_base, ring.pose(len(ring) - 1), corner, rate, feed), rows])
-
-
-def promises(fit: ModelFit, poses: Sequence[Pose], path: Path) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the predicted interval of the tool's RMS error at rest and along a path, m, with 95 %, the datum
-    aligned."""
-    # As the fit's own expected tool error, at these very poses and with their own datum instead of the whole box's.
-    # Along the path only what is across it counts.
-    geometry, space = fit.space.geometry, fit.space
-    in_base = [geometry.work @ pose for pose in poses]
-    at = np.linspace(1, len(path) - 1, ON_PATH).astype(int)
-    home = (geometry.home @ geometry.tool).position
-    positions = np.array([pose.position for pose in in_base])
-    ways = np.concatenate([np.diff(positions, axis=0, prepend=[home]), path.positions[at] - path.positions[at - 1]])
-    tool = (
-        np.concatenate([positions, path.positions[at]]),
-        np.concatenate([[pose.rotation for pose in in_base], path.rotations[at]]),
-    )
-    stations = stations_of(Passes.of_tool(commanded_in_base(geometry), *tool, ways))
-    rest, prediction = slice(0, len(poses)), predict(space, fit.solution.x, stations)
-    lengths = np.linalg.norm(ways, axis=1, keepdims=True)
-    along = ways / np.where(lengths > 0.0, lengths, 1.0)
-    covariance = physical_covariance(space, fit.solution.posterior)
-    aligned = without_datum(tool[0], left_errors(space, prediction, stations, covariance)[:, :3], rest)
-    across = aligned - along[:, :, None] * np.einsum("ni,nid->nd", along, aligned)[:, None]
-    rest_left, path_left = (np.sqrt((e**2).sum(axis=1).mean(axis=0)) for e in (aligned[rest], across[len(poses) :]))
-    beyond = fit.verdict.unexplained
-    at_rest = beyond.promised(rest_left, tool[0][rest])
-    return at_rest[1:], beyond.promised(path_left, tool[0][len(poses) :])[1:]
-
-
-def left_by_drives(
-    geometry: HexapodGeometry, truth: MachineModel, poses: Sequence[Pose], path: Path
-) -> tuple[float, float]:
-    """Return the RMS tool error that the drives cause with the true model, at rest and along a path, m, datum aligned.
-
-    The same commands to the same drives, here and without DDS: motor steps, lag, backlash being taken up.
-    """
-    in_base = commanded_in_base(geometry)
-    core, drive = Compensator(in_base, truth), StrutDrive(RealMachine(in_base, truth))
-    seen: list[np.ndarray] = []
-
-    def travel(way: Path) -> None:
-        seen.clear()
-        for n in range(len(way)):
-            drive.set_command(core.correct(way.pose(n)).command)
-            drive.advance(1.0 / way.rate)
-            seen.append(drive.true_tool_pose().position)
-
-    records, at = [], in_base.home @ in_base.tool
-    for target in [geometry.work @ pose for pose in poses]:
-        travel(move(in_base, at, target, path.rate, MOVE_FEED))
-        drive.advance(REST)
-        records.append(PoseRecord(target, true_with=drive.true_tool_pose()))
-        at = target
-    travel(move(in_base, at, path.pose(0), path.rate, MOVE_FEED))
-    drive.advance(REST)
-    travel(path)
-    track = Track.along(path, np.array(seen), np.arange(1, len(path) + 1))
-    result = SessionResult(records, PathRecord(path, None, track, np.zeros((0, 6))))
-    at_rest, on_path = (rms(row.compensated) for row in error_rows(result) if row.datum == ALIGNED)
-    return at_rest, on_path
-
-
-def with_promises(
-    rows: Sequence[ErrorRow], promised: Sequence[tuple[float, float]], drives: Sequence[float]
-) -> list[ErrorRow]:
-    """Return rows whose aligned ones have the predicted interval for rest and path, the drives' share added."""
-    whole = {
-        what: (low, float(np.hypot(high, DRIVES * own)))
-        for what, (low, high), own in zip(("at rest", "path"), promised, drives, strict=True)
-    }
-    return [replace(row, promised=whole[row.what]) if row.datum == ALIGNED else row for row in rows]
+def _complaints(events: list[dict[str, Any]], promised: float, left: dict[str, float], strut: int) -> Iterator[str]:
+    """Yield what is not as it should be."""
+    repairs = [e["text"] for e in events if e["event"] == "repaired"]
+    for wanted in ("a temperature acts", f"a strut's offset has changed: {STRUT_NAMES[strut]}"):
+        if not any(text.startswith(wanted) for text in repairs):
+            yield f"no repair says: {wanted}"
+    for title in ("calibrated", "renewed", "repaired"):
+        if not left.get(title, np.inf) <= promised:
+            yield f"{title}: {left.get(title, np.nan) * 1e6:.3f} µm RMS are left; {promised * 1e6:.3f} were promised"

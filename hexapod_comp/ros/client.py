@@ -1,4 +1,4 @@
-"""Clients of the nodes: :class:`LoopClient` sends poses one by one, for ``run``, ``demo`` and benchmarks;
+"""Clients of the nodes: :class:`LoopClient` sends poses one by one, for ``run`` and benchmarks;
 :class:`Machine` has the mover move the tool."""
 
 from __future__ import annotations

@@ -166,7 +166,7 @@ OPTIONS = {
     "export": ("--units", "--box", "--step-mm", "--poses", "--tilt-deg", "--seed", "--table"),
     "classify": ("--cells", "--clearance-mm", "--tilt-deg", "--allow-um", "--workers", "--budget"),
     "run": ("--rate-hz", "--machine", "--model", "--truth", "--pictures"),
-    "demo": ("--rate-hz", "--machine", "--model", "--truth", "--seed", "--pictures"),
+    "demo": ("--machine", "--truth", "--seed", "--pictures"),
 }
 
 words = st.one_of(

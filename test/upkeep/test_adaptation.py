@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 from foreign_machines import machines
 
-from benchmarks.watched_machine import Instrument, VirtualMachine
 from hexapod_comp.calibration import check
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.parameters import FitSettings
@@ -36,6 +35,7 @@ from hexapod_comp.upkeep.checks import CLEAR, check_run
 from hexapod_comp.upkeep.journal import Journal
 from hexapod_comp.upkeep.loop import Adaptation, State, Task, begun_with, next_step
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
+from hexapod_comp.virtual.watched import Instrument, VirtualMachine
 
 # What is wrong with the machine, and all that is fitted: a fit takes half a second then
 BLOCKS = ("pitch", "backlash")

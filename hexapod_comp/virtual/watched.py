@@ -12,15 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.errors import LimitError
-from hexapod_comp.machine.geometry import HexapodGeometry
-from hexapod_comp.machine.model import MachineModel, RealMachine
-from hexapod_comp.machine.temperatures import Temperatures
-from hexapod_comp.machine.trajectory import commanded_in_base
-from hexapod_comp.measurements.collect import Observation
-from hexapod_comp.pose import Pose, attitude_error
-from hexapod_comp.virtual.machine import DriveParameters, StrutDrive
+from ..compensation.compensator import Compensator
+from ..errors import LimitError
+from ..machine.geometry import HexapodGeometry
+from ..machine.model import MachineModel, RealMachine
+from ..machine.temperatures import Temperatures
+from ..machine.trajectory import commanded_in_base
+from ..measurements.collect import Observation
+from ..pose import Pose, attitude_error
+from .machine import DriveParameters, StrutDrive
 
 PLACES = (0.5, 0.75, 0.875, 0.94, 0.97, 0.99, 1.0)  # of a move, as shares of it: struts turn back where they would
 FARTHEST = 1.0  # A move is a few commands, each further than a step of a stream may be, m
@@ -95,8 +95,8 @@ class VirtualMachine:
         return Observation(seen, np.repeat(sigma, 3) / np.sqrt(SAMPLES), struts, temperatures, float(self.stops))
 
     def reload(self, model: MachineModel) -> None:
-        """Have the compensation run another model."""
-        self._core.set_model(model)
+        """Have the compensation run another model, its ramp over: that takes more commands than a move has here."""
+        self._core = Compensator(self._in_base, model)
 
     def knock(self, strut: int, distance: float) -> None:
         """Make a strut longer for good, m, behind the compensation's back."""
