@@ -579,7 +579,7 @@ example:
   $ hexapod_comp simulate --campaign campaign_1d --seed 1 --out measured.csv
   machine paper with the errors of paper_machine.yaml, moved by nominal strut lengths; seed 1
   channel  readings     rms      max
-   linear      1670  28.603  142.893  um
+   linear      1670  28.598  142.893  um
   1670 readings of 59 runs at 1670 stations: measured.csv""",
         alias="measure",
     ),
