@@ -86,7 +86,7 @@ class Verification:
     measurements : MeasurementSet
         The readings.
     independent : int
-        How many numbers they are without what their instruments do not know.
+        Number of independent values: readings minus their instruments' unknowns (zeros, slopes, frames).
     chi_square : float
         Their squared differences from the model over those to expect of an unchanged machine, per number.
     usual : float
@@ -397,7 +397,7 @@ def verification_report(result: Verification) -> str:
     m, region = result.measurements, result.model.measured
     parts = [
         f"machine {m.geometry.name}, model {result.model.name!r}: {len(m)} check readings of {len(np.unique(m.run))} "
-        f"runs, {result.independent} numbers without what the instruments leave open\n"
+        f"runs, {result.independent} independent values without the instruments' unknowns\n"
         f"{region_text(region, m.geometry)}",
         "\n".join(_verdict(result)),
     ]

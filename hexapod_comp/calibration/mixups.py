@@ -157,7 +157,7 @@ class _Fitted:
 
     @cached_property
     def rows(self) -> np.ndarray:
-        """Derivatives of the cells by components, over their noise, free of what instruments do not know, (C, n)."""
+        """Derivatives of the cells by components, over their noise, free of the instruments' unknowns, (C, n)."""
         return self.problem.rows.dense()
 
     @cached_property
@@ -176,7 +176,7 @@ class _Fitted:
 
     @cached_property
     def _read(self) -> tuple[np.ndarray, np.ndarray]:
-        """Directions of the cells, (C, 6), and their rows with what instruments do not know still in them, (C, n)."""
+        """Directions of the cells, (C, 6), and their rows with the instruments' unknowns still in them, (C, n)."""
         directions = self._seen(self.estimation.measurements)[0]
         return directions, self._along(np.arange(len(directions)), directions)
 
@@ -198,7 +198,7 @@ class _Fitted:
         return self._reduced(rows)
 
     def _seen(self, other: MeasurementSet) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
-        """Return directions and targets of the cells of readings taken otherwise, and what instruments do not know."""
+        """Return directions and targets of the cells of readings taken otherwise, and the instruments' unknowns."""
         e = self.estimation
         directions, values = other.directions()[e.cells.first], self._cell_values(other.value)
         errors = self._prediction.errors[e.cells.station]

@@ -295,7 +295,7 @@ class Adaptation:
         return self._run(None if checks is None else state.checks + checks)
 
     def _run(self, checks: int | None) -> Outcome:
-        """Take step after step until there is none."""
+        """Run the steps in their order until none is due."""
         waits, may_reload = False, self._reload is not None
         steps = {
             PLAN: self._plan,

@@ -27,7 +27,7 @@ def faces(slope: str) -> Campaign:
 
 
 def left(m: MeasurementSet, values: np.ndarray) -> float:
-    """Return how much of a straightness is left beside what instruments do not know, in m."""
+    """Return how much of a straightness is left beside the instruments' unknowns, in m."""
     estimation = Estimation(m, ParameterSpace(m, FEW), alone=False)
     cells = estimation.cells
     mean = np.bincount(cells.of_reading, values) / np.bincount(cells.of_reading)
