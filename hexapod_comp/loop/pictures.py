@@ -29,6 +29,7 @@ def session_figure(result: SessionResult, title: str) -> Figure:
             values = [np.nan if error is None else max(error[0] * 1e6, FLOOR) for error in errors]
             axes.plot(number, values, marker, color=colour, mfc=face or colour, label=f"{name}, {datum}")
     axes.set(title="Tool error at rest", xlabel="pose", ylabel="µm", yscale="log")
+    axes.set_ylim(top=20.0 * axes.get_ylim()[1])  # room for the titles of the chapters
     axes.legend()
     return figure
 
@@ -51,5 +52,6 @@ def story_figure(told: Told, title: str) -> Figure:
         )  # fmt: skip
     axes.axhline(told.promised * 1e6, color="black", ls="--", lw=1.0, label="promised after the calibration (95 %)")
     axes.set(xlabel="time of the machine, min", ylabel="tool error at a stop, datum aligned, µm", yscale="log")
+    axes.set_ylim(top=20.0 * axes.get_ylim()[1])  # room for the titles of the chapters
     axes.legend(loc="lower left")
     return figure

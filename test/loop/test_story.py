@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foreign_machines import machines
+from helpers import long_test
 
 from hexapod_comp import cli
 from hexapod_comp.compensation.checks import check
@@ -55,6 +56,7 @@ def test_a_warm_machine_has_struts_longer_by_steels_growth() -> None:
     np.testing.assert_allclose(warm.pitch, 57.5e-6)
 
 
+@long_test
 @pytest.mark.timeout(300)
 def test_the_whole_story_on_a_foreign_machine(tmp_path: Path) -> None:
     """Turned tool and work frames, every kind of error that ``random`` has."""
