@@ -20,11 +20,12 @@ from scipy.special import chdtr, chdtrc
 from ..errors import CalibrationError
 from ..machine.geometry import STRUT_NAMES
 from ..machine.load import Load
-from ..measurements.readings import AXES, CHANNELS, KINDS, MeasurementSet
+from ..measurements.readings import AXES, CHANNELS, KINDS, MeasurementSet, Stations
 from .assumptions import ASSUMED
-from .blocks.block import Linkage
-from .blocks.load import stated_load
+from .blocks.block import Linkage, Prediction
+from .blocks.load import stated_load, unsettled_lengths
 from .estimator import Estimation
+from .observations import Cells
 from .parameters import BLOCKS, ParameterSpace
 from .posterior import FittedParameters, box_stations
 from .sensitivity import derivatives, predict
@@ -205,6 +206,16 @@ def reading_noise(fitted: FittedParameters) -> np.ndarray:
     return fitted.noise / np.sqrt(consistency(ASSUMED.huber) if fitted.space.settings.robust else 1.0)
 
 
+def unsettled_cells(space: ParameterSpace, prediction: Prediction, stations: Stations, cells: Cells) -> np.ndarray:
+    """Return the effect on cells, (C, k), of struts whose lost motion may be at either end, by standard deviations."""
+    linkage = Linkage(prediction, space.probe, stations)
+    deviation = unsettled_lengths(space.geometry, linkage)
+    station, strut = np.nonzero(deviation)
+    gains = linkage.errors(cells.station, cells.directions, np.arange(6)).gains
+    effect: np.ndarray = gains[:, strut] * deviation[station, strut] * (cells.station[:, None] == station)
+    return effect
+
+
 @dataclass(frozen=True)
 class CheckReadings:
     """Check readings with the prediction of a model and its fit, as n numbers free of the instruments' unknowns."""
@@ -247,24 +258,26 @@ class CheckReadings:
         entries = precision / scale[cells.of_reading], (cells.of_reading, np.arange(len(m)))
         weights = csr_array(entries, shape=(len(scale), len(m)))
         residuals = seen @ linear.target - rows @ fitted.x
+        noise, prediction = (seen * sigma**2) @ seen.T, predict(space, fitted.x, m.stations)
+        if prediction.load.lost_motion.any():
+            unsettled = seen @ estimation.free_of_nuisance(unsettled_cells(space, prediction, m.stations, cells))
+            noise += unsettled @ unsettled.T
 
         def loaded(change: np.ndarray) -> np.ndarray:
-            moved = predict(heavier(space, change), fitted.x, m.stations).errors - before
+            moved = predict(heavier(space, change), fitted.x, m.stations).errors - prediction.errors
             of_cells = (cells.directions * moved[cells.station]).sum(axis=1)
             return seen @ estimation.free_of_nuisance(of_cells[:, None])[:, 0]
 
-        bends = space.model(fitted.x).load.lost_motion.any()
-        before = predict(space, fitted.x, m.stations).errors if bends else np.zeros(0)
         return CheckReadings(
             residuals,
             rows,
-            (seen * sigma**2) @ seen.T,
+            noise,
             seen * sigma,
             names,
             seen,
             cells.kind,
             weights,
-            loaded if bends else None,
+            loaded if prediction.load.lost_motion.any() else None,
         )
 
     def changed_by(self, values: np.ndarray) -> CheckReadings:

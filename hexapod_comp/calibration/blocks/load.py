@@ -95,6 +95,21 @@ def tensions(geometry: HexapodGeometry, linkage: Linkage) -> np.ndarray:
     return pulled + by_friction(geometry, linkage) @ load.friction if load.friction.any() else pulled
 
 
+def taken_up(geometry: HexapodGeometry, linkage: Linkage) -> np.ndarray:
+    """Return the share of half its lost motion by which each strut is longer at a linkage's stations, (M, 6), −1…1."""
+    return np.clip(tensions(geometry, linkage) / linkage.load.take_up, -1.0, 1.0)
+
+
+def unsettled_lengths(geometry: HexapodGeometry, linkage: Linkage) -> np.ndarray:
+    """Return the standard deviation of the struts' lengths where the take-up exceeds their tension, (M, 6), m.
+
+    A clearance goes to one of its ends, to which depends on a force that is known to no better than the take-up; the
+    line between the ends, by which the model lengthens the strut, is the mean of both, weighted by their probabilities.
+    """
+    deviation: np.ndarray = 0.5 * linkage.load.lost_motion * np.sqrt(1.0 - taken_up(geometry, linkage) ** 2)
+    return deviation
+
+
 def as_loaded(settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> set[str]:
     """Return the blocks of load that stations cannot show: at one load, or with forces of one sign, struts look longer.
 
@@ -175,8 +190,7 @@ class LostMotion(LoadBlock):
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
         """Half the sign of the struts' tensions."""
-        taken_up = np.clip(tensions(self._geometry, linkage) / linkage.load.take_up, -1.0, 1.0)
-        return 0.5 * taken_up[..., None] * np.eye(6)
+        return 0.5 * taken_up(self._geometry, linkage)[..., None] * np.eye(6)
 
 
 class Friction(LoadBlock):
@@ -188,6 +202,6 @@ class Friction(LoadBlock):
     def stretched(self, linkage: Linkage) -> np.ndarray:
         """Stretch by the struts' tensions, and the reversal of lost motions."""
         load = linkage.load
-        turning = np.abs(tensions(self._geometry, linkage)) < load.take_up
+        turning = np.abs(taken_up(self._geometry, linkage)) < 1.0
         per_newton = load.compliance + 0.5 * load.lost_motion / load.take_up * turning
         return per_newton[..., None] * by_friction(self._geometry, linkage)
