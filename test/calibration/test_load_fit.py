@@ -317,7 +317,7 @@ def test_lost_motion_and_friction_are_fitted_where_forces_change_their_sign() ->
     assert "lost motion" not in as_loaded(told, paper(), readings.stations)
 
     # Clearances that go to their ends at once, where the model is on its line between them, are no change: the same
-    # machine with a take-up of 1 mN, whose clearances stand out of the noise. Without their variance χ² is 5 per number.
+    # machine with a take-up of 1 mN, whose clearances exceed the noise. Without their variance χ² is 5 per number.
     lost_motion = fitted.space.block("lost motion")
     assert lost_motion is not None
     known, x = FittedParameters.of(fitted), fitted.solution.x.copy()
