@@ -202,9 +202,8 @@ def test_readings_carry_their_load_through_files(tmp_path: Path) -> None:
             read_tidy(tmp_path / "wrong.csv", truth().geometry)
 
 
-@pytest.mark.parametrize(
-    "settings", [pytest.param(BLIND, marks=long_test, id="no stiffness"), pytest.param(TOLD, id="stiffness stated")]
-)
+@long_test
+@pytest.mark.parametrize("settings", [BLIND, TOLD], ids=["no stiffness", "stiffness stated"])
 def test_verify_names_the_payload_and_no_temperature(settings: FitSettings) -> None:
     """Ten kilograms more that nobody tells of; then the same readings with what they carry, where stiffness is known.
 

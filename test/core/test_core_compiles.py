@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import long_test
 
 from benchmarks.same_bits import SANITIZED, STRICT, Build, builds, missing, printed
 from hexapod_comp import core
@@ -33,6 +34,7 @@ def test_no_compiler_warns(compiler, tmp_path):
     assert made.stderr == ""
 
 
+@long_test
 def test_sanitizers_have_nothing_to_say_and_the_numbers_are_the_same(tmp_path):
     """Commands, estimates, temperatures, batches, checks, travel, assembly modes and drives; undefined is an error."""
     if missing(BUILDS["gcc -O0"]):

@@ -519,6 +519,7 @@ def test_a_laser_that_reads_wildly_and_whose_beam_breaks_is_collected(bench: Ben
     assert off.max() < 6e-6, "half of a backlash of 4 µm, steps of the drives, and wild ones within a median"
 
 
+@long_test
 def test_a_tracker_that_stands_anywhere_is_collected_in_two_calls(bench: Bench, tmp_path: Path) -> None:
     """Up to one rigid motion, which six poses leave open, the file is that of a tracker in base."""
     known = machine(bench, "tracker", stands_at=[2.0, -1.0, 0.5], stands_turned=[0.3, 1.0, 2.5], frame_id="tracker")
