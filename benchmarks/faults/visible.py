@@ -66,10 +66,10 @@ REFUSALS = {
 def silence(link: str, record: Record, fault: Happened) -> list[Expected]:
     """A link is silent: visible when nothing has come for the timeout of a node that is alive."""
     node, pattern, timeout = SILENCE[link]
-    times = [*record.delivered[link], math.inf]
+    times, killed = [*record.delivered[link], math.inf], sorted(record.killed[node])
     for last, following in itertools.pairwise(times):
         since = last + timeout
-        for start, end in sorted(record.killed[node]):
+        for start, end in killed:
             if start < since + LOOKED_AT:
                 since = max(since, end)
         if following > fault.began and last < fault.ended and following > since + LOOKED_AT:

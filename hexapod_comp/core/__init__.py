@@ -23,6 +23,8 @@ VERSION, SOURCES_HASH = ffi.string(lib.hc_version()).decode(), ffi.string(lib.hc
 QUATERNION_NORM_TOLERANCE = lib.QUATERNION_TOLERANCE
 # A pause between commands counts as no more than this in a ramp, s: a late command must not step
 LONGEST_RAMP_STEP = lib.LONGEST_RAMP_STEP
+# A bearing that turns by less than this share of the motion does not resist in full
+SLIDING = lib.SLIDING
 MOST_ITERATIONS, MOST_HARMONICS = lib.HC_MOST_ITERATIONS, lib.HC_MOST_HARMONICS
 
 

@@ -16,7 +16,7 @@ FOLDER = Path("hexapod_comp", "core")  # setup.py runs in the root of the source
 # What Python calls; the first is the public one, which ``export --c`` copies
 HEADERS = ("hexapod_comp.h", "hexapod_batch.h")
 UNIT = "hexapod_batch.c"  # Compiled as one unit; it contains ``hexapod_comp.c``
-CONSTANTS = "static const double QUATERNION_TOLERANCE, LONGEST_RAMP_STEP; const char *hc_sources(void);"
+CONSTANTS = "static const double QUATERNION_TOLERANCE, LONGEST_RAMP_STEP, SLIDING; const char *hc_sources(void);"
 FLAGS = ["-std=c99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
 """The same bits on every machine: products and sums are not contracted, and nothing is reordered. Nobody asks for errno
 or for floating-point exceptions; without them loops become vector code."""

@@ -116,11 +116,8 @@ def stands(fitted: FittedParameters, readings: MeasurementSet) -> Whole | None:
     chosen, directions, left, noise = _differences(fitted, readings, ("position",))
     if not len(left):
         return None
-    unknown, size = (
-        _rigid(fitted.space, chosen, directions),
-        0.5 * float(np.linalg.norm(np.ptp(fitted.space.work_box, axis=0))),
-    )
-    unknown[:, 3:] /= size
+    unknown = _rigid(fitted.space, chosen, directions)
+    unknown[:, 3:] /= 0.5 * float(np.linalg.norm(np.ptp(fitted.space.work_box, axis=0)))
     motion, *_ = np.linalg.lstsq(unknown, left, rcond=None)
     variance = max(float(np.mean(noise**2)), float(np.mean((left - unknown @ motion) ** 2)))
     return Whole(motion, float(np.sqrt(variance * np.linalg.inv(unknown.T @ unknown).diagonal().max())))

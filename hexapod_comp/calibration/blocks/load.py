@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from ...core import SLIDING
 from ...errors import CalibrationError
 from ...machine.geometry import STRUT_NAMES, HexapodGeometry
 from ...machine.load import MOST_LOADS, Load
@@ -16,8 +17,6 @@ from .block import Block, Columns, Draft, Facts, Linkage, Prediction
 
 if TYPE_CHECKING:
     from ..parameters import FitSettings
-
-SLIDING = 0.02  # share of the motion below which a bearing turns too little to resist in full; as in the core
 
 
 def stated_load(settings: FitSettings) -> Load:
