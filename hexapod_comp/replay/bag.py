@@ -91,8 +91,8 @@ class Recording:
         Those of all pages, one after the other.
     sources : dict of str to Source
         Geometries and models by their hash.
-    heard : int
-        Commands in the recording; the compensator may have received fewer.
+    recorded : int
+        Commands on their topic in the recording; the compensator may have received fewer.
     notes : list of str
         What was odd.
     """
@@ -103,7 +103,7 @@ class Recording:
     pages: list[tuple[int, Page]]
     commands: np.ndarray
     sources: dict[str, Source]
-    heard: int
+    recorded: int
     notes: list[str]
 
     @property
@@ -169,8 +169,7 @@ def read_recording(
                 key = f"{message.topic} at {message.time} ns"
                 collected.add(wanted[message.topic], message.time, _deserialized(path, key, store, message))
                 progress(1)
-    heard = counts[f"{_namespace(node)}/{COMMANDS}", POSE]
-    return collected.recording(notes, heard)
+    return collected.recording(notes, counts[f"{_namespace(node)}/{COMMANDS}", POSE])
 
 
 def _typestore() -> Any:
@@ -338,7 +337,7 @@ class _Collected:
         except JournalError as error:
             raise InputFileError(self._path, f"{self._node}{name} at {time} ns", str(error)) from error
 
-    def recording(self, notes: list[str], heard: int) -> Recording:
+    def recording(self, notes: list[str], recorded: int) -> Recording:
         commands, pages = self._in_order()
         if not any(page.snapshot for _, page in pages):
             problem = "holds no snapshot of the compensator's state: record for longer than half a second"
@@ -355,7 +354,7 @@ class _Collected:
             f"{count} messages of {name} left out: not a position for each of {', '.join(self._joints)}"
             for name, count in self._odd.items()
         ]
-        recording = Recording(str(self._path), self._node, topics, pages, commands, self._sources, heard, notes)
+        recording = Recording(str(self._path), self._node, topics, pages, commands, self._sources, recorded, notes)
         if (recording.frames == "").any():
             raise InputFileError(self._path, self._node + JOURNAL, "has a command in a frame that no snapshot names")
         return recording

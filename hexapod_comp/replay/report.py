@@ -102,11 +102,11 @@ def _run(report: Report) -> Part:
     first = recording.first
     machine, model = (printable(one["name"]) for one in (first.geometry, first.model))
     began = datetime.fromtimestamp(recording.commands["stamp"][0] * 1e-9, timezone.utc)
-    heard = f"; the recorder heard {recording.heard}" if recording.heard else ""
+    recorded = f"; {recording.recorded} recorded" if recording.recorded else ""
     lines = [
         f"{recording.path}: {printable(recording.node)}, machine {machine}, model {model}",
         f"from {began:%Y-%m-%d %H:%M:%S} UTC, {report.seconds[-1]:.1f} s: {answers + report.refusals} commands "
-        f"taken, {answers} answered, {report.refusals} refused{heard}",
+        f"taken, {answers} answered, {report.refusals} refused{recorded}",
     ]
     return lines, {
         "bag": recording.path,
@@ -114,7 +114,7 @@ def _run(report: Report) -> Part:
         "geometry": first.geometry,
         "model": first.model,
         "commands": answers + report.refusals,
-        "commands_heard_by_recorder": recording.heard,
+        "commands_recorded": recording.recorded,
         "answers": answers,
         "answers_lost": None if report.replayed is None else report.replayed.lost,
         "same": None if report.replayed is None else report.same,

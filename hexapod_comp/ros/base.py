@@ -17,7 +17,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
-from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
@@ -172,7 +172,7 @@ class MachineNode(LifecycleNode):
             callback = possible_only(self, callback) if service.srv_type is ChangeState else callback
             service.callback = self.guard.answering(service.srv_name, service.srv_type, callback)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", EVENT_QOS)
+        self._diagnostics_pub = self._publisher_of_status()
         self.set_hardware_id("")
         self._tickers: dict[str, Alarm] = {}
         self._options = Parameters(self, table, self._on_parameters)
@@ -433,6 +433,20 @@ class MachineNode(LifecycleNode):
     def values(self, now: float) -> dict[str, str]:
         """Return all else of the node's state as key and value."""
         return {}
+
+    def _publisher_of_status(self) -> Publisher:
+        """Return the publisher of diagnostics. A new subscriber gets the status with the next check: discovery takes a
+        moment, and what was published before is lost to it."""
+
+        def on_matched(_: Any) -> None:
+            self._report.renew()
+
+        make = functools.partial(self.create_publisher, DiagnosticArray, "/diagnostics", EVENT_QOS)
+        try:
+            guarded = self.guard.around("matching of /diagnostics", on_matched)
+            return make(event_callbacks=PublisherEventCallbacks(matched=guarded))
+        except UnsupportedEventTypeError:
+            return make()
 
     def _check_state(self) -> None:
         now = time.monotonic()

@@ -51,8 +51,8 @@ beam_slope | 1.0e-4 | 0 to 0.1 rad | always | 1 σ of how a laser's beam lies of
 centre_off | 3.0e-4 | 0 to 0.1 m | always | 1 σ of a ball bar's centre beside its place, from the next run on
 wild_share | 0.0 | 0 to 1 | always | share of readings that are wild
 wild_size | 0.001 | 0 to 1 | always | by so much, m or rad
-fault_break | 0.0 | 0 to 3600 s | always | each setting breaks the beam for this long: NaN is read, and what follows
-    is counted anew
+fault_break | 0.0 | 0 to 3600 s | always | each setting breaks the beam for this long: readings are NaN, and those after
+    it start from a new zero
 fault_silent | false |  | always | publishes nothing, and keeps its zero
 fault_scale | 1.0 | -1e9 to 1e9 | always | of all that it reads: -1 reverses the sign, 1000 has it read mm
 fault_exchanged | false |  | always | its first two channels, or coordinates, are exchanged

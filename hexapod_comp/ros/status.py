@@ -147,6 +147,10 @@ class HealthReport:
         self._shown, self._last = (level, message), now
         return True
 
+    def renew(self) -> None:
+        """Make a message due at the next check, changed or not."""
+        self._last = -math.inf
+
     def message(self, level: bytes, text: str, values: dict[str, str], stamp: Time) -> DiagnosticArray:
         array = DiagnosticArray(status=[status_of(self._name, self._hardware_id, level, text, values)])
         array.header.stamp = stamp

@@ -300,7 +300,7 @@ def words(view: View, machine: str) -> str:
     for name in NODES:
         parts.append(_heading(TITLES[name]))
         if (status := view.states.get(name)) is None:
-            parts.append(f'<div style="color: {SILENT}">not heard</div>')
+            parts.append(f'<div style="color: {SILENT}">no status received</div>')
             continue
         values = {entry.key: escape(entry.value) for entry in status.values}
         shown = {title: values[key] for key, title in KEYS.items() if values.get(key)}
@@ -331,7 +331,7 @@ def words(view: View, machine: str) -> str:
         "<small>Left is tool − command: while the machine moves it holds the drives' lag too.</small>",
         _heading("Struts"),
         _table(struts),
-        "<small>blue −100 µm, white 0, red +100 µm; grey: not heard</small>",
+        "<small>blue −100 µm, white 0, red +100 µm; grey: no correction received</small>",
         _heading("Latency, stamp of a command to its answer here"),
         f"<div>{waited}</div>",
     ]

@@ -340,7 +340,7 @@ def test_a_journal_without_its_end_is_noticed(run, tmp_path, capsys):
     bag = write_bag(tmp_path / "run", without(run.messages, last))
     assert counted(opened(bag)[1]) == {IDENTICAL: 1180}
     assert call(bag) == 0
-    assert "1181 commands taken, 1180 answered, 1 refused; the recorder heard 1201" in capsys.readouterr().out
+    assert "1181 commands taken, 1180 answered, 1 refused; 1201 recorded" in capsys.readouterr().out
 
 
 def test_pages_that_come_twice_or_late_do_no_harm(run, tmp_path):
@@ -481,7 +481,7 @@ def test_verb_writes_report_pictures_and_json(run, tmp_path, capsys):
     with quick_pictures():
         assert call(bag, "--pictures", tmp_path / "pictures") == 0
     said = capsys.readouterr().out
-    assert "1201 commands taken, 1200 answered, 1 refused; the recorder heard 1201" in said
+    assert "1201 commands taken, 1200 answered, 1 refused; 1201 recorded" in said
     assert "replayed 1200 of 1200 answers: identical bit for bit" in said
     assert "changes between commands: 2 × enable, 1 × humidity, 1 × model, 2 × reset, 2 × temperature" in said
     pictures = {path.name for path in (tmp_path / "pictures").iterdir()}

@@ -103,7 +103,7 @@ def test_what_the_verb_records_is_replayed_and_a_folder_that_is_there_is_left_al
     judged = result.outcome[result.outcome != BEFORE]
     assert (judged == IDENTICAL).all()
     assert len(judged) >= 40
-    assert recording.heard >= 40
+    assert recording.recorded >= 40
     with pytest.raises(InputFileError, match="is there already"):
         BagRecorder(tmp_path / "run")
 

@@ -6,6 +6,7 @@ import time
 from typing import Any
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from node_helpers import HOME, RELIABLE, Bench, closed_form_lengths, near
 from rclpy.duration import Duration
@@ -138,3 +139,11 @@ def test_a_deadline_is_asked_for_where_a_parameter_says_so(bench):
     assert bench._publishers["tool_pose_command"].get_subscription_count() == 0
     bench._publishers["tool_pose_command"] = publisher
     bench.ask(HOME)
+
+
+def test_a_late_subscriber_gets_the_status_of_every_node_when_it_is_discovered(bench):
+    bench.machine()
+    for node in bench.nodes:
+        node._report._period = 1e9  # nothing is published again only because time passes
+    arrays = hear(bench, DiagnosticArray, "/diagnostics")
+    bench.until(lambda: len({array.status[0].name for array in arrays}) == 2, "the status of drive and compensator")
