@@ -6,14 +6,12 @@ of the whole machine; finite differences of the core's forward kinematics; a mac
 
 from __future__ import annotations
 
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 from foreign_machines import machines as zoo
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from hexapod_comp.compensation.compensator import Compensator, drifted
 from hexapod_comp.compensation.fusion import (
@@ -33,7 +31,7 @@ from hexapod_comp.pose import Pose
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 
 RULES = FusionRules()
-MACHINES = ("paper", "framed", "hanging", "inches")
+MACHINES = ("framed", "hanging")
 
 
 @pytest.fixture(scope="module", params=[*MACHINES, "example_6_6"])
@@ -92,27 +90,6 @@ def test_the_filter_is_the_posterior_of_all_readings_at_once():
     np.testing.assert_allclose(ours.covariance, covariance[-states:, -states:], rtol=1e-9, atol=1e-12)
 
 
-def test_the_stated_covariance_is_true(paper):
-    """Normalised squared errors over seeds are chi-square with twelve degrees of freedom, their mean within 99.9 %."""
-    seeds, steps, squares, passed = 60, 40, [], 0
-    matrices = [observed(paper, pose) for pose in poses(paper, steps, 3)]
-    noise = RULES.covariance()
-    for seed in range(seeds):
-        rng = np.random.default_rng([seed, 7])
-        true, ours = RULES.initial * rng.standard_normal(DRIFT_STATES), DriftFilter(RULES)
-        for step, matrix in enumerate(matrices):
-            true = true + (RULES.drift_rate * 3.0 * rng.standard_normal(DRIFT_STATES) if step else 0.0)
-            ours.predict(9.0 * step)
-            with suppress(CommandError):
-                ours.update(matrix @ true + rng.multivariate_normal(np.zeros(6), noise), matrix, noise)
-                passed += 1
-        off = true - ours.state
-        squares.append(off @ np.linalg.solve(ours.covariance, off))
-    low, high = chi2.ppf([0.0005, 0.9995], DRIFT_STATES * seeds) / seeds
-    assert low < np.mean(squares) < high
-    assert 0.995 < passed / (seeds * steps) < 1.0  # the gate lets 99.9 % pass
-
-
 @pytest.mark.parametrize("size", [np.nan, 5e-5, 1e-3, 10.0])
 def test_a_wild_reading_moves_nothing(paper, size):
     ours, matrix = DriftFilter(RULES), observed(paper, paper.home)
@@ -134,21 +111,6 @@ def test_a_drift_beyond_the_limit_is_held(paper):
         ours.update(matrix @ np.append(np.zeros(6), np.full(6, 3e-4)), matrix, rules.covariance())
     assert caught.value.reason == "drift_limit"
     assert not ours.state.any()
-
-
-def test_struts_and_base_are_told_apart_by_many_poses(geometry):
-    """At one pose the tool is known and six combinations keep what was assumed; many poses determine all twelve."""
-    rules = FusionRules(initial=1e-3, drift_rate=0.0, limit=1.0)
-    spreads = []
-    for places in ([geometry.home] * 200, poses(geometry, 200, 5, 0.08)):
-        ours = DriftFilter(rules)
-        for place in places:
-            ours.update(np.zeros(6), observed(geometry, place), rules.covariance())
-        spreads.append(np.sqrt(np.linalg.eigvalsh(ours.covariance)))
-        there = observed(geometry, geometry.home)
-        assert np.sqrt(np.diag(there @ ours.covariance @ there.T)[:3]).max() < 1e-6  # the tool
-    np.testing.assert_allclose(spreads[0][6:], rules.initial, rtol=1e-6)
-    assert spreads[1].max() < 0.1 * rules.initial
 
 
 # ---- the machine ----
@@ -249,17 +211,6 @@ def test_a_drift_that_is_none_is_refused(paper, wrong):
         compensator.restore({**compensator.snapshot(), "drift": wrong.tolist()})
 
 
-def test_a_reading_needs_struts_of_its_moment(paper):
-    fusion, struts = Fusion(Compensator(paper, MachineModel(paper.name)), RULES), lengths(paper, paper.home)
-    reading = PoseReading(paper.home @ paper.tool, 1.0, RULES.covariance())
-    assert not fusion.add(reading)
-    for made, since in ((1.1, "none before"), (1.2, "")):
-        (error,) = fusion.add_struts(struts, made) or [None]
-        assert (error is None) == (not since)
-        assert error is None or error.reason == "no_struts"
-    assert fusion.count == 0
-
-
 def test_a_machine_that_moves_makes_its_own_reading_uncertain(paper):
     """A millisecond between the clocks is 0.1 mm at 100 mm/s: no wild reading, and hardly a weight."""
     fusion = Fusion(Compensator(paper, MachineModel(paper.name)), RULES)
@@ -283,8 +234,3 @@ def test_a_covariance_that_is_none_is_rejected(change):
     with pytest.raises(CommandError, match="symmetric and positive definite") as caught:
         checked_covariance(numbers.tolist(), RULES)
     assert caught.value.reason == "covariance"
-
-
-def test_a_covariance_of_zeros_is_the_stated_one():
-    np.testing.assert_array_equal(checked_covariance([0.0] * 36, RULES), RULES.covariance())
-    np.testing.assert_array_equal(checked_covariance((4.0 * np.eye(6)).ravel().tolist(), RULES), 4.0 * np.eye(6))

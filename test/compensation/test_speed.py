@@ -18,7 +18,6 @@ from hexapod_comp.errors import HexapodError, LimitError, TooEarlyError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import MachineModel
-from hexapod_comp.pose import Pose
 
 PAPER = load_geometry(config_file("paper.yaml"))
 SPEED = 0.25
@@ -137,39 +136,3 @@ def test_compensation_is_switched_on_and_a_model_is_taken_while_struts_move():
     compensator.enable(True)
     compensator.set_model(compensator.model)
     assert compensator.enabled
-
-
-def test_without_times_there_is_no_speed():
-    """Single poses in Python: only a step is too far."""
-    compensator = ideal()
-    for n in range(10):
-        compensator.correct(Pose([0.0, 0.0, 0.4 + 1.5e-3 * n], np.eye(3)))
-    with pytest.raises(LimitError, match="in one command"):
-        compensator.correct(Pose([0.0, 0.0, 0.43], np.eye(3)))
-
-
-@pytest.mark.parametrize(("scheduled", "lost"), [(True, 0.0), (False, 0.15)])
-def test_a_controller_that_stalls_now_and_then_loses_nothing_by_scheduled_stamps(scheduled, lost):
-    """At 1 kHz and 80 % of the speed limit; every 200th command it stalls, by 5 ms on average, and then sends
-    what is due. Bunched commands that are stamped with the times of sending seem too fast, and the next are too far."""
-    rng, count = np.random.default_rng(0), 4000
-    due = np.arange(count) * 1e-3
-    sent = due.copy()
-    for first in np.flatnonzero(rng.uniform(size=count) < 0.005):
-        until = due[first] + rng.exponential(5e-3)
-        bunch = np.flatnonzero((due >= due[first]) & (sent < until))
-        sent[bunch] = until + 1e-5 * np.arange(len(bunch))
-    compensator, refused = ideal(), 0
-    for planned, now in zip(due, sent, strict=True):
-        lengthened = 0.015 * (1.0 + 2.0 / math.pi * math.asin(math.sin(0.8 * SPEED / 0.03 * math.pi * planned)))
-        received = now
-        try:
-            while True:
-                try:
-                    compensator.step(at(rise_of(lengthened)), planned if scheduled else now, None, received)
-                    break
-                except TooEarlyError as error:
-                    received += error.wait + 1e-6
-        except LimitError:
-            refused += 1
-    assert refused == 0 if scheduled else refused > lost * count

@@ -19,13 +19,11 @@ from strategies import paper_geometry
 
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.compensation.thermal import Plausibility, TemperatureFilter, Thermometers
-from hexapod_comp.errors import InputFileError, ModelError
-from hexapod_comp.export.c_code import write_c
+from hexapod_comp.errors import ModelError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, ModelOrigin
-from hexapod_comp.machine.model_file import model_text, parse_model
 from hexapod_comp.machine.struts import StrutErrors
-from hexapod_comp.machine.temperatures import LateGrowth, Temperatures
+from hexapod_comp.machine.temperatures import LateGrowth
 
 ROUNDING = 1e-10
 """°C."""
@@ -41,35 +39,6 @@ def test_it_is_the_mean_weighted_by_age(readings: list[tuple[float, float]]) -> 
     values, times = np.array(readings).T
     expected = np.average(values, weights=np.exp((times - times.max()) / 30.0))
     assert taken(TemperatureFilter(30.0), values, times)[-1] == pytest.approx(expected, abs=ROUNDING)
-
-
-def test_after_a_long_gap_it_starts_anew() -> None:
-    """Ten time constants leave e^-10 of up to 31 readings: 0.14 % of the step of 5 K; then two count alike."""
-    low_pass = TemperatureFilter(30.0)
-    taken(low_pass, np.full(200, 20.0), np.arange(200.0))
-    assert low_pass.update("base", 25.0, 500.0) == pytest.approx(25.0, abs=0.01)
-    assert low_pass.update("base", 25.2, 500.0) == pytest.approx(25.1, abs=0.01)
-    assert low_pass.update("base", 30.0, 1e9) == 30.0, "a year later nothing is left, and nothing overflows"
-
-
-def test_a_reading_of_yesterday_counts_for_nothing() -> None:
-    low_pass = TemperatureFilter(30.0)
-    low_pass.update("base", 20.0, 86_400.0)
-    assert low_pass.update("base", 90.0, 0.0) == 20.0
-    assert low_pass.update("base", 22.0, 86_400.0) == 21.0
-
-
-def test_every_sensor_has_its_own_mean() -> None:
-    low_pass = TemperatureFilter(30.0)
-    for n, name in enumerate(Temperatures.NAMES):
-        assert low_pass.update(name, 20.0 + n, 0.0) == 20.0 + n
-    for n, name in enumerate(Temperatures.NAMES):
-        assert low_pass.update(name, 22.0 + n, 0.0) == 21.0 + n
-
-
-def test_zero_is_off() -> None:
-    readings = np.array([20.0, 25.0, 21.0, 23.0])
-    np.testing.assert_array_equal(taken(TemperatureFilter(0.0), readings, np.array([0.0, 0.0, 1.0, 0.5])), readings)
 
 
 @pytest.mark.parametrize(
@@ -89,12 +58,6 @@ def test_what_is_refused_leaves_no_trace(name: str, value: float, time: float, t
     with pytest.raises(ModelError, match=text):
         low_pass.update(name, value, time)
     assert low_pass.update("base", 21.0, 0.0) == 20.5
-
-
-@pytest.mark.parametrize("time_constant", [-1.0, math.nan, math.inf])
-def test_time_constants_that_are_none_are_refused(time_constant: float) -> None:
-    with pytest.raises(ModelError, match="temperature_time_constant: must be finite and not negative"):
-        TemperatureFilter(time_constant)
 
 
 # ---- which readings count ----
@@ -146,13 +109,6 @@ def test_what_is_stale_is_no_measure_for_others() -> None:
     assert made.stale(59.0) == ()
     assert made.stale(61.0) == ("base",)
     assert made.update("platform", 45.0, 61.0) == 45.0
-
-
-def test_a_rule_of_zero_is_none() -> None:
-    made = thermometers(0.0, 0.0, 0.0)
-    for value in (-40.0, 120.0):
-        assert made.update("base", value, 0.0) == value
-    assert made.stale(1e9) == ()
 
 
 def late_model() -> MachineModel:
@@ -255,22 +211,3 @@ def test_humidity_is_smoothed_goes_stale_and_judges_no_temperature() -> None:
     assert sensors.update("humidity", 0.6, 0.0) == pytest.approx(0.5, abs=1e-15)
     assert sensors.update("base", 60.0, 0.0) == 60.0
     assert sensors.stale(60.5) == ("base", "humidity")
-
-
-def test_models_carry_it_and_absurd_ones_are_refused() -> None:
-    geometry = paper_geometry()
-    text = model_text(swelling(geometry))
-    assert "moisture_ppm_per_percent: [2.5, 5" in text
-    back = parse_model(text, "paper", "swelling.yaml")
-    assert model_text(back) == text
-    np.testing.assert_allclose(back.struts.moisture, swelling(geometry).struts.moisture, rtol=4.0 * EPSILON)
-    wrong = text.replace("[2.5,", "[2500.0,")
-    with pytest.raises(InputFileError, match="1000 ppm per % of relative humidity; is the unit right"):
-        parse_model(wrong, "paper", "swelling.yaml")
-
-
-def test_export_to_c_carries_it(tmp_path: Path) -> None:
-    """The C core grows struts by humidity, as every model runs on it."""
-    geometry = load_geometry("paper")
-    write_c(tmp_path / "c", geometry, swelling(geometry), ("", ""))
-    assert ".moisture = 0.0," not in (tmp_path / "c" / "hexapod_model.h").read_text()

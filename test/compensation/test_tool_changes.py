@@ -6,7 +6,6 @@ Truth: the zoo's own frames say which pose of the new tool is where the struts s
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -78,37 +77,11 @@ def test_a_command_for_another_place_is_refused(way: float, machine: Machine, co
     compensator.step(numbers(machine, "probe"), 1.02)
 
 
-def test_the_old_tool_may_come_back(machine: Machine, compensator: Compensator) -> None:
-    before = compensator.step(numbers(machine, None), 1.0).copy()
-    compensator.set_tool("probe")
-    compensator.set_tool("tool")
-    np.testing.assert_array_equal(compensator.step(numbers(machine, None), 1.01), before)
-
-
 def test_a_reset_starts_anew_with_the_new_tool(machine: Machine, compensator: Compensator) -> None:
     measured = compensator.step(numbers(machine, None), 1.0).copy()
     compensator.set_tool("probe")
     compensator.reset(measured)
     np.testing.assert_allclose(compensator.step(numbers(machine, "probe", 5e-4), 1.01), measured, rtol=0, atol=ROUNDING)
-
-
-def test_before_the_first_command_any_tool_will_do(machine: Machine, compensator: Compensator) -> None:
-    compensator.set_tool("probe")
-    first = compensator.step(numbers(machine, "probe"), 1.0).copy()
-    other = Compensator(compensator.geometry.using("tool"), compensator.model)
-    np.testing.assert_allclose(other.step(numbers(machine, None), 1.0), first, rtol=0.0, atol=ROUNDING)
-
-
-def test_a_ramp_goes_on(machine: Machine, compensator: Compensator) -> None:
-    compensator.step(numbers(machine, None), 1.0)
-    compensator.enable(False)
-    other = Compensator(compensator.geometry, compensator.model)
-    other.restore(compensator.snapshot())
-    compensator.set_tool("probe")
-    for n in range(1, 4):
-        by_probe = compensator.step(numbers(machine, "probe"), 1.0 + 0.01 * n)
-        np.testing.assert_allclose(by_probe, other.step(numbers(machine, None), 1.0 + 0.01 * n), rtol=0, atol=ROUNDING)
-        assert compensator.ramping
 
 
 def test_estimates_and_records_are_those_of_the_tool(machine: Machine, compensator: Compensator) -> None:
@@ -150,14 +123,3 @@ def test_an_unknown_tool_changes_nothing(machine: Machine, compensator: Compensa
     np.testing.assert_equal(compensator.snapshot(), state)
     compensator.set_tool("stub")
     assert changes == [("tool", "stub")]
-
-
-def test_limits_are_those_of_the_platform(machine: Machine, tmp_path: Path) -> None:
-    """A step that is too large stays refused with another tool."""
-    tight = replace(machine, limits={"step_mm": 0.05})
-    geometry = load_geometry(tight.write(tmp_path / "tight.yaml"))
-    compensator = Compensator(geometry, load_model(Errors.none().write(tmp_path / "none.yaml", machine), geometry))
-    compensator.set_tool("probe")
-    compensator.step(numbers(machine, "probe"), 1.0)
-    with pytest.raises(LimitError, match="in one command"):
-        compensator.step(numbers(machine, "probe", 2e-4), 1.1)
