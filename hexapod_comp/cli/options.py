@@ -114,20 +114,16 @@ class Rule(NamedTuple):
     """A condition on the given options of a verb."""
 
     kind: str
-    # with EXACTLY_ONE an entry may be several options with spaces between, which together are one alternative
     options: tuple[str, ...]
 
     def problem(self, given: Callable[[str], bool], label: Callable[[str], str]) -> str:
         by, others = self.options[0], self.options[1:]
-        here = [name for name in self.options if any(given(part) for part in re.split(" (?=--)", name))]
+        here = [name for name in self.options if given(name)]
         first = next((label(name) for name in others if given(name)), "") if self.kind in (NEEDS, EXCLUDES) else ""
         if self.kind == EXACTLY_ONE and len(here) != 1:
             return f"give exactly one of {', '.join(map(label, self.options))}"
         if self.kind == SOME and not here:
             return f"at least one of {', '.join(map(label, self.options))} is needed"
-        if self.kind == TOGETHER and 0 < len(here) < len(self.options):
-            missing = next(name for name in self.options if name not in here)
-            return f"{missing} is missing: {', '.join(self.options)} go together"
         if self.kind == NEEDS and first and not given(by):
             return f"{first} needs {label(by)}"
         if self.kind == EXCLUDES and first and given(by):
@@ -135,7 +131,7 @@ class Rule(NamedTuple):
         return ""
 
 
-EXACTLY_ONE, SOME, TOGETHER, NEEDS, EXCLUDES = "exactly one", "some", "together", "needs", "excludes"
+EXACTLY_ONE, SOME, NEEDS, EXCLUDES = "exactly one", "some", "needs", "excludes"
 
 
 def _rule(kind: str, *options: str) -> Rule:
@@ -144,7 +140,6 @@ def _rule(kind: str, *options: str) -> Rule:
 
 exactly_one = partial(_rule, EXACTLY_ONE)  # exactly one of the options
 some_of = partial(_rule, SOME)  # one or more of them
-together = partial(_rule, TOGETHER)  # all of them, or none
 needed_by = partial(_rule, NEEDS)  # the first is needed by the others
 excluded_by = partial(_rule, EXCLUDES)  # the first excludes the others
 

@@ -24,7 +24,6 @@ from ..machine.region import region_json, region_text
 from ..pose import Pose, rotation_from_angles, stacked
 from . import results
 from .results import Result, Table
-from .verbs import POSE_OPTIONS
 
 MOST_NOTES = 10  # limits broken in ik that are named on stderr
 MOST_STEPS = 100_000  # poses on a line, each way
@@ -80,8 +79,7 @@ class Targets:
             with results.stage(f"reading {args.poses}"):
                 rows, positions, rotations = read_pose_arrays(args.poses)
         else:
-            numbers = [getattr(args, name[2:].replace("-", "_")) or 0.0 for name in POSE_OPTIONS]
-            place, angles = args.pose or ([1e-3 * v for v in numbers[:3]], np.radians(numbers[3:]))
+            place, angles = args.pose
             rows, positions, rotations = [Row(0, "1")], np.array([place]), rotation_from_angles(np.array([angles]))
         direction = args.direction or "midway"
         senses = np.full((len(rows), FOLLOWED), DIRECTIONS[direction])

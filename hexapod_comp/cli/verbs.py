@@ -10,7 +10,7 @@ from .options import (
     POSE_HELP, SEPARATE, SHAPE, TRUTH, WORDS, Assumptions, Option, Rule,
     above_zero, bound, box, choice, count, csv_file, excluded_by,
     exactly_one, finite, flag, folder, gone, html_file, joint_names, lengths, line, machine, needed_by, outside_numbers,
-    pictures, pose, readings, reads, scaled, seed_of, some_of, span, table_out, tilts, times, together, under, value,
+    pictures, pose, readings, reads, scaled, seed_of, some_of, span, table_out, tilts, times, under, value,
     whole, writes,
 )  # fmt: skip
 
@@ -38,11 +38,6 @@ eval "$(register-python-argcomplete hexapod_comp)"."""
 
 # removed verbs, and their replacements
 GONE = {"paper": "is `make papers` in the source tree now (python -m examples.papers)"}
-
-# The options of ik that give a pose number by number, and their units
-POSE_OPTIONS = {f"--{axis}-mm": "mm" for axis in "xyz"} | {
-    f"--{axis}-deg": "degrees" for axis in ("alpha", "beta", "gamma")
-}
 
 CORNERS = "X0,Y0,Z0,X1,Y1,Z1"
 
@@ -103,19 +98,12 @@ VERBS = {
             pictures("out"),
             JSON,
         ),
-        """Prints the places of joints and frames (mm, degrees), the tool's largest tilt at home, the reach and the
-limits that end it, and the largest box within the reach. Campaigns without a box use that one. Suspicious entries of
-the file are listed at the end: a mirrored or turned home, swapped joints, a wrong unit, missing joint_axes. With
---pictures, machine.png is written into the folder.
+        """Lengths in mm, angles in degrees: places of joints and frames, the reach and the limits that end it, the
+largest box in it, which campaigns without a box use. Suspicious entries of the file come last. More:
+doc/own_machine.md.
 
 example:
-  $ hexapod_comp show mine.yaml
-  machine mine
-  …
-  largest box in it: 283.0 × 258.0 × 99.0 mm, work frame x -173.0 … 110.0, y -98.0 … 160.0, z 318.0 … 417.0 mm
-    −x stops at stroke, longest, strut 1
-  …
-  picture: out/machine.png""",
+  $ hexapod_comp show mine.yaml""",
     ),
     "ik": Verb(
         "poses", "kinematics",
@@ -123,7 +111,6 @@ example:
         (
             reads("poses", "CSV file of poses; - for standard input", "POSES.csv", "poses", nargs="?"),
             value("--pose", pose, SHAPE, POSE_HELP),
-            *(value(n, finite, "NUMBER", f"the pose number by number, {u}") for n, u in POSE_OPTIONS.items()),
             value("--line", line, LINE_SHAPE, f"both ways along a straight line of the tool, {LINE_HELP}"),
             value("--step-mm", above_zero, "MM", "distance of the poses on that line (default 5)", default=5.0),
             DIRECTION,
@@ -131,32 +118,18 @@ example:
             table_out("the lengths"),
             JSON,
         ),
-        """A file's columns are x_mm, y_mm, z_mm, optionally alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw) and
-sequence or name; other units by their suffix (_m, _um, _in, _rad). CSV input gives CSV output, L1_mm … L6_mm, which fk
-reads. With --model, L1_mm … L6_mm are the lengths to command, nominal_L1_mm … and correction_L1_um … (command −
-nominal) follow. By default no direction of motion is assumed: commands are the mean of both directions, without
-backlash. With --direction forward every axis and every strut is assumed to have moved in its positive direction last
-(struts: longer), with backward in its negative one; the output states which. With --line the tool passes a straight
-line both ways, and each strut moves as the line requires: a row for every --step-mm and for the end, from start to
-end, all forward (towards the end), then all backward. Lengths are computed for any pose; broken limits are reported on
-stderr (see check).
+        """Columns of the file: x_mm, y_mm, z_mm, optionally alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw) and
+sequence or name; other units by their suffix (_m, _um, _in, _rad). CSV in gives CSV out, L1_mm … L6_mm, which fk
+reads. With --model these are the lengths to command; nominal_L1_mm … and correction_L1_um … (command − nominal)
+follow. Without a direction commands are the mean of both; along a line each strut moves as the line requires. Lengths
+are computed for any pose; broken limits are reported on stderr (see check). More: doc/command_line.md.
 
 example:
   $ hexapod_comp ik --pose 0,0,400,5,0,0
-  machine paper: strut lengths for a pose of the tool in work
-    strut  nominal_mm
-  strut_1  519.493721
-  strut_2  519.807869
-  strut_3  509.191843
-  strut_4  509.191843
-  strut_5  499.282327
-  strut_6  498.955256
   $ hexapod_comp ik config/table1.csv --model paper_machine --out lengths.csv
   $ hexapod_comp ik --line=-200,0,450,200,0,450 --step-mm 5 --model paper_machine --out line.csv""",
         (
-            exactly_one("poses", "--pose", "--x-mm --y-mm --z-mm", "--line"),
-            together("--x-mm", "--y-mm", "--z-mm"),
-            needed_by("--x-mm", "--alpha-deg", "--beta-deg", "--gamma-deg"),
+            exactly_one("poses", "--pose", "--line"),
             excluded_by("--line", "--direction"),
         ),
     ),
@@ -174,18 +147,13 @@ example:
             table_out("the poses"),
             JSON,
         ),
-        """A file's columns are L1_mm … L6_mm (or _m, _um, _in), optionally sequence or name; CSV input gives CSV
-output, which ik and check read. With --model the lengths are commands, and the pose is that of the real machine, the
-mean of both directions of motion or, with --direction, the one in which axes and struts moved last (see ik). Newton
-starts at home, or at --guess; --cold needs no guess: it finds every pose with these lengths and selects the one in
-which the machine can work. For a 6-3 machine these are all; for others those that Newton finds from 4000 starts all
-around.
+        """Columns of the file: L1_mm … L6_mm (or _m, _um, _in), optionally sequence or name; CSV in gives CSV out,
+which ik and check read. With --model the lengths are commands, and the pose is that of the real machine. Newton starts
+at home, or at --guess; --cold finds every pose with these lengths (of a machine that is not 6-3: those that Newton
+finds from 4000 starts all around) and selects the one in which the machine can work.
 
 example:
   $ hexapod_comp fk --lengths 519.494,519.808,509.192,509.192,499.282,498.955
-  machine paper: pose of the tool in work
-       x_mm      y_mm        z_mm  alpha_deg  beta_deg  gamma_deg
-  -0.000130  0.000034  400.000021   5.000127  0.000074   0.000011
   $ hexapod_comp ik config/table1.csv | hexapod_comp fk -""",
         (
             exactly_one("lengths_file", "--lengths"),
@@ -210,24 +178,10 @@ example:
 the whole path is checked. With --stream the rows are consecutive commands at --rate-hz, and the steps and strut speeds
 between them are checked. Limits hold for nominal and for compensated values (--model). Margins: stroke in mm to the
 nearer end, joint cones in degrees, distance of the struts' axes in mm if the machine limits it; condition number,
-correction (µm), step (mm) and speed (mm/s) are shown as values. Exit code: 0 all within, 1 a limit is broken, 2 bad
-input.
+correction (µm), step (mm) and speed (mm/s) are shown as values. Exit code 1: a limit is broken.
 
 example:
-  $ hexapod_comp check config/table1.csv
-  machine paper, model ideal: 10 poses of the tool in work as targets joined by moves at 250 Hz; 753 poses examined
-
-  margins of stroke and cones, values of the rest, the worst of the move to each pose:
-  row  line  stroke_mm  base_cone_deg  platform_cone_deg  condition  correction_um  step_mm  speed_mm_s
-    1     2    179.192         50.000             75.000      1.166           0.00        –           –
-    2     3    168.955         49.029             69.450      1.169           0.00   0.7646      191.15
-  …
-
-  smallest margin per limit:
-          limit   margin    value  allowed  unit  strut        stage  row  line  of the move
-         stroke  149.137  479.137  330.000    mm      3      nominal    9    10  at the pose
-  …
-  all within limits""",
+  $ hexapod_comp check config/table1.csv""",
     ),
     "travel": Verb(
         "poses", "kinematics",
@@ -259,12 +213,10 @@ example:
             value("--namespace", None, "NAME", "namespace of those nodes", default=""),
             flag("--no-compare", "leave out the simulated pass without compensation"),
         ),
-        """The tool moves from pose to pose within the machine's limits and rests at each. Its error is read from
-tool_pose_true. Columns of the file: x_mm, y_mm, z_mm, alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw). Poses in the
-file and in the report are the tool's in the work frame, in mm and degrees. Errors are in µm and µrad. From six poses
-on the report also has the error with the datum aligned: minus the rigid motion that setting a workpiece zero removes.
-The simulated machine has the errors of --truth; by default the compensator knows them. Exit code: 0 all commands were
-answered, 1 some were lost or refused, 2 bad input.
+        """The tool moves from pose to pose within the machine's limits and rests at each; its error (µm, µrad) is read
+from tool_pose_true, from six poses on also with the datum aligned. Poses are the tool's in the work frame; columns as
+of ik. The simulated machine has the errors of --truth; by default the compensator knows them. Exit code 1: commands
+were lost or refused.
 
 example:
   $ hexapod_comp run config/table1.csv --pictures out
@@ -284,10 +236,9 @@ example:
             NAMESPACE,
             JSON,
         ),
-        """Sends the target to the node mover, which plans a straight line and the shortest turn in the least time that
-the struts' speed, acceleration and jerk allow, checks every limit along it first, and holds the tool at its end. The
-tool has arrived when its estimate has settled within the mover's tolerances. Ctrl-C brakes. Exit code: 0 arrived, or
-stopped by --stop; 2 refused, or stopped on the way, with the reason.
+        """Sends the target to the node mover, which moves straight, with the shortest turn, in the least time that the
+struts allow, and checks every limit first. Ctrl-C brakes. Exit code 2: refused, or stopped on the way, with the
+reason. More: doc/ros.md.
 
 example:
   $ ros2 run hexapod_comp mover     (beside the compensator)
@@ -321,20 +272,11 @@ example:
             JSON,
             *ESTIMATION,
         ),
-        """Plans a campaign for the goal, has the mover visit it, fits a model, and takes check readings elsewhere,
-which the fit has not seen. Only a model that they bear out becomes FOLDER/model.yaml; with --reload the compensator
-then runs it, by its ramp. Where the fit promises less than the goal a further campaign is planned, up to three in all.
-Then, or where two checks contradict the model, it is refused with the reason.
-
-With --checks or --every-min the model is then checked every so often: a line along x, y and z through places drawn at
-random, and the box's diagonals. A check that contradicts it is repeated at other places. If that one does too, the
-machine has changed: a strut, a temperature or a payload is named, the model is renewed from the checks, checked itself
-and reloaded. What few readings cannot repair is calibrated anew with --reload, else its campaign is proposed.
-
-Every step stands in FOLDER/journal.jsonl. Ctrl-C brakes the machine and ends; the same command goes on from there,
-also after a kill. At each stop the instrument is asked three times and the median counts; a stop at which it reads
-nothing is visited again. Exit code: 0 a model is in use, or proposed; 1 refused, or the machine has changed; 2 bad
-input, or the machine does not answer; 130 stopped.
+        """Plans a campaign for the goal, has the mover visit it, fits a model, and takes check readings elsewhere.
+Only a model that they bear out becomes FOLDER/model.yaml; with --reload the compensator then runs it. With --checks or
+--every-min the model is then checked every so often; what has changed is named, and repaired or proposed. Ctrl-C
+brakes and ends; the same command goes on from FOLDER/journal.jsonl, also after a kill. Exit code 1: a model was
+refused, or the machine has changed; 130: stopped. More: doc/staying_true.md.
 
 example:
   $ ros2 launch hexapod_comp machine.launch.py mover:=true model_folder:=$PWD     (and a simulated machine)
@@ -359,15 +301,10 @@ example:
             seed_of("noise, and of the strut that is knocked"),
             pictures("out"),
         ),
-        """A machine with hidden errors calibrates itself as adapt does, in a box about its home: it plans a campaign,
-moves, reads a tracker with noise, wild readings and broken beams, fits, checks what was promised by new readings, and
-runs the model. Then its struts become warmer by 5 K, which no thermometer reads; later one strut is knocked by 20 µm.
-Checks have to name each and repair the model. No ROS runs: run does that, with nodes over DDS.
-
-The table gives the tool's true error, at the stops and in the whole box, with the datum aligned: minus the rigid motion
-that setting a workpiece zero removes. Errors are in µm.
-
-Exit code: 0 only when warmth and knock were named and repaired, and no model leaves more than was promised (95 %).
+        """A virtual machine calibrates itself as adapt does; then its struts become warmer by 5 K, which no
+thermometer reads, and one is knocked by 20 µm. Checks have to name each and repair the model. Errors in µm, the datum
+aligned; no ROS runs. Exit code 1: warmth or knock was not named and repaired, or a model leaves more than promised (95
+%). More: doc/demo.md.
 
 example:
   $ hexapod_comp demo
@@ -383,14 +320,11 @@ example:
                                              "all that can reach it)", default="127.0.0.1"),
             value("--port", whole(1, 65535), "N", "port to serve on (default 8080)", default=8080),
         ),
-        """Serves a page to this computer alone, unless --host gives another address: the machine in 3-D, its struts
-coloured by correction, the tool's predicted and residual error (µm, µrad), the diagnostics of compensator and drive,
-refusals, strut lengths (mm), and latencies (ms). It only subscribes in this ROS domain: nothing on the page moves or
-changes anything. It ends at Ctrl-C. It needs viser: pip install viser.
+        """Serves a page to this computer alone, unless --host gives another address, until Ctrl-C. It only subscribes:
+nothing on it moves or changes anything. It needs viser: pip install viser. More: doc/ros.md.
 
 example:
-  $ hexapod_comp watch --machine mine.yaml
-  hexapod_comp: mine is shown on http://127.0.0.1:8080 until Ctrl-C""",
+  $ hexapod_comp watch --machine mine.yaml""",
     ),
     "echo": Verb(
         "running", "loop",
@@ -403,18 +337,12 @@ example:
             flag("--hz", "print the rate once a second instead of the messages"),
             JSON,
         ),
-        """Prints each message of TOPIC, of any type: struts in mm, corrections in µm, poses in mm and degrees,
-predicted errors in µm and µrad with their standard deviations, diagnostics by name. Above each message are its rate
-over the last 2 s and its age, from its stamp to its receipt. --hz prints the rate alone, as `ros2 topic hz` does.
-Without TOPIC it lists the topics that are published. With --json each message is one line. It needs no ROS 2
-installation, and it publishes nothing. Exit code: 0 a message arrived, 1 none arrived, 2 bad input, or the topic has
-no publisher.
+        """Struts in mm, corrections in µm, poses in mm and degrees, predicted errors in µm and µrad with their
+standard deviations; above each message its rate over the last 2 s and its age, from its stamp to its receipt. With
+--json each message is one line. Exit code 1: no message arrived.
 
 example:
   $ hexapod_comp echo strut_corrections --count 1
-  /strut_corrections, 0.4 ms old
-    strut_1           18.203 µm
-  …
   $ hexapod_comp echo strut_commands --hz --seconds 10""",
     ),
     "record": Verb(
@@ -426,9 +354,9 @@ example:
             value("--seconds", above_zero, "S", "end after this time (default: at Ctrl-C)"),
             JSON,
         ),
-        """Subscribes to commands, readings, estimates, diagnostics and the compensator's journal in this ROS domain,
-and writes them as ros2 bag does, into a folder with an MCAP file. It ends at Ctrl-C, or after --seconds. It may begin
-during a motion. Exit code: 0 the bag can be replayed, 1 no compensator published, 2 bad input.
+        """Writes commands, readings, estimates, diagnostics and the compensator's journal as ros2 bag does, into a
+folder with an MCAP file; it may begin during a motion. Exit code 1: no compensator published, so that nothing can be
+replayed.
 
 example:
   $ hexapod_comp record --out run
@@ -450,21 +378,14 @@ example:
             table_out("all corrections"),
             JSON,
         ),
-        """BAG is a folder that `ros2 bag record` has written (MCAP or sqlite3), or one of its files. It must hold
-compensator/journal; with compensator/files it contains the geometry and the model in use. The pictures show
-strut_states and tool_pose_estimate. The tool's distance from its path, by tool_pose_estimate and tool_pose_true, is
-given in µm: as the machine stands, and with the datum aligned.
-
-With another --model (or --machine) the report also shows the corrections that it would have made. Exit code 0: the
-same bits, or within --tolerance-um; 1: not the same; 2: the bag cannot be used.
+        """BAG must hold compensator/journal; with compensator/files it contains the geometry and the model in use. The
+tool's distance from its path is given in µm: as the machine stands, and with the datum aligned. With another --model
+(or --machine) the report also shows the corrections that it would have made. Exit code 1: not the same bits, or not
+within --tolerance-um. More: doc/replay.md.
 
 example:
   $ ros2 bag record --storage mcap --output run --all
-  $ hexapod_comp replay run --pictures out/replay
-  run: /compensator, machine paper, model shipped example: the virtual machine of the demo
-  from 2026-11-21 20:11:05 UTC, 12.0 s: 3001 commands taken, 3000 answered, 1 refused
-  replayed 3000 of 3000 answers: identical bit for bit
-  …""",
+  $ hexapod_comp replay run --pictures out/replay""",
     ),
     "plan": Verb(
         "fitting", "calibration",
@@ -491,14 +412,10 @@ example:
             seed_of("scattered poses"),
             JSON,
         ),
-        """Predicts from a campaign file, without readings, which parameters the campaign would determine, which it
-would not, and which tool error (µm) a fit of --scheme joint will leave on a machine within the tolerances. The scatter
-of the machine's stops is included, where the campaign or --repeatability-um states it.
-
-With --goal-um it proposes a campaign: lines and poses in measuring order, within the limits, that reduce the tool
-error (µm, RMS, the datum aligned) to the goal in the available time. The box and the noise are those of CAMPAIGN, by
-default the machine's own box. Where the goal cannot be met it gives the reachable error, and the limiting factor.
-simulate and fit read the file. Exit code: 0 success, 1 the goal is not met, 2 bad input.
+        """Predicts, without readings, which parameters a campaign would determine, which it would not, and which tool
+error (µm) a fit will leave on a machine within the tolerances. With --goal-um it proposes a campaign: lines and poses
+in measuring order, within the limits, that reduce the tool error (µm, RMS, the datum aligned) to the goal in the
+available time. Exit code 1: the goal is not met. More: doc/measuring.md.
 
 example:
   $ hexapod_comp plan campaign_1d --lead-mm 10 --blocks pitch,wave,backlash
@@ -519,12 +436,9 @@ example:
             writes("--out", "write the errors to a model file (YAML)", "MODEL", required=True),
             JSON,
         ),
-        """Draws the errors of a virtual machine at random, uniformly within the bounds, and writes them as a model
-file. simulate, run, demo and fit read it with --truth. The same seed gives the same machine; changing one bound does
-not change the other errors. A bound of 0 leaves that error out.
-
-Wherever an option accepts a truth or a model, `random` is the machine that this verb draws without any option, and
-`random:7` the one of --seed 7.
+        """Draws the errors uniformly within the bounds; a bound of 0 leaves that error out. The same seed gives the
+same machine; changing one bound does not change the other errors. Wherever an option accepts a truth or a model,
+`random` is the machine that this verb draws without any option, and `random:7` the one of --seed 7.
 
 example:
   $ hexapod_comp imagine --machine mine.yaml --joints-um 100 --backlash-um 3,5 --seed 3 --out truth.yaml
@@ -546,10 +460,9 @@ example:
             writes("--out", "write the model to a YAML file", "MODEL", required=True),
             JSON,
         ),
-        """The columns are one or two outside numbers (elevation_deg, rotation_deg; oil_degC) and six components: x_um,
-y_um, z_um of the field's measured point in base, rx_urad, ry_urad, rz_urad about it; in any unit, a row a node of
-their grid, in any order. Between nodes the table is bilinear. The compensator subscribes to the numbers on its topic
-outside; what they change ramps in. doc/model_file.md has frame and sign.
+        """Columns: one or two outside numbers (elevation_deg, rotation_deg; oil_degC), and x_um, y_um, z_um of the
+field's measured point in base, rx_urad, ry_urad, rz_urad about it, in any unit; a row a node of their grid. Between
+nodes the table is bilinear. Frame and sign: doc/model_file.md.
 
 example:
   $ hexapod_comp outside flexure.csv --holds corrections --model model.yaml --out bent.yaml""",
@@ -569,18 +482,13 @@ example:
             writes("--out", "write the readings to a CSV file", type=csv_file, required=True),
             JSON,
         ),
-        """Moves the virtual machine through a campaign (lines, diagonals, scattered poses) and writes its instruments'
-readings, with noise and unknown zeros. fit reads this CSV file: one reading a row, errors as measured minus commanded,
-in um and urad. --model measures the machine with that model's compensation: then the file also holds the commanded
-strut lengths. --warm-up warm_up warms the machine after the campaign, reads three lines again every ten minutes, and
-writes times and sensor readings. The same seed gives the same file.
+        """Writes the readings of the instruments of a campaign, with noise and unknown zeros, for fit: one reading a
+row, measured minus commanded, in um and urad. --model measures the machine with that model's compensation. --warm-up
+warm_up warms it after the campaign, and reads three lines again every ten minutes. The same seed gives the same file.
+More: doc/measuring.md.
 
 example:
-  $ hexapod_comp simulate --campaign campaign_1d --seed 1 --out measured.csv
-  machine paper with the errors of paper_machine.yaml, moved by nominal strut lengths; seed 1
-  channel  readings     rms      max
-   linear      1670  28.598  142.893  um
-  1670 readings of 59 runs at 1670 stations: measured.csv""",
+  $ hexapod_comp simulate --campaign campaign_1d --seed 1 --out measured.csv""",
         alias="measure",
     ),
     "collect": Verb(
@@ -606,18 +514,14 @@ example:
             NAMESPACE,
             JSON,
         ),
-        """Has the mover visit a campaign's stations, each pass of a line from a point before its first one, and reads
-the instruments there when the tool has settled; struts, temperatures and gravity are recorded. fit reads the file,
-which is complete at any time: Ctrl-C, or a mover that was stopped, ends the run, and the same command resumes it. A
-stop at which an instrument reads nothing three times is skipped, and visited by the next run; a run that counts from a
-zero begins anew after a broken beam (NaN) or an interruption. Readings beyond any machine's errors (another unit,
-sign, channel, frame or target) end the run after the first line. Exit code: 0 everything was read, 1 some is missing,
-2 bad input.
+        """Has the mover visit a campaign's stations and reads the instruments there when the tool has settled. The
+file is complete at any time: Ctrl-C, or a mover that was stopped, ends the run, and the same command resumes it.
+Readings beyond any machine's errors (another unit, sign, channel, frame or target) end the run after the first line.
+Exit code 1: some readings are missing. More: doc/measuring.md.
 
 example:
   $ ros2 launch hexapod_comp machine.launch.py mover:=true     (compensator, mover and a simulated machine)
   $ hexapod_comp collect --campaign campaign_1d --out measured.csv
-  1670 of 1670 readings: measured.csv
   $ ros2 launch hexapod_comp machine.launch.py mover:=true instrument:=laser     (in place of the first)
   $ hexapod_comp collect --campaign campaign_1d --readings instrument/readings --out laser.csv""",
     ),
@@ -659,15 +563,10 @@ example:
             flag("--every-line", "report order, R² and residual of each line (scheme lines)"),
         ),
         """Reads tidy CSV (one reading a row, as simulate writes it), or with --columns the wide CSV files of other
-laboratories.
-
---scheme joint fits structure, struts and field to all readings at once. It keeps only blocks that improve the
-prediction of readings left out of the fit. --scheme lines is that of Mou & King 1998: a polynomial per grid line,
-direction and channel. --certificate writes a page to file: machine, instruments, environment, errors before and after,
-figures of ISO 230, pictures, hashes of model and readings; any browser prints it to PDF. --truth names the errors of
-the virtual machine that simulate moved: the report then compares the model with them. --update renews a model from the
-few readings of a check, and writes another one (see verify). Errors are reported in µm and µrad. Exit code: 0 written,
-1 the readings contradict the model (nothing is written without --force), 2 bad input.
+laboratories. --scheme joint fits structure, struts and field to all readings at once, and keeps only blocks that
+improve the prediction of readings left out; --scheme lines is that of Mou & King 1998: a polynomial per grid line,
+direction and channel. The report (µm, µrad) compares with the --truth that simulate moved. Exit code 1: the readings
+contradict the model; nothing is written without --force. More: doc/fitting.md.
 
 example:
   $ hexapod_comp simulate --campaign campaign_5d --seed 1 --out measured.csv
@@ -696,16 +595,11 @@ example:
                                                 "(default linear,rotation)"),
             JSON,
         ),
-        """Compares 6 to 20 check readings, spread over the box, with the model and the uncertainty of its parameters.
-If the machine has changed it gives the most probable change: the datum has moved, a strut's offset has changed (which,
-by how much), a temperature acts, the whole has aged, a single reading is wrong, or none of these. One unchanged
-machine in eighty is reported as changed. If two explanations are similarly probable it lists readings that would
-distinguish them. Readings that are far off are tested in other units, with other signs, axes exchanged, and with the
-compensation on or off: the report opens with the version that fits.
-
-Take the readings as for fit: compensation off, or with the struts' commands in the file, or with this model running
-and --compensated. fit --update renews the model from them. Errors are in µm and µrad. Exit code: 0 valid, 1 changed, 2
-bad input.
+        """Compares 6 to 20 check readings, spread over the box, with the model and the uncertainty of its parameters,
+and gives the most probable change: of the datum, a strut's offset, a temperature, the whole, a single reading, or how
+they were taken. Take them as for fit: compensation off, or with the struts' commands in the file, or with this model
+running and --compensated. fit --update renews the model from them. Errors in µm; exit code 1: changed. More:
+doc/fitting.md.
 
 example:
   $ hexapod_comp verify model.yaml check.csv
@@ -724,12 +618,9 @@ example:
             flag("--targets", "each run target by target, with notes"),
             JSON,
         ),
-        """Evaluates every linear run with two cycles or more and all targets read from both sides in each (the
-standards require five cycles; a campaign states its number). Lines along an axis of the work frame are evaluated by
-ISO 230-2:2014, all others, as body and face diagonals, by ISO 230-6:2002: A, E, R, M, B. Lengths read around a circle
-from its middle, as by a ball bar, are evaluated by ISO 230-4:2005: G, G(b), and F and D where the length is known.
-Figures are in µm. --targets prints each line target by target. Targets that the machine of --machine does not reach
-are evaluated too.
+        """Evaluates every linear run with two cycles or more and all targets read from both sides in each: along an
+axis of the work frame by ISO 230-2:2014, others by ISO 230-6:2002 (A, E, R, M, B); lengths around a circle by ISO
+230-4:2005 (G, G(b), F, D). Figures are in µm. More: doc/iso230.md.
 
 example:
   $ hexapod_comp iso230 measured.csv""",
@@ -761,14 +652,11 @@ example:
             seed_of("the random poses"),
             JSON,
         ),
-        """--linuxcnc writes into a folder: genhexkins.hal (setp lines with the real joints), strut_1.comp …
-strut_6.comp (offset, pitch, screw wave, length map and backlash of each strut, at most 256 points) and comp.ini (lines
-to copy into the ini file). --table writes corrections of struts and of poses on a grid of positions of a level tool,
-forward and backward, as CSV. Files of the same names are replaced.
-
-Every file is then read back, and drives the machine of the model along random poses, level and tilted, forward and
-backward: the report gives the tool's 3-D error before and after, and the size of the errors that the export does not
-contain. The exit code is 1 if it would increase the error.
+        """--linuxcnc writes genhexkins.hal, strut_1.comp … strut_6.comp and comp.ini; --table corrections of struts
+and poses on a grid. Every file is then read back, and drives the machine of the model along random poses: the report
+gives the tool's 3-D error before and after, and the errors that the export does not contain. Files of the same names
+are replaced. Exit code 1: it would increase the error. More: doc/exporting.md, doc/linuxcnc.md, doc/c_core.md,
+doc/ros.md.
 
 example:
   $ hexapod_comp export --machine paper.yaml --model paper_machine.yaml --linuxcnc linuxcnc --table table.csv""",
@@ -791,19 +679,11 @@ example:
             JSON,
         ),
         """Draws machines within the bounds (uniform, ±). For the first one it prints the tables of Song, Mou & King:
-the ideal strut lengths (mm), the lengths that the real machine needs for the same poses, their difference (µm), and
-the pose (mm, degrees) of the real machine with ideal lengths. With --machines N it also prints percentiles over N
-machines with consecutive seeds. --out writes every machine and pose to a CSV file.
+the ideal strut lengths (mm), those that the real machine needs for the same poses, their difference (µm), and the pose
+(mm, degrees) of the real machine with ideal lengths; with --machines N also percentiles over N consecutive seeds.
 
 example:
-  $ hexapod_comp assess config/table1.csv --joint-um 10 --strut-um 10 --machines 200 --seed 1
-  machine paper, joints ±10 µm, struts ±10 µm; seed 1…200
-  …
-  real minus ideal (Table 4 − Table 2):
-  sequence  dL1_um  dL2_um  dL3_um  dL4_um  dL5_um  dL6_um
-         1  21.763  -0.247  -2.168  13.330  -3.268  -4.341
-  …
-  largest strut change 34.198 µm (two joints in a corner of their cubes and a strut allow 44.641 µm)""",
+  $ hexapod_comp assess config/table1.csv --joint-um 10 --strut-um 10 --machines 200 --seed 1""",
     ),
     "classify": Verb(
         "classify", "analysis",
@@ -832,16 +712,11 @@ example:
             flag("--no-page", "omit the interactive page from --pictures"),
             flag("--publish", "then keep the worst type's shells on workspace/shells until Ctrl-C"),
         ),
-        """Computes the reach of the machine (stroke, joint cones, strut clearance, condition number), and the effect
-of every single error of the budget at every grid point of it, by forward kinematics of the machine with that error.
-Prints the ranked table of v. Daake et al. (µm, mdeg), the sum of the budget, and with --allow-um
-the allowed size of each error. --out writes the ranking as CSV. --pictures writes pictures (ranking, causes, one of
-shells for each error type) and, with plotly installed, page.html, which shows every error from all sides.
-
---tilt-deg gives the orientations: every combination of tilts about the tool's x and y, from its attitude at home.
-
---model uses the covariance of a fit instead of a budget: the remaining tool error in the measured box and in the
-workspace (µm; places in work), the parameters that cause it, and the measurement that would reduce it most.
+        """Computes the reach of the machine and, at every grid point of it, the effect (µm, mdeg) of every single
+error of the budget, by forward kinematics of the machine with that error: the ranked table of v. Daake et al., and
+with --allow-um the allowed size of each error. --pictures also writes page.html, where plotly is installed. --model
+uses the covariance of a fit instead of a budget: the remaining tool error, its causes, and the measurement that would
+reduce it most. More: doc/classification.md.
 
 example:
   $ hexapod_comp classify --pictures out
