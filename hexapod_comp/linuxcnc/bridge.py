@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from enum import IntEnum
 from functools import partial
 from typing import Any
@@ -28,7 +28,7 @@ from std_srvs.srv import Trigger
 
 from ..compensation.guards import Sample, StampClock, StampGate
 from ..errors import CommandError, HexapodError
-from ..ros.base import CHECK_PERIOD, COMMAND_QOS, EVENT_QOS, LATCHED_QOS, STATE_QOS, MachineNode
+from ..ros.base import COMMAND_QOS, EVENT_QOS, LATCHED_QOS, STATE_QOS, MachineNode
 from ..ros.messages import StrutBytes, StrutReader, stamp_of
 from ..ros.parameters import Program, read_table
 from ..ros.process import run
@@ -310,7 +310,6 @@ class LinuxcncBridgeNode(MachineNode):
         self.set_hardware_id(self._options["component"])
         self._source = self.subscribe_exclusive(JointState, "strut_corrections", self._on_correction, several)
         self._reset = CompensatorReset(self, self._options)
-        self.every(CHECK_PERIOD, self._check_state)
 
     def unconfigure(self) -> None:
         self._reset = None
@@ -430,17 +429,12 @@ class LinuxcncBridgeNode(MachineNode):
 
     # ---- state ----
 
-    def _check_state(self) -> None:
-        now = time.monotonic()
-        self.update_publishers()
-        level, text = self._judged(now) if self._active else (WARN, "not active")
+    def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
+        level, text = self._judged(now)
         if text != self._last_text:
             self._last_text = text
-            if level != OK:
-                self.log_warning(text, text)
-            else:
-                self.note(text, text)
-        self.publish_status(level, text, lambda: self.values(now))
+            (self.note if level == OK else self.log_warning)(text, text)
+        yield level, text
 
     def _judged(self, now: float) -> tuple[bytes, str]:
         """Return level and message of an active node."""

@@ -14,7 +14,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -24,8 +25,7 @@ from std_srvs.srv import Trigger
 
 from ..errors import LONGEST_TEXT, HexapodError
 from ..upkeep.journal import JOURNAL, Journal
-from . import keep_discovery_local
-from .base import ACKNOWLEDGED_WITHIN, CHECK_PERIOD, LATCHED_QOS, MachineNode
+from .base import ACKNOWLEDGED_WITHIN, LATCHED_QOS, MachineNode
 from .parameters import Program, read_table
 from .process import run
 from .rclpy_compat import callers
@@ -83,40 +83,23 @@ class AdapterNode(MachineNode):
 
     # ---- lifecycle ----
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Open topics and services."""
+    def configure(self) -> None:
         self._forget()
         self._journal = Path(self._options["folder"]).resolve() / JOURNAL
         self.set_hardware_id(self._options["geometry_file"])
-        with self.rolled_back_on_error():
-            self._states = self.create_publisher(DiagnosticStatus, "~/state", LATCHED_QOS)
-            self._ends: list[Any] = [
-                self._states,
-                self.create_service(Trigger, "~/calibrate", self._on_calibrate),
-                self.create_service(Trigger, "~/verify", self._on_verify),
-                self.create_service(Trigger, "~/stop", self._on_stop),
-                self.every(CHECK_PERIOD, self._check_state),
-            ]
-            self._publish_state()
-        return super().on_configure(state)
-
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Accept requests."""
-        self._active = True
-        self.get_logger().info("ready")
-        return super().on_activate(state)
+        self._states = self.create_publisher(DiagnosticStatus, "~/state", LATCHED_QOS)
+        asked = {"calibrate": self._on_calibrate, "verify": self._on_verify, "stop": self._on_stop}
+        self._asked = {name: self.create_service(Trigger, f"~/{name}", answer) for name, answer in asked.items()}
+        self._publish_state()
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Brake the machine and end what runs."""
         self._interrupt()
         return super().on_deactivate(state)
 
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Close topics; a process that still runs brakes the machine and ends by itself."""
-        self._active = False
+    def unconfigure(self) -> None:
+        """Let a process that still runs brake the machine and end by itself."""
         self._interrupt()
-        self.close_ends(*self._ends)
-        return super().on_cleanup(state)
 
     def publish_last_status(self) -> None:
         """Stop a calibration or check that still runs, and publish `stopped` before the node ends."""
@@ -128,17 +111,20 @@ class AdapterNode(MachineNode):
     # ---- what is asked for ----
 
     def _on_calibrate(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response:
-        self.note("calibrate", f"calibrate: asked for by {callers(self, self._ends[1])}")
+        self._note_caller("calibrate")
         return self._start(CALIBRATING)
 
     def _on_verify(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response:
-        self.note("verify", f"verify: asked for by {callers(self, self._ends[2])}")
+        self._note_caller("verify")
         return self._start(VERIFYING)
 
     def _on_stop(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response:
-        self.note("stop", f"stop: asked for by {callers(self, self._ends[3])}")
+        self._note_caller("stop")
         running = self._interrupt()
         return Trigger.Response(success=True, message="the machine brakes" if running else "nothing was running")
+
+    def _note_caller(self, name: str) -> None:
+        self.note(name, f"{name}: asked for by {callers(self, self._asked[name])}")
 
     def _start(self, state: str) -> Trigger.Response:
         """Start the process; refused while one runs."""
@@ -180,19 +166,20 @@ class AdapterNode(MachineNode):
 
     # ---- state ----
 
-    def _check_state(self) -> None:
+    def update(self, now: float) -> None:
         if self._process is not None:
             self._read_journal()
             if (code := self._process.poll()) is not None:
                 self._finish(code)
-        elif (
-            self._active and self._state in GOOD and 0.0 < self._options["check_every"] < time.monotonic() - self._ended
-        ):
+        elif self._active and self._state in GOOD and 0.0 < self._options["check_every"] < now - self._ended:
             self._start(VERIFYING)
+
+    def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
         running = self._process is not None
-        level = OK if running or self._state in (IDLE, "stopped", *GOOD) else WARN
-        text = f"{self._state}: {self._text}" if self._active else "not active"
-        self.publish_status(level if self._active else WARN, text, lambda: {"state": self._state, "step": self._step})
+        yield OK if running or self._state in (IDLE, "stopped", *GOOD) else WARN, f"{self._state}: {self._text}"
+
+    def values(self, now: float) -> dict[str, str]:
+        return {"state": self._state, "step": self._step}
 
     def _read_journal(self) -> None:
         """Publish the newest step where there is one."""
@@ -250,10 +237,7 @@ def _with_package() -> str:
     return os.pathsep.join([str(PACKAGE_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node; the entry of the executable ``adapter``."""
-    keep_discovery_local()
-    return run(AdapterNode, PROGRAM, argv)
+main = partial(run, AdapterNode, PROGRAM)
 
 
 if __name__ == "__main__":

@@ -203,6 +203,7 @@ class MachineNode(LifecycleNode):
         try:
             with self.rolled_back_on_error():
                 self.configure()
+                self.every(CHECK_PERIOD, self._check_state)
         except HexapodError as error:
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
@@ -426,6 +427,10 @@ class MachineNode(LifecycleNode):
         self.hardware_id = f"{self.get_namespace()}/{what}".strip("/")
         self._report = HealthReport(f"{self.get_fully_qualified_name()[1:]}: state", self.hardware_id)
 
+    def update(self, now: float) -> None:
+        """Do what is due every :data:`CHECK_PERIOD` of a configured node, before its state is judged."""
+        self.update_publishers()
+
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
         """Yield level and text of an active node's findings, worst first."""
         yield OK, "running"
@@ -449,21 +454,17 @@ class MachineNode(LifecycleNode):
             return make()
 
     def _check_state(self) -> None:
+        """Publish the state when it is due, with the guard's findings; log steps of the clock."""
         now = time.monotonic()
-        self.update_publishers()
-        level, text = joined(self.findings(now)) if self._active else (WARN, "not active")
-        self.publish_status(level, text, lambda: self.values(now))
-
-    def publish_status(self, level: bytes, text: str, values: Callable[[], dict[str, str]]) -> None:
-        """Publish level, text and values when they are due, with the guard's findings; log steps of the clock."""
-        now = time.monotonic()
+        self.update(now)
+        findings = self.findings(now) if self._active else [(WARN, "not active")]
+        level, text = joined([*self.guard.findings(now), joined(findings)])
         self.clock.read()
         if (steps := self.clock.set_back + self.clock.set_forward) != self._steps_logged:
             self._steps_logged = steps
             step = self.clock.last_step * 1e-9
             self.log_warning("clock", f"the clock was set {'back' if step < 0 else 'forward'} by {abs(step):.3f} s")
-        level, text = joined([*self.guard.findings(now), (level, text)])
         if self._report.due(level, text, now):
             stamp = self.get_clock().now().to_msg()
-            everything = {**values(), **self.guard.values()}
+            everything = {**self.values(now), **self.guard.values()}
             self._diagnostics_pub.publish(self._report.message(level, text, everything, stamp))

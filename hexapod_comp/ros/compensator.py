@@ -12,7 +12,7 @@ import math
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -26,7 +26,7 @@ from ..compensation.thermal import Thermometers
 from ..core import Struct
 from ..errors import CommandError, HexapodError, LimitError, TooEarlyError
 from ..machine.temperatures import HUMIDITY, check_part
-from .base import ACKNOWLEDGED_WITHIN, CHECK_PERIOD, COMMAND_QOS, NEWEST_QOS, MachineNode
+from .base import ACKNOWLEDGED_WITHIN, COMMAND_QOS, NEWEST_QOS, MachineNode
 from .fusion import PoseInstrument
 from .interface import (
     PARAMETERS,
@@ -44,7 +44,7 @@ from .process import run
 from .rclpy_compat import Alarm
 from .requests import Requests
 from .sensors import SensorTopic
-from .status import ADVICE, OTHERWISE, WARN, CompensatorStatus, joined, seconds
+from .status import ADVICE, OTHERWISE, CompensatorStatus, seconds
 
 ESTIMATE_PERIOD = 0.02  # Period of pose estimates from the node's own commands without feedback, s
 JITTER = 0.02  # A command that waits no longer than this, s, is not late, nor is an alarm
@@ -182,7 +182,6 @@ class CompensatorNode(MachineNode):
         if options["fusion.enabled"]:
             frames = {ids[name]: pose for name, pose in compensator.geometry.work_frames.items()}
             self._instrument = PoseInstrument(self, compensator, status, frames)
-        self.every(CHECK_PERIOD, self._check_state)
         self.every(ESTIMATE_PERIOD, self._estimate_from_commands)
 
     # ---- a command ----
@@ -307,8 +306,8 @@ class CompensatorNode(MachineNode):
     def update_publishers(self) -> None:
         self._status.update(time.monotonic())
 
-    def _check_state(self) -> None:
-        now, status = time.monotonic(), self._status
+    def update(self, now: float) -> None:
+        status = self._status
         status.update(now)
         status.log_space.check()
         guard = status.problem()
@@ -323,8 +322,12 @@ class CompensatorNode(MachineNode):
             self._instrument.update(now)
         self._journal.tick(now)
         self._outputs.stop(not self._active or status.stops(now))
-        level, text = joined(status.findings(now)) if self._active else (WARN, "not active")
-        self.publish_status(level, text, lambda: status.values(now))
+
+    def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
+        return self._status.findings(now)
+
+    def values(self, now: float) -> dict[str, str]:
+        return self._status.values(now)
 
 
 class Pacing:

@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
-from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 
 from ..errors import HexapodError, shorten
@@ -23,9 +23,8 @@ from ..formats.paths import config_file
 from ..machine.geometry import load_geometry
 from ..pose import Pose
 from ..virtual.instruments import LIVE, TRACKER, LiveFlaws, LiveInstrument
-from . import keep_discovery_local
-from .base import CHECK_PERIOD, LATCHED_QOS, NEWEST_QOS, STATE_QOS, MachineNode
-from .messages import message_pose, stamp_of, write_pose
+from .base import LATCHED_QOS, NEWEST_QOS, STATE_QOS, MachineNode
+from .messages import message_pose, pose_message, stamp_of
 from .parameters import Program, read_table
 from .process import run
 from .status import OK, WARN
@@ -80,55 +79,25 @@ class InstrumentNode(MachineNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("instrument", PARAMETERS, **options)
-        self._instrument: LiveInstrument | None = None
 
-    # ---- lifecycle ----
-
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Make the instrument and open topics."""
+    def configure(self) -> None:
         options = self._options
         stands = Pose.from_angles(np.array(options["stands_at"]), np.array(options["stands_turned"]))
-        try:
-            geometry = load_geometry(config_file(options["geometry_file"], "geometry"))
-            what = options["kind"], options["components"]
-            self._instrument = LiveInstrument(geometry, *what, self._flaws(), stands, options["noise_seed"])
-        except HexapodError as error:
-            self.get_logger().error(f"cannot configure: {error}")
-            return TransitionCallbackReturn.FAILURE
+        geometry = load_geometry(config_file(options["geometry_file"], "geometry"))
+        what, self._tracker = (options["kind"], options["components"]), options["kind"] == TRACKER
+        self._instrument = LiveInstrument(geometry, *what, self._flaws(), stands, options["noise_seed"])
         self.set_hardware_id(geometry.name)
         self._seen: tuple[Pose, float] | None = None  # the tool's pose, and when it arrived, monotonic
         self._broken_until, self._published, self._problem = -math.inf, 0, ""
-        with self.rolled_back_on_error():
-            tracker = options["kind"] == TRACKER
-            self._out = self.publish_on(
-                PoseStamped if tracker else JointState, "~/pose" if tracker else "~/readings", STATE_QOS
-            )
-            self._ends: list[Any] = [
-                self._out,
-                self.subscribe(PoseStamped, "tool_pose_true", self._on_tool, NEWEST_QOS),
-                self.subscribe(PoseStamped, SET_UP_TOPIC, self._on_set_up, LATCHED_QOS),
-                self.every(1.0 / options["rate"], self._publish),
-                self.every(CHECK_PERIOD, self._check_state),
-            ]
-        return super().on_configure(state)
-
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Read."""
-        self._active = True
-        self.get_logger().info("ready")
-        return super().on_activate(state)
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Close topics and forget the instrument."""
-        self._active, self._instrument = False, None
-        self.close_ends(*self._ends)
-        return super().on_cleanup(state)
-
-    # ---- parameters ----
+        kind, topic = (PoseStamped, "~/pose") if self._tracker else (JointState, "~/readings")
+        self._out = self.publish_on(kind, topic, STATE_QOS)
+        self.subscribe(PoseStamped, "tool_pose_true", self._on_tool, NEWEST_QOS)
+        self.subscribe(PoseStamped, SET_UP_TOPIC, self._on_set_up, LATCHED_QOS)
+        self.every(1.0 / options["rate"], self._publish)
 
     def on_parameters(self, names: set[str]) -> None:
         """Err by what has been set while the node runs; a beam breaks where it is asked for anew."""
-        if self._instrument is not None:
+        if self.configured:
             self._instrument.flaws = self._flaws()
             if "fault_break" in names:
                 self._broken_until = time.monotonic() + self._options["fault_break"]
@@ -146,7 +115,7 @@ class InstrumentNode(MachineNode):
             self._seen = pose, time.monotonic()
 
     def _on_set_up(self, message: PoseStamped) -> None:
-        if (pose := self._pose_in_base(message, SET_UP_TOPIC)) and self._instrument is not None:
+        if pose := self._pose_in_base(message, SET_UP_TOPIC):
             self._instrument.set_up(pose)
             self.note("set up", f"set up for {', '.join(self._instrument.channels)}")
 
@@ -167,55 +136,40 @@ class InstrumentNode(MachineNode):
 
     def _publish(self) -> None:
         now = time.monotonic()
-        if not self._active or self._instrument is None or self._options["fault_silent"]:
+        if not self._active or self._options["fault_silent"]:
             return
         if self._seen is None or now - self._seen[1] > SEEN_WITHIN:
             return
-        broken, stamp = now < self._broken_until, stamp_of(self.get_clock().now().nanoseconds)
-        if self._options["kind"] == TRACKER:
-            if not broken:
-                pose, message = self._instrument.pose(self._seen[0]), PoseStamped()
-                message.header.frame_id = self._options["frame_id"]
-                write_pose(message, pose.position, pose.rotation)
-                message.header.stamp = stamp
-                self._out.publish(message)
-                self._published += 1
-            return
-        if broken:
-            self._instrument.zero()
-        readings = dict.fromkeys(self._instrument.channels, math.nan)
-        if not broken:
-            readings = self._instrument.read(self._seen[0])
-        if readings:
-            message = JointState(name=list(readings), position=list(readings.values()))
-            message.header.stamp = stamp
+        broken, message = now < self._broken_until, None
+        if self._tracker and not broken:
+            message = pose_message(self._instrument.pose(self._seen[0]), self._options["frame_id"])
+        elif not self._tracker:
+            if broken:
+                self._instrument.zero()
+            nothing = dict.fromkeys(self._instrument.channels, math.nan)
+            if readings := nothing if broken else self._instrument.read(self._seen[0]):
+                message = JointState(name=list(readings), position=list(readings.values()))
+        if message is not None:
+            message.header.stamp = stamp_of(self.get_clock().now().nanoseconds)
             self._out.publish(message)
             self._published += 1
 
     # ---- state ----
 
-    def _check_state(self) -> None:
-        now = time.monotonic()
-        level, text = OK, "reading"
-        if not self._active:
-            level, text = WARN, "not active"
-        elif self._problem:
-            level, text = WARN, self._problem
+    def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
+        if self._problem:
+            yield WARN, self._problem
         elif self._seen is None or now - self._seen[1] > SEEN_WITHIN:
-            level, text = WARN, "nobody publishes tool_pose_true"
+            yield WARN, "nobody publishes tool_pose_true"
         elif now < self._broken_until:
-            level, text = WARN, "the beam is broken"
-        elif self._instrument and self._options["kind"] != TRACKER and not self._instrument.channels:
-            text = f"waiting for {SET_UP_TOPIC}"
-        channels = self._instrument.channels if self._instrument else ()
-        values = {"channels": ", ".join(channels), "readings": str(self._published)}
-        self.publish_status(level, text, lambda: values)
+            yield WARN, "the beam is broken"
+        yield OK, "reading" if self._tracker or self._instrument.channels else f"waiting for {SET_UP_TOPIC}"
+
+    def values(self, now: float) -> dict[str, str]:
+        return {"channels": ", ".join(self._instrument.channels), "readings": str(self._published)}
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node; the entry of the executable ``instrument``."""
-    keep_discovery_local()
-    return run(InstrumentNode, PROGRAM, argv)
+main = partial(run, InstrumentNode, PROGRAM)
 
 
 if __name__ == "__main__":

@@ -11,8 +11,9 @@ from __future__ import annotations
 import sys
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,8 +31,7 @@ from ..machine.geometry import BASE, TOOL, HexapodGeometry
 from ..machine.path import Motion
 from ..machine.trajectory import Path
 from ..pose import Pose, rotation_angle
-from . import keep_discovery_local
-from .base import ACKNOWLEDGED_WITHIN, CHECK_PERIOD, COMMAND_QOS, EVENT_QOS, LATCHED_QOS, NEWEST_QOS, MachineNode
+from .base import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, LATCHED_QOS, NEWEST_QOS, MachineNode
 from .interface import frame_ids
 from .messages import message_pose, nanoseconds_of, pose_message, stamp_of
 from .parameters import Program, read_table
@@ -148,20 +148,13 @@ class MoverNode(MachineNode):
 
     # ---- lifecycle ----
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Open topics."""
-        with self.rolled_back_on_error():
-            self._open_topics()
-        return super().on_configure(state)
-
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Accept targets from now on; nothing moves before the first one."""
         self._halt()
         self._commands = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS)
-        self._active = True
+        done = super().on_activate(state)
         self._change(IDLE, "no move yet")
-        self.get_logger().info("ready")
-        return super().on_activate(state)
+        return done
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Send nothing more, so that others may command."""
@@ -171,14 +164,9 @@ class MoverNode(MachineNode):
         self.close_ends(self._commands)
         return super().on_deactivate(state)
 
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Close topics and forget the machine."""
-        self._active = False
+    def unconfigure(self) -> None:
         self._worker.close()
-        self._ticker.close()
-        self.close_ends(*self._ends)
         self._forget()
-        return super().on_cleanup(state)
 
     def publish_last_status(self) -> None:
         """Publish the end of a move that the end of the node interrupts."""
@@ -186,27 +174,22 @@ class MoverNode(MachineNode):
             self._stopped("shut down", "the node ended on the way")
             self._states.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
-    def _open_topics(self) -> None:
+    def configure(self) -> None:
         name = self._options["compensator"]
         self._worker = Worker()
         self._states = self.create_publisher(DiagnosticStatus, "~/state", LATCHED_QOS)
         self._diagnosed = status_prefix(self.get_namespace(), name)
-        self._ends: list[Any] = [
-            self._states,
-            self.subscribe(PoseStamped, "move_to", self._on_move_to, EVENT_QOS),
-            self.subscribe(PoseStamped, "move_by", self._on_move_by, EVENT_QOS),
-            self.subscribe(PointStamped, "pivot", self._on_pivot, EVENT_QOS),
-            self.subscribe(MultiDOFJointTrajectory, "program", self._on_program, EVENT_QOS),
-            self.subscribe(PoseStamped, "tool_pose_estimate", self._on_estimate, NEWEST_QOS),
-            self.subscribe(JointState, "strut_commands", self._on_answer, COMMAND_QOS),
-            self.subscribe(String, f"{name}/files", self._on_files, LATCHED_QOS),
-            self.subscribe(String, f"{name}/tool", self._on_tool, LATCHED_QOS),
-            self.subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS),
-            self.every(CHECK_PERIOD, self._check_state),
-        ]
+        self.subscribe(PoseStamped, "move_to", self._on_move_to, EVENT_QOS)
+        self.subscribe(PoseStamped, "move_by", self._on_move_by, EVENT_QOS)
+        self.subscribe(PointStamped, "pivot", self._on_pivot, EVENT_QOS)
+        self.subscribe(MultiDOFJointTrajectory, "program", self._on_program, EVENT_QOS)
+        self.subscribe(PoseStamped, "tool_pose_estimate", self._on_estimate, NEWEST_QOS)
+        self.subscribe(JointState, "strut_commands", self._on_answer, COMMAND_QOS)
+        self.subscribe(String, f"{name}/files", self._on_files, LATCHED_QOS)
+        self.subscribe(String, f"{name}/tool", self._on_tool, LATCHED_QOS)
+        self.subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
         self._stop_service = self.create_service(Trigger, "~/stop", self._on_stop)
-        self._ends.append(self._stop_service)
-        self._ticker = self.at_rate("rate", self._tick)
+        self.at_rate("rate", self._tick)
         self._state_due = 0.0
         self._change(IDLE, "no move yet")
 
@@ -518,8 +501,7 @@ class MoverNode(MachineNode):
         self._states.publish(status_of(name, self.hardware_id, level, f"{self._state}: {self._text}", values))
         self._state_due = time.monotonic() + STATE_PERIOD
 
-    def _check_state(self) -> None:
-        now = time.monotonic()
+    def update(self, now: float) -> None:
         self._worker.poll(now)
         if self._ready() != self._ready_shown:
             self._publish_state()
@@ -530,12 +512,16 @@ class MoverNode(MachineNode):
                 self._settle(now)
             if self._state == MOVING and now >= self._state_due:
                 self._publish_state()
-        level, text = (OK, self._state) if self._active else (WARN, "not active")
-        if self._active and self._geometry is None:
-            level, text = WARN, f"waiting for {self._options['compensator']}/files"
-        elif self._active and self._state == STOPPED and self._by != "person":
-            level, text = WARN, f"stopped ({self._by}): {self._text}"
-        self.publish_status(level, text, lambda: {"state": self._state, "moves": str(self._moves), "tool": self._tool})
+
+    def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
+        if self._geometry is None:
+            yield WARN, f"waiting for {self._options['compensator']}/files"
+        elif self._state == STOPPED and self._by != "person":
+            yield WARN, f"stopped ({self._by}): {self._text}"
+        yield OK, self._state
+
+    def values(self, now: float) -> dict[str, str]:
+        return {"state": self._state, "moves": str(self._moves), "tool": self._tool}
 
     def _refused(self) -> None:
         """Continue from the last answered pose if a busy computer has delayed commands; else stop sending."""
@@ -563,10 +549,7 @@ class MoverNode(MachineNode):
         self._stopped(by, reason if under_way else f"at standstill: {reason}")
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node; the entry of the executable ``mover``."""
-    keep_discovery_local()
-    return run(MoverNode, PROGRAM, argv)
+main = partial(run, MoverNode, PROGRAM)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from ..machine.load import Payload
 from ..machine.model import RealMachine
 from ..virtual.machine import DriveParameters, Faults, StrutDrive
 from ..virtual.named import RANDOM, find_model, is_word
-from .base import CHECK_PERIOD, STATE_QOS, MachineNode
+from .base import STATE_QOS, MachineNode
 from .messages import StrutBytes, StrutReader, stamp_of, write_pose
 from .parameters import Program, read_table
 from .process import run
@@ -133,7 +133,6 @@ class StrutDriveNode(MachineNode):
         self._command_guards: tuple[Guard, ...] = (self._source, self._stamps, self._steps)
         self.set_hardware_id(geometry.name)
         self.every(1.0 / options["rate"], self._run)
-        self.every(CHECK_PERIOD, self._check_state)
         self.get_logger().info(f"configured machine {geometry.name!r} with hidden truth {machine.model.name!r}")
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
