@@ -10,13 +10,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .fault import Fault
-from .judge import Limits, Verdict, judge
-from .kinds import KINDS
+from .judge import MOVER_RECOVERS_WITHIN, RECOVER_WITHIN, Limits, Verdict, judge
+from .kinds import KINDS, kinds_of
 from .record import Happened
 from .rig import Rig
 
-BEFORE, AFTER = 0.4, 1.5
-"""How long the machine is watched before the first fault and after the last, s: recovery may take 1 s."""
+BEFORE, AFTER = 0.4, 0.5
+"""How long the machine is watched before the first fault, and after the last has ended and recovery is over, s."""
 
 SECOND_WITHIN = 0.5
 """A second fault begins at most this long after the first, s."""
@@ -79,7 +79,7 @@ class Outcome:
         return f"episode {self.episode.number}: {drawn}: {what}{busy}   (--seed {seed} --only {self.episode.number})"
 
 
-def draw(seed: int, number: int, kinds: Sequence[str] = tuple(KINDS)) -> Episode:
+def draw(seed: int, number: int, kinds: Sequence[str] = kinds_of(mover=False)) -> Episode:
     """Draw one episode: its kinds come in shuffled rounds, so that all come equally often; half have a second.
 
     Parameters
@@ -130,19 +130,20 @@ def run_episode(rig: Rig, episode: Episode) -> Outcome:
         rig.spin(0.005)
     for _, happened in ending:
         happened.ended = math.inf
-    rig.spin(AFTER)
+    recovery = MOVER_RECOVERS_WITHIN if rig.has_mover else RECOVER_WITHIN
+    rig.spin(recovery + AFTER)
     record.ended = time.monotonic()
     longest = max(time_now - waited.get(pid, 0.0) for pid, time_now in rig.waited().items())
     starved = longest / (record.ended - first)
-    return Outcome(episode, judge(record, Limits.of(rig.geometry)), record.faults, starved)
+    return Outcome(episode, judge(record, Limits.of(rig.geometry), recovery), record.faults, starved)
 
 
-def campaign(episodes: Iterable[Episode], seed: int) -> Iterator[Outcome]:
+def campaign(episodes: Iterable[Episode], seed: int, mover: bool) -> Iterator[Outcome]:
     """Run episodes one after the other on one machine; a machine that does not recover is replaced by a new one."""
     remaining = iter(episodes)
     episode = next(remaining, None)
     while episode is not None:
-        with Rig(seed) as rig:
+        with Rig(seed, mover=mover) as rig:
             rig.spin(WARM_UP)
             while episode is not None:
                 outcome = run_episode(rig, episode)

@@ -1,16 +1,24 @@
-"""The controller of the campaign: a machine tool's, with feed hold, which a fault may take from it."""
+"""The controllers of the campaign: a machine tool's, with feed hold, which a fault may take from it; and an
+operator's program that asks the mover node for one move after the other."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
 from enum import Enum
+from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Duration
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, Transform, Vector3
+from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
 from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.trajectory import Path, circle, commanded_in_base, join, move
 from hexapod_comp.pose import Pose
+from hexapod_comp.ros.base import EVENT_QOS, LATCHED_QOS
+from hexapod_comp.ros.messages import nanoseconds_of, pose_message
 
 RATE = 250.0
 """Commands per second, Hz."""
@@ -23,6 +31,9 @@ REPEAT_AFTER = 0.1
 
 STUCK_AFTER = 0.25
 """Without an answer for this long, s, it asks whether it must start again from where the machine stands."""
+
+REPEAT_MOVE_AFTER = 0.5
+"""A move of which the mover has published no state is asked for again after this long, s."""
 
 
 class Mode(Enum):
@@ -131,6 +142,81 @@ class Controller:
 
     def _way_back(self, pose: Pose) -> Path:
         return move(self._geometry, pose, self.target, RATE, FEED)
+
+
+class MoverController:
+    """Asks the mover for a program along the path, then for moves to points of it, one after the other.
+
+    When the mover stands because the machine is not where it was told to be, it resets the compensator first, as an
+    operator does, unless it may not; after any other end it asks for the next move. The mover decides itself what it
+    does about missing answers: it is never `heedless`.
+    """
+
+    def __init__(
+        self, geometry: HexapodGeometry, node: Any, reset: Callable[[Callable[[Pose | None], None]], None]
+    ) -> None:
+        self._node, self._reset, self._path = node, reset, endless_path(geometry)
+        self.mode, self.heedless, self.may_reset = Mode.MILL, False, True
+        self._publishers = {
+            kind: node.create_publisher(kind, topic, EVENT_QOS)
+            for kind, topic in ((MultiDOFJointTrajectory, "program"), (PoseStamped, "move_to"))
+        }
+        self._state: dict[str, str] = {}
+        self._asked = self._moves = 0
+        self._asked_at = 0.0
+        node.create_subscription(DiagnosticStatus, "mover/state", self._on_state, LATCHED_QOS)
+
+    def _on_state(self, message: DiagnosticStatus) -> None:
+        self._state = {entry.key: entry.value for entry in message.values}
+
+    def answered(self, stamp: int, now: float) -> None:
+        """The mover counts its own answers."""
+
+    def start_over(self) -> None:
+        """The mover plans from where the machine stands."""
+
+    def due(self) -> float:
+        """Nothing is due: the mover sends."""
+        return float("inf")
+
+    def tick(self, now: float, stuck: bool) -> None:
+        """Ask for the next move when the last one has ended, or was not received."""
+        unseen = self._state.get("request") != str(self._asked) and now < self._asked_at + REPEAT_MOVE_AFTER
+        if self.mode is Mode.ASK or unseen or self._state.get("state") not in ("idle", "arrived", "stopped"):
+            return
+        if stuck and self._state["state"] == "stopped":
+            if self.may_reset:
+                self.mode = Mode.ASK
+                self._reset(self._has_reset)
+        elif self._state["ready"] == "true":
+            self._ask(now)
+
+    def _has_reset(self, _: Pose | None) -> None:
+        self.mode, self._asked_at = Mode.MILL, 0.0
+
+    def _ask(self, now: float) -> None:
+        """Ask for a program every second time."""
+        self._moves += 1
+        if self._moves % 2 == 0:
+            message = program(self._path, every=5)
+        else:
+            message = pose_message(self._path.pose(self._moves * len(self._path) * 3 // 10 % len(self._path)), "base")
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._asked, self._asked_at = nanoseconds_of(message.header.stamp), now
+        self._publishers[type(message)].publish(message)
+
+
+def program(path: Path, every: int) -> MultiDOFJointTrajectory:
+    """Return a path's poses, one of `every`, with their times."""
+    message = MultiDOFJointTrajectory(joint_names=["tool"])
+    message.header.frame_id = "base"
+    for n in range(0, len(path), every):
+        pose, seconds = pose_message(path.pose(n), "base").pose, n / path.rate
+        at = Vector3(x=pose.position.x, y=pose.position.y, z=pose.position.z)
+        point = MultiDOFJointTrajectoryPoint(transforms=[Transform(translation=at, rotation=pose.orientation)])
+        point.time_from_start = Duration(sec=int(seconds), nanosec=round(seconds % 1.0 * 1e9))
+        message.points.append(point)
+    return message
 
 
 def endless_path(geometry: HexapodGeometry) -> Path:

@@ -16,6 +16,9 @@ from .visible import REPORT_WITHIN, VISIBLE, Reported
 RECOVER_WITHIN = 1.0
 """All is well again this long after the last fault has ended, s."""
 
+MOVER_RECOVERS_WITHIN = 3.0
+"""With a mover, which starts a process and plans before it sends anything again, s."""
+
 ANSWER_WITHIN = 0.2
 """A command without an answer for this long is lost, s."""
 
@@ -77,6 +80,8 @@ class Verdict:
         From the end of the last fault until all was well, s; infinite if never.
     sent, lost : int
         Good commands outside the faults, and how many of these got no answer.
+    within : float
+        Longest recovery allowed, s.
     """
 
     breaches: list[str] = field(default_factory=list)
@@ -84,6 +89,7 @@ class Verdict:
     recovery: float = 0.0
     sent: int = 0
     lost: int = 0
+    within: float = RECOVER_WITHIN
 
     def misses(self) -> list[str]:
         """Return which bars were missed, in words."""
@@ -92,24 +98,25 @@ class Verdict:
             if report.visible and not report.delay <= REPORT_WITHIN:
                 when = "never" if math.isinf(report.delay) else f"after {report.delay * 1e3:.0f} ms"
                 found.append(f"{kind}: reported {when}")
-        if not self.recovery <= RECOVER_WITHIN:
+        if not self.recovery <= self.within:
             found.append(f"recovery took {self.recovery:.2f} s")
         if self.lost:
             found.append(f"{self.lost} of {self.sent} good commands lost")
         return found
 
 
-def judge(record: Record, limits: Limits) -> Verdict:
-    """Return the verdict over one episode."""
+def judge(record: Record, limits: Limits, within: float = RECOVER_WITHIN) -> Verdict:
+    """Return the verdict over one episode; within: longest recovery allowed, s."""
     began = min((fault.began for fault in record.faults), default=math.inf)
     ended = max((fault.ended for fault in record.faults), default=-math.inf)
-    outside = [s for s in _due(record) if not began - ANSWER_WITHIN < s.sent_at < ended + RECOVER_WITHIN]
+    outside = [s for s in _due(record) if not began - ANSWER_WITHIN < s.sent_at < ended + within]
     return Verdict(
         breaches=breaches(record, limits),
         reports=[(fault.kind, reported(record, fault)) for fault in record.faults],
         recovery=recovery(record, ended) if record.faults else 0.0,
         sent=len(outside),
         lost=sum(not _answered(entry) for entry in outside),
+        within=within,
     )
 
 

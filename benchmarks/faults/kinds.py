@@ -75,6 +75,7 @@ KINDS: dict[str, type[Fault]] = {
     for kind in (
         *_process_kinds("compensator", "command", {"compensator", "command"}),
         *_process_kinds("drive", "feedback", {"drive", "feedback"}),
+        *_process_kinds("mover", "pose", {"mover", "pose"}),
         *(kind for link in LINKS for kind in _wired_kinds(link)),
         _make(Restart, "restart_under_stream", {"compensator", *LINKS}, SILENT["command"]),
         _make(Reset, "reset_under_stream", {"compensator", *LINKS}, SILENT["feedback"]),
@@ -93,3 +94,11 @@ KINDS: dict[str, type[Fault]] = {
         HalfModel,
     )
 }
+
+MOVERS, CONTROLLERS = ("kill_mover", "stop_mover"), ("too_fast",)
+"""Kinds of a machine whose poses come from the mover, and of one whose poses come from the harness, alone."""
+
+
+def kinds_of(mover: bool) -> tuple[str, ...]:
+    """Return the names of the kinds of faults that a machine with, or without, a mover can have."""
+    return tuple(kind for kind in KINDS if kind not in (CONTROLLERS if mover else MOVERS))

@@ -11,7 +11,7 @@ import numpy as np
 LINKS = ("pose", "command", "feedback")
 """Controller to compensator, compensator to drive, drive to compensator: a wire of the harness lies in each."""
 
-NODES = ("compensator", "strut_drive")
+NODES = ("compensator", "strut_drive", "mover")
 
 
 @dataclass

@@ -36,25 +36,26 @@ from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.base import COMMAND_QOS, NEWEST_QOS, STATE_QOS
 from hexapod_comp.ros.client import LISTENER_QOS, TRACK_QOS
-from hexapod_comp.ros.messages import message_pose, pose_message
+from hexapod_comp.ros.messages import message_pose, nanoseconds_of, pose_message
 
-from .controller import Controller, Mode
+from .controller import Controller, Mode, MoverController
 from .logdisk import LogDisk
 from .record import Record, Sent, Status, Struts, lengths_of
-from .wire import NANOSECONDS, Wire
+from .wire import Wire
 
 GEOMETRY, MODEL = "paper.yaml", "paper_machine.yaml"
 
 STARTS_WITHIN = 60.0
 """A process that is not ready this long after its start will not be, s."""
 
-MODULES = {"compensator": "compensator", "drive": "strut_drive"}
+MODULES = {"compensator": "compensator", "drive": "strut_drive", "mover": "mover"}
 
 REMAPS = {
     "compensator": {},
     "drive": {"strut_commands": "strut_commands_delivered", "strut_states": "strut_states_measured"},
+    "mover": {"tool_pose_command": "tool_pose_sent"},
 }
-"""The drive speaks and listens on topics of its own; the harness carries between them and the compensator's."""
+"""Drive and mover have topics of their own; the harness carries between them and the compensator's."""
 
 
 class RigError(RuntimeError):
@@ -74,14 +75,21 @@ class Rig:
         Make a private ROS domain; else the environment's is one already.
     wrappers : dict of str to sequence of str, optional
         Command that runs a process, by ``compensator`` and ``drive``, such as ``nsenter``.
+    mover : bool
+        The poses come from the mover node, which is asked for moves; else the harness streams them.
     """
 
     def __init__(
-        self, seed: int = 0, wired: bool = True, domain: bool = True, wrappers: dict[str, list[str]] | None = None
+        self,
+        seed: int = 0,
+        wired: bool = True,
+        domain: bool = True,
+        wrappers: dict[str, list[str]] | None = None,
+        mover: bool = False,
     ) -> None:
         self.record = Record()
         self.geometry = load_geometry(config_file(GEOMETRY))
-        self._seed, self._wired, self._wrappers = seed, wired, wrappers or {}
+        self._seed, self._wired, self._wrappers, self.has_mover = seed, wired, wrappers or {}, mover
         self._domain = PrivateDomain() if domain else None
         self.processes: dict[str, NodeProcess] = {}
         self._down_since: dict[str, float] = {}
@@ -142,7 +150,12 @@ class Rig:
         self._set_clock = node.create_client(SetParameters, "compensator/set_parameters")
         self._reload = node.create_client(Trigger, "compensator/reload_model")
         self._reset = node.create_client(Trigger, "compensator/reset")
-        self.controller = Controller(self.geometry, self._send, self._ask_for_reset)
+        self.controller: Controller | MoverController
+        if self.has_mover:
+            self.controller = MoverController(self.geometry, node, self._ask_for_reset)
+            node.create_subscription(PoseStamped, REMAPS["mover"]["tool_pose_command"], self._pass_on, COMMAND_QOS)
+        else:
+            self.controller = Controller(self.geometry, self._send, self._ask_for_reset)
 
     def _open_wires(self, node: Any, poses: Any) -> None:
         self.wires["pose"] = Wire(lambda message, now: self._deliver("pose", poses, message, now))
@@ -161,10 +174,10 @@ class Rig:
         """Start a process, in place of a dead one; it is ready when it has said so."""
         if name in self.processes:
             self.processes[name].stop()
-        parameters: dict[str, object] = {"geometry_file": str(self._geometry_file)}
+        parameters: dict[str, object] = {} if name == "mover" else {"geometry_file": str(self._geometry_file)}
         if name == "compensator":
             parameters.update({"model_file": str(self.model), "model_folder": str(self.folder), "marker_rate": 0.0})
-        else:
+        elif name == "drive":
             parameters.update({"truth_file": str(config_file(MODEL).resolve()), "noise_seed": self._seed})
         remaps = REMAPS[name] if self._wired else {}
         wrapper = self._wrappers.get(name, [])
@@ -174,8 +187,8 @@ class Rig:
             self.record.fresh_starts.append(time.monotonic())
 
     def start_all(self) -> None:
-        """Start both processes, and wait until the machine moves."""
-        for name in MODULES:
+        """Start the processes, and wait until the machine moves."""
+        for name in MODULES if self.has_mover else ("compensator", "drive"):
             self._down_since[name] = time.monotonic()
             self.start(name)
         self.spin(STARTS_WITHIN, lambda: not self._down_since)
@@ -186,7 +199,7 @@ class Rig:
             raise RigError(f"the machine does not come up:\n{said}")
 
     def running(self) -> bool:
-        """Return whether both processes are up, commands are answered and the struts are measured."""
+        """Return whether the processes are up, commands are answered and the struts are measured."""
         now = time.monotonic()
         answered = any(now - s.answered_at < 0.1 for s in list(self.record.sent.values())[-50:])
         measured = bool(self.record.measured) and now - self.record.measured[-1].time < 0.1
@@ -269,13 +282,15 @@ class Rig:
     # ---- what comes and goes ----
 
     def _send(self, pose: Pose) -> int:
-        stamp = self.node.get_clock().now()
         message = pose_message(pose, "base")
-        message.header.stamp = stamp.to_msg()
-        now = time.monotonic()
-        self.record.sent[stamp.nanoseconds] = Sent(now)
+        message.header.stamp = self.node.get_clock().now().to_msg()
+        return self._pass_on(message)
+
+    def _pass_on(self, message: PoseStamped) -> int:
+        now, stamp = time.monotonic(), nanoseconds_of(message.header.stamp)
+        self.record.sent[stamp] = Sent(now)
         self.wires["pose"].put(message, now)
-        return stamp.nanoseconds
+        return stamp
 
     def _deliver(self, link: str, publisher: Any, message: Any, now: float) -> None:
         publisher.publish(message)
@@ -286,7 +301,7 @@ class Rig:
     def _on_commands(self, message: JointState, sent: float) -> None:
         now = time.monotonic()
         self.record.commands.append(Struts(sent, lengths_of(message.position)))  # read late by a starved harness
-        stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
+        stamp = nanoseconds_of(message.header.stamp)
         entry = self.record.sent.get(stamp)
         if entry is not None and math.isnan(entry.answered_at):
             entry.answered_at = now

@@ -118,6 +118,8 @@ VISIBLE: dict[str, Callable[[Record, Happened], list[Expected]]] = {
     "stop_compensator": partial(silence, "command"),
     "kill_drive": partial(silence, "feedback"),
     "stop_drive": partial(silence, "feedback"),
+    "kill_mover": partial(silence, "pose"),
+    "stop_mover": partial(silence, "pose"),
     **{f"drop_{link}": partial(silence, link) for link in SILENCE},
     **{f"delay_{link}": partial(either, partial(silence, link), partial(refusal, link)) for link in SILENCE},
     **{f"duplicate_{link}": nothing for link in SILENCE},
