@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from helpers import long_test
 
 from benchmarks.same_bits import SANITIZED, STRICT, Build, builds, missing, printed
 from hexapod_comp import core
-from hexapod_comp.core.build import FLAGS
+from hexapod_comp.core.build import FLAGS, sources_hash
 from hexapod_comp.export.c_code import write_c
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import load_model
@@ -55,3 +56,28 @@ def test_elementary_functions_are_right_to_one_unit_in_the_last_place(tmp_path):
     assert made.stderr == ""
     ran = subprocess.run([str(tmp_path / "ulps"), "500000"], capture_output=True, text=True, check=True)
     assert max(map(float, ran.stdout.split())) < 1.0
+
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_core_was_built_of_these_very_sources():
+    """Where it fails: python setup.py build_ext --inplace."""
+    assert core.ffi.string(core.lib.hc_sources()).decode() == sources_hash(Path(core.__file__).parent)
+
+
+WITHOUT_CFFI = (
+    "import runpy, sys; sys.modules['cffi'] = None; sys.argv = ['setup.py', *sys.argv[1:]]; runpy.run_path('setup.py')"
+)
+
+
+def test_a_build_without_cffi_fails_and_says_what_is_missing(tmp_path):
+    """As colcon and setup.py run it; pip brings cffi. setuptools alone would end well, with no core."""
+    copied = ("setup.py", "package.xml", "README.md", "LICENSE", "tools", "hexapod_comp")
+    for name in copied:
+        (tmp_path / name).symlink_to(ROOT / name)
+    words = [sys.executable, "-c", WITHOUT_CFFI, "build"]
+    made = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert made.returncode != 0
+    assert "setup.py: cffi is missing" in made.stderr
+    assert "python3-cffi" in made.stderr

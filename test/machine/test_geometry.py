@@ -1,13 +1,24 @@
-"""Geometry files: the paper's machine, a general one in inches, and everything that must be refused."""
+"""Geometry files: the paper's machine, a general one in inches, named tools and frames; what is refused or doubted."""
 
 from __future__ import annotations
 
+import copy
+import pickle
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
 import numpy as np
 import pytest
+import yaml
+from foreign_machines import machines, with_frames
 from strategies import PAPER_FILE, paper_geometry
 
-from hexapod_comp.errors import GeometryError, InputFileError
-from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry, paper_joints
+from hexapod_comp.errors import FrameError, GeometryError, InputFileError
+from hexapod_comp.machine.doubts import doubts, joint_doubts, twist_per_lead
+from hexapod_comp.machine.geometry import MOST, HexapodGeometry, Limits, load_geometry, paper_joints, parse_geometry
+from hexapod_comp.machine.struts import home_twists
+from hexapod_comp.pose import Pose
 
 PAPER_TEXT = PAPER_FILE.read_text(encoding="utf-8")
 
@@ -43,22 +54,6 @@ limits:
 """
 
 
-def written(folder, text):
-    path = folder / "machine.yaml"
-    path.write_text(text, encoding="utf-8")
-    return path
-
-
-def refusal(folder, text):
-    """Load a geometry text that must be refused and return what the message says, file left out."""
-    path = written(folder, text)
-    with pytest.raises(InputFileError) as caught:
-        load_geometry(path)
-    message = str(caught.value)
-    assert message.startswith(str(path))
-    return message[len(str(path)) :]
-
-
 def test_the_papers_joints():
     """Truth: the joints worked by hand from a = 300, b = 572, d = 243 mm, to 1 µm.
 
@@ -80,9 +75,9 @@ def test_the_papers_joints():
     np.testing.assert_allclose(geometry.platform_joints * 1e3, np.repeat(corners, 2, axis=0), atol=5e-4)
 
 
-def test_a_general_machine_in_inches(tmp_path):
-    """Truth: 25.4 mm to the inch; axes are made unit vectors."""
-    geometry = load_geometry(written(tmp_path, GENERAL))
+def test_a_general_machine_in_inches():
+    """Truth: 25.4 mm to the inch; axes are made unit vectors; one cone angle serves all; 12 m/min are 0.2 m/s."""
+    geometry = parse_geometry(GENERAL)
     np.testing.assert_allclose(geometry.base_joints[1], np.array([-8, 18, 0.5]) * 0.0254, rtol=1e-15)
     np.testing.assert_allclose(geometry.platform_joints[4], np.array([4, -9, 1]) * 0.0254, rtol=1e-15)
     np.testing.assert_allclose(geometry.base_axes[0], [0, 1, 0], atol=1e-15)
@@ -93,11 +88,7 @@ def test_a_general_machine_in_inches(tmp_path):
     np.testing.assert_allclose(geometry.tool.position, [0, 0, -0.1016], rtol=1e-15)
     np.testing.assert_allclose(geometry.tool.rotation @ [0, 0, 1], [1, 0, 0], atol=1e-15)  # β = 90° about y
     np.testing.assert_allclose(geometry.work.position, np.array([1, 2, 3]) * 0.0254, rtol=1e-15)
-
-
-def test_limits_in_their_units(tmp_path):
-    """Truth: arithmetic. Six stroke pairs stay six; one cone angle serves all; 12 m/min are 0.2 m/s."""
-    limits = load_geometry(written(tmp_path, GENERAL)).limits
+    limits = geometry.limits
     low, high = np.array([10, 10, 10, 10, 11, 12]), np.array([40, 40, 40, 40, 41, 42])
     np.testing.assert_allclose(limits.stroke, np.stack([low, high], axis=1) * 0.0254, rtol=1e-15)
     np.testing.assert_allclose(np.rad2deg(limits.base_cone), [60, 60, 60, 60, 60, 50], rtol=1e-15)
@@ -115,11 +106,6 @@ def test_cone_axes_default_to_the_struts_at_home():
     np.testing.assert_allclose(geometry.platform_cone_axes, along, atol=1e-15)
 
 
-def test_a_geometry_cannot_be_changed_afterwards():
-    with pytest.raises(ValueError, match="read-only"):
-        paper_geometry().base_joints[0, 0] = 0.0
-
-
 # Refused, naming file, key and value.
 
 FIFTH_JOINT = ", [20, -2, 0]]"
@@ -130,7 +116,6 @@ FIFTH_JOINT = ", [20, -2, 0]]"
     [
         pytest.param(FIFTH_JOINT, "]", ["base.joints_in", "6×3", "5×3"], id="five joints"),
         pytest.param("[5, 8, 0]", "[5, 8, .nan]", ["platform.joints_in[0][2]", "finite", "nan"], id="NaN"),
-        pytest.param("[5, 8, 0]", "[5, eight, 0]", ["platform.joints_in[0][1]", "number", "eight"], id="a word"),
         pytest.param(
             "[-8, 18, 0.5]",
             "[20, 2, 0]",
@@ -144,75 +129,42 @@ FIFTH_JOINT = ", [20, -2, 0]]"
         pytest.param("number: 20", "number: 0.5", ["limits.condition", "above 1", "0.5"], id="condition"),
         pytest.param("correction_um: 2000", "correction_um: 0", ["limits.correction", "above 0"], id="zero limit"),
         pytest.param("step_mm: 2", "step: 2", ["limits.step", "no unit", "step_mm", "2"], id="unit missing"),
-        pytest.param("step_mm: 2", "step_kg: 2", ["limits.step", "missing", "step_mm"], id="wrong unit"),
-        pytest.param("step_mm: 2", "step_mm: 2\n  step_um: 2000", ["limits.step_", "given twice"], id="two units"),
-        pytest.param(
-            "speed_m_min: 12", "speed_m_min: 12\n  warp: 9", ["limits.warp", "not a known key", "9"], id="unknown key"
-        ),
         pytest.param("screw:", "screws:", ["screws", "not a known key"], id="unknown block"),
-        pytest.param("  platform_cone", "  base_cone_deg: 3\n  platform_cone", ["base_cone_deg", "twice"], id="twice"),
         pytest.param("version: 1", "version: 2", ["version", "only version 1", "2"], id="version"),
         pytest.param("hexapod_comp/geometry", "hexapod_comp/model", ["format", "geometry", "model"], id="format"),
-        pytest.param("machine: general", "machine: 12", ["machine", "text", "12"], id="name not text"),
         pytest.param("[0, 2, 0]", "[0, 0, 0]", ["base.joint_axes[0]", "zero vector"], id="axis of no direction"),
         pytest.param("position_in: [0, 0, 20]", "position_in: [0, 0, 90]", ["home", "stroke"], id="home too high"),
-        pytest.param("home:\n  position_in: [0, 0, 20]", "home:", ["home", "mapping"], id="empty block"),
-        pytest.param("[0, 90, 0]", "[0, 90]", ["tool.rotation_deg", "shape 3"], id="two angles"),
+        # 000, Table 2: at 400 mm all struts are 509.192 mm long
+        pytest.param("[330, 880]", "[330, 509]", ["breaks a limit: strut_1: nominal length 509.19"], id="home"),
+        pytest.param("version: 1", "version: 1\nscrew: {lead_mm: 5}", ["base.joint_axes: are needed"], id="lead"),
     ],
 )
-def test_refused(tmp_path, old, new, said):
-    assert old in GENERAL
-    message = refusal(tmp_path, GENERAL.replace(old, new, 1))
-    for part in said:
-        assert part in message
+def test_refused(old, new, said):
+    text = GENERAL if old in GENERAL and "lead" not in new else PAPER_TEXT
+    assert old in text
+    with pytest.raises(InputFileError) as caught:
+        parse_geometry(text.replace(old, new, 1))
+    assert all(part in str(caught.value) for part in said)
 
 
-def test_home_outside_the_stroke_names_the_strut(tmp_path):
-    """Truth: Table 2: at 400 mm all six struts are 509.192 mm long."""
-    message = refusal(tmp_path, PAPER_TEXT.replace("stroke_mm: [330, 880]", "stroke_mm: [330, 509]"))
-    assert "home: breaks a limit: strut_1: nominal length 509.19" in message
-    assert "mm is outside the stroke 330.000…509.000 mm" in message
-
-
-def test_home_at_a_singular_pose(tmp_path):
-    """Truth: with the platform in the base's plane all struts lie flat and none can hold it up."""
-    text = PAPER_TEXT.replace("[0, 0, 400]", "[0, 0, 0]").replace("[330, 880]", "[100, 880]")
-    assert "home: breaks a limit: condition number inf of the nominal pose is above 10" in refusal(tmp_path, text)
-
-
-def test_home_outside_a_cone_of_its_own_axes(tmp_path):
-    """Truth: at a height of 400 mm struts of 509.192 mm lean by arccos(400/509.192) = 38.23°."""
-    upright = "[[0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 1]]"
-    text = PAPER_TEXT.replace("base_cone_deg: 50", "base_cone_deg: 20")
-    assert "paper_dimensions" in text
-    text += f"base:\n  cone_axes: {upright}\n"
-    assert "home: breaks a limit: strut_1: base joint at 38.2" in refusal(tmp_path, text)
-
-
-def test_clearance(tmp_path):
+def test_clearance():
     """Optional; never negative; not more than there is at home: 243 mm between base joints 2 and 3."""
-    assert load_geometry(written(tmp_path, PAPER_TEXT)).limits.clearance == 0.0
+    assert parse_geometry(PAPER_TEXT).limits.clearance == 0.0
     text = PAPER_TEXT.replace("  step_mm: 2", "  clearance_mm: {}\n  step_mm: 2")
-    assert load_geometry(written(tmp_path, text.format(60))).limits.clearance == 0.06
-    load_geometry(written(tmp_path, text.format(242.9)))
-    assert "limits.clearance: must be finite and not negative" in refusal(tmp_path, text.format(-1))
-    assert "home: breaks a limit: strut_" in refusal(tmp_path, text.format(243.1))
-
-
-def test_a_lead_needs_axes(tmp_path):
-    assert "base.joint_axes: are needed" in refusal(tmp_path, PAPER_TEXT + "screw:\n  lead_mm: 5\n")
+    assert parse_geometry(text.format(60)).limits.clearance == 0.06
+    parse_geometry(text.format(242.9))
+    for wrong, said in ((-1, "limits.clearance: must be finite and not negative"), (243.1, "home: breaks a limit: ")):
+        with pytest.raises(InputFileError, match=said):
+            parse_geometry(text.format(wrong))
 
 
 @pytest.mark.parametrize(("a", "b", "d"), [(0.0, 0.5, 0.2), (0.3, -0.5, 0.2), (0.3, 0.5, np.nan)])
 def test_dimensions_of_no_machine(a, b, d):
     with pytest.raises(GeometryError, match="finite and positive"):
         paper_joints(a, b, d)
-
-
-def test_platform_joints_in_one_point():
     paper = paper_geometry()
     with pytest.raises(GeometryError, match=r"platform\.joints.*coincide"):
-        HexapodGeometry("point", paper.base_joints, np.zeros((6, 3)), paper.home, paper.limits)
+        replace(paper, platform_joints=np.zeros((6, 3)))
 
 
 # ---- text, path, shipped name ----
@@ -224,3 +176,141 @@ def test_a_shipped_machine_goes_by_its_name(name, tmp_path, monkeypatch):
     (tmp_path / name).mkdir()
     monkeypatch.chdir(tmp_path)
     assert load_geometry(name).name == "paper"
+
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "config" / "example_6_6.yaml"
+ROUNDING = 1e-14  # m; a few products of numbers below one
+
+
+@pytest.mark.parametrize("name", ["framed", "hanging", "inches", "mirror"])
+def test_poses_are_those_of_the_tool_and_frame_in_use(name: str, tmp_path: Path) -> None:
+    """Truth: the zoo's own frames, multiplied there."""
+    machine = with_frames(name)
+    geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
+    assert (list(geometry.tools), list(geometry.work_frames)) == (
+        ["tool", "probe", "stub"],
+        ["base", "work", "fixture"],
+    )
+    rng = np.random.default_rng(4)
+    tips = machine.middle + rng.uniform(-0.05, 0.05, (5, 3))
+    turns = np.array([Pose.from_angles(np.zeros(3), angles).rotation for angles in rng.uniform(-0.2, 0.2, (5, 3))])
+    for tool, work in ((None, None), ("probe", None), (None, "fixture"), ("stub", "fixture"), ("tool", "work")):
+        truth, used = machine.using(tool, work), geometry.using(tool, work)
+        assert (used.tool_name, used.work_name) == (tool or "tool", work or "work")
+        for ours, theirs in zip(used.platform_poses(tips, turns), truth.platform_poses(tips, turns), strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=ROUNDING)
+    in_base = geometry.using("stub", "base")
+    assert np.array_equal(in_base.work.position, np.zeros(3))
+    assert in_base.using("tool", "work").tool is geometry.tool
+
+
+def test_a_geometry_with_tools_can_be_copied_replaced_and_sent_elsewhere() -> None:
+    shipped = load_geometry(EXAMPLE)
+    geometry = shipped.using("probe", "fixture")
+    for name in (
+        "base_cone_axes",
+        "platform_cone_axes",
+        "base_axes",
+        "platform_axes",
+        "kernel_joints",
+        "limit_numbers",
+    ):
+        assert getattr(geometry, name) is getattr(shipped, name)  # axes made unit vectors twice may lose a bit
+    for other in (pickle.loads(pickle.dumps(geometry)), copy.deepcopy(geometry), replace(geometry)):
+        assert (other.tool_name, other.work_name) == ("probe", "fixture")
+        assert list(other.tools) == list(geometry.tools)
+    moved = replace(geometry, tool=Pose(np.ones(3), np.eye(3)))
+    assert moved.using("tool").using("probe").tool is moved.tool  # the one in use is the one by its name
+    with pytest.raises(FrameError, match=r"machine example_6_6 has no tool 'prob'; it has tool, probe$"):
+        geometry.using(tool="prob")
+    with pytest.raises(FrameError, match=r"no work frame ''; it has base, work, fixture$"):
+        geometry.using(work="")
+
+
+POSE = {"position_mm": [0, 0, 10]}
+
+
+@pytest.mark.parametrize(
+    ("key", "named", "complaint"),
+    [
+        ("tools", {"tool": POSE}, "tools.tool: is what the machine's own tool frame is called"),
+        ("work_frames", {"base": POSE}, "work_frames.base: is what the machine's own base frame"),
+        ("tools", {"platform": POSE}, "tools.platform: is what another frame of the machine is called"),
+        ("tools", {"strut_1_rod": POSE}, "tools.strut_1_rod: is what another frame"),
+        ("tools", {"a probe": POSE}, "tools.a probe: a name must begin with a letter"),
+        ("tools", {"x" * 65: POSE}, "64 letters, digits and underscores"),
+        ("tools", {"fixture": POSE}, "tools.fixture: is a tool and a work frame; their names must differ"),
+        ("tools", {"probe": {"position": [0, 0, 1]}}, "tools.probe.position: has no unit"),
+        (
+            "work_frames",
+            {f"f{n}": dict(POSE, position_mm=[0, 0, n]) for n in range(MOST + 1)},
+            "work_frames: must be no more than 100",
+        ),
+    ],
+)
+def test_frames_that_cannot_be_are_refused(key: str, named: object, complaint: str) -> None:
+    content = yaml.safe_load(EXAMPLE.read_text(encoding="utf-8"))
+    with pytest.raises(InputFileError, match=complaint):
+        parse_geometry(yaml.safe_dump({**content, key: named}))
+
+
+CONFIG = Path(__file__).resolve().parents[2] / "config"
+WIDE = Limits(np.tile([0.01, 3.0], (6, 1)), np.full(6, np.pi), np.full(6, np.pi), 1e9, 1.0, 1.0, 1.0)
+
+
+def example(**changes: object) -> HexapodGeometry:
+    """Return the 6-6 example with limits so wide that mistakes of all kinds come through."""
+    return replace(load_geometry("example_6_6"), limits=WIDE, **changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["paper", "positioning_unit", "jugglebot", "example_6_6"])
+def test_shipped_machines_are_right(name: str):
+    assert doubts(load_geometry(name)) == ()
+
+
+@pytest.mark.parametrize("name", machines())
+def test_foreign_machines_are_right(name: str, tmp_path: Path):
+    """6-6 uneven, hanging, with turned frames, in inches."""
+    assert doubts(load_geometry(machines()[name].write(tmp_path / "machine.yaml"))) == ()
+
+
+@pytest.mark.parametrize("pair", [*pairwise(range(6)), (0, 5), (1, 4), (0, 3)])
+@pytest.mark.parametrize("body", ["base_joints", "platform_joints"])
+def test_swapped_joints_are_named(pair: tuple[int, int], body: str):
+    order = np.arange(6)
+    order[list(pair)] = order[list(pair)][::-1]
+    (doubt,) = doubts(example(**{body: getattr(example(), body)[order]}))
+    assert doubt.startswith(f"joints {pair[0] + 1}, {pair[1] + 1} of the platform, or of the base, look swapped")
+
+
+def test_a_turned_or_mirrored_home_and_a_wrong_unit_are_noticed():
+    home, base = example().home, example().base_joints
+    for turn in (-100.0, 60.0, 175.0):
+        (doubt,) = doubts(example(home=Pose.from_angles(home.position, np.radians([0.0, 0.0, turn]))))
+        found = float(doubt.partition("turned by ")[2].partition("°")[0])
+        assert found == pytest.approx(turn, abs=10.0)  # the 6-6's platform is no exact copy of its base
+    (doubt,) = doubts(example(home=Pose(home.position * [1.0, 1.0, -1.0], home.rotation)))
+    assert "mirrored" in doubt
+    assert [text.split(" ")[0] for text in joint_doubts(base * 25.4, base * 0.5 + [0, 0, 9.0])] == ["base.joints"]
+
+
+def test_a_home_that_breaks_a_limit_says_what_may_be_wrong(tmp_path: Path):
+    """As a user meets it: the platform's y has the wrong sign, and the machine is nearly singular so."""
+    text = (CONFIG / "example_6_6.yaml").read_text(encoding="utf-8")
+    before, after = text.split("platform:", 1)
+    joints = load_geometry("example_6_6").platform_joints * [1.0, -1.0, 1.0] * 1e3
+    start, end = after.index("joints_mm:"), after.index("  # Direction of the cardan axis")
+    wrong = f"{before}platform:{after[:start]}joints_mm: {joints.tolist()}\n{after[end:]}"
+    with pytest.raises(InputFileError, match=r"home: breaks a limit: .*; platform joints 1…6 run the other way round"):
+        parse_geometry(wrong)
+
+
+def test_twist_is_that_of_a_machine_that_says_its_axes():
+    """Axes across the struts at home, alike at both ends, given to the geometry itself: its own code's twist."""
+    bare = replace(load_geometry("paper"), limits=WIDE)
+    neutral = np.asarray(bare.base_cone_axes)
+    across = np.cross(neutral, np.eye(3)[np.abs(neutral).argmin(axis=1)])
+    turned = Pose.from_angles(bare.home.position, np.radians([2.0, -3.0, 6.0]))
+    told = replace(bare, base_axes=across, platform_axes=across, screw_lead=np.full(6, 0.01), home=turned)
+    share = twist_per_lead(bare, turned.position[None], turned.rotation[None])
+    assert share == pytest.approx(np.abs(home_twists(told)).max() / (2.0 * np.pi), rel=1e-12)

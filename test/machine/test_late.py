@@ -52,19 +52,6 @@ def test_readings_one_by_one_and_all_at_once_in_any_order():
     np.testing.assert_allclose(found, np.array(behind)[shuffled], atol=1e-12)
 
 
-def test_a_base_that_lags_its_struts_tells_what_they_are():
-    """One source warms base (T = 5400 s) and struts (τ = 1500 s) through a lag each, by 3 and 2.5 K.
-
-    The struts' share that comes late is then 1 − T/τ of their growth, by the lags' transfer functions. Readings a
-    second apart, straight in between, follow the base's curve to 1e-7 K.
-    """
-    times = np.arange(0.0, 7200.0)
-    base, struts = (rise * -np.expm1(-times / constant) for rise, constant in ((3.0, 5400.0), (2.5, 1500.0)))
-    behind = late(times, base[:, None], [1500.0])[:, 0, 0]
-    steady = 2.5 / 3.0
-    np.testing.assert_allclose(steady * base + steady * (1.0 - 5400.0 / 1500.0) * behind, struts, atol=1e-6)
-
-
 def warming_model(**changes) -> MachineModel:
     """Return a model with two time constants, all parts by the base's thermometer."""
     expansion = 1e-6 * np.arange(16.0).reshape(8, 2)
@@ -115,8 +102,6 @@ def test_stations_driven_together_go_where_each_goes_alone():
         ("time_constants_s: [600.0, 7200.0]", "time_constants_s: [7200.0, 600.0]", ["time_constants", "increasing"]),
         ("time_constants_s: [600.0, 7200.0]", "time_constants_s: [0.6, 7200.0]", ["time_constants", "10…1e"]),
         ("time_constants_s: [600.0, 7200.0]", "time_constants_s: [1, 2, 3]", ["late_struts"]),
-        ("time_constants_s: [600.0, 7200.0]", "time_constants: [600, 7200]", ["no unit", "time_constants_s"]),
-        ("late_base_ppm_per_K: [12.0, 13.0]", "late_base_ppm_per_K: [12.0, .nan]", ["late_base", "finite"]),
         ("late_base_ppm_per_K: [12.0, 13.0]", "late_base_ppm_per_K: [12.0, 1300000]", ["thermal.late", "unit"]),
     ],
 )
@@ -130,18 +115,14 @@ def test_a_file_in_doubt_is_refused(tmp_path: Path, old: str, new: str, words: l
     assert all(word in str(refused.value) for word in words)
 
 
-def test_a_reading_without_its_time_is_refused_where_time_counts():
-    temperatures = Temperatures()
+def test_a_restart_does_not_know_what_was_before_and_says_for_how_long():
+    """Three time constants of the slowest, 7200 s, from the first reading of the thermometer that counts."""
+    late_growth, temperatures = warming_model().late_growth, Temperatures()
     temperatures.follow("base", 21.0, math.nan, ())
     with pytest.raises(ModelError, match="time of the temperature of base"):
         temperatures.follow("base", 22.0, math.nan, (600.0,))
     assert temperatures.at("base") == 21.0
-    assert len(PARTS) == 8
-
-
-def test_a_restart_does_not_know_what_was_before_and_says_for_how_long():
-    """Three time constants of the slowest, 7200 s, from the first reading of the thermometer that counts."""
-    late_growth, temperatures = warming_model().late_growth, Temperatures()
+    temperatures = Temperatures()
     assert temperatures.unknown_for(late_growth, 1000.0) == 0.0
     temperatures.follow("strut_1", 25.0, 900.0, late_growth.time_constants)
     assert temperatures.unknown_for(late_growth, 1000.0) == 0.0

@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 from helpers import segment_distance
-from hypothesis import given
+from hypothesis import given, settings
 from strategies import fixed, paper_geometry, random_model, random_pose, seeds, skewed_geometry
 
 from hexapod_comp.compensation.checks import check
@@ -27,7 +27,6 @@ from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.kinematics import Structure, strut_lengths
 from hexapod_comp.machine.limits import REASONS, Limits
 from hexapod_comp.machine.model import MachineModel
-from hexapod_comp.machine.passes import Passes
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.pose import Pose
 from hexapod_comp.workspace.reach import Examiner
@@ -62,60 +61,6 @@ def condition_by_inverse(pose: Pose) -> float:
     return float(np.linalg.norm(matrix) * np.linalg.norm(np.linalg.inv(matrix)) / 6.0)
 
 
-def with_limits(**changes: object) -> HexapodGeometry:
-    return replace(PAPER, limits=replace(WIDE, **changes))
-
-
-def one_strut(value: float, strut: int, wide: float) -> np.ndarray:
-    values = np.full(6, wide)
-    values[strut] = value
-    return values
-
-
-def refusal(geometry: HexapodGeometry, pose: Pose, model: MachineModel | None = None) -> LimitError:
-    """Return the error with which a fresh compensator refuses the pose."""
-    compensator = Compensator(geometry, model or MachineModel(PAPER.name))
-    with pytest.raises(LimitError) as caught:
-        compensator.correct(pose)
-    assert np.isnan(compensator.command).all()
-    return caught.value
-
-
-def accepted(geometry: HexapodGeometry, pose: Pose, model: MachineModel | None = None) -> None:
-    Compensator(geometry, model or MachineModel(PAPER.name)).correct(pose)
-
-
-@pytest.mark.parametrize("strut", range(6))
-@pytest.mark.parametrize(("end", "pose"), [(1, TILTED), (0, LOW)], ids=["longest", "shortest"])
-def test_stroke(end: int, pose: Pose, strut: int) -> None:
-    length, inside = np.linalg.norm(struts(pose), axis=1)[strut], HAIR if end else -HAIR
-    bounds = WIDE.stroke.copy()
-    bounds[strut, end] = length * (1.0 + inside)
-    accepted(with_limits(stroke=bounds), pose)
-    bounds[strut, end] = length * (1.0 - inside)
-    error = refusal(with_limits(stroke=bounds), pose)
-    assert (error.reason, error.strut, error.stage) == ("stroke", strut, "nominal")
-    assert error.value == pytest.approx(length, rel=1e-14)
-    assert error.limit == bounds[strut, end]
-    assert f"strut_{strut + 1}" in str(error)
-    assert f"{length * 1e3:.4f} mm" in str(error)
-
-
-@pytest.mark.parametrize("strut", range(6))
-@pytest.mark.parametrize("body", ["base", "platform"])
-def test_joint_cones(body: str, strut: int) -> None:
-    """Neutral directions are the struts' at home, each seen from the body that carries the joint."""
-    now, home = struts(TILTED), struts(HOME)
-    if body == "platform":
-        now, home = now @ TILTED.rotation, home @ HOME.rotation
-    angle = angles_between(now, home)[strut]
-    accepted(with_limits(**{f"{body}_cone": one_strut(angle * (1.0 + HAIR), strut, np.pi)}), TILTED)
-    error = refusal(with_limits(**{f"{body}_cone": one_strut(angle * (1.0 - HAIR), strut, np.pi)}), TILTED)
-    assert (error.reason, error.strut, error.stage) == (f"{body}_cone", strut, "nominal")
-    assert error.value == pytest.approx(angle, rel=1e-12)
-    assert f"{np.degrees(angle):.3f}°" in str(error)
-
-
 def least_distance(pose: Pose, base: np.ndarray) -> tuple[float, int]:
     """Return the smallest distance of two struts that share no joint, m, and the first of the two."""
     ends = pose.position + PAPER.platform_joints @ pose.rotation.T
@@ -123,44 +68,62 @@ def least_distance(pose: Pose, base: np.ndarray) -> tuple[float, int]:
     return min((segment_distance(base[i], ends[i], base[j], ends[j]), i) for i, j in pairs)
 
 
-def test_clearance() -> None:
-    """Turned by 60° about its axis the machine's struts cross, nearer to each other than at home."""
-    distance, strut = least_distance(CROSSED, PAPER.base_joints)
-    accepted(with_limits(clearance=distance * (1.0 - HAIR)), CROSSED)
-    error = refusal(with_limits(clearance=distance * (1.0 + HAIR)), CROSSED)
-    assert (error.reason, error.strut, error.stage) == ("clearance", strut, "nominal")
-    assert error.value == pytest.approx(distance, rel=1e-9)
-    assert f"strut_{strut + 1}: {distance * 1e3:.3f} mm from the nearest other strut" in str(error)
+def cone_angles(pose: Pose, body: str) -> np.ndarray:
+    """Return the struts' angles to their directions at home, each seen from the body that carries the joint."""
+    turns = (pose.rotation, HOME.rotation) if body == "platform" else (np.eye(3), np.eye(3))
+    return angles_between(struts(pose) @ turns[0], struts(HOME) @ turns[1])
 
 
-def test_condition_number() -> None:
-    condition = condition_by_inverse(TILTED)
-    accepted(with_limits(condition=condition * (1.0 + HAIR)), TILTED)
-    error = refusal(with_limits(condition=condition * (1.0 - HAIR)), TILTED)
-    assert (error.reason, error.strut, error.stage) == ("condition", None, "nominal")
-    assert error.value == pytest.approx(condition, rel=1e-12)
+def six(value: float, strut: int, others: float) -> np.ndarray:
+    return np.where(np.arange(6) == strut, value, others)
 
 
-def test_other_assembly_mode() -> None:
-    """The machine mirrored in the base plane: same lengths, det J of the other sign (six rows, z negated)."""
-    flip = np.diag([1.0, 1.0, -1.0])
-    mirrored = Pose(flip @ HOME.position, flip @ HOME.rotation @ flip)
-    error = refusal(with_limits(), mirrored)
-    assert error.reason == "assembly"
+SHORT = MachineModel(PAPER.name, struts=StrutErrors(offset=six(-50e-6, 2, 0.0)))
+ASIDE = MachineModel(PAPER.name, base_deviation=np.outer(np.arange(6) == 3, [4e-4, 8e-4, 0.0]))
+LENGTHS, MOVED = (
+    np.linalg.norm(struts(TILTED), axis=1),
+    angles_between(struts(TILTED) - ASIDE.base_deviation, struts(HOME)),
+)
+CLOSEST, NEAREST = least_distance(CROSSED, PAPER.base_joints)
+LIMITS = [
+    # Limit, value, sign of what is allowed beside it, strut, pose, model
+    *(("longest", LENGTHS[i], 1.0, i, TILTED, None) for i in range(6)),
+    *(("shortest", np.linalg.norm(struts(LOW)[i]), -1.0, i, LOW, None) for i in range(6)),
+    *((f"{b}_cone", cone_angles(TILTED, b)[i], 1.0, i, TILTED, None) for b in ("base", "platform") for i in range(6)),
+    ("clearance", CLOSEST, -1.0, NEAREST, CROSSED, None),
+    ("condition", condition_by_inverse(TILTED), 1.0, None, TILTED, None),
+    ("correction", 50e-6, 1.0, 2, TILTED, SHORT),
+    ("longest", LENGTHS[2] + 50e-6, 1.0, 2, TILTED, SHORT),
+    ("base_cone", MOVED[3], 1.0, 3, TILTED, ASIDE),
+]
 
 
-@pytest.mark.parametrize("strut", range(6))
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_largest_correction(strut: int, sign: float) -> None:
-    """A strut that is 40 µm long is told 40 µm less: the correction is minus the offset, by definition."""
-    offset = np.zeros(6)
-    offset[strut] = sign * 40e-6
-    model = MachineModel(PAPER.name, struts=StrutErrors(offset=offset))
-    accepted(with_limits(correction=40e-6 * (1.0 + HAIR)), TILTED, model)
-    error = refusal(with_limits(correction=40e-6 * (1.0 - HAIR)), TILTED, model)
-    assert (error.reason, error.strut, error.stage) == ("correction", strut, "compensated")
-    assert error.value == pytest.approx(-offset[strut], rel=1e-9)
-    assert "40.000 µm" in str(error)
+@pytest.mark.parametrize(("limit", "value", "side", "strut", "pose", "model"), LIMITS)
+def test_a_hair_inside_passes_and_a_hair_outside_is_refused(limit, value, side, strut, pose, model) -> None:
+    """Compensated values too: a strut that is 50 µm short is told 50 µm more, a base joint stands 0.9 mm aside."""
+    for inside in (True, False):
+        edge = value * (1.0 + side * (HAIR if inside else -HAIR))
+        changes: dict[str, object] = {limit: edge}
+        if limit in ("longest", "shortest"):
+            stroke = WIDE.stroke.copy()
+            stroke[strut, int(limit == "longest")] = edge
+            changes = {"stroke": stroke}
+        elif limit.endswith("cone"):
+            changes = {limit: six(edge, strut, np.pi)}
+        geometry = replace(PAPER, limits=replace(WIDE, **changes))
+        compensator = Compensator(geometry, model or MachineModel(PAPER.name))
+        if inside:
+            compensator.correct(pose)
+            continue
+        with pytest.raises(LimitError) as caught:
+            compensator.correct(pose)
+        error = caught.value
+        assert (error.reason, error.strut) == (next(iter(changes)), strut)
+        assert error.stage == ("nominal" if model is None else "compensated")
+        assert abs(error.value) == pytest.approx(value, rel=1e-9)
+        assert error.limit == pytest.approx(edge, rel=1e-15)
+        assert strut is None or f"strut_{strut + 1}" in str(error)
+        assert np.isnan(compensator.command).all()
 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
@@ -170,7 +133,7 @@ def test_largest_step(way: float) -> None:
     flat = np.linalg.norm(struts(HOME)[0, :2])
     length = np.hypot(flat, z)
     for step, allowed in ((2e-3 * (1.0 - HAIR), True), (2e-3 * (1.0 + HAIR), False)):
-        compensator = Compensator(with_limits(step=2e-3), MachineModel(PAPER.name))
+        compensator = Compensator(replace(PAPER, limits=replace(WIDE, step=2e-3)), MachineModel(PAPER.name))
         compensator.correct(HOME)
         next_z = np.sqrt((length + way * step) ** 2 - flat**2)
         there = Pose([0.0, 0.0, next_z], HOME.rotation)
@@ -183,65 +146,6 @@ def test_largest_step(way: float) -> None:
         assert caught.value.value == pytest.approx(way * step, rel=1e-9)
 
 
-@pytest.mark.parametrize("mode", ["poses", "stream", "moves"])
-def test_progress_counts_every_row_once(mode: str) -> None:
-    done: list[int] = []
-    poses = [Pose([0.0, 0.0, 0.4 + 1e-4 * n], np.eye(3)) for n in range(130)]
-    check(paper_geometry(), MachineModel("paper"), poses, mode, progress=done.append)
-    assert sum(done) == len(poses)
-    assert min(done) > 0
-
-
-def test_a_pass_out_of_reach_is_named_by_its_place() -> None:
-    positions = np.array([[0.0, 0.0, 0.4], [0.0125, 0.0, 0.9]])
-    passes = Passes(paper_geometry(), positions, np.tile(np.eye(3), (2, 1, 1)), np.tile([1.0, 0.0, 0.0], (2, 1)))
-    with pytest.raises(LimitError, match=r"^platform at \(12\.500, 0\.000, 900\.000\) mm in base: strut_1"):
-        passes.refuse_unreachable()
-
-
-def test_compensated_lengths_are_checked_too() -> None:
-    """Nominally 30 µm inside; the correction of +50 µm leads 20 µm outside."""
-    length = np.linalg.norm(struts(TILTED), axis=1)[2]
-    bounds = WIDE.stroke.copy()
-    bounds[2, 1] = length + 30e-6
-    model = MachineModel(PAPER.name, struts=StrutErrors(offset=np.array([0, 0, -50e-6, 0, 0, 0])))
-    accepted(with_limits(stroke=bounds), TILTED)
-    error = refusal(with_limits(stroke=bounds), TILTED, model)
-    assert (error.reason, error.strut, error.stage) == ("stroke", 2, "compensated")
-    assert error.value == pytest.approx(length + 50e-6, rel=1e-12)
-
-
-def test_compensated_cones_are_checked_too() -> None:
-    """The real base joint 4 stands 1 mm aside, which turns its strut past a cone that nominally fits."""
-    home = struts(HOME)
-    sideways = np.cross(home[3], [0.0, 0.0, 1.0])
-    deviation = np.zeros((6, 3))
-    deviation[3] = -1e-3 * sideways / np.linalg.norm(sideways)
-    there = Pose(HOME.position + 0.02 * sideways / np.linalg.norm(sideways), HOME.rotation)
-    angle = angles_between(struts(there), home)[3]
-    real = angles_between(struts(there) - deviation, home)[3]
-    geometry = with_limits(base_cone=one_strut(0.5 * (angle + real), 3, np.pi))
-    accepted(geometry, there)
-    error = refusal(geometry, there, MachineModel(PAPER.name, base_deviation=deviation))
-    assert (error.reason, error.strut, error.stage) == ("base_cone", 3, "compensated")
-    assert error.value == pytest.approx(real, rel=1e-9)
-
-
-def test_compensated_clearances_are_checked_too() -> None:
-    """The real base joint of the nearest strut stands 2 mm aside, towards or away from the other."""
-    nominal, strut = least_distance(CROSSED, PAPER.base_joints)
-    deviations = np.zeros((2, 6, 3))
-    deviations[:, strut, 0] = 2e-3, -2e-3
-    real, deviation = min(
-        ((least_distance(CROSSED, PAPER.base_joints + one)[0], one) for one in deviations), key=lambda found: found[0]
-    )
-    geometry = with_limits(clearance=0.5 * (nominal + real))
-    accepted(geometry, CROSSED)
-    error = refusal(geometry, CROSSED, MachineModel(PAPER.name, base_deviation=deviation))
-    assert (error.reason, error.strut, error.stage) == ("clearance", strut, "compensated")
-    assert error.value == pytest.approx(real, rel=1e-9)
-
-
 def test_compensated_steps_are_checked_too() -> None:
     """A pitch error of 2 % makes the compensated step 2 % longer than the nominal one."""
     model = MachineModel(
@@ -250,7 +154,7 @@ def test_compensated_steps_are_checked_too() -> None:
     )
     there = Pose(HOME.position + np.array([0.0, 0.0, 2.5e-3]), HOME.rotation)
     step = np.linalg.norm(struts(there)[0]) - np.linalg.norm(struts(HOME)[0])
-    compensator = Compensator(with_limits(step=1.01 * step), model)
+    compensator = Compensator(replace(PAPER, limits=replace(WIDE, step=1.01 * step)), model)
     compensator.correct(HOME)
     with pytest.raises(LimitError) as caught:
         compensator.correct(there)
@@ -395,7 +299,7 @@ def compensators_refusal(machine: HexapodGeometry, model: MachineModel, tool: Po
 
 
 @pytest.mark.parametrize("name", MACHINES)
-@fixed
+@settings(fixed, max_examples=15)
 @given(seed=seeds)
 def test_check_reach_cold_start_and_compensator_agree(name: str, seed: int) -> None:
     """A model with all errors, random tool poses: who refuses, refuses for a reason that the others know."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,8 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from helpers import assert_equal
-from hypothesis import given
-from strategies import UNEVEN_GRID, fixed, paper_geometry, random_field, random_model, seeds, skewed_geometry
+from strategies import UNEVEN_GRID, paper_geometry, random_field, random_model, skewed_geometry
 
 from hexapod_comp.errors import InputFileError, ModelError
 from hexapod_comp.formats.schema import Section
@@ -98,18 +96,11 @@ def test_a_model_comes_back(tmp_path, seed):
     model = replace(
         random_model(rng, "skewed"), region=random_region(rng), reversal_threshold=rng.uniform(0.0, 1e-5), origin=ORIGIN
     )
-    assert_equal(there_and_back(model, tmp_path, SKEWED), model, relative=2.3e-16)
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_what_was_read_is_written_unchanged(tmp_path, seed):
-    """Truth: from the first reading on everything is exact, and a second file equals the first."""
-    model = replace(random_model(np.random.default_rng(seed), "skewed"), origin=ORIGIN)
     once = there_and_back(model, tmp_path, SKEWED)
+    assert_equal(once, model, relative=2.3e-16)
     first = (tmp_path / "there.yaml").read_bytes()
-    twice = there_and_back(once, tmp_path, SKEWED)
+    assert_equal(there_and_back(once, tmp_path, SKEWED), once)  # from the first reading on everything is exact
     assert (tmp_path / "there.yaml").read_bytes() == first
-    assert_equal(twice, once)
 
 
 def _families(*powers):
@@ -130,8 +121,6 @@ def _only_dx_along_x():
     [
         pytest.param(GridField(UNEVEN_GRID, _families(0, 0, 0), outside="refuse"), id="a box without lines"),
         pytest.param(GridField(UNEVEN_GRID, _families(0, 2, 0)), id="a family of zeros"),
-        pytest.param(GridField(UNEVEN_GRID, _only_dx_along_x()), id="one component of one family"),
-        pytest.param(random_field(np.random.default_rng(2), powers=1), id="constants"),
         pytest.param(random_field(np.random.default_rng(3), powers=9, probe=[0, 0, -0.15]), id="nine powers"),
     ],
 )
@@ -176,18 +165,8 @@ def test_the_file_opens_with_its_provenance(tmp_path):
     save_model(replace(random_model(np.random.default_rng(0), "paper"), origin=ORIGIN), tmp_path / "m.yaml")
     text = (tmp_path / "m.yaml").read_text(encoding="utf-8")
     keys = [line.split(":")[0] for line in text.splitlines() if line[0] not in " -"]
-    assert keys[:9] == [
-        "format",
-        "version",
-        "closed",
-        "machine",
-        "name",
-        "date",
-        "sources",
-        "held_out_residual_um",
-        "note",
-    ]
-    assert keys[9:] == ["reversal_threshold_um", "structure", "struts", "thermal", "field", "end"]
+    opening = "format version closed machine name date sources held_out_residual_um note"
+    assert keys == [*opening.split(), "reversal_threshold_um", "structure", "struts", "thermal", "field", "end"]
     assert "Größe: 4 µm" in text
 
 
@@ -229,32 +208,13 @@ HARMONICS = """    harmonics:
 
 def test_harmonics_of_the_waves(tmp_path):
     """Truth: the numbers in HARMONICS; their order does not matter, and what is not given is zero."""
-    model = load(tmp_path, BY_HAND.replace("    sine_um: 2\n", f"    sine_um: 2\n{HARMONICS}"))
+    text = BY_HAND.replace("2026-01-31", "2026-01-31T12:30:00+01:00")
+    model = load(tmp_path, text.replace("    sine_um: 2\n", f"    sine_um: 2\n{HARMONICS}"))
     zero, six = np.zeros(6), np.arange(1.0, 7.0)
+    assert model.origin.date == "2026-01-31T12:30:00+01:00"
     np.testing.assert_allclose(model.struts.cosine.T, np.array([zero, six, zero, zero + 1.0]) * 1e-6, rtol=1e-15)
     np.testing.assert_allclose(model.struts.sine.T, np.array([zero + 2.0, zero + 0.5, zero, zero]) * 1e-6, rtol=1e-15)
     assert_equal(there_and_back(model, tmp_path, PAPER), model)
-
-
-@pytest.mark.parametrize(
-    ("harmonic", "said"),
-    [
-        ("{times: 1, cosine_um: 1}", ["struts.wave.harmonics[0].times", "2…4", "found 1"]),
-        ("{times: 5, cosine_um: 1}", ["times", "2…4", "found 5"]),
-        ("{times: 2.0, cosine_um: 1}", ["times", "whole number", "2.0"]),
-        ("{cosine_um: 1}", ["times", "missing"]),
-        ("{times: 2, cosine: 1}", ["cosine", "no unit", "cosine_um"]),
-        ("{times: 2, cosine_m: 1}", ["struts", "allowed 0.2"]),
-        ("{times: 2, period_mm: 1}", ["harmonics[0].period_mm", "not a known key"]),
-        ("{times: 2}\n    - {times: 2}", ["harmonics[1].times", "given twice", "2"]),
-    ],
-)
-def test_harmonics_that_are_none(tmp_path, harmonic, said):
-    text = BY_HAND.replace("    sine_um: 2\n", f"    sine_um: 2\n    harmonics:\n    - {harmonic}\n")
-    with pytest.raises(InputFileError) as refusal:
-        load(tmp_path, text)
-    for word in said:
-        assert word in str(refusal.value)
 
 
 def test_a_field_written_by_hand(tmp_path):
@@ -272,26 +232,9 @@ def test_a_field_written_by_hand(tmp_path):
     np.testing.assert_array_equal(field.lines[2], truth)
 
 
-@pytest.mark.parametrize(
-    "date",
-    [
-        "'2026-01-31'",
-        "2026-01-31T12:30:00",
-        "'2026-01-31T12:30:00Z'",
-        "'2026-01-31 12:30'",
-        "2026-01-31T12:30:00+01:00",
-        "'2026-01-31T12:30:00.123456+01:00'",
-    ],
-)
-def test_dates_that_are_understood(tmp_path, date):
-    model = load(tmp_path, BY_HAND.replace("2026-01-31", date))
-    assert model.origin.date.startswith("2026-01-31")
-    assert_equal(there_and_back(model, tmp_path, PAPER), model)
-
-
 # Refused, naming file, key and value.
 
-LAST_LINE = "  - {axis: z, at: [1, 1], direction: both, dx_um: []}\n"
+WAVE = "    sine_um: 2\n"
 
 
 @pytest.mark.parametrize(
@@ -302,39 +245,18 @@ LAST_LINE = "  - {axis: z, at: [1, 1], direction: both, dx_um: []}\n"
         ("machine: paper", "machine: other", ["machine", "another machine", "'paper'", "'other'"]),
         ("name: by hand\n", "", ["name", "missing"]),
         ("2026-01-31", "31.1.2026", ["date", "ISO 8601", "31.1.2026"]),
-        ("2026-01-31", "'2026-02-30'", ["date", "ISO 8601", "2026-02-30"]),
-        ("2026-01-31", "2026", ["date", "ISO 8601", "found 2026"]),
-        ("2026-01-31", "yesterday", ["date", "ISO 8601", "yesterday"]),
         (DIGEST, DIGEST[1:], ["sources[0].sha256", "64", "laser.csv", DIGEST[1:10]]),
-        (DIGEST, DIGEST.upper(), ["sources[0].sha256", "lower-case"]),
-        (DIGEST, "g" * 64, ["sources[0].sha256", "hexadecimal", "gggg"]),
-        ("{file: laser.csv,", "{file: laser.csv, size: 3,", ["sources[0].size", "not a known key", "3"]),
-        ("valid_box_mm", "valid_box", ["valid_box", "no unit", "valid_box_mm"]),
         ("[200, 200, 550]]", "[200, 200, 350]]", ["valid_box", "lowest", "0.35"]),
-        ("[200, 200, 550]]", "[200, 200]]", ["valid_box_mm", "2×3"]),
-        ("residual_um: 4.2", "residual_um: .nan", ["held_out_residual_um", "finite", "nan"]),
         ("residual_um: 4.2", "residual_um: -1", ["held_out_residual", "negative", "-1e-06"]),
         ("threshold_um: 3", "threshold_um: -3", ["reversal_threshold", "negative", "-3e-06"]),
         ("base_deviation_um", "base_deviation_m", ["structure.base_deviation", "±50 mm", "unit", "5.5"]),
-        ("[1, 2, 3], ", "", ["structure.base_deviation_um", "6×3", "5×3"]),
-        ("[10, 20, 30, 40, 50, 60]", "[10, 20]", ["struts.offset_um", "shape 6"]),
-        ("[10, 20, 30, 40, 50, 60]", "a lot", ["struts.offset_um", "number", "a lot"]),
         ("pitch_ppm: 12", "pitch_percent: 50", ["struts", "0.50", "allowed 0.2"]),
-        ("backlash_mm: 0.01", "backlash_mm: -0.01", ["struts.backlash", "negative", "-1e-05"]),
-        ("[5, 5, 5, 5, 5, 4]", "0", ["struts.period", "above zero", "0.0"]),
-        ("knots_mm: [330, 880]", "knots_mm: [880, 330]", ["struts.map_knots", "increasing", "0.88"]),
-        ("knots_mm: [330, 880]", "knots_mm: [330, 600, 880]", ["struts.map_values", "(6, 3)", "(6, 2)"]),
-        ("thermal:\n", "thermal:\n  tool_expansion_ppm_per_K: 5\n", ["thermal.tool_expansion_ppm_per_K", "5"]),
-        ("thermal:\n  platform_expansion_ppm_per_K: 23.1", "thermal:", ["thermal", "mapping"]),
-        ("grid_x_mm: [-200, 200]", "grid_x_mm: [200, -200]", ["field.grid_x", "increasing", "0.2"]),
         ("  probe_mm", "  outside: guess\n  probe_mm", ["field.outside", "hold, refuse", "guess"]),
         ("axis: z, at: [0, 0]", "axis: w, at: [0, 0]", ["field.lines[0].axis", "x, y, z", "'w'"]),
         ("direction: forward", "direction: up", ["field.lines[1].direction", "forward, backward, both", "up"]),
         ("at: [1, 1]", "at: [1, 2]", ["field.lines[4].at", "0…1 and 0…1", "[1, 2]"]),
-        ("at: [1, 1]", "at: [-1, 1]", ["field.lines[4].at", "0…1", "[-1, 1]"]),
         ("at: [1, 1]", "at: [1.0, 1]", ["field.lines[4].at", "indices", "[1.0, 1]"]),
         ("at: [1, 1]", "at: [1]", ["field.lines[4].at", "two node indices", "[1]"]),
-        ("at: [1, 1]", "at: [true, 1]", ["field.lines[4].at", "True"]),
         # Largest on −1…1: of 60u mm at its end; 40 + 40 − 40u² mm in the middle, below its coefficients' sum.
         ("dz_um: [1, 2, 3]", "dz_mm: [0, 60]", ["field.lines_z.dz", "±50 mm", "unit", "0.06"]),
         ("dz_um: [1, 2, 3]", "dz_mm: [80, 0, -40]", ["field.lines_z.dz", "±50 mm", "0.08"]),
@@ -345,6 +267,15 @@ LAST_LINE = "  - {axis: z, at: [1, 1], direction: both, dx_um: []}\n"
         ("at: [0, 1], direction: backward", "at: [0, 0], direction: backward", ["lines[2].at", "given twice"]),
         ("direction: backward", "direction: both", ["lines[2].at", "forward line along z", "twice", "[0, 1]"]),
         ("direction: forward", "direction: backward", ["lines[2].at", "backward line along z", "twice"]),
+        *(
+            (WAVE, f"{WAVE}    harmonics:\n    - {harmonic}\n", said)
+            for harmonic, said in (
+                ("{times: 1, cosine_um: 1}", ["struts.wave.harmonics[0].times", "2…4", "found 1"]),
+                ("{times: 2.0, cosine_um: 1}", ["times", "whole number", "2.0"]),
+                ("{times: 2, cosine_m: 1}", ["struts", "allowed 0.2"]),
+                ("{times: 2}\n    - {times: 2}", ["harmonics[1].times", "given twice", "2"]),
+            )
+        ),
     ],
 )
 def test_refused(tmp_path, old, new, said):
@@ -355,12 +286,6 @@ def test_refused(tmp_path, old, new, said):
     assert message.startswith(str(tmp_path / "model.yaml"))
     for part in said:
         assert part in message[len(str(tmp_path)) :]
-
-
-def test_a_polynomial_is_judged_by_its_values(tmp_path):
-    """Coefficients may be larger than any value: 40 − 80u² mm lies within ±40 mm."""
-    field = load(tmp_path, BY_HAND.replace("dz_um: [1, 2, 3]", "dz_mm: [40, 0, -80]")).field
-    assert field.lines[2][0, 0, 0, 2, 2] == pytest.approx(-0.08)
 
 
 def test_one_missing_line_of_a_family_is_named(tmp_path):
@@ -388,7 +313,6 @@ def test_many_nodes_with_few_lines_take_no_memory(tmp_path):
     ("origin", "said"),
     [
         (ModelOrigin(), "date: must be ISO 8601"),
-        (ModelOrigin("2026-13-01"), "date: must be ISO 8601.*2026-13-01"),
         (ModelOrigin("2026-01-31", (("x.csv", "abc"),)), r"sources\[0\].sha256.*64.*x.csv.*abc"),
         (ModelOrigin("2026-01-31", (), np.nan), "held_out_residual.*nan"),
     ],
@@ -401,21 +325,11 @@ def test_a_model_without_provenance_is_not_written(tmp_path, origin, said):
     assert path.read_text() == "the old one"
 
 
-def test_a_file_that_cannot_be_written_says_so(tmp_path):
-    with pytest.raises(InputFileError, match="cannot be written"):
-        save_model(MachineModel("paper", origin=ORIGIN), tmp_path / "nowhere" / "m.yaml")
-    assert not os.listdir(tmp_path)
-
-
-@fixed
-@given(seeds)
-def test_names_of_every_kind_come_back(tmp_path_factory, seed):
-    """Text that YAML would take for something else (no, 1.5, null, a date, colons) stays text."""
-    rng = np.random.default_rng(seed)
-    words = ["no", "1.5", "null", "2026-01-31", "a: b", "- x", "#1", "0400", "é µ 漢", "'", '"', "!x", "&a", "*b"]
-    name, note, file = (" ".join(rng.choice(words, rng.integers(1, 4))) for _ in range(3))
-    model = MachineModel("paper", name, origin=ModelOrigin("2026-01-31", ((file, DIGEST),), None, note))
-    assert_equal(there_and_back(model, tmp_path_factory.getbasetemp(), PAPER), model)
+def test_names_of_every_kind_come_back(tmp_path):
+    """Text that YAML would take for something else stays text."""
+    for word in ("no", "1.5", "null", "2026-01-31", "a: b", "- x", "#1", "0400", "é µ 漢", "'", '"', "!x", "&a", "*b"):
+        model = MachineModel("paper", word, origin=ModelOrigin("2026-01-31", ((word, DIGEST),), None, word))
+        assert_equal(there_and_back(model, tmp_path, PAPER), model)
 
 
 def test_a_file_cut_off_anywhere_is_refused(tmp_path):

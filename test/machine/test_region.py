@@ -48,19 +48,6 @@ def test_readings_that_are_added_never_make_it_smaller(seed: int) -> None:
     np.testing.assert_array_equal(more.point, few.point)
 
 
-def test_a_ball_bar_beside_a_tracker_does_not_shrink_it() -> None:
-    """60 poses of a tracker, tilted, in a box of 0.2 m; then level ones on circles of 30 mm."""
-    poses = drawn(np.random.default_rng(1), 60, 0.1, 8.0)
-    angles = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
-    circle = 0.03 * np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
-    level = [Pose(np.array([0.0, 0.0, 0.45]) + np.roll(p, n), np.eye(3)) for n in range(3) for p in circle]
-    alone, both = (space_of(part) for part in (poses, poses + level))
-    assert alone.measured is not None
-    assert both.measured is not None
-    np.testing.assert_array_equal(both.measured.box, alone.measured.box)
-    assert (np.ptp(both.measured.box, axis=0) > 0.18).all()
-
-
 def test_the_promise_is_made_where_the_model_says_that_it_was_measured() -> None:
     """Poses of the promise, level and tilted, are all inside, and reach within a twentieth of each face."""
     rng = np.random.default_rng(2)
