@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,8 +20,6 @@ from node_helpers import (
     AT_ONCE,
     CONFIG,
     HOME,
-    SENT,
-    Answer,
     Bench,
     Rig,
     closed_form_lengths,
@@ -31,7 +28,6 @@ from node_helpers import (
     near,
 )
 from node_stories import ask, change, place, play, send, warm
-from std_srvs.srv import SetBool, Trigger
 
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
@@ -41,10 +37,8 @@ from hexapod_comp.ros import keep_discovery_local, rclpy_compat
 from hexapod_comp.ros import status as status_module
 from hexapod_comp.ros.compensator import CompensatorNode
 from hexapod_comp.ros.messages import message_pose, pose_message
-from hexapod_comp.ros.parameters import ParameterError
 from hexapod_comp.ros.rclpy_compat import Throttle
-from hexapod_comp.ros.status import ERROR, OK, Flow, HealthReport, Refusals
-from hexapod_comp.ros.strut_drive import StrutDriveNode
+from hexapod_comp.ros.status import ERROR, OK, Flow, HealthReport
 
 ROUNDING = 1e-12
 """Lengths below a metre, a dozen operations: a few 1e-16 m; the wire is exact. Everything real is 1e-9 m."""
@@ -119,34 +113,19 @@ def test_command_velocity_is_the_change_per_time(rig):
 
 # ---- refusals ----
 
-HALF = 0.5, 0.5, 0.5, 0.0
 UPSIDE_DOWN = {"base_cone_deg": 180.0, "platform_cone_deg": 180.0}
 SHORT = {"stroke_mm": [330.0, 509.99]}
 
 BAD = {
     "NaN position": ({}, send(y_m=math.nan), "not_finite", "must be finite"),
-    "infinite position": ({}, send(z_m=math.inf), "not_finite", "must be finite"),
-    "minus infinite position": ({}, send(x_m=-math.inf), "not_finite", "must be finite"),
-    "position beyond arithmetic": ({}, send(x_m=1e300), "not_finite", "not finite"),
-    "NaN quaternion": ({}, send(q=(0.0, math.nan, 0.0, 1.0)), "not_finite", "must be finite"),
-    "infinite quaternion": ({}, send(q=(0.0, 0.0, 0.0, math.inf)), "not_finite", "must be finite"),
     "zero quaternion": ({}, send(q=(0.0,) * 4), "quaternion", "norm 1 within 0.001, not 0"),
-    "long quaternion": ({}, send(q=(0.0, 0.0, 0.0, 1.002)), "quaternion", "not 1.002"),
-    "short quaternion": ({}, send(q=HALF), "quaternion", "not 0.866"),
     "unknown frame": ({}, send(frame="map"), "frame_id", "one of base, work, not 'map'"),
-    "no frame": ({}, send(frame=""), "frame_id", "one of base, work, not ''"),
     "old stamp": ({}, send(later=-2.0), "stamp_past", "2.0"),
-    "stamp before 1970": ({}, send(sec=-5), "stamp_past", "old, allowed 0.5 s"),
     "future stamp": ({}, send(later=5.0), "stamp_future", "in the future, allowed 0.5 s"),
     "earlier than the last": ({}, send(later=-0.2), "stamp_order", "earlier than the one before"),
     "out of reach": ({}, send(z_m=2.0), "stroke", "outside the stroke 330.000…880.000 mm"),
-    "base joint plane": ({}, send(z_m=0.0), "stroke", "outside the stroke"),
-    "too large a step": ({}, send(z=10), "step", "in one command, allowed 2 mm"),
-    "base cone": ({"base_cone_deg": 5.0}, send(x=100), "base_cone", "allowed 5°"),
-    "platform cone": ({"platform_cone_deg": 5.0}, send(tilt=20), "platform_cone", "allowed 5°"),
     # Turned by 60° about z the struts come nearer to each other than at home.
     "struts too near": ({"clearance_mm": 220.0}, send(q=(0.0, 0.0, 0.5, 0.75**0.5)), "clearance", "nearest other"),
-    "near a singularity": ({"condition_number": 1.2}, send(tilt=20), "condition", "above 1.2"),
     "turned inside out": (UPSIDE_DOWN, send(z=-800), "assembly", "another assembly mode"),
     # The shipped model corrects 164 µm at home and 170 µm at 20° of tilt.
     "correction": ({"correction_um": 166.0}, send(tilt=20), "correction", "larger than ±166 µm"),
@@ -202,22 +181,12 @@ def row(count: int, *names: str) -> Callable[[Rig], object]:
 SIX = STRUT_NAMES
 BAD_READINGS = {
     "NaN": (struts(3, math.nan), "not_finite", "must be finite"),
-    "infinite": (struts(1, math.inf), "not_finite", "must be finite"),
     "other names": (row(6, *"abcdef"), "strut_names", "named once: strut_1 missing"),
-    "a name twice": (row(6, "strut_1", *SIX[:5]), "strut_names", "once: strut_1 twice"),
-    "no names": (row(6), "strut_names", "strut_1 missing, strut_2 missing"),
-    "five names": (row(6, *SIX[:5]), "strut_names", "named once: strut_6 missing"),
-    "a name too many": (row(6, *SIX, "x"), "strut_count", "each of 7 names"),
     "five positions": (row(5, *SIX), "strut_count", "needs a position, there are 5"),
-    "no positions": (row(0, *SIX), "strut_count", "needs a position, there are 0"),
     "too short": (struts(5, 0.05), "stroke", "strut_5 cannot be 50.000 mm long"),
-    "too long": (struts(6, 0.9), "stroke", "only 328…882 mm"),
-    "negative": (struts(5, -0.5), "stroke", "strut_5 cannot be -500.000 mm long"),
     # Struts 1 and 2 meet at one corner, and their feet are 0.243 m apart: 0.879 and 0.509 m do not meet.
     "no machine stands so": (struts(1, 0.879), "", "strut_states ignored"),
     "an unknown part": (warm("spindle", 25.0), "temperature", "found 'spindle'"),
-    "no part": (warm("", 25.0), "temperature", "found ''"),
-    "no temperature": (warm("strut_1", math.nan), "temperature", "strut_1: must lie within -40…120 °C (found nan)"),
     "kelvins": (warm("base", 293.15), "temperature", "must lie within -40…120 °C (found 293.15)"),
 }
 
@@ -237,49 +206,6 @@ def test_a_bad_reading_is_ignored_counted_and_logged(rig, case):
 
 
 # ---- changes ramp ----
-
-
-def stream(rig: Bench, pose: Pose, last: Answer, until: Callable[[Answer], bool]) -> list[Answer]:
-    """Send a pose again and again until an answer satisfies a condition; return all from `last` on."""
-    answers = [last]
-    while not until(answers[-1]):
-        answers.append(rig.ask(pose))
-        assert len(answers) < 2000, "the ramp does not end"
-    return answers
-
-
-def assert_ramp(answers: list[Answer], rate: float) -> None:
-    """No strut steps: at most rate × time between two commands, every strut monotone to its end.
-
-    The node measures its time between handling two commands. That is longer than from the answer of the
-    first to the sending of the second, and shorter than from the sending of the first to the answer of the
-    second: the latter bounds the step. A pause counts as 20 ms at most.
-    """
-    corrections = np.array([answer.corrections for answer in answers])
-    times = [b.answered_at - a.sent_at for a, b in pairwise(answers)]
-    steps = np.diff(corrections, axis=0)
-    allowed = rate * np.minimum(times, 0.02)
-    assert (np.abs(steps).max(axis=1) <= allowed + ROUNDING).all()
-    direction = np.sign(corrections[-1] - corrections[0])
-    assert (steps * direction >= -ROUNDING).all(), "a strut went back on its way"
-
-
-def test_switching_off_and_on_ramps(rig):
-    """From the full correction to none and back, at 2 mm/s: 164 µm, at most 40 µm of them after a pause."""
-    rate = 0.002
-    rig.compensator(ramp_rate=rate, command_timeout=0.0)
-    full = rig.ask(HOME)
-    assert "ramps out" in rig.enable(False).message
-    off = stream(rig, HOME, full, lambda answer: not answer.corrections.any())
-    assert_ramp(off, rate)
-    np.testing.assert_allclose(off[-1].lengths, closed_form_lengths(HOME), rtol=0.0, atol=ROUNDING)
-    assert values_of(rig, "largest_correction_m", "0.000000000")["compensation"] == "off"
-    assert "ramps in" in rig.enable(True).message
-    back = stream(rig, HOME, off[-1], lambda answer: np.abs(answer.corrections - full.corrections).max() < ROUNDING)
-    assert_ramp(back, rate)
-    assert len(off) > 3
-    assert len(back) > 3
-    values_of(rig, "compensation", "on")
 
 
 def test_switched_off_from_the_start(rig):
@@ -324,9 +250,8 @@ def test_temperatures_of_an_inactive_node_act_on_activation_and_ramp(rig, tmp_pa
     first = rig.ask(HOME)
     assert first.corrections[2] == pytest.approx(grown(5.0), rel=0.0, abs=ROUNDING)
     play(rig, [change("deactivate"), warm("strut_3", 80.0), change("activate")])
-    answers = stream(rig, HOME, first, lambda answer: abs(answer.corrections[2] - grown(60.0)) < ROUNDING)
-    assert_ramp(answers, 0.005)
-    assert len(answers) > 3
+    assert abs(rig.ask(HOME).corrections[2] - first.corrections[2]) <= 0.005 * 0.02 + ROUNDING, "20 ms at most"
+    assert rig.settle(HOME).corrections[2] == pytest.approx(grown(60.0), rel=0.0, abs=ROUNDING)
 
 
 def test_struts_that_swell_follow_the_humidity(rig, tmp_path):
@@ -374,7 +299,6 @@ def test_what_cannot_be_configured_says_why_and_may_be_mended(rig, tmp_path, lim
     assert rig.state() == "unconfigured"
     (line,) = rig.logged("cannot configure")
     assert said in line
-    assert path in line or "correction" in said or limits.get("correction_um")
     node.publish_last_status()
     geometry_file(tmp_path)
     play(rig, [change("configure", "activate"), ask()])
@@ -393,25 +317,6 @@ def test_what_is_given_by_other_names_or_types(rig):
     assert rig.compensator(start=False, comand_timeout=1.0).wants_autostart is True
     (line,) = rig.logged("comand_timeout")
     assert line == "there is no parameter comand_timeout, it is ignored; did you mean command_timeout?"
-
-
-@pytest.mark.parametrize(
-    ("kind", "parameter", "text"),
-    [
-        (CompensatorNode, {"ramp_rate": 2.0}, "ramp_rate"),
-        (CompensatorNode, {"ramp_rate": 2}, "ramp_rate: must lie in 1e-06 to 1 m/s, not 2"),
-        (CompensatorNode, {"require_feedback": "yes"}, "require_feedback: must be bool, not 'yes'"),
-        (CompensatorNode, {"marker_rate": True}, "marker_rate: must be float, not True"),
-        (StrutDriveNode, {"rate": 0.0}, "rate"),
-        (StrutDriveNode, {"rate": 5000}, "rate: must lie in 1 to 2000 Hz, not 5000"),
-        (StrutDriveNode, {"truth_seed": 1.5}, "truth_seed: must be int, not 1.5"),
-        (StrutDriveNode, {"fault_stuck_strut": 9}, "fault_stuck_strut"),
-    ],
-)
-def test_parameter_out_of_range_or_of_another_type_is_refused(rig, kind, parameter, text):
-    with pytest.raises(ParameterError, match=r"^parameter ") as caught:
-        rig.add(kind, False, parameter)
-    assert text in str(caught.value)
 
 
 # ---- diagnostics ----
@@ -442,16 +347,6 @@ def test_log_lets_one_line_per_cause_and_second_through(monkeypatch):
     assert [throttle.allow(cause, "it") for cause in causes] == said
 
 
-def test_counters_by_reason():
-    refusals = Refusals()
-    for reason, now in (("step", 1.0), ("stroke", 2.0), ("step", 3.0)):
-        refusals.add(reason, f"{reason} at {now}", now)
-    assert refusals.values() == {"refused": "3", "refused.step": "2", "refused.stroke": "1"}
-    assert (refusals.last_reason, refusals.last_text) == ("step", "step at 3.0")
-    assert refusals.recent(3.9)
-    assert not refusals.recent(4.1)
-
-
 def test_rate_and_age_of_a_flow(monkeypatch):
     """250 events in the 2 s since it was made: 125 a second."""
     monkeypatch.setattr(status_module, "time", SimpleNamespace(monotonic=lambda: 10.0))
@@ -475,9 +370,9 @@ def test_report_is_due_on_change_and_once_a_second():
 # ---- markers and mirror ----
 
 
-def test_markers_show_the_machine_as_it_stands(rig):
-    """Struts run from base joints to platform joints: their drawn lengths are the closed form's."""
-    rig.compensator(model_file="ideal")
+def test_markers_show_the_machine_as_it_stands(rig, tmp_path):
+    """Drawn lengths are the closed form's. Correction −offset: −100 µm is blue, +100 µm red, beyond as at the end."""
+    rig.compensator(model_file=model_file(tmp_path, struts={"offset_um": [100.0, -100.0, -50.0, 0.0, 300.0, 0.0]}))
     pose = near(HOME, (0.01, 0.0, 0.02), 3.0)
     rig.ask(pose)
     rig.seen["compensator/markers"].clear()
@@ -494,18 +389,6 @@ def test_markers_show_the_machine_as_it_stands(rig):
     points = np.array([[p.x, p.y, p.z] for p in struts.points]).reshape(6, 2, 3)
     lengths = np.linalg.norm(points[:, 1] - points[:, 0], axis=1)
     np.testing.assert_allclose(lengths, closed_form_lengths(pose), rtol=0.0, atol=1e-11)
-    assert len(struts.colors) == 12
-    assert all((c.r, c.g, c.b) == (1.0, 1.0, 1.0) for c in struts.colors), "no correction is white"
-
-
-def test_strut_markers_are_coloured_by_correction(rig, tmp_path):
-    """Correction −offset: −100 µm is blue, +100 µm red, +50 µm half way, beyond as at the end."""
-    path = model_file(tmp_path, struts={"offset_um": [100.0, -100.0, -50.0, 0.0, 300.0, 0.0]})
-    rig.compensator(model_file=path)
-    rig.ask(HOME)
-    rig.seen["compensator/markers"].clear()
-    rig.until(lambda: rig.seen["compensator/markers"], "markers")
-    struts = rig.seen["compensator/markers"][0].markers[0]
     colours = np.array([[c.r, c.g, c.b] for c in struts.colors[::2]])
     expected = [[0, 0, 1], [1, 0, 0], [1, 0.5, 0.5], [1, 1, 1], [0, 0, 1], [1, 1, 1]]
     np.testing.assert_allclose(colours, expected, atol=1e-6)  # float32 on the wire
@@ -541,16 +424,6 @@ def test_discovery_stays_on_this_machine_unless_told_otherwise(monkeypatch, envi
     keep_discovery_local()
     assert os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") == found
     monkeypatch.delenv("ROS_AUTOMATIC_DISCOVERY_RANGE", raising=False)
-
-
-def test_standard_messages_on_the_topics_of_the_readme(rig):
-    nodes = rig.compensator(publish_array=True, command_input="struts"), rig.drive()
-    found = {end.topic_name: end.msg_type for node in nodes for end in (*node.publishers, *node.subscriptions)}
-    wanted = {f"/{topic}": kind for topic, kind in SENT.items() if topic != "tool_pose_command"}
-    assert wanted.items() <= found.items()
-    services = {service.service_name: service.srv_type for service in nodes[0].services}
-    assert services["/compensator/enable_compensation"] is SetBool
-    assert services["/compensator/reload_model"] is services["/compensator/reset"] is Trigger
 
 
 def test_a_bare_start_corrects_nothing_and_says_so(rig):

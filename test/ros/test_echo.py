@@ -34,12 +34,9 @@ def test_struts_are_in_mm_and_corrections_in_um():
     assert len(keyed("/strut_corrections", message)) == 6  # struts at rest have no speeds to show
     message.velocity = [0.0, 0.012, 0.0, 0.0, 0.0, 0.0]
     assert keyed("/strut_commands", message)["strut_2_speed_mm_s"] == pytest.approx(12.0)
+    others = JointState(name=["strut_1", "strut_1_universal"], position=[0.5, 0.1])
+    assert keyed("/joint_states", others)["position[1]"] == 0.1
     assert keyed("/strut_commands_array", Float64MultiArray(data=[0.5] * 6))["strut_6_mm"] == pytest.approx(500.0)
-
-
-def test_other_joints_are_shown_as_they_are():
-    message = JointState(name=["strut_1", "strut_1_universal"], position=[0.5, 0.1])
-    assert keyed("/joint_states", message)["position[1]"] == 0.1
 
 
 def test_a_pose_is_in_mm_and_the_papers_angles():
@@ -160,8 +157,5 @@ def test_a_topic_that_nobody_publishes_is_refused_with_a_close_one(ros_context, 
     error = capfd.readouterr().err
     assert "nobody publishes /strut_comands" in error
     assert "did you mean /strut_commands" in error
-
-
-def test_what_is_no_topic_name_is_refused(isolated_ros, capfd):
     assert cli.main(["echo", "strut commands"]) == 2
     assert "'strut commands' is not a valid topic name" in capfd.readouterr().err

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import runpy
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -16,20 +15,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 import yaml
 from hal_stand_in import StandInHal
 from launch_stand_in import LaunchFile
-from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
-from node_helpers import CONFIG, HOME, Bench, Rig, closed_form_lengths, model_file
+from node_helpers import CONFIG, HOME, Rig, closed_form_lengths, model_file
 from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import DescribeParameters
-from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from std_msgs.msg import UInt64
-from std_srvs.srv import SetBool, Trigger
 
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
@@ -39,7 +33,7 @@ from hexapod_comp.ros.client import LoopClient
 from hexapod_comp.ros.compensator import CompensatorNode
 from hexapod_comp.ros.instrument import InstrumentNode
 from hexapod_comp.ros.mover import MoverNode
-from hexapod_comp.ros.parameters import Taken
+from hexapod_comp.ros.parameters import ParameterError, Taken
 from hexapod_comp.ros.process import QUIET, RosSession
 from hexapod_comp.ros.recorder import BagRecorder
 from hexapod_comp.ros.strut_drive import StrutDriveNode
@@ -75,14 +69,6 @@ def test_what_is_taken_at_configure_is_refused_until_a_cleanup(rig):
     rig.ask(HOME, "table")
 
 
-def test_frames_are_held_against_each_other_whichever_is_set(rig):
-    rig.compensator(start=False)
-    for name, value in (("base_frame", "work"), ("work_frame", "base")):
-        result = rig.set_parameter(COMPENSATOR, name, value)
-        assert not result.successful
-        assert "work_frame: must differ from base_frame" in result.reason
-
-
 @pytest.mark.parametrize(
     ("name", "value", "reason"),
     [
@@ -91,6 +77,8 @@ def test_frames_are_held_against_each_other_whichever_is_set(rig):
         ("ramp_rate", "fast", "must be float, not 'fast'"),
         ("ramp_rate", None, "must be float, not None"),
         ("autostart", False, "read-only"),
+        ("work_frame", "base", "work_frame: must differ from base_frame"),
+        ("use_sim_time", True, "use_sim_time: is false for as long as the node runs; set it at the start"),
     ],
 )
 def test_a_value_that_is_not_allowed_is_refused_and_changes_nothing(rig, name, value, reason):
@@ -101,6 +89,25 @@ def test_a_value_that_is_not_allowed_is_refused_and_changes_nothing(rig, name, v
     assert not result.successful
     assert reason in result.reason
     assert node.get_parameter(name).value == before
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "text"),
+    [
+        (CompensatorNode, {"ramp_rate": 2}, "parameter ramp_rate: must lie in 1e-06 to 1 m/s, not 2"),
+        (CompensatorNode, {"require_feedback": "yes"}, "parameter require_feedback: must be bool, not 'yes'"),
+        (CompensatorNode, {"marker_rate": True}, "parameter marker_rate: must be float, not True"),
+        (CompensatorNode, {"model_folder": "/nowhere"}, "parameter model_folder: '/nowhere' is not a folder"),
+        (CompensatorNode, {"base_frame": "a", "work_frame": "a"}, "work_frame: must differ from base_frame, 'a'"),
+        (CompensatorNode, {"command_input": "both"}, "command_input: must be one of poses, struts, not 'both'"),
+        (CompensatorNode, {"joint_names": ["a"] * 6}, "joint_names: must be 6 different names"),
+        (StrutDriveNode, {"fault_stuck_strut": 9}, "parameter fault_stuck_strut"),
+        (LinuxcncBridgeNode, {"units": "cm"}, "parameter units: must be one of mm, inch, not 'cm'"),
+    ],
+)
+def test_what_cannot_be_does_not_start(rig, kind, parameters, text):
+    with pytest.raises(ParameterError, match=text):
+        rig.add(kind, False, parameters, **({"hal": StandInHal()} if kind is LinuxcncBridgeNode else {}))
 
 
 def test_rates_and_timeouts_change_at_once(rig):
@@ -242,6 +249,7 @@ LATCHED = {
     "linuxcnc_bridge": set(),
 }
 """For late subscribers."""
+READINGS = {"/strut_states", "/temperatures", "/humidity", "/gravity", "/wrench", "/outside"}
 STATES = {"/strut_states", "/tool_pose_estimate", "/nominal_strut_states", "/tool_pose_true"}
 
 
@@ -268,14 +276,10 @@ def test_default_subscribers_hear_all_that_is_published(rig: Rig, name: str) -> 
             assert (end.qos_profile.depth, end.qos_profile.history) == (queue, HistoryPolicy.KEEP_LAST), end.topic_name
             reading = name == "compensator" and end.topic_name == "/strut_states"
             assert end.qos_profile.reliability == (ReliabilityPolicy.BEST_EFFORT if reading else RELIABLE)
+        if name == "compensator" and end.topic_name in READINGS:
+            assert "ERROR" not in str(qos_check_compatible(BEST_EFFORT, end.qos_profile)[0]), end.topic_name
     kept = {end.topic_name for end in node.publishers if end.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL}
     assert kept == LATCHED[name]
-
-
-def test_readings_are_heard_from_best_effort_publishers_too(rig: Rig) -> None:
-    heard = {end.topic_name: end.qos_profile for end in made(rig, "compensator").subscriptions}
-    for topic in ("/strut_states", "/temperatures", "/humidity", "/gravity", "/wrench", "/outside"):
-        assert "ERROR" not in str(qos_check_compatible(BEST_EFFORT, heard[topic])[0]), topic
 
 
 def test_what_is_named_can_be_overridden_and_nothing_else(rig: Rig) -> None:
@@ -349,17 +353,6 @@ def opened(witness: Node, node: str, namespace: str) -> dict[str, set[str]]:
         "request": witness.get_client_names_and_types_by_node,
     }
     return {right: {name for name, _ in ask(node, namespace or "/")} for right, ask in asked.items()}
-
-
-def test_form() -> None:
-    """What sros2 wants: its version, enclaves only, and every right an ALLOW."""
-    root = ET.parse(POLICY, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True))).getroot()
-    assert root.tag == "policy"
-    assert root.get("version") == "0.2.0"
-    assert [child.tag for child in root] == ["enclaves"]
-    assert {child.tag for child in root.find("enclaves")} == {"enclave"}
-    groups = root.findall(".//topics") + root.findall(".//services")
-    assert {value for group in groups for value in group.attrib.values()} == {"ALLOW"}
 
 
 def test_nobody_else_may_move_the_machine() -> None:
@@ -441,45 +434,6 @@ def test_who_only_listens_may_and_opens_nothing_more(tmp_path: Path) -> None:
     others |= {"/gravity", "/wrench", "/outside"}
     by_input = {"/strut_setpoints", "/nominal_strut_states"}  # with command_input: struts
     assert witness["subscribe"] == said | others | by_input
-
-
-LIFECYCLE = ("change_state", "get_state", "get_available_transitions", "get_transition_graph")
-"""What ``ros2 lifecycle`` (ros2cli 0.32, Jazzy) asks nodes for: ``list`` the third, with -a the last; ``set`` the
-third, then the first; ``get`` the second."""
-
-
-def tool_nodes(context: Context, machines: tuple[str, ...]) -> Iterator[Node]:
-    """Make what the tools of Jazzy make: its name, its services, and its clients.
-
-    ``ros2 topic``, ``node``, ``lifecycle`` and ``param``: ros2cli/node/direct.py; ``ros2 param``'s client is rclpy's
-    own. ``ros2 service call``: ros2service/verb/call.py, named after the service's type.
-    """
-    direct = rclpy.create_node(TOOLS.replace("*", "4711"), context=context, start_parameter_services=False)
-    for machine in machines:
-        AsyncParameterClient(direct, machine)
-        for name in LIFECYCLE:
-            kind = {"change_state": ChangeState, "get_state": GetState}.get(name, GetAvailableTransitions)
-            direct.create_client(kind, f"{machine}/{name}")
-    yield direct
-    for kind in (SetBool, Trigger):
-        yield rclpy.create_node(TOOLS.replace("*", f"requester_std_srvs_{kind.__name__}"), context=context)
-
-
-def test_the_operator_may_all_that_the_ros2_tools_open(ros_context: Context, capfd: pytest.CaptureFixture[str]) -> None:
-    """Nothing less: a tool ends when one of its clients cannot be made. Nothing more: what else nobody asks for."""
-    operator = read_policy()["operator"].allowed
-    machines = ("compensator", "strut_drive", "linuxcnc_bridge")
-    wanted: dict[str, set[str]] = {right: set() for right in RIGHTS}
-    with Bench(ros_context, capfd) as rig:
-        for node in tool_nodes(ros_context, machines):
-            rig.until(lambda node=node: "/rosout" in opened(rig.witness, node.get_name(), "")["publish"], "a tool")
-            for right, names in opened(rig.witness, node.get_name(), "").items():
-                wanted[right] |= {name.replace(f"/{node.get_name()}/", f"/{TOOLS}/") for name in names}
-            node.destroy_node()
-    own = {f"/compensator/{name}" for name in ("enable_compensation", "reload_model", "reset", "get_travel")}
-    assert wanted["request"] == operator["request"] - own
-    assert wanted["publish"] == operator["publish"]
-    assert wanted["reply"] == operator["reply"]
 
 
 def test_the_launch_file_names_the_enclaves_of_the_policy(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -64,7 +64,7 @@ def settled(rig: Rig) -> np.ndarray:
 def test_the_struts_follow_gravity_and_wrench(rig: Rig, tmp_path: Path) -> None:
     """Parameter, topic, force at the platform and the same at the tool, hold: each ends where the model says."""
     tilted, wrench = (0.0, 5.0, -8.4), [40.0, -20.0, 60.0, 0.0, 3.0, 0.0]
-    started(rig, tmp_path, gravity=[1.0, 0.0, -9.7])
+    started(rig, tmp_path, gravity=[1.0, 0.0, -9.7], outside_timeout=0.3)
     pose = load_geometry("paper").platform_pose(HOME)
     np.testing.assert_array_equal(settled(rig), commands(Loading.of([1.0, 0.0, -9.7]), pose))
     publish_gravity(rig, *tilted)
@@ -82,6 +82,7 @@ def test_the_struts_follow_gravity_and_wrench(rig: Rig, tmp_path: Path) -> None:
     np.testing.assert_array_equal(settled(rig), commands(Loading.of([0.0, 0.0, -9.8], wrench), pose))
     rig.nodes[0].set_parameters([Parameter("gravity_dead_band", value=0.1)])
     publish_gravity(rig, 0.05, 0.0, -9.8)
+    rig.until_status(WARN, "gravity, wrench stale")
     np.testing.assert_array_equal(settled(rig), commands(Loading.of([0.0, 0.0, -9.8], wrench), pose))
 
 
@@ -90,7 +91,6 @@ def test_the_struts_follow_gravity_and_wrench(rig: Rig, tmp_path: Path) -> None:
     [
         ("gravity", [0.0, 0.0, -1.0], "base", "gravity: must be 9…10.6 m/s² in all, not 1"),
         ("gravity", [0.0, 0.0, -9.8], "work", "gravity: frame_id must be base, not 'work'"),
-        ("gravity", [0.0, 0.0, math.nan], "base", "gravity: must be 9…10.6 m/s² in all, not nan"),
         ("wrench", [math.inf, 0.0, 0.0, 0.0, 0.0, 0.0], "platform", "wrench: must be six finite numbers"),
         ("wrench", [0.0] * 6, "base", "wrench: frame_id must be platform or tool, not 'base'"),
     ],
@@ -104,14 +104,6 @@ def test_what_cannot_be_is_ignored_and_named(
     values = rig.until_status(ERROR, "bad feedback")
     assert text in values["last_bad_feedback"]
     np.testing.assert_array_equal(settled(rig), before)
-
-
-def test_gravity_that_falls_silent_is_said_and_stays(rig: Rig, tmp_path: Path) -> None:
-    started(rig, tmp_path, outside_timeout=0.3)
-    publish_gravity(rig, 0.0, 5.0, -8.4)
-    tilted = settled(rig)
-    assert rig.until_status(WARN, "gravity stale")["gravity_m_s2"] == "0.000, 5.000, -8.400"
-    np.testing.assert_array_equal(settled(rig), tilted)
 
 
 # ---- outside numbers ----
@@ -169,7 +161,6 @@ def test_the_struts_follow_outside_numbers(rig: Rig, tmp_path: Path) -> None:
     ("names", "numbers", "text"),
     [
         (["elevation"], [45.0], "outside.elevation: the table holds elevation 0 to 90 deg; is the unit right?"),
-        (["elevation"], [math.nan], "outside.elevation: must be finite"),
         (["elevation", "rotator"], [0.3], "outside: has 2 names for 1 positions"),
         (["azimuth"], [0.3], "outside: must name elevation or rotator, not 'azimuth'"),
     ],

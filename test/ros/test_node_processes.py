@@ -17,11 +17,10 @@ from rclpy.context import Context
 
 from hexapod_comp.linuxcnc import bridge as bridge_module
 from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
-from hexapod_comp.ros import base, received_signals
 from hexapod_comp.ros import compensator as compensator_module
+from hexapod_comp.ros import received_signals
 from hexapod_comp.ros.compensator import CompensatorNode
 from hexapod_comp.ros.process import ENDED_WITHIN
-from hexapod_comp.ros.strut_drive import StrutDriveNode
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -100,23 +99,16 @@ def test_a_node_without_anybody_to_print_to_ends_in_order(isolated_ros):
     assert subprocess.run(["sh", "-c", command], env=environment, timeout=60.0, check=False).returncode == 1
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_while_modules_load_ends_a_program_without_a_traceback(tmp_path: Path, number: int):
+def test_a_signal_while_modules_load_ends_a_program_without_a_traceback(tmp_path: Path):
     """Loading takes seconds on a busy computer; here it takes for ever, in small steps as there.
 
     In one long wait a signal would be lost that came just before it: Python looks at it between two steps only.
     """
     (tmp_path / "endless.py").write_text("import time\nprint('loading', flush=True)\nwhile True: time.sleep(0.01)\n")
     program = "from hexapod_comp.ros import start; start('endless')"
-    process = subprocess.Popen(
-        [sys.executable, "-c", program],
-        env={**os.environ, "PYTHONPATH": f"{ROOT}:{tmp_path}"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
+    process = script(program, tmp_path)  # where `endless` is
     assert process.stdout.readline() == "loading\n"
-    process.send_signal(number)
+    process.send_signal(signal.SIGTERM)
     rest, _ = process.communicate(timeout=STOP_WITHIN)
     assert (process.returncode, rest) == (0, "")
 
@@ -165,8 +157,7 @@ print(*sorted(name for name in sys.modules if name.partition(".")[0] in ("scipy"
 # ---- streams and topics that cannot be had ----
 
 
-@pytest.mark.parametrize("closed", [(2,), (1, 2), (0, 1, 2)])
-def test_closed_streams_are_opened_again(closed: tuple[int, ...]) -> None:
+def test_closed_streams_are_opened_again() -> None:
     """rclpy's executor switches faulthandler on, which raises without a stderr: the node ended after "ready"."""
     program = (
         "import os, sys\n"
@@ -178,8 +169,7 @@ def test_closed_streams_are_opened_again(closed: tuple[int, ...]) -> None:
         "pipe = os.pipe()\n"
         "sys.exit(7 if min(pipe) > 2 else 1)\n"
     )
-    shell = " ".join(f"{number}>&-" for number in closed)
-    done = subprocess.run(["sh", "-c", f'exec "$0" -c "$1" {shell}', sys.executable, program], check=False)
+    done = subprocess.run(["sh", "-c", 'exec "$0" -c "$1" 0>&- 1>&- 2>&-', sys.executable, program], check=False)
     assert done.returncode == 7
 
 
@@ -202,8 +192,6 @@ def test_a_hang_up_ends_a_node_as_other_signals_do_unless_it_is_ignored() -> Non
 
 NO_MORE = {
     "requests": (CompensatorNode, compensator_module, "Requests"),
-    "journal": (CompensatorNode, compensator_module, "JournalTopics"),
-    "a drive's sender": (StrutDriveNode, base, "OneSender"),
     "a bridge's reset": (LinuxcncBridgeNode, bridge_module, "CompensatorReset"),
 }
 
@@ -259,9 +247,10 @@ def relayed(body: str, **streams: object) -> subprocess.Popen[bytes]:
 
 
 def test_all_lines_arrive_in_order() -> None:
-    child = relayed("for i in range(20000): write(2, f'{i}\\n')", stderr=subprocess.PIPE)
-    _, said = child.communicate(timeout=60)
-    assert child.returncode == 0
+    body = "os.write(1, b'out'); [write(2, f'{i}\\n') for i in range(20000)]"
+    child = relayed(body, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    out, said = child.communicate(timeout=60)
+    assert (child.returncode, out) == (0, b"out")
     assert said.split() == [b"%d" % i for i in range(20000)]
 
 
@@ -277,22 +266,9 @@ def test_a_reader_that_does_not_read_stops_nobody() -> None:
         os.close(writing)
 
 
-def test_a_reader_that_has_gone_stops_nobody() -> None:
-    reading, writing = os.pipe()
-    os.close(reading)
-    child = relayed("for i in range(4096): write(2, 'x' * 1023 + '\\n')", stderr=writing)
-    os.close(writing)
-    assert child.wait(60) == 0
-
-
 def test_a_closed_stream_and_a_file_are_left_alone(tmp_path) -> None:
     path = tmp_path / "log"
     with path.open("wb") as log:
         child = relayed("os.write(2, b'straight')", stderr=log, preexec_fn=lambda: os.close(1))
         assert child.wait(60) == 0
     assert path.read_bytes() == b"straight"
-
-
-def test_stdout_is_relayed_too() -> None:
-    said = relayed("os.write(1, b'out'); os.write(2, b'err')", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    assert said.communicate(timeout=60) == (b"out", b"err")

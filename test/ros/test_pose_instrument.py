@@ -110,13 +110,9 @@ def test_the_compensation_follows_without_a_step_and_a_reset_takes_it_back(rig, 
     [
         ("frame_id", {"frame_id": "nowhere"}),
         ("stamp_past", {"late": 5.0}),
-        ("stamp_future", {"late": -5.0}),
         ("bad_pose", {"x": math.nan}),
-        ("bad_pose", {"w": 1.1}),
         ("covariance", {"variance": -1.0}),
-        ("covariance", {"variance": math.nan}),
         ("wild_pose", {"x": 1e-3}),
-        ("wild_pose", {"x": 1e300}),
     ],
 )
 def test_what_is_no_reading_moves_nothing_and_is_named(rig, tmp_path, reason, changes):
@@ -133,15 +129,6 @@ def test_what_is_no_reading_moves_nothing_and_is_named(rig, tmp_path, reason, ch
     rig.until_status(OK, "running")
 
 
-def test_an_overtaken_reading_is_rejected(rig, tmp_path):
-    started(rig, tmp_path)
-    say = instrument(rig).say
-    measured(rig, say, 3)
-    say()
-    say(late=0.1)
-    rig.until_status(WARN, "measured poses rejected: stamp_order")
-
-
 def test_a_drift_beyond_the_limit_is_held_and_an_instrument_that_falls_silent_is_said(rig, tmp_path):
     started(rig, tmp_path, **{"fusion.limit": 5e-6})
     say = instrument(rig).say
@@ -152,10 +139,13 @@ def test_a_drift_beyond_the_limit_is_held_and_an_instrument_that_falls_silent_is
     rig.until_status(WARN, "no measured pose counts")
 
 
-def test_a_second_instrument_is_not_heard_and_stops_nothing(rig, tmp_path, stranger):
+def test_an_overtaken_reading_and_a_second_instrument_stop_nothing(rig, tmp_path, stranger):
     started(rig, tmp_path)
     say = instrument(rig).say
     measured(rig, say, 3)
+    say()
+    say(late=0.1)
+    rig.until_status(WARN, "measured poses rejected: stamp_order")
     stranger.create_publisher(PoseWithCovarianceStamped, TOPIC, RELIABLE)
     rig.until(lambda: "tool_pose_measured ignored: several_publishers" in rig.status().message, "both named")
     rig.ask(HOME)
@@ -174,29 +164,3 @@ def test_a_machine_without_feedback_is_measured_beside_its_commands(rig, tmp_pat
         rig.ask(HOME)
     rig.step(0.1)
     assert off(rig) == pytest.approx(1e-5, abs=1e-6)
-
-
-def test_nothing_steps_whatever_the_instrument_says(rig, tmp_path):
-    """Two hundred messages, good, wild, late, NaN, doubled: no correction changes by more than the ramp."""
-    started(rig, tmp_path, **{"fusion.compensate": True, "ramp_rate": 1e-4})
-    say, rng = instrument(rig).say, np.random.default_rng(5)
-    wrong = [
-        {"x": math.nan},
-        {"x": 1e300},
-        {"w": 0.5},
-        {"late": 0.3},
-        {"late": 3.0},
-        {"late": -3.0},
-        {"variance": -1.0},
-    ]
-    rows = []
-    for _ in range(200):
-        size = float(rng.choice([0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1.0]))
-        kind = rng.integers(3)
-        measured(rig, say, 1, size * rng.standard_normal(), **(rng.choice(wrong) if kind == 0 else {}))
-        if kind == 1:
-            say(1e-5)
-            say(1e-5, late=0.001)
-        rows.append(rig.seen["strut_corrections"][-1].position.tolist())
-    assert np.abs(np.diff(rows, axis=0)).max() <= 1e-4 * 0.02 + 1e-12  # ramps count 20 ms of a pause at most
-    assert int(rig.values()["rejected_poses"]) > 50

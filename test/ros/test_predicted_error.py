@@ -24,7 +24,7 @@ from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros import requests, worker
-from hexapod_comp.ros.requests import PredictedError, error_message
+from hexapod_comp.ros.requests import PredictedError
 from hexapod_comp.ros.status import WARN
 
 STANDING, ALIGNED = "compensator/predicted_error", "compensator/predicted_error_aligned"
@@ -82,35 +82,22 @@ def test_without_a_fit_the_covariance_is_nan_never_zero(rig):
     np.testing.assert_allclose([q.x, q.y, q.z, q.w], turn, atol=1e-12)
 
 
-def test_nothing_is_worked_out_while_nobody_listens(bench, tmp_path, monkeypatch):
-    """No process at all, until somebody subscribes; and it goes a while after they have left."""
+def test_a_process_begins_with_a_listener_is_started_anew_when_it_dies_and_ends_with_the_last(
+    bench, tmp_path, monkeypatch
+):
+    """Killed whenever it may be at work: one that dies without work is started anew, without a word."""
+    monkeypatch.setattr(requests, "TRY_AGAIN_AFTER", (0.3, 60.0))
     monkeypatch.setattr(worker, "IDLE_AFTER", 0.5)
     node = bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
     bench.ask(small.paper().home)
-    beside = node._requests._worker
+    beside, predicted, seen = node._requests._worker, node._requests._predicted, bench.seen[STANDING]
     node._requests.update(1e12)
     assert beside.process is None
-    subscription = bench.witness.create_subscription(
-        PoseWithCovarianceStamped, STANDING, bench.seen[STANDING].append, RELIABLE
-    )
-    bench.until(lambda: bench.seen[STANDING], "predicted error", STARTED)
-    process = beside.process
-    bench.witness.destroy_subscription(subscription)
-    bench.until(lambda: process.poll() is not None, "the end of the process")
-    assert beside.process is None
-
-
-def test_a_process_that_dies_is_said_and_started_anew(bench, tmp_path, monkeypatch):
-    monkeypatch.setattr(requests, "TRY_AGAIN_AFTER", (0.3, 60.0))
-    node = bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
-    bench.ask(small.paper().home)
-    listen(bench, STANDING)
-    bench.until(lambda: bench.seen[STANDING], "predicted error", STARTED)
-    beside, predicted = node._requests._worker, node._requests._predicted
+    subscription = bench.witness.create_subscription(PoseWithCovarianceStamped, STANDING, seen.append, RELIABLE)
+    bench.until(lambda: seen, "predicted error", STARTED)
     first = beside.process.pid
 
     def warned() -> bool:
-        """Kill the process whenever it may be at work: one that dies without work is started anew, without a word."""
         if predicted._busy and beside.process is not None:
             beside.process.kill()
         return "no predicted error: the process beside the node" in bench.message()
@@ -118,10 +105,14 @@ def test_a_process_that_dies_is_said_and_started_anew(bench, tmp_path, monkeypat
     bench.until(warned, "the warning", STARTED)
     assert bench.status().level == WARN
     bench.ask(small.paper().home)
-    before = len(bench.seen[STANDING])
-    bench.until(lambda: len(bench.seen[STANDING]) > before, "predicted errors again", STARTED)
-    assert beside.process.pid != first
+    before = len(seen)
+    bench.until(lambda: len(seen) > before, "predicted errors again", STARTED)
+    process = beside.process
+    assert process.pid != first
     bench.until(lambda: "no predicted error" not in bench.message(), "the end of the warning")
+    bench.witness.destroy_subscription(subscription)
+    bench.until(lambda: process.poll() is not None, "the end of the process")
+    assert beside.process is None
 
 
 def test_a_process_that_fails_every_time_is_tried_less_and_less_often(monkeypatch):
@@ -163,11 +154,3 @@ def test_a_new_model_is_predicted_with(rig, tmp_path):
     rig.until(lambda: rig.seen[STANDING][-1].pose.pose.position.z > 1.5 * before, "the new error", STARTED)
     assert rig.seen[STANDING][-1].pose.pose.position.z == pytest.approx(2.0 * before, rel=1e-3)
     assert not math.isnan(rig.seen[STANDING][-1].pose.covariance[0])  # its own posterior, not the old model's
-
-
-def test_a_message_holds_a_small_motion() -> None:
-    """Half a turn about z is (0, 0, 1, 0)."""
-    message = error_message([1.0, 2.0, 3.0, 0.0, 0.0, math.pi], None, "work", 5_000_000_007)
-    q = message.pose.pose.orientation
-    np.testing.assert_allclose([q.x, q.y, q.z, q.w], [0.0, 0.0, 1.0, 0.0], atol=1e-15)
-    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (5, 7)

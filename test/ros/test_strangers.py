@@ -15,7 +15,6 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from geometry_msgs.msg import PoseStamped
 from hal_stand_in import StandInHal
 from lifecycle_msgs.srv import ChangeState
 from node_helpers import HOME, RELIABLE, Bench, Stranger, closed_form_lengths
@@ -127,8 +126,6 @@ def broken(*_: object, **__: object) -> None:
     ("what", "owner", "method"),
     [
         ("tool_pose_command", "compensator", "step"),
-        ("strut_states", "compensator", "estimate"),
-        ("temperatures", "compensator", "set_temperature"),
         ("check_state", "_status", "problem"),
         ("matching of tool_pose_command", "_status", "update"),
     ],
@@ -140,8 +137,6 @@ def test_a_callback_that_raises_is_counted_and_said_and_the_node_goes_on(rig, mo
     with monkeypatch.context() as patch:
         patch.setattr(getattr(node, owner), method, broken)
         rig.send(HOME)
-        rig.feed(closed_form_lengths(HOME))
-        rig.publish("temperatures", Temperature(temperature=20.0, header=pose_message(HOME, "base").header))
         rig.add_publisher("tool_pose_command") if what.startswith("matching") else None
         rig.until(lambda: what in node.guard.values()["last_callback_error"], "the error to be caught")
     values = rig.until_status(ERROR, "error in a callback")
@@ -178,10 +173,6 @@ def test_the_guard_of_the_spin_loop_holds_whatever_comes():
 # ---- what they send is shown on one line, short, and is not kept ----
 
 
-def strange_pose(text: str) -> PoseStamped:
-    return pose_message(HOME, text)
-
-
 def strange_struts(text: str) -> JointState:
     return JointState(name=[text, *STRUT_NAMES[1:]], position=[0.5] * 6)
 
@@ -193,7 +184,7 @@ def strange_temperature(text: str) -> Temperature:
 
 
 DOORS = {
-    "frame_id": ("compensator", "tool_pose_command", strange_pose),
+    "frame_id": ("compensator", "tool_pose_command", lambda text: pose_message(HOME, text)),
     "measured": ("compensator", "strut_states", strange_struts),
     "sensor": ("compensator", "temperatures", strange_temperature),
     "commanded": ("strut_drive", "strut_commands", strange_struts),
@@ -201,14 +192,13 @@ DOORS = {
 }
 
 
-@pytest.mark.parametrize("text", [FORGED, HUGE], ids=["forged", "huge"])
 @pytest.mark.parametrize("door", DOORS)
-def test_text_in_a_message_neither_forges_a_line_nor_fills_anything(rig, door, text):
+def test_text_in_a_message_neither_forges_a_line_nor_fills_anything(rig, door):
     name, topic, message = DOORS[door]
     NODES[name](rig)
     publisher = rig._publishers.get(topic) or rig.witness.create_publisher(JointState, topic, RELIABLE)
     counter = "bad_feedback" if topic in ("strut_states", "temperatures") else "refused"
-    stranger = message(text)
+    stranger = message(HUGE)
     for count in range(1, 4):
         if isinstance(stranger, JointState):
             stranger.header.stamp = rig.now()
@@ -280,12 +270,11 @@ def test_a_flood_of_refused_requests_gives_a_line_a_second(bench):
     assert int(bench.nodes[0].guard.values()["refused_requests"]) >= 300
 
 
-@pytest.mark.parametrize("parameter", ["geometry_file", "model_file", f"modell_file{FORGED}"])
-def test_names_of_files_and_parameters_do_not_forge_a_line(rig, tmp_path, parameter):
-    rig.compensator(start=False, **{parameter: str(tmp_path / f"{FORGED}.yaml")})
-    misspelt = parameter.startswith("modell")
-    assert rig.change("configure") is misspelt
-    assert rig.logged("there is no parameter modell_file" if misspelt else "cannot configure: ")
+def test_names_of_files_and_parameters_do_not_forge_a_line(rig, tmp_path):
+    rig.compensator(start=False, **{"model_file": str(tmp_path / f"{FORGED}.yaml"), f"modell_file{FORGED}": "x"})
+    assert not rig.change("configure")
+    assert rig.logged("there is no parameter modell_file")
+    assert rig.logged("cannot configure: ")
     assert_harmless(rig)
 
 

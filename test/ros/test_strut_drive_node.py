@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 import time
 
@@ -121,14 +120,6 @@ def test_noise_and_rate_are_those_that_were_asked_for(rig):
 # ---- the hidden truth ----
 
 
-def test_truth_from_a_file(rig, tmp_path):
-    """All struts 100 µm longer than told lift a level platform by 100 µm · L/z, to first order."""
-    rig.drive(**{**EXACT, "truth_file": model_file(tmp_path, struts={"offset_um": 100.0})})
-    rig.until(lambda: rig.seen["tool_pose_true"], "a pose")
-    command(rig, AT_HOME)
-    until_tool_at(rig, near(HOME, (0.0, 0.0, 100e-6 * AT_HOME[0] / 0.4)).position, 1e-7)
-
-
 def test_a_plant_with_physics_gives_under_its_weight(rig):
     """30 kg on six struts of 20 N/µm: mg / Σ k sin² at home, then elsewhere; the encoders see nothing of it."""
     pytest.importorskip("mujoco", reason="no mujoco-core (make test: from Python 3.11 on)")
@@ -168,26 +159,6 @@ def test_true_pose_is_in_base_whatever_the_work_frame(rig, tmp_path):
 
 # ---- what it refuses and reports ----
 
-HALF = np.full(6, 0.5)
-BAD = {
-    "NaN": (np.where(np.arange(6) == 1, math.nan, 0.5), STRUT_NAMES, "not_finite"),
-    "infinite": (np.where(np.arange(6) == 5, math.inf, 0.5), STRUT_NAMES, "not_finite"),
-    "a name twice": (HALF, ("strut_2", *STRUT_NAMES[1:]), "strut_names"),
-    "five positions": (HALF[:5], STRUT_NAMES, "strut_count"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_commands_are_refused_counted_and_logged(machine, case):
-    lengths, names, reason = BAD[case]
-    command(machine, lengths, names)
-    values = machine.until_status(ERROR, f"refusing commands: {reason}", NODE)
-    assert (values["refused"], values[f"refused.{reason}"], values["commands"]) == ("1", "1", "0")
-    assert len(machine.logged(f"command refused ({reason})")) == 1
-    equal(newest(machine), AT_HOME)
-    command(machine, AT_TARGET)
-    until_at(machine, AT_TARGET)
-
 
 def test_travel_stop_is_reported(rig, tmp_path):
     """Strut 3 is sent 20 mm beyond its longest of 520 mm; the drive stands at the stop and says so."""
@@ -219,14 +190,6 @@ def test_lost_encoder_reads_nan_and_the_machine_goes_on(machine):
     until_tool_at(machine, TARGET.position)
 
 
-def test_dropped_feedback(rig):
-    rig.drive(fault_feedback_drop=1.0, **EXACT)
-    rig.until(lambda: len(rig.seen["tool_pose_true"]) > 10, "true poses")
-    assert not rig.seen["strut_states"]
-    play(rig, [setting("fault_feedback_drop", 0.0, NODE)])
-    rig.until(lambda: rig.seen["strut_states"], "readings")
-
-
 def test_delayed_feedback_is_old(rig):
     """With a delay of 100 ms, the encoders still read home when the tool has long begun to move."""
     rig.drive(fault_feedback_delay=0.1, **EXACT)
@@ -246,21 +209,6 @@ def test_jump_knocks_once_and_is_pulled_back(machine):
     machine.seen["strut_states"].clear()
     machine.until(lambda: len(machine.seen["strut_states"]) > 5, "readings")
     assert all(abs(message.position[5] - AT_HOME[5]) < 1e-9 for message in machine.seen["strut_states"])
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "text"),
-    [
-        ("fault_stuck_strut", 7, "Min: 0, Max: 6, value: 7"),
-        ("fault_feedback_delay", math.nan, "fault_feedback_delay"),
-        ("fault_encoder_lost", 2.0, "must be int, not 2.0"),
-        ("rate", 10.0, "parameter rate: is taken at configure, and the node is active; set it after a cleanup"),
-    ],
-)
-def test_what_cannot_be_set_is_refused(machine, name, value, text):
-    result = machine.set_parameter(NODE, name, value)
-    assert not result.successful
-    assert text in result.reason
 
 
 # ---- lifecycle ----

@@ -13,7 +13,6 @@ import rclpy
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 
-from hexapod_comp.ros.compensator import CompensatorNode
 from hexapod_comp.ros.rclpy_compat import Alarm
 
 
@@ -45,38 +44,4 @@ def test_a_flood_of_rates_moves_neither_ticks_nor_timers(executor, ros_context):
     assert 35 <= len(ticks) <= 58, "90 to 110 Hz for half a second, on a busy computer"
     assert np.diff([began, *ticks, time.monotonic()]).max() < 0.1
     assert len(checks) >= 6
-    node.destroy_node()
-
-
-def test_a_rate_of_zero_rests_and_another_goes_on_from_the_last_tick(executor, ros_context):
-    node = rclpy.create_node("ticking", context=ros_context)
-    executor.add_node(node)
-    ticks = []
-    ticker = Alarm(node, lambda: ticks.append(time.monotonic()), 0.0)
-    spin(executor, 0.03)
-    assert not ticks
-    ticker.set_rate(1000.0)
-    spin(executor, 0.03)
-    assert ticks
-    ticker.set_rate(0.0)
-    spin(executor, 0.005)
-    count = len(ticks)
-    spin(executor, 0.03)
-    assert len(ticks) == count
-    ticker.close()
-    node.destroy_node()
-
-
-def test_no_timer_of_a_node_is_reset_when_a_parameter_is_set(executor, ros_context, monkeypatch):
-    """rclpy's timers, by the one way to reset them: whatever parameter is set, none is."""
-    node = CompensatorNode(context=ros_context)
-    executor.add_node(node)
-    node.trigger_configure()
-    resets = []
-    monkeypatch.setattr(rclpy.timer.Timer, "reset", lambda timer: resets.append(timer))
-    monkeypatch.setattr(rclpy.timer.Timer, "cancel", lambda timer: resets.append(timer))
-    for name in ("heartbeat_rate", "marker_rate"):
-        for rate in (5.0, 0.0, 7.0):
-            assert node.set_parameters([rclpy.parameter.Parameter(name, value=rate)])[0].successful
-    assert not resets
     node.destroy_node()

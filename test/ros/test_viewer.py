@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import shutil
 import socket
-import subprocess
 import sys
-import time
 from http.client import HTTPConnection
-from pathlib import Path
 
-import matplotlib.image
 import numpy as np
 import pytest
 import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from helpers import long_test
 from node_helpers import HOME, closed_form_lengths, model_file, near
 from sensor_msgs.msg import JointState
 from test_workspace_pictures import RINGS, SECTORS, layers, mesh
@@ -169,7 +163,7 @@ def test_without_viser_the_verb_says_what_to_install(monkeypatch, capsys):
     assert "pip install viser" in capsys.readouterr().err
 
 
-def test_an_address_that_cannot_be_had():
+def test_a_page_shows_the_machine_and_an_address_that_cannot_be_had_is_named():
     """Nothing else is taken in its place, and nothing hangs."""
     pytest.importorskip("viser", reason="the page needs viser")
     geometry = load_geometry("paper.yaml")
@@ -177,6 +171,13 @@ def test_an_address_that_cannot_be_had():
     try:
         port = int(page.address.rpartition(":")[2])
         assert page._server.request_share_url() is None
+        shown = View(platform=Pose([0.0, 0.0, 0.5], np.eye(3)), corrections=1e-6 * OFFSETS)
+        page.show(shown)
+        np.testing.assert_allclose(page._struts.points, strut_ends(geometry, shown.platform), atol=1e-6)
+        assert page._struts.colors[0].tolist() == [[0, 0, 255]] * 2, "-100 µm is blue"
+        assert "-100.0 µm" in page._words.content
+        page.show(View())
+        assert len(np.unique(page._struts.colors.reshape(-1, 3), axis=0)) == 1, "grey, where it was"
         with pytest.raises(HexapodError, match=f"cannot serve on 127.0.0.1, port {port}: .*in use"):
             WatchPage(geometry, port=port)
     finally:
@@ -195,10 +196,7 @@ def test_an_address_that_cannot_be_had():
         ("machine.shop:8080", "http://machine.shop:8080", True),  # with --host machine.shop
         ("127.0.0.1:8080", "http://evil.example", False),
         ("127.0.0.1:8080", "http://127.0.0.1:3000", False),  # another server on this computer
-        ("127.0.0.1:8080", "null", False),  # a file, or a frame in a sandbox
         ("evil.example:8080", "http://evil.example:8080", False),  # its name was made to mean 127.0.0.1
-        ("evil.example", None, False),
-        ("", None, False),
         ("[::1", None, False),
     ],
 )
@@ -239,63 +237,6 @@ def free_port() -> int:
     """Return a port that nobody has."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         return int(server.getsockname()[1])
-
-
-def screenshot(browser: str, folder: Path, address: str, patience: int) -> list[str]:
-    """Return the command that writes page.png, as the page is after some of the browser's seconds."""
-    options = (
-        "--headless --no-sandbox --disable-dev-shm-usage --use-angle=swiftshader --enable-unsafe-swiftshader "
-        "--no-first-run --disable-background-networking --disable-component-update --disable-sync"
-    )
-    command = [browser, *options.split(), f"--user-data-dir={folder / 'profile'}", "--window-size=1200,1200"]
-    return [*command, f"--virtual-time-budget={patience * 1000}", f"--screenshot={folder / 'page.png'}", address]
-
-
-@long_test
-@pytest.mark.timeout(700)
-def test_the_page_in_a_browser(rig, tmp_path):
-    """Truth: strut 1 is corrected by +100 µm and struts 5 and 6 by −100 and −200 µm, red and blue
-    by the legend, and the compensator
-    runs, in green. The page dims what it renders, so hues count, not brightness."""
-    pytest.importorskip("viser", reason="the page needs viser")
-    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if browser is None:
-        pytest.skip("no Chromium here")
-    model = model_file(tmp_path, struts={"offset_um": OFFSETS.tolist()})
-    rig.drive(truth_file=model)
-    patient = {"max_command_age": 0.0, "command_timeout": 0.0, "max_reading_age": 0.0, "feedback_timeout": 60.0}
-    rig.compensator(model_file=model, **patient)  # the browser takes all there is of the processor
-    watcher, page = watched(rig), WatchPage(load_geometry("paper.yaml"), port=free_port())
-    newest, due = View(), 0.0
-
-    def shown() -> View:
-        nonlocal newest, due
-        if time.monotonic() > due:  # no faster than the rig hears its own messages
-            rig.send(HOME)
-            newest, due = watcher.view(), time.monotonic() + 0.3
-            page.show(newest)
-        return newest
-
-    try:
-        rig.settle(HOME)
-        rig.until(lambda: shown().platform is not None and rig.message() == "running", "the machine", 30.0)
-        for patience in (8, 40, 120):  # on a busy computer the scene comes later than the page
-            command = screenshot(browser, tmp_path, page.address, patience)
-            with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
-                try:
-                    rig.until(lambda process=process: shown() and process.poll() is not None, "the screenshot", 200.0)
-                finally:
-                    process.kill()  # else the end of the with would wait for a browser that hangs
-            pixels = np.rint(255 * matplotlib.image.imread(tmp_path / "page.png")[..., :3]).astype(int)
-            scene, panel = pixels[:, :800], pixels[:, 800:]
-            others = np.stack([np.delete(scene, hue, axis=2).max(axis=2) for hue in (0, 2)], axis=2)
-            coloured = ((scene[..., [0, 2]] > 60) & (scene[..., [0, 2]] > 2 * others)).sum(axis=(0, 1))
-            if (coloured > 400).all():
-                break
-    finally:
-        page.close()
-    assert (coloured > 400).all(), coloured
-    assert (np.abs(panel - [0x3F, 0xB9, 0x50]).max(axis=2) < 30).sum() > 20
 
 
 # ---- shells ----

@@ -80,15 +80,6 @@ def test_views_name_what_the_nodes_publish(rig: Bench) -> None:
             assert (kind, parts[:2]) == ("PoseStamped", ["pose", "position"])
 
 
-def test_every_panel_of_foxglove_has_its_place() -> None:
-    layout = json.loads((VIEWS / "foxglove.json").read_text(encoding="utf-8"))
-
-    def placed(part: Any) -> list[str]:
-        return [part] if isinstance(part, str) else [*placed(part["first"]), *placed(part["second"])]
-
-    assert sorted(placed(layout["layout"])) == sorted(layout["configById"])
-
-
 def test_views_name_frames_of_the_description() -> None:
     """And RViz looks from the frame that the markers are in, by the node's own default."""
     links = {link.get("name") for link in ET.fromstring(urdf(load_geometry("paper"))).iter("link")}
