@@ -134,7 +134,7 @@ def test_every_pose_is_read_as_it_was_sent(sec, nanosec, frame_id, numbers):
 
 def test_nanoseconds_beyond_a_second_are_refused():
     """With the largest seconds they would not fit into the stamp of an answer."""
-    with pytest.raises(CommandError, match=f"nanosec of the stamp must be below 1000000000, not 1000000000"):
+    with pytest.raises(CommandError, match="nanosec of the stamp must be below 1000000000, not 1000000000"):
         read_pose_bytes(serialize_message(pose([0.5] * 7, "base", 2**31 - 1, 10**9)))
 
 
