@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> Result:
     compare = not (args.attach or args.no_compare)  # a real machine's compensation is not switched off as a side effect
     with results.ended_in_order(), started as nodes:
         result = session.run_poses(geometry, nodes, poses, rate, compare, args.namespace)
-    errors, unanswered = report.error_rows(result), result.lost + result.refused
+    errors, unanswered = result.errors(), result.lost + result.refused
 
     def pictures() -> dict[str, Figure]:
         from ..loop.pictures import session_figure

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from ..formats.figures import WITH, WITHOUT, picture_text
 from ..machine.arrays import rms
-from .report import SessionResult
+from .report import ALIGNED, SessionResult
 from .story import Told
 
 matplotlib.rcParams.update({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3})
@@ -18,19 +18,19 @@ FLOOR = 0.01  # lower end of the error axes, µm: a tenth of the drives' steps
 
 def session_figure(result: SessionResult, title: str) -> Figure:
     """Draw the error at each pose: filled with the datum aligned, hollow as the machine stands."""
-    aligned, figure = result.aligned(), Figure(figsize=(9, 5), layout="constrained")
+    figure = Figure(figsize=(9, 5), layout="constrained")
     axes, number = figure.subplots(), np.arange(1, len(result.poses) + 1)
     figure.suptitle(picture_text(title))
-    shown = [("as it is", result, "none")] + ([("datum aligned", aligned, None)] if aligned else [])
-    for datum, one, face in shown:
-        sides = zip(("without", "with compensation"), (WITHOUT, WITH), ("o", "D"), strict=True)
-        for side, (name, colour, marker) in enumerate(sides):
-            errors = [record.errors()[side] for record in one.poses]
-            values = [np.nan if error is None else max(error[0] * 1e6, FLOOR) for error in errors]
-            axes.plot(number, values, marker, color=colour, mfc=face or colour, label=f"{name}, {datum}")
+    for datum, errors in result.errors().items():
+        sides = zip(("without", "with compensation"), (WITHOUT, WITH), ("o", "D"), errors, strict=True)
+        for name, colour, marker, distances in sides:
+            face = colour if datum == ALIGNED else "none"
+            axes.plot(
+                number, np.maximum(distances * 1e6, FLOOR), marker, color=colour, mfc=face, label=f"{name}, {datum}"
+            )
     axes.set(title="Tool error at rest", xlabel="pose", ylabel="µm", yscale="log")
-    axes.set_ylim(top=20.0 * axes.get_ylim()[1])  # room for the titles of the chapters
-    axes.legend()
+    if axes.lines:
+        axes.legend()
     return figure
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -18,13 +18,13 @@ FEWEST_ALIGNED = 6  # a datum removes six numbers, two poses' worth: fewer poses
 # A computer counts as busy when more of its answers are late, or its processes wait for more of the time
 LATE_SHARE, WAITED_SHARE = 0.02, 0.2
 
-# Rigid motions of the commanded poses, and of the tool without and with compensation; None: not known
-Motions = tuple[Pose, "Pose | None", "Pose | None"]
+# Definition of a tool error: as the machine stands, or minus the rigid motion that a new zero removes
+AS_IT_IS, ALIGNED = "as it is", "datum aligned"
 
 
 @dataclass
 class PoseRecord:
-    """Record of one commanded pose; m, rotation matrices; all poses in one frame, ``base`` at first."""
+    """Record of one commanded pose; m, rotation matrices; all poses in one frame, ``work``."""
 
     target: Pose  # commanded pose of the tool
     command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # (6,): compensated strut commands, m
@@ -32,17 +32,6 @@ class PoseRecord:
     estimate: Pose | None = None  # estimated pose of the tool with compensation
     true_without: Pose | None = None  # true pose of the tool without compensation, if known
     true_with: Pose | None = None  # and with it
-
-    def moved(self, motions: Motions) -> PoseRecord:
-        """Return the same with its poses moved."""
-        target, estimate, without, compensated = (
-            None if motion is None or pose is None else motion @ pose
-            for motion, pose in zip(
-                (motions[0], *motions), (self.target, self.estimate, self.true_without, self.true_with), strict=True
-            )
-        )
-        target = target or self.target
-        return replace(self, target=target, estimate=estimate, true_without=without, true_with=compensated)
 
     def errors(self) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
         """Return (position error m, rotation error rad) without and with compensation; None where it is unknown."""
@@ -87,78 +76,50 @@ class SessionResult:
     refusals: dict[str, int] = field(default_factory=dict)  # refused commands by reason
     model: str = ""  # model that the compensator ran
 
-    def _moved(self, motions: Motions) -> SessionResult:
-        return replace(self, poses=[record.moved(motions) for record in self.poses])
+    def distances(self, aligned: bool = False) -> np.ndarray:
+        """Return the tool's distances to its poses without and with compensation, shape (2, n), m; NaN: not measured.
 
-    def seen_from(self, frame: Pose) -> SessionResult:
-        """Return the same in another frame, whose own pose is given in the present one."""
-        inverse = frame.inverse()
-        return self._moved((inverse, inverse, inverse))
+        Aligned: each pass is moved by the rigid motion that fits its poses best; NaN where fewer than
+        :data:`FEWEST_ALIGNED` poses, or poses in a line, do not determine it.
+        """
+        targets, sides = np.array([record.target.position for record in self.poses]), []
+        for name in ("true_without", "true_with"):
+            poses = [getattr(record, name) for record in self.poses]
+            actual = np.array([np.full(3, np.nan) if pose is None else pose.position for pose in poses])
+            if aligned:
+                enough = len(targets) >= FEWEST_ALIGNED and np.isfinite(actual).all()
+                datum = best_motion(actual, targets) if enough else None
+                actual = np.full_like(targets, np.nan)
+                if datum is not None:
+                    actual = datum.position + np.array([pose.position for pose in poses]) @ datum.rotation.T
+            sides.append(np.linalg.norm(actual - targets, axis=1))
+        return np.array(sides)
 
-    def aligned(self) -> SessionResult | None:
-        """Return the same with the datum aligned: each pass by the rigid motion that fits its poses best."""
-        # None with fewer than FEWEST_ALIGNED poses, with poses in a line, or when the tool was not measured
-        targets = np.array([record.target.position for record in self.poses])
-
-        def datum(actual: list[Pose | None]) -> Pose | None:
-            seen = [pose.position for pose in actual if pose is not None]
-            return None if len(seen) < max(len(targets), FEWEST_ALIGNED) else best_motion(np.array(seen), targets)
-
-        after = datum([record.true_with for record in self.poses])
-        before = datum([record.true_without for record in self.poses])
-        return None if after is None else self._moved((Pose.identity(), before, after))
-
-
-# Definition of a tool error: as the machine stands, or minus the rigid motion that a new zero removes
-AS_IT_IS, ALIGNED = "as it is", "datum aligned"
-
-
-@dataclass(frozen=True)
-class ErrorRow:
-    """The tool's error at rest, by one definition."""
-
-    datum: str  # :data:`AS_IT_IS` or :data:`ALIGNED`
-    count: int  # poses
-    without: np.ndarray | None  # errors of the pass without compensation, m: distances to the pose
-    compensated: np.ndarray  # errors of the pass with it, m
-
-    def cells(self) -> list[str]:
-        """Return the row of a table as text: datum, RMS without and with, largest, removed share, poses."""
-        before, left = None if self.without is None else rms(self.without), rms(self.compensated)
-        return [
-            f"at rest, {self.datum}",
-            "–" if before is None else number(before * 1e6, 2),
-            number(left * 1e6, 3),
-            number(float(self.compensated.max()) * 1e6, 3),
-            "–" if before is None else f"{100.0 * (1.0 - left / before):.2f} %",
-            f"RMS of {self.count} poses",
-        ]
-
-    def record(self) -> dict[str, object]:
-        """Return the row for programs."""
-        without, compensated = (
-            None if errors is None else {"rms_um": rms(errors) * 1e6, "max_um": float(errors.max()) * 1e6}
-            for errors in (self.without, self.compensated)
-        )
-        return {"what": "at rest", "datum": self.datum, "without": without, "with": compensated}
+    def errors(self) -> dict[str, np.ndarray]:
+        """Return the :meth:`distances` of a measured tool by definition, first with the datum aligned if possible."""
+        both = {ALIGNED: self.distances(aligned=True), AS_IT_IS: self.distances()}
+        return {datum: distances for datum, distances in both.items() if np.isfinite(distances[1]).any()}
 
 
-def error_rows(result: SessionResult) -> list[ErrorRow]:
-    """Return the tool's errors, first with the datum aligned where that is possible."""
-    taken = [(datum, one) for datum, one in ((ALIGNED, result.aligned()), (AS_IT_IS, result)) if one is not None]
-    rows = []
-    for datum, one in taken:
-        pairs = [record.errors() for record in one.poses]
-        before, after = (np.array([error[0] for pair in pairs if (error := pair[n]) is not None]) for n in (0, 1))
-        if len(after):
-            rows.append(ErrorRow(datum, len(pairs), before if len(before) else None, after))
-    return rows
+def _size(distances: np.ndarray) -> dict[str, float] | None:
+    """Return RMS and largest of the measured distances, µm."""
+    known = distances[np.isfinite(distances)] * 1e6
+    return {"rms_um": rms(known), "max_um": float(known.max())} if len(known) else None
 
 
-def error_table(rows: Sequence[ErrorRow]) -> str:
+def error_table(errors: Mapping[str, np.ndarray]) -> str:
     """Return the table of errors: RMS without and with compensation, removed share, largest residual; µm."""
-    header = ["tool error, µm", "without", "with", "largest", "removed", ""]
-    return aligned(header, [row.cells() for row in rows])
+    rows = []
+    for datum, distances in errors.items():
+        before, left = map(_size, distances)
+        if left is not None:
+            rms_before, removed = "–", "–"
+            if before is not None:
+                removed = f"{100.0 * (1.0 - left['rms_um'] / before['rms_um']):.2f} %"
+                rms_before = number(before["rms_um"], 2)
+            sizes = number(left["rms_um"], 3), number(left["max_um"], 3)
+            rows.append([f"at rest, {datum}", rms_before, *sizes, removed, f"RMS of {distances.shape[1]} poses"])
+    return aligned(["tool error, µm", "without", "with", "largest", "removed", ""], rows)
 
 
 def pose_block(title: str, record: PoseRecord) -> str:
@@ -185,9 +146,9 @@ def pose_block(title: str, record: PoseRecord) -> str:
     return "\n".join(lines)
 
 
-def summary(result: SessionResult, rows: Sequence[ErrorRow]) -> str:
+def summary(result: SessionResult, errors: Mapping[str, np.ndarray]) -> str:
     """Return the closing lines: model, errors without and with it, latency, commands."""
-    lines = [f"model {result.model}", *([error_table(rows)] if rows else [])]
+    lines = [f"model {result.model}", *([error_table(errors)] if errors else [])]
     if len(result.answering.latencies):
         p50, p95, worst = np.percentile(result.answering.latencies, [50, 95, 100]) * 1e3
         lines.append(f"latency, command to answer: median {p50:.2f} ms, 95 % {p95:.2f} ms, longest {worst:.2f} ms")
@@ -207,8 +168,8 @@ def busy_text(answering: Answering) -> str:
     )
 
 
-def as_json(rows: list[Row], result: SessionResult, errors: Sequence[ErrorRow]) -> dict[str, object]:
-    """Return a session for programs: tool poses in ``work``, and its :func:`~.report.error_rows`."""
+def as_json(rows: list[Row], result: SessionResult, errors: Mapping[str, np.ndarray]) -> dict[str, object]:
+    """Return a session for programs: tool poses in ``work``, and its errors."""
     answering, poses = result.answering, list[dict[str, object]]()
     for row, record in zip(rows, result.poses, strict=True):
         without, compensated = (
@@ -235,6 +196,9 @@ def as_json(rows: list[Row], result: SessionResult, errors: Sequence[ErrorRow]) 
         "late_answers": answering.late,
         "longest_latency_ms": answering.longest * 1e3,
         "waited_for_processor_s": answering.waited,
-        "errors": [row.record() for row in errors],
+        "errors": [
+            {"what": "at rest", "datum": datum, "without": _size(without), "with": _size(compensated)}
+            for datum, (without, compensated) in errors.items()
+        ],
         "poses": poses,
     }

@@ -235,7 +235,13 @@ def run_poses(
                 busy = busy_text(watch.answering(client, rate))
                 raise NoAnswerError(f"{error}; {busy}" if busy else str(error)) from error
         result.answering = watch.answering(client, rate, result.answering.latencies)
-        return result.seen_from(geometry.work)
+        in_work = geometry.work.inverse()
+        for record, pose in zip(result.poses, poses, strict=True):
+            record.target = pose
+            for name in ("estimate", "true_without", "true_with"):
+                if (seen := getattr(record, name)) is not None:
+                    setattr(record, name, in_work @ seen)
+        return result
     finally:
         client.close()
 
