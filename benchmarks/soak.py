@@ -17,7 +17,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -31,7 +31,7 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_msgs.msg import UInt64
 
-from hexapod_comp.loop.processes import PrivateDomain, processor_wait
+from hexapod_comp.loop.processes import PrivateDomain
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.base import COMMAND_QOS, EVENT_QOS
 from hexapod_comp.ros.messages import nanoseconds_of, pose_message
@@ -208,7 +208,12 @@ class Commander:
 
     def _run_queue(self) -> dict[str, float]:
         """Return how long the threads of each process have waited for a processor up to now, s."""
-        return {name: processor_wait(pid) for name, pid in {**self._pids, "client": os.getpid()}.items()}
+        waited = dict.fromkeys((*self._pids, "client"), 0.0)
+        for name, pid in {**self._pids, "client": os.getpid()}.items():
+            for path in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+                with suppress(OSError, IndexError):  # a thread that has just ended
+                    waited[name] += int(path.read_text(encoding="ascii").split()[1]) * 1e-9
+        return waited
 
 
 def _resident(pid: int) -> int:

@@ -15,11 +15,10 @@ from typing import Any
 from ..errors import CommandError, HexapodError, InputFileError
 from ..formats.outputs import protected
 from ..formats.texts import run_with_plain_streams
-from .verbs import DESCRIPTION, EPILOG, GONE, VERBS, Verb
+from .verbs import DESCRIPTION, EPILOG, VERBS, Verb
 
 PROGRAM = "hexapod_comp"
 
-ALIASES = {verb.alias: name for name, verb in VERBS.items() if verb.alias}  # old names of verbs, which still work
 NEGATIVE = re.compile(r"-[.\d]")  # a value after an option may begin like this; it is not another option
 
 NUMBERS = re.compile(r"[-+.\d]+(,[-+.\d]+)+")  # numbers typed in place of a file's name
@@ -46,10 +45,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str]) -> int:
     name = arguments[0] if arguments and not arguments[0].startswith("-") else ""
-    if name in GONE:
-        return _fail(f"{name} {GONE[name]}")
-    if name and name not in VERBS and name not in ALIASES:
-        return _fail(f"there is no verb {name!r}{_meant(name, [*VERBS, *ALIASES])}; {PROGRAM} --help lists them")
+    if name and name not in VERBS:
+        return _fail(f"there is no verb {name!r}{_meant(name, VERBS)}; {PROGRAM} --help lists them")
     parser = make_parser()
     if "_ARGCOMPLETE" in os.environ:
         complete(parser)
@@ -57,8 +54,6 @@ def _run(arguments: Sequence[str]) -> int:
         args = parser.parse_args(_with_negative_values(arguments))
     except SystemExit as leaving:  # argparse has printed help or the error
         return leaving.code if isinstance(leaving.code, int) else USAGE_ERROR
-    if args.called != args.verb:
-        print(f"{PROGRAM}: note: {args.called} is now called {args.verb}", file=sys.stderr)
     verb = VERBS[args.verb]
     named = {role: {o.label: getattr(args, o.dest) for o in verb.options if o.role == role} for role in ROLES}
     try:
@@ -154,7 +149,7 @@ class _Version(argparse.Action):
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser; it stores the verb as ``verb``, and the typed name as ``called``."""
+    """Return the parser; it stores the verb's name as ``verb``."""
     raw = argparse.RawDescriptionHelpFormatter
     parser = _Parser(PROGRAM, description=DESCRIPTION, epilog=EPILOG, formatter_class=raw)
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
@@ -164,7 +159,7 @@ def make_parser() -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(
         title="verbs",
         description="\n".join(listed),
-        dest="called",
+        dest="verb",
         metavar="VERB",
         required=True,
         help="VERB --help gives its options, units and an example",
@@ -172,7 +167,6 @@ def make_parser() -> argparse.ArgumentParser:
     for name, verb in VERBS.items():
         own = subparsers.add_parser(
             name,
-            aliases=[verb.alias] * bool(verb.alias),
             description=verb.summary,
             epilog=verb.text,
             formatter_class=raw,
@@ -186,7 +180,6 @@ def make_parser() -> argparse.ArgumentParser:
             if option.keywords.get("default") == []:
                 action.required = False
             action.declared = option
-        own.set_defaults(verb=name)
     return parser
 
 
@@ -213,6 +206,4 @@ def complete(parser: argparse.ArgumentParser) -> None:
         for action in verb._actions:
             if (declared := getattr(action, "declared", None)) is not None and declared.role:
                 action.completer = names
-    argcomplete.autocomplete(
-        parser, exclude=list(ALIASES), default_completer=argcomplete.completers.SuppressCompleter()
-    )
+    argcomplete.autocomplete(parser, default_completer=argcomplete.completers.SuppressCompleter())

@@ -74,11 +74,6 @@ def folder(name: str, text: str, **more: Any) -> Option:
     return Option(name, text, {"metavar": "FOLDER", **more}, "folder")
 
 
-def gone(name: str, now: str) -> Option:
-    """Return an option of an older version, which is refused with its new name."""
-    return Option(name, argparse.SUPPRESS, {"action": Renamed, "const": now, "metavar": "X"})
-
-
 def under(heading: str, *options: Option) -> tuple[Option, ...]:
     return tuple(replace(option, heading=heading) for option in options)
 
@@ -93,13 +88,6 @@ class Assumptions(argparse.Action):
         for block, tolerance in TOLERANCES.items():
             print(f"tolerance of {block} = {tolerance:g}: first guess of its size (the fit estimates it)")
         parser.exit()
-
-
-class Renamed(argparse.Action):
-    """Refuse an option of an older version, and give its new name."""
-
-    def __call__(self, parser: argparse.ArgumentParser, _: object, __: object, option: str | None = None) -> None:
-        parser.error(f"argument {option}: is now {self.const}")
 
 
 class StoreMachine(argparse.Action):

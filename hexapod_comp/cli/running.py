@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> Result:
         lambda: report.as_json(rows, result, errors),
         pictures=pictures,
         code=1 if unanswered else 0,
-        notes=filter(None, [report.busy_text(result.answering)]) if unanswered else (),
+        notes=filter(None, [result.busy]) if unanswered else (),
     )
 
 

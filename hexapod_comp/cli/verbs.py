@@ -9,7 +9,7 @@ from .options import (
     COMPENSATED, DIRECTION, ESTIMATION, FRAMES, JSON, LINE_HELP, LINE_SHAPE, MACHINE, MODEL, NAMESPACE, OUTSIDE,
     POSE_HELP, SEPARATE, SHAPE, TRUTH, WORDS, Assumptions, Option, Rule,
     above_zero, bound, box, choice, count, csv_file, excluded_by,
-    exactly_one, finite, flag, folder, gone, html_file, joint_names, lengths, line, machine, needed_by, outside_numbers,
+    exactly_one, finite, flag, folder, html_file, joint_names, lengths, line, machine, needed_by, outside_numbers,
     pictures, pose, readings, reads, scaled, seed_of, some_of, span, table_out, tilts, times, under, value,
     whole, writes,
 )  # fmt: skip
@@ -24,7 +24,6 @@ class Verb(NamedTuple):
     options: tuple[Option, ...]
     text: str  # help below the options
     rules: tuple[Rule, ...] = ()
-    alias: str = ""  # an old name, which still works
 
 
 DESCRIPTION = """Error compensation for hexapod machine tools: tool poses in, compensated strut lengths out.
@@ -35,9 +34,6 @@ shipped one (paper, paper_machine, …)."""
 
 EPILOG = """Verbs, options and files complete in the shell: pip install argcomplete, then
 eval "$(register-python-argcomplete hexapod_comp)"."""
-
-# removed verbs, and their replacements
-GONE = {"paper": "is `make papers` in the source tree now (python -m examples.papers)"}
 
 CORNERS = "X0,Y0,Z0,X1,Y1,Z1"
 
@@ -51,7 +47,6 @@ LOOP = (
     MACHINE,
     TRUTH,
     value("--rate-hz", float, "HZ", "commands per second (default 250)", default=250.0),
-    gone("--plot", "--pictures FOLDER"),
     JSON,
 )
 
@@ -294,9 +289,6 @@ example:
         (
             MACHINE,
             TRUTH,
-            gone("--rate-hz", "hexapod_comp run --rate-hz"),
-            gone("--model", "hexapod_comp run --model"),
-            gone("--plot", "--pictures FOLDER"),
             JSON,
             seed_of("noise, and of the strut that is knocked"),
             pictures("out"),
@@ -489,7 +481,6 @@ More: doc/measuring.md.
 
 example:
   $ hexapod_comp simulate --campaign campaign_1d --seed 1 --out measured.csv""",
-        alias="measure",
     ),
     "collect": Verb(
         "measuring", "calibration",
@@ -539,7 +530,6 @@ example:
             writes("--certificate", "write a calibration certificate, an HTML page to file or print (scheme joint)",
                    "FILE.html", type=html_file),
             reads("--details", "the certificate's information on instruments, place and people (YAML)"),
-            gone("--covariance", "always written, beside the model, as MODEL.posterior.npz"),
             pictures(),
             JSON,
             reads("--truth", f"errors of the virtual machine that was measured: file, shipped name, {WORDS}",

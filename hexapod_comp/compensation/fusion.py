@@ -32,9 +32,9 @@ class FusionRules:
     """Assumptions about machine and instrument."""
 
     drift_rate: float = 5e-8  # standard deviation that each state gains in a second, m; grows with the root of time
-    initial: float = 5e-6  # standard deviation of each state at the start, m
+    initial_deviation: float = 5e-6  # standard deviation of each state at the start, m
     limit: float = 2e-4  # largest state, m: beyond it the filter holds
-    gate: float = 0.999  # probability that a correct reading passes the gate
+    gate_probability: float = 0.999  # probability that a correct reading passes the gate
     strut_deviation: float = 1e-6  # of a strut's reading, and of the model's residual error, m
     time_deviation: float = 1e-3  # between the stamps of instrument and struts, s
     position_deviation: float = 2e-6  # of the instrument, where its message states no covariance, m
@@ -50,7 +50,7 @@ class DriftFilter:
     def __init__(self, rules: FusionRules, states: int = DRIFT_STATES) -> None:
         self.rules = rules
         self.state: np.ndarray = np.zeros(states)
-        self.covariance: np.ndarray = rules.initial**2 * np.eye(states)
+        self.covariance: np.ndarray = rules.initial_deviation**2 * np.eye(states)
         self.time = math.nan  # of the newest reading, s
         self.chi_square = 0.0  # of the last innovation
 
@@ -71,10 +71,10 @@ class DriftFilter:
         self.chi_square = float(innovation @ np.linalg.solve(spread, innovation))
         from scipy.special import gammaincinv  # a node without fusion need not load SciPy
 
-        allowed = 2.0 * float(gammaincinv(len(innovation) / 2.0, self.rules.gate))
+        allowed = 2.0 * float(gammaincinv(len(innovation) / 2.0, self.rules.gate_probability))
         if not self.chi_square <= allowed:
             off = f"{1e3 * math.hypot(*innovation[:3]):.4g} mm, {1e3 * math.hypot(*innovation[3:]):.4g} mrad"
-            rule = f"{allowed:.3g} (probability {self.rules.gate:g})"
+            rule = f"{allowed:.3g} (probability {self.rules.gate_probability:g})"
             problem = f"the measured pose is {off} from the estimate: chi-square {self.chi_square:.4g}, allowed {rule}"
             raise CommandError("wild_pose", problem)
         gain = np.linalg.solve(spread, observation @ self.covariance).T

@@ -36,17 +36,10 @@ from ..machine.load import Loading
 from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL, parse_model
 from ..machine.outside import read_numbers
-from .compensator import BESIDE_NUMBERS, Compensator
+from .compensator import Compensator
 
 FORMAT = 5  # Version of pages
 READABLE = (4, FORMAT)  # Versions that can be read. Version 4 had one tool and two frames.
-
-# Why older versions cannot be replayed
-OLDER = {
-    1: "does not hold what the compensator consumed, in its order",
-    2: "holds the compensator's state as numbers without names, which another release may order differently",
-    3: "does not hold when each command was received, by which the struts' speed is limited",
-}
 
 # Longest time between two snapshots, s: the cost of a lost message for a replay. A late subscriber receives the ten
 # newest pages; at one every 50 ms a snapshot is among them.
@@ -330,11 +323,9 @@ def _content(text: str) -> dict[str, Any]:
     except ValueError as error:
         raise JournalError(f"not JSON: {error}") from error
     version = content.get("journal") if isinstance(content, dict) else content
-    if isinstance(version, int) and version in OLDER:
-        advice = f"this release reads versions 4 to {FORMAT}. Replay the recording with the release that made it"
-        raise JournalError(f"is of version {int(version)}, which {OLDER[version]}; {advice}")
     if not isinstance(content, dict) or version not in READABLE:
-        raise JournalError(f"must be of version {FORMAT}, not {str(version)[:40]}")
+        advice = "replay a recording with the release that made it"
+        raise JournalError(f"must be of version {' or '.join(map(str, READABLE))}, not {str(version)[:40]}; {advice}")
     return content
 
 
@@ -377,26 +368,25 @@ def _read_entry(content: Any) -> Entry:
     return Entry(int(content["after"]), what, found)
 
 
+def _array(found: Sequence[float | None]) -> np.ndarray:
+    return np.array([_number(value) for value in found])
+
+
+# Readers of what a snapshot holds beside the numbers of the state
+BESIDE: dict[str, Callable[[Any], Any]] = {
+    "temperatures": lambda found: {str(name): float(value) for name, value in found.items()},
+    "lags": lambda found: {str(name): _numbers(values) for name, values in found.items()},
+    "tool": str,
+    "drift": _numbers,
+    "loading": lambda found: Loading.from_numbers(found).numbers(),
+    "outside": read_numbers,
+}
+
+
 def _read_snapshot(content: Any) -> Snapshot:
-    state = _object(_object(content, "snapshot")["state"], "snapshot.state")
-    temperatures = _object(state["temperatures"], "snapshot.state.temperatures").items()
-    lags = _object(state.get("lags", {}), "snapshot.state.lags").items()
-    arrays = {
-        name: np.array([math.nan if v is None else float(v) for v in numbers])
-        for name, numbers in state.items()
-        if name not in BESIDE_NUMBERS
-    }
-    beside = {
-        "temperatures": {key: float(value) for key, value in temperatures},
-        "lags": {name: [float(v) for v in numbers] for name, numbers in lags},
-        "tool": str(state.get("tool", TOOL)),
-    }
-    if "drift" in state:
-        beside["drift"] = [float(value) for value in state["drift"]]
-    if "loading" in state:
-        beside["loading"] = Loading.from_numbers(state["loading"]).numbers()
-    if "outside" in state:
-        beside["outside"] = read_numbers(_object(state["outside"], "snapshot.state.outside"))
+    state = {"lags": {}, "tool": TOOL, **_object(_object(content, "snapshot")["state"], "snapshot.state")}
+    for part in ("temperatures", "lags", "outside"):
+        _object(state.get(part, {}), f"snapshot.state.{part}")
 
     def words(key: str, *required: str) -> dict[str, str]:
         found = {name: str(value) for name, value in _object(content[key], f"snapshot.{key}").items()}
@@ -405,7 +395,7 @@ def _read_snapshot(content: Any) -> Snapshot:
         return found
 
     return Snapshot(
-        state={**arrays, **beside},
+        state={name: BESIDE.get(name, _array)(state[name]) for name in {"temperatures": None, **state}},
         model=words("model", "name", "sha256"),
         geometry=words("geometry", "name", "sha256"),
         frames=words("frames", *ROLES),

@@ -27,7 +27,7 @@ from std_msgs.msg import Bool, UInt64
 from std_srvs.srv import Trigger
 
 from ..compensation.guards import Sample, StampClock, StampGate
-from ..errors import CommandError, HexapodError
+from ..errors import CommandError
 from ..ros.base import COMMAND_QOS, EVENT_QOS, LATCHED_QOS, STATE_QOS, MachineNode
 from ..ros.messages import StrutBytes, StrutReader, stamp_of
 from ..ros.parameters import Program, read_table
@@ -89,8 +89,6 @@ PROGRAM = Program(
 # Time that one update may ramp for, s: a process that was stopped for longer goes on, it does not catch up
 LONGEST_STEP = 0.02
 
-ON_LOSS = ("zero", "hold")  # what the output may do when corrections stop coming: ramp to zero, or stay where it is
-
 ZERO = (0.0,) * 6
 
 
@@ -115,12 +113,7 @@ class CorrectionGuard:
         self._accepted_at = self._updated_at = -math.inf
 
     def follow(self, limit: float, ramp_rate: float, timeout: float, on_loss: str) -> None:
-        """Go by other rules from now on; what has been accepted stays so. Arguments and errors as for the class."""
-        for name, value in (("limit", limit), ("ramp_rate", ramp_rate), ("timeout", timeout)):
-            if not 0.0 < value < math.inf:
-                raise HexapodError(f"{name} must be positive and finite, not {value!r}")
-        if on_loss not in ON_LOSS:
-            raise HexapodError(f"on_loss must be {' or '.join(ON_LOSS)}, not {on_loss!r}")
+        """Go by other rules from now on, all positive; what has been accepted stays so."""
         self._limit, self._ramp_rate, self._timeout = limit, ramp_rate, timeout
         self._holds = on_loss == "hold"
 
@@ -128,20 +121,13 @@ class CorrectionGuard:
         return now - self._accepted_at
 
     def offer(self, correction: Sequence[float], now: float) -> None:
-        """Take a correction as what the output shall become."""
-        values, problem = [float(value) for value in correction], None
-        if len(values) != 6:
-            problem = CommandError("strut_count", f"six corrections are needed, not {len(values)}")
-        for number, value in enumerate(values, start=1):
-            if problem is None and not math.isfinite(value):
-                problem = CommandError("not_finite", f"strut {number}: a correction must be finite, not {value}")
-            elif problem is None and abs(value) > self._limit:
+        """Make six corrections, m, the target of the output; a CommandError if one exceeds the limit, or is NaN."""
+        for number, value in enumerate(correction, start=1):
+            if not abs(value) <= self._limit:
+                self.rejected += 1
                 text = f"correction {value * 1e6:.3f} µm is larger than ±{self._limit * 1e6:g} µm"
-                problem = CommandError("correction", f"strut {number}: {text}")
-        if problem is not None:
-            self.rejected += 1
-            raise problem
-        self._newest, self._accepted_at = values, now
+                raise CommandError("correction", f"strut {number}: {text}")
+        self._newest, self._accepted_at = list(correction), now
         self.accepted += 1
 
     def update(self, now: float, enabled: bool) -> list[float]:
@@ -239,23 +225,6 @@ class CompensatorReset:
         return True
 
 
-class StopInput:
-    def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:
-        self._stopped, self._beat_at, self._options = True, -math.inf, options
-        node.subscribe(Bool, "compensator/stopped", self._on_stopped, LATCHED_QOS)
-        node.subscribe(UInt64, "compensator/heartbeat", self._on_beat, EVENT_QOS)
-
-    def stopped(self, now: float) -> bool:
-        """Return whether the compensator refuses commands, or is silent, at the monotonic time `now`, s."""
-        return self._stopped or now - self._beat_at > self._options["timeout"]
-
-    def _on_stopped(self, message: Bool) -> None:
-        self._stopped = message.data
-
-    def _on_beat(self, _: UInt64) -> None:
-        self._beat_at = time.monotonic()
-
-
 GUARDED = ("limit", "ramp_rate", "timeout", "on_loss")  # the guard's parameters
 NEVER = 1e9  # what the pin `age` shows before the first correction, s
 STANDING = 2e-3  # struts slower than this stand, m/s: no drive lags behind by more than some micrometres then
@@ -288,7 +257,9 @@ class LinuxcncBridgeNode(MachineNode):
         self._hal: HalComponent | None = HalComponent(self._options["component"], PINS, hal)
         self._open_pins(self._hal)
         self._pose_out, self._states_out = PoseStamped(), StrutBytes()
-        self._stop = StopInput(self, self._options)
+        self._stopped, self._beat_at = True, -math.inf  # whether the compensator refuses commands; its last heartbeat
+        self.subscribe(Bool, "compensator/stopped", self._on_stopped, LATCHED_QOS)
+        self.subscribe(UInt64, "compensator/heartbeat", self._on_beat, EVENT_QOS)
         self._hal.ready()
         self._loop = self.every(1.0 / self._options["rate"], self._cycle)
 
@@ -335,6 +306,12 @@ class LinuxcncBridgeNode(MachineNode):
             self._hal = None
         super().destroy_node()
 
+    def _on_stopped(self, message: Bool) -> None:
+        self._stopped = message.data
+
+    def _on_beat(self, _: UInt64) -> None:
+        self._beat_at = time.monotonic()
+
     # ---- the loop ----
 
     def _cycle(self) -> None:
@@ -355,7 +332,7 @@ class LinuxcncBridgeNode(MachineNode):
                 max(map(abs, output)) / self._metres,
                 self._guard.status is GuardStatus.COMPENSATING,
                 self._beat,
-                self._stop.stopped(now),
+                self._stopped or now - self._beat_at > self._options["timeout"],
                 self._guard.accepted % COUNTS,
                 self._refusals.total % COUNTS,
                 self._resets % COUNTS,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import os
 import signal
 import socket
@@ -131,17 +130,6 @@ class NodeProcess:
         output = self.output()
         self.log.unlink(missing_ok=True)
         return code, output
-
-
-def processor_wait(pid: int) -> float:
-    """Return the total time for which the threads of a process have waited for a processor, s; 0 if unknown."""
-    waited = 0
-    for path in glob.glob(f"/proc/{pid}/task/*/schedstat"):
-        try:
-            waited += int(Path(path).read_text(encoding="ascii").split()[1])
-        except (OSError, IndexError):  # a thread that has just ended, or a system that does not report it
-            continue
-    return waited * 1e-9
 
 
 def ros_arguments(parameters: Mapping[str, object], remaps: Mapping[str, str] | None = None) -> Sequence[str]:

@@ -15,8 +15,7 @@ from ..pose import Pose, best_motion, rotation_angle
 
 FEWEST_ALIGNED = 6  # a datum removes six numbers, two poses' worth: fewer poses would hardly leave any error
 
-# A computer counts as busy when more of its answers are late, or its processes wait for more of the time
-LATE_SHARE, WAITED_SHARE = 0.02, 0.2
+LATE_SHARE = 0.02  # A computer counts as busy when a larger share of its answers is late
 
 # Definition of a tool error: as the machine stands, or minus the rigid motion that a new zero removes
 AS_IT_IS, ALIGNED = "as it is", "datum aligned"
@@ -48,28 +47,14 @@ class PoseRecord:
 
 
 @dataclass
-class Answering:
-    """Latency of the loop, and delays of its processes."""
-
-    latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))  # command to answer of the compensated pass, s
-    answered: int = 0  # commands of the whole session that were answered
-    late: int = 0  # those whose answer arrived after the next command was due
-    longest: float = 0.0  # longest time to an answer in the whole session, s
-    elapsed: float = 0.0  # length of the session, s
-    waited: float = 0.0  # total time for which its processes waited for a processor, s
-
-    @property
-    def busy(self) -> bool:
-        """Whether other programs kept the processors: a share of the answers was late, or the processes waited long."""
-        return self.late > LATE_SHARE * self.answered or self.waited > WAITED_SHARE * self.elapsed
-
-
-@dataclass
 class SessionResult:
     """All records of a session."""
 
     poses: list[PoseRecord] = field(default_factory=list)  # the single poses
-    answering: Answering = field(default_factory=Answering)
+    latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))  # command to answer of the compensated pass, s
+    late: int = 0  # answers of the whole session that came after the next command was due
+    longest: float = 0.0  # longest time to an answer, s
+    busy: str = ""  # whether the computer was busy: :func:`busy_text`
     sent: int = 0  # commands of the whole session
     lost: int = 0  # of these neither answered nor refused
     refused: int = 0
@@ -149,28 +134,29 @@ def pose_block(title: str, record: PoseRecord) -> str:
 def summary(result: SessionResult, errors: Mapping[str, np.ndarray]) -> str:
     """Return the closing lines: model, errors without and with it, latency, commands."""
     lines = [f"model {result.model}", *([error_table(errors)] if errors else [])]
-    if len(result.answering.latencies):
-        p50, p95, worst = np.percentile(result.answering.latencies, [50, 95, 100]) * 1e3
+    if len(result.latencies):
+        p50, p95, worst = np.percentile(result.latencies, [50, 95, 100]) * 1e3
         lines.append(f"latency, command to answer: median {p50:.2f} ms, 95 % {p95:.2f} ms, longest {worst:.2f} ms")
     refused = "".join(f", {count} {reason}" for reason, count in sorted(result.refusals.items()))
     lines.append(f"commands: {result.sent} sent, {result.lost} lost, {result.refused} refused{refused}")
     return "\n".join(lines)
 
 
-def busy_text(answering: Answering) -> str:
-    """Return whether and why the computer was busy, as text; empty if it was not."""
-    if not answering.busy:
+def busy_text(every: np.ndarray, rate: float) -> str:
+    """Return whether the computer was busy, by the latencies, s, of all answers at some rate, Hz, as text; empty if it
+    was not."""
+    late = int((every > 1.0 / rate).sum())
+    if late <= LATE_SHARE * len(every):
         return ""
     return (
-        f"the computer was busy: {answering.late} of {answering.answered} answers came after the next command was due, "
-        f"the longest after {answering.longest * 1e3:.0f} ms, and its processes waited {answering.waited:.1f} s in "
-        f"{answering.elapsed:.0f} s for a processor; try again with less going on"
+        f"the computer was busy: {late} of {len(every)} answers came after the next command was due, the longest after "
+        f"{every.max() * 1e3:.0f} ms; try again with less going on"
     )
 
 
 def as_json(rows: list[Row], result: SessionResult, errors: Mapping[str, np.ndarray]) -> dict[str, object]:
     """Return a session for programs: tool poses in ``work``, and its errors."""
-    answering, poses = result.answering, list[dict[str, object]]()
+    poses = list[dict[str, object]]()
     for row, record in zip(rows, result.poses, strict=True):
         without, compensated = (
             None if error is None else {"position_um": error[0] * 1e6, "rotation_urad": error[1] * 1e6}
@@ -192,10 +178,9 @@ def as_json(rows: list[Row], result: SessionResult, errors: Mapping[str, np.ndar
         "sent": result.sent,
         "lost": result.lost,
         "refused": result.refused,
-        "latency_median_ms": np.median(answering.latencies) * 1e3 if len(answering.latencies) else None,
-        "late_answers": answering.late,
-        "longest_latency_ms": answering.longest * 1e3,
-        "waited_for_processor_s": answering.waited,
+        "latency_median_ms": np.median(result.latencies) * 1e3 if len(result.latencies) else None,
+        "late_answers": result.late,
+        "longest_latency_ms": result.longest * 1e3,
         "errors": [
             {"what": "at rest", "datum": datum, "without": _size(without), "with": _size(compensated)}
             for datum, (without, compensated) in errors.items()

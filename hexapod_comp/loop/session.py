@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -24,8 +22,8 @@ from ..machine.model import MachineModel
 from ..machine.model_file import save_model
 from ..machine.trajectory import Path, commanded_in_base, move
 from ..pose import Pose
-from .processes import NodeProcess, PrivateDomain, processor_wait
-from .report import Answering, PoseRecord, SessionResult, busy_text
+from .processes import NodeProcess, PrivateDomain
+from .report import PoseRecord, SessionResult, busy_text
 
 if TYPE_CHECKING:
     from ..ros.client import LoopClient, Sent
@@ -93,26 +91,6 @@ def _latencies(sent: Iterable[Sent]) -> np.ndarray:
     return values[np.isfinite(values)]
 
 
-class Watch:
-    """Times for which the loop's processes work, and wait for a processor, from now on."""
-
-    def __init__(self, nodes: Sequence[NodeProcess]) -> None:
-        self._pids = [os.getpid(), *(node.pid for node in nodes)]
-        self._began, self._waited = time.monotonic(), sum(map(processor_wait, self._pids))
-
-    def answering(self, client: LoopClient, rate: float, latencies: np.ndarray | None = None) -> Answering:
-        """Return the latencies and delays of a client's commands at some rate, Hz, since then."""
-        every, waited = _latencies(client.sent.values()), sum(map(processor_wait, self._pids))
-        return Answering(
-            latencies=np.zeros(0) if latencies is None else latencies,
-            answered=len(every),
-            late=int((every > 1.0 / rate).sum()),
-            longest=float(every.max(initial=0.0)),
-            elapsed=time.monotonic() - self._began,
-            waited=max(0.0, waited - self._waited),  # an ended thread's time is lost
-        )
-
-
 def connect(client: LoopClient, nodes: Sequence[NodeProcess] = (), timeout: float = CONNECT_TIMEOUT) -> None:
     """Wait until the loop answers."""
 
@@ -123,7 +101,7 @@ def connect(client: LoopClient, nodes: Sequence[NodeProcess] = (), timeout: floa
                 raise HexapodError(f"{node.name} ended with code {node.exit_code()}:").with_lines(output)
         return client.connected() and (client.has_true_pose or not nodes)
 
-    client.spin_until(ready, timeout, "compensator and strut drive to answer")
+    client.wait(ready, timeout, "compensator and strut drive to answer")
 
 
 def run_session(
@@ -146,7 +124,9 @@ def run_session(
         session.sent = []
     announce("pass with compensation …")
     session.visit(result.poses, compensated=True)
-    result.answering.latencies = _latencies(session.sent)
+    result.latencies, every = _latencies(session.sent), _latencies(client.sent.values())
+    result.late, result.longest = int((every > 1.0 / rate).sum()), float(every.max(initial=0.0))
+    result.busy = busy_text(every, rate)
     accepted, result.refused = client.counted()
     result.sent = len(client.sent)
     result.lost = max(0, result.sent - accepted - result.refused)
@@ -227,14 +207,13 @@ def run_poses(
     client = loop_client(namespace)
     try:
         connect(client, nodes)
-        watch, targets = Watch(nodes), [geometry.work @ pose for pose in poses]
+        targets = [geometry.work @ pose for pose in poses]
         with tqdm(unit=" commands", disable=None, leave=False, mininterval=0.5) as bar:
             try:
                 result = run_session(client, geometry, targets, rate, compare, bar.update, announce)
             except NoAnswerError as error:
-                busy = busy_text(watch.answering(client, rate))
+                busy = busy_text(_latencies(client.sent.values()), rate)
                 raise NoAnswerError(f"{error}; {busy}" if busy else str(error)) from error
-        result.answering = watch.answering(client, rate, result.answering.latencies)
         in_work = geometry.work.inverse()
         for record, pose in zip(result.poses, poses, strict=True):
             record.target = pose

@@ -37,7 +37,7 @@ class AdaptedMachine(WatchedMachine):
         self._going_on, self._compensator = going_on, compensator
         self._arrived: MoveState | None = None  # at the target of the newest move,
         self._target: tuple[Pose, tuple[Any, ...], dict[str, Any]]  # which was asked for so
-        node = self._session.node
+        node = self.node
         self._reload_model = node.create_client(Trigger, f"{compensator}/reload_model")
         self._set = node.create_client(SetParameters, f"{compensator}/set_parameters")
         self._get = node.create_client(GetParameters, f"{compensator}/get_parameters")
@@ -67,11 +67,11 @@ class AdaptedMachine(WatchedMachine):
                 return self._arrived
 
     def _wait_for_others(self) -> None:
-        self._session.node.get_logger().warning("another client moves the tool: waiting until it stands")
+        self.node.get_logger().warning("another client moves the tool: waiting until it stands")
         while self.last.state not in ("idle", "arrived", "stopped"):
             if not self._going_on():
                 raise MoveError("person", "stopped while another client moved the tool")
-            self._session.spin_once(0.02)
+            self.spin_once(0.02)
 
     def observe(self) -> Observation | None:
         """Observe as a watched machine; anew where another client has moved the tool meanwhile."""
@@ -87,7 +87,7 @@ class AdaptedMachine(WatchedMachine):
         """Have the compensator run a model file, by its ramp; where it refuses, the old model and its name stay."""
         (before,) = self._parameters("model_file")
         for client in (self._reload_model, self._set):
-            self._wait(client.service_is_ready, 10.0, f"the services of {self._compensator}")
+            self.wait(client.service_is_ready, 10.0, f"the services of {self._compensator}")
         wanted = str(path.resolve())
         self._name_model(wanted)
         answer = self._call(self._reload_model, Trigger.Request())
@@ -116,7 +116,7 @@ class AdaptedMachine(WatchedMachine):
         return self._parameters("model_file") == [str(path.resolve())]
 
     def _parameters(self, *names: str) -> list[str]:
-        self._wait(self._get.service_is_ready, 10.0, f"the services of {self._compensator}")
+        self.wait(self._get.service_is_ready, 10.0, f"the services of {self._compensator}")
         return [str(value.string_value) for value in self._call(self._get, GetParameters.Request(names=names)).values]
 
     def _name_model(self, name: str) -> None:
@@ -131,5 +131,5 @@ class AdaptedMachine(WatchedMachine):
         while not future.done():
             if time.monotonic() > end:
                 raise NoAnswerError(f"{client.srv_name} did not answer within {ANSWERED_WITHIN:g} s")
-            self._session.spin_once(0.02)
+            self.spin_once(0.02)
         return future.result()

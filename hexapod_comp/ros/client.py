@@ -8,7 +8,6 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -45,12 +44,11 @@ class Sent:
     correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # shape (6,): The answer, m
 
 
-class LoopClient:
+class LoopClient(RosSession):
     """Commands the compensator and subscribes to all its topics."""
 
     def __init__(self, frame_id: str = "base", namespace: str = "") -> None:
-        self._session = RosSession("hexapod_comp_client", namespace)
-        self.node, self._spin_once, self.close = self._session.node, self._session.spin_once, self._session.close
+        super().__init__("hexapod_comp_client", namespace)
         self._frame_id, self._reader = frame_id, StrutReader()
         self.sent: dict[int, Sent] = {}  # by their stamps, ns
         # positions of the tool, m, and the number of commands sent by then
@@ -111,14 +109,6 @@ class LoopClient:
             raise NoAnswerError(f"no {topic} has been received")
         return message_pose(self._newest[topic])
 
-    def spin_until(self, condition: Callable[[], bool], timeout: float, what: str) -> None:
-        end = time.monotonic() + timeout
-        while not condition():
-            left = end - time.monotonic()
-            if left <= 0.0:
-                raise NoAnswerError(f"waited {timeout:g} s in vain for {what}")
-            self._spin_once(min(left, 0.02))
-
     def connected(self) -> bool:
         """Return whether commands reach a compensator and its answers and pose estimates arrive."""
         return (
@@ -145,11 +135,11 @@ class LoopClient:
             accepted, refused = accepted - accepted_before, refused - refused_before
             if accepted + refused >= len(self.sent) or time.monotonic() > end:
                 return accepted, refused
-            self._spin_once(0.05)
+            self.spin_once(0.05)
 
     def enable(self, enabled: bool) -> None:
         future = self._enable.call_async(SetBool.Request(data=enabled))
-        self.spin_until(future.done, 5.0, "the service enable_compensation")
+        self.wait(future.done, 5.0, "the service enable_compensation")
 
     def send(self, pose: Pose) -> Sent:
         """Send one command and return its record, to which the answer will be added."""
@@ -183,7 +173,7 @@ class LoopClient:
                 raise NoAnswerError(f"a command was refused: {why}" + (f"; {advice}" if advice else ""))
             if time.monotonic() > end:
                 raise NoAnswerError(f"no answer to a command within {timeout:g} s")
-            self._spin_once(0.01)
+            self.spin_once(0.01)
         return entry
 
     def stream(self, path: Path, each: Callable[[int], None] | None = None) -> list[Sent]:
@@ -198,7 +188,7 @@ class LoopClient:
         due = time.monotonic()
         for index, message in enumerate(messages):
             while (left := due - time.monotonic()) > 0.0:
-                self._spin_once(left)
+                self.spin_once(left)
             if entries:
                 entries[-1] = self.wait_for_answer(entries[-1])
             entries.append(self._send(message))
@@ -217,7 +207,7 @@ class LoopClient:
             entry = self.wait_for_answer(self.send(pose))
             next_due = entry.sent_at + 1.0 / rate
             while (left := next_due - time.monotonic()) > 0.0:
-                self._spin_once(left)
+                self.spin_once(left)
             if until():
                 return entry
             if time.monotonic() > end:
@@ -237,9 +227,6 @@ class LoopClient:
             return len(history) == 25 and float(np.ptp(np.array(history), axis=0).max()) < 20e-9
 
         return quiet
-
-
-AnyMachine = TypeVar("AnyMachine", bound="Machine")
 
 
 class MoveError(HexapodError):
@@ -263,7 +250,7 @@ class MoveState:
     ready: bool = True  # the mover knows the machine, and where its tool stands
 
 
-class Machine:
+class Machine(RosSession):
     """A running machine with a mover: moves its tool and waits until it has arrived.
 
     The machine's nodes are in a namespace, and the mover has a name. A NoAnswerError: no mover that is ready was found
@@ -271,34 +258,24 @@ class Machine:
     """
 
     def __init__(self, namespace: str = "", mover: str = "mover") -> None:
-        self._session = RosSession("hexapod_comp_machine", namespace)
+        super().__init__("hexapod_comp_machine", namespace)
         self.state: MoveState | None = None
-        node = self._session.node
+        node = self.node
         self._to = node.create_publisher(PoseStamped, "move_to", EVENT_QOS)
         self._by = node.create_publisher(PoseStamped, "move_by", EVENT_QOS)
         self._stop = node.create_client(Trigger, f"{mover}/stop")
         node.create_subscription(DiagnosticStatus, f"{mover}/state", self._on_state, LATCHED_QOS)
         try:
-            self._wait(self._connected, 10.0, f"the node {mover}, with a compensator and its pose estimate")
+            self.wait(self._connected, 10.0, f"the node {mover}, with a compensator and its pose estimate")
         except NoAnswerError:
             self.close()
             raise
-
-    def __enter__(self: AnyMachine) -> AnyMachine:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     @property
     def last(self) -> MoveState:
         if self.state is None:
             raise NoAnswerError("the mover has not reported a state yet")
         return self.state
-
-    def close(self) -> None:
-        """Leave ROS; a move in progress continues."""
-        self._session.close()
 
     def move(
         self,
@@ -318,7 +295,7 @@ class Machine:
         `timeout`, s, the move is stopped. A MoveError: it was refused or stopped, ``reason`` is the cause. A
         NoAnswerError: the mover did not answer, or the tool had not arrived in time.
         """
-        stamp = self._session.node.get_clock().now()
+        stamp = self.node.get_clock().now()
         message = pose_message(pose, frame_id)
         message.header.stamp = stamp.to_msg()
         asked, seen = stamp.nanoseconds, self.state
@@ -326,7 +303,7 @@ class Machine:
         (self._by if relative else self._to).publish(message)
         end, answer = time.monotonic() + timeout, time.monotonic() + ANSWER_TIMEOUT
         while True:
-            self._session.spin_once(0.02)
+            self.spin_once(0.02)
             state, now = self.state, time.monotonic()
             if state is not seen and state is not None:
                 seen = state
@@ -350,8 +327,8 @@ class Machine:
     def stop(self) -> None:
         """Brake within the struts' limits; returns when the tool stands."""
         future = self._stop.call_async(Trigger.Request())
-        self._wait(future.done, ANSWER_TIMEOUT, "the mover's answer to stop")
-        self._wait(lambda: self.state is not None and self.state.state in ("idle", "arrived", "stopped"), 60.0, "rest")
+        self.wait(future.done, ANSWER_TIMEOUT, "the mover's answer to stop")
+        self.wait(lambda: self.state is not None and self.state.state in ("idle", "arrived", "stopped"), 60.0, "rest")
 
     def _connected(self) -> bool:
         found = self._to.get_subscription_count() and self._by.get_subscription_count()
@@ -370,10 +347,3 @@ class Machine:
             v["refusal"],
             v["ready"] == "true",
         )
-
-    def _wait(self, condition: Callable[[], bool], timeout: float, what: str) -> None:
-        end = time.monotonic() + timeout
-        while not condition():
-            if time.monotonic() > end:
-                raise NoAnswerError(f"waited {timeout:g} s in vain for {what}")
-            self._session.spin_once(0.02)

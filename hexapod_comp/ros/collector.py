@@ -69,7 +69,7 @@ class WatchedMachine(Machine):
         self._warmth: dict[str, float] = {}
         self._gravity: tuple[float, ...] | None = None
         super().__init__(namespace, mover)
-        node = self._session.node
+        node = self.node
         node.create_subscription(PoseStamped, topic, self._on_pose, SENSOR_QOS)
         node.create_subscription(JointState, "strut_states", self._on_struts, NEWEST_QOS)
         node.create_subscription(Temperature, "temperatures", self._on_temperature, SENSOR_QOS)
@@ -141,7 +141,7 @@ class WatchedMachine(Machine):
         self._wants_pose = len(self._own) < len(run.channels)
         if self._own:
             message = pose_message(run.place, "base")
-            message.header.stamp = stamp_of(self._session.node.get_clock().now().nanoseconds)
+            message.header.stamp = stamp_of(self.node.get_clock().now().nanoseconds)
             self._set_up.publish(message)
             self._set_up.wait_for_all_acked(SET_UP_WITHIN)
             self._confirm(run)
@@ -152,7 +152,7 @@ class WatchedMachine(Machine):
     def _spin(self, seconds: float) -> None:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            self._session.spin_once(0.02)
+            self.spin_once(0.02)
 
     def observe(self) -> Observation | None:
         """Return the medians of the next messages; None where too few arrive in time."""
@@ -161,14 +161,14 @@ class WatchedMachine(Machine):
         self._problem = ""
         end = time.monotonic() + self._patience
         while time.monotonic() < end and not self._problem:
-            self._session.spin_once(0.02)
+            self.spin_once(0.02)
             if self._enough(self._samples):
                 break
         if self._problem:
             raise CommandError("instrument", self._problem)
         if not self._enough(max(LEAST_SAMPLES, self._samples // 2)):
             wanted = [self._topic] * self._wants_pose + [self._readings] * bool(self._own)
-            if silent := [topic for topic in wanted if self._session.node.count_publishers(topic) == 0]:
+            if silent := [topic for topic in wanted if self.node.count_publishers(topic) == 0]:
                 raise NoAnswerError(f"nobody publishes {silent[0]}")
             return None
         pose, uncertainty, channels = None, np.full(6, math.nan), {}

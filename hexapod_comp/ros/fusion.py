@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -30,16 +31,7 @@ FEED_PERIOD = 1.0  # Period at which the drift is passed to the compensation, s:
 
 
 def fusion_rules(options: dict[str, Any]) -> FusionRules:
-    return FusionRules(
-        drift_rate=options["fusion.drift_rate"],
-        initial=options["fusion.initial_deviation"],
-        limit=options["fusion.limit"],
-        gate=options["fusion.gate_probability"],
-        strut_deviation=options["fusion.strut_deviation"],
-        time_deviation=options["fusion.time_deviation"],
-        position_deviation=options["fusion.position_deviation"],
-        rotation_deviation=options["fusion.rotation_deviation"],
-    )
+    return FusionRules(**{one.name: options[f"fusion.{one.name}"] for one in fields(FusionRules)})
 
 
 class PoseInstrument:

@@ -131,12 +131,12 @@ fusion.time_deviation | {RULES.time_deviation:.1e} | 0 to 0.1 s | always | stand
     instrument and struts: reduces the weight of readings made in motion
 fusion.drift_rate | {RULES.drift_rate:.1e} | 0 to 0.001 m | always | by how much each of the base's displacements and
     the struts may drift in a second (standard deviation; it grows with the root of time)
-fusion.initial_deviation | {RULES.initial:.1e} | 1e-09 to 0.001 m | always | standard deviation of both at the start,
-    and after `~/reset`
+fusion.initial_deviation | {RULES.initial_deviation:.1e} | 1e-09 to 0.001 m | always | standard deviation of both at the
+    start, and after `~/reset`
 fusion.limit | {RULES.limit:.1e} | 1e-06 to 0.005 m | always | largest drift: a reading that would exceed it is
     rejected, and the drift stays
-fusion.gate_probability | {RULES.gate} | 0.5 to 0.999999 | always | a reading outside the region that holds this share
-    of correct readings is rejected as wild (chi-square with six degrees of freedom)
+fusion.gate_probability | {RULES.gate_probability} | 0.5 to 0.999999 | always | a reading outside the region that holds
+    this share of correct readings is rejected as wild (chi-square with six degrees of freedom)
 fusion.timeout | 10.0 | 0 to 86400 s | always | without an accepted reading for this long, diagnostics warn; the last
     drift stays; 0 = off
 publish_array | false |  | configure | also publish `strut_commands_array` for ros2_controllers, in the order of

@@ -11,9 +11,10 @@ import signal
 import stat
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
 
 import rclpy
 from rclpy.experimental import EventsExecutor
@@ -22,7 +23,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.signals import SignalHandlerOptions
 
-from ..errors import LONGEST_TEXT, HexapodError, printable
+from ..errors import LONGEST_TEXT, HexapodError, NoAnswerError, printable
 from . import avoid_shared_memory, keep_discovery_local, open_streams, received_signals
 from .base import MachineNode
 from .parameters import Program
@@ -190,6 +191,9 @@ def _forward(source: int, real: int) -> None:
 # ---- other programs ----
 
 
+AnySession = TypeVar("AnySession", bound="RosSession")
+
+
 class RosSession:
     """A private context of ROS with an executor and one node: for programs that talk to nodes; signals are theirs."""
 
@@ -202,7 +206,7 @@ class RosSession:
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self.node)
 
-    def __enter__(self) -> RosSession:
+    def __enter__(self: AnySession) -> AnySession:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -211,6 +215,14 @@ class RosSession:
     def spin_once(self, timeout: float) -> None:
         """Handle received messages, or the first to arrive within this time, s."""
         self._executor.spin_once(timeout_sec=timeout)
+
+    def wait(self, condition: Callable[[], object], timeout: float, what: str) -> None:
+        """Handle messages until a condition holds; a NoAnswerError if it does not within this time, s."""
+        end = time.monotonic() + timeout
+        while not condition():
+            if (left := end - time.monotonic()) <= 0.0:
+                raise NoAnswerError(f"waited {timeout:g} s in vain for {what}")
+            self.spin_once(min(left, 0.02))
 
     def close(self) -> None:
         self._executor.shutdown()

@@ -67,15 +67,6 @@ def test_verbs_explain_themselves_and_rules_name_their_options() -> None:
             assert {name.split(" ")[0] for name in rule.options} <= options
 
 
-def test_an_old_name_works_and_says_the_new_one(tmp_path: Path) -> None:
-    code, out, err = hexapod("measure", "--out", str(tmp_path / "none" / "m.csv"))
-    assert (code, out) == (2, "")
-    note, error = err.splitlines()
-    assert note == "hexapod_comp: note: measure is now called simulate"
-    assert "its folder does not exist" in error
-    assert hexapod("measure", "--help")[1].startswith("usage: hexapod_comp simulate")
-
-
 def test_json_is_printed_and_out_stays_csv(tmp_path: Path) -> None:
     """Both at once: the file is the one that is written without --json."""
     one, two = str(tmp_path / "one.csv"), str(tmp_path / "two.csv")

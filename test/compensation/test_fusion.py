@@ -69,7 +69,7 @@ def lengths(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
 def test_the_filter_is_the_posterior_of_all_readings_at_once():
     """Random walk and readings are jointly Gaussian: conditioned by dense matrices, without a recursion."""
     rng, count, states = np.random.default_rng(1), 12, 5
-    rules = FusionRules(drift_rate=0.7, initial=1.3, limit=1e9, gate=1.0 - 1e-12)
+    rules = FusionRules(drift_rate=0.7, initial_deviation=1.3, limit=1e9, gate_probability=1.0 - 1e-12)
     times = np.sort(rng.uniform(0.0, 20.0, count))
     matrices = rng.standard_normal((count, 3, states))
     noises = [root @ root.T + np.eye(3) for root in rng.standard_normal((count, 3, 3))]
@@ -79,7 +79,7 @@ def test_the_filter_is_the_posterior_of_all_readings_at_once():
         ours.predict(time)
         ours.update(reading, matrix, noise)
     since = times - times[0]
-    walk = np.kron(rules.initial**2 + rules.drift_rate**2 * np.minimum.outer(since, since), np.eye(states))
+    walk = np.kron(rules.initial_deviation**2 + rules.drift_rate**2 * np.minimum.outer(since, since), np.eye(states))
     big, noise = np.zeros((3 * count, states * count)), np.zeros((3 * count, 3 * count))
     for n in range(count):
         big[3 * n : 3 * n + 3, states * n : states * n + states] = matrices[n]
@@ -105,7 +105,7 @@ def test_a_wild_reading_moves_nothing(paper, size):
 
 
 def test_a_drift_beyond_the_limit_is_held(paper):
-    rules = FusionRules(initial=1e-3, limit=5e-5)
+    rules = FusionRules(initial_deviation=1e-3, limit=5e-5)
     ours, matrix = DriftFilter(rules), observed(paper, paper.home)
     with pytest.raises(CommandError, match=r"allowed 0\.05 mm: it is held") as caught:
         ours.update(matrix @ np.append(np.zeros(6), np.full(6, 3e-4)), matrix, rules.covariance())
@@ -147,7 +147,7 @@ def followed(geometry: HexapodGeometry, drift: np.ndarray, wild: float = 0.0) ->
     """Return a compensator whose fusion has heard 300 readings of a machine that has drifted so."""
     compensator, rng = Compensator(geometry, MachineModel(geometry.name)), np.random.default_rng(11)
     truth = Compensator(geometry, drifted(geometry, MachineModel(geometry.name), drift))
-    fusion = Fusion(compensator, FusionRules(initial=3e-5))
+    fusion = Fusion(compensator, FusionRules(initial_deviation=3e-5))
     rejected = 0
     for n, place in enumerate(poses(geometry, 300, 4)):
         struts, at = lengths(geometry, place), float(n)

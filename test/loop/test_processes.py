@@ -64,7 +64,7 @@ def client(running, pair) -> LoopClient:
 def ask(client: LoopClient, pose: Pose) -> Sent:
     """Send one command and wait for its answer."""
     entry = client.send(pose)
-    client.spin_until(lambda: answered(entry), 5.0, "the answer to a command")
+    client.wait(lambda: answered(entry), 5.0, "the answer to a command")
     return entry
 
 
@@ -144,11 +144,11 @@ def test_a_command_for_which_a_socket_had_no_room_is_repeated_at_once(client, pa
     ask(client, HOME)
     compensator.send(signal.SIGSTOP)
     try:
-        client.spin_until(lambda: dropped(compensator.pid), 10.0, "the socket to be full")
+        client.wait(lambda: dropped(compensator.pid), 10.0, "the socket to be full")
         entry = client.send(HOME)
     finally:
         compensator.send(signal.SIGCONT)
-    client.spin_until(lambda: answered(entry), 5.0, "the answer to a command that was lost")
+    client.wait(lambda: answered(entry), 5.0, "the answer to a command that was lost")
 
 
 def test_loop_between_processes(client, pair):
@@ -159,7 +159,7 @@ def test_loop_between_processes(client, pair):
     for share in (0.2, 0.6, 1.0):
         entry = ask(client, near(HOME, (0.0005 * share, -0.0003 * share, 0.0008 * share)))
     np.testing.assert_allclose(entry.command - entry.correction, closed_form_lengths(pose), rtol=0.0, atol=1e-12)
-    client.spin_until(client.settled(), 5.0, "the tool to rest")
+    client.wait(client.settled(), 5.0, "the tool to rest")
     # 0.1 µm steps, 0.05 µm noise of the encoders, J⁻¹ below 3: a fraction of a micrometre; uncorrected 100 µm.
     assert np.abs(client.true_pose.position - pose.position).max() < 0.5e-6
     assert np.abs(client.estimate.position - pose.position).max() < 2e-6
@@ -181,10 +181,10 @@ def test_signals_end_both_with_0(client, pair, to_compensator, to_drive):
     """A double SIGINT is what ``ros2 launch`` sends. The last thing said arrives."""
     ask(client, HOME)
     states = said(client)
-    client.spin_until(lambda: bool(states), 5.0, "a status")
+    client.wait(lambda: bool(states), 5.0, "a status")
     for node, signals in zip(pair, (to_compensator, to_drive), strict=True):
         assert_ends_well(node, *signals)
-    client.spin_until(lambda: states[-1] == "not active", 2.0, "the compensator's last status")
+    client.wait(lambda: states[-1] == "not active", 2.0, "the compensator's last status")
 
 
 def test_compensator_survives_the_end_of_the_drive(client, pair):
@@ -194,15 +194,15 @@ def test_compensator_survives_the_end_of_the_drive(client, pair):
 
     def goes_on(state: str) -> bool:
         entry = client.send(HOME)
-        client.spin_until(lambda: answered(entry) or time.monotonic() > entry.sent_at + 0.2, 5.0, "an answer")
+        client.wait(lambda: answered(entry) or time.monotonic() > entry.sent_at + 0.2, 5.0, "an answer")
         return answered(entry) and states[-1:] == [state]
 
-    client.spin_until(lambda: goes_on("running"), 10.0, "feedback")
+    client.wait(lambda: goes_on("running"), 10.0, "feedback")
     drive.send(signal.SIGKILL)
-    client.spin_until(lambda: goes_on("feedback lost, pose estimated from own commands"), 10.0, "the loss to be said")
+    client.wait(lambda: goes_on("feedback lost, pose estimated from own commands"), 10.0, "the loss to be said")
     again = NodeProcess("strut_drive", {})
     try:
-        client.spin_until(lambda: goes_on("running"), 20.0, "the new drive to be heard")
+        client.wait(lambda: goes_on("running"), 20.0, "the new drive to be heard")
         again.send(signal.SIGKILL)
         assert_ends_well(compensator, signal.SIGINT)  # without waiting for the dead to acknowledge
     finally:
@@ -233,7 +233,7 @@ def test_a_compensator_restarted_under_a_stream_waits_for_the_struts(client, pai
         while not until():
             assert time.monotonic() < end, client.diagnostics
             rest = client.send(pose()).sent_at + 0.004
-            client.spin_until(lambda rest=rest: time.monotonic() >= rest, 1.0, "the next command to be due")
+            client.wait(lambda rest=rest: time.monotonic() >= rest, 1.0, "the next command to be due")
 
     stream(lambda: len(published) > 50)
     compensator.send(signal.SIGKILL)
@@ -248,7 +248,7 @@ def test_a_compensator_restarted_under_a_stream_waits_for_the_struts(client, pai
         stream(lambda: "refused.step" in client.diagnostics or len(published) > before)
         steps = np.abs(np.diff(published, axis=0)).max(axis=1)
         assert steps.max() <= 2e-3 + 1e-9, f"it stepped by {steps.max() * 1e3:.1f} mm"
-        client.spin_until(client.settled(), 5.0, "the tool to rest")
+        client.wait(client.settled(), 5.0, "the tool to rest")
         here = client.estimate
         stream(lambda: len(published) > before, lambda: here)
         assert np.abs(published[-1] - last).max() <= 2e-3 + 1e-9
