@@ -13,43 +13,28 @@ import sys
 from collections.abc import Sequence
 from tempfile import NamedTemporaryFile
 
-import rclpy
 import yaml
-from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import String
 
-from . import avoid_shared_memory
 from .base import LATCHED_QOS
+from .process import SPIN_PERIOD, RosSession
 
 TOPIC = "robot_description"
 
 WARN_AFTER = 5.0  # Without a URDF for this time the log reports what is missing, s
 
 
-SIGNALS_SEEN_WITHIN = 0.2  # rclpy waits in C: Python handles a signal after the wait, s
-
-
 def wait_for_description(arguments: Sequence[str]) -> str:
     """Return the URDF on ``robot_description``, for a program's ROS arguments: namespace, remappings, enclave."""
-    avoid_shared_memory()
-    context = rclpy.Context()
-    rclpy.init(args=list(arguments), context=context)
-    node = rclpy.create_node("description_listener", context=context, start_parameter_services=False)
-    heard: list[String] = []
-    node.create_subscription(String, TOPIC, heard.append, LATCHED_QOS)
-    missing = f"no URDF yet: waiting for a compensator to publish {node.resolve_topic_name(TOPIC)}"
-    waiting = node.create_timer(WARN_AFTER, lambda: node.get_logger().warning(missing))
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    try:
-        while not heard:
-            executor.spin_once(timeout_sec=SIGNALS_SEEN_WITHIN)
-    finally:
-        node.destroy_timer(waiting)
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown(context=context)
-    return heard[0].data
+    found: list[String] = []
+    with RosSession("description_listener", arguments=arguments, start_parameter_services=False) as session:
+        node = session.node
+        node.create_subscription(String, TOPIC, found.append, LATCHED_QOS)
+        missing = f"no URDF yet: waiting for a compensator to publish {node.resolve_topic_name(TOPIC)}"
+        node.create_timer(WARN_AFTER, lambda: node.get_logger().warning(missing))
+        while not found:
+            session.spin_once(SPIN_PERIOD)
+    return found[0].data
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -197,11 +197,11 @@ AnySession = TypeVar("AnySession", bound="RosSession")
 class RosSession:
     """A private context of ROS with an executor and one node: for programs that talk to nodes; signals are theirs."""
 
-    def __init__(self, name: str, namespace: str = "", **options: Any) -> None:
+    def __init__(self, name: str, namespace: str = "", arguments: Sequence[str] = (), **options: Any) -> None:
         open_streams()
         avoid_shared_memory()
         self._context = rclpy.Context()
-        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=list(arguments), context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self.node: Node = rclpy.create_node(name, namespace=namespace, context=self._context, **options)
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self.node)

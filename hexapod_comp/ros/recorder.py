@@ -116,31 +116,28 @@ class BagWriter:
             )
 
 
-class BagRecorder:
+class BagRecorder(RosSession):
     """Subscribes to a machine's topics and writes them."""
 
     def __init__(self, folder: str | Path, namespace: str = "") -> None:
         self._bag = BagWriter(folder)
         self.counts = self._bag.counts  # messages of each topic
-        self._session = RosSession("hexapod_comp_recorder", namespace, **QUIET)
+        super().__init__("hexapod_comp_recorder", namespace, **QUIET)
         for topic, (kind, reliable) in TOPICS.items():
             reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
             self._subscribe(topic, kind, QoSProfile(depth=DEPTH, reliability=reliability))
         for topic in KEPT:
             self._subscribe(topic, String, QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL))
 
-    def __enter__(self) -> BagRecorder:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._session.close()
+    def close(self) -> None:
+        super().close()
         self._bag.close()
 
     def run(self, going_on: Callable[[], bool], progress: Callable[[int], object] = lambda messages: None) -> None:
         """Record while a condition, checked at least every 0.1 s, holds, and while the bag can be written."""
         reported = 0
         while going_on() and not self.problem:
-            self._session.spin_once(SPIN_PERIOD)
+            self.spin_once(SPIN_PERIOD)
             self._bag.check_disk()
             total = sum(self.counts.values())
             progress(total - reported)
@@ -155,10 +152,10 @@ class BagRecorder:
         return sum(count for topic, count in self.counts.items() if topic.endswith(JOURNAL))
 
     def _subscribe(self, topic: str, kind: Any, qos: QoSProfile) -> None:
-        name = self._session.node.resolve_topic_name(topic)
+        name = self.node.resolve_topic_name(topic)
         text = f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
 
         def keep(data: bytes) -> None:
             self._bag.write(name, text, bytes(data))
 
-        self._session.node.create_subscription(kind, topic, keep, qos, raw=True)
+        self.node.create_subscription(kind, topic, keep, qos, raw=True)

@@ -3,30 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
-import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ..errors import GeometryError
 from ..ros import keep_discovery_local
+from ..ros.base import LATCHED_QOS
+from ..ros.process import SPIN_PERIOD, RosSession
 from ..workspace.pictures import shades
 from ..workspace.shells import Layer, Quantity
-
-# Latched: the last message is kept for those who subscribe later
-SHELL_QOS = QoSProfile(
-    depth=1,
-    history=HistoryPolicy.KEEP_LAST,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
 
 TOPIC = "workspace/shells"
 NAMESPACE = "workspace_shells"
@@ -66,7 +58,7 @@ def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, frame
 
 def publish_shells(node: Node, markers: MarkerArray, topic: str = TOPIC) -> Publisher:
     """Publish markers once on a latched topic; keep what is returned as long as they shall be there."""
-    publisher = node.create_publisher(MarkerArray, topic, SHELL_QOS)
+    publisher = node.create_publisher(MarkerArray, topic, LATCHED_QOS)
     publisher.publish(markers)
     return publisher
 
@@ -74,16 +66,12 @@ def publish_shells(node: Node, markers: MarkerArray, topic: str = TOPIC) -> Publ
 def show_shells(layers: Sequence[Layer], quantity: Quantity, title: str, frame_id: str = "work") -> None:
     """Publish shells from a node of its own until Ctrl-C."""
     keep_discovery_local()
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        node = rclpy.create_node("workspace_shells")
-        stamp = node.get_clock().now().to_msg()
-        publisher = publish_shells(node, shell_markers(layers, quantity, title, frame_id, stamp))
-        while rclpy.ok():
-            rclpy.spin_once(node, timeout_sec=0.2)
-        node.destroy_publisher(publisher)
-    finally:
-        rclpy.try_shutdown()
+    with RosSession("workspace_shells") as session:
+        stamp = session.node.get_clock().now().to_msg()
+        publish_shells(session.node, shell_markers(layers, quantity, title, frame_id, stamp))
+        with suppress(KeyboardInterrupt):
+            while True:
+                session.spin_once(SPIN_PERIOD)
 
 
 def triangles(points: np.ndarray) -> np.ndarray:

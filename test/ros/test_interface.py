@@ -416,7 +416,7 @@ def test_who_only_listens_may_and_opens_nothing_more(tmp_path: Path) -> None:
             opens[right] |= names
 
     with BagRecorder(tmp_path / "bag") as recorder:
-        look(recorder._session.node)
+        look(recorder.node)
     with RosSession("hexapod_comp_watch", **QUIET) as session:
         Watcher(load_geometry(config_file("paper.yaml")), session.node)
         look(session.node)

@@ -20,11 +20,12 @@ from hexapod_comp.cli import main
 from hexapod_comp.errors import GeometryError, HexapodError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.pose import Pose
+from hexapod_comp.ros.base import LATCHED_QOS
 from hexapod_comp.ros.process import QUIET
 from hexapod_comp.testing.bench import spin_until
 from hexapod_comp.viewer import page as watching
 from hexapod_comp.viewer.page import View, Watcher, WatchPage, same_site, strut_colours, strut_ends, words
-from hexapod_comp.viewer.shells import SHELL_QOS, TOPIC, publish_shells, shell_markers, triangles
+from hexapod_comp.viewer.shells import TOPIC, publish_shells, shell_markers, triangles
 from hexapod_comp.workspace.shells import TRANSLATION, Layer
 
 OFFSETS = np.array([-100.0, -50.0, 0.0, 50.0, 100.0, 200.0])
@@ -301,7 +302,7 @@ def test_who_comes_late_sees_the_shells(ros_context):
     assert publisher.topic_name == f"/{TOPIC}"
     late = rclpy.create_node("late", context=ros_context)
     seen: list[MarkerArray] = []
-    late.create_subscription(MarkerArray, TOPIC, seen.append, SHELL_QOS)
+    late.create_subscription(MarkerArray, TOPIC, seen.append, LATCHED_QOS)
     executor = EventsExecutor(context=ros_context)
     for node in (sender, late):
         executor.add_node(node)
