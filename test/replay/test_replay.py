@@ -151,7 +151,7 @@ def test_everything_comes_back_bit_for_bit(run, tmp_path, storage):
     assert [event.entry.what for event in result.changes] == whats
     assert [event.row for event in result.changes] == [150, 151, 152, 350, 650, 900, 950, 1001]
     assert [(event.row, event.entry.values["reason"]) for event in result.refused] == [(1000, "step")]
-    assert (recording.heard, recording.notes) == (1201, [])
+    assert (recording.recorded, recording.notes) == (1201, [])
     for path in (bag / "metadata.yaml", *bag.glob("run.[md]*")):
         assert read_recording(path).commands.tobytes() == recording.commands.tobytes()
 
@@ -298,7 +298,7 @@ def test_recording_that_begins_in_motion_is_replayed_from_its_first_snapshot(run
     assert counted(result) == {BEFORE: 80, IDENTICAL: 700}
     assert (result.outcome[:80] == BEFORE).all()
     assert not result.lost
-    assert recording.heard == 1201 - 440
+    assert recording.recorded == 1201 - 440
 
 
 def test_recording_that_begins_at_rest_needs_no_further_snapshot(run, tmp_path):
@@ -366,7 +366,7 @@ def test_the_journal_is_enough_and_other_topics_do_not_disturb(run, tmp_path, al
     messages.append((BEGAN, "/other/journal", "std_msgs/msg/Header", b"\0\1\0\0"))
     recording, result = opened(write_bag(tmp_path / "run", messages))
     assert counted(result) == {IDENTICAL: 1200}
-    assert recording.heard == 0
+    assert recording.recorded == 0
     if also:
         assert recording.topics["strut_states"].values.tolist() == [[5.0, 4.0, 3.0, 2.0, 1.0, 0.0]]
         assert "1 messages of strut_states left out" in recording.notes[0]
