@@ -42,12 +42,17 @@ INSTRUMENTS = (
     "linear", "straightness", "rotation", "5-D", "6-D", "tracker", "tracker_6d", "ball_bar", "station", "r_test",
 )  # fmt: skip
 
-# Of run
-LOOP = (
-    MACHINE,
-    TRUTH,
-    value("--rate-hz", float, "HZ", "commands per second (default 250)", default=250.0),
-    JSON,
+CAMPAIGN = reads(
+    "--campaign",
+    "campaign file, or the name of a shipped one (default campaign_5d.yaml for the machine paper, else campaign)",
+    kind="campaign",
+)
+TRACKER = value(
+    "--topic",
+    None,
+    "TOPIC",
+    "poses of the tool (PoseStamped), from a tracker or motion capture (default tool_pose_true, the simulated one)",
+    default="tool_pose_true",
 )
 
 # Default bounds of the machines that assess draws
@@ -199,7 +204,10 @@ example:
         "send poses through the loop: two simulated nodes, or your own",
         (
             reads("poses", "CSV file of poses (mm, degrees)", "POSES.csv", "poses"),
-            *LOOP,
+            MACHINE,
+            TRUTH,
+            value("--rate-hz", float, "HZ", "commands per second (default 250)", default=250.0),
+            JSON,
             reads("--model", f"model that the compensator runs: file, shipped name, {WORDS}, or truth, the machine's "
                   "own errors "
                   "(default)", kind="model", default="truth"),
@@ -259,8 +267,7 @@ example:
                   "folder's, the campaign's, else the largest that the machine reaches)"),
             value("--instruments", None, "A,B,…", "what to plan for, read from the poses (default 6-D: lines)"),
             value("--hours", above_zero, "H", "how long a planned campaign may take (default 4)"),
-            value("--topic", None, "TOPIC", "poses of the tool in base (PoseStamped), from a tracker or motion capture "
-                  "(default tool_pose_true, what strut_drive's tracker reads)", default="tool_pose_true"),
+            TRACKER,
             value("--samples", whole(3, 10_000), "N", "poses of which the median is taken, three times at each stop "
                   "(default 25)", default=25),
             NAMESPACE,
@@ -466,8 +473,7 @@ example:
             MACHINE,
             MODEL,
             TRUTH,
-            reads("--campaign", "campaign file, or the name of a shipped one (default campaign_5d.yaml for the machine "
-                  "paper, else campaign)", kind="campaign"),
+            CAMPAIGN,
             reads("--warm-up", "file that describes a warm-up during the measurement, warm_up for the shipped one: "
                                "then x, y and z lines are repeated", kind="warm_up"),
             seed_of("all random draws"),
@@ -487,10 +493,8 @@ example:
         "measure a running machine: a campaign's readings as a CSV file",
         (
             MACHINE,
-            reads("--campaign", "campaign file, or the name of a shipped one (default campaign_5d.yaml for the machine "
-                  "paper, else campaign)", kind="campaign"),
-            value("--topic", None, "TOPIC", "poses of the tool (PoseStamped), from a tracker or motion capture "
-                  "(default tool_pose_true, strut_drive's simulated tracker)", default="tool_pose_true"),
+            CAMPAIGN,
+            TRACKER,
             value("--readings", None, "TOPIC", "single readings (JointState: names are channels) of a laser or ball "
                   "bar; lines, lengths and displacements are then read from it", default=""),
             choice("--tracker-frame", ("free", "known"), "known: poses are measured in base (default); free: in an "

@@ -261,7 +261,7 @@ class LinuxcncBridgeNode(MachineNode):
         self.subscribe(Bool, "compensator/stopped", self._on_stopped, LATCHED_QOS)
         self.subscribe(UInt64, "compensator/heartbeat", self._on_beat, EVENT_QOS)
         self._hal.ready()
-        self._loop = self.every(1.0 / self._options["rate"], self._cycle)
+        self.every(1.0 / self._options["rate"], self._cycle)
 
     def _open_pins(self, hal: HalComponent) -> None:
         self._read_axes, self._read_feedback = hal.reader(*AXES), hal.reader(*FEEDBACK)

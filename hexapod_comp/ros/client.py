@@ -51,11 +51,8 @@ class LoopClient(RosSession):
         super().__init__("hexapod_comp_client", namespace)
         self._frame_id, self._reader = frame_id, StrutReader()
         self.sent: dict[int, Sent] = {}  # by their stamps, ns
-        # positions of the tool, m, and the number of commands sent by then
-        self.track: list[tuple[np.ndarray, int]] = []
         self.diagnostics: dict[str, str] = {}  # values of the compensator's newest status
         self.true_count = 0  # received true poses
-        self._streamed: int | None = None
         self._status_name = status_prefix(self.node.get_namespace(), "compensator")
         self._counted_before: tuple[int, int] | None = None
         self._newest: dict[str, PoseStamped] = {}
@@ -80,9 +77,6 @@ class LoopClient(RosSession):
         self._newest[topic] = message
         if topic == "tool_pose_true":
             self.true_count += 1
-            if self._streamed is not None:
-                p = message.pose.position
-                self.track.append((np.array([p.x, p.y, p.z]), self._streamed))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -177,13 +171,12 @@ class LoopClient(RosSession):
         return entry
 
     def stream(self, path: Path, each: Callable[[int], None] | None = None) -> list[Sent]:
-        """Send a path at its rate and return the records; :attr:`track` then holds the tool's positions.
+        """Send a path at its rate and return the records.
 
         A command waits for the answer to the previous one, so that a stall of any process delays the path and causes no
         jump.
         """
         entries: list[Sent] = []
-        self.track = []
         messages = [pose_message(path.pose(n), self._frame_id) for n in range(len(path))]
         due = time.monotonic()
         for index, message in enumerate(messages):
@@ -192,12 +185,10 @@ class LoopClient(RosSession):
             if entries:
                 entries[-1] = self.wait_for_answer(entries[-1])
             entries.append(self._send(message))
-            self._streamed = len(entries)
             if each is not None:
                 each(index)
             due = max(due + 1.0 / path.rate, time.monotonic() - 1.0 / path.rate)
         entries[-1] = self.wait_for_answer(entries[-1])
-        self._streamed = None
         return entries
 
     def hold(self, pose: Pose, rate: float, until: Callable[[], bool], timeout: float, what: str) -> Sent:
