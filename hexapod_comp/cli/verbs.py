@@ -250,7 +250,7 @@ example:
         (exactly_one("--pose", "--stop"),),
     ),
     "adapt": Verb(
-        "adapting", "loop",
+        "running", "loop",
         "a machine calibrates itself, checks its model and repairs it",
         (
             MACHINE,

@@ -61,10 +61,9 @@ class Sample:
 
 class Guard:
     """Checks one property of each sample: `check` raises, `accept` stores one that has passed all guards, `reset`
-    forgets. While there is a `problem` every sample is refused; a `latched` one stays until it is released."""
+    forgets. While there is a `problem` every sample is refused; a latched one stays until it is released."""
 
     reason = ""  # under which refusals are counted
-    latched = False
     problem = ""
 
     def check(self, sample: Sample) -> None:

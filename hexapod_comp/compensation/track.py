@@ -50,7 +50,6 @@ class StrutTrack(Guard):
     """
 
     reason = "following_error"
-    latched = True
 
     def __init__(
         self, geometry: HexapodGeometry | None = None, limit: float = 0.0, anywhere_after: float = 0.0

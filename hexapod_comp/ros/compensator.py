@@ -27,7 +27,6 @@ from ..core import Struct
 from ..errors import CommandError, HexapodError, LimitError, TooEarlyError
 from ..machine.temperatures import HUMIDITY, check_part
 from .base import ACKNOWLEDGED_WITHIN, COMMAND_QOS, NEWEST_QOS, MachineNode
-from .fusion import PoseInstrument
 from .interface import (
     PARAMETERS,
     PROGRAM,
@@ -38,12 +37,11 @@ from .interface import (
     frame_ids,
     temperature_rules,
 )
-from .load import Loads
 from .messages import StrutBytes, StrutReader, check_frame, period
 from .process import run
 from .rclpy_compat import Alarm
 from .requests import Requests
-from .sensors import SensorTopic
+from .sensors import Loads, PoseInstrument, SensorTopic
 from .status import ADVICE, OTHERWISE, CompensatorStatus, seconds
 
 ESTIMATE_PERIOD = 0.02  # Period of pose estimates from the node's own commands without feedback, s

@@ -1,20 +1,38 @@
-"""Topics of readings that a compensator uses beside its struts: temperatures, loads, measured poses.
+"""What a compensator reads beside its struts: temperatures, loads, outside numbers, measured poses.
 
-Each is handled in the same way: one publisher, a minimum period, a valid message; then its handler, which raises an
-error about the content. A rejected reading, or a second publisher, is counted and reported, and stops nothing.
+Each topic is handled in the same way: one publisher, a minimum period, a valid message; then its handler, which raises
+an error about the content. A rejected reading, or a second publisher, is counted and reported, and stops nothing.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields
 from typing import Any
 
-from ..compensation.guards import Sample
-from ..errors import CommandError, HexapodError
+import numpy as np
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Vector3Stamped, WrenchStamped
+from sensor_msgs.msg import JointState
+
+from ..compensation.compensator import Compensator
+from ..compensation.fusion import Fusion, FusionRules, PoseReading, checked_covariance
+from ..compensation.guards import Guard, Sample
+from ..errors import CommandError, HexapodError, OutsideTableError, shorten
+from ..machine.geometry import BASE
+from ..machine.load import EARTH, Loading, wrench_on_platform
+from ..machine.outside import read_numbers
+from ..pose import Pose
 from .base import SENSOR_QOS, MachineNode
-from .messages import read_message
+from .messages import check_frame, command_stamp, message_pose, read_message
 from .status import CompensatorStatus
+
+WRENCH_PERIOD = 0.01  # A wrench that arrives sooner after the last one, s, is ignored: each ramps in, and is journalled
+
+POSE_TOPIC = "tool_pose_measured"
+POSE_MESSAGES = {"pose_with_covariance": PoseWithCovarianceStamped, "pose": PoseStamped}
+FEED_PERIOD = 1.0  # Period at which the drift is passed to the compensation, s: it is slow, and each time makes a model
 
 
 class SensorTopic:
@@ -61,3 +79,186 @@ class SensorTopic:
     def _bad_feedback(self, error: HexapodError) -> None:
         what = self._topic.removesuffix("s")
         self._node.ignore(what, error, self._status.bad_feedback, "" if isinstance(error, CommandError) else what)
+
+
+class Loads:
+    """Passes gravity, wrench and outside numbers from their single publishers to the compensator."""
+
+    def __init__(
+        self, node: MachineNode, compensator: Compensator, status: CompensatorStatus, ids: dict[str, str]
+    ) -> None:
+        self._node, self._compensator, self._status, self._base = node, compensator, status, ids[BASE]
+        self._gravity: tuple[float, ...] | None = None  # as published; None: the parameter's, or the model's
+        self._wrench = Loading().wrench
+        self._numbers: dict[str, float] = {}  # as published; the compensator has those that count
+        self._table = Guard()  # of a table that refuses numbers outside
+        self._table.reason = OutsideTableError.reason
+        status.standing = (*status.standing, self._table)
+        self._topics = {
+            "gravity": SensorTopic(node, status, "gravity", Vector3Stamped, self._on_gravity),
+            "wrench": SensorTopic(node, status, "wrench", WrenchStamped, self._on_wrench, period=WRENCH_PERIOD),
+            "outside": SensorTopic(node, status, "outside", JointState, self._on_numbers),
+        }
+        status.loads = self
+        self.apply()
+
+    def apply(self) -> None:
+        """Pass the present gravity and wrench to the compensator, unless ``outside_hold`` holds the previous ones."""
+        if self._status.options["outside_hold"]:
+            return
+        stated = self._status.options["gravity"]
+        gravity = self._gravity or (stated if any(stated) else None)
+        self._compensator.set_load(Loading.of(gravity, self._wrench))
+
+    def update(self) -> None:
+        """Pass the newest outside numbers to the compensator: periodically, as each change makes a model."""
+        compensator, options = self._compensator, self._status.options
+        if options["outside_hold"] or self._table.problem or self._numbers.items() <= compensator.outside.items():
+            return
+        table, known = compensator.model.outside, compensator.outside | self._numbers
+        change = table.evaluate(known) - table.evaluate(compensator.outside)
+        moved = np.linalg.norm(change[:3]) + np.linalg.norm(change[3:]) * compensator.geometry.characteristic_length
+        if table.missing(compensator.outside) or moved > options["outside_dead_band"]:
+            try:
+                compensator.set_outside(self._numbers)
+            except HexapodError as error:
+                self._node.ignore("outside", error, self._status.bad_feedback, "outside")
+
+    def stale(self, now: float) -> str:
+        """Return the published value, but not for longer than ``outside_timeout``."""
+        timeout = self._status.options["outside_timeout"]
+        return ", ".join(name for name, topic in self._topics.items() if topic.stale(now, timeout))
+
+    def _on_gravity(self, message: Vector3Stamped, _: float) -> None:
+        if message.header.frame_id != self._base:
+            problem = f"frame_id must be {self._base}, not {shorten(message.header.frame_id)}"
+            raise CommandError("gravity", f"gravity: {problem}")
+        vector = message.vector.x, message.vector.y, message.vector.z
+        size = math.hypot(*vector)
+        if not EARTH[0] <= size <= EARTH[1]:
+            allowed = "{:g}…{:g} m/s²".format(*EARTH)
+            raise CommandError("gravity", f"gravity: must be {allowed} in all, not {size:.4g}")
+        moved = np.inf if self._gravity is None else math.dist(vector, self._gravity)
+        if moved > self._status.options["gravity_dead_band"]:
+            self._gravity = vector
+            self.apply()
+
+    def _on_wrench(self, message: WrenchStamped, _: float) -> None:
+        parts = message.wrench.force, message.wrench.torque
+        force, torque = (np.array([part.x, part.y, part.z]) for part in parts)
+        self._wrench = wrench_on_platform(self._compensator.geometry, message.header.frame_id, force, torque)
+        self.apply()
+
+    def _on_numbers(self, message: JointState, _: float) -> None:
+        table = self._compensator.model.outside
+        if len(message.name) != len(message.position):
+            problem = f"has {len(message.name)} names for {len(message.position)} positions"
+            raise CommandError("outside", f"outside: {problem}")
+        told = read_numbers({n: v for n, v in zip(message.name, message.position, strict=True) if n in table.names})
+        if table.names and not told:
+            found = shorten(", ".join(message.name))
+            raise CommandError("outside", f"outside: must name {' or '.join(table.names)}, not {found}")
+        try:
+            table.validate(told)
+        except OutsideTableError as error:
+            self._table.problem = str(error)
+            raise
+        self._numbers |= told
+        self._table.problem = ""
+
+    def findings(self) -> Iterator[str]:
+        """Yield warnings about the model's table of outside numbers."""
+        table, numbers = self._compensator.model.outside, self._compensator.outside
+        if missing := table.missing(numbers):
+            yield f"the model's table does not count: not known is {missing}"
+        elif held := table.held(numbers):
+            yield f"running, outside the model's table, whose edge holds: {held}"
+
+    def values(self) -> dict[str, str]:
+        """Return the loads in use, as key and value of diagnostics, as far as the model uses them."""
+        compensator, model = self._compensator, self._compensator.model
+        values = {}
+        if model.load.bends or model.outside.names:
+            values["outside_hold"] = str(self._status.options["outside_hold"]).lower()
+        if model.outside.names:
+            error = 1e6 * model.outside.evaluate(compensator.outside)
+            known = {name: value for name, value in compensator.outside.items() if name in model.outside.names}
+            values["outside"] = ", ".join(model.outside.shown(*one) for one in known.items()) or "not known"
+            values["outside_um"] = ", ".join(f"{value:.3f}" for value in error[:3])
+            values["outside_urad"] = ", ".join(f"{value:.3f}" for value in error[3:])
+        if not model.load.bends:
+            return values
+        gravity = compensator.loading.gravity or tuple(model.load.gravity.tolist())
+        return values | {
+            "gravity_m_s2": ", ".join(f"{value:.3f}" for value in gravity),
+            "wrench_N_Nm": ", ".join(f"{value:.2f}" for value in compensator.loading.wrench),
+            "payload": str(compensator.geometry.payload),
+        }
+
+
+# ---- a pose instrument ----
+
+
+def fusion_rules(options: dict[str, Any]) -> FusionRules:
+    return FusionRules(**{one.name: options[f"fusion.{one.name}"] for one in fields(FusionRules)})
+
+
+class PoseInstrument:
+    """Receives the instrument's readings in a configured node; made only with ``fusion.enabled``."""
+
+    def __init__(
+        self, node: MachineNode, compensator: Compensator, status: CompensatorStatus, frames: dict[str, Pose]
+    ) -> None:
+        self._node, self._status, self._options, self._frames = node, status, status.options, frames
+        self._kind = POSE_MESSAGES[self._options["fusion.message"]]
+        SensorTopic(node, status, POSE_TOPIC, self._kind, self._on_reading, self._reject)
+        self.fusion, self._fed = Fusion(compensator, fusion_rules(self._options)), -math.inf
+        status.fusion = self.fusion
+
+    def follow(self) -> None:
+        """Apply the present parameters, from the next reading on."""
+        self.fusion.rules = self.fusion.filter.rules = fusion_rules(self._options)
+
+    def reset(self) -> None:
+        """Forget the drift; its correction ramps out."""
+        self.fusion.reset()
+        self._status.pose_stamps.reset()
+        self._fed = -math.inf
+        self.update(time.monotonic())
+
+    def update(self, now: float) -> None:
+        if now - self._fed < FEED_PERIOD:
+            return
+        self._fed, self._status.drift_problem = now, ""
+        try:
+            self.fusion.feed(bool(self._options["fusion.compensate"]))
+        except HexapodError as error:
+            self._status.drift_problem = f"drift not compensated: {error.reason}: {error}"
+            self._node.log_warning("drift", self._status.drift_problem)
+
+    def add_struts(self, struts: Sequence[float], made: float) -> None:
+        """Store struts, m, of a monotonic time, s, for the readings about them."""
+        for error in self.fusion.add_struts(struts, made):
+            self._reject(error)
+
+    def weighed(self, pose: np.ndarray) -> np.ndarray:
+        """Return the compensator's estimate, weighed with the readings."""
+        return self.fusion.weighed(pose)
+
+    def _on_reading(self, message: Any, now: float) -> None:
+        sample, gate = Sample(now, command_stamp(message.header.stamp)), self._status.pose_stamps
+        check_frame(frame_id := message.header.frame_id, self._frames)
+        gate.check(sample)
+        stated = [0.0] * 36
+        if self._kind is PoseWithCovarianceStamped:
+            stated, message = message.pose.covariance, message.pose
+        pose, frame = message_pose(message), self._frames[frame_id]
+        turn = np.kron(np.eye(2), frame.rotation)
+        covariance = turn @ checked_covariance(stated, self.fusion.rules) @ turn.T
+        gate.accept(sample)
+        if self._node.active:
+            for error in self.fusion.add(PoseReading(frame @ pose, now - sample.age, covariance)):
+                self._reject(error)
+
+    def _reject(self, error: HexapodError) -> None:
+        self._node.ignore(POSE_TOPIC, error, self._status.bad_poses)

@@ -27,7 +27,7 @@ from ..errors import LONGEST_TEXT, printable
 from ..machine.temperatures import HUMIDITY, REFERENCE_HUMIDITY
 
 if TYPE_CHECKING:
-    from .load import Loads
+    from .sensors import Loads
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
