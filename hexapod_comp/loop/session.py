@@ -20,7 +20,7 @@ from ..formats.texts import CODES, own_terminal
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
 from ..machine.model_file import save_model
-from ..machine.trajectory import Path, commanded_in_base, move
+from ..machine.trajectory import commanded_in_base, move
 from ..pose import Pose
 from .processes import NodeProcess, PrivateDomain
 from .report import PoseRecord, SessionResult, busy_text
@@ -34,55 +34,6 @@ CONNECT_TIMEOUT = 60.0
 SETTLE_TIMEOUT = 5.0
 
 MOVE_FEED = 0.25  # largest tool speed between poses, m/s; on most machines the struts' speed limits it first
-
-
-class Session:
-    """Drives a machine through poses, and records it."""
-
-    def __init__(
-        self, client: LoopClient, geometry: HexapodGeometry, rate: float, progress: Callable[[int], None] | None = None
-    ) -> None:
-        self._client, self._rate, self._progress = client, rate, progress
-        self._base = commanded_in_base(geometry)
-        self._at = client.estimate
-        self.sent: list[Sent] = []  # commands streamed so far
-
-    def go(self, target: Pose) -> Sent:
-        """Move smoothly to a tool pose in ``base`` and hold it until the true tool rests; return the last command."""
-        client = self._client
-        self._stream(move(self._base, self._at, target, self._rate, MOVE_FEED))
-        self._at = target
-        quiet = client.settled() if client.has_true_pose else (lambda: True)
-        return client.hold(target, self._rate, quiet, SETTLE_TIMEOUT, "the machine to come to rest")
-
-    def enable(self, enabled: bool) -> None:
-        """Switch compensation and wait until the change has ramped through."""
-        client, wanted = self._client, "on" if enabled else "off"
-        client.enable(enabled)
-        before = dict(client.diagnostics)
-
-        def through() -> bool:
-            seen = client.diagnostics
-            return seen != before and seen["compensation"] == wanted and seen["ramping"] == "false"
-
-        client.hold(self._at, self._rate, through, 10.0, "compensation to ramp")
-
-    def visit(self, records: list[PoseRecord], compensated: bool) -> None:
-        """Move to every pose, rest, and record it."""
-        for record in records:
-            last = self.go(record.target)
-            true = self._client.true_pose if self._client.has_true_pose else None
-            if compensated:
-                record.command, record.correction = last.command, last.correction
-                record.estimate, record.true_with = self._client.estimate, true
-            else:
-                record.true_without = true
-
-    def _stream(self, path: Path) -> list[Sent]:
-        progress = self._progress
-        sent = self._client.stream(path, None if progress is None else (lambda _: progress(1)))
-        self.sent += sent
-        return sent
 
 
 def _latencies(sent: Iterable[Sent]) -> np.ndarray:
@@ -110,21 +61,48 @@ def run_session(
     targets: Sequence[Pose],
     rate: float,
     compare: bool,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[int], object] = lambda commands: None,
     announce: Callable[[str], None] = lambda _: None,
 ) -> SessionResult:
-    """Visit poses; first without compensation when `compare`, then with it."""
-    session, result = Session(client, geometry, rate, progress), SessionResult()
+    """Move to poses and rest at each; first without compensation when `compare`, then with it."""
+    base, at, result = commanded_in_base(geometry), client.estimate, SessionResult()
     result.poses = [PoseRecord(target) for target in targets]
+
+    def enable(enabled: bool) -> None:
+        """Switch compensation and wait until the change has ramped through."""
+        client.enable(enabled)
+        before, wanted = dict(client.diagnostics), "on" if enabled else "off"
+
+        def through() -> bool:
+            seen = client.diagnostics
+            return seen != before and seen["compensation"] == wanted and seen["ramping"] == "false"
+
+        client.hold(at, rate, through, 10.0, "compensation to ramp")
+
+    def visit(compensated: bool) -> list[Sent]:
+        """Move to every pose, rest until the true tool does, and record it; return the commands on the way."""
+        nonlocal at
+        sent = []
+        for record in result.poses:
+            sent += client.stream(move(base, at, record.target, rate, MOVE_FEED), progress)
+            at = record.target
+            quiet = client.settled() if client.has_true_pose else (lambda: True)
+            last = client.hold(at, rate, quiet, SETTLE_TIMEOUT, "the machine to come to rest")
+            true = client.true_pose if client.has_true_pose else None
+            if compensated:
+                record.command, record.correction = last.command, last.correction
+                record.estimate, record.true_with = client.estimate, true
+            else:
+                record.true_without = true
+        return sent
+
     if compare:
         announce("pass without compensation …")
-        session.enable(False)
-        session.visit(result.poses, compensated=False)
-        session.enable(True)
-        session.sent = []
+        enable(False)
+        visit(compensated=False)
+        enable(True)
     announce("pass with compensation …")
-    session.visit(result.poses, compensated=True)
-    result.latencies, every = _latencies(session.sent), _latencies(client.sent.values())
+    result.latencies, every = _latencies(visit(compensated=True)), _latencies(client.sent.values())
     result.late, result.longest = int((every > 1.0 / rate).sum()), float(every.max(initial=0.0))
     result.busy = busy_text(every, rate)
     accepted, result.refused = client.counted()

@@ -170,8 +170,8 @@ class LoopClient(RosSession):
             self.spin_once(0.01)
         return entry
 
-    def stream(self, path: Path, each: Callable[[int], None] | None = None) -> list[Sent]:
-        """Send a path at its rate and return the records.
+    def stream(self, path: Path, progress: Callable[[int], object]) -> list[Sent]:
+        """Send a path at its rate and return the records; `progress` is called with each number of commands sent.
 
         A command waits for the answer to the previous one, so that a stall of any process delays the path and causes no
         jump.
@@ -179,14 +179,13 @@ class LoopClient(RosSession):
         entries: list[Sent] = []
         messages = [pose_message(path.pose(n), self._frame_id) for n in range(len(path))]
         due = time.monotonic()
-        for index, message in enumerate(messages):
+        for message in messages:
             while (left := due - time.monotonic()) > 0.0:
                 self.spin_once(left)
             if entries:
                 entries[-1] = self.wait_for_answer(entries[-1])
             entries.append(self._send(message))
-            if each is not None:
-                each(index)
+            progress(1)
             due = max(due + 1.0 / path.rate, time.monotonic() - 1.0 / path.rate)
         entries[-1] = self.wait_for_answer(entries[-1])
         return entries

@@ -592,7 +592,7 @@ def test_messages_that_are_damaged_are_named(run, tmp_path):
     """A message cut short, a page that is no JSON, of another version, or without its numbers."""
     pages = [
         ("{", "not JSON"),
-        ("[1]", "must be of version 5"),
+        ("[1]", "must be of version 4 or 5"),
         ('{"journal": 9}', "must be of version 4 or 5, not 9"),
         ('{"journal": 3}', "not 3; replay a recording with the release that made it"),
         ('{"journal": 4}', "not a page of the journal"),

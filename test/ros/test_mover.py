@@ -333,7 +333,7 @@ class StandIn(LoopClient):
         self._entry.sent_at = 1e12  # never overdue
         return self._entry
 
-    def _spin_once(self, timeout: float) -> None:
+    def spin_once(self, timeout: float) -> None:
         outcome = self._outcomes.pop(0)
         if outcome == "answered":
             self._entry.command[:] = self._entry.correction[:] = 0.0
