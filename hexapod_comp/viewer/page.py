@@ -1,4 +1,4 @@
-"""Watching a machine: hears what its nodes publish, publishes nothing, and shows it on a page served by viser."""
+"""Watching a machine: subscribes to what its nodes publish, publishes nothing, shows it on a page served by viser."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from html import escape
 from http import HTTPStatus
 from ipaddress import ip_address
 from typing import Any, TypeVar
@@ -25,6 +24,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
 from ..errors import HexapodError
+from ..formats.pages import render
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import solve_pose
 from ..pose import Pose, rotation_angle
@@ -211,8 +211,6 @@ GOLD = (240, 190, 60)
 COLOURS = {OK: "#3fb950", WARN: "#d9a520", ERROR: "#f85149"}
 SILENT = "#8b949e"
 
-TITLES = dict(zip(NODES, ("Compensator", "Drive"), strict=True))
-
 # What of the diagnostics' values is shown, and its name
 KEYS = {
     "commanded_by": "commanded by",
@@ -296,65 +294,44 @@ def strut_colours(corrections: np.ndarray | None) -> np.ndarray:
 
 def words(view: View, machine: str) -> str:
     """Return what is known as HTML: states and refusals, errors, corrections, latencies. All of it is escaped."""
-    parts = [_heading(escape(machine))]
-    for name in NODES:
-        parts.append(_heading(TITLES[name]))
-        if (status := view.states.get(name)) is None:
-            parts.append(f'<div style="color: {SILENT}">no status received</div>')
-            continue
-        values = {entry.key: escape(entry.value) for entry in status.values}
-        shown = {title: values[key] for key, title in KEYS.items() if values.get(key)}
-        shown |= {f"refused: {escape(key[8:])}": text for key, text in values.items() if key.startswith("refused.")}
-        colour, message = COLOURS.get(status.level, SILENT), escape(status.message)
-        parts += [f'<div style="color: {colour}"><b>{message}</b></div>', _table(shown)]
-        runs = status.hardware_id  # empty before the machine is known, and behind the namespace
-        if runs and not f"/{runs}".endswith(f"/{machine}"):
-            other = f"runs the machine {escape(runs)}, not {escape(machine)}"
-            parts.append(f'<div style="color: {COLOURS[ERROR]}">{other}</div>')
+    nodes = []
+    for name, title in zip(NODES, ("Compensator", "Drive"), strict=True):
+        status = view.states.get(name)
+        values = {} if status is None else {entry.key: entry.value for entry in status.values}
+        rows = [(shown, values[key]) for key, shown in KEYS.items() if values.get(key)]
+        rows += [(f"refused: {key[8:]}", text) for key, text in values.items() if key.startswith("refused.")]
+        nodes.append((title, status, SILENT if status is None else COLOURS.get(status.level, SILENT), rows))
     errors = {
         "without compensation, by the model": view.predicted,
         "left, by the estimate": view.left,
         "left, by tool_pose_true": view.seen,
     }
-    struts = {}
-    for number in range(6):
-        measured = "–" if view.measured is None else f"{1e3 * view.measured[number]:.4f} mm"
-        correction = "–" if view.corrections is None else f"{1e6 * view.corrections[number]:+.1f} µm"
-        struts[str(number + 1)] = f"{measured} &nbsp; {correction}"
-    waited = "no commands"
-    if (latency := view.latency) is not None:
-        waited = f"median {1e3 * latency.median:.2f} ms, largest {1e3 * latency.largest:.2f} ms"
-        waited += f", of {latency.count} in {WINDOW:g} s"
-    parts += [
-        _heading("Tool error, axes of work"),
-        _table({name: _error(error) for name, error in errors.items()}),
-        "<small>Left is tool − command: while the machine moves it holds the drives' lag too.</small>",
-        _heading("Struts"),
-        _table(struts),
-        "<small>blue −100 µm, white 0, red +100 µm; grey: no correction received</small>",
-        _heading("Latency, stamp of a command to its answer here"),
-        f"<div>{waited}</div>",
-    ]
-    return f'<div style="padding: 0 1em 1em; font-size: 0.85em; line-height: 1.35">{"".join(parts)}</div>'
+    nothing = ["–"] * 6
+    measured = nothing if view.measured is None else [f"{1e3 * value:.4f} mm" for value in view.measured]
+    corrections = nothing if view.corrections is None else [f"{1e6 * value:+.1f} µm" for value in view.corrections]
+    latency = "no commands"
+    if view.latency is not None:
+        latency = f"median {1e3 * view.latency.median:.2f} ms, largest {1e3 * view.latency.largest:.2f} ms"
+        latency += f", of {view.latency.count} in {WINDOW:g} s"
+    return render(
+        "watch.html",
+        machine=machine,
+        nodes=nodes,
+        silent=SILENT,
+        error=COLOURS[ERROR],
+        errors=[(name, _error(error)) for name, error in errors.items()],
+        struts=list(zip(measured, corrections, strict=True)),
+        latency=latency,
+    )
 
 
-def _error(error: WatchedError | None) -> str:
+def _error(error: WatchedError | None) -> tuple[str, str, str] | None:
     if error is None:
-        return "not known"
+        return None
     x, y, z = 1e6 * error.displacement
     spread = f" ± {1e6 * error.deviation:.1f}" if np.isfinite(error.deviation) else ""
     length = 1e6 * float(np.linalg.norm(error.displacement))
-    return f"<b>{length:.1f}{spread} µm</b>, {1e6 * error.turn:.0f} µrad<br>{x:+.1f}, {y:+.1f}, {z:+.1f} µm"
-
-
-def _heading(text: str) -> str:
-    return f'<h4 style="margin: 0.7em 0 0.2em">{text}</h4>'
-
-
-def _table(rows: dict[str, str]) -> str:
-    first = '<td style="padding-right: 1em">'
-    cells = "".join(f"<tr>{first}{name}</td><td>{text}</td></tr>" for name, text in rows.items())
-    return f'<table style="vertical-align: top">{cells}</table>'
+    return f"{length:.1f}{spread} µm", f"{1e6 * error.turn:.0f} µrad", f"{x:+.1f}, {y:+.1f}, {z:+.1f} µm"
 
 
 def _outline(joints: np.ndarray) -> np.ndarray:
