@@ -104,7 +104,7 @@ class BagWriter:
             return
         if free < RESERVE:
             full = f"less than {RESERVE // 1_000_000} MB are free on its disk"
-            self.problem = f"{full}; what was heard until then is whole and can be replayed"
+            self.problem = f"{full}; what was received until then is whole and can be replayed"
 
     def close(self) -> None:
         """Close the bag; an error is the :attr:`problem`."""
