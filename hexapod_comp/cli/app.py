@@ -31,14 +31,9 @@ USAGE_ERROR, INTERRUPTED = 2, 130  # exit codes: bad input; Ctrl-C as shells cou
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line, by default with the arguments of this process.
-
-    Returns
-    -------
-    int
-        Exit code: 0 success, 1 the verb's negative result, 2 bad input or output that cannot be written, 130
-        interrupted, 141 the reader of the output has closed it.
-    """
+    """Run the command line, by default with the arguments of this process; return the exit code: 0 success, 1 the
+    verb's negative result, 2 bad input or output that cannot be written, 130 interrupted, 141 the output's reader has
+    closed it."""
     arguments = sys.argv[1:] if argv is None else argv
     return run_with_plain_streams(lambda: _run(arguments)) or 0
 

@@ -67,11 +67,11 @@ class LoopClient(RosSession):
 
     def _on_answer(self, topic: str, message: JointState) -> None:
         if (entry := self.sent.get(nanoseconds_of(message.header.stamp))) is not None:
-            self._reader.read(message)
+            lengths = self._reader.read(message)
             if topic == "strut_commands":
-                entry.answered_at, entry.command = time.monotonic(), self._reader.lengths.copy()
+                entry.answered_at, entry.command = time.monotonic(), lengths
             else:
-                entry.correction = self._reader.lengths.copy()
+                entry.correction = lengths
 
     def _on_pose(self, topic: str, message: PoseStamped) -> None:
         self._newest[topic] = message

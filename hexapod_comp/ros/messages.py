@@ -202,7 +202,6 @@ class StrutReader:
     """Extracts the six struts, by their joint names, from JointState messages; other joints are ignored."""
 
     def __init__(self, names: Sequence[str] = STRUT_NAMES) -> None:
-        self.lengths = np.zeros(6)  # last read, in strut order, m
         self._struts, self._names = names, list[str]()
         self._order: Sequence[int] = range(6)
         # Layout of the last message: size, bytes before the positions except the stamp, offset of the positions, number
@@ -224,26 +223,20 @@ class StrutReader:
             self.check(values)
             sample.stamp, sample.values = seconds * _SECOND + nanoseconds, values
             return
-        message = self.parse(data)
-        sample.stamp, sample.values = nanoseconds_of(message.header.stamp), tuple(self.lengths.tolist())
+        message: JointState = read_message(data, JointState)
+        sample.stamp, sample.values = nanoseconds_of(message.header.stamp), tuple(self.read(message).tolist())
         at, fast = len(_before_positions(message.header.frame_id, message.name)), len(message.velocity)
         efforts, self._shape = at + (104 if fast else 52), (0, b"", 0, b"", 0)
         six = len(message.position) == 6 and fast in (0, 6) and not len(message.effort)
         if six and data[:2] == LITTLE_ENDIAN and data[at : at + 48] == message.position.tobytes():
             self._shape = (len(data), data[:4] + data[12:at], at, _COUNT.pack(fast), efforts)
 
-    def parse(self, data: bytes) -> JointState:
-        """Read a message that came as bytes, and return it; errors as :func:`read_message` and :meth:`read`."""
-        message: JointState = read_message(data, JointState)
-        self.read(message)
-        return message
-
-    def read(self, message: JointState) -> None:
-        """Read a message; a CommandError, ``strut_names``, ``strut_count`` or ``not_finite``, leaves the lengths last
-        read."""
+    def read(self, message: JointState) -> np.ndarray:
+        """Return a message's lengths in strut order, m; a CommandError: ``strut_names``, ``strut_count``,
+        ``not_finite``."""
         lengths = self.pick(message)
         self.check(lengths.tolist())
-        self.lengths[:] = lengths
+        return lengths
 
     def pick(self, message: JointState) -> np.ndarray:
         """Return a message's six lengths in strut order, whatever their values; errors ``strut_names`` and

@@ -153,8 +153,7 @@ class Watcher:
             return None
 
     def _lengths(self, data: bytes) -> np.ndarray:
-        self._reader.parse(data)
-        return self._reader.lengths.copy()
+        return self._reader.read(read_message(data, JointState))
 
     def _pose_of(self, lengths: np.ndarray) -> Pose | None:
         """Return the platform's pose in ``base`` with nominal lengths, if there is one."""

@@ -141,7 +141,9 @@ def test_a_recording_ends_while_its_disk_has_room_to_close_it(
     bag = BagWriter(run)
     record(bag, machine, 600)
     bag.close()
-    assert bag.problem == "less than 64 MB are free on its disk; what was received until then is whole and can be replayed"
+    assert (
+        bag.problem == "less than 64 MB are free on its disk; what was received until then is whole and can be replayed"
+    )
     assert bag.counts["/padding"] * 0.1 < room + 18.0, "some 16 MB and a chunk after the last look at the latest"
     result = replay_recording(read_recording(run))
     assert result.identical
