@@ -1,25 +1,31 @@
-"""Virtual instruments against errors known in closed form, and the verb ``simulate`` from file to file."""
+"""Virtual machines, instruments and warm-up against errors known in closed form; ``simulate`` and ``imagine``."""
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from foreign_machines import UM, Errors, aligned_rms, machine_names, machines, tool_errors
 from strategies import paper_geometry
 
 from hexapod_comp import cli
-from hexapod_comp.errors import HexapodError
+from hexapod_comp.errors import HexapodError, InputFileError, ModelError
 from hexapod_comp.formats.paths import config_file
+from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.struts import StrutErrors
-from hexapod_comp.machine.temperatures import Temperatures
+from hexapod_comp.machine.temperatures import PARTS
 from hexapod_comp.measurements.campaign import Campaign, load_campaign, template
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
 from hexapod_comp.measurements.tidy import read_tidy
 from hexapod_comp.virtual.instruments import compensated, measure, station_errors
+from hexapod_comp.virtual.warm_up import SENSED, WarmUp, growing, load_warm_up
 
 BOX = np.array([[-0.1, -0.1, 0.4], [0.1, 0.1, 0.55]])
 QUIET = Campaign(BOX, cell=0.1, step=0.05, instrument="6-D", diagonals=4, cycles=2, poses=20, tilt=0.1,
@@ -34,12 +40,6 @@ def filled(campaign: Campaign, truth: RealMachine, seed: int = 3) -> Measurement
     return measure(template(campaign, truth.geometry), campaign, truth, seed)
 
 
-def test_a_perfect_machine_reads_nothing() -> None:
-    """Forward kinematics of nominal lengths is the commanded pose to rounding: 1e-15 m over a metre."""
-    found = filled(QUIET, RealMachine(paper_geometry(), MachineModel("paper")))
-    np.testing.assert_allclose(found.value, 0.0, atol=1e-13)
-
-
 def test_a_shifted_base_shows_in_absolute_positions_only() -> None:
     """All base joints moved by d: the platform moves by d, exactly. Lines are zeroed at their first reading."""
     d = np.array([20e-6, -30e-6, 50e-6])
@@ -47,22 +47,6 @@ def test_a_shifted_base_shows_in_absolute_positions_only() -> None:
     found = filled(QUIET, truth)
     np.testing.assert_allclose(found.value[of_kind(found, "position")].reshape(-1, 3), np.tile(d, (20, 1)), atol=1e-13)
     np.testing.assert_allclose(found.value[~of_kind(found, "position")], 0.0, atol=1e-12)
-
-
-def test_a_machine_that_grows_evenly_takes_similar_poses() -> None:
-    """Struts, base and platform grown by a·ΔT: every pose is the commanded one, grown. The stations' temperature
-    counts, not the truth's own. Linear error: a·ΔT × way from the first point; angles and straightness: none."""
-    growth, kelvin = 11.7e-6, 10.0
-    model = MachineModel("paper", struts=StrutErrors(expansion=np.full(6, growth)),
-                         base_expansion=growth, platform_expansion=growth)  # fmt: skip
-    truth = RealMachine(paper_geometry(), model, Temperatures({"base": 35.0}))
-    plan = template(replace(QUIET, poses=0), paper_geometry())
-    warm = np.full_like(plan.stations.temperatures, 20.0 + kelvin)
-    plan = replace(plan, stations=replace(plan.stations, temperatures=warm))
-    found = measure(plan, QUIET, truth, 0)
-    linear = of_kind(found, "linear")
-    np.testing.assert_allclose(found.value[linear], growth * kelvin * found.along()[linear], atol=1e-12)
-    np.testing.assert_allclose(found.value[~linear], 0.0, atol=1e-12)
 
 
 def test_backlash_separates_the_directions() -> None:
@@ -177,3 +161,223 @@ def test_verb_writes_what_it_says(tmp_path: Path, capsys: pytest.CaptureFixture[
     stated = {kind: found.uncertainty[of_kind(found, kind)][0] for kind in ("linear", "rotation", "position")}
     assert stated == pytest.approx({"linear": 0.5e-6, "rotation": np.radians(0.2 / 3600.0), "position": 10e-6})
     assert np.isnan(found.uncertainty[of_kind(found, "straightness")]).all()
+
+
+ALIKE = WarmUp(
+    rise=np.array([3.0] * 8 + [0.2]), time_constants=np.array([600.0] * 8 + [1200.0]), humidity=0.45, sensors=SENSED,
+    noise=(0.0, 0.0), rounds=2, every=1200, pace=2,
+)  # fmt: skip
+STEEL = 11.5e-6
+
+
+def test_parts_follow_the_power_by_a_first_order_lag() -> None:
+    """On for 1000 s, off for another thousand: closed form on both ways; rounding of two thousand steps."""
+    t = np.arange(1001.0)
+    course = ALIKE.course(2000, off=(1000, 2000))
+    reached = 1.0 - np.exp(-1000.0 / 600.0)
+    np.testing.assert_allclose(course[:1001, 0], 20.0 + 3.0 * (1.0 - np.exp(-t / 600.0)), atol=1e-11)
+    np.testing.assert_allclose(course[1000:, 7], 20.0 + 3.0 * reached * np.exp(-t / 600.0), atol=1e-11)
+    np.testing.assert_allclose(course[:1001, 8], 0.45 + 0.2 * (1.0 - np.exp(-t / 1200.0)), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["framed", "inches"])
+def test_a_machine_that_grows_evenly_shows_it_on_every_round(name: str, tmp_path: Path) -> None:
+    """Struts, base and platform alike: the platform's place is the commanded one, grown; the tool's offset does not.
+    What acts is the temperature, not what the filter makes of it 30 s later. Second order: 1e-9 of a metre's 1e-5."""
+    geometry, box = load_geometry(machines()[name].write(tmp_path / "machine.yaml")), machines()[name].box
+    side = float(np.ptp(box, axis=0).min())
+    campaign = ALIKE.campaign(Campaign(box, side, side, None, 4, noise=(0.0,) * len(KINDS), beam_slope=0.0))
+    truth = RealMachine(geometry, growing(MachineModel(geometry.name), np.full(3, STEEL)))
+    read = ALIKE.measured(template(campaign, geometry), campaign, truth, seed=1)
+    assert [run.name for run in read.runs[4:]] == [f"{a} {w}" for w in ("cold 1", "round 1", "round 2") for a in "xyz"]
+    times = read.stations.times[read.station]
+    assert times[read.run == 7].min() == 600.0, "half of the first round"
+    warmth = 3.0 * (1.0 - np.exp(-np.maximum(times, 0.0) / 600.0))
+    assert (read.stations.temperatures[read.station][times < 0.0] == 20.0).all()
+    linear = read.channel == 0
+    # From each run's first reading on, which has a warmth of its own.
+    for run in range(len(read.runs)):
+        rows = np.flatnonzero(linear & (read.run == run) & (read.direction == 1))
+        grown = read.stations.positions[read.station[rows]] * (STEEL * warmth[rows])[:, None]
+        wanted = (grown - grown[0]) @ read.runs[run].axis
+        np.testing.assert_allclose(read.value[rows], wanted, atol=1e-11)
+
+
+def test_sensors_tell_what_they_have() -> None:
+    one = replace(ALIKE, sensors=("base",), humidity=np.nan, noise=(0.05, 0.0))
+    true = one.course(3000)
+    seen = one.sensed(true, np.random.default_rng(1))
+    assert (np.delete(seen[:, :8], PARTS.index("base"), axis=1) == 20.0).all()
+    assert np.isnan(seen[:, 8]).all()
+    off = seen[1000:, 6] - true[1000:, 6]
+    assert 0.002 < off.std() < 0.02, "0.05 K, an eighth of it after the filter"
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"sensors": ("spindle",)}, "must be of strut_1"),
+        ({"humidity": np.nan}, "of the humidity only where it is given"),
+        ({"humidity": 45.0}, r"warm-up of humidity: must end within 0\.01…1"),
+        ({"rise": np.array([300.0] * 9)}, "warm-up of strut_1: must end within -40…120"),
+        ({"rounds": 0}, "cold_rounds"),
+        ({"every": 10**7}, "1000000 s in all at most"),
+    ],
+)
+def test_what_cannot_be_is_refused(change: dict, problem: str) -> None:
+    with pytest.raises(ModelError, match=problem):
+        replace(ALIKE, **change)
+
+
+def test_the_shipped_file_and_one_with_a_slip(tmp_path: Path) -> None:
+    text = config_file("warm_up").read_text(encoding="utf-8")
+    warm, expansion = load_warm_up("warm_up")
+    assert warm.sensors == PARTS
+    np.testing.assert_array_equal(expansion, [11.5e-6] * 3)
+    path = tmp_path / "slip.yaml"
+    for wrong, problem in (
+        (text.replace("strut_spread_percent: 10", "strut_spread_percent: 90"), "must be 0…20 %"),
+        (text + "humidity_percent: [0.45, 0.65]\nhumidity_time_constant_s: 3600\n", "warm-up of humidity"),
+    ):
+        path.write_text(wrong, encoding="utf-8")
+        with pytest.raises(InputFileError, match=problem):
+            load_warm_up(path)
+
+
+SHORT = """format: hexapod_comp/warm_up
+version: 1
+struts_rise_K: 3.0
+struts_time_constant_s: 1500
+base_time_constant_s: 5400
+platform_time_constant_s: 3000
+expansion_ppm_per_K: [11.5, 11.5, 11.5]
+humidity_percent: [45, 65]
+humidity_time_constant_s: 3600
+rounds: 1
+"""
+
+
+def test_the_verb_writes_times_and_what_sensors_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = {name: tmp_path / name for name in ("warm.yaml", "small.yaml", "out.csv")}
+    paths["warm.yaml"].write_text(SHORT, encoding="utf-8")
+    paths["small.yaml"].write_text(SMALL, encoding="utf-8")
+    options = ["--campaign", str(paths["small.yaml"]), "--warm-up", str(paths["warm.yaml"]), "--model", "paper_machine"]
+    assert cli.main(["simulate", *options, "--out", str(paths["out.csv"])]) == 0
+    assert "warms while it is measured: strut_1 0." in capsys.readouterr().out
+    back = read_tidy(paths["out.csv"], load_geometry("paper"))
+    assert np.isfinite(back.stations.times).all()
+    assert np.ptp(back.stations.temperatures[:, 0]) > 0.3
+    assert np.ptp(back.stations.humidity) > 0.005
+
+
+# Leaves what the tests' own reader and kinematics have: structure, offsets and pitch
+PLAIN = ("--wave-um", "0", "--map-um", "0", "--backlash-um", "0")
+
+
+@pytest.mark.parametrize("name", machine_names())
+def test_any_machine(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The figures of the report are those of the file, at random places of the box that the report names."""
+    # Of 1,000 places each. Aligned errors grow towards the corners, so that squares scatter by one and a half times
+    # their size: a mean square good to 4.5/√1000 = 14 %, its root to 7 %, two such 10 %.
+    machine = machines()[name]
+    geometry, out = machine.write(tmp_path / "machine.yaml"), tmp_path / "truth.yaml"
+    bounds = ("--joints-um", "30", "--struts-um", "20", "--pitch-ppm", "100")
+    words = ["imagine", "--machine", geometry, *bounds, *PLAIN, "--seed", "3", "--out", out]
+    assert cli.main([str(word) for word in words]) == 0
+    said = capsys.readouterr().out
+    truth = Errors.read(out)
+    for values, bound in (
+        (truth.base, 30 * UM),
+        (truth.platform, 30 * UM),
+        (truth.offset, 20 * UM),
+        (truth.pitch, 1e-4),
+    ):
+        assert 0.5 * bound < np.abs(values).max() <= bound
+        assert len(np.unique(values)) > 3
+    corners, raw, aligned = re.search(r"in \((.*)\) mm of work: ([\d.]+) µm RMS as it is, ([\d.]+) µm", said).groups()
+    box = np.array([[float(v) * 1e-3 for v in c.split(",")] for c in corners.split(")…(")])
+    tips = np.random.default_rng(8).uniform(box[0], box[1], (1000, 3))
+    errors = tool_errors(machine, truth, None, tips)
+    assert float(raw) * UM == pytest.approx(np.sqrt((errors**2).sum(axis=1).mean()), rel=0.1)
+    assert float(aligned) * UM == pytest.approx(aligned_rms(tips, errors), rel=0.1)
+
+
+def test_every_bound_ends_where_it_belongs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The file's keys carry the units; each value lies within its option's bound, and only then."""
+    out = tmp_path / "truth.yaml"
+    words = ["--joints-um", "0", "--struts-um", "0", "--pitch-ppm", "0", "--wave-um", "2,3", "--wave-period-mm", "4"]
+    words += ["--map-um", "1.5", "--backlash-um", "5,6", "--wear-um", "3", "--strut-expansion-ppm-per-k", "10,11"]
+    words += ["--body-expansion-ppm-per-k", "12,13", "--field-um", "7", "--field-urad", "9"]
+    words += ["--field-reversal-percent", "20", "--box", "-50,-50,360,50,50,440", "--name", "all of it"]
+    assert cli.main(["imagine", *words, "--seed", "2", "--json", "--out", str(out)]) == 0
+    told = json.loads(capsys.readouterr().out)
+    content = yaml.safe_load(out.read_text())
+    assert (content["machine"], content["name"], told["name"], told["seed"]) == ("paper", "all of it", "all of it", 2)
+    struts, field = content["struts"], content["field"]
+    assert "structure" not in content or not np.any(content["structure"].get("base_deviation_um", 0.0))
+    assert not np.any(struts.get("offset_um", 0.0))
+    model = load_model(out, load_geometry("paper"))
+    amplitude = np.hypot(model.struts.cosine, model.struts.sine) / UM
+    assert ((amplitude >= 2.0) & (amplitude <= 3.0)).all()
+    assert model.struts.period.tolist() == [0.004] * 6
+    assert np.sqrt((model.struts.map_values**2).mean(axis=1)) / UM == pytest.approx([1.5] * 6)
+    wear = model.struts.map_backlash.max(axis=1) / UM
+    assert ((wear > 1.4) & (wear <= 3.0)).all()  # at least half of it, between knots
+    for values, low, high in (
+        (struts["backlash_um"], 5.0, 6.0),
+        (model.struts.expansion * 1e6, 10.0, 11.0),
+        ([model.base_expansion * 1e6, model.platform_expansion * 1e6], 12.0, 13.0),
+    ):
+        assert ((np.array(values) >= low) & (np.array(values) <= high)).all()
+    assert [field["grid_x_mm"][0], field["grid_x_mm"][-1]] == [-50.0, 50.0]
+    assert [field["grid_z_mm"][0], field["grid_z_mm"][-1]] == [360.0, 440.0]
+    places = np.random.default_rng(1).uniform(model.field.box[0], model.field.box[1], (300, 3))
+    seen = np.array([model.field.evaluate(place, np.ones(3))[0] for place in places])
+    back = np.array([model.field.evaluate(place, -np.ones(3))[0] for place in places])
+    assert 0.2 * 7 * UM < np.abs(seen[:, :3]).max() <= 7.1 * UM  # scaled on a grid of nine places a side
+    assert 0.2 * 9e-6 < np.abs(seen[:, 3:]).max() <= 9.1e-6
+    assert np.abs(seen - back).max() > 0.1 * UM
+    assert told["largest"]["backlash_um"] <= 6.0
+    assert told["tool_error"]["frame"] == "work"
+
+
+CAMPAIGN = """format: hexapod_comp/campaign
+version: 1
+box_mm: [[-30, -30, 380], [30, 30, 420]]
+cell_mm: 40
+step_mm: 20
+instrument: 1-D
+diagonals: 0
+"""
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "ik --pose 10,20,400 --json --model",
+        "export --box -50,-50,380,50,50,420 --table {}/t.csv --json --model",
+        "simulate --campaign {}/campaign.yaml --out {}/m.csv --json --truth",
+    ],
+)
+def test_random_is_the_same_machine_in_every_verb(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By its name and by the file of ``imagine`` with that seed: the same answers and files, but for the name."""
+    (tmp_path / "campaign.yaml").write_text(CAMPAIGN)
+    file = tmp_path / "truth.yaml"
+    assert cli.main(["imagine", "--seed", "4", "--out", str(file)]) == 0
+    capsys.readouterr()
+    answers = []
+    for name in (str(file), "random:4", "random:5"):
+        assert cli.main([*command.replace("{}", str(tmp_path)).split(), name]) == 0
+        made = [path.read_text() for path in sorted(tmp_path.glob("*.csv"))]
+        answers.append((numbers(capsys.readouterr().out), [numbers(text) for text in made]))
+    assert answers[0][0] == pytest.approx(answers[1][0], rel=1e-12, abs=1e-12)
+    for one, other in zip(answers[0][1], answers[1][1], strict=True):
+        assert one == pytest.approx(other, rel=1e-12, abs=1e-12)
+    assert answers[0] != answers[2]
+
+
+def numbers(text: str) -> list[float]:
+    """Return all numbers of a text that have a point."""
+    return [float(word) for word in re.findall(r"-?\d+\.\d+(?:e[+-]?\d+)?", text)]

@@ -73,7 +73,6 @@ def test_proposed_readings_are_written_to_be_filled_in(folder: Path, capsys: pyt
         ((), "at least one of FILE, --propose is needed"),
         ((folder / "same.csv", "--propose", proposed), "FILE cannot be combined with --propose"),
         (("--propose", proposed, "--readings", "2"), "must be 6…60, not 2"),
-        (("--readings", "8"), "at least one of FILE, --propose is needed"),
         ((proposed,), "value"),
     ):
         assert run("verify", model_in(folder), *wrong) == 2
