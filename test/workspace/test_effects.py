@@ -102,61 +102,6 @@ def test_exact_effects_solve_the_loop_closures(make):
             np.testing.assert_allclose(found[n, e], truth, rtol=0.0, atol=2e-14, err_msg=errors.labels[e])
 
 
-def test_a_wrong_tool_shifts_the_tip_by_as_much_everywhere():
-    geometry = tooled(paper())
-    errors = every_error(geometry, {"tool_offset": 25e-6})
-    positions, rotations = poses_about(geometry.home, 5, seed=2)
-    found = effects(geometry, errors, positions, rotations)
-    np.testing.assert_allclose(found[..., 0], 25e-6, rtol=1e-14)
-    np.testing.assert_array_equal(found[..., 1], 0.0)
-
-
-def test_six_equal_strut_errors_lift_the_platform_straight_up():
-    # At home L² = ρ² + h²: dh = L/h·dL, and nothing turns; first-order effects add up.
-    geometry = paper()
-    errors = every_error(geometry, {"strut_length": 20e-6})
-    home = geometry.home
-    vectors = effect_vectors(geometry, errors, home.position[None], home.rotation, LINEAR)[0]
-    length = strut_lengths(Structure.of(geometry), home)[0]
-    expected = [0.0, 0.0, 20e-6 * length / home.position[2], 0.0, 0.0, 0.0]
-    np.testing.assert_allclose(vectors.sum(axis=0), expected, rtol=0.0, atol=1e-18)
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_shared_ball_joint_moves_a_level_platform_by_a_third(axis):
-    # Closed forms: three balls that are all off by d are a platform that stands by d off in its own frame, whatever the
-    # struts' directions, so the three first-order effects add up to -d. Off along z, one ball of the level platform
-    # stays where it is in space, and the middle of the three sinks by d/3.
-    geometry = paper()
-    names = ("platform_joint_xy", "platform_joint_xy", "platform_joint_z")
-    errors = every_error(geometry, {names[axis]: 10e-6})
-    home = geometry.home
-    vectors = effect_vectors(geometry, errors, home.position[None], home.rotation)[0]
-    along = [n for n, label in enumerate(errors.labels) if label.endswith("xyz"[axis])]
-    assert len(along) == 3
-    # second order: (10 µm)² over the platform's 0.17 m, some 1e-9
-    np.testing.assert_allclose(vectors[along, :3].sum(axis=0), -10e-6 * np.eye(3)[axis], rtol=0.0, atol=2e-9)
-    if axis == 2:
-        np.testing.assert_allclose(np.linalg.norm(vectors[along, :3], axis=1), 10e-6 / 3.0, rtol=1e-3)
-
-
-def test_a_joint_off_across_its_strut_acts_like_a_strut_too_short():
-    # Moved across by c, the strut would have to be √(L² + c²): to first order in that difference, the same effect.
-    geometry = paper()
-    positions, rotations = poses_about(geometry.home, 1, seed=3, tilt_deg=10.0)
-    strut = positions[0] + rotations[0] @ geometry.platform_joints[2] - geometry.base_joints[2]
-    length, across = np.linalg.norm(strut), 1e-3
-    way = across * np.cross(strut, [0.0, 0.0, 1.0]) / np.linalg.norm(np.cross(strut, [0.0, 0.0, 1.0]))
-    moved = one_error(BASE_JOINT, 2, list(way))
-    short = one_error(LENGTH, 2, [length - np.hypot(length, across), 0.0, 0.0])
-    found = effect_vectors(geometry, moved, positions, rotations)[0, 0]
-    expected = effect_vectors(geometry, short, positions, rotations)[0, 0]
-    largest = np.linalg.norm(expected[:3])
-    assert 3e-7 < largest < 3e-6  # c²/2L is 1.2 µm
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=0.01 * largest)  # c/L is 0.2 %, times a lever
-    assert np.abs(effect_vectors(geometry, moved, positions, rotations, LINEAR)).max() < 1e-18
-
-
 def test_linear_effects_are_the_limit_of_exact_ones():
     # What is left of the difference is of second order: it goes to a quarter when the errors go to a half.
     geometry = tooled(general_machine())
@@ -186,18 +131,6 @@ def test_a_joint_that_is_far_off_is_solved_with_pivoting():
         np.testing.assert_allclose(found[n], [*(actual.position - p), *turn], atol=1e-12)
 
 
-def test_effects_of_a_nanometre_keep_their_digits():
-    # Errors of 1 nm: exact and linear effects differ by their square over the platform's size, 1e-17. What is left is
-    # the rounding of lengths of half a metre, 1e-16 m, times gains of the machine of about ten.
-    geometry = tooled(general_machine())
-    names = [name for name in SIZES if name not in ("thermal_growth", "screw_pitch_slope")]
-    errors = every_error(geometry, dict.fromkeys(names, 1e-9))
-    poses = poses_about(geometry.home, 20, seed=12, tilt_deg=15.0)
-    exact, linear = (effect_vectors(geometry, errors, *poses, method) for method in (EXACT, LINEAR))
-    assert np.abs(linear).max() > 1e-9
-    np.testing.assert_allclose(exact, linear, rtol=0.0, atol=5e-15)
-
-
 def test_poses_without_a_certified_answer_are_nan_and_counted():
     geometry = paper()
     errors = every_error(geometry)
@@ -217,13 +150,13 @@ def test_poses_without_a_certified_answer_are_nan_and_counted():
     assert (with_none.at_pose == -1).all()
 
 
-@pytest.mark.parametrize(("method", "poses", "block"), [(EXACT, 5000, 1024), (LINEAR, 5000, 1024)])
-def test_extremes_are_those_of_all_effects_however_they_are_parted(method, poses, block, monkeypatch):
+@pytest.mark.parametrize("method", [EXACT, LINEAR])
+def test_extremes_are_those_of_all_effects_however_they_are_parted(method, monkeypatch):
     monkeypatch.setattr(kinematics, "ALONE", -1.0)  # others help from the second slice on
     geometry = tooled(paper())
     errors = every_error(geometry)
-    positions, rotations = poses_about(geometry.home, poses, seed=9)
-    monkeypatch.setattr("hexapod_comp.workspace.effects.BLOCK", block)
+    positions, rotations = poses_about(geometry.home, 5000, seed=9)
+    monkeypatch.setattr("hexapod_comp.workspace.effects.BLOCK", 1024)
     whole = extremes(geometry, errors, positions, rotations, method, threads=3)
     sizes = effects(geometry, errors, positions, rotations, method)
     for kind in range(len(errors.kinds)):
@@ -234,10 +167,9 @@ def test_extremes_are_those_of_all_effects_however_they_are_parted(method, poses
             assert whole.at_error[kind, column] == of_kind[error]
             assert whole.values[kind, column] == sizes[pose, of_kind[error], quantity]
             np.testing.assert_array_equal(whole.positions[kind, column], positions[pose])
-    cuts = poses * np.array([0, 1, 1500, 4097, 5000]) // 5000
     parts = merged(
         extremes(geometry, errors, positions[a:b], rotations[a:b], method, first=a, threads=1)
-        for a, b in pairwise(cuts)
+        for a, b in pairwise([0, 1, 1500, 4097, 5000])
     )
     for name in ("values", "at_pose", "at_error", "positions", "rotations", "failed", "poses"):
         np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
@@ -259,22 +191,3 @@ def test_the_papers_iteration_agrees_to_a_thousandth(make):
             size = np.maximum(np.linalg.norm(exact[:, e, part], axis=1), smallest)
             assert (apart <= 1e-3 * size).all(), errors.labels[e]
         assert (result.drift <= 1e-3 * np.maximum(result.travel, STEP)).all(), errors.labels[e]
-
-
-def test_the_iteration_corrects_passive_legs_on_a_long_way():
-    # 5 mm in steps of 0.01 mm: drift adds up until ε is reached; the corrections then keep it there.
-    geometry = paper()
-    errors = one_error(LENGTH, 3, [5e-3, 0.0, 0.0])
-    positions, rotations = poses_about(geometry.home, 1, seed=11, tilt_deg=10.0)
-    tolerance = 5e-9
-    result = tangential_effects(geometry, errors, 0, positions, rotations, tolerance=tolerance)
-    assert result.steps == 500
-    assert 0 < result.corrections[0] < 250
-    assert result.travel == pytest.approx([5e-3], rel=1e-4)  # the rest was corrected
-    assert tolerance < result.drift[0] < 1e-3 * STEP
-    exact = effect_vectors(geometry, errors, positions, rotations)[0, 0]
-    # ε in every leg, times a gain of about one
-    np.testing.assert_allclose(result.vectors[0], exact, rtol=0.0, atol=10.0 * tolerance)
-    loose = tangential_effects(geometry, errors, 0, positions, rotations, tolerance=1.0)
-    assert loose.corrections[0] == 0
-    assert loose.drift[0] < 1e-3 * loose.travel[0]  # even uncorrected, as 004 reports

@@ -1,34 +1,43 @@
-"""Where a machine can go: against Pythagoras, plain NumPy with every limit on its own, and random points."""
+"""Where a machine can go, shells and boxes: against Pythagoras, plain NumPy, every box of small grids, drawn points."""
 
 from __future__ import annotations
 
+import csv
+import json
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
+from pathlib import Path
 
 import numpy as np
 import pytest
+from foreign_machines import machines
 from helpers import segment_distance
 from strategies import PAPER_FILE, paper_geometry
 
+from hexapod_comp import cli
 from hexapod_comp.core import Status
-from hexapod_comp.core.batch import segment_distance as closest
-from hexapod_comp.errors import GeometryError
+from hexapod_comp.errors import GeometryError, InputFileError
 from hexapod_comp.machine import kinematics
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.measurements.campaign import load_campaign
 from hexapod_comp.pose import Pose
 from hexapod_comp.workspace.reach import (
+    FACES,
     FINDINGS,
+    ROOM,
     Boundary,
     Examiner,
     Reach,
-    _crossings,
-    _grid,
+    _largest_cells,
     home_orientation,
+    largest_box,
+    machine_box,
     orientations,
     possible_box,
     reach,
     reaches,
 )
+from hexapod_comp.workspace.shells import Shell, shell
 
 UNIT_FILE = PAPER_FILE.with_name("positioning_unit.yaml")
 LEVEL = np.eye(3)
@@ -108,24 +117,6 @@ def test_how_low_and_how_high_the_unit_goes():
     assert findings.tolist() == [Status.STROKE_SHORT, Status.STROKE_LONG]
 
 
-@pytest.mark.parametrize(
-    ("first", "second", "distance"),
-    [
-        pytest.param([[0, 0, 0], [1, 0, 0]], [[0.5, -1, 0.3], [0.5, 1, 0.3]], 0.3, id="crossing"),
-        pytest.param([[0, 0, 0], [1, 0, 0]], [[2, -1, 0.3], [2, 1, 0.3]], np.hypot(1, 0.3), id="end to inside"),
-        pytest.param([[0, 0, 0], [1, 0, 0]], [[4, 4, 0], [4, 5, 0]], 5.0, id="end to end"),
-        pytest.param([[0, 0, 0], [1, 0, 0]], [[0.2, 0.7, 0], [3, 0.7, 0]], 0.7, id="parallel, side by side"),
-        pytest.param([[0, 0, 0], [1, 0, 0]], [[3, 0, 0], [2, 0, 0]], 1.0, id="on one line"),
-        pytest.param([[0, 0, 0], [1, 1, 1]], [[1, 0, 0], [0, 1, 1]], 0.0, id="through each other"),
-    ],
-)
-def test_distance_of_two_segments(first, second, distance):
-    """Truth: read off the coordinates."""
-    first, second = np.array(first, dtype=float), np.array(second, dtype=float)
-    assert closest(*first, *second) == pytest.approx(distance, abs=1e-15)
-    assert closest(*second[::-1], *first) == pytest.approx(distance, abs=1e-15)
-
-
 def test_poses_of_their_own_orientation(monkeypatch):
     """Truth: the same poses asked one by one; and the same on one thread and on three, more than one slice."""
     monkeypatch.setattr(kinematics, "ALONE", -1.0)  # others help from the second slice on
@@ -173,7 +164,7 @@ def test_at_the_boundary_the_named_limit_is_reached_and_no_other_broken(make, li
     """Truth: every limit computed on its own in plain NumPy. The boundary is bisected to 10⁻⁹ m; cones and
     condition change by less than 100 per metre there. A clearance found by least squares is good to 10⁻⁹ m."""
     geometry, rotation = make()
-    found = reach(geometry, rotation, cells=10)
+    found = reach(geometry, rotation, cells=8)
     assert limiting <= set(found.boundary.findings.tolist())
     for tip, finding, struts in zip(
         found.boundary.positions, found.boundary.findings, found.boundary.struts, strict=True
@@ -202,35 +193,6 @@ def test_volume_of_the_unit():
     assert np.ptp(found.volumes) < 0.02 * found.volume
 
 
-class Ball(Examiner):
-    """A machine that reaches a ball of 80 mm about a point, or two such balls."""
-
-    def __init__(self, *centres: tuple[float, float, float]) -> None:
-        self.geometry, self.centres = unit(), np.array(centres)
-
-    def findings(self, positions, rotations, threads=None):
-        far = np.linalg.norm(positions[:, None] - self.centres, axis=2).min(axis=1) > 0.08
-        return np.where(far, Status.STROKE_LONG, 0).astype(np.int8), np.full((len(far), 2), -1, np.int8)
-
-
-def ball_reach(*centres: tuple[float, float, float]) -> Reach:
-    ball = Ball(*centres)
-    box = np.array([ball.centres.min(axis=0) - 0.1, ball.centres.max(axis=0) + 0.1])
-    axes, findings = _grid(ball, LEVEL, box, 41)
-    return Reach(ball.geometry, LEVEL, axes, findings, _crossings(ball, LEVEL, axes, findings))
-
-
-def test_volume_and_box_of_a_ball():
-    """Truth: 4/3·π·r³; the columns' error falls with the 1.5th power of the step: below 0.5 % at r/16."""
-    found = ball_reach((0.0, 0.0, 0.3))
-    np.testing.assert_allclose(found.volumes, 4.0 / 3.0 * np.pi * 0.08**3, rtol=5e-3)
-    np.testing.assert_allclose(found.box, [[-0.08, -0.08, 0.22], [0.08, 0.08, 0.38]], atol=2e-4)
-    assert found.parts == 1
-    regions = found.regions()
-    assert set(regions) == {"top", "bottom", *(f"side {k}…{k + 60}°" for k in range(0, 360, 60))}
-    assert all(shares == {FINDINGS[Status.STROKE_LONG]: 1.0} for shares in regions.values())
-
-
 def test_shares_and_regions():
     """Truth: counted by hand: two faces above, one below, one on the side at 200°."""
     cube = (np.array([-1.0, 1.0]),) * 3
@@ -249,7 +211,7 @@ def test_shares_and_regions():
     }
 
 
-@pytest.mark.parametrize("name", ["positioning_unit", "paper", "jugglebot"])
+@pytest.mark.parametrize("name", ["positioning_unit", "jugglebot"])
 def test_the_grid_holds_the_whole_reach(name):
     """Truth: nothing is within reach on the grid's outermost points, nor beyond the box that cannot be left,
     of which a wide grid sees that it loses nothing."""
@@ -268,18 +230,6 @@ def test_the_grid_holds_the_whole_reach(name):
     assert (tips[inside] < found.box[1] + margin).all()
 
 
-def test_poses_to_study():
-    """Truth: they are within the limits, at the asked orientation, and as many as the grid has within."""
-    geometry = unit()
-    rotations = turned_by(geometry, [0, 8], [0], [0])
-    level, turned = reaches(geometry, rotations, cells=16)
-    assert turned.volume < level.volume
-    positions, of_platform = turned.platform_poses()
-    assert len(positions) == turned.within.sum() == len(turned.points())
-    np.testing.assert_allclose(of_platform[0], rotations[1], atol=1e-15)
-    np.testing.assert_allclose(positions + of_platform @ [0.0, 0.0, 0.025], turned.points(), atol=1e-15)
-
-
 # Refused.
 
 
@@ -288,11 +238,176 @@ def test_an_empty_workspace_says_where_and_why():
         reach(unit(), tilted(unit(), gamma=80.0))
     with pytest.raises(GeometryError, match=r"empty at the orientation \(70, 0, 0\)°"):
         reaches(unit(), turned_by(unit(), [0, 70], [0], [0]), cells=8)
-
-
-def test_no_point_near_enough_to_all_base_joints():
-    """Truth: turned by 180° about z, base joint and platform joint of a strut are on opposite sides: each strut's
-    ball is about a point some 260 mm from the axis, and 250 mm do not reach across."""
-    geometry = limited(unit(), stroke=np.tile([0.187, 0.19], (6, 1)))
+    # Turned by 180° about z each strut's ball is about a point 260 mm from the axis; 250 mm do not reach across
+    short = limited(unit(), stroke=np.tile([0.187, 0.19], (6, 1)))
     with pytest.raises(GeometryError, match="no point is near enough"):
-        possible_box(geometry, tilted(geometry, gamma=180.0))
+        possible_box(short, tilted(short, gamma=180.0))
+
+
+def unit_reach() -> Reach:
+    return reach(unit(), cells=24)
+
+
+def small_shell() -> Shell:
+    return shell(unit_reach(), 19, 36)
+
+
+def within(found: Shell, points: np.ndarray) -> np.ndarray:
+    return Examiner(found.geometry).findings(points.reshape(-1, 3), found.rotation[None])[0] == Status.OK
+
+
+def test_a_shell_is_the_boundary():
+    """Truth: the limits themselves, a micrometre before the shell and a micrometre beyond it."""
+    for rotation in (LEVEL, tilted(unit(), 6.0, -3.0, 5.0)):
+        found = shell(reach(unit(), rotation, 24), 19, 36)
+        away = found.points - found.centre
+        step = 1e-6 * away / np.linalg.norm(away, axis=-1, keepdims=True)
+        assert within(found, found.points - step).all()
+        assert not within(found, found.points + step).any()
+        beyond, _ = Examiner(unit()).findings((found.points + step).reshape(-1, 3), rotation[None])
+        assert (beyond == found.findings.ravel()).mean() > 0.99  # at an edge of two limits either may come first
+
+
+def test_the_mesh_is_closed():
+    """Truth: a surface without a hole: poles are points, the last azimuth is the first."""
+    points = small_shell().points
+    assert np.array_equal(points[:, 0], points[:, -1])
+    for pole in (points[0], points[-1]):
+        assert (pole == pole[0]).all()
+    assert points[0, 0, 2] < points[:, :, 2].mean() < points[-1, 0, 2]
+
+
+def test_poses_of_a_shell_put_the_tool_there():
+    """Truth: the tool is 25 mm above the platform, along the platform's z axis (the file)."""
+    rotation = tilted(unit(), 6.0)
+    found = shell(reach(unit(), rotation, 16), 7, 12)
+    positions, rotations = found.platform_poses(0.7)
+    assert rotations.shape == (7 * 13, 3, 3)
+    np.testing.assert_allclose(positions + 0.025 * rotations[:, :, 2], found.scaled(0.7).reshape(-1, 3), atol=1e-15)
+    np.testing.assert_allclose(rotations, np.broadcast_to(rotation, rotations.shape), atol=1e-15)
+
+
+def test_the_units_shell_holds_its_reach():
+    """Truth: the volume by grid columns, which assumes nothing about the shape. The mesh's faces cut off what
+    bulges beyond them, less the finer it is."""
+    found = unit_reach()
+    coarse, fine = shell(found, 19, 36), shell(found, 61, 120)
+    assert not fine.folded.any()
+    assert 0.97 < coarse.coverage < fine.coverage
+    assert fine.coverage == pytest.approx(1.0, abs=0.01)
+
+
+def test_what_rays_do_not_see_is_said():
+    """Truth: Jugglebot without joint cones reaches around its struts; between the shell and a later point on the
+    same ray that is within reach lies a point that is not, by the limits themselves."""
+    geometry = load_geometry(UNIT_FILE.with_name("jugglebot.yaml"))
+    found = shell(reach(geometry, cells=24), 19, 36)
+    assert 0 < found.folded.sum() < found.folded.size
+    assert found.coverage < 0.99
+    rays = found.points - found.centre
+    beyond = found.centre + np.linspace(1.001, 4.0, 400)[:, None, None, None] * rays
+    again = within(found, beyond).reshape(400, *found.folded.shape).any(axis=0)
+    assert again[found.folded].all()
+
+
+def lengths(geometry: HexapodGeometry, tips: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Return strut lengths (N, 6) for tool tips in work, by NumPy alone."""
+    work, tool = geometry.work, geometry.tool
+    platform = work.rotation @ rotation @ tool.rotation.T
+    positions = work.position + tips @ work.rotation.T - platform @ tool.position
+    return np.linalg.norm(positions[:, None] + geometry.platform_joints @ platform.T - geometry.base_joints, axis=2)
+
+
+def test_the_largest_box_of_a_grid_is_found():
+    rng = np.random.default_rng(5)
+    for shape, density in product([(5, 4, 6), (2, 7, 3), (3, 3, 3)], (0.95, 0.8, 0.5)):
+        within = rng.random(shape) < density
+        best = 0
+        for ends in product(*(combinations(range(n), 2) for n in shape)):
+            if within[tuple(slice(a, b + 1) for a, b in ends)].all():
+                best = max(best, int(np.prod([b - a for a, b in ends])))
+        corners = _largest_cells(within)
+        if not best:
+            assert corners is None
+            continue
+        low, high = corners
+        assert np.prod(np.subtract(high, low)) == best
+        assert within[tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))].all()
+
+
+@pytest.mark.parametrize("name", ["positioning_unit", "example_6_6"])
+def test_all_of_the_box_is_within_the_limits_and_no_face_can_move_out(name: str):
+    geometry = load_geometry(name)
+    seen = reach(geometry, cells=20)
+    box, rotation, causes = largest_box(seen)
+    tips = np.random.default_rng(1).uniform(box[0], box[1], (500, 3))
+    found = lengths(geometry, tips, rotation)
+    assert (found >= geometry.limits.stroke[:, 0]).all()
+    assert (found <= geometry.limits.stroke[:, 1]).all()
+    for tip, row in zip(tips[:100], found, strict=False):
+        pose = geometry.platform_pose(Pose(tip, rotation))
+        assert geometry.refusal(pose.position, pose.rotation, row) is None
+    assert list(causes) == list(FACES)
+    assert all(cause.split(", strut")[0] in FINDINGS for cause in causes.values())
+    room = ROOM / (1.0 - 2.0 * ROOM) * np.ptp(box, axis=0) * [[-1.0], [1.0]]
+    for axis, side in product(range(3), range(2)):
+        moved = box + room  # as it was before it came in; rounding took up to 1 % of the shortest edge beside
+        moved[side, axis] += 0.05 * (2 * side - 1) * np.ptp(box, axis=0)[axis]
+        grid = np.stack(np.meshgrid(*(np.linspace(*ends, 9) for ends in moved.T), indexing="ij"), -1).reshape(-1, 3)
+        stroke = geometry.limits.stroke
+        far = lengths(geometry, grid, rotation)
+        assert ((far < stroke[:, 0]) | (far > stroke[:, 1])).any(), (axis, side)
+
+
+def test_the_papers_own_box_fits_into_what_its_machine_reaches():
+    """16 × 16 × 8 inches, by Mou & King; the largest box is larger."""
+    box = machine_box(load_geometry("paper")).box
+    papers = load_campaign("campaign_5d").box
+    assert (box[0] <= papers[0]).all()
+    assert (box[1] >= papers[1]).all()
+
+
+# As campaigns use it.
+
+
+def test_a_campaign_without_a_box_needs_a_machine():
+    with pytest.raises(InputFileError, match="box: is missing"):
+        load_campaign("campaign")
+    box = np.array([[-0.1, -0.2, 0.3], [0.1, 0.2, 0.4]])
+    campaign = load_campaign("campaign", lambda: (box, np.eye(3)))
+    np.testing.assert_array_equal(campaign.box, box)
+    assert (campaign.cell, campaign.step) == pytest.approx((0.1, 0.025))  # a quarter of 0.4 m, a quarter of that
+    with_box = load_campaign("campaign_1d", lambda: pytest.fail("a file's own box is taken"))
+    np.testing.assert_allclose(with_box.box[0], [-0.2032, -0.2032, 0.35])
+
+
+@pytest.mark.parametrize("name", ["hanging", "inches"])
+def test_simulate_measures_any_machine_in_its_own_box(name: str, tmp_path: Path, capsys):
+    machine = machines()[name]
+    geometry = machine.write(tmp_path / "machine.yaml")
+    out = tmp_path / "measured.csv"
+    campaign = tmp_path / "coarse.yaml"
+    campaign.write_text("format: hexapod_comp/campaign\nversion: 1\ninstrument: 1-D\ncell_mm: 300\nstep_mm: 150\n")
+    asked = ["simulate", "--machine", str(geometry), "--truth", "ideal", "--campaign", str(campaign), "--out", str(out)]
+    assert cli.main(asked) == 0
+    assert "gives no box: the largest that" in capsys.readouterr().err
+    box = machine_box(load_geometry(geometry)).box
+    with out.open(newline="", encoding="utf-8") as file:
+        tips = np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in csv.DictReader(file)]) * 1e-3
+    np.testing.assert_allclose([tips.min(axis=0), tips.max(axis=0)], box, atol=1e-9)
+
+
+# As `show` shows it.
+
+
+def test_show_draws_and_says_in_which_frame(tmp_path: Path, capsys):
+    assert cli.main(["show", "example_6_6", "--pictures", str(tmp_path / "new")]) == 0
+    printed = capsys.readouterr().out
+    assert (tmp_path / "new" / "machine.png").stat().st_size > 50_000
+    assert printed.count("work frame x ") == 3  # reach, largest box, box for campaigns
+    assert "look again" not in printed
+    assert cli.main(["show", "paper", "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["largest_box"]["frame"] == shown["campaign_box"]["frame"] == "work"
+    assert any("joint_axes are missing" in text for text in shown["look_again"])
+    np.testing.assert_allclose(shown["home_lengths_m"], 0.509192, atol=5e-7)  # Table 2 of Song et al., pose 1

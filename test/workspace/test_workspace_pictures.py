@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -15,13 +14,12 @@ import pytest
 from matplotlib.figure import Figure
 from test_reach import unit
 
-from hexapod_comp.errors import GeometryError, HexapodError
+from hexapod_comp.errors import GeometryError
 from hexapod_comp.formats.figures import save
 from hexapod_comp.workspace.page import MOST_BYTES, PageData, page_text, write_page
 from hexapod_comp.workspace.pictures import (
     TRANSLATION,
     Layer,
-    outline,
     ranking_figure,
     shells_figure,
 )
@@ -62,17 +60,6 @@ def test_shells_say_what_they_show(tmp_path):
     assert [len(axes.collections) for axes in (context, near)] == [1, 1]
     save(figure, tmp_path / "shells.png")
     assert (tmp_path / "shells.png").stat().st_size > 20_000
-
-
-def test_the_outline_is_the_machine_at_home():
-    """Truth: the file: base in z = 0, platform at 225 mm, tool 25 mm above it, struts between."""
-    base, platform, *struts, tool = outline(unit())
-    assert base.shape == platform.shape == (7, 3)
-    np.testing.assert_allclose(base[:, 2], 0.0)
-    np.testing.assert_allclose(platform[:, 2], 0.16)
-    np.testing.assert_allclose(tool, [[0, 0, 0.16], [0, 0, 0.185]])
-    assert len(struts) == 6
-    np.testing.assert_allclose(struts[3], [base[3], platform[3]])
 
 
 def test_bars_from_minimum_to_maximum(tmp_path):
@@ -171,12 +158,6 @@ def test_the_largest_page_that_is_allowed_is_below_its_limit(tmp_path):
     with pytest.raises(GeometryError, match="at most 7000000 bytes"):
         page_data(frames=["level"] * (2 * count), points=np.tile(points, (2, 1, 1, 1, 1)),
                   values=np.tile(values, (2, 1, 1, 1, 1, 1)))  # fmt: skip
-
-
-def test_without_plotly_it_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "plotly.offline", None)
-    with pytest.raises(HexapodError, match=r"pip install plotly"):
-        page_text(unit(), page_data())
 
 
 @pytest.mark.parametrize(
