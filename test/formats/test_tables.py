@@ -13,7 +13,6 @@ from hexapod_comp.machine.pose_files import length_values, read_lengths, read_po
 from hexapod_comp.pose import Pose
 
 HEADER = "name,x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg\n"
-LENGTHS = "L1_mm,L2_mm,L3_mm,L4_mm,L5_mm,L6_mm\n"
 
 
 def written(folder: Path, text: str | bytes) -> Path:
@@ -32,12 +31,6 @@ def test_mm_and_degrees_become_m_and_rotations(tmp_path: Path) -> None:
     np.testing.assert_allclose(poses[0].rotation, expected.as_matrix(), atol=1e-15)
 
 
-def test_quaternions(tmp_path: Path) -> None:
-    """Half a turn about z."""
-    _, poses = read_poses(written(tmp_path, "x_m,y_m,z_m,qx,qy,qz,qw\n0,0,0.4,0,0,1,0\n"))
-    np.testing.assert_allclose(poses[0].rotation, np.diag([-1.0, -1.0, 1.0]), atol=1e-15)
-
-
 def test_comments_blank_lines_spaces_bom_and_windows_line_ends(tmp_path: Path) -> None:
     """Lines are counted as an editor counts them."""
     text = "\ufeff# a comment\r\nx_mm, y_mm, z_mm\r\n\r\n# more\r\n1, 2, 3\r\n"
@@ -48,31 +41,21 @@ def test_comments_blank_lines_spaces_bom_and_windows_line_ends(tmp_path: Path) -
 
 MALFORMED = {
     "empty": ("", "has no header"),
-    "header only": (HEADER, "has a header but no rows"),
     "no z": ("x_mm,y_mm\n1,2\n", "header: column z_m or z_mm or z_um or z_in is missing"),
-    "no unit": ("x,y_mm,z_mm\n1,2,3\n", "header: column x_m or"),
     "two units": ("x_mm,x_in,y_mm,z_mm\n1,1,2,3\n", "header: x is given twice"),
-    "column twice": ("x_mm,x_mm,y_mm,z_mm\n1,1,2,3\n", "header: column is given twice (found 'x_mm')"),
     "unknown column": ("x_mm,y_mm,z_mm,feed\n1,2,3,4\n", "header: is not a known column (found 'feed')"),
     "two angles": ("x_mm,y_mm,z_mm,alpha_deg,beta_deg\n1,2,3,4,5\n", "header: column gamma_rad or"),
-    "three quaternion parts": ("x_mm,y_mm,z_mm,qx,qy,qz\n1,2,3,0,0,0\n", "header: column qw is missing"),
     "angles and quaternion": (
         "x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg,qx,qy,qz,qw\n1,2,3,0,0,0,0,0,0,1\n",
         "header: give either angles or a quaternion",
     ),
     "text": (HEADER + "a,1,2,3,0,0,0\nb,1,two,3,0,0,0\n", "line 3, column y_mm: must be a finite number (found 'two')"),
-    "empty cell": (HEADER + "a,1,,3,0,0,0\n", "line 2, column y_mm: must be a finite number (found '')"),
-    "NaN": (HEADER + "a,1,2,nan,0,0,0\n", "line 2, column z_mm: must be a finite number"),
     "infinite": (HEADER + "a,1,2,3,0,-inf,0\n", "line 2, column beta_deg: must be a finite number"),
-    "digits with underscore": (HEADER + "a,1_0,2,3,0,0,0\n", "line 2, column x_mm: must be a finite number"),
     "decimal comma": (HEADER + "a,1,5,2,3,0,0,0\n", "line 2: has 8 columns, the header has 7"),
-    "short row": (HEADER + "a,1,2,3,0,0,0\n\nb,1,2\n", "line 4: has 3 columns, the header has 7"),
     "quaternion too long": (
         "x_mm,y_mm,z_mm,qx,qy,qz,qw\n1,2,3,0,0,0,1\n1,2,3,0,0,0,1.1\n",
         "line 3, columns qx…qw: quaternion must have norm 1, not 1.1",
     ),
-    "zero quaternion": ("x_mm,y_mm,z_mm,qx,qy,qz,qw\n1,2,3,0,0,0,0\n", "line 2, columns qx…qw: quaternion"),
-    "open quote": (HEADER + '"a,1,2,3\n', "line 2: has 1 columns"),
     "huge field": (HEADER + "a" * 200_000, "is not CSV: field larger than field limit"),
 }
 
@@ -91,7 +74,6 @@ def test_malformed_poses_are_refused_with_file_line_and_column(
 @pytest.mark.parametrize(
     ("folder", "asked", "complaint"),
     [
-        ((), "gone.csv", "there is no such file; shipped: table1.csv"),
         (
             ("mine.csv", "notes.txt"),
             "mien.csv",
@@ -127,7 +109,6 @@ POSE = Pose([0.0015, -0.002, 0.4], np.eye(3))
 @pytest.mark.parametrize(
     "text",
     [
-        "x_mm;y_mm;z_mm\n1.5;-2;400\n",
         "x_mm;y_mm;z_mm\n1,5;-2;400\n",
         "x_mm; y_mm; z_mm\n1,5; -2; 4,0E2\n",
         "x_mm\ty_mm\tz_mm\n1,500\t-2,000\t400,0\n",
@@ -148,13 +129,10 @@ def test_semicolons_tabs_decimal_commas_and_micro_signs(tmp_path: Path, text: st
     [
         ("x_mm,y_mm,z_mm\n1,5,-2,400\n", "line 2: has 4 columns, the header has 3; are its decimal points commas?"),
         ("x_mm,y_mm,z_mm\n1;-2;400\n", "commas separate columns here, as in the header, and this line has semicolons"),
-        ("x_mm;y_mm;z_mm\n1,-2,400\n", "semicolons separate columns here, as in the header, and this line has commas"),
         ('x_mm,y_mm,z_mm\n"1,5",-2,400\n', "column x_mm: must be a finite number, with a decimal point: 1.5 (found"),
         ("x_mm;y_mm;z_mm\n1,5;-2;400.5\n", "column x_mm: has a decimal comma, but line 2 has a decimal point"),
         ("x_mm;y_mm;z_mm\n1,500;2;-400,000\n", "column x_mm: has a comma that may be a decimal one or stand between"),
-        ("x_mm;y_mm;z_mm\n1.234,5;2;400\n", "column x_mm: must be a finite number (found '1.234,5')"),
         ("x_mm y_mm z_mm\n1 2 400\n", "columns are separated by commas, semicolons, tabs, and this is one column"),
-        ("x_um,x_µm,y_mm,z_mm\n1,1,2,400\n", "header: x is given twice"),
     ],
 )
 def test_what_may_mean_two_things_is_refused(tmp_path: Path, text: str | bytes, complaint: str) -> None:
@@ -163,24 +141,15 @@ def test_what_may_mean_two_things_is_refused(tmp_path: Path, text: str | bytes, 
     assert complaint in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        ("L1_mm,L2_mm,L3_mm,L4_mm,L5_mm\n1,2,3,4,5\n", "header: column L6_m or"),
-        (LENGTHS + "1,2,3,x,5,6\n", "line 2, column L4_mm: must be a finite number (found 'x')"),
-        ("L1_mm,L2_mm,L3_mm,L4_mm,L5_mm,L6_in\n1,2,3,4,5,6\n", None),
-        (LENGTHS[:-1] + ",correction_L1_um\n1,2,3,4,5,6,7\n", "header: column correction_L2_m or"),
-    ],
-    ids=["five", "text", "mixed units are fine", "half of what ik adds"],
-)
-def test_malformed_lengths(tmp_path: Path, text: str, complaint: str | None) -> None:
-    path = written(tmp_path, text)
-    if complaint is None:
-        assert read_lengths(path)[1][0, 5] == pytest.approx(6 * 0.0254)
-        return
-    with pytest.raises(InputFileError) as caught:
-        read_lengths(path)
-    assert complaint in str(caught.value)
+def test_malformed_lengths(tmp_path: Path) -> None:
+    five = "L1_mm,L2_mm,L3_mm,L4_mm,L5_mm"
+    assert read_lengths(written(tmp_path, f"{five},L6_in\n1,2,3,4,5,6\n"))[1][0, 5] == pytest.approx(6 * 0.0254)
+    for text, complaint in (
+        (f"{five}\n1,2,3,4,5\n", "header: column L6_m or"),
+        (f"{five},L6_mm,correction_L1_um\n1,2,3,4,5,6,7\n", "header: column correction_L2_m or"),
+    ):
+        with pytest.raises(InputFileError, match=complaint):
+            read_lengths(written(tmp_path, text))
 
 
 def test_what_is_written_reads_back(tmp_path: Path) -> None:
