@@ -21,7 +21,11 @@ from hexapod_comp.cli import main
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.core import Status, Struct, ffi, lib
 from hexapod_comp.export.c_code import CORE, model_header, write_c
-from hexapod_comp.machine.model import MachineModel, core_model
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.kinematics import strut_lengths
+from hexapod_comp.machine.load import Load, Loading
+from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine, core_model
+from hexapod_comp.machine.model_file import save_model
 
 COMPILER = shutil.which("gcc")
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic", "-O1"]
@@ -33,7 +37,7 @@ pytestmark = pytest.mark.skipif(COMPILER is None, reason="no gcc here")
 MACHINES = [
     ("paper", "paper_machine"),
     pytest.param("paper", "paper_lines_model", marks=long_test),
-    ("positioning_unit", "ideal"),
+    pytest.param("positioning_unit", "ideal", marks=long_test),
 ]
 
 
@@ -72,16 +76,22 @@ def test_self_test_notices_three_units_in_the_last_place(tmp_path):
 
 
 def test_the_loop_of_the_page_compiles_and_answers(tmp_path):
-    """doc/c_core.md, as it stands there; at home an ideal machine is told its nominal lengths."""
-    geometry = paper_geometry()
+    """doc/c_core.md, as it stands there; at home an ideal machine is told its nominal lengths.
+
+    Names go into string literals: quotes, backslashes, trigraphs and letters beyond ASCII.
+    """
+    geometry = replace(paper_geometry(), name='mill "7" \\n ??/ Größe')
     write_c(tmp_path, geometry, MachineModel(geometry.name), ("", ""))
     page = (CONFIG.parent / "doc" / "c_core.md").read_text(encoding="utf-8")
-    (tmp_path / "loop.c").write_text(page.split("```c\n")[1].split("```")[0])
+    asked = "\nconst char *name(void);\nconst char *name(void)\n{\n    return hexapod_model.machine;\n}\n"
+    (tmp_path / "loop.c").write_text(page.split("```c\n")[1].split("```")[0] + asked)
     made = compiled(tmp_path, "-fPIC", "-shared", "hexapod_comp.c", "loop.c", "-o", "loop.so")
     assert made.returncode == 0, made.stderr
     loop, struts, pose = ctypes.CDLL(str(tmp_path / "loop.so")), (c_double * 6)(), geometry.tool_pose(geometry.home)
     loop.start()
     assert loop.cycle((c_double * 7)(*pose.position, *pose.quaternion()), c_double(0.0), struts) == 0
+    loop.name.restype = ctypes.c_char_p
+    assert loop.name().decode() == geometry.name
     expected = np.linalg.norm(geometry.home.position + geometry.platform_joints - geometry.base_joints, axis=1)
     np.testing.assert_allclose(list(struts), expected, rtol=0.0, atol=1e-15)
 
@@ -151,14 +161,91 @@ def flat(value: object) -> list[float]:
     return [x for part in value for x in flat(part)] if isinstance(value, (list, tuple)) else [float(value)]
 
 
-def test_a_hostile_name_stays_what_it_is(tmp_path):
-    """Names go into string literals: quotes, backslashes, trigraphs and letters beyond ASCII."""
-    name = 'mill "7" \\n ??/ Größe'
-    geometry = replace(paper_geometry(), name=name)
-    write_c(tmp_path, geometry, MachineModel(name, "ideal"), ("", ""))
-    (tmp_path / "name.c").write_text(
-        '#include <stdio.h>\n#include "hexapod_model.h"\nint main(void) { return puts(hexapod_model.machine) < 0; }\n'
+TYPES = {"float": "double", "bit": "int", "s32": "int", "u32": "unsigned"}
+TILTED, PUSHED = [3.0, 0.0, -9.3], [100.0, -50.0, 20.0, 1.0, 2.0, 3.0]
+
+# Two seconds at 1 kHz each: as the model has it; with gravity and wrench; with no numbers; with zeros again
+DRIVER = """
+#include <stdio.h>
+static state one;
+static void run(void)
+{
+    for (int n = 0; n < 2000; n++) {
+        correct(&one, 1000000);
+    }
+    for (int i = 0; i < 6; i++) {
+        printf("%.12f ", one.correction_[i]);
+    }
+    puts(one.ok_ ? "" : "nan");
+}
+int main(void)
+{
+    const double lengths[6] = {LENGTHS}, down[3] = {DOWN}, pushing[6] = {PUSHING};
+    one.unit_ = 1e-3, one.gravity_step_ = 0.01, one.wrench_step_ = 1.0, one.temperature_step_ = 0.01;
+    one.enable_ = one.machine_on_ = 1;
+    for (int i = 0; i < 8; i++) {
+        one.temperature_[i] = 20.0;
+    }
+    for (int i = 0; i < 6; i++) {
+        one.joint_pos_cmd_[i] = lengths[i];
+    }
+    run();
+    for (int i = 0; i < 6; i++) {
+        one.gravity_[i % 3] = down[i % 3], one.wrench_[i] = pushing[i];
+    }
+    run();
+    one.gravity_[1] = one.wrench_[5] = NAN;
+    run();
+    for (int i = 0; i < 6; i++) {
+        one.gravity_[i % 3] = one.wrench_[i] = 0.0;
+    }
+    run();
+    return 0;
+}
+"""
+
+
+def as_c(component: str) -> str:
+    """Return a component in plain C: pins, parameters and variables as members of `inst`."""
+    head, body = component.split("\n;;\n", 1)
+    members, names = [], []
+    for kind, name, count in re.findall(r"^(?:pin|param) \w+ (\w+) ([\w-]+?)(?:-#\[(\d+)\])?[ ;]", head, re.MULTILINE):
+        own = name.replace("-", "_")
+        members.append(f"{TYPES[kind]} {own}_{f'[{count}]' if count else ''};")
+        names.append(f"#define {own}{'(i)' if count else ''} inst->{own}_{'[i]' if count else ''}")
+    for kind, name, size in re.findall(r"^variable (\w+) (\w+)((?:\[\d+\])?);", head, re.MULTILINE):
+        members.append(f"{kind} {name}_{size};")
+        names.append(f"#define {name} inst->{name}_")
+    function = "#define FUNCTION(name) void name(state *inst, long period)"
+    undone = "\n".join(f"#undef {re.split(r'[ (]', name)[1]}" for name in names)
+    struct = "typedef struct {\n" + "\n".join(members) + "\n} state;"
+    return "\n".join(
+        ['#include "hexapod_comp.c"', '#include "hexapod_model.h"', struct, function, *names, body, undone, DRIVER]
     )
-    made = compiled(tmp_path, "name.c", "hexapod_comp.c", "-o", "name")
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_gravity_and_wrench_are_pins(tmp_path: Path) -> None:
+    """Corrections, mm, to 1e-9: those of the machine under each load; what is no number leaves them as they were."""
+    geometry = load_geometry("paper")
+    origin = ModelOrigin("2026-01-31")
+    model = MachineModel("paper", name="soft", origin=origin, load=Load(stiffness=np.full(6, 20e6), mass=30.0))
+    save_model(model, tmp_path / "soft.yaml")
+    assert main(["export", "--model", str(tmp_path / "soft.yaml"), "--c", str(tmp_path / "c")]) == 0
+    lengths = strut_lengths(geometry, geometry.home)
+    texts = {"LENGTHS": lengths * 1e3, "DOWN": TILTED, "PUSHING": PUSHED}
+    source = as_c((tmp_path / "c" / "hexapod_rt.comp").read_text())
+    for name, values in texts.items():
+        source = source.replace(f"{{{name}}}", "{" + ", ".join(repr(float(value)) for value in values) + "}")
+    (tmp_path / "c" / "rt.c").write_text(source)
+    words = ["cc", "-O1", "-ffp-contract=off", "rt.c", "-lm", "-o", "rt"]
+    made = subprocess.run(words, cwd=tmp_path / "c", capture_output=True, text=True)
     assert made.returncode == 0, made.stderr
-    assert subprocess.check_output([tmp_path / "name"], text=True).rstrip("\n") == name
+    out = subprocess.run([tmp_path / "c" / "rt"], capture_output=True, text=True, check=True).stdout
+    found = np.array([line.split() for line in out.splitlines()], dtype=float)
+    alone, loaded = (
+        (RealMachine(geometry, model, loading=loading).commands_for(geometry.home)[0] - lengths) * 1e3
+        for loading in (Loading(), Loading.of(TILTED, PUSHED))
+    )
+    assert np.abs(loaded - alone).max() > 1e-3
+    np.testing.assert_allclose(found, [alone, loaded, loaded, alone], rtol=0.0, atol=1e-9)

@@ -6,9 +6,10 @@ import json
 import math
 import re
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,8 @@ from strategies import PAPER_FILE, paper_geometry, random_model, skewed_geometry
 from hexapod_comp.cli import export
 from hexapod_comp.cli.app import make_parser
 from hexapod_comp.errors import GeometryError, HexapodError, InputFileError, LimitError, ModelError, OutsideFieldError
+from hexapod_comp.export.c_code import model_header
+from hexapod_comp.export.carried import CARRIED, PROVENANCE, refuse_unknown
 from hexapod_comp.export.linuxcnc import (
     COMP_FILES,
     HAL_FILE,
@@ -40,6 +43,7 @@ from hexapod_comp.export.table import (
 from hexapod_comp.export.trial import ExportTrial, diagonal_passes
 from hexapod_comp.machine.field import GridField, no_field
 from hexapod_comp.machine.geometry import HexapodGeometry
+from hexapod_comp.machine.load import Load
 from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine, commanded_box
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.passes import Passes
@@ -102,13 +106,6 @@ def written(
     return told, read_genhexkins(folder, unit)
 
 
-def edited(path: Path, change: Callable[[str], str]) -> None:
-    """Change a file, and make sure that the change was one."""
-    before = path.read_text()
-    path.write_text(change(before))
-    assert path.read_text() != before
-
-
 # LinuxCNC
 
 
@@ -121,7 +118,8 @@ def test_reader_agrees_with_linuxcnc(tmp_path: Path) -> None:
     written(tmp_path, cardanic_machine(), MachineModel("skewed"), SMALL_BOX)
     for i, name in enumerate(COMP_FILES):
         table = "\n".join(hand_made_table(i))
-        edited(tmp_path / name, lambda text, table=table: table + "\n" + text[text.index("# set") :])
+        text = (tmp_path / name).read_text()
+        (tmp_path / name).write_text(table + "\n" + text[text.index("# set") :])
     told = read_genhexkins(tmp_path, "mm")
     for pose, joints, *corrections in LINUXCNC:
         rotation = Rotation.from_euler("xyz", pose[3:], degrees=True).as_matrix()  # roll, pitch, yaw: Rz·Ry·Rx
@@ -198,17 +196,6 @@ def test_waves_are_followed_as_well_as_256_points_can() -> None:
         assert rms < 0.5 * bound
 
 
-def test_paper_machine_keeps_its_field_only(tmp_path: Path) -> None:
-    """Truth: the model. What is left is the field (1.4 µm) and the tables' 0.2 µm a strut."""
-    geometry, model = paper_geometry(), paper_machine()
-    _, back = written(tmp_path, geometry, model, PAPER_BOX)
-    check = ExportTrial(geometry, model, PAPER_BOX, 300).check(back.commands)
-    assert check.level.after.rms < 0.015 * check.level.before.rms
-    assert check.level.after.rms == pytest.approx(check.field.rms, rel=0.1)
-    without = replace(model, field=no_field())
-    assert ExportTrial(geometry, without, PAPER_BOX, 300).check(back.commands).level.after.rms < 0.5e-6
-
-
 def test_inches_and_millimetres_say_the_same(tmp_path: Path) -> None:
     """Numbers have 12 digits after the point (trims, joints) or 9 (nominal): below a tenth of a nanometre."""
     geometry, model = paper_geometry(), paper_machine()
@@ -236,31 +223,6 @@ def test_files_are_what_linuxcnc_reads(tmp_path: Path) -> None:
         assert max(map(len, rows)) < 255
     ini = (tmp_path / INI_FILE).read_text()
     assert re.findall(r"^COMP_FILE = (.*)$", ini, re.MULTILINE) == list(COMP_FILES)
-
-
-@pytest.mark.parametrize(
-    ("file", "pattern", "replacement", "message"),
-    [
-        (HAL_FILE, r"setp genhexkins.base.3.y .*\n", "", "base.3.y: is not set"),
-        (HAL_FILE, r"(setp genhexkins.base.3.y) .*", r"\1 nan", "finite number"),
-        (HAL_FILE, r"setp genhexkins.base.3.y", "setp motion.base.3.y", "is not setp of a genhexkins pin"),
-        (HAL_FILE, r"# set ....", "# set 0000", "files of two exports"),
-        (INI_FILE, r"COMP_FILE_TYPE = 1", "COMP_FILE_TYPE = 0", "must be 1"),
-        (INI_FILE, r"\[JOINT_5\]", "[JOINT_6]", "reads back otherwise than written"),
-        ("strut_2.comp", r"\A", "# a comment\n", "has no points"),
-        ("strut_2.comp", r"\A(.*\n)", r"\1\1", "must increase"),
-        ("strut_2.comp", r"\A(.*\n)", r"1 0 0\n2 0 0\n\1", "at most 256"),
-        ("strut_2.comp", r"\A\S+", "inf", "finite number"),
-    ],
-)
-def test_files_that_linuxcnc_would_misread_are_refused(
-    tmp_path: Path, file: str, pattern: str, replacement: str, message: str
-) -> None:
-    written(tmp_path, paper_geometry(), paper_machine(), PAPER_BOX)
-    edited(tmp_path / file, lambda text: re.sub(pattern, replacement, text, count=1))
-    with pytest.raises(InputFileError, match=message) as caught:
-        read_genhexkins(tmp_path, "mm")
-    assert file in str(caught.value)
 
 
 def test_what_genhexkins_cannot_have_is_refused() -> None:
@@ -301,29 +263,19 @@ def test_table_file_brings_trilinear_functions_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(corrections, wanted + 0.5 * senses * np.abs(wanted), atol=2e-12, rtol=0.0)
     with pytest.raises(ModelError, match="holds positions within"):
         back.pose_corrections(np.array([[0.0, 0.0, 0.51]]), np.array([False]))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda rows: rows[:-1], "has 35 rows, its grid needs 36"),
-        (lambda rows: [rows[0], *(row for row in rows if row.startswith("0.0"))], "at least two positions along x"),
-        (lambda rows: [*rows, rows[4]], "line 38: position and direction are given twice"),
-        (lambda rows: [rows[0], rows[1].replace("forward", "left"), *rows[2:]], "column direction: must be one of"),
-        (lambda rows: [rows[0].replace("dx_um", "dx"), *rows[1:]], "column dx_m or .* is missing"),
-        (lambda rows: [rows[0], rows[1].replace("forward,", "forward,nan,", 1), *rows[2:]], "columns, the header has"),
-        (lambda rows: [f"{rows[0]},colour", *(f"{row},1" for row in rows[1:])], "not a known column"),
-    ],
-)
-def test_tables_that_are_none_are_refused(
-    tmp_path: Path, change: Callable[[list[str]], list[str]], message: str
-) -> None:
-    write_table(trilinear_table()[0], tmp_path / "t.csv", [])
     rows = (tmp_path / "t.csv").read_text().splitlines()
-    assert rows[0] == ",".join(COLUMNS)
-    (tmp_path / "t.csv").write_text("\n".join(change(rows)) + "\n")
-    with pytest.raises(InputFileError, match=message):
-        read_table(tmp_path / "t.csv")
+    first = rows.index(",".join(COLUMNS))
+    comments, rows = rows[:first], rows[first:]
+    for changed, message in (
+        (rows[:-1], "has 35 rows, its grid needs 36"),
+        ([rows[0], *(row for row in rows if row.startswith("0.0"))], "at least two positions along x"),
+        ([*rows, rows[4]], "position and direction are given twice"),
+        ([rows[0], rows[1].replace("forward", "left"), *rows[2:]], "column direction: must be one of"),
+        ([f"{rows[0]},colour", *(f"{row},1" for row in rows[1:])], "not a known column"),
+    ):
+        (tmp_path / "t.csv").write_text("\n".join([*comments, *changed]) + "\n")
+        with pytest.raises(InputFileError, match=message):
+            read_table(tmp_path / "t.csv")
 
 
 def test_nodes_hold_the_models_own_corrections() -> None:
@@ -350,9 +302,9 @@ def test_nodes_hold_the_models_own_corrections() -> None:
             np.testing.assert_allclose(told - nominal, table.struts[at_node], atol=1e-13, rtol=0.0)
 
 
-@pytest.mark.parametrize(("step", "left"), [(0.0508, 0.25e-6), (0.0254, 0.06e-6)])
-def test_table_leaves_what_its_step_leaves(tmp_path: Path, step: float, left: float) -> None:
-    """Truth: the model, without waves. A cell of half the size leaves a quarter: quadratic interpolation error."""
+def test_table_leaves_what_its_step_leaves(tmp_path: Path) -> None:
+    """Truth: the model, without waves: interpolation errors are quadratic in the step."""
+    step, left = 0.0508, 0.25e-6
     geometry, model = paper_geometry(), paper_machine()
     model = replace(model, struts=replace(model.struts, cosine=np.zeros(6), sine=np.zeros(6)))
     table, left_out = make_table(geometry, model, PAPER_BOX, step)
@@ -409,22 +361,14 @@ def test_verb_writes_reads_back_and_reports(tmp_path: Path, capsys: pytest.Captu
     assert report["checks"][0]["level"]["after_rms_um"] < 2.0
 
 
-def test_verb_says_what_thermal_growth_costs(tmp_path: Path) -> None:
-    """Truth: a machine whose every part grows alike only gets larger: 11 ppm of a position's distance to base."""
-    struts = StrutErrors(expansion=np.full(6, 11e-6))
-    model = MachineModel("paper", struts=struts, base_expansion=11e-6, platform_expansion=11e-6)
-    _, back = written(tmp_path, paper_geometry(), model, PAPER_BOX)
-    check = ExportTrial(paper_geometry(), model, PAPER_BOX, 200).check(back.commands)
-    far = np.linalg.norm(diagonal_passes(paper_geometry(), PAPER_BOX, 200, 0).positions, axis=1)
-    assert check.per_kelvin is not None
-    assert check.per_kelvin.largest == pytest.approx(11e-6 * far.max(), rel=1e-4)
-    assert check.per_kelvin.rms == pytest.approx(11e-6 * np.sqrt((far**2).mean()), rel=1e-4)
-
-
 def test_verb_tells_when_an_export_makes_it_worse(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine without errors can only lose; one read back wrongly must not pass."""
     box = ("--box=-100,-100,350,100,100,500", "--linuxcnc", str(tmp_path / "cnc"))
     assert run_verb(*box) == 0
+    with pytest.raises(InputFileError, match="cannot be made"):
+        run_verb("--linuxcnc", "/nonexistent/folder/x", "--box=-9,-9,390,9,9,410")
+    with pytest.raises(HexapodError, match="tells of no box in which it was measured"):
+        run_verb("--linuxcnc", str(tmp_path))
     read = read_genhexkins
 
     def wrong(folder: str | Path, unit: str) -> Genhexkins:
@@ -435,24 +379,78 @@ def test_verb_tells_when_an_export_makes_it_worse(tmp_path: Path, monkeypatch: p
     assert run_verb(*box) == 1
 
 
-@pytest.mark.parametrize(
-    ("arguments", "error"),
-    [
-        (("--linuxcnc", "x"), "tells of no box in which it was measured"),
-        (("--linuxcnc", "/nonexistent/folder/x", "--box=-9,-9,390,9,9,410"), "cannot be made"),
-        (("--table", "/nonexistent/x.csv", "--box=-9,-9,390,9,9,410"), "cannot be written"),
-        (("--linuxcnc", "x", "--box=-900,-9,390,9,9,410"), "outside the stroke"),
-    ],
-)
-def test_verb_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], error: str) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(HexapodError, match=error):
-        run_verb(*arguments)
-
-
 def test_box_comes_from_the_model_and_follows_the_frames() -> None:
     geometry, model = paper_geometry(), paper_machine()
     np.testing.assert_allclose(commanded_box(geometry, model), PAPER_BOX, atol=1e-12)
     valid = replace(model, region=Region(SMALL_BOX))
     shifted = replace(geometry, work=Pose([0.1, 0.0, 0.3], np.eye(3)), tool=Pose([0.0, 0.0, -0.05], np.eye(3)))
     np.testing.assert_allclose(commanded_box(shifted, valid), SMALL_BOX - [0.1, 0.0, 0.35], atol=1e-12)
+
+
+PAPER = paper_geometry()
+BOX = np.array([[-0.02, -0.02, 0.40], [0.02, 0.02, 0.42]])
+
+
+@dataclass(frozen=True)
+class ModelWithSag(MachineModel):
+    sag: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+
+@dataclass(frozen=True)
+class StrutsWithWind(StrutErrors):
+    wind: np.ndarray = field(default_factory=lambda: np.zeros(6))
+
+
+def linuxcnc(model: MachineModel) -> object:
+    return make_genhexkins(RealMachine(PAPER, model), BOX)
+
+
+def table(model: MachineModel) -> object:
+    return make_table(PAPER, model, BOX, 0.02)
+
+
+def c_core(model: MachineModel) -> object:
+    return model_header(PAPER, model, ("", ""))
+
+
+def widened(model: MachineModel, kind: type, **more: Any) -> Any:
+    return kind(**{entry.name: getattr(model, entry.name) for entry in fields(MachineModel)} | more)
+
+
+@pytest.mark.parametrize("export", [linuxcnc, table, c_core])
+def test_an_unknown_term_is_refused_and_zero_passes(export: Callable[[MachineModel], object]):
+    assert export(MachineModel("paper", struts=StrutsWithWind()))
+    with pytest.raises(ModelError, match=r"^struts\.wind: .*1e-09"):
+        export(MachineModel("paper", struts=StrutsWithWind(wind=np.full(6, 1e-9))))
+    known = random_model(np.random.default_rng(1), "paper")
+    assert export(widened(known, ModelWithSag))
+    with pytest.raises(ModelError, match=r"^sag: cannot be exported: .* does not know it.*\[0\.0, 0\.0, 1e-06\]"):
+        export(widened(known, ModelWithSag, sag=np.array([0.0, 0.0, 1e-6])))
+
+
+def test_the_lists_hold_todays_terms_and_no_others():
+    """Who adds a field decides here, for each export."""
+    blocks = {
+        "struts": StrutErrors,
+        "field": type(MachineModel("m").field),
+        "late_growth": type(MachineModel("m").late_growth),
+        "load": Load,
+    }
+    today = {
+        name
+        for entry in fields(MachineModel)
+        if entry.name not in PROVENANCE
+        for name in (
+            [f"{entry.name}.{one.name}" for one in fields(blocks[entry.name])] if entry.name in blocks else [entry.name]
+        )
+    }
+    assert today - CARRIED == {"outside"}  # no controller is told the numbers that it needs
+    assert today >= CARRIED
+
+
+def test_genhexkins_has_no_term_for_a_load():
+    """The table and the C core carry it."""
+    model = MachineModel("paper", load=Load(stiffness=np.full(6, 20e6), mass=30.0))
+    refuse_unknown(model, "the C core")
+    with pytest.raises(ModelError, match=r"^load\.stiffness: cannot be exported: genhexkins does not know it"):
+        refuse_unknown(model, "genhexkins", without="load.")

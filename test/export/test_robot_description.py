@@ -1,8 +1,6 @@
 """URDF and MJCF of machines, each read by a program of its own kind.
 
-Truth: the closed form of a strut's ends, on foreign machines and at random poses. URDF is walked by a reader of the
-test's own, in the words of its specification (each joint: origin, then a motion about or along its axis), and by
-MuJoCo; MJCF by MuJoCo, which also runs it.
+Truth: the closed form of a strut's ends, on foreign machines and at random poses. MuJoCo reads both, and runs MJCF.
 """
 
 from __future__ import annotations
@@ -15,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from foreign_machines import machines, with_frames
+from helpers import ALL_TESTS
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.cli import main
@@ -24,7 +23,8 @@ from hexapod_comp.machine.robot_description import joint_positions, mjcf, urdf
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.physics import find_mujoco
 
-SHIPPED = ("paper", "example_6_6", "jugglebot", "positioning_unit")
+FOREIGN = list(machines()) if ALL_TESTS else ["framed", "hanging", "inches"]
+MACHINES = ["example_6_6", "positioning_unit", *FOREIGN]
 
 SAME = 1e-9  # m; angles of a URDF are rounded to doubles, on machines of half a metre 1e-16 m
 
@@ -47,71 +47,36 @@ def mujoco() -> ModuleType:
     return find_mujoco()
 
 
-def transform(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, position
-    return matrix
-
-
-def links(robot: ET.Element, positions: dict[str, float]) -> dict[str, np.ndarray]:
-    """Return where each link is in ``base``, (4, 4), walking the tree as the URDF specification has it."""
-    placed, joints = {"base": np.eye(4)}, robot.findall("joint")
-    while joints:
-        joint = next(j for j in joints if j.find("parent").get("link") in placed)
-        joints.remove(joint)
-        origin, motion = np.eye(4), np.eye(4)
-        if (at := joint.find("origin")) is not None:
-            xyz, rpy = (np.array(at.get(key).split(), dtype=float) for key in ("xyz", "rpy"))
-            origin = transform(xyz, Rotation.from_euler("xyz", rpy).as_matrix())
-        if joint.get("type") != "fixed":
-            axis, value = np.array(joint.find("axis").get("xyz").split(), dtype=float), positions[joint.get("name")]
-            low, high = (float(joint.find("limit").get(key)) for key in ("lower", "upper"))
-            assert low <= value <= high, joint.get("name")
-            if joint.get("type") == "prismatic":
-                motion = transform(value * axis, np.eye(3))
-            else:
-                motion = transform(np.zeros(3), Rotation.from_rotvec(value * axis).as_matrix())
-        placed[joint.find("child").get("link")] = placed[joint.find("parent").get("link")] @ origin @ motion
-    return placed
-
-
-@pytest.mark.parametrize("name", machines())
-def test_urdf_places_struts_platform_tool_and_work(name: str, tmp_path: Path):
-    geometry = load_geometry(machines()[name].write(tmp_path / "machine.yaml"))
-    robot = ET.fromstring(urdf(geometry).encode())
-    assert {link.get("name") for link in robot.findall("link")} == set(
-        links(robot, joint_positions(geometry, geometry.home))
-    )
-    for pose in poses(geometry):
-        placed = links(robot, joint_positions(geometry, pose))
-        np.testing.assert_allclose(placed["platform"], transform(pose.position, pose.rotation), rtol=0, atol=SAME)
-        ends = pose.position + geometry.platform_joints @ pose.rotation.T
-        rods = np.array([placed[f"{strut}_rod"][:3, 3] for strut in STRUT_NAMES])
-        np.testing.assert_allclose(rods, ends, rtol=0, atol=SAME)
-        tool = pose @ geometry.tool
-        np.testing.assert_allclose(placed["tool"], transform(tool.position, tool.rotation), rtol=0, atol=SAME)
-        work = transform(geometry.work.position, geometry.work.rotation)
-        np.testing.assert_allclose(placed["work"], work, rtol=0, atol=SAME)
-
-
-@pytest.mark.parametrize("name", machines())
+@pytest.mark.parametrize("name", FOREIGN)
 def test_mujoco_reads_the_urdf(name: str, mujoco: ModuleType, tmp_path: Path):
-    """A reader that nobody here wrote. It wants masses, which this URDF has not, and folds fixed links unless told."""
-    geometry = load_geometry(machines()[name].write(tmp_path / "machine.yaml"))
+    """A reader that nobody here wrote. It wants masses, which this URDF has not, and folds fixed links unless told.
+
+    Named tools and work frames by the zoo's own frames, also of MJCF's sites.
+    """
+    machine = with_frames(name)
+    geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
     told = '<compiler discardvisual="false" fusestatic="false" boundmass="0.001" boundinertia="0.001"/>'
     model = mujoco.MjModel.from_xml_string(urdf(geometry).replace("</robot>", f"<mujoco>{told}</mujoco></robot>"))
     data = mujoco.MjData(model)
     for pose in poses(geometry):
         for joint, value in joint_positions(geometry, pose).items():
             data.joint(joint).qpos[0] = value
+            low, high = model.joint(joint).range
+            assert low <= value <= high or not model.joint(joint).limited, joint
         mujoco.mj_kinematics(model, data)
         ends = pose.position + geometry.platform_joints @ pose.rotation.T
         rods = np.array([data.body(f"{strut}_rod").xpos for strut in STRUT_NAMES])
         np.testing.assert_allclose(rods, ends, rtol=0, atol=SAME)
         frames = {"platform": pose, "tool": pose @ geometry.tool, "work": geometry.work}
+        frames |= {tool: pose @ Pose(frame.position, frame.matrix) for tool, frame in machine.tools.items()}
+        frames |= {work: Pose(frame.position, frame.matrix) for work, frame in machine.work_frames.items()}
         for link, wanted in frames.items():
             np.testing.assert_allclose(data.body(link).xpos, wanted.position, rtol=0, atol=SAME)
             np.testing.assert_allclose(data.body(link).xmat.reshape(3, 3), wanted.rotation, rtol=0, atol=SAME)
+
+    for tool, frame in machine.tools.items():
+        site = ET.fromstring(mjcf(geometry).encode()).find(f".//site[@name='{tool}']")
+        np.testing.assert_allclose(np.array(site.get("pos").split(), dtype=float), frame.position, rtol=0, atol=SAME)
 
 
 def off_pose(mujoco: ModuleType, data: Any, pose: Pose) -> tuple[float, float]:
@@ -121,7 +86,7 @@ def off_pose(mujoco: ModuleType, data: Any, pose: Pose) -> tuple[float, float]:
     return float(np.abs(body.xpos - pose.position).max()), float(turn.magnitude())
 
 
-@pytest.mark.parametrize("name", [*SHIPPED, *machines()])
+@pytest.mark.parametrize("name", MACHINES)
 def test_mujoco_stands_and_moves(name: str, mujoco: ModuleType, tmp_path: Path):
     """At another pose, by the lengths that inverse kinematics gives for it; then 10 s at home under gravity.
 
@@ -150,7 +115,7 @@ def test_mujoco_stands_and_moves(name: str, mujoco: ModuleType, tmp_path: Path):
     assert sum(warning.number for warning in data.warning) == 0
 
 
-@pytest.mark.parametrize("name", ["paper", "framed", "hanging"])
+@pytest.mark.parametrize("name", ["paper", "hanging"])
 def test_who_forgets_the_drives_input_throws_nothing(name: str, mujoco: ModuleType, tmp_path: Path):
     """`ctrl` is 0 in MuJoCo until somebody sets it: the struts get as short as they can, no faster than they may."""
     geometry = shipped_or_foreign(name, tmp_path)
@@ -163,7 +128,7 @@ def test_who_forgets_the_drives_input_throws_nothing(name: str, mujoco: ModuleTy
     assert 0.01 < fastest < 1.05 * min(geometry.limits.speed, 1.0)  # the weight pushes, too
 
 
-@pytest.mark.parametrize("name", [*SHIPPED, *machines()])
+@pytest.mark.parametrize("name", MACHINES)
 def test_mujoco_agrees_and_closes_the_loops(name: str, mujoco: ModuleType, tmp_path: Path):
     geometry = shipped_or_foreign(name, tmp_path)
     model = mujoco.MjModel.from_xml_string(mjcf(geometry))
@@ -185,22 +150,6 @@ def test_mujoco_agrees_and_closes_the_loops(name: str, mujoco: ModuleType, tmp_p
         tied = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
         assert tied.sum() == 18
         assert np.abs(data.efc_pos[tied]).max() < SAME
-
-
-@pytest.mark.parametrize("name", ["framed", "hanging", "inches", "mirror"])
-def test_named_tools_and_work_frames_are_there(name: str, tmp_path: Path):
-    """Truth: the zoo's own frames; the tools' poses in the platform are where MJCF's sites stand."""
-    machine = with_frames(name)
-    geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
-    placed = links(ET.fromstring(urdf(geometry).encode()), joint_positions(geometry, geometry.home))
-    for tool, frame in machine.tools.items():
-        in_base = transform(geometry.home.position, np.eye(3)) @ transform(np.array(frame.position), frame.matrix)
-        np.testing.assert_allclose(placed[tool], in_base, rtol=0, atol=SAME)
-        site = ET.fromstring(mjcf(geometry).encode()).find(f".//site[@name='{tool}']")
-        np.testing.assert_allclose(np.array(site.get("pos").split(), dtype=float), frame.position, rtol=0, atol=SAME)
-    fixture = machine.work_frames["fixture"]
-    wanted = transform(np.array(fixture.position), fixture.matrix)
-    np.testing.assert_allclose(placed["fixture"], wanted, rtol=0, atol=SAME)
 
 
 def test_export_writes_both_without_a_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
