@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-BENCHMARKS = ("speed", "assembly", "thermal")
+BENCHMARKS = ("speed", "thermal")
 """Those of some minutes; ``benchmarks.calibration`` (an hour) and ``benchmarks.jugglebot`` are run by their names."""
 
 if __name__ == "__main__":

@@ -1,127 +1,157 @@
-"""The compensation in C: its self-test on other targets, and what a command takes in a servo thread.
+"""The core in C: the same bits under every compiler and instruction set that is here, and what a command takes.
 
-The self-test of an export runs on targets whose compiler is here (32-bit x86, ARM under QEMU): the answers of this
-machine, to the last digit. Then one thread times commands and estimates, and LinuxCNC's genhexkins beside them, on the
-same poses in turn.
+``test/core/driver.c`` goes through all that the core does, on a shipped machine, and prints each number in full. It is
+compiled by gcc, clang and zig, for each width of vectors, for 32-bit x86 and for ARM under QEMU (Debian packages:
+clang, gcc-i686-linux-gnu, gcc-arm-linux-gnueabihf, qemu-user; PyPI: ziglang), and with sanitizers. What a build prints
+is compared with gcc's: no C library's sine or exponential is in it. Then one thread times commands and estimates, as a
+servo thread makes them, and LinuxCNC's genhexkins beside them, on the same poses in turn.
 
-Run ``python -m benchmarks.c_core``. Exits 1 when a bar is missed.
+Run ``python -m benchmarks.c_core [--only bits|times]``. Exits 1 when a bit differs, a sanitizer complains or a bar is
+missed, 2 without gcc.
 """
 
 from __future__ import annotations
 
 import argparse
 import ctypes
+import importlib.util
 import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks import judged
+from hexapod_comp import core
 from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.core.build import FLAGS
 from hexapod_comp.export.c_code import write_c
-from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.machine.model import MachineModel
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.kinematics import Structure
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.temperatures import Temperatures
 
+from . import cannot_run, judged, table
 from .blocks import commands, compensators
 from .genhexkins import Genhexkins, NotHere, emc_poses
 
-FLAGS = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic"]
-# Compilers and emulators that Debian packages: gcc-i686-linux-gnu, gcc-arm-linux-gnueabihf, qemu-user
-TARGETS = {
-    "32-bit x86": (["i686-linux-gnu-gcc", "-msse2", "-mfpmath=sse", "-static"], []),
-    "ARM, 32 bits": (["arm-linux-gnueabihf-gcc", "-static"], ["qemu-arm"]),
-}
+DRIVER = Path(__file__).resolve().parents[1] / "test" / "core" / "driver.c"
+SOURCES = Path(core.__file__).parent
 
-# Bars: of the whole model's command, beside genhexkins' inverse, of a warm estimate
+STRICT = ["-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic"]
+SANITIZED = ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+
+# Bars: of the whole model's command, µs; beside genhexkins' inverse; of a warm estimate, µs
 LARGEST_US, LARGEST_RATIO, LARGEST_ESTIMATE_US = 1.5, 8.0, 1.5
-
-ROUNDS = 15
-INNER = 20  # Times that the poses are run through between two looks at the clock
+INNER = 20  # Times that the poses are run through between two readings of the clock
 
 
-@dataclass(frozen=True)
-class Cost:
-    """What a command and a warm estimate take, µs: medians of rounds; the command beside genhexkins in its round."""
-
-    block: str
-    command_us: float
-    estimate_us: float
-    ratio: float | None
+# ---- the same bits ----
 
 
 @dataclass(frozen=True)
-class Spread:
-    """Single commands of the whole model by the clock on the wall, µs."""
+class Build:
+    """A way to compile the driver: compiler and words, what runs it, the processor it needs."""
 
-    commands: int
-    median_us: float
-    tail_us: float
-    largest_us: float
-
-
-def build(geometry: HexapodGeometry, model: MachineModel, folder: Path, *extra: str) -> Path:
-    """Return an export as a shared library."""
-    write_c(folder, geometry, model, ("", ""))
-    name = folder / "libhexapod.so"
-    sources = ["hexapod_comp.c", "hexapod_library.c", *extra]
-    words = [_compiler(), *FLAGS, f"-I{folder}", "-fPIC", "-shared", *sources, "-lm", "-o", str(name)]
-    subprocess.run(words, cwd=folder, check=True)
-    return name
+    name: str
+    words: list[str]
+    runs: tuple[str, ...] = ()
+    needs: str = ""
 
 
-def _compiler() -> str:
-    found = shutil.which("gcc") or shutil.which("cc")
-    if found is None:
-        raise SystemExit("benchmarks.c_core: no C compiler here (gcc or cc)")
-    return found
+def builds() -> list[Build]:
+    """Return the ways; the first one is what the others are compared with."""
+    zig = [sys.executable, "-m", "ziglang", "cc"] if importlib.util.find_spec("ziglang") else ["zig", "cc"]
+    return [
+        Build("gcc -O3", ["gcc", "-O3"]),
+        Build("gcc -O0", ["gcc", "-O0"]),
+        Build("gcc, SSE2", ["gcc", "-O3", "-DWIDE="]),
+        Build("gcc, AVX2 with FMA", ["gcc", "-O3", "-DWIDE=", "-mavx2", "-mfma"], needs="avx2"),
+        Build("gcc, AVX-512", ["gcc", "-O3", "-DWIDE=", "-mavx512f"], needs="avx512f"),
+        Build("gcc, sanitizers", ["gcc", *SANITIZED]),
+        Build("clang -O3", ["clang", "-O3"]),
+        Build("clang, sanitizers", ["clang", *SANITIZED]),
+        Build("zig -O3", [*zig, "-O3"]),
+        Build("32-bit x86", ["i686-linux-gnu-gcc", "-O2", "-msse2", "-mfpmath=sse", "-static"]),
+        Build("ARM, 32 bits", ["arm-linux-gnueabihf-gcc", "-O2", "-static"], ("qemu-arm",)),
+    ]
 
 
-def self_tests() -> dict[str, str]:
-    """Return what the self-test says on each target."""
-    geometry = load_geometry("paper")
-    model = load_model("paper_machine", geometry)
-    said = {}
-    for target, (compiler, emulator) in {"this machine": ([_compiler()], []), **TARGETS}.items():
-        missing = [word for word in (compiler[0], *emulator) if shutil.which(word) is None]
-        if missing:
-            said[target] = f"not tried: no {missing[0]}"
+def printed(build: Build, folder: Path, commands: int) -> str:
+    """Compile the driver in a folder with an export; return what it prints."""
+    flags = [*(flag for flag in FLAGS if flag != "-O3"), *STRICT, f"-I{folder}", f"-I{SOURCES}"]
+    words = [*build.words, *flags, str(DRIVER)]  # which includes the core
+    made = subprocess.run([*words, "-lm", "-o", str(folder / "driver")], capture_output=True, text=True)
+    if made.returncode or made.stderr:
+        raise RuntimeError(made.stderr.strip())
+    ran = subprocess.run([*build.runs, str(folder / "driver"), str(commands)], capture_output=True, text=True)
+    if ran.returncode or ran.stderr:
+        raise RuntimeError(f"ended with {ran.returncode}: {ran.stderr.strip()}")
+    return ran.stdout
+
+
+def missing(build: Build) -> str:
+    """Return what is not here that a build needs, or nothing."""
+    for word in (build.words[0], *build.runs):
+        if shutil.which(word) is None:
+            return word
+    flags = Path("/proc/cpuinfo")
+    if build.needs and not (flags.exists() and f" {build.needs} " in flags.read_text()):
+        return build.needs
+    return ""
+
+
+def bits(machine: str, model: str, commands: int) -> list[str]:
+    """Print a line for each build; return what differs."""
+    geometry = load_geometry(machine)
+    expected, failed = "", []
+    for build in builds():
+        if lacks := missing(build):
+            print(f"{build.name:22} not tried: no {lacks} here")
             continue
-        with tempfile.TemporaryDirectory() as folder:
-            write_c(folder, geometry, model, ("", ""))
-            words = [*compiler, *FLAGS, "hexapod_comp.c", "hexapod_selftest.c", "-lm", "-o", "selftest"]
-            subprocess.run(words, cwd=folder, check=True)
-            done = subprocess.run([*emulator, f"{folder}/selftest"], capture_output=True, text=True, check=False)
-        said[target] = done.stdout.strip() or f"ended with {done.returncode}"
-    return said
+        with tempfile.TemporaryDirectory() as name:
+            write_c(Path(name), geometry, load_model(model, geometry), ("", ""))
+            try:
+                text = printed(build, Path(name), commands)
+            except RuntimeError as error:
+                failed.append(f"{build.name}: {error}")
+                continue
+        expected = expected or text
+        apart = sum(line != other for line, other in zip_longest(text.splitlines(), expected.splitlines()))
+        numbers = sum(len(line.split()) - 1 for line in text.splitlines())
+        said = f"{apart:,} lines differ" if apart else "the same bits"
+        print(f"{build.name:22} {numbers:,} numbers: {said}", flush=True)
+        failed += [f"{build.name}: {said}"] if apart else []
+    return failed
 
 
-# --- what it takes -------------------------------------------------------------------------------------------
+# ---- what it takes ----
 
 
 class Timed:
-    """A model's core, with the loops around it."""
+    """A model's exported core, with the loops of c_core.c around it."""
 
     def __init__(self, compensator: Compensator) -> None:
-        folder = tempfile.TemporaryDirectory()
-        source = str(Path(__file__).with_suffix(".c"))
-        path = build(compensator.geometry, compensator.model, Path(folder.name), source)
-        self.library = ctypes.CDLL(str(path))
-        folder.cleanup()
-        for name in ("commands_many", "estimates_many", "each_command", "clock_cost"):
-            getattr(self.library, name).restype = ctypes.c_double
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            write_c(folder, compensator.geometry, compensator.model, ("", ""))
+            sources = ["hexapod_comp.c", "hexapod_library.c", str(Path(__file__).with_suffix(".c"))]
+            flags = ["-std=c99", "-O2", *STRICT, f"-I{folder}", "-fPIC", "-shared"]
+            subprocess.run(["gcc", *flags, *sources, "-lm", "-o", "libhexapod.so"], cwd=folder, check=True)
+            self.library = ctypes.CDLL(str(folder / "libhexapod.so"))
+        for function in ("commands_many", "estimates_many", "each_command", "clock_cost"):
+            getattr(self.library, function).restype = ctypes.c_double
         self.poses = np.array(commands(compensator.geometry))
         self.warm = np.array([compensator.temperatures.values.get(name, 20.0) for name in Temperatures.NAMES])
 
     def run(self, function: str, rounds: int, *more: Any) -> float:
-        """Return what a function of the library says of so many rounds of the poses."""
+        """Return what a function of the library returns of so many rounds of the poses."""
         arrays = [array.ctypes.data_as(ctypes.c_void_p) for array in (self.poses, self.warm)]
         call = getattr(self.library, function)
         result = call(ctypes.c_long(len(self.poses)), ctypes.c_long(rounds), *arrays, *more)
@@ -130,31 +160,14 @@ class Timed:
         return result
 
 
-def costs(rounds: int) -> list[Cost]:
-    """Return what each block costs; every round times all of them and genhexkins."""
+def genhexkins_inverse(poses: np.ndarray) -> Callable[[], float]:
+    """Return a function that returns what genhexkins' inverse takes for a pose, s; NaN where there is none."""
     geometry = load_geometry("paper")
-    everybody = {name: Timed(compensator) for (name, _), compensator in compensators(geometry).items()}
-    poses = next(iter(everybody.values())).poses
-    inverse = _genhexkins(geometry, poses)
-    glance = next(iter(everybody.values())).library.clock_cost(ctypes.c_long(100_000))
-    rows: dict[str, list[tuple[float, float, float]]] = {name: [] for name in everybody}
-    for _ in range(rounds):
-        beside = inverse() if inverse else np.nan
-        for name, timed in everybody.items():
-            command = timed.run("commands_many", INNER) / (INNER * len(poses))
-            estimate = timed.run("estimates_many", 1) / len(poses) - glance
-            rows[name].append((command * 1e6, estimate * 1e6, command / beside))
-    medians = {name: np.median(row, axis=0).tolist() for name, row in rows.items()}
-    return [Cost(name, c, e, None if np.isnan(r) else r) for name, (c, e, r) in medians.items()]
-
-
-def _genhexkins(geometry: HexapodGeometry, poses: np.ndarray) -> Any:
-    """Return a function that tells what genhexkins' inverse takes for a pose, s; None where there is none."""
     try:
-        module = Genhexkins(Compensator(geometry, MachineModel(geometry.name)).machine.structure)
+        module = Genhexkins(Structure.of(geometry))
     except NotHere as reason:
         print(reason, file=sys.stderr)
-        return None
+        return lambda: np.nan
     rotations = Rotation.from_quat(poses[:, 3:]).as_matrix()
     platform = [geometry.platform_poses(p[None], r[None]) for p, r in zip(poses[:, :3], rotations, strict=True)]
     told = emc_poses(*(np.concatenate(part) for part in zip(*platform, strict=True)))
@@ -163,45 +176,51 @@ def _genhexkins(geometry: HexapodGeometry, poses: np.ndarray) -> Any:
     return lambda: module.inverse(told, lengths, codes) / len(told)
 
 
-def spread(count: int) -> Spread:
-    """Return how single commands of the whole model spread."""
-    geometry = load_geometry("paper")
-    timed = Timed(Compensator(geometry, load_model("paper_machine", geometry)))
-    bins = np.zeros(4000, np.int64)
-    rounds = max(1, count // len(timed.poses))
-    largest = timed.run("each_command", rounds, bins.ctypes.data_as(ctypes.c_void_p))
-    share = np.cumsum(bins) / bins.sum()
-    median, tail = (float(np.searchsorted(share, q)) * 0.01 for q in (0.5, 0.9999))
-    return Spread(int(bins.sum()), median, tail, largest * 1e6)
-
-
-def report(said: dict[str, str], cost: list[Cost], single: Spread) -> str:
-    """Return everything for a person."""
-    lines = ["self-test", *(f"  {target}: {text}" for target, text in said.items())]
-    lines += ["", f"{'block':16} {'command, µs':>12} {'× genhexkins':>13} {'warm estimate, µs':>18}"]
-    for c in cost:
-        ratio = "" if c.ratio is None else f"{c.ratio:.2f}"
-        lines.append(f"{c.block:16} {c.command_us:12.3f} {ratio:>13} {c.estimate_us:18.3f}")
-    lines += ["", f"{single.commands:,} single commands of the whole model by the clock on the wall:"]
-    lines += [f"median {single.median_us:.2f} µs, 99.99 % {single.tail_us:.2f} µs, largest {single.largest_us:.0f} µs"]
-    return "\n".join(lines)
+def times(rounds: int, single: int) -> list[str]:
+    """Print what each block costs, medians of rounds in turn, and how single commands spread; return bars missed."""
+    every = compensators(load_geometry("paper")).items()  # of these, tables over outside numbers are not in an export
+    everybody = {name: Timed(one) for (name, _), one in every if "outside" not in name}
+    whole = everybody["all of them"]
+    beside, count = genhexkins_inverse(whole.poses), len(whole.poses)
+    glance = whole.library.clock_cost(ctypes.c_long(100_000))
+    rows = []
+    for _ in range(rounds):
+        inverse = beside()
+        for timed in everybody.values():
+            command = timed.run("commands_many", INNER) / (INNER * count)
+            estimate = timed.run("estimates_many", 1) / count - glance
+            rows.append((command * 1e6, command / inverse, estimate * 1e6))
+    medians = np.median(np.reshape(rows, (rounds, len(everybody), 3)), axis=0)
+    cells = ([name, f"{c:.3f}", f"{r:.2f}", f"{e:.3f}"] for name, (c, r, e) in zip(everybody, medians, strict=True))
+    print(table(["block", "command, µs", "× genhexkins", "warm estimate, µs"], cells))
+    bins = np.zeros(4000, np.int64)  # of 10 ns
+    largest = whole.run("each_command", max(1, single // count), bins.ctypes.data_as(ctypes.c_void_p))
+    median, tail = np.searchsorted(np.cumsum(bins) / bins.sum(), (0.5, 0.9999)) * 0.01
+    print(f"\n{bins.sum():,} single commands of the whole model by the clock on the wall:")
+    print(f"median {median:.2f} µs, 99.99 % {tail:.2f} µs, largest {largest * 1e6:.0f} µs")
+    command, ratio, estimate = medians[list(everybody).index("all of them")]
+    kept = {
+        f"whole model within {LARGEST_US} µs": command <= LARGEST_US,
+        f"within {LARGEST_RATIO:g} × genhexkins": not ratio > LARGEST_RATIO,
+        f"warm estimate within {LARGEST_ESTIMATE_US} µs": estimate <= LARGEST_ESTIMATE_US,
+    }
+    return [bar for bar, held in kept.items() if not held]
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.c_core", description=__doc__.split("\n")[0])
-    parser.add_argument("--single", type=int, default=10_000_000, help="single commands to time")
-    parser.add_argument("--rounds", type=int, default=ROUNDS)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.c_core", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--only", choices=("bits", "times"), help="one part alone (default: both)")
+    parser.add_argument("--machine", default="paper", help="whose bits are compared (default paper)")
+    parser.add_argument("--model", default="paper_machine")
+    parser.add_argument("--commands", type=int, default=20_000, help="of which the bits are compared (default 20000)")
+    parser.add_argument("--single", type=int, default=10_000_000, help="single commands to time (default 10 million)")
+    parser.add_argument("--rounds", type=int, default=15, help="of times in turn (default 15)")
     args = parser.parse_args()
-    said, cost, single = self_tests(), costs(args.rounds), spread(args.single)
-    print(report(said, cost, single))
-    whole = cost[-1]
-    kept = {
-        "self-tests": all("as they should be" in text or "not tried" in text for text in said.values()),
-        f"whole model within {LARGEST_US} µs": whole.command_us <= LARGEST_US,
-        f"within {LARGEST_RATIO:g} × genhexkins": whole.ratio is None or whole.ratio <= LARGEST_RATIO,
-        f"warm estimate within {LARGEST_ESTIMATE_US} µs": whole.estimate_us <= LARGEST_ESTIMATE_US,
-    }
-    return judged([bar for bar, held in kept.items() if not held])
+    if shutil.which("gcc") is None:
+        return cannot_run("no gcc")
+    problems = bits(args.machine, args.model, args.commands) if args.only != "times" else []
+    problems += times(args.rounds, args.single) if args.only != "bits" else []
+    return judged(problems)
 
 
 if __name__ == "__main__":

@@ -21,11 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from hexapod_comp.machine.kinematics import Structure
 
-from .peers import STEP_TOLERANCE
-from .poses import NEAR, WIDE, Contender, Poses, joined
-
 NAME = "LinuxCNC genhexkins"
-LOOSE, SECOND = f"{NAME}, to 1e-8 m", f"{NAME}: second solve"
 # Where Debian puts it; another one by the environment variable GENHEXKINS
 MODULE = Path("/usr/lib/linuxcnc/modules/genhexkins.so")
 
@@ -33,9 +29,6 @@ MM = 1e-3
 # Its own default: it ends when every strut was right to this, mm, before the last step. Its steps shrink by a
 # constant factor each, so its answers are about as good as this; ours converges quadratically.
 CRITERION = 1e-9
-
-# What ours calls a last step, 1e-8 m, mm: genhexkins is quicker with it, and its answers are worse
-LOOSE_CRITERION = STEP_TOLERANCE / MM
 
 ANY_ERROR = 1e9  # Its default refuses a guess whose struts are off by 500 mm altogether; here it may try
 
@@ -131,6 +124,18 @@ class Genhexkins:
         arrays = pointer(poses), pointer(lengths), pointer(codes)
         return self.stand_in.inverse_many(self.module.kinematicsInverse, count, *arrays)
 
+    def one_call(self, inverse: bool) -> Callable[..., int]:
+        """Return a function of the module for single calls from Python, with addresses."""
+        function = self.module.kinematicsInverse if inverse else self.module.kinematicsForward
+        function.argtypes = [ctypes.c_void_p] * 4
+        return function
+
+    @staticmethod
+    def addresses(given: np.ndarray, found: np.ndarray, flags: np.ndarray) -> list[tuple[int, int, int, int]]:
+        """Return the four arguments of one call per row, ready: looking them up is not counted."""
+        rows = zip(given, found, strict=True)
+        return [(row.ctypes.data, to.ctypes.data, flags.ctypes.data, flags.ctypes.data + 8) for row, to in rows]
+
     def solved(self, lengths: np.ndarray, guesses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return codes (N,), 0 for success, and poses (N, 9) for lengths (N, 6), m, from guesses (N, 9)."""
         poses, codes = np.empty((len(lengths), POSE)), np.empty(len(lengths), np.int32)
@@ -140,80 +145,3 @@ class Genhexkins:
 
 def pointer(array: np.ndarray) -> ctypes.c_void_p:
     return array.ctypes.data_as(ctypes.c_void_p)
-
-
-# --- taking part in benchmarks.kernels ---------------------------------------------------------------------
-
-
-def contenders(single: Poses, batch: Poses, near_single: Poses, near: Poses) -> list[Contender]:
-    """Return genhexkins' runs: batches in C loops that time themselves, single calls from Python by ctypes."""
-    module, found = Genhexkins(batch.structure), []
-    for shape, wide, close in (("batch", batch, near), ("single", single, near_single)):
-        found.append(_inverse(module, wide, shape))
-        for criterion in (CRITERION, LOOSE_CRITERION):
-            found += [_forward(module, WIDE, wide, shape, criterion), _forward(module, NEAR, close, shape, criterion)]
-    return [*found, _second_solve(module, near)]
-
-
-def _inverse(module: Genhexkins, poses: Poses, shape: str) -> Contender:
-    told, count = emc_poses(poses.positions, poses.rotations), len(poses.positions)
-    lengths, codes, flags = np.empty((count, STRUTS)), np.empty(count, np.int32), np.zeros(2, np.uint64)
-    inverse, calls = _caller(module.module.kinematicsInverse), _addresses(told, lengths, flags)
-
-    def one_by_one(kept: tuple = (told, flags)) -> None:  # whose addresses are used
-        for call in calls:
-            inverse(*call)
-
-    run = one_by_one if shape == "single" else functools.partial(module.inverse, told, lengths, codes)
-    return Contender("inverse", NAME, shape, count, run, lambda: lengths * MM)
-
-
-def _forward(module: Genhexkins, task: str, poses: Poses, shape: str, criterion: float) -> Contender:
-    count, lengths = len(poses.lengths), poses.lengths / MM
-    home = emc_poses(poses.home.position[None], poses.home.rotation[None])
-    found, codes, flags = np.empty((count, POSE)), np.empty(count, np.int32), np.zeros(2, np.uint64)
-    forward, calls = _caller(module.module.kinematicsForward), _addresses(lengths, found, flags)
-
-    def many() -> float:
-        module.criterion(criterion)
-        return module.forward(lengths, home, found, codes)
-
-    def one_by_one(kept: tuple = (lengths, flags)) -> None:  # whose addresses are used
-        module.criterion(criterion)
-        found[:] = home
-        codes[:] = [forward(*call) for call in calls]
-
-    name, run = NAME if criterion == CRITERION else LOOSE, one_by_one if shape == "single" else many
-    return Contender(task, name, shape, count, run, lambda: _checked(found, codes))
-
-
-def _second_solve(module: Genhexkins, poses: Poses) -> Contender:
-    """Time what each call spends on a second solution, from the first, for the pins of its display.
-
-    Started at the solution, both solutions of a call take one iteration: half the time is the second one's.
-    """
-    count, lengths, told = len(poses.lengths), poses.lengths / MM, emc_poses(poses.positions, poses.rotations)
-    found, codes = np.empty((count, POSE)), np.empty(count, np.int32)
-
-    def run() -> float:
-        module.criterion(CRITERION)
-        return 0.5 * module.forward(lengths, told, found, codes)
-
-    return Contender(NEAR, SECOND, "batch", count, run, lambda: _checked(found, codes))
-
-
-def _checked(poses: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """Return poses for comparison; those that it did not solve hold NaN."""
-    return np.where(codes[:, None] == 0, joined(*si_poses(np.where(codes[:, None] == 0, poses, 0.0))), np.nan)
-
-
-def _caller(function: Callable[..., int]) -> Callable[..., int]:
-    """Return a function of the module for calls from Python with addresses."""
-    function.argtypes = [ctypes.c_void_p] * 4  # type: ignore[attr-defined]
-    return function
-
-
-def _addresses(given: np.ndarray, found: np.ndarray, flags: np.ndarray) -> list[tuple[int, int, int, int]]:
-    """Return the four arguments of one call per row, ready: looking them up is not counted."""
-    rows = zip(given, found, strict=True)
-    return [(row.ctypes.data, to.ctypes.data, flags.ctypes.data, flags.ctypes.data + 8) for row, to in rows]

@@ -1,7 +1,7 @@
 """Compensator and drive on two hosts: network namespaces, and a cable that is cut, loses frames or delays them.
 
-The controller stands beside the compensator. The cable is one of ours in user space (benchmarks/faults/cable.py),
-since not every kernel has netem. Exits 2, with the reason, where namespaces are not permitted.
+The controller stands beside the compensator. The cable is one of ours in user space, since not every kernel has netem.
+Exits 2, with the reason, where namespaces are not permitted.
 
 Usage: python -m benchmarks.network [--rounds 3] [--seconds 5] [--seed 0] [--only cut,loss,delay,long_cut]
 """
@@ -9,28 +9,152 @@ Usage: python -m benchmarks.network [--rounds 3] [--seconds 5] [--seed 0] [--onl
 from __future__ import annotations
 
 import argparse
+import heapq
+import itertools
 import os
+import select
 import socket
+import struct
 import subprocess
 import sys
+import time
 from functools import partial
 
 import numpy as np
 
-from hexapod_comp.formats.texts import aligned
 from hexapod_comp.ros import avoid_shared_memory
 
 from . import cannot_run
-from .faults import visible
-from .faults.cable import Cable
-from .faults.campaign import RUNS_AGAIN_WITHIN, WARM_UP, Episode, Outcome, run_episode
-from .faults.fault import SILENT, Fault, Meaning
-from .faults.namespaces import OWN_NETWORK, make_host, refusal
+from .faults import judge
+from .faults.campaign import RUNS_AGAIN_WITHIN, WARM_UP, Episode, Outcome, run_episode, table
+from .faults.kinds import NOT_REPORTED, SILENT, Fault, Meaning
 from .faults.record import Happened
 from .faults.rig import Rig
 
 # Set where this program runs again, in a namespace of its own: to ``cable``, or to the descriptor for orders
 INSIDE = "HEXAPOD_COMP_NETWORK_BENCHMARK"
+
+OWN_NETWORK = ("unshare", "--map-root-user", "--net")  # A network namespace, in which we are root and may set it up
+APPEARS_WITHIN = 5.0  # A namespace that is not there after this long, s, will not be
+
+ALL_PROTOCOLS, OUTGOING, LONGEST_FRAME = 3, 4, 65_536  # ETH_P_ALL and PACKET_OUTGOING, our own frames, of Linux
+IPV4, UDP = 0x0800, 17
+
+
+# ---- the cable ----
+
+
+class Cable:
+    """Carries frames between two interfaces of this network namespace.
+
+    It obeys lines on a socket: ``delay SECONDS``, ``loss SHARE``, ``cut`` (all is lost) and ``mend``.
+    """
+
+    def __init__(self, names: tuple[str, str], orders: socket.socket, seed: int) -> None:
+        self._ends = [socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ALL_PROTOCOLS)) for _ in names]
+        for end, name in zip(self._ends, names, strict=True):
+            end.bind((name, 0))
+        self._orders, self._unread = orders, b""
+        self._rng = np.random.default_rng(seed)
+        self._delay, self._loss = 0.0, 0.0
+        self._on_the_way: list[tuple[float, int, int, bytes]] = []
+        self._count = itertools.count()
+        self.carried = self.lost = 0
+
+    def run(self) -> None:
+        """Carry until whoever gives the orders hangs up."""
+        while True:
+            wait = max(0.0, self._on_the_way[0][0] - time.monotonic()) if self._on_the_way else 1.0
+            ready, _, _ = select.select([*self._ends, self._orders], [], [], wait)
+            for index, end in enumerate(self._ends):
+                if end in ready:
+                    self._accept(index, *end.recvfrom(LONGEST_FRAME))
+            while self._on_the_way and self._on_the_way[0][0] <= time.monotonic():
+                _, _, index, frame = heapq.heappop(self._on_the_way)
+                self._ends[1 - index].send(frame)
+            if self._orders in ready and not self._obey():
+                return
+
+    def _accept(self, index: int, frame: bytes, address: tuple) -> None:
+        if address[2] == OUTGOING:
+            return
+        if self._rng.uniform() < self._loss:
+            self.lost += 1
+            return
+        self.carried += 1
+        due = time.monotonic() + self._delay
+        heapq.heappush(self._on_the_way, (due, next(self._count), index, without_udp_checksum(frame)))
+
+    def _obey(self) -> bool:
+        data = self._orders.recv(4096)
+        *lines, self._unread = (self._unread + data).split(b"\n")
+        for line in lines:
+            word, *values = line.decode("ascii").split()
+            if word == "delay":
+                self._delay = float(values[0])
+            else:
+                self._delay, self._loss = 0.0, {"mend": 0.0, "cut": 1.0}.get(word) or float((*values, 0.0)[0])
+        return bool(data)
+
+
+def without_udp_checksum(frame: bytes) -> bytes:
+    """Return a frame whose UDP checksum, if it has one, says that there is none.
+
+    A virtual Ethernet leaves it to a hardware that is not there, so what we take off it is not valid yet.
+    """
+    if len(frame) < 42 or struct.unpack_from("!H", frame, 12)[0] != IPV4 or frame[23] != UDP:
+        return frame
+    fragment = struct.unpack_from("!H", frame, 20)[0] & 0x1FFF
+    place = 14 + 4 * (frame[14] & 0x0F) + 6
+    return frame if fragment else frame[:place] + b"\0\0" + frame[place + 2 :]
+
+
+# ---- two hosts: namespaces, each with one end of a virtual Ethernet ----
+
+
+def refusal() -> str:
+    """Return why there cannot be network namespaces with virtual Ethernet here, or nothing if there can."""
+    script = "ip link add he0 type veth peer name hw0 && ip link set lo up"
+    try:
+        done = subprocess.run([*OWN_NETWORK, "sh", "-c", script], capture_output=True, text=True, check=False)
+    except OSError as error:
+        return str(error)
+    return "" if done.returncode == 0 else done.stderr.strip() or "not permitted"
+
+
+def make_host(number: int) -> subprocess.Popen:
+    """Make a host with address 10.99.0.NUMBER in a namespace of ours; return a process that does nothing but keep it.
+
+    The cable's end of its Ethernet is hwNUMBER.
+    """
+    holder = subprocess.Popen(["unshare", "--net", "sleep", "infinity"])
+    give_up = time.monotonic() + APPEARS_WITHIN
+    while os.readlink(f"/proc/{holder.pid}/ns/net") == os.readlink("/proc/self/ns/net"):
+        if time.monotonic() > give_up:
+            raise RuntimeError("the new network namespace does not appear")
+        time.sleep(0.01)
+    wire, end, inside = f"hw{number}", f"he{number}", " ".join(entering(holder))
+    for words in (
+        f"ip link add {wire} type veth peer name {end}",
+        f"ip link set {end} netns {holder.pid}",
+        f"ip link set {wire} up",
+        f"{inside} ip link set lo up",
+        f"{inside} ip addr add 10.99.0.{number}/24 dev {end}",
+        f"{inside} ip link set {end} up",
+        f"{inside} ip route add 224.0.0.0/4 dev {end}",
+    ):
+        done = subprocess.run(words.split(), capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            raise RuntimeError(f"{words}: {done.stderr.strip()}")
+    return holder
+
+
+def entering(host: subprocess.Popen) -> list[str]:
+    """Return the words before a command that make it run on a host."""
+    return ["nsenter", f"--target={host.pid}", "--net", "--"]
+
+
+# ---- the episodes ----
 
 
 class OnCable(Fault):
@@ -38,14 +162,11 @@ class OnCable(Fault):
 
     order: str
     cable: socket.socket
-    touches = frozenset()
 
     def begin(self, rig: Rig, happened: Happened) -> None:
-        """Do it."""
         self.cable.sendall(f"{self.order}\n".encode("ascii"))
 
     def end(self, rig: Rig, happened: Happened) -> None:
-        """Mend it."""
         self.cable.sendall(b"mend\n")
 
 
@@ -67,24 +188,19 @@ class Loss(OnCable):
     """One frame in twenty is lost, either way."""
 
     kind, order = "loss", "loss 0.05"
-    meaning = Meaning("never: a newer message is there before anybody misses one", "nothing need be reported")
+    meaning = Meaning("never: a newer message is there before anybody misses one", NOT_REPORTED)
 
 
 class Late(OnCable):
     """All frames take 50 ms, either way."""
 
     kind, order = "delay", "delay 0.05"
-    meaning = Meaning("never: readings come as often as before, only older", "nothing need be reported")
+    meaning = Meaning("never: readings come as often as before, only older", NOT_REPORTED)
 
 
 KINDS = {kind.kind: kind for kind in (Cut, Loss, Late, LongCut)}
-
-visible.VISIBLE.update(
-    cut=partial(visible.silence, "feedback"),
-    long_cut=partial(visible.silence, "feedback"),
-    loss=visible.nothing,
-    delay=visible.nothing,
-)
+silent = partial(judge.silence, "feedback")
+judge.VISIBLE.update(cut=silent, long_cut=silent, loss=judge.nothing, delay=judge.nothing)
 
 
 def harness(args: argparse.Namespace, descriptor: int) -> int:
@@ -95,7 +211,7 @@ def harness(args: argparse.Namespace, descriptor: int) -> int:
     avoid_shared_memory()
     wanted = [kind for kind in KINDS if kind in args.only.split(",")]
     outcomes: list[Outcome] = []
-    with cable, Rig(args.seed, wired=False, domain=False, wrappers={"drive": args.far.split()}) as rig:
+    with cable, Rig(args.seed, domain=False, host=args.far.split()) as rig:
         rig.spin(WARM_UP)
         for number in range(args.rounds * len(wanted)):
             fault = KINDS[wanted[number % len(wanted)]](np.random.default_rng([args.seed, number]))
@@ -111,37 +227,24 @@ def harness(args: argparse.Namespace, descriptor: int) -> int:
     return int(any(outcome.verdict.misses() for outcome in outcomes))
 
 
-def table(outcomes: list[Outcome]) -> str:
-    """Return the results by kind."""
-    lines = []
-    for kind in KINDS:
-        verdicts = [o.verdict for o in outcomes if o.episode.kinds == [kind]]
-        delays = [report.delay for v in verdicts for _, report in v.reports if report.visible]
-        if verdicts:
-            counts = np.sum([[v.sent, v.lost, len(v.breaches)] for v in verdicts], axis=0)
-            report = f"{max(delays) * 1e3:.0f}" if delays else "–"
-            recovery = f"{max(v.recovery for v in verdicts):.2f}"
-            lines.append([kind, str(len(verdicts)), report, recovery, *map(str, counts)])
-    header = ["cable", "episodes", "worst report, ms", "worst recovery, s", "good commands", "lost", "breaches"]
-    return aligned(header, lines)
-
-
-def cable(args: argparse.Namespace) -> int:
+def between_hosts(args: argparse.Namespace) -> int:
     """Make the two hosts, run the harness on one of them, and carry frames until it ends."""
-    near, far = make_host(1), make_host(2)
+    hosts = [make_host(number) for number in (1, 2)]
     ours, theirs = socket.socketpair()
-    command = [*near.enter, sys.executable, "-m", "benchmarks.network", *sys.argv[1:], "--far", " ".join(far.enter)]
-    environment = {**os.environ, INSIDE: str(theirs.fileno())}
+    near, far = map(entering, hosts)
+    command = [*near, sys.executable, "-m", "benchmarks.network", *sys.argv[1:], "--far", " ".join(far)]
     try:
+        environment = {**os.environ, INSIDE: str(theirs.fileno())}
         child = subprocess.Popen(command, env=environment, pass_fds=[theirs.fileno()])
         theirs.close()
-        carrier = Cable((near.wire, far.wire), ours, args.seed)
+        carrier = Cable(("hw1", "hw2"), ours, args.seed)
         carrier.run()
         print(f"{carrier.carried} frames carried, {carrier.lost} lost", file=sys.stderr)
         return child.wait()
     finally:
-        near.close()
-        far.close()
+        for host in hosts:
+            host.kill()
+            host.wait()
 
 
 def main() -> int:
@@ -155,11 +258,10 @@ def main() -> int:
     args = parser.parse_args()
     role = os.environ.get(INSIDE, "")
     if role == "cable":
-        return cable(args)
+        return between_hosts(args)
     if role:
         return harness(args, int(role))
-    why_not = refusal()
-    if why_not:
+    if why_not := refusal():
         return cannot_run(f"no network namespaces here: {why_not}")
     command = [*OWN_NETWORK, sys.executable, "-m", "benchmarks.network", *sys.argv[1:]]
     return subprocess.run(command, env={**os.environ, INSIDE: "cable"}, check=False).returncode

@@ -13,12 +13,12 @@ import time
 
 from tqdm import tqdm
 
-from hexapod_comp.formats.texts import aligned
+from benchmarks import table as markdown
 
-from .campaign import STARVED, Episode, Outcome, campaign, draw, rows
+from .campaign import STARVED, Episode, Outcome, campaign, draw, table
 from .judge import REPORT_WITHIN
 from .kinds import KINDS, kinds_of
-from .logdisk import refusal_to_mount
+from .rig import refusal_to_mount
 
 
 def chosen(only: str, episodes: int, seed: int, kinds: tuple[str, ...]) -> list[Episode]:
@@ -32,24 +32,14 @@ def chosen(only: str, episodes: int, seed: int, kinds: tuple[str, ...]) -> list[
     if unknown:
         raise SystemExit(f"--only: there is no kind {', '.join(unknown)}; there are {', '.join(KINDS)}")
     picked = [draw(seed, number, kinds) for number in sorted(numbers)]
-    return picked + [e for e in drawn if e.number not in numbers and set(e.kinds) & set(names)]
+    return picked + [e for e in drawn if e.number not in numbers and {f.kind for _, f in e.faults} & set(names)]
 
 
 def definitions() -> str:
-    """Return the table of what each fault is, when it is visible, and who must say what."""
-    lines = [["fault", "what", "visible from the moment at which", "who must say what"]]
-    lines += [[name, (k.__doc__ or "").split("\n")[0], k.meaning.visible, k.meaning.said] for name, k in KINDS.items()]
-    return "\n".join("| " + " | ".join(line) + " |" for line in [lines[0], ["---"] * 4, *lines[1:]])
-
-
-def table(outcomes: list[Outcome]) -> str:
-    """Return the table of results."""
-    header, lines = ["fault", "episodes", "visible", "worst report, ms", "worst recovery, s", "lost", "breaches"], []
-    for row in rows(outcomes):
-        report = f"{max(row.reports) * 1e3:.0f}" if row.reports else "–"
-        counts = str(row.episodes), str(row.visible)
-        lines.append([row.kind, *counts, report, f"{max(row.recoveries):.2f}", str(row.lost), str(row.breaches)])
-    return aligned(header, lines)
+    """Return the table of doc/faults.md: what each fault is, when it is visible, and which node must report what."""
+    columns = ["fault", "what", "visible from the moment at which", "which node must report what"]
+    rows = ([n, " ".join((k.__doc__ or "").split()), k.meaning.visible, k.meaning.said] for n, k in KINDS.items())
+    return markdown(columns, rows, texts=4)
 
 
 def main() -> int:
@@ -69,9 +59,11 @@ def main() -> int:
         kinds = tuple(kind for kind in kinds if kind != "log_disk_full")
         print(f"log_disk_full is left out: no file system can be mounted here ({why_not})", file=sys.stderr)
     episodes = chosen(args.only, args.episodes, args.seed, kinds)
-    began, outcomes, total = time.monotonic(), [], len(episodes)
+    began, outcomes = time.monotonic(), list[Outcome]()
     try:
-        for outcome in tqdm(campaign(episodes, args.seed, args.mover), total=total, unit="episode", disable=None):
+        for outcome in tqdm(
+            campaign(episodes, args.seed, args.mover), total=len(episodes), unit="episode", disable=None
+        ):
             outcomes.append(outcome)
             if outcome.verdict.misses():
                 tqdm.write(outcome.line(args.seed))
@@ -79,24 +71,19 @@ def main() -> int:
     except KeyboardInterrupt:
         print(f"interrupted after {len(outcomes)} of {len(episodes)} episodes", file=sys.stderr)
     print(table(outcomes))
-    print(summary(outcomes, time.monotonic() - began))
-    return int(any(outcome.verdict.misses() for outcome in outcomes))
-
-
-def summary(outcomes: list[Outcome], seconds: float) -> str:
-    """Return what the campaign comes down to."""
     missed = [outcome for outcome in outcomes if outcome.verdict.misses()]
-    busy = sum(outcome.starved > STARVED for outcome in missed)
-    starved = sum(outcome.starved > STARVED for outcome in outcomes)
+    busy, starved = (sum(o.starved > STARVED for o in some) for some in (missed, outcomes))
     good, lost = (sum(getattr(o.verdict, name) for o in outcomes) for name in ("sent", "lost"))
     within = max((o.verdict.within for o in outcomes), default=0.0)
-    return (
-        f"{len(outcomes)} episodes in {seconds / 60.0:.1f} min; {good} good commands outside the faults, {lost} lost.\n"
+    print(
+        f"{len(outcomes)} episodes in {(time.monotonic() - began) / 60.0:.1f} min; "
+        f"{good} good commands outside the faults, {lost} lost.\n"
         f"Bars (report ≤ {REPORT_WITHIN * 1e3:.0f} ms, recovery ≤ {within:g} s, nothing lost, no breach): "
         f"{f'MISSED in {len(missed)} episodes, {busy} of them on a busy computer' if missed else 'kept'}.\n"
         f"In {starved} of the {len(outcomes)} episodes a process was ready to run and got no processor for more than "
         f"{STARVED:.0%} of the time."
     )
+    return int(bool(missed))
 
 
 if __name__ == "__main__":

@@ -5,71 +5,41 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from .fault import Fault
+from hexapod_comp.formats.texts import aligned
+
 from .judge import MOVER_RECOVERS_WITHIN, RECOVER_WITHIN, Limits, Verdict, judge
-from .kinds import KINDS, kinds_of
+from .kinds import KINDS, Fault, kinds_of
 from .record import Happened
 from .rig import Rig
 
-BEFORE, AFTER = 0.4, 0.5
-"""How long the machine is watched before the first fault, and after the last has ended and recovery is over, s."""
-
-SECOND_WITHIN = 0.5
-"""A second fault begins at most this long after the first, s."""
-
-WARM_UP = 2.0
-"""The machine moves for so long before the first episode, s."""
-
-RUNS_AGAIN_WITHIN = 5.0
-"""A machine that does not run this long after an episode, s, is replaced."""
-
-STARVED = 0.1
-"""A process that waits for a processor for more than this share of the time is starved."""
-
-GIVE_UP = 30.0
-"""A fault that is not over by then never will be, s."""
+BEFORE, AFTER = 0.4, 0.5  # How long the machine is watched before the first fault, and after recovery is over, s
+SECOND_WITHIN = 0.5  # A second fault begins at most this long after the first, s
+WARM_UP = 2.0  # The machine moves for so long before the first episode, s
+RUNS_AGAIN_WITHIN = 5.0  # A machine that does not run this long after an episode, s, is replaced
+STARVED = 0.1  # Share of the time that a process waits for a processor above which its times say little of the nodes
+GIVE_UP = 30.0  # A fault that is not over by then never will be, s
 
 
 @dataclass
 class Episode:
-    """What is to happen.
-
-    Attributes
-    ----------
-    number : int
-        Its number; with the campaign's seed it decides everything that is drawn.
-    faults : list of (float, Fault)
-        One or two, and when each begins, s.
-    """
+    """One or two faults, and when each begins, s; its number and the campaign's seed decide all that is drawn."""
 
     number: int
     faults: list[tuple[float, Fault]]
 
-    @property
-    def kinds(self) -> list[str]:
-        """Names of its faults."""
-        return [fault.kind for _, fault in self.faults]
-
 
 @dataclass
 class Outcome:
-    """What has happened, and what the judge says.
-
-    Attributes
-    ----------
-    starved : float
-        Share of the episode for which one of the processes was ready to run and got no processor: above
-        :data:`STARVED` its times say as much about the computer as about the nodes.
-    """
+    """What has happened, and what the judge says."""
 
     episode: Episode
     verdict: Verdict
     happened: list[Happened]
-    starved: float = 0.0
+    starved: float  # share of the episode for which one of the processes was ready to run and got no processor
 
     def line(self, seed: int) -> str:
         """Return what was missed, and how to run it alone."""
@@ -80,17 +50,7 @@ class Outcome:
 
 
 def draw(seed: int, number: int, kinds: Sequence[str] = kinds_of(mover=False)) -> Episode:
-    """Draw one episode: its kinds come in shuffled rounds, so that all come equally often; half have a second.
-
-    Parameters
-    ----------
-    seed : int
-        Of the campaign.
-    number : int
-        Of the episode, from 0.
-    kinds : sequence of str
-        To draw from.
-    """
+    """Draw one episode: its kinds come in shuffled rounds, so that all come equally often; half have a second."""
     rounds, place = divmod(number, len(kinds))
     order = np.random.default_rng([seed, rounds, 0]).permutation(len(kinds))
     rng, of_first, of_second = (np.random.default_rng([seed, number, part]) for part in (1, 2, 3))
@@ -134,8 +94,8 @@ def run_episode(rig: Rig, episode: Episode) -> Outcome:
     rig.spin(recovery + AFTER)
     record.ended = time.monotonic()
     longest = max(time_now - waited.get(pid, 0.0) for pid, time_now in rig.waited().items())
-    starved = longest / (record.ended - first)
-    return Outcome(episode, judge(record, Limits.of(rig.geometry), recovery), record.faults, starved)
+    verdict = judge(record, Limits.of(rig.geometry), recovery)
+    return Outcome(episode, verdict, record.faults, longest / (record.ended - first))
 
 
 def campaign(episodes: Iterable[Episode], seed: int, mover: bool) -> Iterator[Outcome]:
@@ -146,38 +106,23 @@ def campaign(episodes: Iterable[Episode], seed: int, mover: bool) -> Iterator[Ou
         with Rig(seed, mover=mover) as rig:
             rig.spin(WARM_UP)
             while episode is not None:
-                outcome = run_episode(rig, episode)
-                yield outcome
+                yield run_episode(rig, episode)
                 episode = next(remaining, None)
                 rig.spin(RUNS_AGAIN_WITHIN, rig.running)
                 if not rig.running():
                     break
 
 
-@dataclass
-class Row:
-    """One kind of fault over a campaign: worst figures and counts."""
-
-    kind: str
-    episodes: int = 0
-    visible: int = 0
-    reports: list[float] = field(default_factory=list)
-    recoveries: list[float] = field(default_factory=list)
-    lost: int = 0
-    breaches: int = 0
-
-
-def rows(outcomes: Sequence[Outcome]) -> list[Row]:
-    """Gather outcomes by kind; recovery, losses and breaches of an episode count for each of its faults."""
-    table = {kind: Row(kind) for kind in KINDS}
-    for outcome in outcomes:
-        for kind, report in outcome.verdict.reports:
-            row = table[kind]
-            row.episodes += 1
-            row.recoveries.append(outcome.verdict.recovery)
-            row.lost += outcome.verdict.lost
-            row.breaches += len(outcome.verdict.breaches)
-            if report.visible:
-                row.visible += 1
-                row.reports.append(report.delay)
-    return [row for row in table.values() if row.episodes]
+def table(outcomes: Sequence[Outcome]) -> str:
+    """Return worst figures and counts by kind; recovery, losses and breaches of an episode count for each fault."""
+    header = ["fault", "episodes", "visible", "worst report, ms", "worst recovery, s", "good commands", "lost"]
+    lines: dict[str, list[str]] = {}
+    for kind in dict.fromkeys(kind for outcome in outcomes for kind, _ in outcome.verdict.reports):
+        found = [(o.verdict, report) for o in outcomes for name, report in o.verdict.reports if name == kind]
+        delays = [report.delay for _, report in found if report.visible]
+        sent, lost, breaches = np.sum([[v.sent, v.lost, len(v.breaches)] for v, _ in found], axis=0)
+        worst = f"{max(delays) * 1e3:.0f}" if delays else "–"
+        recovery = f"{max(verdict.recovery for verdict, _ in found):.2f}"
+        lines[kind] = [kind, *map(str, (len(found), len(delays), worst, recovery, sent, lost, breaches))]
+    order = sorted(lines, key=[*KINDS, *lines].index)
+    return aligned([*header, "breaches"], [lines[kind] for kind in order])

@@ -20,20 +20,11 @@ from hexapod_comp.pose import Pose
 from hexapod_comp.ros.base import EVENT_QOS, LATCHED_QOS
 from hexapod_comp.ros.messages import nanoseconds_of, pose_message
 
-RATE = 250.0
-"""Commands per second, Hz."""
-
-FEED = 0.08
-"""Largest tool speed, m/s."""
-
-REPEAT_AFTER = 0.1
-"""A command without an answer is sent again after this long, s."""
-
-STUCK_AFTER = 0.25
-"""Without an answer for this long, s, it asks whether it must start again from where the machine stands."""
-
-REPEAT_MOVE_AFTER = 0.5
-"""A move of which the mover has published no state is asked for again after this long, s."""
+RATE = 250.0  # Commands per second, Hz
+FEED = 0.08  # Largest tool speed, m/s
+REPEAT_AFTER = 0.1  # A command without an answer is sent again after this long, s
+STUCK_AFTER = 0.25  # Without an answer for this long, s, it asks whether to start again from where the machine stands
+REPEAT_MOVE_AFTER = 0.5  # A move of which the mover has published no state is asked for again after this long, s
 
 
 class Mode(Enum):
@@ -52,15 +43,6 @@ class Controller:
 
     When the compensator no longer takes commands because the machine is not where it was told to be, or after
     the drive was restarted, it resets the compensator and moves from the measured pose back to its path.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        The machine.
-    send : callable
-        Sends a pose; returns its stamp, ns.
-    reset : callable
-        Asks for a reset of the compensator; calls back with the pose to start from, or None when it failed.
     """
 
     def __init__(

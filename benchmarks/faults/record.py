@@ -1,4 +1,4 @@
-"""What the harness saw during one episode: every message with the time at which it came or left."""
+"""What the harness saw during one episode: every message with the monotonic time, s, at which it came or left."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+# Controller to compensator, compensator to drive, drive to compensator: a wire of the harness lies in each
 LINKS = ("pose", "command", "feedback")
-"""Controller to compensator, compensator to drive, drive to compensator: a wire of the harness lies in each."""
-
 NODES = ("compensator", "strut_drive", "mover")
 
 
 @dataclass
 class Sent:
-    """One good command of the controller; monotonic times, s, NaN while unanswered."""
+    """One good command of the controller."""
 
     sent_at: float
     answered_at: float = math.nan
@@ -24,35 +23,15 @@ class Sent:
 
 @dataclass(frozen=True)
 class Struts:
-    """Six lengths as one message had them, m, shape (6,); NaN where it had none.
+    """Six lengths as one message had them, m, shape (6,); NaN where it had none."""
 
-    Attributes
-    ----------
-    time : float
-        When it came or was delivered, or, a command, when the compensator's middleware sent it, monotonic, s.
-    """
-
-    time: float
+    time: float  # when it came or was delivered, or, a command, when the compensator's middleware sent it
     lengths: np.ndarray
 
 
 @dataclass(frozen=True)
 class Status:
-    """One diagnostics status.
-
-    Attributes
-    ----------
-    time : float
-        When it came, monotonic, s.
-    node : str
-        Who says it.
-    level : int
-        0 is well, 1 a warning, 2 an error.
-    message : str
-        What a person reads.
-    values : dict of str to str
-        The rest.
-    """
+    """One diagnostics status of a node; level 0 is well, 1 a warning, 2 an error."""
 
     time: float
     node: str
@@ -67,72 +46,40 @@ class Status:
 
 @dataclass
 class Happened:
-    """One fault as it happened.
-
-    Attributes
-    ----------
-    kind : str
-        Which.
-    began, ended : float
-        Monotonic times, s: of doing it, and of having undone it.
-    marks : list of float
-        When something wrong was delivered, for the kinds whose visibility is that.
-    detail : str
-        What was drawn.
-    standing : list of (float, float)
-        From when to when no command may be published, whatever comes.
-    breaches : list of str
-        What else was done and must not be.
-    """
+    """One fault as it happened."""
 
     kind: str
     began: float
-    ended: float = math.nan
-    marks: list[float] = field(default_factory=list)
-    detail: str = ""
-    standing: list[tuple[float, float]] = field(default_factory=list)
-    breaches: list[str] = field(default_factory=list)
+    ended: float = math.nan  # when it was undone
+    marks: list[float] = field(default_factory=list)  # when something wrong was delivered, where that makes it visible
+    detail: str = ""  # what was drawn
+    standing: list[tuple[float, float]] = field(default_factory=list)  # from when to when no command may be published
+    breaches: list[str] = field(default_factory=list)  # what else was done and must not be
+
+
+def _of_links() -> dict[str, list[float]]:
+    return {link: [] for link in LINKS}
+
+
+def _of_nodes() -> dict[str, list[tuple[float, float]]]:
+    return {node: [] for node in NODES}
 
 
 @dataclass
 class Record:
-    """One episode.
+    """One episode."""
 
-    Attributes
-    ----------
-    sent : dict of int to Sent
-        Good commands by stamp, ns.
-    commands, corrections : list of Struts
-        What the compensator published; the first may be the last of the episode before.
-    measured : list of Struts
-        Encoder readings as they were delivered to the compensator.
-    delivered : dict of str to list of float
-        When each link delivered a message.
-    statuses : list of Status
-        Of both nodes.
-    outages : dict of str to list of (float, float)
-        When a process was dead or stopped; the end of one is the moment at which it said that it is ready.
-    killed : dict of str to list of (float, float)
-        Those of the outages in which a process was killed: its successor does not know what it received.
-    fresh_starts : list of float
-        When a compensator was started or reset: its next command starts from the measured struts.
-    faults : list of Happened
-        What went wrong.
-    ended : float
-        When the record ends, monotonic, s: what was sent just before has had no time to be answered.
-    """
-
-    sent: dict[int, Sent] = field(default_factory=dict)
-    commands: list[Struts] = field(default_factory=list)
+    sent: dict[int, Sent] = field(default_factory=dict)  # good commands by stamp, ns
+    commands: list[Struts] = field(default_factory=list)  # the first may be the last of the episode before
     corrections: list[Struts] = field(default_factory=list)
-    measured: list[Struts] = field(default_factory=list)
-    delivered: dict[str, list[float]] = field(default_factory=lambda: {link: [] for link in LINKS})
+    measured: list[Struts] = field(default_factory=list)  # as delivered to the compensator
+    delivered: dict[str, list[float]] = field(default_factory=_of_links)  # when each link delivered a message
     statuses: list[Status] = field(default_factory=list)
-    outages: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {node: [] for node in NODES})
-    killed: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {node: [] for node in NODES})
-    fresh_starts: list[float] = field(default_factory=list)
+    outages: dict[str, list[tuple[float, float]]] = field(default_factory=_of_nodes)  # dead or stopped, until ready
+    killed: dict[str, list[tuple[float, float]]] = field(default_factory=_of_nodes)  # of these, those that were killed
+    fresh_starts: list[float] = field(default_factory=list)  # of a compensator, from the measured struts
     faults: list[Happened] = field(default_factory=list)
-    ended: float = math.inf
+    ended: float = math.inf  # what was sent just before has had no time to be answered
 
     def said(self, node: str) -> list[Status]:
         """Return the statuses of a node, oldest first."""
@@ -142,19 +89,12 @@ class Record:
         """Return the record of the next episode, which knows what the last one ended with."""
         following = Record(commands=self.commands[-1:], measured=self.measured[-50:])
         following.statuses = [status for node in NODES for status in self.said(node)[-1:]]
-        for link in LINKS:
-            following.delivered[link] = self.delivered[link][-1:]
+        following.delivered = {link: times[-1:] for link, times in self.delivered.items()}
         return following
 
 
 class Told:
-    """What the struts were told, to hold readings against.
-
-    Parameters
-    ----------
-    commands : list of Struts
-        Oldest first.
-    """
+    """What the struts were told, oldest first, to hold readings against."""
 
     def __init__(self, commands: list[Struts]) -> None:
         self._times = np.array([command.time for command in commands])

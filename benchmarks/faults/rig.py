@@ -7,12 +7,14 @@ come back to it and go through a third wire to the compensator.
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import math
 import os
 import re
 import shutil
 import signal
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable
@@ -22,9 +24,9 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.experimental import EventsExecutor
+from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
@@ -39,23 +41,56 @@ from hexapod_comp.ros.client import LISTENER_QOS, TRACK_QOS
 from hexapod_comp.ros.messages import message_pose, nanoseconds_of, pose_message
 
 from .controller import Controller, Mode, MoverController
-from .logdisk import LogDisk
 from .record import Record, Sent, Status, Struts, lengths_of
 from .wire import Wire
 
 GEOMETRY, MODEL = "paper.yaml", "paper_machine.yaml"
-
-STARTS_WITHIN = 60.0
-"""A process that is not ready this long after its start will not be, s."""
-
+STARTS_WITHIN = 60.0  # A process that is not ready this long after its start will not be, s
 MODULES = {"compensator": "compensator", "drive": "strut_drive", "mover": "mover"}
-
+# Drive and mover have topics of their own; the harness carries between them and the compensator's
 REMAPS = {
     "compensator": {},
     "drive": {"strut_commands": "strut_commands_delivered", "strut_states": "strut_states_measured"},
     "mover": {"tool_pose_command": "tool_pose_sent"},
 }
-"""Drive and mover have topics of their own; the harness carries between them and the compensator's."""
+
+
+class LogDisk:
+    """A folder for ``ROS_LOG_DIR`` on a file system of 1 MB, which can be filled, where mounting one is permitted."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir()
+        command = ["mount", "-t", "tmpfs", "-o", "size=1m", "hexapod_comp_faults", str(folder)]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            self.why_not = "" if done.returncode == 0 else done.stderr.strip() or "not permitted"
+        except OSError as error:
+            self.why_not = str(error)
+
+    def fill(self) -> None:
+        """Fill it: not one more byte."""
+        assert not self.why_not
+        with (self.folder / "filler").open("wb", buffering=0) as file, contextlib.suppress(OSError):
+            while True:
+                file.write(b"\0" * 4096)
+
+    def clear(self) -> None:
+        """Make room again."""
+        (self.folder / "filler").unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Unmount it."""
+        if not self.why_not:
+            subprocess.run(["umount", "--lazy", str(self.folder)], capture_output=True, check=False)
+
+
+def refusal_to_mount() -> str:
+    """Return why no small file system can be mounted here, or nothing if it can."""
+    with tempfile.TemporaryDirectory() as folder:
+        disk = LogDisk(Path(folder) / "try")
+        disk.close()
+        return disk.why_not
 
 
 class RigError(RuntimeError):
@@ -65,31 +100,15 @@ class RigError(RuntimeError):
 class Rig:
     """Processes, wires, controller and witness; a context manager.
 
-    Parameters
-    ----------
-    seed : int
-        Of the drive's noise.
-    wired : bool
-        Put the harness's wires between compensator and drive; else the two speak directly.
-    domain : bool
-        Make a private ROS domain; else the environment's is one already.
-    wrappers : dict of str to sequence of str, optional
-        Command that runs a process, by ``compensator`` and ``drive``, such as ``nsenter``.
-    mover : bool
-        The poses come from the mover node, which is asked for moves; else the harness streams them.
+    By default it makes a private ROS `domain`. Where the drive is on another `host`, a command that runs a process
+    there, compensator and drive speak to each other directly, without the harness's wires. With a `mover` the poses
+    come from the mover node, which is asked for moves; else the harness streams them.
     """
 
-    def __init__(
-        self,
-        seed: int = 0,
-        wired: bool = True,
-        domain: bool = True,
-        wrappers: dict[str, list[str]] | None = None,
-        mover: bool = False,
-    ) -> None:
+    def __init__(self, seed: int = 0, domain: bool = True, host: list[str] | None = None, mover: bool = False) -> None:
         self.record = Record()
         self.geometry = load_geometry(config_file(GEOMETRY))
-        self._seed, self._wired, self._wrappers, self.has_mover = seed, wired, wrappers or {}, mover
+        self._seed, self._host, self.has_mover = seed, host, mover
         self._domain = PrivateDomain() if domain else None
         self.processes: dict[str, NodeProcess] = {}
         self._down_since: dict[str, float] = {}
@@ -140,12 +159,15 @@ class Rig:
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(node)
         poses = node.create_publisher(PoseStamped, "tool_pose_command", COMMAND_QOS)
-        self._poses = poses
         node.create_subscription(JointState, "strut_commands", dated(self._on_commands), LISTENER_QOS)
         node.create_subscription(JointState, "strut_corrections", self._on_corrections, LISTENER_QOS)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, LISTENER_QOS)
-        node.create_subscription(PoseStamped, "tool_pose_estimate", self._on_estimate, NEWEST_QOS)
-        self._open_wires(node, poses)
+        node.create_subscription(PoseStamped, "tool_pose_estimate", lambda m: setattr(self, "_estimate", m), NEWEST_QOS)
+        self.wires["pose"] = Wire(lambda message, now: self._deliver("pose", poses, message, now))
+        if self._host is None:
+            self._open_wires(node)
+        else:
+            node.create_subscription(JointState, "strut_states", self._on_states, TRACK_QOS)
         self._set_parameters = node.create_client(SetParameters, "strut_drive/set_parameters")
         self._set_clock = node.create_client(SetParameters, "compensator/set_parameters")
         self._reload = node.create_client(Trigger, "compensator/reload_model")
@@ -157,11 +179,7 @@ class Rig:
         else:
             self.controller = Controller(self.geometry, self._send, self._ask_for_reset)
 
-    def _open_wires(self, node: Any, poses: Any) -> None:
-        self.wires["pose"] = Wire(lambda message, now: self._deliver("pose", poses, message, now))
-        if not self._wired:
-            node.create_subscription(JointState, "strut_states", self._on_states, TRACK_QOS)
-            return
+    def _open_wires(self, node: Any) -> None:
         commands = node.create_publisher(JointState, "strut_commands_delivered", COMMAND_QOS)
         states = node.create_publisher(JointState, "strut_states", STATE_QOS)
         self.wires["command"] = Wire(lambda message, now: self._deliver("command", commands, message, now))
@@ -179,8 +197,8 @@ class Rig:
             parameters.update({"model_file": str(self.model), "model_folder": str(self.folder), "marker_rate": 0.0})
         elif name == "drive":
             parameters.update({"truth_file": str(config_file(MODEL).resolve()), "noise_seed": self._seed})
-        remaps = REMAPS[name] if self._wired else {}
-        wrapper = self._wrappers.get(name, [])
+        remaps = REMAPS[name] if self._host is None else {}
+        wrapper = self._host if name == "drive" and self._host else []
         self.processes[name] = NodeProcess(MODULES[name], parameters, remaps, wrapper)
         self._starting[name] = time.monotonic()
         if name == "compensator":
@@ -249,11 +267,7 @@ class Rig:
 
     def set_drive(self, **values: float | int) -> None:
         """Set fault parameters of the drive, without waiting."""
-        parameters = []
-        for name, value in values.items():
-            kind = ParameterType.PARAMETER_INTEGER if isinstance(value, int) else ParameterType.PARAMETER_DOUBLE
-            typed = ParameterValue(type=kind, **{"integer_value" if isinstance(value, int) else "double_value": value})
-            parameters.append(Parameter(name=name, value=typed))
+        parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
         self._set_parameters.call_async(SetParameters.Request(parameters=parameters))
 
     def reload_model(self, then: Callable[[bool], None]) -> None:
@@ -263,8 +277,7 @@ class Rig:
 
     def simulate_time(self, then: Callable[[bool], None]) -> None:
         """Ask the compensator to go by simulated time; calls back with whether it does."""
-        value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True)
-        request = SetParameters.Request(parameters=[Parameter(name="use_sim_time", value=value)])
+        request = SetParameters.Request(parameters=[Parameter("use_sim_time", value=True).to_parameter_msg()])
         future = self._set_clock.call_async(request)
         future.add_done_callback(lambda f: then(bool(f.result().results[0].successful)))
 
@@ -306,7 +319,7 @@ class Rig:
         if entry is not None and math.isnan(entry.answered_at):
             entry.answered_at = now
         self.controller.answered(stamp, now)
-        if self._wired:
+        if self._host is None:
             self.wires["command"].put(message, now)
 
     def _on_corrections(self, message: JointState) -> None:
@@ -316,9 +329,6 @@ class Rig:
         now = time.monotonic()
         self.record.delivered["feedback"].append(now)
         self.record.measured.append(Struts(now, lengths_of(message.position)))
-
-    def _on_estimate(self, message: PoseStamped) -> None:
-        self._estimate = message
 
     def _on_diagnostics(self, array: DiagnosticArray) -> None:
         now = time.monotonic()
@@ -386,7 +396,7 @@ class Rig:
 def dated(callback: Callable[[Any, float], None]) -> Callable[..., None]:
     """Return a callback for rclpy that hands on a message and when its publisher sent it, s, monotonic.
 
-    As :func:`hexapod_comp.ros.callbacks.numbered`: rclpy asks the signature, and its executors differ.
+    rclpy asks the signature, and its executors call with two arguments or with a pair.
     """
 
     def called(*arguments: Any) -> None:

@@ -17,14 +17,12 @@ import pytest
 
 pytest.importorskip("rclpy")
 
+from benchmarks.faults import wire
 from benchmarks.faults.campaign import STARVED, draw, run_episode
-from benchmarks.faults.judge import Limits, judge
+from benchmarks.faults.judge import VISIBLE, Limits, judge
 from benchmarks.faults.kinds import KINDS, kinds_of
-from benchmarks.faults.logdisk import refusal_to_mount
 from benchmarks.faults.record import Happened, Record, Sent, Status, Struts
-from benchmarks.faults.rig import Rig
-from benchmarks.faults.visible import VISIBLE
-from benchmarks.faults.wire import Corrupt, Delay, Drop, Duplicate, Reorder, Wire
+from benchmarks.faults.rig import Rig, refusal_to_mount
 from hexapod_comp.ros.status import LogSpace
 
 LIMITS = Limits(np.tile([0.33, 0.88], (6, 1)), 2e-3, 2e-3, 0.25)
@@ -221,32 +219,32 @@ def test_recovery_ends_with_the_last_command_that_was_not_answered(last_bad, rec
 def carried(rule, messages: int = 100) -> list[tuple[float, int]]:
     """Return what a wire delivers, and when, of messages sent every 10 ms."""
     out: list[tuple[float, int]] = []
-    wire = Wire(lambda message, now: out.append((now, message.number)))
-    wire.rule = rule
+    link = wire.Wire(lambda message, now: out.append((now, message.number)))
+    link.rule = rule
     for tick in range(messages * 10 + 1000):
         now = tick * 1e-3
         if tick % 10 == 0 and tick < messages * 10:
-            wire.put(SimpleNamespace(number=tick // 10), now)
-        wire.release(now)
+            link.put(SimpleNamespace(number=tick // 10), now)
+        link.release(now)
     return out
 
 
 def test_wires_do_what_their_rules_say():
     rng = np.random.default_rng(0)
-    numbers = [number for _, number in carried(Duplicate(rng, 1.0))]
+    numbers = [number for _, number in carried(wire.duplicate(rng, 1.0))]
     assert numbers == sorted([*range(100)] * 2)
-    assert [number for _, number in carried(Drop(rng, 1.0))] == []
-    assert 50 < len(carried(Drop(rng, 0.3))) < 90
-    delayed = carried(Delay(rng, 0.25, False))
+    assert [number for _, number in carried(wire.drop(rng, 1.0))] == []
+    assert 50 < len(carried(wire.drop(rng, 0.3))) < 90
+    delayed = carried(wire.delay(0.25))
     assert [number for _, number in delayed] == [*range(100)]
     assert all(now - number * 0.01 == pytest.approx(0.25, abs=2e-3) for now, number in delayed)
-    overtaken = [number for _, number in carried(Reorder(rng, 0.2))]
+    overtaken = [number for _, number in carried(wire.reorder(rng, 0.2))]
     assert sorted(overtaken) == [*range(100)] != overtaken
 
     def spoil(message):
         message.number = -1
 
-    spoilt = [number for _, number in carried(Corrupt(rng, 0.2, spoil))]
+    spoilt = [number for _, number in carried(wire.corrupt(rng, 0.2, spoil))]
     assert len(spoilt) == 100
     assert 5 < spoilt.count(-1) < 40
 

@@ -1,6 +1,6 @@
 """The core under the compilers that are here: no warnings, no complaint of a sanitizer, the same bits.
 
-``benchmarks.same_bits`` does it for more compilers, instruction sets and processors.
+``benchmarks.c_core`` does it for more compilers, instruction sets and processors.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from helpers import long_test
 
-from benchmarks.same_bits import SANITIZED, STRICT, Build, builds, missing, printed
+from benchmarks.c_core import SANITIZED, STRICT, Build, builds, missing, printed
 from hexapod_comp import core
 from hexapod_comp.core.build import FLAGS, sources_hash
 from hexapod_comp.export.c_code import write_c
