@@ -459,7 +459,7 @@ def answers(
     module: Genhexkins, structure: Structure, lengths: np.ndarray, positions: np.ndarray, rotations: np.ndarray
 ) -> tuple[Answers, Answers]:
     """Solve from one guess each, with our kernel and with genhexkins."""
-    count, places, turns = len(lengths), positions.copy(), np.ascontiguousarray(rotations)
+    count, places, turns = len(lengths), positions.copy(), rotations.copy()  # ours writes its answer there
     outcomes, iterations, conditions = np.empty(count, np.intc), np.empty(count, np.intc), np.empty(count)
     limits = structure.characteristic_length, structure.home_sign, structure.max_condition
     codes, poses = module.solved(lengths, emc_poses(positions, rotations))
