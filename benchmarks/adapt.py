@@ -38,7 +38,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from benchmarks import fusion
-from benchmarks.warm_up import zoo
+from benchmarks.drawn import machines as zoo
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.compensation.checks import check
 from hexapod_comp.loop.story import demo_place

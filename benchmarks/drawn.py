@@ -1,4 +1,4 @@
-"""What the benchmarks share that judge many drawn machines: options, one process a core, results case by case."""
+"""What the benchmarks share that judge many drawn machines: the zoo, options, one process a core, results by case."""
 
 from __future__ import annotations
 
@@ -8,14 +8,28 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TypeVar
 
 from tqdm import tqdm
 
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+
 from . import table
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
+from foreign_machines import Machine, machines
 
 Case = TypeVar("Case")
 Result = TypeVar("Result")
+
+
+def of_zoo(name: str) -> tuple[HexapodGeometry, Machine]:
+    """Return a machine of test/foreign_machines.py, its geometry read from a file as users have it."""
+    machine = machines()[name]
+    with TemporaryDirectory() as folder:
+        return load_geometry(machine.write(Path(folder) / "geometry.yaml")), machine
 
 
 def options(doc: str | None, machines: int, first: int = 1, of: str = "case") -> argparse.ArgumentParser:

@@ -1,6 +1,6 @@
 """A machine warms by 5 K while an instrument on it measures the tool: what fusion leaves of the drift.
 
-The machine is calibrated and cold; struts, base and platform warm as in :mod:`benchmarks.warm_up`, by 5, 3.3 and 4.2 K.
+The machine is calibrated and cold; struts, base and platform warm as in :mod:`benchmarks.thermal`, by 5, 3.3 and 4.2 K.
 Nobody tells temperatures. Every 10 s the tool is sent to another pose of the box, turned by up to 2 degrees, and
 measured there five times with 2 µm and 10 µrad; 1 % of the readings are wild by 0.05 to 5 mm. Judged is each arrival:
 how far the tool is from where it was sent, by the hidden machine, before it was measured there.
@@ -13,22 +13,18 @@ from __future__ import annotations
 
 import argparse
 import sys
-import tempfile
 import time
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.calibration import CONFIG, LARGE
-from benchmarks.drawn import Table, verdict
-from benchmarks.warm_up import RISE, SPREAD, STEEL, TAU, zoo
+from benchmarks.calibration import LARGE
+from benchmarks.drawn import Table, of_zoo, verdict
+from benchmarks.thermal import RISE, TAU, of_steel
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.compensation.fusion import Fusion, FusionRules, PoseReading
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.temperatures import PARTS
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import draw_model
@@ -45,24 +41,13 @@ LEFT = 0.25  # the bar
 
 def geometry_of(name: str) -> HexapodGeometry:
     """Return a machine's geometry."""
-    if name == "example_6_6":
-        return load_geometry(CONFIG / "example_6_6.yaml")
-    with tempfile.TemporaryDirectory() as folder:
-        return load_geometry(zoo()[name].write(Path(folder) / "geometry.yaml"))
-
-
-def truth_of(geometry: HexapodGeometry, seed: int) -> MachineModel:
-    """Return a machine with hidden errors that grows like steel."""
-    rng, model = np.random.default_rng([seed, 16]), draw_model(geometry, LARGE, seed)
-    struts, base, platform = STEEL + SPREAD * rng.standard_normal(3)
-    grown = replace(model.struts, expansion=struts + 0.2 * SPREAD * rng.standard_normal(6))
-    return replace(model, struts=grown, base_expansion=float(base), platform_expansion=float(platform))
+    return load_geometry(name) if name == "example_6_6" else of_zoo(name)[0]
 
 
 def warmed(geometry: HexapodGeometry, seed: int) -> tuple[np.ndarray, np.ndarray, int, int, int]:
     """Return squared errors at each arrival, m², without and with fusion; wild readings, those that counted, and true
     ones that were rejected."""
-    rng, model = np.random.default_rng([seed, 31]), truth_of(geometry, seed)
+    rng, model = np.random.default_rng([seed, 31]), of_steel(draw_model(geometry, LARGE, seed), seed)
     hidden, blind, fused = (Compensator(geometry, model, 1.0) for _ in range(3))
     fusion = Fusion(fused, FusionRules(position_deviation=NOISE, rotation_deviation=TURN_NOISE))
     course = WarmUp(np.append(WARMING, 0.0), np.append(TAU, 1.0)).apart(0.1, seed).course(LASTS)
@@ -71,7 +56,9 @@ def warmed(geometry: HexapodGeometry, seed: int) -> tuple[np.ndarray, np.ndarray
     for second in range(EVERY, LASTS, EVERY):
         for part, value in zip(PARTS, course[second], strict=False):
             hidden.set_temperature(part, float(value))
-        platform = _place(geometry, rng)
+        turn = Rotation.from_rotvec(TURNS * rng.uniform(-1.0, 1.0, 3) / np.sqrt(3.0)).as_matrix()
+        place = geometry.home.position + REACH * rng.uniform(-1.0, 1.0, 3)
+        platform = Pose(place, geometry.home.rotation @ turn)
         wanted = platform @ geometry.tool
         for kept, compensator in zip(left, (blind, fused), strict=True):
             compensator.reset()
@@ -89,11 +76,6 @@ def warmed(geometry: HexapodGeometry, seed: int) -> tuple[np.ndarray, np.ndarray
                 counts += _measure(fusion, tool, commands, second + 2.0 * n, rng)
             fusion.feed(compensate=True)
     return np.array(left[0]), np.array(left[1]), *counts.tolist()
-
-
-def _place(geometry: HexapodGeometry, rng: np.random.Generator) -> Pose:
-    turn = Rotation.from_rotvec(TURNS * rng.uniform(-1.0, 1.0, 3) / np.sqrt(3.0)).as_matrix()
-    return Pose(geometry.home.position + REACH * rng.uniform(-1.0, 1.0, 3), geometry.home.rotation @ turn)
 
 
 def _measure(fusion: Fusion, tool: Pose, struts: np.ndarray, at: float, rng: np.random.Generator) -> tuple[int, ...]:
@@ -126,7 +108,7 @@ def show(found: Table, name: str, machines: int) -> None:
 def cost() -> tuple[float, float]:
     """Return how long a pose estimate takes, s of processor time, without and with the weighing of fusion."""
     geometry = geometry_of("paper")
-    compensator = Compensator(geometry, truth_of(geometry, 1))
+    compensator = Compensator(geometry, of_steel(draw_model(geometry, LARGE, 1), 1))
     fusion, times = Fusion(compensator, FusionRules()), []
     fusion.filter.state = np.full(12, 1e-6)
     struts = tuple(compensator.correct(geometry.tool_pose(geometry.home)).command.tolist())
