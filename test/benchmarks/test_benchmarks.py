@@ -14,8 +14,8 @@ from helpers import long_test
 
 from benchmarks import jugglebot, kinematics, network, rubin
 from benchmarks.genhexkins import Genhexkins, NotHere, emc_poses, si_poses
-from benchmarks.network import refusal, without_udp_checksum
 from benchmarks.kinematics import make_poses
+from benchmarks.network import refusal, without_udp_checksum
 from benchmarks.soak import BINS, Soak, soak
 
 
