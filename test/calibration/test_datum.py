@@ -13,9 +13,9 @@ from pathlib import Path
 import calibration_helpers as small
 import numpy as np
 import pytest
-from foreign_machines import Errors, commands, machines, rotation
+from foreign_machines import Errors, commands, machine_names, machines, rotation
 
-from hexapod_comp.calibration.datum import HeldDatum, unseen_part
+from hexapod_comp.calibration.datum import unseen_part
 from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
@@ -33,27 +33,21 @@ from hexapod_comp.virtual.instruments import measure
 STILL = 1e-9  # m and rad: the bar; a model file keeps a hundredth of a nanometre
 
 
-@pytest.fixture(scope="module", params=["framed", "hanging", "inches", "mirror", "left-hand"])
-def foreign(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory):
-    """A machine, its errors, and a fit of laser lines on it."""
-    folder, machine = tmp_path_factory.mktemp("datum"), machines()[request.param]
-    geometry = load_geometry(machine.write(folder / "machine.yaml"))
+@pytest.mark.parametrize("name", machine_names())
+def test_switching_compensation_on_does_not_move_the_tool_at_home(name: str, tmp_path: Path) -> None:
+    """After a fit of laser lines; by the tests' own kinematics the model wants the nominal lengths there."""
+    machine = machines()[name]
+    geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
     truth = Errors.drawn(machine, 5)
-    real = RealMachine(geometry, load_model(truth.write(folder / "truth.yaml", machine), geometry))
+    real = RealMachine(geometry, load_model(truth.write(tmp_path / "truth.yaml", machine), geometry))
     side = float(np.ptp(machine.box, axis=0).min())
     campaign = Campaign(machine.box, side, side / 3.0, "5-D", 4)
     fit = fit_model(measure(template(campaign, geometry), campaign, real, 1), FitSettings(blocks=("pitch",)))
-    save_model(fit.model, folder / "model.yaml")
-    return machine, truth, fit, Errors.read(folder / "model.yaml")
-
-
-def test_switching_compensation_on_does_not_move_the_tool_at_home(foreign) -> None:
-    """By the tests' own kinematics the model wants the nominal lengths there."""
-    machine, _, fit, believed = foreign
+    save_model(fit.model, tmp_path / "model.yaml")
+    believed = Errors.read(tmp_path / "model.yaml")
     home = np.array([machine.home]), np.eye(3)[None]
     told, nominal = commands(machine, believed, *home), machine.lengths(*home)
     np.testing.assert_allclose(told, nominal, rtol=0.0, atol=STILL / 10.0)
-    geometry = fit.measurements.geometry
     by_the_model, _, _ = RealMachine(geometry, fit.model).commands_for(geometry.home)
     np.testing.assert_allclose(by_the_model, nominal[0], rtol=0.0, atol=STILL / 10.0)
     assert fit.model.origin.datum == Datum(machine.home, (0.0, 0.0, 0.0), 6)
@@ -88,15 +82,6 @@ def test_a_tracker_is_believed_and_one_pose_of_it_shows_no_more_than_its_place()
         shift, turn = taken[:3], taken[3:]
         arm = far.position - small.paper().home.position
         np.testing.assert_allclose(shift + np.cross(turn, arm), 0.0, atol=1e-10)
-
-
-def test_a_fit_with_poses_of_a_tracker_in_a_known_frame_is_not_touched() -> None:
-    truth = small.virtual_machine(4)
-    known = replace(small.FEW, tracker_frame="known")
-    fit = fit_model(small.measured(truth, small.campaign(poses=6), 4), known)
-    assert fit.held.held == 0
-    np.testing.assert_array_equal(fit.model.base_deviation, fit.space.model(fit.solution.x.round(11)).base_deviation)
-    assert "the readings saw it" in str(fit.model.origin.datum)
 
 
 def test_another_datum_can_be_given_and_one_out_of_reach_is_refused(unsuspected: None) -> None:
@@ -146,17 +131,7 @@ def test_the_model_file_keeps_it_and_older_ones_have_none() -> None:
     np.testing.assert_array_equal(again.base_axes_turn, model.base_axes_turn)
     older = model_text(replace(model, origin=replace(origin, datum=None)))
     assert parse_model(older, "paper").origin.datum is None
-    for wrong in ("held: 7", "held: 1.5", "held: yes"):
-        with pytest.raises(InputFileError, match=r"datum\.held"):
-            parse_model(text.replace("held: 3", wrong), "paper")
-    with pytest.raises(InputFileError, match="position"):
-        parse_model(text.replace("position_mm: [10.0, 0.0, 450.0]", "position_mm: [10.0, .nan, 450.0]"), "paper")
+    with pytest.raises(InputFileError, match=r"datum\.held"):
+        parse_model(text.replace("held: 3", "held: 7"), "paper")
     with pytest.raises(ModelError, match="base_axes_turn"):
         MachineModel("paper", base_axes_turn=np.full(3, np.nan))
-
-
-def test_holding_moves_the_machine_as_a_rigid_body() -> None:
-    """A turn of 1 mrad about z at the datum moves a point 0.1 m along x by 0.1 mm along y."""
-    held = HeldDatum(Pose.identity(), np.eye(6), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1e-3]))
-    moved = held.moved(np.array([[0.1, 0.0, 0.0]]), np.eye(3))
-    np.testing.assert_allclose(moved[0], [0.0, 1e-4, 0.0, 0.0, 0.0, 1e-3], atol=1e-18)

@@ -1,4 +1,6 @@
-"""What a fit tells of heat, on machines whose expansions and time constants are known."""
+"""What fits tell of heat and humidity, on machines whose growth is known, and the courses behind what sensors read."""
+
+from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
@@ -6,11 +8,12 @@ from functools import cache
 import calibration_helpers as small
 import numpy as np
 import pytest
+from foreign_machines import machines
 
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings
-from hexapod_comp.calibration.thermal import warming_json, warming_text
-from hexapod_comp.errors import ModelError
+from hexapod_comp.calibration.thermal import warming_json, warming_text, with_courses
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.temperatures import LateGrowth
@@ -18,10 +21,76 @@ from hexapod_comp.measurements.campaign import Campaign, CampaignRun, template
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
 from hexapod_comp.virtual.instruments import measure
 
-pytestmark = pytest.mark.usefixtures("unsuspected")
+NOISE = 0.0065  # What the compensator's filter of 30 s leaves of 0.05 K, K
+PLAN = template(small.campaign("1-D"), small.paper())
+COUNT = len(PLAN.stations)
+# Fifty stations every ten minutes, one in four seconds
+BURSTS = 600.0 * (np.arange(COUNT) // 50) + 4.0 * (np.arange(COUNT) % 50)
 
+
+def warmed(times: np.ndarray, wait: float = 0.0) -> np.ndarray:
+    """Return a temperature that goes up by 3 K, °C."""
+    return 20.0 - 3.0 * np.expm1(-np.maximum(times - wait, 0.0) / 1500.0)
+
+
+def read(times: np.ndarray, temperatures: np.ndarray) -> MeasurementSet:
+    """Return a plan whose stations have these times, s, and all parts' temperatures (COUNT, 8), °C."""
+    return replace(PLAN, stations=replace(PLAN.stations, times=times, temperatures=temperatures))
+
+
+def noise() -> np.ndarray:
+    """Return what sensors of which the filter has made 30 s alike read beside, (COUNT, 8), K."""
+    white = np.random.default_rng(7).standard_normal((COUNT + 30, 8))
+    alike = np.array([white[n : n + 8].mean(axis=0) for n in range(COUNT)])
+    return NOISE * alike / alike.std(axis=0)
+
+
+def test_what_sensors_add_within_a_burst_is_taken_off() -> None:
+    """Of fifty readings of which eight are alike, six are independent; a level and a slope are two of them. What is
+    left changes from reading to reading by no more than a slope that is known from half of the noise over a minute."""
+    true = np.tile(warmed(BURSTS)[:, None], 8)
+    course = with_courses(read(BURSTS, true + noise())).stations.temperatures
+    assert ((course - true).std(axis=0) < NOISE * np.sqrt(2.0 / 6.0) * 1.3).all()
+    jitter = np.diff(course, axis=0)[np.diff(BURSTS) < 5.0] - np.diff(true, axis=0)[np.diff(BURSTS) < 5.0]
+    assert np.abs(jitter).max() < 4.0 * 0.5 * NOISE / 60.0 * 4.0
+
+
+@pytest.mark.parametrize(("step", "every", "share"), [(0.1, 200.0, 0.4), (0.5, 600.0, 0.8)])
+def test_what_is_rounded_is_no_staircase(step: float, every: float, share: float) -> None:
+    """Without pauses, and in bursts. As read, a temperature stays still and then jumps by a step, within a burst too;
+    a course takes most of that off, and less where two thirds of it are pauses, in which it may do anything."""
+    times = every * (np.arange(COUNT) // 50) + 4.0 * (np.arange(COUNT) % 50)
+    true = warmed(times)[:, None] + 0.01 * np.arange(8)
+    rounded = np.round(true / step) * step
+    course = with_courses(read(times, rounded)).stations.temperatures
+    whole = [np.sqrt(((values - true) ** 2).mean()) for values in (rounded, course)]
+    assert whole[1] < share * whole[0]
+
+
+def test_without_times_each_run_has_a_course() -> None:
+    """A step from run to run, as of one temperature written beside each, is no slope within them."""
+    run = np.zeros(COUNT, dtype=int)
+    run[PLAN.station] = PLAN.run
+    steps = np.tile(20.0 + 0.5 * (run[:, None] % 3), 8)
+    unknown = np.full(COUNT, np.nan)
+    np.testing.assert_allclose(with_courses(read(unknown, steps)).stations.temperatures, steps, atol=1e-9)
+
+
+pytestmark = pytest.mark.usefixtures("unsuspected")
 TAU = 1500.0
 SETTINGS = FitSettings(blocks=("expansion", "late"))
+
+
+def rounds(box: np.ndarray, count: int) -> Campaign:
+    """Return x, y and z lines of five points through a box's middle, read again in each round."""
+    runs = []
+    for number in range(count):
+        for axis in range(3):
+            positions = np.tile(box.mean(axis=0), (5, 1))
+            positions[:, axis] = np.linspace(*box[:, axis], 5)
+            runs.append(CampaignRun(f"{axis} {number}", "5-D", positions, np.tile(np.eye(3), (5, 1, 1))))
+    side = float(np.ptp(box, axis=0).min())
+    return Campaign(box, side, side, None, 0, runs=tuple(runs), noise=(2e-7,) * len(KINDS))
 
 
 def truth(thermometer: str = "base") -> RealMachine:
@@ -36,14 +105,8 @@ def truth(thermometer: str = "base") -> RealMachine:
 
 @cache
 def measured(rise: float = 3.0, timed: bool = True, parts: tuple[int, ...] = (6,)) -> MeasurementSet:
-    """Return x, y and z lines read in eight rounds, a quarter of an hour apart, while thermometers rise."""
-    runs = []
-    for number in range(8):
-        for axis in range(3):
-            positions = np.tile(small.BOX.mean(axis=0), (5, 1))
-            positions[:, axis] = np.linspace(*small.BOX[:, axis], 5)
-            runs.append(CampaignRun(f"{axis} {number}", "5-D", positions, np.tile(np.eye(3), (5, 1, 1))))
-    plan = Campaign(small.BOX, 0.2, 0.05, None, 0, runs=tuple(runs), noise=(2e-7,) * len(KINDS))
+    """Return lines read in eight rounds, a quarter of an hour apart, while thermometers rise."""
+    plan = rounds(small.BOX, 8)
     planned = template(plan, small.paper())
     times = 30.0 * np.arange(len(planned.stations))
     temperatures = np.full((len(times), 8), 20.0)
@@ -70,6 +133,11 @@ def test_expansions_and_time_constant_come_back():
     assert warming.parts[0].expansion == pytest.approx(15e-6, abs=1e-6)
     (constant,), (deviation,) = warming.time_constants.values, warming.time_constants.deviations
     assert abs(np.log(constant / TAU)) < 3.0 * deviation < 0.6
+    model, text = fit().model.late_growth, warming_text(warming)
+    assert (model.thermometer, model.time_constants) == ("base", (constant,))
+    assert "base stands for all parts" in text
+    assert "struts: 1" in text
+    assert warming_json(warming)["time_constants_s"] == (constant,)
 
 
 def test_the_noise_of_sensors_is_not_taken_for_growth():
@@ -116,21 +184,6 @@ def test_expansions_are_known_no_better_than_the_time_constant():
         assert part.deviation == pytest.approx(np.hypot(alone, moved), rel=0.1), part
 
 
-def test_the_model_follows_the_one_thermometer():
-    model = fit().model.late_growth
-    assert (model.thermometer, model.time_constants) == ("base", fit().warming.time_constants.values)
-
-
-def test_the_report_says_what_came_out_and_which_thermometers_were_read():
-    text = warming_text(fit().warming)
-    assert "base 2." in text.splitlines()[0]
-    assert "base stands for all parts" in text
-    assert "struts: 1" in text
-    assert "(stated 0)" in text
-    assert "with 95 %" in text
-    assert warming_json(fit().warming)["time_constants_s"] == fit().warming.time_constants.values
-
-
 def test_without_a_warm_up_nothing_is_invented():
     """0.3 K are below what a sensor's drift may be: stated expansions stay, and the report says so."""
     cold = fit_model(measured(rise=0.35), replace(SETTINGS, strut_expansion=12e-6))
@@ -148,9 +201,39 @@ def test_a_part_that_stayed_cold_keeps_what_was_stated():
     assert warming_text(struts.warming).count("these readings do not determine it") == 2
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"time_constants": (5.0,)}, {"time_constants": (90.0, 30.0)}, {"thermometer": "spindle"}]
-)
-def test_settings_in_doubt_are_refused(wrong: dict):
-    with pytest.raises(ModelError, match="thermal"):
-        FitSettings(**wrong)
+MOISTURE = 3e-4  # 3 ppm per %, m/m
+DAMP = FitSettings(blocks=("moisture",), strut_moisture=1e-4)
+
+
+@pytest.fixture(scope="module")
+def geometry(tmp_path_factory: pytest.TempPathFactory) -> HexapodGeometry:
+    return load_geometry(machines()["framed"].write(tmp_path_factory.mktemp("machine") / "framed.yaml"))
+
+
+def damp(geometry: HexapodGeometry) -> MeasurementSet:
+    """Return lines of a 6-6 machine with turned frames, read in four rounds, while the air goes from 40 % to 65 %."""
+    plan = rounds(machines()["framed"].box, 4)
+    planned = template(plan, geometry)
+    humidity = 0.4 + 0.25 * np.linspace(0.0, 1.0, len(planned.stations))
+    planned = replace(planned, stations=replace(planned.stations, humidity=humidity.round(6)))
+    model = MachineModel(geometry.name, struts=StrutErrors(moisture=np.full(6, MOISTURE)))
+    return measure(planned, plan, RealMachine(geometry, model), seed=5)
+
+
+def test_what_humidity_does_to_struts_comes_back(geometry: HexapodGeometry) -> None:
+    fitted = fit_model(damp(geometry), DAMP)
+    swelling = fitted.warming.swelling
+    assert swelling is not None
+    assert swelling.change == pytest.approx(0.25)
+    assert abs(swelling.moisture - MOISTURE) < 3.0 * swelling.deviation < 0.3 * MOISTURE
+    assert swelling.determined > 0.9
+    np.testing.assert_allclose(fitted.model.struts.moisture, swelling.moisture, atol=1e-11)  # files have 11 digits
+
+
+def test_missing_humidity_is_said_and_counts_as_50_percent(geometry: HexapodGeometry) -> None:
+    dry = damp(geometry)
+    dry = replace(dry, stations=replace(dry.stations, humidity=np.full(len(dry.stations), np.nan)))
+    unknown = fit_model(dry, DAMP)
+    assert any("not every reading has its humidity" in note for note in unknown.notes)
+    assert unknown.warming.swelling is not None
+    assert unknown.warming.swelling.change == 0.0
