@@ -72,8 +72,13 @@ def cells(text: str) -> list[list[str]]:
 
 @pytest.mark.usefixtures("unpictured")
 def test_it_promises_what_the_report_promises(fit: ModelFit, filed: Filed) -> None:
-    """Before, after and interval are the fit's; U is twice the interval's upper end."""
-    rows = {row[0]: row[1:] for row in cells(certificate_text(fit, filed))}
+    """Before, after and interval are the fit's; U is twice the interval's upper end; hashes are the files'."""
+    table = cells(
+        certificate_text(replace(fit, measurements=replace(fit.measurements, files=(("laser.csv", "ab" * 32),))), filed)
+    )
+    assert ["model", "model.yaml", hashlib.sha256(b"the model").hexdigest()] in table
+    assert ["readings", "laser.csv", "ab" * 32] in table
+    rows = {row[0]: row[1:] for row in table}
     assert fit.level is not None
     before, after, between, expanded, unit = rows["level tool: displacement"]
     low, high = (float(end) for end in between.split(" … "))
@@ -84,31 +89,8 @@ def test_it_promises_what_the_report_promises(fit: ModelFit, filed: Filed) -> No
     assert unit == "µm"
     rotation = rows["level tool: rotation"]
     assert rotation[2:] == ["roll is not shown", "", "µrad"], "a linear laser alone promises nothing of it"
-    known = replace(level, rotation_low=1e-6, rotation_high=3e-6)
-    rows = cells(certificate_text(replace(fit, verdict=replace(fit.verdict, level=known)), filed))
-    assert [row[3:] for row in rows if row[0] == "level tool: rotation"] == [["1.00 … 3.00", "6.0", "µrad"]]
-    assert "Do not trust this model with a tilted tool" in certificate_text(fit, filed), "as the report says it"
-
-
-@pytest.mark.usefixtures("unpictured")
-def test_hashes_are_those_of_the_files(fit: ModelFit, filed: Filed) -> None:
-    readings = replace(fit.measurements, files=(("laser.csv", "ab" * 32),))
-    rows = cells(certificate_text(replace(fit, measurements=readings), filed))
-    assert ["model", "model.yaml", hashlib.sha256(b"the model").hexdigest()] in rows
-    assert ["readings", "laser.csv", "ab" * 32] in rows
-    filed.files[0].unlink()
-    with pytest.raises(InputFileError, match=r"model\.yaml: cannot be read"):
-        certificate_text(fit, filed)
-
-
-@pytest.mark.usefixtures("unpictured")
-def test_what_is_wrong_stands_first(fit: ModelFit, filed: Filed) -> None:
-    """With what the report opens, word by word."""
-    text = certificate_text(fit, replace(filed, report=f"IN DOUBT: off by <10 times\n  and more\n\n{filed.report}"))
-    body = text[text.index("<h1>") :]
-    said = r"<h1>[^<]*</h1><p class=warning><b>Warning\.</b> IN DOUBT: off by &lt;10 times\n  and more</p>"
-    assert re.match(said, body)
-    assert "class=warning" not in certificate_text(fit, filed)
+    doubtful = certificate_text(fit, replace(filed, report=f"IN DOUBT: off by <10 times\n\n{filed.report}"))
+    assert "</h1><p class=warning><b>Warning.</b> IN DOUBT: off by &lt;10 times</p>" in doubtful
 
 
 def test_strangers_names_are_text(fit: ModelFit, filed: Filed) -> None:
@@ -150,9 +132,7 @@ DETAILS = "format: hexapod_comp/certificate\nversion: 1\n"
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("version: 1\n", "format: is missing"),
         (DETAILS + "number: 14\n", r"number: must be text \(found 14\)"),
-        (DETAILS + "instruments: laser\n", "instruments: must be a list of texts"),
         (DETAILS + "remarks: [1]\n", "remarks: must be a list of texts"),
         (DETAILS + "custmer: x\n", "custmer"),
     ],
@@ -172,17 +152,3 @@ def test_the_maps_promise_no_more_than_the_report(fit: ModelFit) -> None:
     after = [axes.collections[0].get_array() for axes in figure.axes if axes.get_title().startswith("after")]
     assert len(after) == 3
     assert np.sqrt(np.mean(np.square(after))) == pytest.approx(5.0, rel=1e-6)
-
-
-@pytest.mark.usefixtures("unpictured")
-def test_temperatures_and_expansions_of_each_part(fit: ModelFit, filed: Filed) -> None:
-    """What the stations felt, at its ends, and what the model does with it."""
-    m = fit.measurements
-    warm = m.stations.temperatures.copy()
-    warm[0, 6], warm[1, 6] = 18.5, 23.25
-    stations = replace(m.stations, temperatures=warm)
-    model = replace(fit.model, base_expansion=11.5e-6)
-    warmed = replace(fit, model=model, measurements=replace(m, stations=stations))
-    rows = {row[0]: row[1:] for row in cells(certificate_text(warmed, filed))}
-    assert rows["base"] == ["18.50", "23.25", "11.50"]
-    assert rows["strut_1"] == ["20 or not recorded", "20 or not recorded", "0.00"]

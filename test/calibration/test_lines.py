@@ -8,7 +8,7 @@ from foreign_machines import machines
 from scipy.stats import linregress
 
 from hexapod_comp.calibration.evaluation import PaperMetric, paper_metric
-from hexapod_comp.calibration.lines import LinesFit, _kind, fit_lines
+from hexapod_comp.calibration.lines import LinesFit, fit_lines
 from hexapod_comp.calibration.pictures import fitted_lines_figure, strut_error_figure, strut_length_errors
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.formats.paths import config_file
@@ -18,8 +18,7 @@ from hexapod_comp.machine.kinematics import Structure, jacobian
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.region import Region
 from hexapod_comp.measurements.campaign import Campaign, template
-from hexapod_comp.measurements.readings import BACKWARD, CHANNELS, FORWARD, MeasurementSet, Reading
-from hexapod_comp.measurements.runs import assemble
+from hexapod_comp.measurements.readings import FORWARD, MeasurementSet
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
 from hexapod_comp.virtual.instruments import compensated, measure
@@ -174,20 +173,6 @@ def test_cycles_are_averaged_and_their_spread_is_told(geometry, linear_truth):
     assert [line.repeat_std for line in fit.lines] == pytest.approx([0.7e-6 * np.sqrt(2.0)] * len(fit.lines), rel=1e-4)
 
 
-def test_lines_that_share_a_polynomial_are_no_repeats_of_each_other(geometry, five, real, real_fit):
-    """Parallel lines of a machine that twists differ by 10 µrad; each was read twice, with the campaign's noise.
-
-    Truth: the noise that was drawn, known to 1/√(2n) of some hundred repeats of a kind. Read once, nothing is a repeat.
-    """
-    for kind, noise in (("straightness", LASER.noise[1]), ("rotation", LASER.noise[2])):
-        shared = [line for line in real_fit.lines if len(line.nodes) > 1 and _kind(line) == kind]
-        assert shared
-        assert np.sqrt(np.mean([line.repeat_std**2 for line in shared])) == pytest.approx(noise, rel=0.15)
-    assert real_fit.misfit == ""
-    once = fit_lines(measure(five, replace(QUIET, instrument="5-D"), real, 0))
-    assert all(np.isnan(line.repeat_std) for line in once.lines)
-
-
 def test_zeros_and_beam_slopes_change_nothing(five, real):
     """Invariance: other zeros of every run and channel, other slopes of every straightness beam."""
     campaign = replace(QUIET, instrument="5-D")
@@ -228,40 +213,6 @@ def test_families_do_not_count_twice(geometry, five):
         assert np.abs(rest).max() < 1e-10
 
 
-def split(measured: MeasurementSet, geometry: HexapodGeometry) -> MeasurementSet:
-    """Return the readings of which each run is cut in two that overlap, with zeros and slopes of their own."""
-    rng = np.random.default_rng(8)
-    readings = []
-    along, points = measured.along(), measured.points()[measured.station]
-    lengths = {r: along[measured.run == r].max() for r in np.unique(measured.run)}
-    for half, (low, high) in enumerate(((-0.1, 0.6), (0.4, 1.1))):
-        zero, slope = rng.uniform(-1e-4, 1e-4, (2, len(measured.runs), 16))
-        for n in range(len(measured)):
-            run, channel = measured.run[n], measured.channel[n]
-            share = along[n] / lengths[run]
-            if low <= share <= high:
-                beam = slope[run, channel] * share if channel in (1, 2, 3) else 0.0
-                value = measured.value[n] + zero[run, channel] + beam
-                name = f"{measured.runs[run].name} part {half}"
-                readings.append(
-                    Reading(name, 1, int(measured.direction[n]), Pose(points[n], np.eye(3)), CHANNELS[channel], value)
-                )
-    return assemble(geometry, readings)
-
-
-def test_runs_along_one_line_are_merged_each_after_its_own_zero(geometry, five):
-    """Polynomial errors on x-lines, read in two overlapping halves with other zeros and slopes: the same model as in
-    one piece, 1e-11 m being the rounding of a regression with readings of 1e-4 m."""
-    rng = np.random.default_rng(1)
-    family = random_family(rng, 0, list(range(6)), 0.0)
-    truth = machine_of(geometry, (family, *(np.zeros((2, 5, n, 6, 0)) for n in (3, 5))))
-    on_x = np.array([run.base_axis == 0 for run in five.runs])[five.run]
-    measured = measure(five, replace(QUIET, instrument="5-D"), truth, 0).select(on_x)
-    whole, halves = (fit_lines(m, 4).model.field.lines[0] for m in (measured, split(measured, geometry)))
-    assert whole[:, :, :, 0] == pytest.approx(family[:, :, :, 0], abs=1e-12)
-    assert halves == pytest.approx(whole, abs=1e-11)
-
-
 def test_one_direction_serves_for_both_with_a_note(quiet, linear_truth):
     forward = quiet.select(quiet.direction == FORWARD)
     fit = fit_lines(forward, 4)
@@ -283,86 +234,6 @@ def test_the_work_frame_may_be_turned_by_right_angles(geometry, linear_truth, qu
         fits.append(fit_lines(measure(template(campaign, machine), campaign, truth, 0), 2).model.field)
     for first, second in zip(fits[0].lines, fits[1].lines, strict=True):
         assert first == pytest.approx(second, abs=1e-11)
-
-
-def test_a_skew_work_frame_is_refused(geometry, linear_truth):
-    """Turned by 30° about z: z-lines stay parallel to an axis, but are read across other axes."""
-    turn = Pose.from_angles([0.0, 0.0, 0.0], np.deg2rad([0.0, 0.0, 30.0]))
-    skew = replace(geometry, work=turn, tool=turn)
-    campaign = replace(QUIET, box=BOX * [0.5, 0.5, 1.0], instrument="5-D")
-    measured = measure(template(campaign, skew), campaign, RealMachine(skew, linear_truth.model), 0)
-    with pytest.raises(CalibrationError, match="turned against those of base"):
-        fit_lines(measured)
-
-
-def runs_named(measured: MeasurementSet, start: str) -> np.ndarray:
-    return np.array([run.name.startswith(start) for run in measured.runs])[measured.run]
-
-
-@pytest.mark.parametrize(
-    ("drop", "message"),
-    [
-        ("x line at y 101.6, z 451.6", r"dx on the x line at y 101.6, z 451.6 mm: is missing; of 15 lines .* 1 were"),
-        ("z line at x 0.0", r"dz on the z line at x 0.0, y -203.2 mm: is missing; of 25 lines .* 5 were"),
-    ],
-)
-def test_a_missing_line_is_named(quiet, drop, message):
-    with pytest.raises(CalibrationError, match=message):
-        fit_lines(quiet.select(~runs_named(quiet, drop)))
-
-
-def test_a_line_that_ends_within_the_grid_is_refused(quiet):
-    short = runs_named(quiet, "x line at y 0.0, z 350.0") & (quiet.points()[quiet.station][:, 0] > 0.19)
-    with pytest.raises(CalibrationError, match=r"x line at y 0.0, z 350.0 mm: is read from -203.2 to 177.8 mm"):
-        fit_lines(quiet.select(~short))
-
-
-def test_families_may_be_missing_whole(quiet, linear_truth):
-    """Only x-lines: their family, on a grid that reaches as far as they do."""
-    fit = fit_lines(quiet.select(runs_named(quiet, "x line")), 4)
-    field, true = fit.model.field, linear_truth.model.field
-    assert field.lines[0] == pytest.approx(true.lines[0], abs=1e-12)
-    assert [family.shape[-1] for family in field.lines] == [5, 0, 0]
-    assert field.box == pytest.approx(BOX)
-
-
-def test_too_few_points(geometry):
-    coarse = replace(QUIET, cell=0.1016, step=0.1016)
-    wanted = r"has 5 points in a direction, over 406\.4 mm; 6 are needed: one every 81\.28 mm"
-    with pytest.raises(CalibrationError, match=wanted):
-        fit_lines(template(coarse, geometry))
-
-
-def test_diagonals_are_left_out_with_a_note(geometry, linear_truth, quiet):
-    campaign = replace(QUIET, diagonals=16)
-    fit = fit_lines(measure(template(campaign, geometry), campaign, linear_truth, 0))
-    assert any("16 runs are not parallel" in note and "diagonal 1" in note for note in fit.notes)
-    for found, plain in zip(fit.model.field.lines, fit_lines(quiet).model.field.lines, strict=True):
-        assert found == pytest.approx(plain, abs=1e-15)
-
-
-def test_a_compensated_machine_is_refused(geometry, real, real_fit):
-    """Its readings are what the compensation left: a model of them would undo it."""
-    told = compensated(template(QUIET, geometry), real_fit.model)
-    with pytest.raises(CalibrationError, match="compensated"):
-        fit_lines(measure(told, QUIET, real, 0))
-
-
-def test_lines_at_different_attitudes_are_refused(geometry):
-    level, tilted = Pose(np.zeros(3), np.eye(3)), Pose.from_angles(np.zeros(3), [0.01, 0.0, 0.0])
-    readings = []
-    for y, attitude in ((-0.1, level), (0.1, tilted)):
-        for x in np.linspace(-0.1, 0.1, 9):
-            pose = Pose([x, y, 0.45], attitude.rotation)
-            readings += [Reading(f"y {y}", 1, way, pose, "linear", 0.0) for way in (FORWARD, BACKWARD)]
-    with pytest.raises(CalibrationError, match="at one attitude"):
-        fit_lines(assemble(geometry, readings))
-
-
-@pytest.mark.parametrize("order", [0, "best", 2.5])
-def test_orders_that_are_none(quiet, order):
-    with pytest.raises(CalibrationError, match="order: must be adjusted-r2, aicc or a whole number"):
-        fit_lines(quiet, order)
 
 
 def reduction(found: PaperMetric) -> float:
@@ -415,3 +286,46 @@ def test_pictures(geometry, real_fit):
         strut_error_figure(geometry, {"ideal": MachineModel(geometry.name)})
     with pytest.raises(CalibrationError, match="rx on x lines: was not fitted"):
         fitted_lines_figure(real_fit, 0, 3)
+
+
+def line_of(measured: MeasurementSet, start: str) -> np.ndarray:
+    """Return which readings are of runs whose names begin so."""
+    return np.array([run.name.startswith(start) for run in measured.runs])[measured.run]
+
+
+def with_a_tilted_line(m: MeasurementSet) -> MeasurementSet:
+    """Return readings of which the first run's are taken with a tilted tool."""
+    rotations = m.stations.rotations.copy()
+    rotations[m.station[m.run == 0]] = Pose.from_angles(np.zeros(3), [0.01, 0.0, 0.0]).rotation
+    return replace(m, stations=replace(m.stations, rotations=rotations))
+
+
+def skewed(geometry: HexapodGeometry) -> MeasurementSet:
+    """Return lines of a work frame that is turned by 30° about z: z lines alone stay parallel to an axis."""
+    turn = Pose.from_angles([0.0, 0.0, 0.0], np.deg2rad([0.0, 0.0, 30.0]))
+    campaign = replace(QUIET, box=BOX * [0.5, 0.5, 1.0], instrument="5-D")
+    return template(campaign, replace(geometry, work=turn, tool=turn))
+
+
+REFUSED = {
+    r"dx on the x line at y 101.6, z 451.6 mm: is missing; of 15 lines .* 1 were": lambda m: m.select(
+        ~line_of(m, "x line at y 101.6, z 451.6")
+    ),
+    r"x line at y 0.0, z 350.0 mm: is read from -203.2 to 177.8 mm": lambda m: m.select(
+        ~(line_of(m, "x line at y 0.0, z 350.0") & (m.points()[m.station][:, 0] > 0.19))
+    ),
+    r"has 5 points in a direction, over 406\.4 mm; 6 are needed: one every 81\.28 mm": lambda m: template(
+        replace(QUIET, cell=0.1016, step=0.1016), m.geometry
+    ),
+    "turned against those of base": lambda m: skewed(m.geometry),
+    "at one attitude": with_a_tilted_line,
+    "compensated": lambda m: compensated(m, MachineModel(m.geometry.name, base_deviation=np.full((6, 3), 1e-5))),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_lines_that_make_no_field_are_refused(quiet, what):
+    with pytest.raises(CalibrationError, match=what):
+        fit_lines(REFUSED[what](quiet))
+    with pytest.raises(CalibrationError, match="order: must be adjusted-r2, aicc or a whole number"):
+        fit_lines(quiet, 2.5)
