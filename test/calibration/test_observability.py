@@ -9,20 +9,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import gmean
 
-from hexapod_comp.calibration.design import plan
 from hexapod_comp.calibration.estimator import DesignMatrix, Estimation, LinearProblem, Posterior, solve
 from hexapod_comp.calibration.parameters import TOLERANCES, FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import (
     MACHINE_ERRORS,
     Observability,
-    ToolError,
     box_errors,
     box_stations,
     expected_error,
     observe,
     without_trace,
 )
-from hexapod_comp.calibration.report import tilt_doubt
 from hexapod_comp.calibration.sensitivity import predict
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -69,9 +66,6 @@ def rank(space: ParameterSpace, problem: LinearProblem) -> int:
     return int((singular > 1.0).sum())
 
 
-# ---------------------------------------------------------------- what the issue says
-
-
 def test_level_lines_see_14_of_33_structure_parameters():
     """The issue's count, on the shipped campaign without its diagonals: 33 parameters, 14 of them seen."""
     plan = replace(load_campaign(config_file("campaign_5d.yaml")), diagonals=0)
@@ -86,10 +80,7 @@ def test_level_lines_see_14_of_33_structure_parameters():
     [
         ("5-D", 0, {*SQUARENESS, *TWISTS, *ROLLS}),
         ("5-D", 4, {*ROLLS}),
-        ("5-D", 16, {*ROLLS}),
         ("6-D", 0, {*SQUARENESS, *TWISTS}),
-        ("6-D", 4, set()),
-        ("1-D", 0, {*SQUARENESS, *TWISTS, *ROLLS}),
     ],
 )
 def test_machine_errors_that_leave_no_trace(instrument: str, diagonals: int, unseen: set[str]):
@@ -99,22 +90,13 @@ def test_machine_errors_that_leave_no_trace(instrument: str, diagonals: int, uns
     assert {error.name for error in errors} == unseen
 
 
-def test_errors_are_unseen_however_few_terms_the_field_has():
-    """A field of degree 2 has no term for a twist that involves the short z axis: it is no less unseen."""
-    small_field = replace(FIELD, field_degree=2)
-    errors = without_trace(read("5-D", 0, small_field))
-    assert {error.name for error in errors} == {*SQUARENESS, *TWISTS, *ROLLS}
-    assert {error.reason for error in errors} == {"no reading shows it"}
-
-
-@pytest.mark.parametrize("poses", [54, 216])
-def test_what_is_below_the_noise_was_read(poses: int) -> None:
+def test_what_is_below_the_noise_was_read() -> None:
     """Attitudes at random places, of 1 mrad; a roll of the field's tolerance turns about x by up to that at the faces.
 
     So all of them together change by tolerance/noise · √(Σu²) standard deviations.
     """
-    turns = Rotation.from_rotvec(np.radians(8.0) * np.random.default_rng(4).uniform(-1.0, 1.0, (poses, 3))).as_matrix()
-    places = np.random.default_rng(3).uniform(*small.BOX, (poses, 3))
+    turns = Rotation.from_rotvec(np.radians(8.0) * np.random.default_rng(4).uniform(-1.0, 1.0, (54, 3))).as_matrix()
+    places = np.random.default_rng(3).uniform(*small.BOX, (54, 3))
     readings = small.scattered(small.paper(), [Pose(p, turn) for p, turn in zip(places, turns, strict=True)])
     assert np.degrees(readings.tilt()) == pytest.approx(np.degrees(Rotation.from_matrix(turns).magnitude()).max())
     readings = replace(readings, uncertainty=np.full(len(readings), 1e-3))
@@ -129,27 +111,13 @@ def test_what_is_below_the_noise_was_read(poses: int) -> None:
     assert found["roll of x"].reason.startswith(f"below the noise: it changes all readings together by {wanted:.2g} σ")
 
 
-def test_the_warning_for_tilted_tools_says_what_was_read() -> None:
-    """Level lines against tilted poses that are not enough: neither may say of the other what is true of itself."""
-    stays = ToolError(100e-6, 20e-6, 1e-6, 30e-6, 1e-4, 2e-5, None, None)
-    for poses, said in ((0, "The readings, all level, show 14 of 33"), (2, "taken at tilts of up to 8.0°, show")):
-        plan = template(small.campaign("5-D", 0, poses=poses, tilt=np.radians(8.0)), small.paper())
-        space, problem = problem_of(plan, STRUCTURE)
-        posterior = solve(space, problem, space.start_tolerances(), ONES, 0)
-        seen = observe(space, problem, posterior, np.radians(8.0) if poses else plan.tilt())
-        (text,) = tilt_doubt(stays, seen)
-        assert said in text
-        assert "tilted by 10°, 20 % of the error stays (10 % allowed)" in text
-    assert not list(tilt_doubt(replace(stays, after=9e-6), seen))
-
-
 def readings_of(instrument: str, diagonals: int, model: MachineModel) -> Estimation:
     """Return what lasers without noise read on a machine, against the nominal one."""
     quiet = small.campaign(instrument, diagonals, noise=(0.0,) * len(KINDS), beam_slope=0.0)
     return Estimation(small.measured(RealMachine(small.paper(), model), quiet, 0), linearised("5-D", 0, FIELD)[0])
 
 
-@pytest.mark.parametrize("name", [*SQUARENESS, *TWISTS, *ROLLS])  # a laser sees size; circles do not
+@pytest.mark.parametrize("name", [SQUARENESS[0], TWISTS[1], ROLLS[2]])
 def test_an_unseen_error_really_changes_no_reading(name: str):
     """10 µm or 10 µrad of it are put on a machine: 5-D lines differ by zeros and slopes, diagonals and roll do not.
 
@@ -165,9 +133,6 @@ def test_an_unseen_error_really_changes_no_reading(name: str):
         left, _ = estimation.linearise(np.zeros(space.size), np.ones(len(estimation.measurements)))
         assert (np.abs(left.target).max() > 1.0) == is_seen
         assert is_seen or np.abs(left.target).max() < 1e-3
-
-
-# ---------------------------------------------------------------- definitions
 
 
 def by_hand(singular: np.ndarray) -> tuple[ParameterSpace, LinearProblem, Posterior]:
@@ -198,17 +163,8 @@ def test_indices_are_the_published_ones():
     wanted = {"O1": gmean(kept) / 10.0, "O2": 2.0 / 400.0, "O3": 2.0, "O4": 4.0 / 400.0}
     assert seen.indices == pytest.approx(wanted, rel=1e-6)
     assert [strength for strength, _ in seen.weak] == pytest.approx(kept[kept < 5.0][::-1][:5], rel=1e-6)
-
-
-def test_blocks_say_how_much_of_them_is_data():
-    """With singular values s, data give s²/(1 + s²) of each direction; the rest is the prior's."""
-    singular = np.geomspace(400.0, 1e-3, 33)
-    block = observe(*by_hand(singular)).blocks[0]
-    assert block.determined == pytest.approx((singular**2 / (1.0 + singular**2)).sum(), rel=1e-9)
-    assert (block.parameters, block.unit) == (33, "m")
-
-
-# ---------------------------------------------------------------- the tool error to expect
+    # Data give s²/(1 + s²) of each direction; the rest is the prior's
+    assert seen.blocks[0].determined == pytest.approx((singular**2 / (1.0 + singular**2)).sum(), rel=1e-9)
 
 
 def test_expected_error_of_one_known_parameter():
@@ -239,35 +195,3 @@ def test_expected_error_of_one_known_parameter():
 def cross(v: np.ndarray) -> np.ndarray:
     """Return the matrix of v × ."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-
-
-def test_level_campaigns_are_not_trusted_with_a_tilted_tool():
-    """What 5-D lines of a level tool leave open shows as soon as it tilts by 10°."""
-    space, problem = linearised("5-D", 4, STRUCTURE)
-    answer = solve(space, problem, space.start_tolerances(), ONES, 0)
-    boxes = (box_errors(space, np.zeros(space.size), tilt) for tilt in (0.0, np.radians(10.0)))
-    level, tilted = (expected_error(errors, answer.covariance) for errors in boxes)
-    assert tilted.after > 10.0 * level.after
-
-
-def test_a_plan_counts_the_machine_s_repeatability():
-    """Each stop is 5 µm off along each axis, √3 times that in space; what the parameters leave is small beside it."""
-    loose = small.campaign(repeatability=5e-6)
-    expected = plan(template(loose, small.paper()), loose, small.FEW).level
-    assert expected is not None
-    assert 1.0 < expected.after / (5e-6 * np.sqrt(3.0)) < 1.1
-    assert expected.high > expected.after
-
-
-def test_stations_are_in_the_box_and_passed_both_ways():
-    stations = box_stations(linearised("5-D", 4, STRUCTURE)[0])
-    half = len(stations) // 2
-    low, high = small.BOX
-    assert ((stations.positions >= low) & (stations.positions <= high)).all()
-    np.testing.assert_array_equal(stations.positions[:half], stations.positions[half:])
-    np.testing.assert_array_equal(stations.sense[:half, :3], -stations.sense[half:, :3])
-    back = (
-        stations.sense[:half] == stations.sense[half:]
-    ).mean()  # struts that turn back within 2 mm of where they are
-    assert back < 0.01
-    assert 0.4 < (stations.sense[:half, :3] > 0.0).mean() < 0.6
