@@ -1,11 +1,12 @@
 """How much the tests see: mutants of the package, each changed in one place, and whether a test fails.
 
-    python -m benchmarks.mutants [--count 300] [--seed 0] [--rooms ROOM ...] [--only N [N ...]]
+    python -m benchmarks.mutants [--count 300] [--seed 0] [--jobs 2] [--rooms ROOM ...] [--only N [N ...]]
 
 A mutant is a copy of the sources with one operator, ``not``, number, returned value or statement changed, drawn at
 random from all such places of all rooms; in the C core, whose text is changed and compiled again, one operator, number
-or statement. The tests that concern its file run until one fails: it is killed, also when they run out of time.
-``--only`` repeats mutants by their numbers, as after a new test.
+or statement. It is killed where a test fails, also by running out of time. The tests are those that pass its line, by
+the coverage recorded in a run of all tests, the most specific ones first; then those of its room, which start processes
+of their own. ``--only`` repeats mutants by their numbers, as after a new test.
 Exits 1 when fewer than 95 % are killed. What it does is explained in doc/benchmarks.md.
 """
 
@@ -25,13 +26,16 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from multiprocessing import get_context
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
+from queue import SimpleQueue
 
 # What all tests import, loaded once: each mutant has a fork of this process.
 import hypothesis  # noqa: F401
 import pytest
 import scipy.optimize
 import scipy.spatial.transform  # noqa: F401
+from coverage import CoverageData
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "hexapod_comp"
@@ -39,23 +43,8 @@ FOLDER = ROOT / "out" / "mutants"
 # Files and folders of what is judged by eye, or not ours
 NOT_DRAWN = {"pictures.py", "page.py", "shell_page.py", "__main__.py", "stable_abi"}
 
-# Where a room's tests are, from near to far, where not in the folder of its name alone
-TESTS = {
-    "pose.py": ["test_pose.py", "ros/test_wire.py", "machine"],
-    "errors.py": ["test_errors.py", "formats"],
-    "core": ["core", "machine", "compensation", "export/test_c_core.py", "workspace"],
-    "machine": ["machine", "compensation", "calibration/test_sensitivity.py", "workspace", "fuzz/test_fuzz_files.py"],
-    "compensation": ["compensation", "machine/test_limits.py", "replay", "ros"],
-    "calibration": ["calibration", "cli"],
-    "measurements": ["measurements", "cli", "calibration"],
-    "formats": ["formats", "measurements", "machine", "cli", "fuzz/test_fuzz_files.py"],
-    "virtual": ["calibration/test_instruments.py", "cli/test_simulate.py", "measurements", "loop"],
-    "replay": ["replay", "ros/test_recorder.py"],
-    "cli": ["cli", "test_doc_commands.py", "test_zoo.py"],
-    "ros": ["ros", "loop/test_processes.py"],
-    "viewer": ["ros"],
-    "testing": ["test_testing.py", "ros"],
-}
+# The tests of the C core, whose lines no Python tool sees
+C_TESTS = ["core", "machine", "compensation", "export", "workspace"]
 
 LONGEST = 120  # Time of a test with a mutant that waits, s
 
@@ -186,6 +175,42 @@ class ProcessorTime:
             signal.setitimer(signal.ITIMER_PROF, 0.0)
 
 
+class Coverage:
+    """Which tests pass which lines of the package: recorded in a run of all tests, anew when a file has changed."""
+
+    def __init__(self) -> None:
+        recorded = FOLDER / "coverage"
+        newest = max(path.stat().st_mtime for room in (PACKAGE, ROOT / "test") for path in room.rglob("*.py"))
+        if not recorded.exists() or recorded.stat().st_mtime < newest:
+            recorded.unlink(missing_ok=True)
+            command = ["pytest", "-q", "-n2", "--dist=loadfile", "--ignore=test/packaging", "--cov=hexapod_comp"]
+            own = {"COVERAGE_FILE": str(recorded), "OPENBLAS_NUM_THREADS": "1"}
+            print("recording which tests pass which lines, minutes", flush=True)
+            subprocess.run([sys.executable, "-m", *command, "--cov-context=test", "--cov-report="],
+                           cwd=ROOT, env=os.environ | own, check=True, stdout=subprocess.DEVNULL)  # fmt: skip
+        data = CoverageData(str(recorded))
+        data.read()
+        self.tests = {
+            path: {
+                line: {context.rpartition("|")[0] for context in contexts} - {""}
+                for line, contexts in data.contexts_by_lineno(path).items()
+            }
+            for path in data.measured_files()
+        }
+        self.passed = Counter(test for lines in self.tests.values() for tests in lines.values() for test in tests)
+
+    def of(self, path: Path, first: int, last: int) -> list[str]:
+        """Return the tests that pass these lines, where none does those that pass the file; the most specific first."""
+        lines = self.tests.get(str(path), {})
+        found = set[str]().union(*(lines.get(line, ()) for line in range(first, last + 1))) or set[str]().union(
+            *lines.values()
+        )
+        by_file: dict[str, list[str]] = {}  # together, so that a file's fixtures are made once
+        for test in sorted(found, key=lambda one: self.passed[one]):
+            by_file.setdefault(test.partition("::")[0], []).append(test)
+        return [test for tests in by_file.values() for test in tests]
+
+
 class Copy:
     """A copy of sources and tests with one mutant at a time."""
 
@@ -200,43 +225,44 @@ class Copy:
 
     def failure(self, tests: list[str]) -> str:
         """Return what failed first, or "" where nothing does."""
-        lines = self._run(tests, LIMIT, "-x", "--tb=no").splitlines()
+        arguments = ["-q", "-x", "--tb=no", "-p", "no:cacheprovider", "-o", f"timeout={LONGEST}", *tests]
+        # In a process of its own, which has the libraries but nothing of the project.
+        with tempfile.TemporaryFile("w+") as output:
+            child = get_context("fork").Process(target=self._in_child, args=(arguments, output.fileno()))
+            child.start()
+            child.join()
+            output.seek(0)
+            lines = output.read().splitlines()
         failed = [line for line in lines if line.startswith(FAILURES)]
         last = lines[-1] if lines else "no output"
         return failed[0] if failed else "" if " passed" in last and "error" not in last else last
 
-    def _run(self, tests: list[str], limit: float, *options: str) -> str:
-        """Return what pytest prints in a process of its own, which has the libraries but nothing of the project."""
-        arguments = ["-q", "-p", "no:cacheprovider", "-o", f"timeout={LONGEST}", *options]
-        arguments += dict.fromkeys(f"test/{test}" for test in tests)
-        with tempfile.TemporaryFile("w+") as output:
-            child = get_context("fork").Process(target=self._in_child, args=(arguments, limit, output.fileno()))
-            child.start()
-            child.join()
-            output.seek(0)
-            return output.read()
-
-    def _in_child(self, arguments: list[str], limit: float, output: int) -> None:
+    def _in_child(self, arguments: list[str], output: int) -> None:
         os.dup2(output, 1)
         os.dup2(output, 2)
         os.chdir(self.folder)
         os.environ["PYTHONPATH"] = str(self.folder)
         sys.path.insert(0, str(self.folder))
-        code = pytest.main(arguments, plugins=[ProcessorTime(limit)])
+        code = pytest.main(arguments, plugins=[ProcessorTime(LIMIT)])
         sys.stdout.flush()
         os._exit(int(code))
 
-    def killed_by(self, path: Path, tree: ast.Module | str, mutant: Mutant | CMutant) -> str:
-        """Put a mutant in its file's place, run the tests, and put the file back."""
+    def killed_by(self, path: Path, text: str, tests: list[str]) -> str:
+        """Put a mutant in its file's place, run the tests, then those of its room, and put the file back."""
         place = self.folder / path.relative_to(ROOT)
-        room = path.relative_to(PACKAGE).parts[0]
-        own = [str(test.relative_to(ROOT / "test")) for test in (ROOT / "test").rglob(f"test_{path.stem}.py")]
-        parts = [[test] for test in dict.fromkeys(own + TESTS.get(room, [room]))]
+        room = f"test/{path.relative_to(PACKAGE).parts[0]}"
+        parts = [[f"test/{one}"] for one in C_TESTS] if path.suffix == ".c" else [tests, [room]]
         try:
-            place.write_text(mutated(tree, mutant), encoding="utf-8")
+            place.write_text(text, encoding="utf-8")
             if path.suffix == ".c" and not self.compiled():
                 return "the compiler"
-            return next(filter(None, map(self.failure, parts)), "")
+            return next(
+                filter(
+                    None,
+                    (self.failure(part) for part in parts if part and (ROOT / part[0].partition("::")[0]).exists()),
+                ),
+                "",
+            )
         finally:
             shutil.copy2(path, place)
             if path.suffix == ".c":
@@ -264,11 +290,27 @@ def mutated(tree: ast.Module | str, mutant: Mutant | CMutant) -> str:
         setattr(node, field, was)  # type: ignore[arg-type]
 
 
+def lines_of(tree: ast.Module | str, mutant: Mutant | CMutant) -> tuple[int, int]:
+    """Return the first and last line of the statement that a mutant changes; of C, which is not recorded, none."""
+    if isinstance(tree, str):
+        return 0, 0
+    node, field, value = mutant
+    if isinstance(value, list) and field != "ops":  # a statement was removed
+        node = next(old for old, new in zip(getattr(node, field), value, strict=True) if old is not new)  # type: ignore[arg-type]
+    first = node.lineno  # type: ignore[union-attr]
+    around = [
+        one for one in ast.walk(tree) if isinstance(one, ast.stmt) and one.lineno <= first <= (one.end_lineno or 0)
+    ]
+    body = max(around, key=lambda one: one.lineno)
+    return body.lineno, first if hasattr(body, "body") else body.end_lineno or first
+
+
 def main() -> int:
     """Draw mutants, try them and say which survive."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=300, metavar="N", help="how many mutants (default 300)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the draw (default 0)")
+    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (default 2)")
     parser.add_argument("--rooms", nargs="+", metavar="ROOM", help="of these rooms alone, as ros, cli or core")
     parser.add_argument("--only", type=int, nargs="+", metavar="N", help="only the mutants of these numbers")
     args = parser.parse_args()
@@ -282,21 +324,32 @@ def main() -> int:
         every += [(path, one) for one in (c_mutants(tree) if isinstance(tree, str) else mutants(tree))]
     drawn = list(enumerate(random.Random(args.seed).sample(every, args.count), 1))
     print(f"{len(every)} mutants of {len(files)} files; {len(drawn)} drawn with seed {args.seed}", flush=True)
-    chosen = [one for one in drawn if not args.only or one[0] in args.only]
-    survived, rooms, start = 0, Counter[str](), time.monotonic()
     FOLDER.mkdir(parents=True, exist_ok=True)
-    copy = Copy(FOLDER)
-    for number, (path, mutant) in chosen:
-        began, what = time.monotonic(), describe(path, mutant)
-        by = copy.killed_by(path, trees[path], mutant)
-        survived += not by
-        room = path.relative_to(PACKAGE).parts[0]
-        rooms.update([room] if by else [room, f"{room} survived"])
+    coverage, start = Coverage(), time.monotonic()
+    chosen = [
+        (number, path, describe(path, one), mutated(trees[path], one), coverage.of(path, *lines_of(trees[path], one)))
+        for number, (path, one) in drawn
+        if not args.only or number in args.only
+    ]
+    copies = SimpleQueue[Copy]()
+    for number in range(args.jobs):
+        (FOLDER / f"{number}").mkdir(exist_ok=True)
+        copies.put(Copy(FOLDER / f"{number}"))
+
+    def judged(one: tuple[int, Path, str, str, list[str]]) -> tuple[str, bool]:
+        number, path, what, text, tests = one
+        copy, began = copies.get(), time.monotonic()
+        by = copy.killed_by(path, text, tests)
+        copies.put(copy)
         outcome = f"killed   {what}  {by}" if by else f"SURVIVED {what}"
         print(f"{number:4} {outcome}  {time.monotonic() - began:.0f} s", flush=True)
-    killed = len(chosen) - survived
-    for room in sorted(name for name in rooms if not name.endswith(" survived")):
-        print(f"{room}: {rooms[room] - rooms[f'{room} survived']} of {rooms[room]} killed")
+        return path.relative_to(PACKAGE).parts[0], bool(by)
+
+    with ThreadPool(args.jobs) as pool:
+        rooms = Counter(pool.map(judged, chosen, chunksize=1))
+    for room in sorted({name for name, _ in rooms}):
+        print(f"{room}: {rooms[room, True]} of {rooms[room, True] + rooms[room, False]} killed")
+    killed = sum(number for (_, by), number in rooms.items() if by)
     print(f"{killed} of {len(chosen)} killed, {killed / len(chosen):.1%}; {time.monotonic() - start:.0f} s")
     return 0 if killed >= BAR * len(chosen) else 1
 
