@@ -205,7 +205,7 @@ def write_table(table: GridTable, path: str | Path, titles: Sequence[str]) -> No
 
 
 def read_table(path: str | Path) -> GridTable:
-    """Read a table; its rows may stand in any order, its lengths and angles in any unit of theirs."""
+    """Read a table: rows in any order, lengths and angles in any unit that the header names."""
     table = Table(path)
     positions = table.numbers(table.required(POSITION, "length"))
     struts = table.numbers(table.required(CORRECTION, "length"))

@@ -35,7 +35,7 @@ class Region:
 
     @cached_property
     def frame(self) -> Pose:
-        """Of the box in ``base``."""
+        """Pose of the box in ``base``."""
         return Pose.from_angles(self.position, self.angles)
 
     def __post_init__(self) -> None:

@@ -441,7 +441,7 @@ class _Collecting:
         return whole
 
     def _tell_directions(self) -> None:
-        """State of poses that the machine has visited one after the other that each was reached from the one before."""
+        """Set the direction of poses outside of passes: reached from the pose before, or unknown after a gap."""
         for before, visit in zip([None, *self.visits], self.visits, strict=False):
             if visit.direction not in PASSES:
                 read = before is not None and before.run == visit.run and before.readings[0] in self.found

@@ -110,7 +110,7 @@ class PoseCheck:
         return np.asarray(np.array(places) - np.mean(places, axis=0))
 
     def _offset(self) -> np.ndarray:
-        """Return measured minus commanded place: the mean, in a free frame that of the last stop."""
+        """Return measured minus commanded place, (3,), m: the mean of all stops; in a free frame, of the last."""
         if not self._meant or (frame := self.frame()) is None:
             return np.zeros(3)
         off = [(frame @ seen).position - meant.position for meant, seen in zip(self._meant, self._seen, strict=True)]

@@ -154,7 +154,7 @@ class LoadBlock(Block):
         """Return by how much each number lengthens the struts, (M, 6, 6)."""
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Every strut that a number lengthens moves the point by that strut's gain."""
+        """Each number lengthens struts, and each strut moves the measured point by its gain per length."""
         factors = self.stretched(linkage) @ (self.root if whitened else np.eye(6))
         return lambda errors: np.einsum("ns,nsp->np", errors.gains, factors[errors.at])
 
