@@ -41,7 +41,7 @@ from .rclpy_compat import (
     publishers,
     sampled,
 )
-from .status import ERROR, OK, WARN, HealthReport, Refusals, joined
+from .status import ERROR, OK, WARN, Refusals, joined, status_of
 
 _LAST, _RELIABLE, _BEST_EFFORT = HistoryPolicy.KEEP_LAST, ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
 
@@ -78,6 +78,7 @@ OVERRIDES = QoSOverridingOptions(
 TRANSITIONS = ("on_configure", "on_activate", "on_deactivate", "on_cleanup", "on_shutdown")
 
 CHECK_PERIOD = 0.05  # Period at which a node evaluates its state, s
+STATUS_PERIOD = 1.0  # A status is published at once when level or text change, and after this time, s
 
 # Longest wait for the last message's acknowledgement: DDS may take 3 s, and dead subscribers never send it
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.4)
@@ -173,6 +174,7 @@ class MachineNode(LifecycleNode):
             service.callback = self.guard.answering(service.srv_name, service.srv_type, callback)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._diagnostics_pub = self._publisher_of_status()
+        self._status_shown: tuple[bytes, str] | None = None
         self.set_hardware_id("")
         self._tickers: dict[str, Alarm] = {}
         self._options = Parameters(self, table, self._on_parameters)
@@ -425,7 +427,7 @@ class MachineNode(LifecycleNode):
         two of a kind are distinguished. The status's name stays: an aggregator would otherwise wait for the old one for
         ever."""
         self.hardware_id = f"{self.get_namespace()}/{what}".strip("/")
-        self._report = HealthReport(f"{self.get_fully_qualified_name()[1:]}: state", self.hardware_id)
+        self._status_due = 0.0
 
     def update(self, now: float) -> None:
         """Do what is due every :data:`CHECK_PERIOD` of a configured node, before its state is judged."""
@@ -444,7 +446,7 @@ class MachineNode(LifecycleNode):
         moment, and what was published before is lost to it."""
 
         def on_matched(_: Any) -> None:
-            self._report.renew()
+            self._status_due = 0.0
 
         make = functools.partial(self.create_publisher, DiagnosticArray, "/diagnostics", EVENT_QOS)
         try:
@@ -464,7 +466,9 @@ class MachineNode(LifecycleNode):
             self._steps_logged = steps
             step = self.clock.last_step * 1e-9
             self.log_warning("clock", f"the clock was set {'back' if step < 0 else 'forward'} by {abs(step):.3f} s")
-        if self._report.due(level, text, now):
-            stamp = self.get_clock().now().to_msg()
-            everything = {**self.values(now), **self.guard.values()}
-            self._diagnostics_pub.publish(self._report.message(level, text, everything, stamp))
+        if (level, text) != self._status_shown or now >= self._status_due:
+            self._status_shown, self._status_due = (level, text), now + STATUS_PERIOD
+            name, values = f"{self.get_fully_qualified_name()[1:]}: state", {**self.values(now), **self.guard.values()}
+            array = DiagnosticArray(status=[status_of(name, self.hardware_id, level, text, values)])
+            array.header.stamp = self.get_clock().now().to_msg()
+            self._diagnostics_pub.publish(array)

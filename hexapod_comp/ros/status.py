@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.logging import get_logging_directory
 
 from ..compensation.compensator import Compensator
@@ -130,31 +129,6 @@ class LogSpace:
             return
         full = usage.f_bavail * usage.f_frsize < LEAST_ROOM
         self.problem = f"log disk full: {self._folder}" if full else ""
-
-
-class HealthReport:
-    """Publishes a status once a `period`, s, and at once when level or message change."""
-
-    def __init__(self, name: str, hardware_id: str, period: float = 1.0) -> None:
-        self._name, self._hardware_id, self._period = name, hardware_id, period
-        self._shown: tuple[bytes, str] | None = None
-        self._last = -math.inf
-
-    def due(self, level: bytes, message: str, now: float) -> bool:
-        """Return whether a message is due, and count it as sent."""
-        if (level, message) == self._shown and now - self._last < self._period:
-            return False
-        self._shown, self._last = (level, message), now
-        return True
-
-    def renew(self) -> None:
-        """Make a message due at the next check, changed or not."""
-        self._last = -math.inf
-
-    def message(self, level: bytes, text: str, values: dict[str, str], stamp: Time) -> DiagnosticArray:
-        array = DiagnosticArray(status=[status_of(self._name, self._hardware_id, level, text, values)])
-        array.header.stamp = stamp
-        return array
 
 
 # ---- the compensator's ----

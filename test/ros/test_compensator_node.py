@@ -38,7 +38,7 @@ from hexapod_comp.ros import status as status_module
 from hexapod_comp.ros.compensator import CompensatorNode
 from hexapod_comp.ros.messages import message_pose, pose_message
 from hexapod_comp.ros.rclpy_compat import Throttle
-from hexapod_comp.ros.status import ERROR, OK, Flow, HealthReport
+from hexapod_comp.ros.status import ERROR, OK, Flow
 
 ROUNDING = 1e-12
 """Lengths below a metre, a dozen operations: a few 1e-16 m; the wire is exact. Everything real is 1e-9 m."""
@@ -358,13 +358,6 @@ def test_rate_and_age_of_a_flow(monkeypatch):
     assert flow.rate(12.5) == pytest.approx(125.0), "over the last full second"
     assert flow.rate(14.0) == 0.0
     assert flow.age(14.0) == pytest.approx(14.0 - 10.0 - 249 / 125.0)
-
-
-def test_report_is_due_on_change_and_once_a_second():
-    report = HealthReport("node: machine", "machine")
-    running, refusing = (OK, "running"), (ERROR, "refusing commands: step")
-    asked = [(running, 0.0), (running, 0.9), (refusing, 0.95), (refusing, 1.9), (refusing, 2.0)]
-    assert [report.due(*state, now) for state, now in asked] == [True, False, True, False, True]
 
 
 # ---- markers and mirror ----

@@ -17,6 +17,7 @@ from sensor_msgs.msg import JointState, TimeReference
 from std_msgs.msg import Bool, UInt64
 
 from hexapod_comp.compensation import guards
+from hexapod_comp.ros import base
 from hexapod_comp.ros.base import LATCHED_QOS
 from hexapod_comp.ros.status import ERROR, OK, WARN
 
@@ -138,9 +139,8 @@ def test_a_deadline_is_asked_for_where_a_parameter_says_so(bench):
     bench.ask(HOME)
 
 
-def test_a_late_subscriber_gets_the_status_of_every_node_when_it_is_discovered(bench):
+def test_a_late_subscriber_gets_the_status_of_every_node_when_it_is_discovered(bench, monkeypatch):
+    monkeypatch.setattr(base, "STATUS_PERIOD", 1e9)  # nothing is published again only because time passes
     bench.machine()
-    for node in bench.nodes:
-        node._report._period = 1e9  # nothing is published again only because time passes
     arrays = hear(bench, DiagnosticArray, "/diagnostics")
     bench.until(lambda: len({array.status[0].name for array in arrays}) == 2, "the status of drive and compensator")
