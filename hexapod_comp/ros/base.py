@@ -41,7 +41,7 @@ from .rclpy_compat import (
     publishers,
     sampled,
 )
-from .status import ERROR, OK, WARN, Refusals, joined, status_of
+from .status import ERROR, OK, WARN, Refusals, joined, log_problem, status_of
 
 _LAST, _RELIABLE, _BEST_EFFORT = HistoryPolicy.KEEP_LAST, ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
 
@@ -460,7 +460,8 @@ class MachineNode(LifecycleNode):
         now = time.monotonic()
         self.update(now)
         findings = self.findings(now) if self._active else [(WARN, "not active")]
-        level, text = joined([*self.guard.findings(now), joined(findings)])
+        log = log_problem()
+        level, text = joined([*self.guard.findings(now), joined(findings), (WARN if log else OK, log)])
         self.clock.read()
         if (steps := self.clock.set_back + self.clock.set_forward) != self._steps_logged:
             self._steps_logged = steps

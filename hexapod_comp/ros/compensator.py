@@ -307,7 +307,6 @@ class CompensatorNode(MachineNode):
     def update(self, now: float) -> None:
         status = self._status
         status.update(now)
-        status.log_space.check()
         guard = status.problem()
         problem = guard.problem if guard is not None and self._active else ""
         if problem and problem != self._logged_problem:

@@ -10,7 +10,6 @@ import os
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -110,25 +109,17 @@ class Refusals:
         return {"refused": str(self.total), **counts}
 
 
-class LogSpace:
-    """Whether there is room for ROS's log: only the nodes can report that nothing is written any more."""
-
-    def __init__(self, folder: Path | None = None) -> None:
-        self._folder = Path(get_logging_directory()) if folder is None else folder
-        self.problem = ""
-
-    def check(self) -> None:
-        """Measure the room; takes a few microseconds on a local file system."""
-        self.problem = ""
-        try:
-            usage = os.statvfs(self._folder)
-        except FileNotFoundError:
-            return  # nothing is logged to files
-        except OSError as error:
-            self.problem = f"log folder lost: {error.strerror}"
-            return
-        full = usage.f_bavail * usage.f_frsize < LEAST_ROOM
-        self.problem = f"log disk full: {self._folder}" if full else ""
+def log_problem(folder: str = "") -> str:
+    """Return why ROS's log cannot be written, empty if it can: only the nodes can report that nothing is written any
+    more. Takes a few microseconds on a local file system."""
+    folder = folder or str(get_logging_directory())
+    try:
+        usage = os.statvfs(folder)
+    except FileNotFoundError:
+        return ""  # nothing is logged to files
+    except OSError as error:
+        return f"log folder lost: {error.strerror}"
+    return f"log disk full: {folder}" if usage.f_bavail * usage.f_frsize < LEAST_ROOM else ""
 
 
 # ---- the compensator's ----
@@ -160,7 +151,7 @@ class CompensatorStatus:
         self.options, self.clock = options, clock
         self.command_stamps, self.reading_stamps = StampGate("command", clock), StampGate("reading", clock, capped=True)
         self.pose_stamps = StampGate("measured pose", clock, capped=True)
-        self.track, self.log_space = StrutTrack(), LogSpace()
+        self.track = StrutTrack()
         # Senders of sensor readings and of the tool's choice: a second one is ignored, and stops nothing
         self.sensing: dict[str, OneSender] = {}
         self.commands, self.feedback = Flow(), Flow()  # accepted commands, usable measured struts
@@ -250,8 +241,8 @@ class CompensatorStatus:
             yield WARN, "running, commands are being missed"
         if self.behind.holds(now):
             yield WARN, "running, catching up with commands that came late"
-        problems = self.prediction_problem, self.drift_problem, self.log_space.problem
-        for problem in filter(None, (*problems, self.fusion.held if self.fusion is not None else "")):
+        held = self.fusion.held if self.fusion is not None else ""
+        for problem in filter(None, (self.prediction_problem, self.drift_problem, held)):
             yield WARN, problem
         if self.fusion is not None and 0.0 < self.options["fusion.timeout"] < now - self.fusion.last:
             yield WARN, "no measured pose counts" if self.fusion.count else "waiting for the first measured pose"

@@ -31,7 +31,7 @@ from .base import STATE_QOS, MachineNode
 from .messages import StrutBytes, StrutReader, stamp_of, write_pose
 from .parameters import Program, read_table
 from .process import run
-from .status import ERROR, OK, WARN, Flow, LogSpace, Refusals, seconds
+from .status import ERROR, OK, WARN, Flow, Refusals, seconds
 
 LONGEST_PAUSE = 0.25  # After a longer pause (a stopped process), the machine has moved on by no more than this, s
 
@@ -129,7 +129,7 @@ class StrutDriveNode(MachineNode):
         several = options["allow_several_publishers"]
         self._source = self.subscribe_exclusive(JointState, "strut_commands", self._on_commands, several)
         self._stamps = StampGate("command", self.clock, options["command_validity"], future=False)
-        self._steps, self._log_space = StrutSteps(geometry.limits.step, geometry.limits.speed), LogSpace()
+        self._steps = StrutSteps(geometry.limits.step, geometry.limits.speed)
         self._command_guards: tuple[Guard, ...] = (self._source, self._stamps, self._steps)
         self.set_hardware_id(geometry.name)
         self.every(1.0 / options["rate"], self._run)
@@ -211,7 +211,6 @@ class StrutDriveNode(MachineNode):
     # ---- state ----
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
-        self._log_space.check()
         stopped = [name for name, at_stop in zip(STRUT_NAMES, self.drive.stopped, strict=True) if at_stop]
         if stopped:
             yield ERROR, f"at the travel stop: {', '.join(stopped)}"
@@ -224,8 +223,6 @@ class StrutDriveNode(MachineNode):
             yield WARN, "no new command"
         elif missing:
             yield WARN, "running, commands are being missed"
-        if self._log_space.problem:
-            yield WARN, self._log_space.problem
         yield OK, "running" if self._commands.count else "waiting for the first command"
 
     def values(self, now: float) -> dict[str, str]:

@@ -23,7 +23,7 @@ from benchmarks.faults.judge import VISIBLE, Limits, judge
 from benchmarks.faults.kinds import KINDS, kinds_of
 from benchmarks.faults.record import Happened, Record, Sent, Status, Struts
 from benchmarks.faults.rig import Rig, refusal_to_mount
-from hexapod_comp.ros.status import LogSpace
+from hexapod_comp.ros.status import log_problem
 
 LIMITS = Limits(np.tile([0.33, 0.88], (6, 1)), 2e-3, 2e-3, 0.25)
 
@@ -258,23 +258,19 @@ def test_wires_do_what_their_rules_say():
 def test_a_full_log_disk_is_a_problem(monkeypatch, tmp_path, blocks, said):
     """64 KiB are 16 blocks of 4,096 byte."""
     monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=blocks, f_frsize=4096))
-    space = LogSpace(tmp_path)
-    space.check()
-    assert space.problem.startswith(said)
-    assert bool(space.problem) == bool(said)
+    problem = log_problem(str(tmp_path))
+    assert problem.startswith(said)
+    assert bool(problem) == bool(said)
 
 
 def test_a_log_folder_that_is_not_there_is_no_problem_and_one_that_fails_is(monkeypatch, tmp_path):
-    space = LogSpace(tmp_path / "nowhere")
-    space.check()
-    assert space.problem == ""
+    assert log_problem(str(tmp_path / "nowhere")) == ""
 
     def fail(_):
         raise OSError(5, "Input/output error")
 
     monkeypatch.setattr(os, "statvfs", fail)
-    space.check()
-    assert space.problem == "log folder lost: Input/output error"
+    assert log_problem(str(tmp_path)) == "log folder lost: Input/output error"
 
 
 # ---- episodes ----

@@ -58,9 +58,10 @@ from hexapod_comp.compensation import guards
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.ros import base
 from hexapod_comp.ros.compensator import CompensatorNode
 from hexapod_comp.ros.messages import period, pose_message
-from hexapod_comp.ros.status import CompensatorStatus, LogSpace
+from hexapod_comp.ros.status import CompensatorStatus
 from hexapod_comp.ros.strut_drive import StrutDriveNode
 
 DRIVE = "strut_drive"
@@ -560,7 +561,7 @@ def test_speeds_depend_on_stamps_alone() -> None:
 
 @pytest.mark.parametrize("node", ["compensator", DRIVE])
 def test_a_full_log_disk_is_said_beside_everything_else(rig, monkeypatch, node):
-    monkeypatch.setattr(LogSpace, "check", lambda space: setattr(space, "problem", "log disk full: /var/log"))
+    monkeypatch.setattr(base, "log_problem", lambda: "log disk full: /var/log")
     rig.compensator() if node == "compensator" else rig.drive()
     rig.until(lambda: rig.status(node), "a status")
     assert (rig.status(node).level, rig.message(node).endswith("log disk full: /var/log")) == (WARN, True)
