@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..core import Status, batch
 from ..core.batch import settle
@@ -376,6 +375,8 @@ def _sought_poses(structure: Structure, lengths: np.ndarray) -> list[Pose]:
 
 def _starts_around(structure: Structure, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return positions (N, 3), m, and rotations (N, 3, 3) with approximately the struts' lengths."""
+    from scipy.spatial.transform import Rotation  # half of the time in which ik starts, and it needs none
+
     rotations = Rotation.random(ORIENTATIONS, random_state=0).as_matrix()
     centres = structure.base_joints - structure.platform_joints @ np.swapaxes(rotations, 1, 2)
     middle = centres.mean(axis=1)
@@ -412,6 +413,8 @@ def _frames(triangles: np.ndarray) -> np.ndarray:
 def _starts_near(structure: Structure, pose: Pose, gap: float) -> list[Pose]:
     """Return guesses at a pose and, where it is nearly singular, to both sides along the weakest motion."""
     size = structure.characteristic_length
+    from scipy.spatial.transform import Rotation  # as in _starts_around
+
     matrix = jacobian(structure, pose)
     matrix[:, 3:] /= size
     _, singular_values, directions = np.linalg.svd(matrix)

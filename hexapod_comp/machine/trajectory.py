@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..pose import Pose, attitude_error, best_motion, rotation_angle
 from .geometry import HexapodGeometry
@@ -143,6 +142,8 @@ def _interpolate(
     positions: np.ndarray, rotations: np.ndarray, leg: np.ndarray, share: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the poses at the given shares, (K,), of the given legs, (K,): straight, shortest arc."""
+    from scipy.spatial.transform import Rotation  # as in attitude_error
+
     travel = np.diff(positions, axis=0)
     turn = attitude_error(rotations[1:], rotations[:-1])
     turned = Rotation.from_rotvec(share[:, None] * turn[leg]).as_matrix() @ rotations[leg]
