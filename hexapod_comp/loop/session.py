@@ -42,7 +42,7 @@ def _latencies(sent: Iterable[Sent]) -> np.ndarray:
     return values[np.isfinite(values)]
 
 
-def connect(client: LoopClient, nodes: Sequence[NodeProcess] = (), timeout: float = CONNECT_TIMEOUT) -> None:
+def connect(client: LoopClient, nodes: Sequence[NodeProcess] = ()) -> None:
     """Wait until the loop answers."""
 
     def ready() -> bool:
@@ -52,7 +52,7 @@ def connect(client: LoopClient, nodes: Sequence[NodeProcess] = (), timeout: floa
                 raise HexapodError(f"{node.name} ended with code {node.exit_code()}:").with_lines(output)
         return client.connected() and (client.has_true_pose or not nodes)
 
-    client.wait(ready, timeout, "compensator and strut drive to answer")
+    client.wait(ready, CONNECT_TIMEOUT, "compensator and strut drive to answer")
 
 
 def run_session(

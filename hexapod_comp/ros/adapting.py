@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
 from std_srvs.srv import Trigger
 
-from ..errors import CommandError, NoAnswerError
+from ..errors import CommandError
 from ..formats.paths import folder_of
 from ..measurements.collect import Observation
 from ..pose import Pose
@@ -127,9 +126,6 @@ class AdaptedMachine(WatchedMachine):
             raise CommandError("reload", f"{self._compensator} keeps its model_file: {result.reason}")
 
     def _call(self, client: Any, request: Any) -> Any:
-        future, end = client.call_async(request), time.monotonic() + ANSWERED_WITHIN
-        while not future.done():
-            if time.monotonic() > end:
-                raise NoAnswerError(f"{client.srv_name} did not answer within {ANSWERED_WITHIN:g} s")
-            self.spin_once(0.02)
+        future = client.call_async(request)
+        self.wait(future.done, ANSWERED_WITHIN, f"the answer of {client.srv_name}")
         return future.result()

@@ -173,7 +173,10 @@ class MachineNode(LifecycleNode):
             callback = possible_only(self, callback) if service.srv_type is ChangeState else callback
             service.callback = self.guard.answering(service.srv_name, service.srv_type, callback)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._diagnostics_pub = self._publisher_of_status()
+        diagnostics = functools.partial(self.create_publisher, DiagnosticArray, "/diagnostics", EVENT_QOS)
+        self._diagnostics_pub: Publisher = self._when_matched(
+            "/diagnostics", PublisherEventCallbacks, diagnostics, self._renew_status
+        )
         self._status_shown: tuple[bytes, str] | None = None
         self.set_hardware_id("")
         self._tickers: dict[str, Alarm] = {}
@@ -369,7 +372,7 @@ class MachineNode(LifecycleNode):
         names = functools.partial(publishers, self, full)
         sender = OneSender(full, lambda: int(subscription.get_publisher_count()), names, several)
 
-        def on_matched(_: Any) -> None:
+        def on_matched() -> None:
             if subscription in self.subscriptions:  # the event of one that has been closed meanwhile
                 self.update_publishers()
 
@@ -383,12 +386,17 @@ class MachineNode(LifecycleNode):
             qos_overriding_options=OVERRIDES,
             raw=True,
         )
-        try:
-            guarded = self.guard.around(f"matching of {topic}", on_matched)
-            subscription = make(event_callbacks=SubscriptionEventCallbacks(matched=guarded))
-        except UnsupportedEventTypeError:
-            subscription = make()
+        subscription = self._when_matched(topic, SubscriptionEventCallbacks, make, on_matched)
         return sender
+
+    def _when_matched(self, topic: str, events: type, make: Callable[..., Any], callback: Callable[[], None]) -> Any:
+        """Make an end of a topic that calls back, where the middleware can tell, when one at the other end comes or
+        goes."""
+        try:
+            guarded = self.guard.around(f"matching of {topic}", lambda _: callback())
+            return make(event_callbacks=events(matched=guarded))
+        except UnsupportedEventTypeError:
+            return make()
 
     def update_publishers(self) -> None:
         """Update who publishes what only one node may; called when a publisher comes or goes, and periodically."""
@@ -441,19 +449,10 @@ class MachineNode(LifecycleNode):
         """Return all else of the node's state as key and value."""
         return {}
 
-    def _publisher_of_status(self) -> Publisher:
-        """Return the publisher of diagnostics. A new subscriber gets the status with the next check: discovery takes a
-        moment, and what was published before is lost to it."""
-
-        def on_matched(_: Any) -> None:
-            self._status_due = 0.0
-
-        make = functools.partial(self.create_publisher, DiagnosticArray, "/diagnostics", EVENT_QOS)
-        try:
-            guarded = self.guard.around("matching of /diagnostics", on_matched)
-            return make(event_callbacks=PublisherEventCallbacks(matched=guarded))
-        except UnsupportedEventTypeError:
-            return make()
+    def _renew_status(self) -> None:
+        """Let a new subscriber get the status with the next check: what was published before its discovery is lost to
+        it."""
+        self._status_due = 0.0
 
     def _check_state(self) -> None:
         """Publish the state when it is due, with the guard's findings; log steps of the clock."""

@@ -497,8 +497,8 @@ def machine_markers(
     return MarkerArray(markers=markers)
 
 
-def correction_colour(correction: float, full: float = 100e-6) -> ColorRGBA:
-    """Return blue for −`full`, white for 0, red for +`full` metres and beyond."""
-    share = max(-1.0, min(1.0, correction / full))
+def correction_colour(correction: float) -> ColorRGBA:
+    """Return blue for −100 µm, white for 0, red for +100 µm and beyond."""
+    share = max(-1.0, min(1.0, correction / 100e-6))
     rest = 1.0 - abs(share)
     return ColorRGBA(r=1.0 if share > 0 else rest, g=rest, b=1.0 if share < 0 else rest, a=1.0)

@@ -56,19 +56,19 @@ def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, frame
     return MarkerArray(markers=markers)
 
 
-def publish_shells(node: Node, markers: MarkerArray, topic: str = TOPIC) -> Publisher:
+def publish_shells(node: Node, markers: MarkerArray) -> Publisher:
     """Publish markers once on a latched topic; keep what is returned as long as they shall be there."""
-    publisher = node.create_publisher(MarkerArray, topic, LATCHED_QOS)
+    publisher = node.create_publisher(MarkerArray, TOPIC, LATCHED_QOS)
     publisher.publish(markers)
     return publisher
 
 
-def show_shells(layers: Sequence[Layer], quantity: Quantity, title: str, frame_id: str = "work") -> None:
+def show_shells(layers: Sequence[Layer], quantity: Quantity, title: str) -> None:
     """Publish shells from a node of its own until Ctrl-C."""
     keep_discovery_local()
     with RosSession("workspace_shells") as session:
         stamp = session.node.get_clock().now().to_msg()
-        publish_shells(session.node, shell_markers(layers, quantity, title, frame_id, stamp))
+        publish_shells(session.node, shell_markers(layers, quantity, title, "work", stamp))
         with suppress(KeyboardInterrupt):
             while True:
                 session.spin_once(SPIN_PERIOD)
