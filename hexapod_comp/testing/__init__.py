@@ -26,18 +26,10 @@ NODE_FIXTURES = {"hexapod_context"}
 def hexapod_domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     """Keep a session's nodes on this computer, in a domain of their own, their logs in a temporary folder."""
     # Yields the domain id. Processes that tests start inherit all of it through the environment.
-    from ..formats.paths import config_file
-    from ..loop.processes import reserve_domain
+    from ..loop.processes import PrivateDomain
 
-    domain, reservation = reserve_domain()
-    with reservation, pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_DOMAIN_ID", str(domain))
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with PrivateDomain() as domain, pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("ros_log")))
-        patch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(config_file("fastdds.xml")))
-        patch.setenv("RMW_FASTRTPS_USE_QOS_FROM_XML", "1")  # as the nodes do with it
-        for name in ("ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER"):
-            patch.delenv(name, raising=False)
         yield domain
 
 
