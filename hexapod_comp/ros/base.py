@@ -20,7 +20,7 @@ from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.subscription import Subscription
@@ -43,26 +43,34 @@ from .rclpy_compat import (
 )
 from .status import ERROR, OK, WARN, Refusals, joined, log_problem, status_of
 
-_LAST, _RELIABLE, _BEST_EFFORT = HistoryPolicy.KEEP_LAST, ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+
+def profile(depth: int, reliable: bool = True, latched: bool = False) -> QoSProfile:
+    """Return the QoS of a topic that keeps its last `depth` messages; latched: also for late subscribers."""
+    return QoSProfile(
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
 
 # Commands: each must arrive. A hundred wait while a busy processor pauses for 0.1 s at 1 kHz, or lost ones are
 # repeated.
-COMMAND_QOS = QoSProfile(depth=100, history=_LAST, reliability=_RELIABLE)
+COMMAND_QOS = profile(100)
 
 # Publishers of states: the newest only, to reliable subscribers too, as those with rclpy's defaults are
-STATE_QOS = QoSProfile(depth=1, history=_LAST, reliability=_RELIABLE)
+STATE_QOS = profile(1)
 
 # Subscriptions of states, however published: only the newest counts, an old one need not be repeated
-NEWEST_QOS = QoSProfile(depth=1, history=_LAST, reliability=_BEST_EFFORT)
+NEWEST_QOS = profile(1, reliable=False)
 
 # Subscriptions of sensors, for any publisher's QoS
-SENSOR_QOS = QoSProfile(depth=10, history=_LAST, reliability=_BEST_EFFORT)
+SENSOR_QOS = profile(10, reliable=False)
 
 # Rare messages, each of which counts: diagnostics, markers
-EVENT_QOS = QoSProfile(depth=10, history=_LAST, reliability=_RELIABLE)
+EVENT_QOS = profile(10)
 
 # A state that late subscribers must receive too
-LATCHED_QOS = QoSProfile(depth=1, history=_LAST, reliability=_RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+LATCHED_QOS = profile(1, latched=True)
 
 # QoS policies of a topic that a user may override by parameters; subscriptions have no lifespan
 OVERRIDES = QoSOverridingOptions(

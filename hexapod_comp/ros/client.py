@@ -12,22 +12,21 @@ from functools import partial
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from ..errors import HexapodError, NoAnswerError
 from ..machine.trajectory import Path
 from ..pose import Pose
-from .base import COMMAND_QOS, EVENT_QOS, LATCHED_QOS, NEWEST_QOS
+from .base import COMMAND_QOS, EVENT_QOS, LATCHED_QOS, NEWEST_QOS, profile
 from .messages import StrutReader, message_pose, nanoseconds_of, pose_message
 from .process import RosSession
 from .status import status_prefix
 
 # Answers are all kept until they are read: a recorder must not lose any
-LISTENER_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
+LISTENER_QOS = profile(200)
 
-TRACK_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
+TRACK_QOS = profile(200, reliable=False)
 
 # A command without an answer after this time is lost, s: a busy computer may delay it by seconds
 ANSWER_TIMEOUT = 5.0

@@ -15,13 +15,14 @@ from builtin_interfaces.msg import Duration, Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from sensor_msgs.msg import JointState, RelativeHumidity, Temperature, TimeReference
 from std_msgs.msg import Float64MultiArray
 
 from ..errors import CommandError, HexapodError, printable
 from ..machine.geometry import STRUT_NAMES
 from ..pose import Pose
+from .base import profile
 from .messages import nanoseconds_of, read_message
 
 DISCOVERY_TIME = 3.0  # How long a topic may take to be discovered, s; Fast DDS needs 0.1 to 1 s
@@ -183,11 +184,7 @@ class Echo:
         offered = [info.qos_profile for info in publishers]
         reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
         latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
-        qos = QoSProfile(
-            depth=QUEUE,
-            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-        )
+        qos = profile(QUEUE, reliable, latched)
         node.create_subscription(self._kind, self.topic, self._on_message, qos, raw=True)
 
     def _on_message(self, data: bytes) -> None:

@@ -15,7 +15,6 @@ import numpy as np
 from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import Point, PoseStamped
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState, TimeReference
 from std_msgs.msg import Bool, ColorRGBA, String, UInt64
 from visualization_msgs.msg import Marker, MarkerArray
@@ -35,7 +34,7 @@ from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL
 from ..machine.robot_description import joint_positions, urdf
 from ..pose import Pose
-from .base import ACKNOWLEDGED_WITHIN, EVENT_QOS, LATCHED_QOS, STATE_QOS, MachineNode
+from .base import ACKNOWLEDGED_WITHIN, EVENT_QOS, LATCHED_QOS, STATE_QOS, MachineNode, profile
 from .messages import PoseBytes, StrutBytes, StrutReader, command_stamp, period, read_message, read_pose, stamp_of
 from .parameters import ParameterError, Program, read_table
 
@@ -48,13 +47,8 @@ REPEATED_AFTER = 1.0
 # Largest time of a message, ns: later validities are limited to it
 LAST_STAMP = 2**31 * 10**9 - 1
 
-# Pages: each counts, and late subscribers need the last snapshot
-JOURNAL_QOS = QoSProfile(
-    depth=10,  # a recorder's own queue is no longer than this
-    history=HistoryPolicy.KEEP_LAST,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+# Pages: each counts, and late subscribers need the last snapshot; a recorder's own queue is no longer than this
+JOURNAL_QOS = profile(10, latched=True)
 
 RULES = FusionRules()
 

@@ -10,11 +10,12 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, Vector3Stamped, WrenchStamped
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
 from std_msgs.msg import String
 
 from ..errors import HexapodError, InputFileError
+from .base import profile
 from .process import QUIET, SPIN_PERIOD, RosSession
 
 # Recorded topics, their types, and whether they are offered reliably
@@ -124,10 +125,9 @@ class BagRecorder(RosSession):
         self.counts = self._bag.counts  # messages of each topic
         super().__init__("hexapod_comp_recorder", namespace, **QUIET)
         for topic, (kind, reliable) in TOPICS.items():
-            reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-            self._subscribe(topic, kind, QoSProfile(depth=DEPTH, reliability=reliability))
+            self._subscribe(topic, kind, profile(DEPTH, reliable))
         for topic in KEPT:
-            self._subscribe(topic, String, QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+            self._subscribe(topic, String, profile(DEPTH, latched=True))
 
     def close(self) -> None:
         super().close()

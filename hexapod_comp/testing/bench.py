@@ -25,7 +25,6 @@ from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
 from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
 from std_msgs.msg import Float64MultiArray
@@ -36,6 +35,7 @@ from ..formats.paths import config_file
 from ..machine.geometry import STRUT_NAMES, load_geometry
 from ..machine.model_file import save_model
 from ..pose import Pose
+from ..ros.base import profile
 from ..ros.compensator import CompensatorNode
 from ..ros.messages import message_pose, pose_message
 from ..ros.process import autostart
@@ -46,8 +46,8 @@ from ..virtual.named import find_model, is_random
 if TYPE_CHECKING:
     import pytest
 
-RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+RELIABLE = profile(100)
+BEST_EFFORT = profile(100, reliable=False)
 
 WATCHED = {
     "strut_commands": (JointState, RELIABLE),

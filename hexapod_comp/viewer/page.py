@@ -20,7 +20,6 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
 from ..errors import HexapodError
@@ -29,14 +28,14 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import solve_pose
 from ..pose import Pose, rotation_angle
 from ..ros import keep_discovery_local
-from ..ros.base import EVENT_QOS, NEWEST_QOS
+from ..ros.base import EVENT_QOS, NEWEST_QOS, profile
 from ..ros.interface import correction_colour
 from ..ros.messages import StrutReader, message_pose, nanoseconds_of, read_message
 from ..ros.process import QUIET, SPIN_PERIOD, RosSession
 from ..ros.status import ERROR, OK, WARN, status_prefix
 
 # Best effort, so that nobody waits for a slow witness; deep enough that the latencies are those of all commands
-STREAM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+STREAM_QOS = profile(100, reliable=False)
 
 SILENT_AFTER = 2.0  # What nobody has said for this long is not known any more, s: diagnostics come once a second
 WINDOW = 5.0  # seconds whose latencies are shown
