@@ -203,7 +203,7 @@ class Parameters(dict[str, Any]):
 # ---- the program ----
 
 
-ROS_ARGUMENTS, END_OF_ROS_ARGUMENTS = "--ros-args", "--"
+ROS_ARGUMENTS = "--ros-args"
 
 USAGE_ERROR = 2
 
@@ -245,12 +245,11 @@ class Program:
             allow_abbrev=False,
         )
         try:
-            _, strange = parser.parse_known_args(outside_ros(arguments))
+            _, strange = parser.parse_known_args(remove_ros_args(list(arguments)))
             if strange:
                 listed = printable(" ".join(strange), LONGEST_TEXT)
                 parser.error(f"arguments not understood: {listed}. Parameters follow --ros-args: {example}")
-            remove_ros_args(list(arguments))
-        except RuntimeError as error:
+        except (RuntimeError, ValueError) as error:  # a ValueError: bytes that are no text
             parser.print_usage(sys.stderr)
             text = f"{self.name}: error: ROS arguments not understood: {error}"
             print(printable(text, LONGEST_TEXT), file=sys.stderr)
@@ -258,16 +257,3 @@ class Program:
         except SystemExit as leaving:
             return leaving.code if isinstance(leaving.code, int) else USAGE_ERROR
         return None
-
-
-def outside_ros(arguments: Sequence[str]) -> list[str]:
-    """Return the arguments that do not stand between ``--ros-args`` and ``--`` or the end."""
-    left, inside = [], False
-    for argument in arguments:
-        if argument == ROS_ARGUMENTS:
-            inside = True
-        elif inside:
-            inside = argument != END_OF_ROS_ARGUMENTS
-        else:
-            left.append(argument)
-    return left

@@ -24,7 +24,6 @@ from hexapod_comp.pose import Pose
 from hexapod_comp.ros import PROFILE_VARIABLES, avoid_shared_memory
 from hexapod_comp.ros.client import LISTENER_QOS, LoopClient, Sent
 from hexapod_comp.ros.interface import PROGRAM as COMPENSATOR
-from hexapod_comp.ros.parameters import outside_ros
 
 STOP_WITHIN = 2.0  # from the signal to the end of the process, s
 
@@ -336,11 +335,6 @@ def test_all_programs_refuse_what_they_do_not_know_on_any_terminal():
         _, said = process.communicate(timeout=60.0)
         assert (process.returncode, "Traceback" in said) == (2, False)
         assert f"{name} --ros-args" in said
-
-
-def test_arguments_of_ros_stand_between_its_two_marks():
-    given = ["a", "--ros-args", "-r", "__node:=x", "--", "b", "--ros-args", "-p", "c:=1"]
-    assert outside_ros(given) == ["a", "b"]
 
 
 def test_nodes_end_when_their_parent_is_killed(isolated_ros):
