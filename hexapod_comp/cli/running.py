@@ -222,10 +222,10 @@ def watch(args: argparse.Namespace) -> int:
 
     geometry = load_geometry(args.machine)
     page = WatchPage(geometry, args.host, args.port)
-    heard = received_signals()
+    signals = received_signals()
     print(f"hexapod_comp: {geometry.name} is shown on {page.address} until Ctrl-C", file=sys.stderr)
     try:
-        watch(geometry, page.show, lambda: not heard, args.namespace)
+        watch(geometry, page.show, lambda: not signals, args.namespace)
     finally:
         page.close()
     return 0
@@ -252,22 +252,22 @@ def echo(args: argparse.Namespace) -> int | Result:
             return Result(lambda: "\n".join(lines), lambda: topics, code=0 if topics else 1)
 
         def print_message(received: EchoedMessage) -> None:
-            if not args.hz and (args.count is None or heard.intervals.count <= args.count):
+            if not args.hz and (args.count is None or watched.intervals.count <= args.count):
                 print(json_text(received.record(), indent=None) if args.json else received.text() + "\n")
 
-        heard = Echo(session.node, session.spin_once, args.topic, print_message)
+        watched = Echo(session.node, session.spin_once, args.topic, print_message)
         end, next_line = began + (args.seconds or math.inf), began + HZ_PERIOD
-        while going_on(end) and (args.count is None or heard.intervals.count < args.count):
+        while going_on(end) and (args.count is None or watched.intervals.count < args.count):
             session.spin_once(SPIN_PERIOD)
             sys.stdout.flush()
             if args.hz and not args.json and time.monotonic() > next_line:
                 next_line += HZ_PERIOD
-                print(f"{heard.topic}: {heard.intervals.text()}")
-    intervals = heard.intervals
+                print(f"{watched.topic}: {watched.intervals.text()}")
+    intervals = watched.intervals
     if args.hz and args.json:
-        print(json_text({"topic": heard.topic, **intervals.record()}), end="")
+        print(json_text({"topic": watched.topic, **intervals.record()}), end="")
     elif not args.json:
-        print(f"{heard.topic}: {intervals.text()}", file=sys.stderr)
+        print(f"{watched.topic}: {intervals.text()}", file=sys.stderr)
     return 0 if intervals.count else 1
 
 
@@ -276,10 +276,10 @@ def record(args: argparse.Namespace) -> int:
     from ..ros import received_signals
     from ..ros.recorder import BagRecorder
 
-    heard, end = received_signals(), time.monotonic() + (args.seconds or math.inf)
+    signals, end = received_signals(), time.monotonic() + (args.seconds or math.inf)
     with BagRecorder(args.folder, args.namespace) as recorder, results.progress_bar(0, " messages") as bar:
         print(f"hexapod_comp: recording to {args.folder} until Ctrl-C", file=sys.stderr)
-        recorder.run(lambda: not heard and time.monotonic() < end, bar.update)
+        recorder.run(lambda: not signals and time.monotonic() < end, bar.update)
     lines = [f"{count:8d}  {topic}" for topic, count in sorted(recorder.counts.items())]
     lines.append("recording ended early" if recorder.problem else f"written: {args.folder}")
     nothing = not (recorder.problem or recorder.journal)

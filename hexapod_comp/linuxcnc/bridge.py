@@ -204,15 +204,15 @@ class CompensatorReset:
             if status.level == ERROR and status.name.startswith(self._name):
                 self._complained_at = time.monotonic()
 
-    def ask(self, streaming_since: float, heard_at: float, now: float) -> bool:
+    def ask(self, streaming_since: float, received_at: float, now: float) -> bool:
         """Request a reset when commands are sent but no correction arrives for too long, monotonic times, s; return
         whether it was requested."""
-        if heard_at > self._asked_at:
+        if received_at > self._asked_at:
             self._unanswered = 0
-        waited = now - max(streaming_since, heard_at)
+        waited = now - max(streaming_since, received_at)
         if waited < self._options["timeout"] + RESET_AFTER or now - self._asked_at < RESET_PERIOD:
             return False
-        if self._complained_at < heard_at or now - self._complained_at > COMPLAINT_COUNTS_FOR:
+        if self._complained_at < received_at or now - self._complained_at > COMPLAINT_COUNTS_FOR:
             return False
         self._asked_at = now
         if not self._client.service_is_ready():
@@ -243,7 +243,7 @@ class LinuxcncBridgeNode(MachineNode):
         self._metres = METRES[self._options["units"]]
         self._guard = CorrectionGuard(*(self._options[name] for name in GUARDED))
         # cycles of the loop; published commands and measured struts; corrections that arrived
-        self._cycles, self._sent, self._states, self._heard = Flow(), Flow(), Flow(), Flow()
+        self._cycles, self._sent, self._states, self._received = Flow(), Flow(), Flow(), Flow()
         self._refusals, self._bad_pins = Refusals(), Refusals()  # corrections and pins that were not used
         self._machine_on = self._enabled = False  # the controller's switches
         self._resets = 0  # how often the compensator was asked to start anew
@@ -320,7 +320,7 @@ class LinuxcncBridgeNode(MachineNode):
         if self._active and self._machine_on:
             self._send(now)
             if self._reset is not None:
-                self._resets += self._reset.ask(self._streaming_since, self._heard.last, now)
+                self._resets += self._reset.ask(self._streaming_since, self._received.last, now)
         output = self._guard.update(now, self._active and self._machine_on and self._enabled)
         self._cycles.tick(now)
         self._write_corrections([value / self._metres for value in output])
@@ -370,7 +370,7 @@ class LinuxcncBridgeNode(MachineNode):
         if not followed or max(map(abs, out.velocity.tolist())) > STANDING:
             self._moved_at = now
         unanswered = self._reset is not None and self._reset.unanswered
-        silent = self._heard.age(now) > self._options["timeout"]
+        silent = self._received.age(now) > self._options["timeout"]
         if silent and now - self._moved_at < self._options["timeout"] and not unanswered:
             return
         self._states_pub.publish(message)
@@ -389,7 +389,7 @@ class LinuxcncBridgeNode(MachineNode):
         self._source.update(time.monotonic())
 
     def _on_correction(self, data: bytes, sample: Sample) -> None:
-        self._heard.tick(sample.now)
+        self._received.tick(sample.now)
         try:
             self._source.check(sample)
             self._reader.sample(data, sample)
@@ -435,7 +435,7 @@ class LinuxcncBridgeNode(MachineNode):
             "enabled": str(self._enabled).lower(),
             "cycle_rate_hz": f"{self._cycles.rate(now):.1f}",
             "command_rate_hz": f"{self._sent.rate(now):.1f}",
-            "correction_rate_hz": f"{self._heard.rate(now):.1f}",
+            "correction_rate_hz": f"{self._received.rate(now):.1f}",
             "correction_age_s": seconds(self._guard.age(now)),
             "latency_s": f"{self._latency:.6f}",
             "largest_correction_m": f"{max(map(abs, self._guard.output)):.9f}",

@@ -44,7 +44,7 @@ PINS = (
     *pins("out", "bit", "valid"),
 )
 
-HEARD_WITHIN = 0.1  # longest sleep, s: how soon a signal ends the component
+LONGEST_SLEEP = 0.1  # s: how soon a signal ends the component
 
 
 class WatchedMachine:
@@ -110,12 +110,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"cannot start: {error}", file=sys.stderr)
         return 1
     shown.cycle()  # the pins hold values before LinuxCNC goes on
-    heard = received_signals()
+    signals = received_signals()
     shown.component.ready()
     period, due = 1.0 / options.rate, time.monotonic()
-    while not heard:
+    while not signals:
         if (now := time.monotonic()) < due:
-            time.sleep(min(due - now, HEARD_WITHIN))
+            time.sleep(min(due - now, LONGEST_SLEEP))
             continue
         shown.cycle()
         due = max(due + period, time.monotonic())

@@ -39,9 +39,9 @@ def received_signals() -> list[int]:
     Not an event: setting one acquires its lock, and the signal may have interrupted the holder, a main thread about to
     wait for the event or another signal's handler. Then the process would deadlock.
     """
-    heard: list[int] = []
-    _handle_stop_signals(lambda number, _: heard.append(number))
-    return heard
+    received: list[int] = []
+    _handle_stop_signals(lambda number, _: received.append(number))
+    return received
 
 
 def _handle_stop_signals(handler: Callable[[int, FrameType | None], object]) -> None:

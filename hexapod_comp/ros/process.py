@@ -44,9 +44,9 @@ QUIET: dict[str, Any] = {
 }
 
 
-def autostart(node: LifecycleNode, heard: Sequence[int] = ()) -> bool:
+def autostart(node: LifecycleNode, signals: Sequence[int] = ()) -> bool:
     for step in (node.trigger_configure, node.trigger_activate):
-        if heard:
+        if signals:
             break
         if step() != TransitionCallbackReturn.SUCCESS:
             return False
@@ -77,14 +77,14 @@ def run(
     if refusal is not None:
         return refusal
     open_streams()
-    heard = received_signals()
+    signals = received_signals()
     try:  # the present directory, even if it is replaced
         stderr = os.fdopen(os.dup(sys.stderr.fileno()), "w")
     except (AttributeError, OSError):  # closed, or a test's
         stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
     with stderr:
         with LogRelay():
-            code = _run_until(heard, make_node, arguments, stderr)
+            code = _run_until(signals, make_node, arguments, stderr)
         if argv is None:
             # Python's own exit waits for threads of DDS, which sometimes never end, though all has been closed.
             for stream in filter(None, (sys.stdout, sys.stderr)):  # None: it was closed from the beginning
@@ -97,7 +97,7 @@ def run(
 
 
 def _run_until(
-    heard: Sequence[int],
+    signals: Sequence[int],
     make_node: Callable[[], MachineNode],
     arguments: list[str],
     stderr: TextIO,
@@ -121,14 +121,14 @@ def _run_until(
         for end in (rclpy.try_shutdown, node.destroy_node, executor.shutdown, node.publish_last_status):
             ending.callback(end)
         ending.callback(_end_within, ENDED_WITHIN, stderr)
-        if node.wants_autostart and node.unconfigured and not autostart(node, heard):
+        if node.wants_autostart and node.unconfigured and not autostart(node, signals):
             return 1
         # Modules loaded by now stay, and the collector need not examine them while the machine moves: for 45,000
         # objects a full collection takes 17 ms, the time of eight commands. The allocator is left alone: told to give
         # large blocks back it held 2 to 11 MB less after sixty messages of up to 6 MB, not worth a call into glibc.
         gc.collect()
         gc.freeze()
-        while not heard and rclpy.ok():
+        while not signals and rclpy.ok():
             spin()
     return 0
 

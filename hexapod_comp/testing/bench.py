@@ -176,11 +176,11 @@ class Bench:
 
     def matched(self) -> bool:
         """Return whether all topics and services between nodes and witness are connected, in both directions."""
-        heard = [s.topic_name for node in self.nodes for s in node.subscriptions]
+        read = [s.topic_name for node in self.nodes for s in node.subscriptions]
         ours = [s.topic_name for s in self.witness.subscriptions]
         theirs = [p for node in self.nodes for p in node.publishers if p.topic_name in ours]
         return (
-            all(p.get_subscription_count() for p in self._publishers.values() if p.topic_name in heard)
+            all(p.get_subscription_count() for p in self._publishers.values() if p.topic_name in read)
             and all(p.get_subscription_count() for p in theirs)
             and all(
                 s.get_publisher_count() >= sum(p.topic_name == s.topic_name for p in theirs)
