@@ -7,7 +7,6 @@ import csv
 import io
 import json
 import os
-import pty
 import re
 import signal
 import subprocess
@@ -263,19 +262,6 @@ def test_fk_names_the_row_without_a_pose(tmp_path: Path) -> None:
 # check.
 
 
-def test_a_terminal_shows_what_is_done() -> None:
-    """What takes seconds says so on a terminal, in whole lines also where that gives no width; pipes stay clean."""
-    code = "import hexapod_comp.cli as cli; cli.main(['plan', 'campaign_1d', '--blocks', 'pitch'])"
-    ours, theirs = pty.openpty()
-    with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=theirs) as process:
-        out = process.communicate(timeout=60)[0]
-    os.close(theirs)
-    shown = os.read(ours, 10_000).decode()
-    os.close(ours)
-    assert "s  what 1670 readings determine\r" in shown
-    assert out.startswith(b"machine paper: 1670 readings")
-
-
 def test_lists_of_broken_limits_are_capped(tmp_path: Path) -> None:
     """However many targets are out of reach: twenty lines in check, ten notes of ik, and how many more there are."""
     path = file_of(tmp_path, [(n, 0, 0, 950, 0, 0, 0) for n in range(30)])
@@ -390,20 +376,6 @@ def test_check_long_streams_in_pieces() -> None:
     np.testing.assert_allclose(result.limits["stroke"].margin[:, 0], margins, atol=1e-15)
     steps = np.abs(np.diff(lengths, axis=0)).max(axis=1)
     np.testing.assert_allclose(np.abs(result.limits["step"].value[1:, 0]), steps, atol=1e-15)
-
-
-def test_check_writes_all_margins(tmp_path: Path) -> None:
-    out = tmp_path / "margins.csv"
-    code, text, err = hexapod("check", TABLE_1, "--model", "paper_machine", "--out", str(out))
-    assert (code, err) == (0, DEFAULT_NOTE)
-    assert text.endswith("all within limits\n")
-    rows = parsed(out.read_text())
-    assert len(rows) == 10
-    assert rows[0]["step_nominal_mm"] == ""  # nothing to compare with
-    assert float(rows[0]["stroke_margin_nominal_mm"]) == pytest.approx(509.192 - 330.0, abs=5e-4)
-    assert {"base_cone_margin_compensated_deg", "condition_nominal", "correction_um", "speed_nominal_mm_s"} <= set(
-        rows[0]
-    )
 
 
 def test_check_says_when_poses_leave_the_measured_box(tmp_path: Path) -> None:

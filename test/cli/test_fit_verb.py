@@ -1,7 +1,7 @@
-"""``simulate``, ``fit``, ``plan`` and ``iso230`` in-process, from file to file: what they print, write and refuse.
+"""``simulate``, ``fit``, ``plan``, ``iso230`` and ``verify`` in-process, from file to file.
 
 One campaign of a 1-D laser is measured and fitted once for the whole module; tests of options that only change
-what is written get that fit again instead of a new one.
+what is written get that fit again instead of a new one. A model whose parameters are known to 2 µm is verified.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_helpers import paper, scattered
+from calibration_helpers import fitted_model, paper, scattered
 from helpers import hexapod, long_test, quick_pictures
 
 from hexapod_comp import cli
@@ -27,10 +27,14 @@ from hexapod_comp.cli import fitting as fit_module
 from hexapod_comp.cli.fitting import beyond_limits
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.machine.model import MachineModel
+from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.measurements.campaign import Campaign, template
+from hexapod_comp.measurements.readings import KINDS
+from hexapod_comp.measurements.tidy import write_measurements
 from hexapod_comp.pose import Pose
+from hexapod_comp.virtual.instruments import compensated, measure
 
 # Six readings on the shortest lines, the fewest that scheme lines takes; two cycles, the fewest for ISO 230-2
 CAMPAIGN = """format: hexapod_comp/campaign
@@ -467,3 +471,105 @@ def test_each_scheme_models_a_shipped_machine_or_says_why_not(
         worth = json.loads(out)["worth"]
         before, after = (worth[key]["aligned_rms_m"] for key in ("error_without", "error_with"))
         assert after < (1.0 - LEAST_REMOVED[scheme]) * before
+
+
+MICRON = (1e-6,) * len(KINDS)
+STRUT = 1  # which strut is moved, by 50 µm
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a model, and checks of the machine as it is, with a strut moved, and compensated."""
+    folder = tmp_path_factory.mktemp("verify")
+    model = load_model(fitted_model(folder), paper())
+    box = np.array([[-0.1, -0.1, 0.38], [0.1, 0.1, 0.45]])
+    plan = Campaign(box, 0.07, 0.07, None, 0, poses=3, noise=MICRON)
+    laid_out = template(plan, paper())
+    laid_out = replace(laid_out, uncertainty=np.full(len(laid_out), 1e-6))
+    struts = model.struts
+    moved = replace(model, struts=replace(struts, offset=struts.offset + 50e-6 * (np.arange(6) == STRUT)))
+    for name, truth, told in (
+        ("same", model, laid_out),
+        ("moved", moved, laid_out),
+        ("running", model, compensated(laid_out, model)),
+    ):
+        readings = measure(told, plan, RealMachine(paper(), truth), 3)
+        write_measurements(replace(readings, stations=laid_out.stations), folder / f"{name}.csv")
+    return folder
+
+
+def model_in(folder: Path) -> Path:
+    """Return the model file."""
+    return next(folder.glob("*.yaml"))
+
+
+def run(*arguments: object) -> int:
+    """Run the command line."""
+    return cli.main([str(argument) for argument in arguments])
+
+
+def test_a_valid_model_exits_0(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("verify", model_in(folder), folder / "same.csv") == 0
+    assert "\nVALID: " in capsys.readouterr().out
+
+
+def test_proposed_readings_are_written_to_be_filled_in(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """They are of the model that is named; what is measured has its own files; and one of both is needed."""
+    proposed = folder / "check.csv"
+    assert run("verify", model_in(folder), "--propose", proposed, "--readings", "8") == 0
+    rows = proposed.read_text().splitlines()[1:]
+    assert len(rows) == 8
+    assert all(row.split(",")[-2] == "" for row in rows), "no values yet"
+    assert f"fill in the values: {proposed}" in capsys.readouterr().out
+    for wrong, problem in (
+        ((), "at least one of FILE, --propose is needed"),
+        ((folder / "same.csv", "--propose", proposed), "FILE cannot be combined with --propose"),
+        (("--propose", proposed, "--readings", "2"), "must be 6…60, not 2"),
+        ((proposed,), "value"),
+    ):
+        assert run("verify", model_in(folder), *wrong) == 2
+        assert problem in capsys.readouterr().err
+
+
+def test_readings_under_compensation_need_its_option(folder: Path) -> None:
+    """All struts are 30 µm too long: taken for readings without compensation, those of a compensated one differ."""
+    assert run("verify", model_in(folder), folder / "running.csv", "--compensated") == 0
+    assert run("verify", model_in(folder), folder / "running.csv") == 1
+
+
+def test_a_moved_strut_exits_1_and_is_in_the_json(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("verify", model_in(folder), folder / "moved.csv", "--json") == 1
+    result = json.loads(capsys.readouterr().out)
+    best = result["candidates"][0]
+    assert (result["verdict"], best["kind"], best["name"]) == ("named", "strut", f"strut_{STRUT + 1}")
+    size = best["sizes"][0]
+    assert abs(size["value"] - 50.0) < 4.0 * size["standard_error"] < 20.0
+
+
+def test_update_writes_another_model_and_counts_readings_once(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old, new = model_in(folder), tmp_path / "new.yaml"
+    before = old.read_bytes()
+    assert run("fit", folder / "moved.csv", "--update", old, "--out", new) == 0
+    assert "renewed" in capsys.readouterr().out
+    assert old.read_bytes() == before
+    change = load_model(new, paper()).struts.offset - load_model(old, paper()).struts.offset
+    assert abs(change[STRUT] - 50e-6) < 12e-6
+    assert run("verify", new, folder / "moved.csv") == 0
+    assert run("fit", folder / "moved.csv", "--update", new, "--out", tmp_path / "twice.yaml") == 2
+    assert "count twice" in capsys.readouterr().err
+
+
+def test_update_never_replaces_what_it_reads(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    old = model_in(folder)
+    assert run("fit", folder / "moved.csv", "--update", old, "--out", old) == 2
+    assert "would be replaced" in capsys.readouterr().err
+    assert run("fit", folder / "moved.csv", "--update", old, "--out", old.with_suffix(".yml")) == 2
+    assert "would replace the fit's result" in capsys.readouterr().err
+
+
+def test_a_model_without_its_posterior_cannot_be_checked(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("verify", "paper_machine", folder / "same.csv") == 2
+    assert "cannot be checked" in capsys.readouterr().err
+    assert run("fit", folder / "same.csv", "--out", folder / "no.yaml", "--compensated") == 2

@@ -71,34 +71,27 @@ def test_malformed_poses_are_refused_with_file_line_and_column(
     assert complaint in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("folder", "asked", "complaint"),
-    [
-        (
-            ("mine.csv", "notes.txt"),
-            "mien.csv",
-            ".csv files beside it: mine.csv; shipped: table1.csv, table3.csv, table5.csv; did you mean mine",
-        ),
-        ((), "none/gone.csv", "there is no such file, nor its folder"),
-        ([f"{n:02}.csv" for n in range(15)], "x.csv", "10.csv, 11.csv and 3 more; shipped"),
-    ],
-)
-def test_a_missing_file_lists_those_of_its_kind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: tuple[str, ...], asked: str, complaint: str
-) -> None:
-    for name in folder:
-        (tmp_path / name).write_text("# by hand\n x_mm,y_mm,z_mm\n")
-    (tmp_path / "lengths.csv").write_text("sequence;L1_mm\n")
+def test_a_missing_file_lists_those_of_its_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside it and shipped; poses for who reads poses, lengths for who reads lengths."""
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputFileError) as caught:
-        read_poses(asked)
-    assert complaint in str(caught.value)
-    for other in ("notes.txt", "paper.yaml", "fastdds.xml", "lengths.csv", "table2.csv"):
-        assert other not in str(caught.value)
-    with pytest.raises(InputFileError) as caught:
-        read_lengths(asked)
-    assert "table1.csv" not in str(caught.value), "it holds poses"
-    assert "none/" in asked or "files beside it: lengths.csv; shipped: table2.csv" in str(caught.value)
+    Path("lengths.csv").write_text("sequence;L1_mm\n")
+    Path("notes.txt").write_text("x_mm\n")
+    Path("mine.csv").write_text("# by hand\n x_mm,y_mm,z_mm\n")
+    for read, asked, said in (
+        (read_poses, "none/gone.csv", r"there is no such file, nor its folder"),
+        (
+            read_poses,
+            "mien.csv",
+            r"beside it: mine.csv; shipped: table1.csv, table3.csv, table5.csv; did you mean mine",
+        ),
+        (read_lengths, "x.csv", r"files beside it: lengths.csv; shipped: table2.csv"),
+    ):
+        with pytest.raises(InputFileError, match=said):
+            read(asked)
+    for n in range(15):
+        Path(f"{n:02}.csv").write_text("x_mm,y_mm,z_mm\n")
+    with pytest.raises(InputFileError, match=r"10.csv, 11.csv and 4 more; shipped"):
+        read_poses("x.csv")
 
 
 # Files of spreadsheets.

@@ -1,15 +1,34 @@
-"""The error field of 001: weights, polynomials, directions, and what happens outside the measured box."""
+"""The error field of 001, a table of errors over outside numbers, and the box in which a model was measured.
+
+Truth: 001's formula, SciPy's interpolation, frames by hand, and machines of the zoo.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
+import calibration_helpers as small
 import numpy as np
 import pytest
+from foreign_machines import machine_names, machines
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import UNEVEN_GRID, fixed, random_field, seeds
+from scipy.interpolate import RegularGridInterpolator
+from scipy.spatial.transform import Rotation
+from strategies import UNEVEN_GRID, fixed, paper_geometry, random_field, seeds
 
-from hexapod_comp.errors import ModelError
-from hexapod_comp.machine.field import CROSS_AXES, GridField
+from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
+from hexapod_comp.calibration.posterior import box_stations
+from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.errors import InputFileError, LimitError, ModelError, OutsideTableError
+from hexapod_comp.machine.field import CROSS_AXES, GridField, no_field
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
+from hexapod_comp.machine.model_file import model_text, parse_model
+from hexapod_comp.machine.outside import NO_TABLE, OutsideTable, load_outside
+from hexapod_comp.machine.region import Region
+from hexapod_comp.pose import Pose
 
 FORWARD = np.ones(3)
 
@@ -72,12 +91,12 @@ def paper_weights(p, q, corners):
 def test_equals_the_papers_formula(seed, on_a_line):
     """Truth: 001, W_xi, W_yi, W_zi and Δx, Δy, Δz, written out here over the four corners; np.polyval.
 
-    The paper's lines carry one component each, here they carry six; the three families add up. On a grid line only
-    that line weighs, whichever cell is asked. Tolerance: 1e-14 of some 1e-4.
+    The paper's lines carry one component each, here they carry six; the three families add up; an unknown direction
+    has the mean of both. On a grid line only that line weighs, whichever cell is asked. Tolerance: 1e-14 of some 1e-4.
     """
     rng = np.random.default_rng(seed)
     field = random_field(rng)
-    point, sense = inside(rng), rng.choice([-1.0, 1.0], 3)
+    point, sense = inside(rng), rng.choice([-1.0, 0.0, 1.0], 3)
     if on_a_line:
         for axis in CROSS_AXES[rng.integers(3)]:
             point[axis] = rng.choice(UNEVEN_GRID[axis])
@@ -91,29 +110,11 @@ def test_equals_the_papers_formula(seed, on_a_line):
         u = (point[axis] - middle) / (UNEVEN_GRID[axis][-1] - middle)
         weights = paper_weights(point[a], point[b], corners)
         for n, (m, k) in at.items():
-            truth += weights[n] * np.polyval(field.lines[axis][0 if sense[axis] > 0 else 1, m, k, :, ::-1].T, u)
+            forward, backward = (np.polyval(line[m, k, :, ::-1].T, u) for line in field.lines[axis])
+            truth += weights[n] * {1.0: forward, -1.0: backward, 0.0: (forward + backward) / 2.0}[sense[axis]]
     error, outside = field.evaluate(point, sense)
     np.testing.assert_allclose(error, truth, atol=1e-18)
     assert not outside
-
-
-def test_directions():
-    """Truth: constants. Forward 1, 2, 4 µm along x, y, z, backward ten times that; unknown is the mean.
-
-    Every axis goes by its own direction of motion.
-    """
-    lines = [np.zeros((2, len(UNEVEN_GRID[a]), len(UNEVEN_GRID[b]), 6, 1)) for a, b in CROSS_AXES]
-    for axis, size in enumerate((1e-6, 2e-6, 4e-6)):
-        lines[axis][0, :, :, axis], lines[axis][1, :, :, axis] = size, 10 * size
-    field = GridField(UNEVEN_GRID, tuple(lines))
-    for sense, truth in {
-        (1, 1, 1): (1, 2, 4),
-        (-1, -1, -1): (10, 20, 40),
-        (0, 0, 0): (5.5, 11, 22),
-        (1, -1, 0): (1, 20, 22),
-    }.items():
-        error, _ = field.evaluate([0.0, 0.0, 0.4], sense)
-        np.testing.assert_allclose(error[:3] * 1e6, truth, rtol=1e-14)
 
 
 @fixed
@@ -132,24 +133,6 @@ def test_outside_holds_the_boundary_value_and_says_so(seed):
     assert outside is True
     assert still_inside is False
     np.testing.assert_array_equal(held, on_boundary)
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_continuous_across_the_boundary_and_the_nodes(axis):
-    """Truth: the step over 1 nm may be no more than the field's slope allows.
-
-    A line is worth at most 4·20 µm, so two neighbours differ by at most 160 µm over the narrowest cell of
-    30 mm, and three families add up: 1 nm · 3 · 160 µm/30 mm = 2e-11. A jump to wrong lines would be 1e-5.
-    """
-    rng = np.random.default_rng(4)
-    field = random_field(rng)
-    for node in UNEVEN_GRID[axis]:
-        for _ in range(20):
-            point = inside(rng)
-            before, after = point.copy(), point.copy()
-            before[axis], after[axis] = node - 5e-10, node + 5e-10
-            step = field.evaluate(after, FORWARD)[0] - field.evaluate(before, FORWARD)[0]
-            assert np.abs(step).max() < 1e-10
 
 
 def _family(values, axis):
@@ -175,3 +158,326 @@ def test_refuses_what_is_no_field(axis, nodes, lines, key):
     for change in ({"probe": [0, 0]}, {"probe": [0, np.nan, 0]}, {"outside": "guess"}):
         with pytest.raises(ModelError, match=f"field.{next(iter(change))}"):
             GridField(UNEVEN_GRID, tuple(empty_lines(UNEVEN_GRID)), **change)
+
+
+ELEVATION, ROTATION = np.radians([0.0, 20.0, 60.0, 90.0]), np.radians([-90.0, 0.0, 45.0])
+HERE = {"elevation": 0.7, "rotation": -0.3}
+
+
+def random_table(seed: int = 1, size: float = 50e-6, beyond: str = "hold") -> OutsideTable:
+    rng = np.random.default_rng(seed)
+    values = rng.uniform(-size, size, (2, len(ELEVATION) * len(ROTATION), 3))
+    return OutsideTable(("elevation", "rotation"), ("deg", "deg"), (ELEVATION, ROTATION), *values, beyond=beyond)
+
+
+def flexure(beyond: str = "hold") -> OutsideTable:
+    """Return a table of a sag alone, 10 µm at 0° to 40 µm at 90°."""
+    sag = np.outer([10e-6, 40e-6], [0.0, 0.0, -1.0])
+    return OutsideTable(("elevation",), ("deg",), (np.array([0.0, np.pi / 2]),), sag, np.zeros_like(sag), beyond=beyond)
+
+
+# ---- the table ----
+
+
+def test_between_nodes_it_is_bilinear_and_beyond_them_held() -> None:
+    """SciPy's grid interpolation, clipped; at the nodes the very numbers."""
+    table, rng = random_table(), np.random.default_rng(2)
+    values = np.hstack([table.displacement, table.rotation]).reshape(len(ELEVATION), len(ROTATION), 6)
+    reference = RegularGridInterpolator(table.nodes, values)
+    for place in rng.uniform([-0.3, -2.0], [1.9, 1.2], (200, 2)):
+        inside = np.clip(place, [ELEVATION[0], ROTATION[0]], [ELEVATION[-1], ROTATION[-1]])
+        found = table.evaluate(dict(zip(table.names, place.tolist(), strict=True)))
+        np.testing.assert_allclose(found, reference(inside)[0], atol=1e-19)
+    for index in np.ndindex(values.shape[:2]):
+        at = {"elevation": float(ELEVATION[index[0]]), "rotation": float(ROTATION[index[1]])}
+        np.testing.assert_array_equal(table.evaluate(at), values[index])
+
+
+def test_a_number_that_cannot_be_is_refused() -> None:
+    """45 is degrees; 2 rad is further from 90° than a quarter of 90°, though 1.9 is held."""
+    compensator = Compensator(paper_geometry(), MachineModel("paper", outside=random_table()))
+    compensator.set_outside({"elevation": 1.9, "rotation": 0.0, "azimuth": 1e9})
+    assert compensator.model.outside.held(compensator.outside).startswith("elevation 108.862 deg")
+    for numbers, problem in (
+        ({"elevation": 2.0}, r"outside.elevation: the table holds elevation 0 to 90 deg; is the unit right\?"),
+        ({"rotation": -2.2}, "outside.rotation: the table holds rotation -90 to 45 deg; is the unit right"),
+        ({"elevation": np.nan}, "outside.elevation: must be finite"),
+    ):
+        with pytest.raises(ModelError, match=problem):
+            compensator.set_outside(numbers)
+        assert compensator.outside == {"elevation": 1.9, "rotation": 0.0, "azimuth": 1e9}
+
+
+def test_a_table_that_refuses_and_a_correction_above_its_limit_keep_the_last_numbers() -> None:
+    compensator = Compensator(paper_geometry(), MachineModel("paper", outside=random_table(beyond="refuse")))
+    compensator.set_outside(HERE)
+    with pytest.raises(OutsideTableError, match=r"elevation 91\.6732 deg: the table holds elevation 0 to 90 deg"):
+        compensator.set_outside({"elevation": 1.6})
+    assert compensator.outside == HERE
+    compensator.set_outside({"elevation": 1.570797})  # 90° as a sender may round it: 0.7 µrad more
+    assert not compensator.model.outside.held(compensator.outside)
+    tight = replace(paper_geometry(), limits=replace(paper_geometry().limits, correction=20e-6))
+    compensator = Compensator(tight, MachineModel("paper", outside=flexure()))
+    compensator.set_outside({"elevation": 0.1})
+    with pytest.raises(LimitError, match="correction"):
+        compensator.set_outside({"elevation": 1.5})
+    assert compensator.outside == {"elevation": 0.1}
+
+
+# ---- the machine ----
+
+
+def goes(model: MachineModel, geometry: HexapodGeometry, numbers: dict[str, float], struts: np.ndarray) -> Pose:
+    return RealMachine(geometry, model.at(numbers)).pose_for(struts)[0]
+
+
+@pytest.mark.parametrize("name", machine_names())
+def test_it_moves_the_measured_point_as_it_says(name: str, tmp_path: Path) -> None:
+    """actual = commanded ∘ error: nominal struts leave the table's displacement at the point, and turn about it.
+
+    To rounding of the forward kinematics; whatever the pose, since the table knows none.
+    """
+    geometry, point = load_geometry(machines()[name].write(tmp_path / "machine.yaml")), np.array([0.01, -0.02, 0.05])
+    model = MachineModel(geometry.name, field=replace(no_field(), probe=point), outside=random_table())
+    error = model.outside.evaluate(HERE)
+    for shift, turn in (((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((1e-3, -2e-3, 1e-3), (0.02, -0.01, 0.03))):
+        rotation = geometry.home.rotation @ Rotation.from_rotvec(turn).as_matrix()
+        pose = Pose(geometry.home.position + np.array(shift), rotation)
+        joints = pose.position + geometry.platform_joints @ pose.rotation.T
+        struts = np.linalg.norm(joints - geometry.base_joints, axis=1)
+        if geometry.screw_lead.any():  # turning screws are another test's
+            struts = RealMachine(geometry, MachineModel(geometry.name)).commands_for(pose)[0]
+        actual = goes(model, geometry, HERE, struts)
+        moved = actual.position + actual.rotation @ point - pose.position - pose.rotation @ point
+        np.testing.assert_allclose(moved, error[:3], atol=1e-13)
+        turned = Rotation.from_matrix(actual.rotation @ pose.rotation.T).as_rotvec()
+        np.testing.assert_allclose(turned, error[3:], atol=1e-12)
+
+
+def test_a_field_and_the_table_add_up() -> None:
+    """Wherever the field is measured, and whichever of its families is: the table adds the same everywhere."""
+    rng, table = np.random.default_rng(5), random_table()
+    error = table.evaluate(HERE)
+    whole = random_field(rng)
+    for field in (whole, replace(whole, lines=(whole.lines[0][..., :0], *whole.lines[1:])), no_field()):
+        with_table = MachineModel("paper", field=field, outside=table).at(HERE)
+        assert with_table.outside is NO_TABLE
+        for _ in range(20):
+            position = rng.uniform(field.box[0], field.box[1]) if field is not no_field() else rng.normal(size=3)
+            sense = rng.uniform(-1.0, 1.0, 3)
+            added = with_table.field.evaluate(position, sense)[0] - field.evaluate(position, sense)[0]
+            np.testing.assert_allclose(added, error, atol=1e-19)
+
+
+def test_nothing_steps_when_a_number_jumps() -> None:
+    """From 0° to 90° at once: between commands of one pose no strut is faster than the ramp; then it arrives."""
+    geometry = paper_geometry()
+    compensator = Compensator(geometry, MachineModel("paper", outside=flexure()), ramp_rate=1e-3)
+    tool = geometry.tool_pose(geometry.home)
+    last, moved = compensator.correct(tool, 0.0).command, []
+    for n in range(1, 400):
+        if n in (50, 150, 250):
+            compensator.set_outside({"elevation": (0.0, np.pi / 2, 0.3)[n // 100]})
+        command = compensator.correct(tool, 0.002 * n).command
+        moved.append(np.abs(command - last).max())
+        last = command
+    assert max(moved) == pytest.approx(2e-6, rel=1e-9)  # 1 mm/s over 2 ms
+    assert not compensator.ramping
+    sag = 10e-6 + 30e-6 * 0.3 / (np.pi / 2)
+    level = np.array([0.0, 0.0, sag])  # the nominal machine must be told to go higher by what it sags
+    joints = geometry.home.position + level + geometry.platform_joints @ geometry.home.rotation.T
+    np.testing.assert_allclose(last, np.linalg.norm(joints - geometry.base_joints, axis=1), atol=1e-14)
+
+
+def test_another_model_keeps_the_numbers_and_a_drift_stands_beside_them() -> None:
+    compensator = Compensator(paper_geometry(), MachineModel("paper"))
+    compensator.set_outside({"elevation": np.pi / 2})
+    struts = np.linalg.norm(
+        compensator.platform.position
+        + compensator.geometry.platform_joints @ compensator.platform.rotation.T
+        - compensator.geometry.base_joints,
+        axis=1,
+    )
+    height = compensator.estimate(struts)[2]
+    compensator.set_model(MachineModel("paper", outside=flexure()))
+    compensator.set_drift(np.array([0.0, 0.0, 7e-6, *[0.0] * 9]))
+    assert compensator.estimate(struts)[2] - height == pytest.approx(7e-6 - 40e-6, abs=1e-12)
+    compensator.set_outside({"elevation": 0.0})
+    assert compensator.estimate(struts)[2] - height == pytest.approx(7e-6 - 10e-6, abs=1e-12)
+    with pytest.raises(ModelError, match="is the unit right"):  # a model whose table the present number cannot be in
+        compensator.set_model(MachineModel("paper", outside=replace(flexure(), nodes=(np.array([5.0, 6.0]),))))
+
+
+# ---- files ----
+
+
+def test_the_model_file_holds_the_table() -> None:
+    """Written and read it gives the same numbers in the same words, in the units that its columns had."""
+    table = random_table()
+    model = MachineModel("paper", outside=table, origin=ModelOrigin("2026-11-25"))
+    text = model_text(model)
+    assert "nodes_deg: [0.0, 20.0, 60.0, 90.0]" in text
+    again = parse_model(text, "paper")
+    assert model_text(again) == text
+    for ours, theirs in zip(again.outside.nodes, table.nodes, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    for name in ("displacement", "rotation"):  # drawn numbers come back to one rounding
+        np.testing.assert_allclose(getattr(again.outside, name), getattr(table, name), rtol=3e-16)
+    assert "outside" not in model_text(MachineModel("paper", origin=ModelOrigin("2026-11-25")))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("nodes_deg", "nodes_furlong", "nodes_furlong: must be nodes_UNIT"),
+        ("[0.0, 20.0,", "[20.0, 0.0,", "outside.elevation: needs at least two increasing nodes"),
+        ("beyond: hold", "beyond: guess", "outside.beyond: must be one of hold, refuse"),
+        ("displacement_um", "displacement_mm", r"outside.displacement: must stay within ±50 mm; is the unit right\?"),
+        (
+            "displacement_um:\n  - [",
+            "displacement_um:\n  - [0, 0, 0]\n  - [",
+            "outside.displacement: must have 12 rows",
+        ),
+    ],
+)
+def test_a_block_that_is_none_is_refused(old: str, new: str, problem: str) -> None:
+    text = model_text(MachineModel("paper", outside=random_table(size=9e-4), origin=ModelOrigin("2026-11-25")))
+    assert old in text
+    with pytest.raises(InputFileError, match=problem):
+        parse_model(text.replace(old, new, 1), "paper")
+
+
+HEADER = "rotation_deg,elevation_deg,x_um,y_um,z_um,rx_urad,ry_arcsec,rz_urad"
+
+
+def test_a_table_is_read_from_csv(tmp_path: Path) -> None:
+    """Rows in any order, units by the column names, the axes in the order of their columns; one axis or two."""
+    file = tmp_path / "table.csv"
+    rows = [f"{r},{e},{r + e},{r},{e},1,{e},3" for e in (90, 0, 45) for r in (10, -10)]
+    file.write_text("\n".join([HEADER, *rows]))
+    table = load_outside(file)
+    assert (table.names, table.units) == (("rotation", "elevation"), ("deg", "deg"))
+    np.testing.assert_array_equal(table.nodes[1], np.radians([0.0, 45.0, 90.0]))
+    # x + y is a linear function of both numbers, so the table holds it everywhere
+    error = table.evaluate({"elevation": np.radians(33.0), "rotation": np.radians(7.0)})
+    np.testing.assert_allclose(error[:4], [40e-6, 7e-6, 33e-6, 1e-6], rtol=1e-12)
+    assert error[4] == pytest.approx(np.radians(33.0 / 3600.0))
+    file.write_text("sequence,oil_degC,x_um,y_um,z_mm,rx_µrad,ry_urad,rz_urad\n1,20,0,0,0,0,0,0\n2,30,0,0,0.02,5,0,0\n")
+    table = load_outside(file)
+    assert (table.names, table.units) == (("oil",), ("degC",))
+    np.testing.assert_allclose(table.evaluate({"oil": 24.0}), [0.0, 0.0, 8e-6, 2e-6, 0.0, 0.0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("x_um,y_um,z_um,rx_urad,ry_urad,rz_urad\n1,2,3,4,5,6\n", "one or two columns of outside numbers"),
+        (HEADER.replace("elevation_deg", "elevation") + "\n1,2,3,4,5,6,7,8\n", "must end in a unit, such as _deg"),
+        (
+            f"{HEADER}\n1,2,3,4,5,6,7,8\n1,3,3,4,5,6,7,8\n2,2,3,4,5,6,7,8\n",
+            "has 3 rows, its grid needs 4: one for every",
+        ),
+        (f"{HEADER}\n1,2,3,4,5,6,7,8\n1,2,3,4,5,6,7,8\n", "line 3: rotation and elevation are given twice"),
+        (f"{HEADER}\n1,2,3,4,5,6,7,8\n", "outside.rotation: needs at least two increasing nodes"),
+    ],
+)
+def test_a_csv_that_is_no_table_is_refused(text: str, problem: str, tmp_path: Path) -> None:
+    file = tmp_path / "table.csv"
+    file.write_text(text)
+    with pytest.raises(InputFileError, match=problem):
+        load_outside(file)
+
+
+SIDES = np.array([[-0.1, -0.05, 0.3], [0.1, 0.05, 0.5]])
+
+
+def space_of(poses: list[Pose]) -> ParameterSpace:
+    return ParameterSpace(small.scattered(small.paper(), poses), FitSettings(blocks=()))
+
+
+def drawn(rng: np.random.Generator, count: int, half: float, tilt_deg: float) -> list[Pose]:
+    middle = np.array([0.0, 0.0, 0.45])
+    turns = Rotation.from_rotvec(np.radians(tilt_deg) * rng.uniform(-1.0, 1.0, (count, 3))).as_matrix()
+    return [Pose(middle + rng.uniform(-half, half, 3), turn) for turn in turns]
+
+
+@fixed
+@given(seeds)
+def test_readings_that_are_added_never_make_it_smaller(seed: int) -> None:
+    """Some poses tilted, some level, some all tilted one way: in any order."""
+    rng = np.random.default_rng(seed)
+    poses = drawn(rng, 4, 0.1, 8.0) + drawn(rng, 4, 0.03, 0.0) + drawn(rng, 3, 0.1, 0.0)
+    poses = [poses[n] for n in rng.permutation(len(poses))]
+    few, more = (space_of(part).measured for part in (poses[: rng.integers(3, 11)], poses))
+    assert few is not None
+    assert more is not None
+    assert (more.box[0] <= few.box[0]).all()
+    assert (more.box[1] >= few.box[1]).all()
+    np.testing.assert_array_equal(more.point, few.point)
+
+
+def test_the_promise_is_made_where_the_model_says_that_it_was_measured() -> None:
+    """Poses of the promise, level and tilted, are all inside, and reach within a twentieth of each face."""
+    rng = np.random.default_rng(2)
+    poses = drawn(rng, 30, 0.05, 5.0)
+    geometry = replace(small.paper(), tool=Pose([0.01, 0.0, 0.08], np.eye(3)))
+    space = ParameterSpace(small.scattered(geometry, poses), FitSettings(blocks=()))
+    region = space.measured
+    assert region is not None
+    for tilt in (0.0, 0.1):
+        stations = box_stations(space, tilt)
+        assert stations is not None
+        assert region.contains(stations.positions, stations.rotations).all()
+    places, _ = geometry.tool_poses(stations.positions, stations.rotations)
+    box = region.commanded(geometry)
+    assert (np.abs(places.min(axis=0) - box[0]) < 0.05 * np.ptp(box, axis=0)).all()
+    assert (np.abs(places.max(axis=0) - box[1]) < 0.05 * np.ptp(box, axis=0)).all()
+
+
+def test_a_tilted_tool_is_inside_where_its_point_is() -> None:
+    """The point is 0.2 m above the platform: tilted by 0.3 rad about x it goes 0.2·sin 0.3 along −y, at the edge."""
+    region = Region(SIDES, np.array([0.0, 0.0, 0.2]))
+    tilted = Rotation.from_rotvec([0.3, 0.0, 0.0]).as_matrix()
+    edge = np.array([0.0, 0.05 + 0.2 * np.sin(0.3), 0.4 - 0.2 * np.cos(0.3)])
+    assert region.contains(edge - [0.0, 1e-6, 0.0], tilted)
+    assert not region.contains(edge + np.array([0.0, 1e-6, 0.0]), tilted)
+    assert not region.contains(edge, np.eye(3))
+    many = region.contains(np.array([edge, edge]) - [0.0, 1e-6, 0.0], np.array([tilted, np.eye(3)]))
+    np.testing.assert_array_equal(many, [True, False])
+
+
+def test_the_tools_box_follows_tool_and_work_frame() -> None:
+    """Measured 0.1 m below a tip, in base: the tip's box is higher by that. In a frame turned by 90° x and y change."""
+    base = Region(SIDES, np.array([0.0, 0.0, 0.05]))
+    turned = Pose.from_angles([0.2, 0.0, 0.1], np.radians([0.0, 0.0, 90.0]))
+    geometry = replace(small.paper(), tool=Pose([0.0, 0.0, 0.15], np.eye(3)), work=turned)
+    low, high = SIDES + np.array([0.0, 0.0, 0.1])
+    wanted = np.array([[low[1], 0.2 - high[0], low[2] - 0.1], [high[1], 0.2 - low[0], high[2] - 0.1]])
+    np.testing.assert_allclose(base.commanded(geometry), wanted, atol=1e-12)
+    of_work = Region.of(SIDES, np.array([0.0, 0.0, 0.15]), turned)
+    np.testing.assert_allclose(of_work.commanded(geometry), SIDES, atol=1e-12)
+    corners = of_work.poses(SIDES, np.eye(3))
+    assert of_work.contains(*corners).all()
+    tip = turned.position + turned.rotation @ SIDES[0]
+    np.testing.assert_allclose(corners[0][0] + np.array([0.0, 0.0, 0.15]), tip, atol=1e-12)
+
+
+def test_in_a_frame_turned_askew_all_of_the_tools_box_was_measured() -> None:
+    turned = Pose.from_angles([0.0, 0.0, 0.0], np.radians([10.0, -5.0, 30.0]))
+    geometry, region = replace(small.paper(), work=turned), Region(SIDES)
+    box = region.commanded(geometry)
+    corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)
+    level = np.tile(np.eye(3), (8, 1, 1))
+    assert region.contains(*geometry.platform_poses(corners, level)).all()
+    larger = box.mean(axis=0) + 1.01 * (corners - box.mean(axis=0))
+    assert not region.contains(*geometry.platform_poses(larger, level)).all()
+
+
+def test_what_is_no_box_is_refused() -> None:
+    for box, point, message in (
+        (np.zeros((2, 2)), np.zeros(3), "region.box.*lowest.*highest"),
+        ([[0, 0, 1], [1, 1, 0]], np.zeros(3), r"region.box.*\[1.0, 1.0, 0.0\]"),
+        (SIDES, [0.0, np.inf, 0.0], "region.point.*inf"),
+    ):
+        with pytest.raises(ModelError, match=message):
+            Region(box, point)

@@ -97,15 +97,6 @@ def test_a_general_machine_in_inches():
     assert limits.speed == pytest.approx(0.2, rel=1e-15)
 
 
-def test_cone_axes_default_to_the_struts_at_home():
-    """Truth: directions between joints at home, where nothing is turned, by NumPy."""
-    geometry = paper_geometry()
-    along = geometry.home.position + geometry.platform_joints - geometry.base_joints
-    along /= np.linalg.norm(along, axis=1)[:, None]
-    np.testing.assert_allclose(geometry.base_cone_axes, along, atol=1e-15)
-    np.testing.assert_allclose(geometry.platform_cone_axes, along, atol=1e-15)
-
-
 # Refused, naming file, key and value.
 
 FIFTH_JOINT = ", [20, -2, 0]]"

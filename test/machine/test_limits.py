@@ -269,26 +269,6 @@ def test_both_ways_of_asking_agree_to_the_last_bit(name: str) -> None:
         assert set(verdicts) >= {"", "stroke", "base_cone", "platform_cone", "condition"}
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 0.0])
-@pytest.mark.parametrize("name", MACHINES)
-def test_both_ways_of_asking_refuse_what_is_no_number(name: str, bad: float) -> None:
-    """Lengths, positions and rotations that are none; a platform joint in its base joint: a strut without direction."""
-    machine = MACHINES[name]
-    for strut in range(6):
-        lengths = strut_lengths(Structure.of(machine), machine.home)
-        lengths[strut] = bad
-        assert hold_together(machine, machine.limits, machine.home, lengths) in ("not_finite", "stroke")
-    lengths = strut_lengths(Structure.of(machine), machine.home)
-    if not np.isfinite(bad):
-        for part in ("position", "rotation"):
-            pose = Pose(machine.home.position.copy(), machine.home.rotation.copy())
-            getattr(pose, part).flags.writeable = True
-            getattr(pose, part)[...] = bad
-            assert hold_together(machine, machine.limits, pose, lengths) != ""
-    joints = machine.home.rotation @ machine.platform_joints[2]
-    assert hold_together(machine, machine.limits, Pose(machine.base_joints[2] - joints, machine.home.rotation), lengths)
-
-
 def compensators_refusal(machine: HexapodGeometry, model: MachineModel, tool: Pose) -> tuple[str, int | None] | None:
     """Return reason and strut with which a fresh compensator refuses a tool pose, None where it does not."""
     try:

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import contextlib
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
+import make_example_models as tool
 import numpy as np
 import pytest
 import yaml
 from helpers import assert_equal
 from strategies import UNEVEN_GRID, paper_geometry, random_field, random_model, skewed_geometry
 
+from hexapod_comp.calibration.evaluation import evaluate_model
 from hexapod_comp.errors import InputFileError, ModelError
-from hexapod_comp.formats.schema import Section
 from hexapod_comp.machine.field import CROSS_AXES, GridField
-from hexapod_comp.machine.model import MachineModel, ModelOrigin
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
 from hexapod_comp.machine.model_file import load_model, parse_model, save_model, terms_text
 from hexapod_comp.machine.region import Region
 from hexapod_comp.machine.struts import StrutErrors
-from hexapod_comp.machine.terms import check_magnitudes, read_terms, settle, table_text, term, write_terms
 
 PAPER, SKEWED = paper_geometry(), skewed_geometry()
 DIGEST = "0123456789abcdef" * 4
@@ -288,16 +289,6 @@ def test_refused(tmp_path, old, new, said):
         assert part in message[len(str(tmp_path)) :]
 
 
-def test_one_missing_line_of_a_family_is_named(tmp_path):
-    """A family is whole or absent: a hole in it would count as a machine without error there."""
-    text = BY_HAND.replace("direction: forward}", "direction: both}").replace(
-        "  - {axis: z, at: [0, 1], direction: backward, dz_mm: [0.001]}\n", ""
-    )
-    assert load(tmp_path, text).field.lines[2].shape[4] == 3
-    with pytest.raises(InputFileError, match=r"the backward line along z at \[0, 1\] is missing"):
-        load(tmp_path, text.replace("at: [0, 1], direction: both", "at: [0, 1], direction: forward"))
-
-
 def test_many_nodes_with_few_lines_take_no_memory(tmp_path):
     """20,000 nodes both ways would be 100 GB of coefficients; the missing lines are found first."""
     nodes = "[" + ", ".join(str(n) for n in range(20_000)) + "]"
@@ -309,19 +300,16 @@ def test_many_nodes_with_few_lines_take_no_memory(tmp_path):
 # Writing.
 
 
-@pytest.mark.parametrize(
-    ("origin", "said"),
-    [
+def test_a_model_without_provenance_is_not_written(tmp_path):
+    path = tmp_path / "m.yaml"
+    path.write_text("the old one")
+    for origin, said in (
         (ModelOrigin(), "date: must be ISO 8601"),
         (ModelOrigin("2026-01-31", (("x.csv", "abc"),)), r"sources\[0\].sha256.*64.*x.csv.*abc"),
         (ModelOrigin("2026-01-31", (), np.nan), "held_out_residual.*nan"),
-    ],
-)
-def test_a_model_without_provenance_is_not_written(tmp_path, origin, said):
-    path = tmp_path / "m.yaml"
-    path.write_text("the old one")
-    with pytest.raises(ModelError, match=said):
-        save_model(MachineModel("paper", origin=origin), path)
+    ):
+        with pytest.raises(ModelError, match=said):
+            save_model(MachineModel("paper", origin=origin), path)
     assert path.read_text() == "the old one"
 
 
@@ -349,21 +337,12 @@ def test_a_file_cut_off_anywhere_is_refused(tmp_path):
     assert load_model(whole, PAPER).origin == ORIGIN
 
 
-@pytest.mark.parametrize(
-    ("text", "key"),
-    [
-        (BY_HAND.replace("machine: paper", "machine: paper\nclosed: true"), "end"),
-        (BY_HAND + "end: true\n", "closed"),
-        (BY_HAND.replace("machine: paper", "machine: paper\nclosed: 1") + "end: true\n", "closed"),
-        (BY_HAND.replace("machine: paper", "machine: paper\nclosed: true") + "end: false\n", "end"),
-    ],
-)
-def test_marks_of_a_closed_file_belong_together(text, key, tmp_path):
-    path = tmp_path / "m.yaml"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(InputFileError) as caught:
-        load_model(path, PAPER)
-    assert caught.value.key == key
+def test_marks_of_a_closed_file_belong_together():
+    opened = BY_HAND.replace("machine: paper", "machine: paper\nclosed: true")
+    for text, key in ((opened, "end"), (BY_HAND + "end: true\n", "closed"), (opened + "end: false\n", "end")):
+        with pytest.raises(InputFileError) as caught:
+            parse_model(text, "paper")
+        assert caught.value.key == key
 
 
 # ---- what the documentation says ----
@@ -389,32 +368,6 @@ def test_the_documented_example_is_a_model():
         parse_model(text, "paper")
 
 
-@dataclass(frozen=True)
-class Sagging:
-    """A model with a term that is a row, and nothing else."""
-
-    sag: np.ndarray = term("load", "um", "of each strut under 1 kN", least=0.0, largest=1e-3)
-
-    def __post_init__(self):
-        settle(self)
-
-
-def test_a_new_term_is_one_row():
-    """Read in any unit, per strut or once; written in its own; refused where no machine has it; and documented."""
-    section = Section("m.yaml", "load", {"sag_mm": 0.02})
-    sagging = Sagging(**read_terms(Sagging, section, "load"))
-    np.testing.assert_allclose(sagging.sag, np.full(6, 2e-5), rtol=1e-15)
-    assert write_terms(sagging, "load") == {"sag_um": 20.0}
-    assert write_terms(Sagging(), "load") == {}
-    with pytest.raises(ModelError, match=r"load.sag.*±1 mm.*unit.*0\.002"):
-        check_magnitudes(Sagging(np.full(6, 2e-3)))
-    with pytest.raises(ModelError, match=r"load.sag.*negative.*-1e-06"):
-        Sagging(np.full(6, -1e-6))
-    with pytest.raises(ModelError, match=r"load.sag.*\(6,\).*\(5,\)"):
-        Sagging(np.zeros(5))
-    assert "| load | `sag_um` | per strut | 0 | ≥ 0, ±1 mm | of each strut under 1 kN |" in table_text(Sagging)
-
-
 # ---- text, shipped name, ideal ----
 
 
@@ -426,3 +379,42 @@ def test_the_ideal_model_has_no_file(tmp_path, monkeypatch):
     assert not any(block.any() for block in (model.base_deviation, model.platform_deviation, model.struts.offset))
     with pytest.raises(InputFileError):  # a path means the file
         load_model(tmp_path / "ideal", SKEWED)
+
+
+CONFIG = Path(__file__).parents[2] / "config"
+
+
+def assert_same(found, expected, where: str) -> None:
+    """Compare parsed YAML: texts and structure exactly, numbers to one last digit (1e-4 of a unit)."""
+    if isinstance(expected, dict):
+        assert list(found) == list(expected), where
+        for key in expected:
+            if key not in ("note", "sources"):
+                assert_same(found[key], expected[key], f"{where}.{key}")
+    elif isinstance(expected, list):
+        assert len(found) == len(expected), where
+        for index, (a, b) in enumerate(zip(found, expected, strict=True)):
+            assert_same(a, b, f"{where}[{index}]")
+    elif isinstance(expected, float):
+        assert found == pytest.approx(expected, abs=1.01e-4 if "held_out" not in where else 2e-3), where
+    else:
+        assert found == expected, where
+
+
+def test_shipped_files_are_what_the_tool_makes(tmp_path):
+    """To the last digit or one beside it: another processor may round the laser lines differently."""
+    tool.main(["--out", str(tmp_path)])
+    for name in ("paper_machine.yaml", "paper_lines_model.yaml"):
+        shipped, fresh = (yaml.safe_load((folder / name).read_text("utf-8")) for folder in (CONFIG, tmp_path))
+        assert_same(fresh, shipped, name)
+
+
+def test_lines_model_is_worth_what_its_file_says():
+    """On the same held-out points; the paper's own figure, about 70 %, is reached on its own metric."""
+    geometry = load_geometry("paper")
+    truth, lines = (load_model(name, geometry) for name in ("paper_machine", "paper_lines_model"))
+    found = evaluate_model(RealMachine(geometry, truth), lines, tool.BOX)
+    assert lines.origin.held_out_residual == pytest.approx(found.after.raw.rms, abs=2e-9)
+    assert found.after.raw.rms < found.before.raw.rms
+    assert found.after.aligned.rms < 0.8 * found.before.aligned.rms
+    assert found.paper.after < 0.3 * found.paper.before

@@ -130,15 +130,6 @@ def test_lost_motion_changes_along_a_worn_screw():
     assert StrutErrors(map_knots=knots, map_values=np.zeros((6, 4))).map_backlash.shape == (6, 4)
 
 
-@pytest.mark.parametrize("count", [2, 3])
-def test_length_map_of_few_knots(count):
-    """Truth: a natural spline through two points is their straight line; through three, SciPy's."""
-    knots, values = np.array([0.3, 0.5, 0.6])[:count], np.array([1e-5, -2e-5, 3e-5])[:count]
-    struts = StrutErrors(map_knots=knots, map_values=np.tile(values, (6, 1)))
-    truth = -0.5e-5 if count == 2 else make_interp_spline(knots, values, 3, bc_type="natural")(0.4)
-    assert length(struts, 0.4) - 0.4 == pytest.approx(truth, abs=2e-16)
-
-
 # There and back.
 
 
@@ -194,13 +185,6 @@ def test_undone_also_where_the_error_is_as_steep_as_allowed(period, offset, phas
 def test_refused(bad, message):
     with pytest.raises(ModelError, match=message):
         StrutErrors(**bad)
-
-
-def test_harmonics_that_no_strut_has_are_left_out():
-    """The core works for those that a model has; and a model is the same however it was written."""
-    struts = StrutErrors(cosine=on_strut_4(3e-6)[:, None] * [1.0, 0.0, 0.0], sine=np.zeros((6, 3)))
-    assert struts.cosine.shape == struts.sine.shape == (6, 1)
-    np.testing.assert_array_equal(machine_of(struts).constants.view["struts"]["harmonics"], on_strut_4(1.0))
 
 
 # Rotation of the screws.

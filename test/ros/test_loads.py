@@ -1,6 +1,6 @@
 """Gravity, wrench and outside numbers through the node: what moves the struts, what is refused, held, or stale.
 
-Truth: the machine model at that load, whose arithmetic test/machine/test_load.py holds against energy and closed forms.
+Truth: the machine model at that load, which test/machine/test_machine.py holds against energy and closed forms.
 """
 
 from __future__ import annotations

@@ -277,16 +277,6 @@ def test_the_mesh_is_closed():
     assert points[0, 0, 2] < points[:, :, 2].mean() < points[-1, 0, 2]
 
 
-def test_poses_of_a_shell_put_the_tool_there():
-    """Truth: the tool is 25 mm above the platform, along the platform's z axis (the file)."""
-    rotation = tilted(unit(), 6.0)
-    found = shell(reach(unit(), rotation, 16), 7, 12)
-    positions, rotations = found.platform_poses(0.7)
-    assert rotations.shape == (7 * 13, 3, 3)
-    np.testing.assert_allclose(positions + 0.025 * rotations[:, :, 2], found.scaled(0.7).reshape(-1, 3), atol=1e-15)
-    np.testing.assert_allclose(rotations, np.broadcast_to(rotation, rotations.shape), atol=1e-15)
-
-
 def test_the_units_shell_holds_its_reach():
     """Truth: the volume by grid columns, which assumes nothing about the shape. The mesh's faces cut off what
     bulges beyond them, less the finer it is."""
