@@ -186,29 +186,6 @@ def test_a_model_of_which_nobody_knows_how_good_it_is_leaves_nobody_knows_what()
 # What is refused: nothing is written, one line says what and where.
 
 
-@pytest.mark.parametrize("when", ["survey", "drawing"])
-def test_an_interruption_leaves_no_half_written_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, when: str
-) -> None:
-    """Exit 130, as shells count it; before the tables are complete there is none, afterwards they are whole."""
-
-    def interrupted(*arguments: object, **options: object) -> None:
-        raise KeyboardInterrupt
-
-    where = {
-        "survey": "hexapod_comp.workspace.study.look_at",
-        "drawing": "hexapod_comp.workspace.pictures.ranking_figure",
-    }
-    monkeypatch.setattr(where[when], interrupted)
-    code, _, err = classify("--out", tmp_path / "ranking.csv", "--pictures", tmp_path, *QUICK)
-    assert code == 130
-    assert "Traceback" not in err
-    written = {path.name for path in tmp_path.iterdir()}
-    assert written == (TABLE if when == "drawing" else set())
-    if when == "drawing":
-        assert len(Done(tmp_path, (code, "", err)).rows) == 4
-
-
 def test_a_tilt_that_no_pose_allows_is_refused_with_the_limits() -> None:
     """At 60° about both axes nothing is reached; the message names every limit that stops it."""
     code, out, err = classify(*QUICK, "--tilt-deg", 60)

@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_machines import Machine, with_frames
+from foreign_machines import with_frames
 from helpers import hexapod, table_lengths, table_poses
 from scipy.spatial.transform import Rotation
 from strategies import paper_geometry, random_model
 
-from hexapod_comp.cli import main, poses, results
+from hexapod_comp.cli import poses, results
 from hexapod_comp.cli.verbs import VERBS
 from hexapod_comp.compensation.checks import check
 from hexapod_comp.compensation.compensator import Compensator
@@ -32,7 +32,7 @@ from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
 from hexapod_comp.machine.model_file import load_model, model_text
-from hexapod_comp.machine.pose_files import read_lengths, read_poses
+from hexapod_comp.machine.pose_files import read_lengths
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.pose import Pose, angles_from_rotation
 
@@ -41,8 +41,6 @@ TABLE_1 = str(ROOT / "config" / "table1.csv")
 PAPER = paper_geometry()
 IDEAL = MachineModel("paper")
 POSE_HEADER = "name,x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg"
-
-DEFAULT_NOTE = "hexapod_comp: note: no --machine was given: this is machine paper, the default\n"
 
 
 def parsed(text: str) -> list[dict[str, str]]:
@@ -131,23 +129,6 @@ def test_control_c_and_a_closed_pipe(monkeypatch: pytest.MonkeyPatch) -> None:
 # ik and fk.
 
 
-@pytest.mark.parametrize(
-    ("model", "start"),
-    [("ideal", ()), ("paper_machine", ("--guess", "-5,3,390,2,-2,1")), ("paper_machine", ("--cold",))],
-)
-def test_ik_then_fk_is_where_it_started(tmp_path: Path, model: str, start: tuple[str, ...]) -> None:
-    """CSV carries 1e-9 mm and degrees; the pose moves by less than ten times the lengths' rounding."""
-    lengths, poses = str(tmp_path / "lengths.csv"), str(tmp_path / "poses.csv")
-    assert hexapod("ik", TABLE_1, "--model", model, "--out", lengths) == (0, "", DEFAULT_NOTE)
-    assert hexapod("fk", lengths, "--model", model, *start, "--out", poses) == (0, "", DEFAULT_NOTE)
-    rows, found = read_poses(poses)
-    assert [row.label for row in rows] == [str(n) for n in range(1, 11)]
-    for pose, wanted in zip(found, table_poses(), strict=True):
-        np.testing.assert_allclose(pose.position, wanted.position, atol=1e-11)
-        np.testing.assert_allclose(pose.rotation, wanted.rotation, atol=1e-10)
-    assert len(read_lengths(lengths)[1]) == 10
-
-
 def test_one_pose_as_text_and_as_json() -> None:
     """Table 2, row 2. Negative numbers need no equals sign."""
     by_list = hexapod("ik", "--pose", "0,0,400,5,0,0")
@@ -223,7 +204,7 @@ def test_a_line_has_both_ways_of_every_strut(tmp_path: Path, machine: str) -> No
     assert len(read_lengths(str(out))[1]) == 2 * half  # fk reads it
 
 
-def test_ik_predicts_the_error_without_compensation_in_the_work_frame(tmp_path: Path) -> None:
+def test_ik_predicts_the_error_without_compensation_in_the_work_frame() -> None:
     """Told nominal lengths, the machine is where ``fk`` says. The shipped model carries no covariance: never a zero."""
     pose = "10,20,420,2,-3,4"
     lengths = json.loads(hexapod("ik", "--pose", pose, "--json")[1])["rows"][0]
@@ -241,14 +222,7 @@ def test_ik_predicts_the_error_without_compensation_in_the_work_frame(tmp_path: 
     assert abs(row["error_aligned_x_um"]) < abs(row["error_x_um"])  # 80 µm of the datum
     text = hexapod("ik", "--pose", pose, "--model", "paper_machine")[1]
     assert text.count("not known") == 1 + 1 + 12  # the direction, the reason, six components twice
-    poses, table = tmp_path / "poses.csv", tmp_path / "table.csv"
-    poses.write_text(f"x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg\n{pose}\n")
-    assert hexapod("ik", str(poses), "--model", "paper_machine", "--out", str(table))[0] == 0
-    header, values = (line.split(",") for line in table.read_text().splitlines())
-    cells = dict(zip(header, values, strict=True))
-    assert float(cells["error_z_um"]) == pytest.approx(row["error_z_um"], abs=1e-5)
-    assert cells["error_z_sd_um"] == ""
-    assert "error_z_um" not in hexapod("ik", str(poses))[1]
+    assert "error_z_um" not in hexapod("ik", "--pose", pose, "--json")[1]
 
 
 def test_fk_names_the_row_without_a_pose(tmp_path: Path) -> None:
@@ -378,15 +352,6 @@ def test_check_long_streams_in_pieces() -> None:
     np.testing.assert_allclose(np.abs(result.limits["step"].value[1:, 0]), steps, atol=1e-15)
 
 
-def test_check_says_when_poses_leave_the_measured_box(tmp_path: Path) -> None:
-    """The shipped field reaches to z = 553 mm; the model of lines was measured in the same box."""
-    path = file_of(tmp_path, [("in", 0, 0, 400, 0, 0, 0), ("out", 0, 0, 600, 0, 0, 0)])
-    _, out, _ = hexapod("check", path, "--model", "paper_machine")
-    assert "boundary value is used there: 1 of 2, first line 3 (row out)\n" in out
-    _, out, _ = hexapod("check", path, "--model", "paper_lines_model")
-    assert "outside the box in which the model was measured: 1 of 2, first line 3 (row out)\n" in out
-
-
 def test_check_refuses_what_makes_no_sense() -> None:
     for mode, rate in (("moves", 0.5), ("moves", np.nan), ("jumps", 250.0)):
         with pytest.raises(GeometryError):
@@ -413,20 +378,6 @@ def test_assess_prints_the_papers_tables() -> None:
     assert "round trip of the real structure" in blocks[-1]
 
 
-def test_assess_statistics_follow_the_seed() -> None:
-    first, again, other = (
-        json.loads(hexapod("assess", "--machines", "5", "--seed", seed, "--json")[1]) for seed in ("5", "5", "6")
-    )
-    assert first == again
-    assert first["statistics"] != other["statistics"]
-    assert first["seeds"] == list(range(5, 10))
-    assert first["round_trip_m"] <= 1e-13
-    assert len(first["records"]) == 50
-    largest = max(row["displacement_um"][2] for row in first["statistics"])
-    found = max(np.linalg.norm([r[f"error_{axis}_um"] for axis in "xyz"]) for r in first["records"])
-    assert largest == pytest.approx(found, rel=1e-9)
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_signals_end_a_session_in_order(number: signal.Signals) -> None:
     """What was started inside is ended, as contexts do; 128 + signal, as shells count."""
@@ -445,136 +396,87 @@ def test_signals_end_a_session_in_order(number: signal.Signals) -> None:
     assert signal.getsignal(number) == before
 
 
-SHOWN = 1e-9  # mm; the last digit of lengths
-
-Printed = pytest.CaptureFixture[str]
-
-
-@pytest.fixture(params=["framed", "inches"])
-def machine(request: pytest.FixtureRequest) -> Machine:
-    return with_frames(request.param)
-
-
-@pytest.fixture
-def file(machine: Machine, tmp_path: Path) -> str:
-    return str(machine.write(tmp_path / "machine.yaml"))
-
-
-def at_home(machine: Machine) -> tuple[str, Pose]:
-    """Return the probe's pose in the fixture with the platform at home: as an option, and as a pose."""
-    used = machine.using("probe", "fixture")
-    pose = Pose(used.tips(np.array([machine.home]), np.eye(3)[None])[0], used.work.matrix.T @ used.tool.matrix)
-    values = [*(pose.position * 1e3), *np.degrees(angles_from_rotation(pose.rotation))]
-    return ",".join(repr(float(value)) for value in values), pose
-
-
-def test_ik_fk_and_check_take_tool_and_work_frame(machine: Machine, file: str, tmp_path: Path, capsys: Printed) -> None:
-    text, pose = at_home(machine)
-    names = ["--machine", file, "--tool", "probe", "--work", "fixture"]
-    assert main(["ik", f"--pose={text}", *names, "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
+@pytest.mark.parametrize("name", ["framed", "inches"])
+def test_tool_and_work_frame_of_ik_fk_check_and_travel(name: str, tmp_path: Path) -> None:
+    """Truth: the zoo's frames and kinematics for the probe in the fixture with the platform at home."""
+    machine = with_frames(name)
+    used, home = machine.using("probe", "fixture"), np.array([machine.home])
+    pose = Pose(used.tips(home, np.eye(3)[None])[0], used.work.matrix.T @ used.tool.matrix)
+    text = ",".join(repr(float(v)) for v in (*pose.position * 1e3, *np.degrees(angles_from_rotation(pose.rotation))))
+    names = ("--machine", machine.write(tmp_path / "machine.yaml"), "--tool", "probe", "--work", "fixture")
+    said = json.loads(hexapod("ik", f"--pose={text}", *names, "--json")[1])
     assert (said["tool"], said["frame"]) == ("probe", "fixture")
     lengths = [said["rows"][0][f"L{n}_mm"] for n in range(1, 7)]
-    truth = machine.lengths(np.array([machine.home]), np.eye(3)[None])[0]
-    np.testing.assert_allclose(lengths, truth * 1e3, rtol=0.0, atol=SHOWN)
-    assert main(["fk", "--lengths", ",".join(map(repr, lengths)), *names, "--json"]) == 0
-    row = json.loads(capsys.readouterr().out)["rows"][0]
+    np.testing.assert_allclose(lengths, machine.lengths(home, np.eye(3)[None])[0] * 1e3, rtol=0.0, atol=1e-9)
+    row = json.loads(hexapod("fk", "--lengths", ",".join(map(repr, lengths)), *names, "--json")[1])["rows"][0]
     np.testing.assert_allclose([row[f"{axis}_mm"] for axis in "xyz"], pose.position * 1e3, rtol=0.0, atol=1e-7)
-    (tmp_path / "poses.csv").write_text(f"x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg\n{text}\n")
-    assert main(["check", str(tmp_path / "poses.csv"), *names]) == 0
-    assert "1 pose of the probe in fixture" in capsys.readouterr().out
-
-
-def test_travel_from_a_pose_and_from_home(machine: Machine, file: str, capsys: Printed) -> None:
-    """The same both ways, and what the function says."""
-    text, pose = at_home(machine)
-    frames = ["--machine", file, "--tool", "probe", "--work", "fixture"]
-    assert main(["travel", f"--pose={text}", *frames, "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    geometry = load_geometry(file).using("probe", "fixture")
+    (tmp_path / "poses.csv").write_text(f"{POSE_HEADER.removeprefix('name,')}\n{text}\n")
+    assert "1 pose of the probe in fixture" in hexapod("check", tmp_path / "poses.csv", *names)[1]
+    geometry = load_geometry(names[1]).using("probe", "fixture")
     ways = travel(RealMachine(geometry, MachineModel(geometry.name)), pose)
-    assert (said["tool"], said["frame"]) == ("probe", "fixture")
-    for row, way in zip(said["travel"], ways, strict=True):
-        assert (row["way"], row["unit"]) == (way.way, way.unit)
-        assert row["travel"] == pytest.approx(way.shown, abs=1e-6)
-        assert row["limit"] == (way.error and way.error.reason)
-    assert main(["travel", *frames]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    told = json.loads(hexapod("travel", f"--pose={text}", *names, "--json")[1])["travel"]
+    assert [(row["way"], row["unit"], row["limit"]) for row in told] == [
+        (way.way, way.unit, way.error and way.error.reason) for way in ways
+    ]
+    assert [row["travel"] for row in told] == pytest.approx([way.shown for way in ways], abs=1e-6)
+    lines = hexapod("travel", *names)[1].splitlines()  # from home
     assert lines[0].startswith(f"machine {machine.name}: how far the probe in fixture may go from x, y, z ")
     assert [line.split()[:3] for line in lines[2:]] == [[w.way, f"{w.shown:.3f}", w.unit] for w in ways]
 
 
-CSV = """elevation_deg,x_um,y_um,z_um,rx_urad,ry_urad,rz_urad
+# A table over outside numbers: a sag of 10 µm at 0° and of 40 µm at 90°.
+
+SAG = """elevation_deg,x_um,y_um,z_um,rx_urad,ry_urad,rz_urad
 0,0,0,-10,0,0,0
 90,0,0,-40,0,0,0
 """
 
 
-@pytest.fixture
-def bent(tmp_path: Path) -> Path:
-    (tmp_path / "sag.csv").write_text(CSV)
-    assert main(["outside", str(tmp_path / "sag.csv"), "--holds", "errors", "--out", str(tmp_path / "bent.yaml")]) == 0
-    return tmp_path / "bent.yaml"
-
-
-def raised_um(model: Path, capsys: Printed, *options: str) -> float:
+def raised_um(model: Path, *options: str) -> float:
     """Return by how much the tool is commanded higher at home."""
-    geometry = load_geometry("paper")
-    x, y, z = geometry.tool_pose(geometry.home).position * 1e3
-    pose = ["--pose", f"{x!r},{y!r},{z!r}".replace("np.float64(", "").replace(")", "")]
-    capsys.readouterr()
-    assert main(["ik", *pose, "--model", str(model), "--json", *options]) == 0
-    row = json.loads(capsys.readouterr().out)["rows"][0]
+    row = json.loads(hexapod("ik", "--pose", "0,0,400", "--model", model, "--json", *options)[1])["rows"][0]
     lengths = np.array([row[f"L{n}_mm"] for n in range(1, 7)]) * 1e-3
-    nominal = RealMachine(geometry, MachineModel("paper")).pose_for(lengths)[0]
-    return float(nominal.position[2] - geometry.home.position[2]) * 1e6
+    return float(RealMachine(PAPER, IDEAL).pose_for(lengths)[0].position[2] - PAPER.home.position[2]) * 1e6
 
 
-def test_a_table_moves_the_tool_where_it_is_looked_up(bent: Path, capsys: Printed) -> None:
-    assert raised_um(bent, capsys, "--outside", "elevation_deg=30") == pytest.approx(20.0, abs=1e-6)
-    assert raised_um(bent, capsys) == pytest.approx(0.0, abs=1e-6)
-    main(["ik", "--pose", "0,0,400", "--model", str(bent)])
-    assert "table over elevation does not count: --outside says where" in capsys.readouterr().err
-
-
-def test_corrections_have_the_other_sign_and_a_calibration_has_seen_some(bent: Path, capsys: Printed) -> None:
-    table = ["outside", str(bent.parent / "sag.csv"), "--out", str(bent)]
-    capsys.readouterr()
-    assert main([*table, "--holds", "corrections", "--beyond", "refuse"]) == 0
-    assert "error of up to 40.00 µm and 0.00 µrad; beyond the table: refuse" in capsys.readouterr().out
-    assert raised_um(bent, capsys, "--outside", "elevation_deg=90") == pytest.approx(-40.0, abs=1e-6)
-    assert main(["ik", "--pose", "0,0,400", "--model", str(bent), "--outside", "elevation_deg=91"]) == 2
-    assert "elevation 91 deg: the table holds elevation 0 to 90 deg" in capsys.readouterr().err
-    assert main([*table, "--holds", "errors", "--calibrated-at", "elevation_deg=60"]) == 0
-    assert raised_um(bent, capsys, "--outside", "elevation_deg=60") == pytest.approx(0.0, abs=1e-6)
-    assert raised_um(bent, capsys, "--outside", "elevation_deg=0") == pytest.approx(-20.0, abs=1e-6)
-
-
-def test_a_table_leaves_what_a_fit_knows_of_a_model(bent: Path) -> None:
-    """The hash that the posterior's file names is that of the model with a table and without."""
-    geometry, out = load_geometry("paper"), bent.parent / "both.yaml"
-    main(["outside", str(bent.parent / "sag.csv"), "--holds", "errors", "--model", "paper_machine", "--out", str(out)])
-    text = out.read_text()
-    (bent.parent / "plain.yaml").write_text(text[: text.index("\noutside:\n") + 1] + "end: true\n")
-    plain, both = (load_model(bent.parent / name, geometry) for name in ("plain.yaml", "both.yaml"))
-    assert both.outside.names == ("elevation",)
-    assert not plain.outside.names
-    assert both.origin.text_sha256 == plain.origin.text_sha256 != ""
-
-
-def test_numbers_that_the_table_has_not_are_refused(bent: Path, capsys: Printed) -> None:
+def test_a_table_moves_the_tool_where_it_is_looked_up(tmp_path: Path) -> None:
+    """Corrections have the other sign; of what a calibration has seen only the difference counts."""
+    (tmp_path / "sag.csv").write_text(SAG)
+    bent = tmp_path / "bent.yaml"
+    table = ("outside", tmp_path / "sag.csv", "--out", bent)
+    for options, at, raised in (
+        (("--holds", "errors"), "30", 20.0),
+        (("--holds", "errors", "--calibrated-at", "elevation_deg=60"), "60", 0.0),
+        (("--holds", "errors", "--calibrated-at", "elevation_deg=60"), "0", -20.0),
+        (("--holds", "corrections", "--beyond", "refuse"), "90", -40.0),
+    ):
+        code, out, _ = hexapod(*table, *options)
+        assert code == 0
+        assert raised_um(bent, "--outside", f"elevation_deg={at}") == pytest.approx(raised, abs=1e-6)
+    assert "error of up to 40.00 µm and 0.00 µrad; beyond the table: refuse" in out
+    assert raised_um(bent) == pytest.approx(0.0, abs=1e-6)
+    assert "table over elevation does not count" in hexapod("ik", "--pose", "0,0,400", "--model", bent)[2]
     for model, given, problem in (
         ("ideal", "elevation_deg=3", "the model has no table"),
-        (bent, "elevation_deg=90000", "the table holds elevation 0 to 90 deg; is the unit right?"),
+        (bent, "elevation_deg=91", "elevation 91 deg: the table holds elevation 0 to 90 deg"),
         (bent, "elevation_mm=3", "outside.elevation_mm: the model's table is over elevation_deg"),
     ):
-        assert main(["ik", "--pose", "0,0,400", "--model", str(model), "--outside", given]) == 2
-        assert problem in capsys.readouterr().err
+        code, _, err = hexapod("ik", "--pose", "0,0,400", "--model", model, "--outside", given)
+        assert code == 2
+        assert problem in err
+    export = ("export", "--c", tmp_path / "c", "--model", bent)
+    assert "outside.names: cannot be exported: the C core does not know it" in hexapod(*export)[2]
+    assert hexapod(*export, "--outside", "elevation_deg=45")[0] == 0
+    assert ".powers = {1, 0, 0}" in (tmp_path / "c" / "hexapod_model.h").read_text()
 
 
-def test_an_export_needs_to_know_where(bent: Path, capsys: Printed) -> None:
-    folder = str(bent.parent / "c")
-    assert main(["export", "--c", folder, "--model", str(bent)]) == 2
-    assert "outside.names: cannot be exported: the C core does not know it" in capsys.readouterr().err
-    assert main(["export", "--c", folder, "--model", str(bent), "--outside", "elevation_deg=45"]) == 0
-    assert ".powers = {1, 0, 0}" in (bent.parent / "c" / "hexapod_model.h").read_text()
+def test_a_table_leaves_what_a_fit_knows_of_a_model(tmp_path: Path) -> None:
+    """The hash that the posterior's file names is that of the model with a table and without."""
+    (tmp_path / "sag.csv").write_text(SAG)
+    out = ("--model", "paper_machine", "--out", tmp_path / "both.yaml")
+    assert hexapod("outside", tmp_path / "sag.csv", "--holds", "errors", *out)[0] == 0
+    text = (tmp_path / "both.yaml").read_text()
+    (tmp_path / "plain.yaml").write_text(text[: text.index("\noutside:\n") + 1] + "end: true\n")
+    plain, both = (load_model(tmp_path / name, PAPER) for name in ("plain.yaml", "both.yaml"))
+    assert (both.outside.names, plain.outside.names) == (("elevation",), ())
+    assert both.origin.text_sha256 == plain.origin.text_sha256 != ""

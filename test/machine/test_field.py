@@ -43,38 +43,6 @@ def inside(rng):
     return np.array([rng.uniform(nodes[0], nodes[-1]) for nodes in UNEVEN_GRID])
 
 
-# One cell, x from −100 to 100 mm, y from 0 to 100 mm, z from 0 to 200 mm, in micrometres.
-CELL = (np.array([-0.1, 0.1]), np.array([0.0, 0.1]), np.array([0.0, 0.2]))
-ALONG_X = {(0, 0): [1, 2, 0], (0, 1): [3, 0, 0], (1, 0): [5, -4, 8], (1, 1): [7, 1, 0]}
-ALONG_Y = {(0, 0): [2, 0, 0], (0, 1): [4, 10, 0], (1, 0): [0, 0, 0], (1, 1): [8, 0, 0]}
-ALONG_Z = {(0, 0): [1, 0, 4], (0, 1): [0, 0, 0], (1, 0): [6, 2, 0], (1, 1): [10, 0, 0]}
-
-
-def test_hand_worked_cell():
-    """At (25, 30, 50) mm. Truth: worked by hand from 001, W_xi and Δx; every number is below.
-
-    u = 25/100 = 0.25, v = 2·30/100 − 1 = −0.4, w = 2·50/200 − 1 = −0.5; shares of the way through the cell:
-    x 125/200 = 0.625, y 0.3, z 0.25.
-
-    dx: lines at (y, z) low-low, low-high, high-low, high-high are worth 1.5, 3, 5 − 1 + 0.5 = 4.5, 7.25 and
-        weigh 0.7·0.75 = 0.525, 0.7·0.25 = 0.175, 0.3·0.75 = 0.225, 0.3·0.25 = 0.075:
-        0.7875 + 0.525 + 1.0125 + 0.54375 = 2.86875.
-    dy: (x, z): 2, 4 − 4 = 0, 0, 8 weigh 0.375·0.75 = 0.28125, 0.09375, 0.46875, 0.625·0.25 = 0.15625:
-        0.5625 + 0 + 0 + 1.25 = 1.8125.
-    dz: (x, y): 1 + 4·0.25 = 2, 0, 6 − 1 = 5, 10 weigh 0.375·0.7 = 0.2625, 0.1125, 0.4375, 0.1875:
-        0.525 + 0 + 2.1875 + 1.875 = 4.5875.
-    Tolerance: a few roundings of 1e-16 relative.
-    """
-    lines = [np.zeros((2, 2, 2, 6, 3)) for _ in range(3)]
-    for component, worked in enumerate((ALONG_X, ALONG_Y, ALONG_Z)):
-        for (first, second), coefficients in worked.items():
-            lines[component][:, first, second, component] = np.array(coefficients) * 1e-6
-    error, outside = GridField(CELL, tuple(lines)).evaluate([0.025, 0.030, 0.050], FORWARD)
-    np.testing.assert_allclose(error[:3], [2.86875e-6, 1.8125e-6, 4.5875e-6], rtol=1e-14)
-    assert not error[3:].any()
-    assert outside is False
-
-
 def paper_weights(p, q, corners):
     """Return W_1 … W_4 of 001 for the point (p, q): the corner opposite to i is k = Mod(i + 2).
 

@@ -216,19 +216,6 @@ def test_the_first_error_ends_a_shared_batch(monkeypatch: pytest.MonkeyPatch, fa
 # --- errors ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("yaw", [90.0, -90.0])
-def test_octahedral_machine_yawed_by_a_quarter_turn_is_singular(yaw: float) -> None:
-    """Fichter 1986: a 6-3 machine with both bodies level loses a freedom at γ = ±90°, at any height."""
-    singular = Pose.from_angles(HOME.position, np.deg2rad([0.0, 0.0, yaw]))
-    with pytest.raises(SingularError) as caught:
-        solve_pose(IDEAL, strut_lengths(IDEAL, singular), singular)
-    assert caught.value.limit == IDEAL.max_condition
-    near = Pose.from_angles(HOME.position, np.deg2rad([0.0, 0.0, yaw * 0.97]))
-    with pytest.raises(SingularError) as caught:
-        solve_pose(IDEAL, strut_lengths(IDEAL, near), near)
-    assert caught.value.value > caught.value.limit
-
-
 def test_refused_by_name() -> None:
     lengths = strut_lengths(IDEAL, HOME)
     with pytest.raises(NotFiniteError, match="strut_4"):

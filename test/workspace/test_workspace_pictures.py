@@ -62,23 +62,6 @@ def test_shells_say_what_they_show(tmp_path):
     assert (tmp_path / "shells.png").stat().st_size > 20_000
 
 
-def test_bars_from_minimum_to_maximum(tmp_path):
-    """Truth: 004, Table 1, two of its rows; 15.41 m° are 268.95 µrad."""
-    rows = [
-        ("screw pitch ±20 µm", np.array([34.4e-6, 22.4e-6, 268.95e-6, 186.92e-6])),
-        ("base joint x/y ±10 µm", np.array([13.68e-6, 1e-12, 107.51e-6, 0.0])),
-    ]
-    figure = ranking_figure(rows, "Table 1 of 004")
-    left, right = figure.axes
-    bar = left.patches[0]
-    assert (bar.get_x(), bar.get_x() + bar.get_width()) == pytest.approx((22.4, 34.4))
-    assert right.patches[0].get_x() + right.patches[0].get_width() == pytest.approx(15.41, abs=1e-3)
-    for part in ("Table 1 of 004", "screw pitch ±20 µm", "22.4 – 34.4", "≈ 0 – 13.7", "µm", "m°", "minimum – maximum"):
-        assert part in texts(figure)
-    assert left.get_ylim()[0] > left.get_ylim()[1]  # the worst on top
-    save(figure, tmp_path / "bars.png")
-
-
 def test_no_picture_of_nothing():
     empty = Layer(mesh(), np.full((9, 17), np.nan))
     for make, said in (
