@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import yaml
 from foreign_machines import UM, Errors, aligned_rms, machine_names, machines, tool_errors
+from helpers import hexapod
 from strategies import paper_geometry
 
-from hexapod_comp import cli
 from hexapod_comp.errors import HexapodError, InputFileError, ModelError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
@@ -127,31 +127,32 @@ noise: {linear_um: 0.5, rotation_arcsec: 0.2, straightness_um: 0}
 """
 
 
-def run(*arguments: str) -> int:
-    return cli.main(["simulate", *arguments])
-
-
-def test_verb_writes_what_it_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    small = tmp_path / "small.yaml"
-    small.write_text(SMALL)
-    paths = [str(tmp_path / name) for name in ("one.csv", "two.csv", "other.csv")]
-    for path, seed in zip(paths, ("1", "1", "2"), strict=True):
-        assert run("--campaign", str(small), "--seed", seed, "--out", path) == 0
-    text = capsys.readouterr().out
-    one, two, other = (Path(path).read_bytes() for path in paths)
+def test_verb_writes_what_it_says(tmp_path: Path) -> None:
+    (tmp_path / "small.yaml").write_text(SMALL)
+    paths = [tmp_path / name for name in ("one.csv", "two.csv", "other.csv")]
+    for path, seed in zip(paths, (1, 1, 2), strict=True):
+        said = hexapod("simulate", "--campaign", tmp_path / "small.yaml", "--seed", seed, "--out", path)
+        assert said[0] == 0
+    one, two, other = (path.read_bytes() for path in paths)
     assert one == two != other
-    geometry = paper_geometry()
-    campaign = load_campaign(small)
+    geometry, campaign = paper_geometry(), load_campaign(tmp_path / "small.yaml")
     truth = RealMachine(geometry, load_model(config_file("paper_machine"), geometry))
     expected = measure(template(campaign, geometry, 1), campaign, truth, 1)
-    assert f"{len(expected)} readings of 21 runs" in text  # 16 lines, 4 diagonals, the poses
+    assert f"{len(expected)} readings of 21 runs" in said[1]  # 16 lines, 4 diagonals, the poses
     # The file has what instruments show, a tenth of a nanometre, and states their noise, to rounding in its unit.
-    found = read_tidy(paths[0], geometry)
+    found = read_tidy(str(paths[0]), geometry)
     np.testing.assert_allclose(found.value, expected.value, rtol=0.0, atol=0.51e-10)
     np.testing.assert_allclose(found.uncertainty, expected.uncertainty, rtol=1e-15)
     stated = {kind: found.uncertainty[of_kind(found, kind)][0] for kind in ("linear", "rotation", "position")}
     assert stated == pytest.approx({"linear": 0.5e-6, "rotation": np.radians(0.2 / 3600.0), "position": 10e-6})
     assert np.isnan(found.uncertainty[of_kind(found, "straightness")]).all()
+    # A machine that warms: times, temperatures and humidity of the shipped sensors.
+    options = ("--warm-up", "warm_up", "--model", "paper_machine", "--out", tmp_path / "warm.csv")
+    said = hexapod("simulate", "--campaign", tmp_path / "small.yaml", *options)
+    assert "\nwarms while it is measured: strut_1 " in said[1]
+    stations = read_tidy(str(tmp_path / "warm.csv"), geometry).stations
+    assert np.isfinite(stations.times).all()
+    assert np.ptp(stations.temperatures[:, 0]) > 0.3
 
 
 ALIKE = WarmUp(
@@ -232,54 +233,22 @@ def test_the_shipped_file_and_one_with_a_slip(tmp_path: Path) -> None:
             load_warm_up(path)
 
 
-SHORT = """format: hexapod_comp/warm_up
-version: 1
-struts_rise_K: 3.0
-struts_time_constant_s: 1500
-base_time_constant_s: 5400
-platform_time_constant_s: 3000
-expansion_ppm_per_K: [11.5, 11.5, 11.5]
-humidity_percent: [45, 65]
-humidity_time_constant_s: 3600
-rounds: 1
-"""
-
-
-def test_the_verb_writes_times_and_what_sensors_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    paths = {name: tmp_path / name for name in ("warm.yaml", "small.yaml", "out.csv")}
-    paths["warm.yaml"].write_text(SHORT, encoding="utf-8")
-    paths["small.yaml"].write_text(SMALL, encoding="utf-8")
-    options = ["--campaign", str(paths["small.yaml"]), "--warm-up", str(paths["warm.yaml"]), "--model", "paper_machine"]
-    assert cli.main(["simulate", *options, "--out", str(paths["out.csv"])]) == 0
-    assert "warms while it is measured: strut_1 0." in capsys.readouterr().out
-    back = read_tidy(paths["out.csv"], load_geometry("paper"))
-    assert np.isfinite(back.stations.times).all()
-    assert np.ptp(back.stations.temperatures[:, 0]) > 0.3
-    assert np.ptp(back.stations.humidity) > 0.005
-
-
 # Leaves what the tests' own reader and kinematics have: structure, offsets and pitch
 PLAIN = ("--wave-um", "0", "--map-um", "0", "--backlash-um", "0")
 
 
 @pytest.mark.parametrize("name", machine_names())
-def test_any_machine(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_any_machine(name: str, tmp_path: Path) -> None:
     """The figures of the report are those of the file, at random places of the box that the report names."""
     # Of 1,000 places each. Aligned errors grow towards the corners, so that squares scatter by one and a half times
     # their size: a mean square good to 4.5/√1000 = 14 %, its root to 7 %, two such 10 %.
     machine = machines()[name]
     geometry, out = machine.write(tmp_path / "machine.yaml"), tmp_path / "truth.yaml"
     bounds = ("--joints-um", "30", "--struts-um", "20", "--pitch-ppm", "100")
-    words = ["imagine", "--machine", geometry, *bounds, *PLAIN, "--seed", "3", "--out", out]
-    assert cli.main([str(word) for word in words]) == 0
-    said = capsys.readouterr().out
+    said = hexapod("imagine", "--machine", geometry, *bounds, *PLAIN, "--seed", 3, "--out", out)[1]
     truth = Errors.read(out)
-    for values, bound in (
-        (truth.base, 30 * UM),
-        (truth.platform, 30 * UM),
-        (truth.offset, 20 * UM),
-        (truth.pitch, 1e-4),
-    ):
+    bodies = np.stack([truth.base, truth.platform])
+    for values, bound in ((bodies, 30 * UM), (truth.offset, 20 * UM), (truth.pitch, 1e-4)):
         assert 0.5 * bound < np.abs(values).max() <= bound
         assert len(np.unique(values)) > 3
     corners, raw, aligned = re.search(r"in \((.*)\) mm of work: ([\d.]+) µm RMS as it is, ([\d.]+) µm", said).groups()
@@ -290,17 +259,15 @@ def test_any_machine(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert float(aligned) * UM == pytest.approx(aligned_rms(tips, errors), rel=0.1)
 
 
-def test_every_bound_ends_where_it_belongs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_bound_ends_where_it_belongs(tmp_path: Path) -> None:
     """The file's keys carry the units; each value lies within its option's bound, and only then."""
     out = tmp_path / "truth.yaml"
-    words = ["--joints-um", "0", "--struts-um", "0", "--pitch-ppm", "0", "--wave-um", "2,3", "--wave-period-mm", "4"]
-    words += ["--map-um", "1.5", "--backlash-um", "5,6", "--wear-um", "3", "--strut-expansion-ppm-per-k", "10,11"]
-    words += ["--body-expansion-ppm-per-k", "12,13", "--field-um", "7", "--field-urad", "9"]
-    words += ["--field-reversal-percent", "20", "--box", "-50,-50,360,50,50,440", "--name", "all of it"]
-    assert cli.main(["imagine", *words, "--seed", "2", "--json", "--out", str(out)]) == 0
-    told = json.loads(capsys.readouterr().out)
+    options = "--joints-um 0 --struts-um 0 --pitch-ppm 0 --wave-um 2,3 --wave-period-mm 4 --map-um 1.5 --wear-um 3"
+    options += " --backlash-um 5,6 --strut-expansion-ppm-per-k 10,11 --body-expansion-ppm-per-k 12,13 --field-um 7"
+    options += " --field-urad 9 --field-reversal-percent 20 --box -50,-50,360,50,50,440 --name all"
+    told = json.loads(hexapod("imagine", *options.split(), "--seed", 2, "--json", "--out", out)[1])
     content = yaml.safe_load(out.read_text())
-    assert (content["machine"], content["name"], told["name"], told["seed"]) == ("paper", "all of it", "all of it", 2)
+    assert (content["machine"], content["name"], told["name"], told["seed"]) == ("paper", "all", "all", 2)
     struts, field = content["struts"], content["field"]
     assert "structure" not in content or not np.any(content["structure"].get("base_deviation_um", 0.0))
     assert not np.any(struts.get("offset_um", 0.0))
@@ -329,16 +296,6 @@ def test_every_bound_ends_where_it_belongs(tmp_path: Path, capsys: pytest.Captur
     assert told["tool_error"]["frame"] == "work"
 
 
-CAMPAIGN = """format: hexapod_comp/campaign
-version: 1
-box_mm: [[-30, -30, 380], [30, 30, 420]]
-cell_mm: 40
-step_mm: 20
-instrument: 1-D
-diagonals: 0
-"""
-
-
 @pytest.mark.parametrize(
     "command",
     [
@@ -347,25 +304,16 @@ diagonals: 0
         "simulate --campaign {}/campaign.yaml --out {}/m.csv --json --truth",
     ],
 )
-def test_random_is_the_same_machine_in_every_verb(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """By its name and by the file of ``imagine`` with that seed: the same answers and files, but for the name."""
-    (tmp_path / "campaign.yaml").write_text(CAMPAIGN)
+def test_random_is_the_same_machine_in_every_verb(command: str, tmp_path: Path) -> None:
+    """By its name and by the file of ``imagine`` with that seed: the same numbers, printed and in files."""
+    (tmp_path / "campaign.yaml").write_text(SMALL)
     file = tmp_path / "truth.yaml"
-    assert cli.main(["imagine", "--seed", "4", "--out", str(file)]) == 0
-    capsys.readouterr()
+    assert hexapod("imagine", "--seed", 4, "--out", file)[0] == 0
     answers = []
-    for name in (str(file), "random:4", "random:5"):
-        assert cli.main([*command.replace("{}", str(tmp_path)).split(), name]) == 0
-        made = [path.read_text() for path in sorted(tmp_path.glob("*.csv"))]
-        answers.append((numbers(capsys.readouterr().out), [numbers(text) for text in made]))
-    assert answers[0][0] == pytest.approx(answers[1][0], rel=1e-12, abs=1e-12)
-    for one, other in zip(answers[0][1], answers[1][1], strict=True):
-        assert one == pytest.approx(other, rel=1e-12, abs=1e-12)
+    for name in (file, "random:4", "random:5"):
+        code, out, _ = hexapod(*command.replace("{}", str(tmp_path)).split(), name)
+        assert code == 0
+        texts = [out, *(path.read_text() for path in sorted(tmp_path.glob("*.csv")))]
+        answers.append([float(n) for n in re.findall(r"-?\d+\.\d+(?:e[+-]?\d+)?", "\n".join(texts))])
+    assert answers[0] == pytest.approx(answers[1], rel=1e-12, abs=1e-12)
     assert answers[0] != answers[2]
-
-
-def numbers(text: str) -> list[float]:
-    """Return all numbers of a text that have a point."""
-    return [float(word) for word in re.findall(r"-?\d+\.\d+(?:e[+-]?\d+)?", text)]

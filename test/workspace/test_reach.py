@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foreign_machines import machines
-from helpers import segment_distance
+from helpers import hexapod, segment_distance
 from strategies import PAPER_FILE, paper_geometry
 
-from hexapod_comp import cli
 from hexapod_comp.core import Status
 from hexapod_comp.errors import GeometryError, InputFileError
 from hexapod_comp.machine import kinematics
@@ -48,13 +47,7 @@ def unit() -> HexapodGeometry:
 
 
 def limited(geometry: HexapodGeometry, **limits: object) -> HexapodGeometry:
-    """Return a machine with other limits and its other parts as they are."""
-    return rebuilt(geometry, limits=replace(geometry.limits, **limits))
-
-
-def rebuilt(geometry: HexapodGeometry, **parts: object) -> HexapodGeometry:
-    kept = ("name", "base_joints", "platform_joints", "home", "limits", "tool", "work")
-    return HexapodGeometry(**{**{name: getattr(geometry, name) for name in kept}, **parts})
+    return replace(geometry, limits=replace(geometry.limits, **limits))
 
 
 def tilted(geometry: HexapodGeometry, alpha: float = 0.0, beta: float = 0.0, gamma: float = 0.0) -> np.ndarray:
@@ -105,18 +98,6 @@ def quantities(geometry: HexapodGeometry, tip: np.ndarray, rotation: np.ndarray)
 # Single poses.
 
 
-def test_how_low_and_how_high_the_unit_goes():
-    """Truth: Pythagoras. On the axis each strut spans the same way across, d² = r² + R² − 2rR·cos 25°, so that
-    the platform is at √(L² − d²); the tool 25 mm above it. The file gives joints to half a micrometre."""
-    across = 0.15**2 + 0.06**2 - 2.0 * 0.15 * 0.06 * np.cos(np.deg2rad(25.0))
-    low, high = np.sqrt(0.158**2 - across) + 0.025, np.sqrt(0.218**2 - across) + 0.025
-    start = np.array([[0.0, 0.0, 0.185]] * 2)
-    end = np.array([[0.0, 0.0, 0.10], [0.0, 0.0, 0.30]])
-    points, findings, _ = Examiner(unit()).boundary(start, end, LEVEL)
-    np.testing.assert_allclose(points[:, 2], [low, high], atol=1e-6)
-    assert findings.tolist() == [Status.STROKE_SHORT, Status.STROKE_LONG]
-
-
 def test_poses_of_their_own_orientation(monkeypatch):
     """Truth: the same poses asked one by one; and the same on one thread and on three, more than one slice."""
     monkeypatch.setattr(kinematics, "ALONE", -1.0)  # others help from the second slice on
@@ -138,7 +119,7 @@ def test_work_and_tool_frames_only_rename_poses():
     """Truth: a rigid motion of the frame in which poses are told changes no pose."""
     geometry, rng = unit(), np.random.default_rng(3)
     work = Pose.from_angles([0.1, -0.2, 0.05], [0.3, -0.2, 1.0])
-    moved = rebuilt(geometry, work=work)
+    moved = replace(geometry, work=work)
     tips = rng.uniform([-0.09, -0.09, 0.14], [0.09, 0.09, 0.23], (2000, 3))
     told = (tips - work.position) @ work.rotation
     expected, _ = Examiner(geometry).findings(tips, LEVEL[None])
@@ -244,47 +225,31 @@ def test_an_empty_workspace_says_where_and_why():
         possible_box(short, tilted(short, gamma=180.0))
 
 
-def unit_reach() -> Reach:
-    return reach(unit(), cells=24)
-
-
-def small_shell() -> Shell:
-    return shell(unit_reach(), 19, 36)
-
-
 def within(found: Shell, points: np.ndarray) -> np.ndarray:
     return Examiner(found.geometry).findings(points.reshape(-1, 3), found.rotation[None])[0] == Status.OK
 
 
-def test_a_shell_is_the_boundary():
-    """Truth: the limits themselves, a micrometre before the shell and a micrometre beyond it."""
+def test_a_shell_is_the_boundary_closed_and_holds_the_reach():
+    """Truth: the limits themselves a micrometre before the shell and beyond it, and the volume by grid columns.
+
+    The mesh's faces cut off what bulges beyond them, less the finer it is.
+    """
     for rotation in (LEVEL, tilted(unit(), 6.0, -3.0, 5.0)):
-        found = shell(reach(unit(), rotation, 24), 19, 36)
+        seen = reach(unit(), rotation, 24)
+        found, fine = shell(seen, 19, 36), shell(seen, 61, 120)
         away = found.points - found.centre
         step = 1e-6 * away / np.linalg.norm(away, axis=-1, keepdims=True)
         assert within(found, found.points - step).all()
         assert not within(found, found.points + step).any()
         beyond, _ = Examiner(unit()).findings((found.points + step).reshape(-1, 3), rotation[None])
         assert (beyond == found.findings.ravel()).mean() > 0.99  # at an edge of two limits either may come first
-
-
-def test_the_mesh_is_closed():
-    """Truth: a surface without a hole: poles are points, the last azimuth is the first."""
-    points = small_shell().points
-    assert np.array_equal(points[:, 0], points[:, -1])
-    for pole in (points[0], points[-1]):
-        assert (pole == pole[0]).all()
-    assert points[0, 0, 2] < points[:, :, 2].mean() < points[-1, 0, 2]
-
-
-def test_the_units_shell_holds_its_reach():
-    """Truth: the volume by grid columns, which assumes nothing about the shape. The mesh's faces cut off what
-    bulges beyond them, less the finer it is."""
-    found = unit_reach()
-    coarse, fine = shell(found, 19, 36), shell(found, 61, 120)
-    assert not fine.folded.any()
-    assert 0.97 < coarse.coverage < fine.coverage
-    assert fine.coverage == pytest.approx(1.0, abs=0.01)
+        assert np.array_equal(found.points[:, 0], found.points[:, -1])  # the last azimuth is the first
+        for pole in (found.points[0], found.points[-1]):
+            assert (pole == pole[0]).all()
+        assert found.points[0, 0, 2] < found.points[:, :, 2].mean() < found.points[-1, 0, 2]
+        assert not fine.folded.any()
+        assert 0.97 < found.coverage < fine.coverage
+        assert fine.coverage == pytest.approx(1.0, abs=0.01)
 
 
 def test_what_rays_do_not_see_is_said():
@@ -301,11 +266,7 @@ def test_what_rays_do_not_see_is_said():
 
 
 def lengths(geometry: HexapodGeometry, tips: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Return strut lengths (N, 6) for tool tips in work, by NumPy alone."""
-    work, tool = geometry.work, geometry.tool
-    platform = work.rotation @ rotation @ tool.rotation.T
-    positions = work.position + tips @ work.rotation.T - platform @ tool.position
-    return np.linalg.norm(positions[:, None] + geometry.platform_joints @ platform.T - geometry.base_joints, axis=2)
+    return np.linalg.norm(ends(geometry, tips, rotation) - geometry.base_joints, axis=2)
 
 
 def test_the_largest_box_of_a_grid_is_found():
@@ -372,32 +333,24 @@ def test_a_campaign_without_a_box_needs_a_machine():
 
 
 @pytest.mark.parametrize("name", ["hanging", "inches"])
-def test_simulate_measures_any_machine_in_its_own_box(name: str, tmp_path: Path, capsys):
-    machine = machines()[name]
-    geometry = machine.write(tmp_path / "machine.yaml")
-    out = tmp_path / "measured.csv"
+def test_simulate_measures_any_machine_in_its_own_box(name: str, tmp_path: Path):
+    geometry, out = machines()[name].write(tmp_path / "machine.yaml"), tmp_path / "measured.csv"
     campaign = tmp_path / "coarse.yaml"
     campaign.write_text("format: hexapod_comp/campaign\nversion: 1\ninstrument: 1-D\ncell_mm: 300\nstep_mm: 150\n")
-    asked = ["simulate", "--machine", str(geometry), "--truth", "ideal", "--campaign", str(campaign), "--out", str(out)]
-    assert cli.main(asked) == 0
-    assert "gives no box: the largest that" in capsys.readouterr().err
+    told = hexapod("simulate", "--machine", geometry, "--truth", "ideal", "--campaign", campaign, "--out", out)
+    assert "gives no box: the largest that" in told[2]
     box = machine_box(load_geometry(geometry)).box
     with out.open(newline="", encoding="utf-8") as file:
         tips = np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in csv.DictReader(file)]) * 1e-3
     np.testing.assert_allclose([tips.min(axis=0), tips.max(axis=0)], box, atol=1e-9)
 
 
-# As `show` shows it.
-
-
-def test_show_draws_and_says_in_which_frame(tmp_path: Path, capsys):
-    assert cli.main(["show", "example_6_6", "--pictures", str(tmp_path / "new")]) == 0
-    printed = capsys.readouterr().out
+def test_show_draws_and_says_in_which_frame(tmp_path: Path):
+    printed = hexapod("show", "example_6_6", "--pictures", tmp_path / "new")[1]
     assert (tmp_path / "new" / "machine.png").stat().st_size > 50_000
     assert printed.count("work frame x ") == 3  # reach, largest box, box for campaigns
     assert "look again" not in printed
-    assert cli.main(["show", "paper", "--json"]) == 0
-    shown = json.loads(capsys.readouterr().out)
+    shown = json.loads(hexapod("show", "paper", "--json")[1])
     assert shown["largest_box"]["frame"] == shown["campaign_box"]["frame"] == "work"
     assert any("joint_axes are missing" in text for text in shown["look_again"])
     np.testing.assert_allclose(shown["home_lengths_m"], 0.509192, atol=5e-7)  # Table 2 of Song et al., pose 1
