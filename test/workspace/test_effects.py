@@ -150,7 +150,7 @@ def test_poses_without_a_certified_answer_are_nan_and_counted():
     errors = every_error(geometry)
     upside_down = geometry.home.position * [1.0, 1.0, -1.0]  # the mirror image: another assembly mode
     positions = np.array([geometry.home.position, upside_down, geometry.home.position, [np.nan, 0.0, 0.4]])
-    fichter = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()  # singular, see benchmarks/assembly.py
+    fichter = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()  # singular
     rotations = np.array([np.eye(3), np.eye(3), fichter, np.eye(3)])
     for method in ("exact", "linear"):
         found = effects(geometry, errors, positions, rotations, method)
