@@ -199,20 +199,22 @@ class Rig(Bench):
                 self.jobs = getattr(self, "jobs", None) or Jobs()
                 return pickle.loads(pickle.dumps(self.jobs.do(*pickle.loads(pickle.dumps(request)))))
 
+        def clocked(simulated: Any = None) -> StampClock:
+            return StampClock(simulated, rig.clock.time_ns, rig.clock.monotonic_ns)
+
         patch.setattr(Source, "model", READ_MODEL)
         patch.setattr(Source, "geometry", READ_GEOMETRY)
         for name, module in list(sys.modules.items()):
             if name.startswith(("hexapod_comp.ros.", "hexapod_comp.linuxcnc.", "hexapod_comp.testing.bench")):
-                for what, stand_in in (("time", self.clock), ("Alarm", Alarm)):
+                for what, stand_in in (("time", self.clock), ("Alarm", Alarm), ("StampClock", clocked)):
                     if hasattr(module, what) and name != "hexapod_comp.ros.rclpy_compat":
                         patch.setattr(module, what, stand_in)
         patch.setattr(rclpy_compat, "time", self.clock)
         patch.setattr(rclpy_compat, "Thread", lambda **_: SimpleNamespace(start=lambda: None, join=lambda: None))
         patch.setattr(worker, "_Process", Process)
         patch.setattr(worker, "ThreadPoolExecutor", AtOnce)
-        base, clock = "hexapod_comp.ros.base", self.clock
-        patch.setattr(f"{base}.StampClock", lambda simulated: StampClock(simulated, clock.time_ns, clock.monotonic_ns))
-        patch.setattr(f"{base}.publishers", lambda node, topic: (tuple(sorted(set(self.speakers(topic)))), ""))
+        clock = self.clock
+        patch.setattr("hexapod_comp.ros.base.publishers", lambda node, topic: (tuple(sorted(set(self.speakers(topic)))), ""))
         patch.setattr("hexapod_comp.ros.requests.callers", lambda node, service: "/witness")
         make = Node.create_subscription
         self.ros_clock = SimpleNamespace(now=lambda: Time(nanoseconds=clock.time_ns(), clock_type=ClockType.ROS_TIME))

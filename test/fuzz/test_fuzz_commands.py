@@ -1,30 +1,23 @@
-"""The command line with mutated files and arguments: a result that is right, or exit code 2 and words for people.
+"""The command line with mutated files, recordings and arguments: a result, or exit code 2 and words for people.
 
-Truth: for lengths and poses, the closed form of the paper machine (node_helpers.py) on the file's own numbers.
+What is read of a file is judged in test_fuzz_files.py; here that a verb bears whatever was accepted.
 """
 
 from __future__ import annotations
 
 import contextlib
-import csv
 import io
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 from fuzzing import COUNTS, NASTY_NUMBERS, NASTY_TEXTS, cases, check_message, edits, mutated
 from hypothesis import example, given
 from hypothesis import strategies as st
-from node_helpers import closed_form_lengths
-from scipy.spatial.transform import Rotation
-from strategies import paper_geometry
-from test_fuzz_files import BY_HAND, CONFIG, GEOMETRIES, LENGTHS, POSES, TIDY, plain_csv
+from replay_helpers import RecordedMachine, write_bag
+from test_fuzz_files import BY_HAND, CONFIG, GEOMETRIES, LENGTHS, POSES, TIDY
 
 from hexapod_comp import cli
-from hexapod_comp.pose import Pose
-
-STROKE = paper_geometry().limits.stroke * 1e3
 
 CAMPAIGN = b"""format: hexapod_comp/campaign
 version: 1
@@ -108,48 +101,9 @@ def test_mutated_files(folder: Path, number: int, changes: list) -> None:
         arguments.insert(0, str(changed))
     COUNTS["commands"] += 1
     code, out, _ = command(verb, *arguments)
-    if code == 2:
-        return
-    COUNTS["commands accepted"] += 1
-    assert out.strip()
-    if (verb, name) == ("ik", "poses.csv"):
-        right_lengths(out, data)
-    if (verb, name) == ("fk", "lengths.csv"):
-        right_poses(out, data)
-
-
-def rows_of(data: bytes) -> list[dict[str, str]]:
-    return list(csv.DictReader(io.StringIO(plain_csv(data).decode())))
-
-
-def poses_in(data: bytes) -> list[Pose]:
-    """Return the poses of a CSV file, by SciPy's Euler angles or quaternions."""
-    poses = []
-    for row in rows_of(data):
-        if "qx" in row:
-            turn = Rotation.from_quat([float(row[f"q{c}"]) for c in "xyzw"])
-        else:
-            names = ("beta", "alpha", "gamma")
-            rad = [float(row.get(f"{name}_rad") or np.radians(float(row.get(f"{name}_deg", 0)))) for name in names]
-            turn = Rotation.from_euler("YXZ", rad)
-        poses.append(Pose([float(row[f"{axis}_m"]) for axis in "xyz"], turn.as_matrix()))
-    return poses
-
-
-def right_lengths(out: str, data: bytes) -> None:
-    """Check the strut lengths that ik printed: a picometre, or what is left of that at 1e300 mm."""
-    expected = np.array([closed_form_lengths(pose) for pose in poses_in(data)])
-    np.testing.assert_allclose(lengths_in(out.encode()), expected, rtol=1e-12, atol=2e-12)
-
-
-def right_poses(out: str, data: bytes) -> None:
-    """Check the poses that fk printed: their lengths are those of the file."""
-    printed = np.array([closed_form_lengths(pose) for pose in poses_in(out.encode())])
-    np.testing.assert_allclose(printed, lengths_in(data), atol=1e-9)
-
-
-def lengths_in(data: bytes) -> np.ndarray:
-    return np.array([[float(row[f"L{i}_m"]) for i in range(1, 7)] for row in rows_of(data)])
+    if code != 2:
+        COUNTS["commands accepted"] += 1
+        assert out.strip()
 
 
 # Verbs and options that are given nonsense; a file that does not exist keeps the long ones from starting
@@ -191,3 +145,32 @@ def test_nonsense_options(folder: Path, verb: str, place: int, value: str, other
         arguments += ["--machine", "no_such_machine"]
     COUNTS["options"] += 1
     command(*arguments)
+
+
+# ---- recordings ----
+
+pytest.importorskip("rosbags")
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    machine = RecordedMachine()
+    machine.wave(30)
+    machine.page()
+    folder = write_bag(tmp_path_factory.mktemp("bags") / "run", machine.messages)
+    return next(folder.glob("*.mcap"))
+
+
+@given(changes=edits, flips=st.lists(st.tuples(st.integers(0, 1 << 20), st.integers(0, 7)), max_size=3))
+@example(changes=[], flips=[])
+@cases(25, 0.01)
+def test_mutated_bags(bag: Path, changes: list, flips: list) -> None:
+    """Edits, or else bits that are turned. What is not touched replays to the same bits."""
+    data = bytearray(bag.read_bytes() if flips else mutated(bag.read_bytes(), changes))
+    for place, bit in flips:
+        data[place % len(data)] ^= 1 << bit
+    path = bag.with_name("mutated.mcap")
+    path.write_bytes(data)
+    COUNTS["bags"] += 1
+    code, _, said = command("replay", str(path))
+    assert changes or flips or code == 0, said

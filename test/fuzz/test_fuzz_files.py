@@ -13,7 +13,7 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -24,25 +24,15 @@ import yaml
 from fuzzing import PLAIN, UNITS, Refused, cases, check_document, edits, finite, mutated, reader_of
 from helpers import assert_equal
 from hypothesis import example, given
-from hypothesis import strategies as st
 from strategies import paper_geometry, random_model, skewed_geometry
 from test_measurement_csv import STRUTS, WIDE, WIDE_COLUMNS
 
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.errors import HexapodError
-from hexapod_comp.export.linuxcnc import (
-    COMP_FILES,
-    HAL_FILE,
-    INI_FILE,
-    make_genhexkins,
-    read_genhexkins,
-    table_misfit,
-    write_genhexkins,
-)
 from hexapod_comp.export.table import make_table, read_table, write_table
 from hexapod_comp.formats.csv import Row
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
+from hexapod_comp.machine.model import MachineModel, ModelOrigin
 from hexapod_comp.machine.model_file import load_model, model_text
 from hexapod_comp.machine.pose_files import read_lengths, read_poses
 from hexapod_comp.machine.region import Region
@@ -375,72 +365,3 @@ def test_a_mutated_file_is_read_as_what_stands_in_it_or_refused(
     kind.judge(found)
     path.write_bytes(kind.plain(data))
     assert_equal(found, kind.read(path), relative=1e-13, absolute=1e-15)
-
-
-# Exports read back.
-
-
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Give a folder with LinuxCNC's files of a machine."""
-    made = tmp_path_factory.mktemp("exported")
-    model = random_model(np.random.default_rng(3), "paper")
-    machine = RealMachine(PAPER, model)
-    told = make_genhexkins(machine, BOX)
-    write_genhexkins(told, made, "mm", ["fuzz"], table_misfit(machine, told, BOX))
-    return made
-
-
-SETP = re.compile(r"^setp\s+genhexkins\.(base|platform)\.(\d)\.([xyz])\s+(\S+)\s*$", re.MULTILINE | re.ASCII)
-
-
-@given(which=st.sampled_from((HAL_FILE, INI_FILE, *COMP_FILES[:2])), changes=edits)
-@example(which=HAL_FILE, changes=[])
-@cases(60, 0.04)
-def test_linuxcnc_files(exported: Path, which: str, changes: list) -> None:
-    path = exported / which
-    before = path.read_bytes()
-    data = mutated(before, changes)
-    try:
-        path.write_bytes(data)
-        with reader_of("linuxcnc", path):
-            found = read_genhexkins(exported, "mm")
-    except Refused:
-        assert changes
-        return
-    finally:
-        path.write_bytes(before)
-    finite(found.base_joints, found.platform_joints, found.lead)
-    text = data.decode("utf-8-sig")
-    if which == HAL_FILE:
-        for body, joint, axis, value in SETP.findall(text.replace("\r", "\n")):
-            joints = found.base_joints if body == "base" else found.platform_joints
-            assert joints[int(joint), "xyz".index(axis)] == pytest.approx(number_in_c(value) * 1e-3, rel=1e-15)
-    for strut, table in enumerate(found.tables):
-        finite(table.nominal, table.trims)
-        assert (np.diff(table.nominal) > 0.0).all()
-        if which == COMP_FILES[strut]:
-            rows = leading_rows(text)
-            np.testing.assert_allclose(
-                np.column_stack([table.nominal, *table.trims]), np.array(rows) * 1e-3, rtol=1e-15
-            )
-
-
-def number_in_c(word: str) -> float:
-    """Return what C's strtod, and so LinuxCNC, reads: leading zeros mean nothing."""
-    return float(number(word, "1"))
-
-
-def leading_rows(text: str) -> list[list[float]]:
-    """Return what LinuxCNC reads of a compensation file: up to the first line without three numbers."""
-    rows: list[list[float]] = []
-    for line in re.split(r"\r\n|\r|\n", text):
-        words = line.split()[:3]
-        try:
-            rows.append([number_in_c(word) for word in words])
-        except (AssertionError, InvalidOperation):
-            break
-        if len(words) < 3:
-            rows.pop()
-            break
-    return rows
