@@ -189,12 +189,11 @@ def simulate(args: argparse.Namespace) -> Result:
 def collect(args: argparse.Namespace) -> Result:
     """Measure a running machine: a campaign's readings, by the mover and an instrument's topic."""
     from ..measurements.collect import collect as collect_readings
-    from ..ros import keep_discovery_local, received_signals
+    from ..ros import received_signals
     from ..ros.collector import WatchedMachine
 
     geometry = load_geometry(args.machine)
     campaign = results.load_campaign(args, geometry)
-    keep_discovery_local()
     signals = received_signals()
     instruments = {"readings": args.readings, "tracker_frame": args.tracker_frame, "samples": args.samples}
     confirm = _confirmed if args.confirm else lambda run: None

@@ -101,7 +101,7 @@ def demo(args: argparse.Namespace) -> Result:
 
 def adapt(args: argparse.Namespace) -> Result:
     """Calibrate a running machine, or check the model that came of it; 0 when a model is borne out by its checks."""
-    from ..ros import keep_discovery_local, received_signals
+    from ..ros import received_signals
     from ..ros.adapting import AdaptedMachine
     from ..upkeep.loop import IN_USE, Adaptation, Task, begun_with
     from ..workspace.reach import machine_box
@@ -127,7 +127,6 @@ def adapt(args: argparse.Namespace) -> Result:
     every = 600.0 if args.every_min is None else 60.0 * args.every_min
     checks = None if args.checks is None and args.every_min is not None else args.checks or 0
     task = Task(box, level, goal, campaign, instruments, 3600.0 * hours, fit_settings(args), every)
-    keep_discovery_local()
     signals = received_signals()
 
     def going_on() -> bool:
@@ -195,10 +194,9 @@ def adapted(events: list[dict[str, Any]]) -> Iterator[str]:
 def move(args: argparse.Namespace) -> Result:
     """Have the mover move the tool, or stop it; 0 when the tool has arrived, or stands."""
     from ..pose import Pose
-    from ..ros import keep_discovery_local, received_signals
+    from ..ros import received_signals
     from ..ros.client import Machine, MoveState
 
-    keep_discovery_local()
     signals = received_signals()
     with Machine(args.namespace) as machine, results.stage_line() as say:
         if args.stop:
@@ -232,11 +230,10 @@ def watch(args: argparse.Namespace) -> int:
 
 
 def echo(args: argparse.Namespace) -> int | Result:
-    from ..ros import keep_discovery_local, received_signals
+    from ..ros import received_signals
     from ..ros.echo import DISCOVERY_TIME, Echo, published_topics
     from ..ros.process import QUIET, SPIN_PERIOD, RosSession
 
-    keep_discovery_local()
     signals = received_signals()
     began = time.monotonic()
 

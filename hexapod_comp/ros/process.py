@@ -24,7 +24,7 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.signals import SignalHandlerOptions
 
 from ..errors import LONGEST_TEXT, HexapodError, NoAnswerError, printable
-from . import avoid_shared_memory, keep_discovery_local, open_streams, received_signals
+from . import keep_discovery_local, open_streams, received_signals
 from .base import MachineNode
 from .parameters import Program
 
@@ -199,7 +199,7 @@ class RosSession:
 
     def __init__(self, name: str, namespace: str = "", arguments: Sequence[str] = (), **options: Any) -> None:
         open_streams()
-        avoid_shared_memory()
+        keep_discovery_local()
         self._context = rclpy.Context()
         rclpy.init(args=list(arguments), context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self.node: Node = rclpy.create_node(name, namespace=namespace, context=self._context, **options)

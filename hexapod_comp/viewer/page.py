@@ -27,7 +27,6 @@ from ..formats.pages import render
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import solve_pose
 from ..pose import Pose, rotation_angle
-from ..ros import keep_discovery_local
 from ..ros.base import EVENT_QOS, NEWEST_QOS, profile
 from ..ros.interface import correction_colour
 from ..ros.messages import StrutReader, message_pose, nanoseconds_of, read_message
@@ -176,7 +175,6 @@ def watch(
     geometry: HexapodGeometry, show: Callable[[View], object], going_on: Callable[[], bool], namespace: str = ""
 ) -> None:
     """Show a machine's present state ten times a second while something holds."""
-    keep_discovery_local()
     with RosSession("hexapod_comp_watch", namespace, **QUIET) as session:
         watcher, due = Watcher(geometry, session.node), time.monotonic()
         while going_on():

@@ -14,7 +14,6 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ..errors import GeometryError
-from ..ros import keep_discovery_local
 from ..ros.base import LATCHED_QOS
 from ..ros.process import SPIN_PERIOD, RosSession
 from ..workspace.pictures import shades
@@ -65,7 +64,6 @@ def publish_shells(node: Node, markers: MarkerArray) -> Publisher:
 
 def show_shells(layers: Sequence[Layer], quantity: Quantity, title: str) -> None:
     """Publish shells from a node of its own until Ctrl-C."""
-    keep_discovery_local()
     with RosSession("workspace_shells") as session:
         stamp = session.node.get_clock().now().to_msg()
         publish_shells(session.node, shell_markers(layers, quantity, title, "work", stamp))
