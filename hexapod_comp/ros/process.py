@@ -61,46 +61,33 @@ def discovery() -> str:
     return f"domain {domain}; ROS_AUTOMATIC_DISCOVERY_RANGE={printable(reach)}{hint}{also}"
 
 
-def run(
-    make_node: Callable[[], MachineNode],
-    program: Program,
-    argv: Sequence[str] | None = None,
-) -> int:
-    """Run a node until SIGINT, SIGTERM or SIGHUP.
+def run(make_node: Callable[[], MachineNode], program: Program) -> int:
+    """Run a node until SIGINT, SIGTERM or SIGHUP, and end this process; return the exit code if it cannot start.
 
     Signals are only stored, since rclpy's own handling loses the last message and exits non-zero on a second Ctrl-C,
     which ``ros2 launch`` sends.
     """
     keep_discovery_local()
-    arguments = sys.argv[1:] if argv is None else list(argv)
-    refusal = program.refusal(arguments)
-    if refusal is not None:
+    arguments = sys.argv[1:]
+    if (refusal := program.refusal(arguments)) is not None:
         return refusal
     open_streams()
     signals = received_signals()
-    try:  # the present directory, even if it is replaced
+    try:  # the present stream, even if another replaces it
         stderr = os.fdopen(os.dup(sys.stderr.fileno()), "w")
-    except (AttributeError, OSError):  # closed, or a test's
+    except (AttributeError, OSError):  # closed
         stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
-    with stderr:
-        with LogRelay():
-            code = _run_until(signals, make_node, arguments, stderr)
-        if argv is None:
-            # Python's own exit waits for threads of DDS, which sometimes never end, though all has been closed.
-            for stream in filter(None, (sys.stdout, sys.stderr)):  # None: it was closed from the beginning
-                with suppress(OSError):
-                    stream.flush()
-            os._exit(code)
-        faulthandler.cancel_dump_traceback_later()
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-    return code
+    with LogRelay():
+        code = _run_until(signals, make_node, arguments, stderr)
+    # Python's own exit waits for threads of DDS, which sometimes never end, though all has been closed.
+    for stream in filter(None, (sys.stdout, sys.stderr)):  # None: it was closed from the beginning
+        with suppress(OSError):
+            stream.flush()
+    os._exit(code)
 
 
 def _run_until(
-    signals: Sequence[int],
-    make_node: Callable[[], MachineNode],
-    arguments: list[str],
-    stderr: TextIO,
+    signals: Sequence[int], make_node: Callable[[], MachineNode], arguments: list[str], stderr: TextIO
 ) -> int:
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
