@@ -79,6 +79,8 @@ fault_feedback_delay | 0.0 | 0 to 10 s | always | age of readings when they are 
 fault_feedback_drop | 0.0 | 0 to 1 | always | share of readings that are never published
 fault_jump_strut | 1 | 1 to 6 | always | strut 1 to 6 that fault_jump displaces
 fault_jump | 0.0 | -0.1 to 0.1 m | always | displacement of a knock; each setting knocks once
+fault_longer | [0.0, 0.0, 0.0, 0.0, 0.0, 0.0] | -0.01 to 0.01 m | always | by which each strut is longer than its
+    encoder measures, as a crash leaves it behind; counts while it is set
 """)
 
 TOPICS = """
@@ -160,6 +162,7 @@ class StrutDriveNode(MachineNode):
             feedback_delay=options["fault_feedback_delay"],
             feedback_drop=options["fault_feedback_drop"],
             jump=(options["fault_jump_strut"] - 1, jump) if jump else None,
+            longer=tuple(options["fault_longer"]),
         )
 
     # ---- the machine ----

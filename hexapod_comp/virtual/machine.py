@@ -103,6 +103,8 @@ class Faults:
     # strut and distance, m, by which its motor is displaced, once, when the fault is set. The encoder measures it and
     # the drive pulls the motor back.
     jump: tuple[int, float] | None = None
+    # by which each strut is longer than its encoder measures, m, as a crash leaves it behind
+    longer: tuple[float, ...] = (0.0,) * 6
 
     def __post_init__(self) -> None:
         struck = None if self.jump is None else self.jump[0]
@@ -116,6 +118,7 @@ class Faults:
             raise ModelError("faults.feedback_drop", "must lie within 0…1", self.feedback_drop)
         if self.jump is not None and not math.isfinite(self.jump[1]):
             raise ModelError("faults.jump", "must be a finite distance, m", self.jump[1])
+        _array(self.longer, (6,), "faults.longer")
 
 
 def _array(values: object, shape: tuple[int, ...], name: str) -> np.ndarray:
@@ -244,7 +247,7 @@ class StrutDrive:
     def _run(self, ticks: int, seconds: float) -> None:
         """Run the drives for some ticks, then compute the platform's pose."""
         run_drives(self._drives, self._commands, ticks, self._motion.sense)
-        went = self._motor, self._motion.sense, self._model_pose, self._true_pose
+        went = self._motor + self._faults.longer, self._motion.sense, self._model_pose, self._true_pose
         self._outcome, self._condition = self.machine.advance(seconds, *went)
 
     def _follow_commanded_point(self) -> None:

@@ -211,6 +211,15 @@ def test_jump_knocks_once_and_is_pulled_back(machine):
     assert all(abs(message.position[5] - AT_HOME[5]) < 1e-9 for message in machine.seen["strut_states"])
 
 
+def test_a_strut_longer_than_its_encoder_measures_moves_the_tool(machine):
+    """Encoders read what was commanded; the closed form finds strut 2 longer in the true pose, by 20 µm."""
+    command(machine, AT_HOME)
+    play(machine, [setting("fault_longer", [0.0, 2e-5, 0.0, 0.0, 0.0, 0.0], NODE)])
+    until_at(machine, AT_HOME, 1e-9)
+    machine.until(lambda: abs(closed_form_lengths(true_pose(machine))[1] - AT_HOME[1] - 2e-5) < 1e-9, "strut 2")
+    equal(closed_form_lengths(true_pose(machine)), AT_HOME + 2e-5 * np.eye(6)[1])
+
+
 # ---- lifecycle ----
 
 
