@@ -103,6 +103,7 @@ def adapt(args: argparse.Namespace) -> Result:
     """Calibrate a running machine, or check the model that came of it; 0 when a model is borne out by its checks."""
     from ..ros import received_signals
     from ..ros.adapting import AdaptedMachine
+    from ..upkeep.journal import sole_user
     from ..upkeep.loop import IN_USE, Adaptation, Task, begun_with
     from ..workspace.reach import machine_box
     from .fitting import fit_settings
@@ -133,6 +134,7 @@ def adapt(args: argparse.Namespace) -> Result:
         return not signals
 
     with (
+        sole_user(args.folder),
         AdaptedMachine(args.topic, args.namespace, samples=args.samples, going_on=going_on) as machine,
         results.stage_line() as say,
     ):

@@ -25,6 +25,7 @@ from std_srvs.srv import Trigger
 
 from ..errors import LONGEST_TEXT, HexapodError
 from ..upkeep.journal import JOURNAL, Journal
+from . import end_with_parent
 from .base import ACKNOWLEDGED_WITHIN, LATCHED_QOS, MachineNode
 from .parameters import Program, read_table
 from .process import run
@@ -149,6 +150,7 @@ class AdapterNode(MachineNode):
             stdin=subprocess.DEVNULL,
             stdout=self._output,
             start_new_session=True,  # so that Ctrl-C reaches it through the node alone
+            preexec_fn=partial(end_with_parent, signal.SIGINT),  # it brakes the machine when the node is killed
         )
         os.setpriority(os.PRIO_PROCESS, self._process.pid, NICENESS)
         # The newest step in the journal is of the run before until this one writes another

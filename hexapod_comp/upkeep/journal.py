@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -12,6 +15,7 @@ from ..errors import InputFileError
 from ..formats.json import json_content, json_text
 
 JOURNAL = "journal.jsonl"  # its name in the loop's folder
+LEFT_WITHIN = 10.0  # A process that was told to end brakes the machine and leaves the folder within this time, s
 
 Event = dict[str, Any]
 
@@ -55,6 +59,27 @@ class Journal:
             raise InputFileError(self.path, "", f"cannot be written: {error.strerror}") from error
         self.events.append(json_content(line))
         return self.events[-1]
+
+
+@contextmanager
+def sole_user(folder: str | Path) -> Iterator[None]:
+    """Keep other processes from working in a loop's folder; an InputFileError where one does, and does not end."""
+    path, end = Path(folder) / JOURNAL, time.monotonic() + LEFT_WITHIN
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("a", encoding="utf-8")
+    except OSError as error:
+        raise InputFileError(path, "", f"cannot be written: {error.strerror}") from error
+    with file:
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system releases it however the process ends
+                break
+            except BlockingIOError:
+                if time.monotonic() > end:
+                    raise InputFileError(folder, "", "another adapt works in this folder: stop it first") from None
+                time.sleep(0.1)
+        yield
 
 
 def _parsed(path: Path, text: str) -> Iterator[Event]:

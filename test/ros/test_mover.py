@@ -8,8 +8,10 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from threading import Thread
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -33,7 +35,7 @@ from hexapod_comp.measurements.readings import KINDS
 from hexapod_comp.pose import Pose, best_motion
 from hexapod_comp.ros.adapter import AdapterNode
 from hexapod_comp.ros.adapting import AdaptedMachine
-from hexapod_comp.ros.client import LoopClient, Machine, MoveError, Sent
+from hexapod_comp.ros.client import LoopClient, Machine, MoveError, MoveState, Sent
 from hexapod_comp.ros.collector import WatchedMachine
 from hexapod_comp.ros.instrument import InstrumentNode
 from hexapod_comp.ros.messages import message_pose, nanoseconds_of, pose_message
@@ -294,8 +296,6 @@ def test_a_tool_that_does_not_settle_is_reported(rig: Rig) -> None:
 
 def test_a_client_moves_a_machine_and_learns_how_it_ended(bench: Bench) -> None:
     """Over DDS: what is latched reaches who comes late; a move that cannot be is an error with a reason."""
-    from threading import Thread  # the bench's nodes run while the client waits
-
     bench.machine()
     bench.add(MoverNode, True, {})
     ended: list[Any] = []
@@ -590,6 +590,47 @@ def test_a_loop_that_shall_not_go_on_brakes_the_move(bench: Bench) -> None:
     error = asked(bench, lambda machine: machine.move(near(HOME, (0.0, 0.0, 0.02)), "base"), lambda: False)
     assert isinstance(error, MoveError)
     assert error.reason == "person"
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_another_clients_move_is_reported_and_waited_for(stopped: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It replaces ours twice: on the way, and while the tool is observed; a person may stop the wait."""
+    machine = object.__new__(AdaptedMachine)
+    own, other = (MoveState("arrived", "", 1.0, 0.0, "", request, 0, "") for request in (1, 2))
+    underway = iter([replace(other, state="moving", share=0.5)] * 4 + [other] * 4)
+    asked, warned, outcomes = list[Pose](), list[str](), ["replaced", ""]
+
+    def move(machine: AdaptedMachine, pose: Pose, *_: Any, **__: Any) -> MoveState:
+        asked.append(pose)
+        if outcomes and (reason := outcomes.pop(0)):
+            raise MoveError(reason, "another move was asked for")
+        machine.state = own
+        return own
+
+    def spin(_: float) -> None:
+        machine.state = next(underway)
+        if stopped and machine.state.state == "moving":
+            machine._going_on = lambda: False
+
+    monkeypatch.setattr(Machine, "move", move)
+    log = SimpleNamespace(warning=warned.append)
+    machine._session = SimpleNamespace(node=SimpleNamespace(get_logger=lambda: log), spin_once=spin)
+    machine._going_on, machine._arrived, machine.state = lambda: True, None, replace(other, state="planning")
+    if stopped:
+        with pytest.raises(MoveError, match="person: stopped while another client moved the tool"):
+            machine.move(HOME)
+        return
+    assert machine.move(HOME) is own
+    assert (asked, warned) == ([HOME] * 2, ["another client moves the tool: waiting until it stands"])
+    seen = iter([other, own])
+
+    def observe(machine: AdaptedMachine) -> str:
+        machine.state = next(seen)
+        return f"of request {machine.state.request}"
+
+    monkeypatch.setattr(WatchedMachine, "observe", observe)
+    assert machine.observe() == "of request 1", "what was read of another client's move counts for nothing"
+    assert (len(asked), len(warned)) == (3, 2)
 
 
 def test_the_node_starts_reports_and_stops_a_calibration(bench: Bench, tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.measurements.campaign import Campaign
 from hexapod_comp.measurements.collect import Observation
 from hexapod_comp.pose import Pose
+from hexapod_comp.upkeep import journal
 from hexapod_comp.upkeep import loop as upkeep
 from hexapod_comp.upkeep.checks import CLEAR, check_run
 from hexapod_comp.upkeep.journal import Journal
@@ -384,6 +385,19 @@ def test_a_journal_of_another_machine_or_with_a_broken_line_is_refused(again: Ri
     path.write_text('{"event": "planned"}\n', encoding="utf-8")
     with pytest.raises(InputFileError, match="planned: lacks 'campaign'"):
         again.loop()
+
+
+def test_a_folder_has_one_user_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A killed one leaves it free: the lock is the open file's."""
+    monkeypatch.setattr(journal, "LEFT_WITHIN", 0.0)
+    with (
+        journal.sole_user(tmp_path / "new"),
+        pytest.raises(InputFileError, match="another adapt works in this folder"),
+        journal.sole_user(tmp_path / "new"),
+    ):
+        pass
+    with journal.sole_user(tmp_path / "new"):
+        assert Journal(tmp_path / "new" / journal.JOURNAL).events == []
 
 
 def test_a_task_has_a_goal_or_a_campaign_and_not_both() -> None:
