@@ -614,7 +614,7 @@ def test_another_clients_move_is_reported_and_waited_for(stopped: bool, monkeypa
 
     monkeypatch.setattr(Machine, "move", move)
     log = SimpleNamespace(warning=warned.append)
-    machine._session = SimpleNamespace(node=SimpleNamespace(get_logger=lambda: log), spin_once=spin)
+    machine.node, machine.spin_once = SimpleNamespace(get_logger=lambda: log), spin  # type: ignore[method-assign]
     machine._going_on, machine._arrived, machine.state = lambda: True, None, replace(other, state="planning")
     if stopped:
         with pytest.raises(MoveError, match="person: stopped while another client moved the tool"):
