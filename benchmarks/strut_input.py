@@ -26,10 +26,11 @@ from sensor_msgs.msg import JointState
 from tqdm import tqdm
 
 from benchmarks import table
-from hexapod_comp.compensation.compensator import NO_SHIFT, Compensator
+from hexapod_comp.compensation.compensator import Compensator, pack_pose
 from hexapod_comp.compensation.guards import Sample
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
+from hexapod_comp.pose import Pose
 from hexapod_comp.ros.interface import StrutInput
 from hexapod_comp.virtual.named import find_model
 
@@ -37,6 +38,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
 from foreign_machines import Machine, machines
 
 BAR = 1e-9  # Largest difference, m
+
+NO_SHIFT = pack_pose(Pose.identity())  # frame of poses that are in ``base`` already
 
 TILT, PER_LINE = 3.0, 200  # Of a pose about each axis, degrees; poses from one random pose to the next
 

@@ -360,13 +360,6 @@ def expected_error(
     )
 
 
-def left_errors(
-    space: ParameterSpace, prediction: Prediction, stations: Stations, covariance: np.ndarray
-) -> np.ndarray:
-    """Return possible errors of a model at stations, by drawn machines, (M, 6, D), m and rad; datum not aligned."""
-    return derivatives(space, prediction, stations) @ _drawn(covariance)
-
-
 def errors_in_space(
     space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -168,9 +168,6 @@ def pack_pose(pose: Pose) -> Struct:
     return Struct("hc_pose", {"position": pose.position, "rotation": pose.rotation})
 
 
-NO_SHIFT = pack_pose(Pose.identity())  # Frame of poses that are in ``base`` already
-
-
 class Compensator:
     """Turns commanded tool poses into compensated strut commands for one machine.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -79,18 +78,6 @@ def circle(centre: Pose, radius: float, feed: float, rate: float) -> Path:
 def quintic(t: np.ndarray) -> np.ndarray:
     """Return 10t³ − 15t⁴ + 6t⁵: from 0 to 1 with speed and acceleration zero at both ends."""
     return t**3 * (10.0 - 15.0 * t + 6.0 * t * t)
-
-
-def pocket(
-    geometry: HexapodGeometry, corner: Pose, size: tuple[float, float], pitch: float, feed: float, rate: float
-) -> Path:
-    """Return a rectangular pocket milled in a zigzag: every row reverses x, so that backlash shows."""
-    rows = round(size[1] / pitch) + 1
-    corners = []
-    for row in range(rows):
-        ends = (0.0, size[0]) if row % 2 == 0 else (size[0], 0.0)
-        corners += [corner @ Pose(np.array([x, row * pitch, 0.0]), np.eye(3)) for x in ends]
-    return join([move(geometry, a, b, rate, feed) for a, b in pairwise(corners)])
 
 
 def commanded_in_base(geometry: HexapodGeometry) -> HexapodGeometry:

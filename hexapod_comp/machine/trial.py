@@ -53,21 +53,6 @@ class ToolErrors:
         return replace(self, displacement=displacement, rotation=(turned.mean().inv() * turned).as_rotvec())
 
 
-def without_datum(points: np.ndarray, displacements: np.ndarray, by: slice = slice(None)) -> np.ndarray:
-    """Return displacements (M, 3, D) of points (M, 3) minus the part that one shift and rotation of the datum explain.
-
-    The linear case of :meth:`ToolErrors.aligned`, for D sets of small displacements at once. The datum is computed from
-    all points, or some of them, and subtracted from all.
-    """
-    arms = points - points[by].mean(axis=0)
-    columns = [np.tile(axis, (len(arms), 1)) for axis in np.eye(3)]
-    columns += [np.cross(axis, arms) for axis in np.eye(3)]
-    free = np.stack(columns, axis=2)
-    seen = free[by].reshape(-1, 6)
-    motion = np.linalg.lstsq(seen, displacements[by].reshape(len(seen), -1), rcond=None)[0]
-    return displacements - (free.reshape(-1, 6) @ motion).reshape(displacements.shape)
-
-
 @dataclass(frozen=True)
 class Driven:
     """Actual poses of a machine."""

@@ -18,7 +18,7 @@ from hexapod_comp.errors import GeometryError, PoseError
 from hexapod_comp.machine import trajectory
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.path import Motion, StrutRates, plan_motion, plan_program
-from hexapod_comp.machine.trajectory import TRACK_WINDOW, circle, feet_on, motion_onto, move, pocket
+from hexapod_comp.machine.trajectory import TRACK_WINDOW, circle, feet_on, motion_onto, move
 from hexapod_comp.pose import Pose
 
 LONG = [pytest.param(name, marks=long_test) for name in ("example_6_6", "hanging")]
@@ -276,22 +276,6 @@ def test_circle_has_its_radius_plane_and_feed() -> None:
     quarter = local[len(local) // 4]
     assert np.cross(local[0], quarter)[2] > 0.0  # counter-clockwise seen from +z
     assert (path.rotations == centre.rotation).all()
-
-
-def test_pocket_mills_every_row_and_keeps_the_limits() -> None:
-    corner = Pose([-0.02, -0.01, 0.4], np.eye(3))
-    path = pocket(PAPER, corner, (0.04, 0.02), pitch=0.005, feed=0.05, rate=250.0)
-    local = path.positions - corner.position
-    assert local[:, 0].min() >= -1e-15
-    assert local[:, 0].max() <= 0.04 + 1e-15
-    rows = np.unique(np.round(local[(local[:, 0] > 0.01) & (local[:, 0] < 0.03), 1], 9))
-    np.testing.assert_allclose(rows, [0.0, 0.005, 0.01, 0.015, 0.02], atol=1e-9)
-    speeds = np.linalg.norm(np.diff(path.positions, axis=0), axis=1) * 250.0
-    assert speeds.max() <= 0.05 * (1.0 + 1e-9)
-    steps = np.abs(np.diff(lengths(PAPER, path.positions, path.rotations), axis=0)).max()
-    assert steps <= PAPER.limits.speed / 250.0
-    directions = np.sign(np.diff(local[:, 0]))[np.abs(np.diff(local[:, 0])) > 1e-9]
-    assert (np.diff(directions) != 0.0).sum() == 4  # five rows, four reversals
 
 
 def figure_of_eight(count: int = 400) -> np.ndarray:
