@@ -145,7 +145,6 @@ check_poses = entry(
 )
 segment_distance = entry("hc_segment_distance", "start[3] end[3] other_start[3] other_end[3]")
 run_drives = entry("hc_run_drives", "drives commands[6] ticks !sense[9]")
-write_lengths = entry("hc_write_lengths", "lengths[6] period fastest !position[6] !velocity[6]")
 
 
 def go(state: Any, tool: Any, frame: Any, shift: np.ndarray, turn: np.ndarray, step: float, longest: float) -> Any:

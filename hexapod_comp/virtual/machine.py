@@ -172,7 +172,7 @@ class StrutDrive:
         self._drives = Struct("hc_drives", at_rest)
         drives = self._drives.view
         self._position, self._speed, self._motor = drives["position"], drives["speed"], drives["motor"]
-        self._play, self._stuck, self._stopped = drives["play"], drives["stuck"], drives["stopped"]
+        self._stuck, self._stopped = drives["stuck"], drives["stopped"]
 
     def _set_up_pose(self, geometry: HexapodGeometry) -> None:
         self._motion = MotionState()
@@ -299,10 +299,6 @@ class StrutDrive:
     def motor_lengths(self) -> np.ndarray:
         """Return the true positions of the motors, as a perfect encoder would read them, m, shape (6,)."""
         return self._motor.copy()
-
-    def play(self) -> np.ndarray:
-        """Return motor minus nut position, m, shape (6,), within ± half the backlash."""
-        return self._play.copy()
 
     def true_pose(self) -> Pose:
         """Return the true ``pose_platform_in_base``."""
