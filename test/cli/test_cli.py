@@ -297,14 +297,17 @@ def test_check_finds_what_happens_on_the_way() -> None:
     assert result.examined > 100
 
 
-def test_check_follows_a_stream_like_the_compensator() -> None:
-    """Directions, backlash and steps along a stream: largest steps and corrections as the compensator makes them."""
+def test_check_follows_a_stream_like_the_compensator(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Directions, backlash and steps along a stream, three pieces long: as the compensator makes them."""
+    done: list[int] = []
+    monkeypatch.setattr("hexapod_comp.compensation.checks.CHUNK", 256)
     model = random_model(np.random.default_rng(22), "paper")
     geometry = replace(PAPER, limits=replace(PAPER.limits, correction=0.02))
     angle = np.linspace(0.0, 4.0 * np.pi, 700)
     positions = PAPER.home.position + 0.02 * np.stack([np.cos(angle), np.sin(2 * angle), 0.2 * np.sin(angle)], axis=1)
     rotations = Rotation.from_rotvec(0.05 * np.stack([np.sin(angle)] * 3, axis=1)).as_matrix()
-    result = check(geometry, model, (positions, rotations), mode="stream")
+    result = check(geometry, model, (positions, rotations), mode="stream", progress=done.append)
+    assert (result.examined, sum(done)) == (700, 700)
     compensator = Compensator(geometry, model)
     records = [
         compensator.correct(Pose(p, r), n / 250) for n, (p, r) in enumerate(zip(positions, rotations, strict=True))
@@ -333,23 +336,6 @@ def test_check_says_where_a_field_cannot_be_undone() -> None:
         (0, "not_converged"),
         (1, "not_converged"),
     ]
-
-
-def test_check_long_streams_in_pieces() -> None:
-    """40,000 poses take three pieces; margins are those of the same poses checked all by themselves."""
-    angle = np.linspace(0.0, 200.0 * np.pi, 40_000)
-    positions = np.stack([0.02 * np.cos(angle), 0.02 * np.sin(angle), np.full_like(angle, 0.4)], axis=1)
-    rotations = np.tile(np.eye(3), (len(angle), 1, 1))
-    done: list[int] = []
-    result = check(PAPER, IDEAL, (positions, rotations), "stream", 250.0, done.append)
-    assert result.ok
-    assert (result.examined, sum(done)) == (40_000, 40_000)
-    lengths = np.linalg.norm(positions[:, None] + PAPER.platform_joints - PAPER.base_joints, axis=2)
-    np.testing.assert_allclose(result.lengths[:, 0], lengths, atol=1e-15)
-    margins = np.minimum(lengths - PAPER.limits.stroke[:, 0], PAPER.limits.stroke[:, 1] - lengths).min(axis=1)
-    np.testing.assert_allclose(result.limits["stroke"].margin[:, 0], margins, atol=1e-15)
-    steps = np.abs(np.diff(lengths, axis=0)).max(axis=1)
-    np.testing.assert_allclose(np.abs(result.limits["step"].value[1:, 0]), steps, atol=1e-15)
 
 
 def test_check_refuses_what_makes_no_sense() -> None:

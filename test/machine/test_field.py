@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 from strategies import UNEVEN_GRID, fixed, paper_geometry, random_field, seeds
 
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
-from hexapod_comp.calibration.posterior import box_stations
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.errors import InputFileError, LimitError, ModelError, OutsideTableError
 from hexapod_comp.machine.field import CROSS_AXES, GridField, no_field
@@ -382,24 +381,6 @@ def test_readings_that_are_added_never_make_it_smaller(seed: int) -> None:
     assert (more.box[0] <= few.box[0]).all()
     assert (more.box[1] >= few.box[1]).all()
     np.testing.assert_array_equal(more.point, few.point)
-
-
-def test_the_promise_is_made_where_the_model_says_that_it_was_measured() -> None:
-    """Poses of the promise, level and tilted, are all inside, and reach within a twentieth of each face."""
-    rng = np.random.default_rng(2)
-    poses = drawn(rng, 30, 0.05, 5.0)
-    geometry = replace(small.paper(), tool=Pose([0.01, 0.0, 0.08], np.eye(3)))
-    space = ParameterSpace(small.scattered(geometry, poses), FitSettings(blocks=()))
-    region = space.measured
-    assert region is not None
-    for tilt in (0.0, 0.1):
-        stations = box_stations(space, tilt)
-        assert stations is not None
-        assert region.contains(stations.positions, stations.rotations).all()
-    places, _ = geometry.tool_poses(stations.positions, stations.rotations)
-    box = region.commanded(geometry)
-    assert (np.abs(places.min(axis=0) - box[0]) < 0.05 * np.ptp(box, axis=0)).all()
-    assert (np.abs(places.max(axis=0) - box[1]) < 0.05 * np.ptp(box, axis=0)).all()
 
 
 def test_a_tilted_tool_is_inside_where_its_point_is() -> None:

@@ -21,7 +21,6 @@ from helpers import (
     table_lengths,
     table_poses,
     three_two_one_machine,
-    twist_between,
 )
 from scipy.spatial.transform import Rotation
 from strategies import paper_geometry
@@ -67,20 +66,6 @@ def test_table_1_gives_table_2_to_the_last_printed_digit() -> None:
     ours = [[f"{length * 1e3:.3f}" for length in strut_lengths(IDEAL, pose)] for pose in table_poses()]
     printed = [[f"{length * 1e3:.3f}" for length in row] for row in table_lengths()]
     assert ours == printed
-
-
-@pytest.mark.parametrize("row", range(10))
-def test_table_2_gives_table_1_within_its_rounding(row: int) -> None:
-    """A length is rounded by at most 0.5 µm: component k of the pose moves by at most Σ_j |J⁻¹|_kj · 0.5 µm.
-
-    The Jacobian is the finite-difference one. Second order: 6 µrad at a radius of 0.2 m change a length by
-    less than (6e-6)² · 0.2 m, which |J⁻¹| ≈ 10 rad/m turns into 1e-10; the slack of 1e-9 holds it ten times.
-    """
-    target, lengths = table_poses()[row], table_lengths()[row]
-    matrix = central_difference(lambda twist: strut_lengths(IDEAL, moved(target, twist)), np.zeros(6))
-    allowed = np.abs(np.linalg.inv(matrix)).sum(axis=1) * 0.5e-6 + 1e-9
-    assert (np.abs(twist_between(target, solve_pose(IDEAL, lengths, HOME))) <= allowed).all()
-    assert (allowed < [*[1.5e-6] * 3, *[7e-6] * 3]).all()  # so that the bound above is worth something
 
 
 # --- round trips -------------------------------------------------------------------------------------------

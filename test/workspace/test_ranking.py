@@ -22,11 +22,7 @@ from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.load import Load
 from hexapod_comp.pose import Pose
 from hexapod_comp.workspace.budget import (
-    BASE_JOINT,
-    LENGTH,
     PLATFORM_JOINT,
-    SOURCE_TYPES,
-    TOOL,
     Budget,
     SingleErrors,
     load_budget,
@@ -284,22 +280,6 @@ def test_the_shipped_budget_has_the_papers_sizes() -> None:
     np.testing.assert_allclose(sizes.pop("quantisation"), 7e-6, rtol=1e-12)
     for size in sizes.values():
         np.testing.assert_allclose(size, 10e-6, rtol=1e-12)
-
-
-def test_every_type_names_what_it_moves() -> None:
-    """Lengths by strut, joints by strut and axis, the tool by axis; a coordinate's error is along its own axis."""
-    errors = made(**{source.name: 1e-5 for source in SOURCE_TYPES})
-    assert len(errors) == 6 * 6 + 12 + 6 + 12 + 6 + 3
-    for part, struts, vector, label in zip(errors.part, errors.struts, errors.vector, errors.labels, strict=True):
-        strut = int(struts.argmax())
-        assert struts.sum() == (part != TOOL)
-        if part == LENGTH:
-            assert label == f"strut_{strut + 1}"
-            continue
-        axis = "xyz"[int(np.flatnonzero(vector)[0])]
-        np.testing.assert_allclose(np.sort(vector), [0.0, 0.0, 1e-5], rtol=1e-12)
-        body = {BASE_JOINT: f"base joint {strut + 1}", PLATFORM_JOINT: f"platform joint {strut + 1}", TOOL: "tool"}
-        assert label == f"{body[part]} {axis}"
 
 
 def test_a_ball_joint_that_two_struts_share_is_one_joint() -> None:

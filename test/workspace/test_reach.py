@@ -28,7 +28,6 @@ from hexapod_comp.workspace.reach import (
     Examiner,
     Reach,
     _largest_cells,
-    home_orientation,
     largest_box,
     machine_box,
     orientations,
@@ -113,20 +112,6 @@ def test_poses_of_their_own_orientation(monkeypatch):
     again = examiner.findings(tips, rotations, threads=1)
     assert np.array_equal(again[0], found)
     assert np.array_equal(again[1], struts)
-
-
-def test_work_and_tool_frames_only_rename_poses():
-    """Truth: a rigid motion of the frame in which poses are told changes no pose."""
-    geometry, rng = unit(), np.random.default_rng(3)
-    work = Pose.from_angles([0.1, -0.2, 0.05], [0.3, -0.2, 1.0])
-    moved = replace(geometry, work=work)
-    tips = rng.uniform([-0.09, -0.09, 0.14], [0.09, 0.09, 0.23], (2000, 3))
-    told = (tips - work.position) @ work.rotation
-    expected, _ = Examiner(geometry).findings(tips, LEVEL[None])
-    found, _ = Examiner(moved).findings(told, work.rotation.T[None])
-    assert np.array_equal(found, expected)
-    np.testing.assert_allclose(home_orientation(moved), work.rotation.T, atol=1e-15)
-    assert reach(moved, cells=24).volume == pytest.approx(reach(geometry, cells=24).volume, rel=0.02)
 
 
 # The reach as a whole.
