@@ -123,6 +123,11 @@ def quick_pictures() -> Iterator[None]:
         yield
 
 
+def distances(machine: Any, pose: Pose) -> np.ndarray:
+    """Return strut lengths by NumPy alone, of whatever has base and platform joints, shape (6,), m."""
+    return np.linalg.norm(pose.position + machine.platform_joints @ pose.rotation.T - machine.base_joints, axis=1)
+
+
 def nominal_error(machine: RealMachine, target: Pose, sense: np.ndarray) -> Pose:
     """Return the platform pose that a machine takes when nominal lengths are commanded."""
     return machine.pose_for(strut_lengths(Structure.of(machine.geometry), target), sense, target)[0]

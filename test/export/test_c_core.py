@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import long_test
+from helpers import distances, long_test
 from hypothesis import given
 from replay_helpers import CONFIG
 from strategies import fixed, paper_geometry, random_model, random_pose, seeds, skewed_geometry
@@ -92,7 +92,7 @@ def test_the_loop_of_the_page_compiles_and_answers(tmp_path):
     assert loop.cycle((c_double * 7)(*pose.position, *pose.quaternion()), c_double(0.0), struts) == 0
     loop.name.restype = ctypes.c_char_p
     assert loop.name().decode() == geometry.name
-    expected = np.linalg.norm(geometry.home.position + geometry.platform_joints - geometry.base_joints, axis=1)
+    expected = distances(geometry, geometry.home)
     np.testing.assert_allclose(list(struts), expected, rtol=0.0, atol=1e-15)
 
 

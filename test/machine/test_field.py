@@ -12,6 +12,7 @@ import calibration_helpers as small
 import numpy as np
 import pytest
 from foreign_machines import machine_names, machines
+from helpers import distances
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
@@ -210,8 +211,7 @@ def test_it_moves_the_measured_point_as_it_says(name: str, tmp_path: Path) -> No
     for shift, turn in (((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((1e-3, -2e-3, 1e-3), (0.02, -0.01, 0.03))):
         rotation = geometry.home.rotation @ Rotation.from_rotvec(turn).as_matrix()
         pose = Pose(geometry.home.position + np.array(shift), rotation)
-        joints = pose.position + geometry.platform_joints @ pose.rotation.T
-        struts = np.linalg.norm(joints - geometry.base_joints, axis=1)
+        struts = distances(geometry, pose)
         if geometry.screw_lead.any():  # turning screws are another test's
             struts = RealMachine(geometry, MachineModel(geometry.name)).commands_for(pose)[0]
         actual = goes(model, geometry, HERE, struts)
@@ -252,19 +252,14 @@ def test_nothing_steps_when_a_number_jumps() -> None:
     assert not compensator.ramping
     sag = 10e-6 + 30e-6 * 0.3 / (np.pi / 2)
     level = np.array([0.0, 0.0, sag])  # the nominal machine must be told to go higher by what it sags
-    joints = geometry.home.position + level + geometry.platform_joints @ geometry.home.rotation.T
-    np.testing.assert_allclose(last, np.linalg.norm(joints - geometry.base_joints, axis=1), atol=1e-14)
+    raised = Pose(geometry.home.position + level, geometry.home.rotation)
+    np.testing.assert_allclose(last, distances(geometry, raised), atol=1e-14)
 
 
 def test_another_model_keeps_the_numbers_and_a_drift_stands_beside_them() -> None:
     compensator = Compensator(paper_geometry(), MachineModel("paper"))
     compensator.set_outside({"elevation": np.pi / 2})
-    struts = np.linalg.norm(
-        compensator.platform.position
-        + compensator.geometry.platform_joints @ compensator.platform.rotation.T
-        - compensator.geometry.base_joints,
-        axis=1,
-    )
+    struts = distances(compensator.geometry, compensator.platform)
     height = compensator.estimate(struts)[2]
     compensator.set_model(MachineModel("paper", outside=flexure()))
     compensator.set_drift(np.array([0.0, 0.0, 7e-6, *[0.0] * 9]))

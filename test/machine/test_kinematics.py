@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from helpers import (
     central_difference,
+    distances,
     general_machine,
     moved,
     poses_about,
@@ -263,12 +264,6 @@ def geometry() -> HexapodGeometry:
 @pytest.fixture(scope="module")
 def structure(geometry) -> Structure:
     return Structure.of(geometry)
-
-
-def distances(structure: Structure, pose: Pose) -> np.ndarray:
-    """Strut lengths from scratch: where the joints are, and how far apart."""
-    joints = np.array([pose.position + pose.rotation @ joint for joint in structure.platform_joints])
-    return np.linalg.norm(joints - structure.base_joints, axis=1)
 
 
 def numbers(pose: Pose) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from calibration_helpers import paper
 from foreign_machines import machine_names, machines
-from helpers import nominal_error, three_two_one_machine
+from helpers import distances, nominal_error, three_two_one_machine
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
@@ -55,11 +55,6 @@ def assert_same_pose(found, truth, position=1e-13, angle=1e-12):
     assert np.abs(found.position - truth.position).max() <= position
     turn = Rotation.from_matrix(found.rotation @ truth.rotation.T)
     assert turn.magnitude() <= angle
-
-
-def distances(base, platform, pose):
-    """Return the six distances between joints, by NumPy alone."""
-    return np.linalg.norm(pose.position + platform @ pose.rotation.T - base, axis=1)
 
 
 def shifted(pose, *by):
@@ -127,13 +122,12 @@ def test_a_deviation_is_a_moved_joint(body):
     deviation = np.zeros((6, 3))
     deviation[2] = [120e-6, -80e-6, 50e-6]
     machine = RealMachine(geometry, MachineModel("skewed", **{f"{body}_deviation": deviation}))
-    joints = {"base": geometry.base_joints, "platform": geometry.platform_joints}
-    joints[body] = joints[body] + deviation
+    real = replace(geometry, **{f"{body}_joints": getattr(geometry, f"{body}_joints") + deviation})
     for seed in range(10):
         pose = random_pose(np.random.default_rng(seed), geometry.home)
         commands, _, _ = machine.commands_for(pose, MotionState())
-        nominal = distances(geometry.base_joints, geometry.platform_joints, pose)
-        np.testing.assert_allclose(commands, distances(joints["base"], joints["platform"], pose), atol=2e-16)
+        nominal = distances(geometry, pose)
+        np.testing.assert_allclose(commands, distances(real, pose), atol=2e-16)
         np.testing.assert_array_equal(np.abs(commands - nominal) > 1e-9, np.arange(6) == 2)
 
 
@@ -143,10 +137,10 @@ def test_backlash_follows_each_struts_own_direction():
     machine = RealMachine(geometry, MachineModel("paper", struts=StrutErrors(backlash=np.full(6, play))))
     motion = MotionState()
     home = geometry.home
-    nominal = distances(geometry.base_joints, geometry.platform_joints, home)
+    nominal = distances(geometry, home)
     np.testing.assert_allclose(machine.commands_for(home, motion)[0], nominal, atol=2e-16)
     up = shifted(home, 0.0, 0.0, 1e-3)
-    lengths_up = distances(geometry.base_joints, geometry.platform_joints, up)
+    lengths_up = distances(geometry, up)
     np.testing.assert_allclose(machine.commands_for(up, motion)[0], lengths_up + play / 2, atol=2e-16)
     np.testing.assert_allclose(machine.commands_for(home, motion)[0], nominal - play / 2, atol=2e-16)
 
@@ -408,10 +402,6 @@ def loaded(geometry: HexapodGeometry, loading: Loading | None = None, **load: ob
     return RealMachine(geometry, MachineModel(geometry.name, load=block), loading=loading or Loading())
 
 
-def nominal(geometry: HexapodGeometry, pose: Pose) -> np.ndarray:
-    return np.linalg.norm(pose.position + geometry.platform_joints @ pose.rotation.T - geometry.base_joints, axis=1)
-
-
 def lowest_energy(
     geometry: HexapodGeometry, lengths: np.ndarray, stiffness: np.ndarray, mass: float, centre: np.ndarray,
     gravity: np.ndarray, start: Pose,
@@ -423,7 +413,7 @@ def lowest_energy(
 
     def energy(x: np.ndarray) -> float:
         at, home = pose(x), start.position + start.rotation @ centre
-        springs = 0.5 * (stiffness * (nominal(geometry, at) - lengths) ** 2).sum()
+        springs = 0.5 * (stiffness * (distances(geometry, at) - lengths) ** 2).sum()
         return float(springs - mass * gravity @ (at.position + at.rotation @ centre - home))
 
     def gradient(x: np.ndarray) -> np.ndarray:
@@ -450,7 +440,7 @@ def test_it_rests_where_the_energy_is_least(name: str, tmp_path: Path) -> None:
     assert_same_pose(actual, Pose(geometry.home.position, turned))
     rest = lowest_energy(geometry, commands, stiffness, 30.0, centre, gravity, geometry.home)
     assert_same_pose(actual, rest, 1e-9, 1e-8)
-    assert np.abs(commands - nominal(geometry, actual)).max() > 1e-6, "and it bends by more than a µm"
+    assert np.abs(commands - distances(geometry, actual)).max() > 1e-6, "and it bends by more than a µm"
 
 
 def test_a_hanging_machine_is_commanded_shorter() -> None:
@@ -461,7 +451,7 @@ def test_a_hanging_machine_is_commanded_shorter() -> None:
         standing, base_joints=standing.base_joints @ over, platform_joints=standing.platform_joints @ over,
         home=Pose(over @ standing.home.position, np.eye(3)), base_cone_axes=None, platform_cone_axes=None,
     )  # fmt: skip
-    pushed, pulled = (loaded(g).commands_for(g.home)[0] - nominal(g, g.home) for g in (standing, hanging))
+    pushed, pulled = (loaded(g).commands_for(g.home)[0] - distances(g, g.home) for g in (standing, hanging))
     assert (pushed > 1e-6).all()
     np.testing.assert_allclose(pulled, -pushed, rtol=1e-9)
     # Lost motion: a strut that pushes is shorter by half of it, so it is told to be longer, and the other way round.
