@@ -151,22 +151,6 @@ def test_screw_rotation_goes_through_genhexkins(tmp_path: Path, turned: float) -
     assert check.tilted.after.largest < 0.5e-6  # struts longer than a level tool needs: coarse points
 
 
-def test_export_follows_work_and_tool_frames(tmp_path: Path) -> None:
-    """Truth: the model. Only the field's absence may be left, and there is none."""
-    geometry = replace(
-        paper_geometry(),
-        tool=Pose.from_angles([0.01, -0.02, -0.08], np.deg2rad([3.0, -2.0, 20.0])),
-        work=Pose.from_angles([0.03, 0.02, 0.35], np.deg2rad([0.5, 1.0, -30.0])),
-    )
-    struts = StrutErrors(offset=np.linspace(-1e-4, 1e-4, 6), backlash=np.full(6, 4e-6))
-    model = MachineModel("paper", base_deviation=np.full((6, 3), 5e-5), struts=struts)
-    box = np.array([[-0.05, -0.05, -0.08], [0.05, 0.05, 0.02]])
-    _, back = written(tmp_path, geometry, model, box)
-    check = ExportTrial(geometry, model, box, 100).check(back.commands)
-    assert check.level.before.rms > 40e-6
-    assert check.level.after.largest < 1e-9  # ten digits of a float32 correction of 0.1 mm
-
-
 def test_table_of_offset_pitch_and_backlash_is_exact(tmp_path: Path) -> None:
     """Truth: L = c + o + p(c − c₀) ∓ b/2 solved for c by hand; a straight line, so no misfit but float32's."""
     o, p, c0, b = 120e-6, 80e-6, 0.5, 6e-6
