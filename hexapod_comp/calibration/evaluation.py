@@ -120,16 +120,13 @@ def evaluate_model(
     truth: RealMachine,
     model: MachineModel,
     box: np.ndarray,
-    points: int = 1000,
     seed: int = 0,
     repeatability: float = 0.0,
-    sensed: Temperatures | None = None,
     level: np.ndarray | None = None,
 ) -> ModelEvaluation:
     """Return the tool errors of a virtual machine without and with a model; `repeatability` acts in space alone."""
-    before = held_out(truth, None, box, points, seed, repeatability, level=level)
-    after = held_out(truth, model, box, points, seed, repeatability, sensed=sensed, level=level)
-    return ModelEvaluation(before, after, paper_metric(truth, model, box, seed=seed, sensed=sensed, level=level))
+    before, after = (held_out(truth, one, box, 1000, seed, repeatability, level=level) for one in (None, model))
+    return ModelEvaluation(before, after, paper_metric(truth, model, box, seed=seed, level=level))
 
 
 def evaluation_text(evaluation: ModelEvaluation) -> str:

@@ -45,16 +45,13 @@ def strut_length_errors(
     return np.array(errors)
 
 
-def strut_error_figure(
-    geometry: HexapodGeometry, models: Mapping[str, MachineModel], y: float | None = None, z: float | None = None
-) -> Figure:
+def strut_error_figure(geometry: HexapodGeometry, models: Mapping[str, MachineModel]) -> Figure:
     """Show Mou & King's Figures 3 and 4: the six struts' length errors along x, forward (a) and backward (b)."""
     if not models or any(model.measured is None for model in models.values()):
         raise CalibrationError("picture of strut errors", "needs models, each with the box in which it holds")
     box = commanded_box(geometry, next(iter(models.values())))
-    middle = box.mean(axis=0)
+    line = box.mean(axis=0)[1:]
     along = np.linspace(box[0, 0], box[1, 0], SAMPLES)
-    line = (middle[1] if y is None else y, middle[2] if z is None else z)
     figure = Figure(figsize=(11, 3.8 * len(models)), layout="constrained")
     rows = figure.subplots(len(models), 2, squeeze=False, sharex=True, sharey="row")
     for panels, (title, model) in zip(rows, models.items(), strict=True):

@@ -215,15 +215,14 @@ def described(error: BaseException) -> str:
 class Throttle:
     """Lets one message per cause and second through, and counts what it held back."""
 
-    def __init__(self, period: float = 1.0) -> None:
-        self._period = period
+    def __init__(self) -> None:
         self._last: dict[str, float] = {}
         self._held: dict[str, int] = {}
 
     def allow(self, cause: str, text: str) -> str | None:
         """Return the text to be logged, with the number of suppressed ones, or None to suppress this one."""
         now = time.monotonic()
-        if now - self._last.get(cause, -1e9) < self._period:
+        if now - self._last.get(cause, -1e9) < 1.0:
             self._held[cause] = self._held.get(cause, 0) + 1
             return None
         self._last[cause] = now

@@ -19,23 +19,23 @@ from ..ros.process import SPIN_PERIOD, RosSession
 from ..workspace.pictures import shades
 from ..workspace.shells import Layer, Quantity
 
-TOPIC = "workspace/shells"
+TOPIC, FRAME = "workspace/shells", "work"
 NAMESPACE = "workspace_shells"
 TEXT_SHARE = 0.06  # Height of the text, of the width of the outermost shell
 OPACITY = (1.0, 0.35)  # Of the innermost and of the outermost shell
 
 
-def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, frame_id: str, stamp: Time) -> MarkerArray:
+def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, stamp: Time) -> MarkerArray:
     """Return shells as triangles coloured from the smallest to the largest value, and a text that names both."""
     values = np.concatenate([layer.values.ravel() for layer in layers]) if layers else np.array([np.nan])
     if not np.isfinite(values).all():
         raise GeometryError("layers", "must be at least one, with finite values")
     low, high = float(values.min()), float(values.max())
     clear = Marker(ns=NAMESPACE, action=Marker.DELETEALL)
-    clear.header.frame_id, clear.header.stamp = frame_id, stamp
+    clear.header.frame_id, clear.header.stamp = FRAME, stamp
     markers = [clear]
     for number, layer in enumerate(layers):
-        marker = _marker(frame_id, stamp, number, Marker.TRIANGLE_LIST)
+        marker = _marker(stamp, number, Marker.TRIANGLE_LIST)
         opacity = OPACITY[0] + number / max(1, len(layers) - 1) * (OPACITY[1] - OPACITY[0])
         shares = (layer.values.ravel() - low) / (high - low if high > low else 1.0)
         colours = [ColorRGBA(r=r, g=g, b=b, a=opacity) for r, g, b, _ in shades(shares).tolist()]
@@ -44,7 +44,7 @@ def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, frame
         marker.points = [points[corner] for corner in corners]
         marker.colors = [colours[corner] for corner in corners]
         markers.append(marker)
-    text = _marker(frame_id, stamp, len(layers), Marker.TEXT_VIEW_FACING)  # above the outermost shell
+    text = _marker(stamp, len(layers), Marker.TEXT_VIEW_FACING)  # above the outermost shell
     values_shown = f"{low * quantity.factor:.4g} (dark) … {high * quantity.factor:.4g} (yellow)"
     text.text = f"{title}\n{quantity.label}: {values_shown}"
     below, above = (end(layers[-1].points.reshape(-1, 3), axis=0) for end in (np.min, np.max))
@@ -66,7 +66,7 @@ def show_shells(layers: Sequence[Layer], quantity: Quantity, title: str) -> None
     """Publish shells from a node of its own until Ctrl-C."""
     with RosSession("workspace_shells") as session:
         stamp = session.node.get_clock().now().to_msg()
-        publish_shells(session.node, shell_markers(layers, quantity, title, "work", stamp))
+        publish_shells(session.node, shell_markers(layers, quantity, title, stamp))
         with suppress(KeyboardInterrupt):
             while True:
                 session.spin_once(SPIN_PERIOD)
@@ -84,9 +84,9 @@ def triangles(points: np.ndarray) -> np.ndarray:
     return facets[(corners != np.roll(corners, 1, axis=1)).any(axis=2).all(axis=1)]
 
 
-def _marker(frame_id: str, stamp: Time, number: int, kind: int) -> Marker:
+def _marker(stamp: Time, number: int, kind: int) -> Marker:
     marker = Marker(ns=NAMESPACE, id=number, type=kind, action=Marker.ADD)
-    marker.header.frame_id, marker.header.stamp = frame_id, stamp
+    marker.header.frame_id, marker.header.stamp = FRAME, stamp
     marker.pose.orientation.w = 1.0
     marker.scale.x = marker.scale.y = marker.scale.z = 1.0
     marker.color.a = 1.0

@@ -53,17 +53,10 @@ def outline(geometry: HexapodGeometry) -> list[np.ndarray]:
     return [to_work.position + line @ to_work.rotation.T for line in lines]
 
 
-def shells_figure(
-    geometry: HexapodGeometry,
-    layers: Sequence[Layer],
-    quantity: Quantity,
-    title: str,
-    limits: tuple[float, float] | None = None,
-) -> Figure:
+def shells_figure(geometry: HexapodGeometry, layers: Sequence[Layer], quantity: Quantity, title: str) -> Figure:
     """Show shells of the workspace coloured by an effect (v. Daake et al., Figure 2), with the machine at home."""
     values = _finite_values(layers) * quantity.factor
-    scale = np.array(limits) * quantity.factor if limits else np.array([values.min(), values.max()])
-    norm = Normalize(*scale)
+    norm = Normalize(values.min(), values.max())
     figure = Figure(figsize=(12.0, 6.0), layout="constrained")
     figure.suptitle(picture_text(title))
     faces, colours = [], []

@@ -247,7 +247,7 @@ STAMP = Time(sec=7)
 
 
 def markers() -> list[Marker]:
-    return shell_markers(layers(), TRANSLATION, "pitch, strut 1", "work", STAMP).markers
+    return shell_markers(layers(), TRANSLATION, "pitch, strut 1", STAMP).markers
 
 
 def test_triangles_enclose_the_mesh_and_look_outwards():
@@ -289,7 +289,7 @@ def test_what_the_markers_hold():
 @pytest.mark.parametrize("wrong", [[], [Layer(mesh(), np.full((RINGS, SECTORS + 1), np.nan))]])
 def test_no_markers_of_nothing(wrong):
     with pytest.raises(GeometryError, match="layers: must be at least one, with finite values"):
-        shell_markers(wrong, TRANSLATION, "", "work", STAMP)
+        shell_markers(wrong, TRANSLATION, "", STAMP)
 
 
 def test_who_comes_late_sees_the_shells(ros_context):
