@@ -325,17 +325,16 @@ def test_check_follows_a_stream_like_the_compensator(monkeypatch: pytest.MonkeyP
 
 
 def test_check_says_where_a_field_cannot_be_undone() -> None:
-    """A field whose displacement grows by 1.5 m per m has no inverse by iteration: named, once, per pose."""
+    """A displacement that grows by 1.5 m per m has no inverse by iteration; a field that refuses has none outside."""
     grid = tuple(np.array(axis) for axis in ([-0.2, 0.2], [-0.2, 0.2], [0.3, 0.5]))
     lines = [np.zeros((2, 2, 2, 6, 2)) for _ in range(3)]
     lines[0][:, :, :, 0, 1] = 0.3  # u runs from −1 to 1 over 0.4 m
-    model = MachineModel("paper", field=GridField(grid, tuple(lines)))  # type: ignore[arg-type]
-    poses = [Pose([0.03, 0.0, 0.4], np.eye(3)), Pose([0.05, 0.0, 0.4], np.eye(3))]
-    result = check(PAPER, model, poses, mode="stream")
-    assert [(b.row, b.limit) for b in result.breaches if b.limit == "not_converged"] == [
-        (0, "not_converged"),
-        (1, "not_converged"),
-    ]
+    flat = [np.zeros((2, 2, 2, 6, 0)) for _ in range(3)]
+    steep, small = GridField(grid, tuple(lines)), GridField(grid, tuple(flat), outside="refuse")  # type: ignore[arg-type]
+    poses = [Pose([x, 0.0, 0.4], np.eye(3)) for x in (0.03, 0.05, 0.21)]
+    for field, limit, rows in ((steep, "not_converged", {0, 1}), (small, "outside_field", {2})):
+        result = check(PAPER, MachineModel("paper", field=field), poses, mode="poses")
+        assert {b.row for b in result.breaches if b.limit == limit} >= rows, limit
 
 
 def test_check_refuses_what_makes_no_sense() -> None:

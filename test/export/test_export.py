@@ -19,7 +19,7 @@ from hexapod_comp.cli import export
 from hexapod_comp.cli.app import make_parser
 from hexapod_comp.errors import GeometryError, HexapodError, InputFileError, LimitError, ModelError, OutsideFieldError
 from hexapod_comp.export.c_code import model_header
-from hexapod_comp.export.carried import CARRIED, PROVENANCE, refuse_unknown
+from hexapod_comp.export.carried import refuse_unknown
 from hexapod_comp.export.linuxcnc import (
     COMP_FILES,
     HAL_FILE,
@@ -395,26 +395,6 @@ def test_an_unknown_term_is_refused_and_zero_passes(export: Callable[[MachineMod
     assert export(widened(known, ModelWithSag))
     with pytest.raises(ModelError, match=r"^sag: cannot be exported: .* does not know it.*\[0\.0, 0\.0, 1e-06\]"):
         export(widened(known, ModelWithSag, sag=np.array([0.0, 0.0, 1e-6])))
-
-
-def test_the_lists_hold_todays_terms_and_no_others():
-    """Who adds a field decides here, for each export."""
-    blocks = {
-        "struts": StrutErrors,
-        "field": type(MachineModel("m").field),
-        "late_growth": type(MachineModel("m").late_growth),
-        "load": Load,
-    }
-    today = {
-        name
-        for entry in fields(MachineModel)
-        if entry.name not in PROVENANCE
-        for name in (
-            [f"{entry.name}.{one.name}" for one in fields(blocks[entry.name])] if entry.name in blocks else [entry.name]
-        )
-    }
-    assert today - CARRIED == {"outside"}  # no controller is told the numbers that it needs
-    assert today >= CARRIED
 
 
 def test_genhexkins_has_no_term_for_a_load():

@@ -213,28 +213,6 @@ def test_sine_of_the_twist_is_genhexkins(seed):
         assert np.sin(twist) == pytest.approx(np.sin(truth), abs=1e-11)
 
 
-@fixed
-@given(seeds)
-def test_command_grows_by_genhexkins_correction_since_home(seed):
-    """Truth: genhexkins' correction here minus that at home, on struts 1–3, whose axes are parallel at home.
-
-    An axle has no direction, but genhexkins' arcsine gives it one: only with axis vectors more than 90°
-    apart, as LinuxCNC's own defaults are, does its lead mean what its header says, positive for a
-    right-hand thread. So it gets the platform's axes turned round. Tolerance: lengths
-    of half a metre are rounded to 1e-16, the difference of two arcsines of small angles no worse.
-    """
-    lead = 0.008
-    geometry = skewed_geometry(lead)
-    pose = random_pose(np.random.default_rng(seed), geometry.home)
-    found = shifts(geometry, pose)
-    for i in range(3):
-        axes = geometry.base_axes[i], -geometry.platform_axes[i]
-        here, home = (
-            genhexkins_correction(lead, *axes, struts_at(geometry, at)[i], at.rotation) for at in (pose, geometry.home)
-        )
-        assert found[i] == pytest.approx(here - home, abs=1e-15)
-
-
 @pytest.mark.parametrize("strut", range(6))
 @pytest.mark.parametrize("body", ["base_axes", "platform_axes"])
 def test_an_axis_has_no_direction(body, strut):

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from helpers import poses_about
 from scipy import stats
-from strategies import PAPER_FILE
 
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.sensitivity import Prediction, derivatives
@@ -22,7 +21,6 @@ from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.load import Load
 from hexapod_comp.pose import Pose
 from hexapod_comp.workspace.budget import (
-    PLATFORM_JOINT,
     Budget,
     SingleErrors,
     load_budget,
@@ -280,21 +278,6 @@ def test_the_shipped_budget_has_the_papers_sizes() -> None:
     np.testing.assert_allclose(sizes.pop("quantisation"), 7e-6, rtol=1e-12)
     for size in sizes.values():
         np.testing.assert_allclose(size, 10e-6, rtol=1e-12)
-
-
-def test_a_ball_joint_that_two_struts_share_is_one_joint() -> None:
-    """As in ``assess`` and ``fit``: three platform joints of the papers' machine, unless they are asked for apart."""
-    paper, sizes = load_geometry(PAPER_FILE), {"platform_joint_xy": 1e-5, "base_joint_z": 1e-5}
-    shared = Budget("paper", sizes).single_errors(paper)
-    platform = shared.part == PLATFORM_JOINT
-    along_x = [label for label in shared.labels if label.endswith("x")]
-    assert along_x == [f"platform joint {pair} x" for pair in ("1/2", "3/4", "5/6")]
-    assert (shared.struts[platform].sum(axis=1) == 2).all()
-    assert (shared.struts.sum(axis=1)[~platform] == 1).all()
-    assert len(shared) == 3 * 2 + 6
-    apart = Budget("paper", sizes).single_errors(paper, shared_platform_joints=False)
-    assert len(apart) == 6 * 2 + 6
-    assert (apart.struts.sum(axis=1) == 1).all()
 
 
 def test_a_strut_is_off_by_half_its_backlash() -> None:

@@ -177,25 +177,6 @@ def test_shares_and_regions():
     }
 
 
-@pytest.mark.parametrize("name", ["positioning_unit", "jugglebot"])
-def test_the_grid_holds_the_whole_reach(name):
-    """Truth: nothing is within reach on the grid's outermost points, nor beyond the box that cannot be left,
-    of which a wide grid sees that it loses nothing."""
-    geometry = load_geometry(PAPER_FILE.with_name(f"{name}.yaml"))
-    found = reach(geometry, cells=20)
-    for axis in range(3):
-        assert not found.within.take([0, -1], axis).any()
-    box = possible_box(geometry, found.rotation)
-    assert (box[0] <= found.box[0]).all()
-    assert (found.box[1] <= box[1]).all()
-    tips = np.random.default_rng(6).uniform(box[0] - 0.05, box[1] + 0.05, (50_000, 3))
-    inside = Examiner(geometry).findings(tips, found.rotation[None])[0] == Status.OK
-    margin = found.spacing
-    assert inside.any()
-    assert (tips[inside] > found.box[0] - margin).all()
-    assert (tips[inside] < found.box[1] + margin).all()
-
-
 # Refused.
 
 
