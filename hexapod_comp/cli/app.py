@@ -46,7 +46,7 @@ def _run(arguments: Sequence[str]) -> int:
     if "_ARGCOMPLETE" in os.environ:
         complete(parser)
     try:
-        args = parser.parse_args(_with_negative_values(arguments))
+        args = parser.parse_args(arguments)
     except SystemExit as leaving:  # argparse has printed help or the error
         return leaving.code if isinstance(leaving.code, int) else USAGE_ERROR
     verb = VERBS[args.verb]
@@ -83,18 +83,6 @@ def _meant(name: str, names: Iterable[str]) -> str:
     return f"; did you mean {near[0]}?" if near else ""
 
 
-def _with_negative_values(arguments: Sequence[str]) -> list[str]:
-    """Join ``--pose -5,0,400`` to ``--pose=-5,0,400``, since argparse reads -5,0,400 as an option."""
-    joined: list[str] = []
-    for argument in arguments:
-        after_option = joined and joined[-1].startswith("--") and "=" not in joined[-1]
-        if after_option and NEGATIVE.match(argument):
-            joined[-1] += f"={argument}"
-        else:
-            joined.append(argument)
-    return joined
-
-
 def _check_conflicts(verb: Verb, args: argparse.Namespace) -> None:
     """Raise CommandError where the options break a rule of the verb."""
     options = {option.name: option for option in verb.options}
@@ -122,7 +110,11 @@ def _refuse_numbers_as_files(verb: Verb, args: argparse.Namespace) -> None:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that suggests the option that was meant."""
+    """A parser that suggests the option that was meant, and reads -5,0,400 as a value."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._negative_number_matcher = NEGATIVE
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         options = [option for option in self._option_string_actions if option.startswith("--")]

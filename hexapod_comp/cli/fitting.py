@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -314,7 +314,7 @@ def _renew(args: argparse.Namespace) -> Result:
 def verify(args: argparse.Namespace) -> Result:
     """Check whether a model still holds, 1 when the machine has changed; or propose check readings."""
     if args.propose is None:
-        result = checked(args, args.model).verification
+        *_, result = checked(args, args.model)
         code = 0 if result.verdict == VALID else 1
         return Result(lambda: verification_report(result), lambda: verification_json(result), code=code)
     from ..calibration.candidates import places
@@ -335,15 +335,8 @@ def verify(args: argparse.Namespace) -> Result:
     )
 
 
-class Checked(NamedTuple):
-    model: MachineModel
-    fitted: FittedParameters
-    measured: MeasurementSet
-    verification: Verification
-
-
-def checked(args: argparse.Namespace, path: str) -> Checked:
-    """Return a model with the check readings that the options name."""
+def checked(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedParameters, MeasurementSet, Verification]:
+    """Return a model, its fit's result, the check readings that the options name, and what they say of it."""
     model, fitted = _known(args, path)
     geometry, probe = fitted.space.geometry, args.probe_mm
     if probe is None and not np.allclose(fitted.space.probe, geometry.tool.position, rtol=0.0, atol=1e-12):
@@ -353,7 +346,7 @@ def checked(args: argparse.Namespace, path: str) -> Checked:
     if args.compensated:
         measured = compensated(measured, model)
     with results.stage("comparing possible changes"):
-        return Checked(model, fitted, measured, verify_model(model, fitted, measured))
+        return model, fitted, measured, verify_model(model, fitted, measured)
 
 
 def _known(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedParameters]:
