@@ -276,7 +276,7 @@ example:
         ),
         """Plans a campaign for the goal, has the mover visit it, fits a model, and takes check readings elsewhere.
 Only a model that they bear out becomes FOLDER/model.yaml; with --reload the compensator then runs it. With --checks or
---every-min the model is then checked every so often; what has changed is named, and repaired or proposed. Ctrl-C
+--every-min the model is then checked at that interval; what has changed is named, and repaired or proposed. Ctrl-C
 brakes and ends; the same command goes on from FOLDER/journal.jsonl, also after a kill. Exit code 1: a model was
 refused, or the machine has changed; 130: stopped. More: doc/staying_true.md.
 

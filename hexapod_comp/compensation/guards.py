@@ -341,8 +341,8 @@ class OneSender(Guard):
     predecessor; a subscriber detects it.
 
     `count` returns how many publishers there are, cheap; `names` their full names, each once, and why they cannot be
-    told, empty where they can: who cannot tell who commands must not obey. Several `allowed` publishers are still
-    named.
+    told, empty where they can: without knowing its sender no command may be accepted. Several `allowed` publishers are
+    still named.
     """
 
     def __init__(

@@ -84,7 +84,7 @@ class MachineComponent:
         self._write_valid = self.component.writer("valid")
 
     def cycle(self) -> None:
-        """Read, look, write; lengths without a pose, as before homing, only take ``valid`` away."""
+        """Read pins, compute, write pins; lengths without a pose, as before homing, only clear ``valid``."""
         axes = np.array(self._read_axes())
         struts = np.array(self._read_struts()) * self._metres
         command = Pose.from_quaternion(axes[:3] * self._metres, np.array(quaternion_from_axes(*axes[3:])))
@@ -129,7 +129,7 @@ def _parser() -> argparse.ArgumentParser:
     text = "model file of the hidden truth, ideal, random or random:SEED"
     parser.add_argument("--truth", default="paper_machine.yaml", metavar="FILE", help=text)
     parser.add_argument("--units", choices=tuple(METRES), default="mm", help="LinuxCNC's length unit (default: mm)")
-    parser.add_argument("--rate", type=_rate, default=50.0, metavar="HZ", help="looks per second (default: 50)")
+    parser.add_argument("--rate", type=_rate, default=50.0, metavar="HZ", help="cycles per second (default: 50)")
     parser.add_argument("--name", default="hexapod_machine", help="of the HAL component (default: hexapod_machine)")
     return parser
 

@@ -40,7 +40,7 @@ KEPT = (JOURNAL, "compensator/files")  # Topics that late subscribers receive to
 DEPTH = 1000  # Messages that may wait while the disk is slow: a second of commands
 
 # With less free space than this on its disk, byte, a recording ends: closing it takes pending chunks of 1 MB,
-# an index of 300 bytes for each chunk, and others may write to the disk between two looks
+# an index of 300 bytes for each chunk, and others may write to the disk between two checks
 RESERVE = 64_000_000
 
 # The disk, and whether the bag is still at its place, are checked at this period, s, and after this many bytes
