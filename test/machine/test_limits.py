@@ -19,8 +19,6 @@ from strategies import fixed, paper_geometry, random_model, random_pose, seeds, 
 
 from hexapod_comp.compensation.checks import check
 from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.core import Status, Struct, batch
-from hexapod_comp.core.batch import check_stage
 from hexapod_comp.errors import HexapodError, LimitError
 from hexapod_comp.machine.assembly import mode_objections
 from hexapod_comp.machine.geometry import HexapodGeometry
@@ -190,83 +188,6 @@ MACHINES = {
     "6-6 in turned frames": tight(skewed_geometry(), 0.01, tool=TOOL, work=WORK),
     "hanging": tight(hanging(), 0.23),
 }
-
-
-def first_broken(limits: Limits, numbers: Struct, found: np.ndarray) -> set[tuple[str, int]]:
-    """Return, of all limits that the full examination finds broken, what a check in the documented order meets first.
-
-    Reason and strut; two struts for a clearance, which concerns both; nothing for a pose within the limits.
-    """
-    margins = {name: (margin[0, 0], value[0, 0]) for name, (margin, value) in limits.margins(found).items()}
-    broken = {name: ~(margin >= 0.0) for name, (margin, _) in margins.items()}
-    for i in np.flatnonzero(broken["stroke"]):
-        return {("stroke" if np.isfinite(margins["stroke"][1][i]) else "not_finite", int(i))}
-    for i in range(6):
-        for cone in ("base_cone", "platform_cone"):
-            if broken[cone][i]:
-                return {(cone, i)}
-    if "clearance" in broken and broken["clearance"].any():
-        return {("clearance", int(i)) for i in np.flatnonzero(broken["clearance"])}
-    if broken["condition"][0]:
-        return {("condition", -1)}
-    return {("assembly", -1)} if found["sign"][0, 0] != numbers.view["home_sign"] else set()
-
-
-def hold_together(machine: HexapodGeometry, limits: Limits, pose: Pose, lengths: np.ndarray) -> str:
-    """Fail unless both ways of asking say the same of a pose of the nominal machine; return what they say."""
-    given = machine.limit_numbers.view
-    numbers = limits.numbers(*(given[name] for name in ("cone_axes", "apart", "characteristic_length", "home_sign")))
-    at = *machine.kernel_joints, pose.position, pose.rotation
-    found = batch.examine(*machine.kernel_joints, numbers.at, pose.position, pose.rotation)
-    found["lengths"][0, 0] = lengths
-    finding, strut, _, other, _ = check_stage(*at, lengths, limits=numbers)
-    expected = first_broken(limits, numbers, found)
-    if finding == Status.OK:
-        assert expected == set()
-    else:
-        assert (REASONS[finding], strut) in expected
-        assert other < 0 or (REASONS[finding], other) in expected
-    return REASONS[finding]
-
-
-def at_the_edge(limits: Limits, lengths: np.ndarray, found: np.ndarray) -> list[Limits]:
-    """Return limits at the very quantities of a pose, and some steps of floating point beside them."""
-    angles = np.arccos(np.clip(found["cosines"][0, 0], -1.0, 1.0))
-    values: list[tuple[str, tuple, float]] = []
-    for i in range(6):
-        values += [("stroke", (i, side), lengths[i]) for side in range(2)]
-        values += [(f"{body}_cone", (i,), angles[side, i]) for side, body in enumerate(("base", "platform"))]
-    values += [("condition", (), found["condition"][0, 0])]
-    values += [
-        ("clearance", (), least) for least in found["distances"][0, 0] if limits.clearance and np.isfinite(least)
-    ]
-    every = []
-    for name, place, value in values:
-        for steps in (-1000, -30, -1, 0, 1, 30, 1000):  # a cosine near 1 resolves some 100 steps of its angle
-            changed = np.array(getattr(limits, name))
-            changed[place] = value + steps * np.spacing(value)
-            every.append(replace(limits, **{name: changed if place else float(changed)}))
-    return every
-
-
-@pytest.mark.parametrize("name", MACHINES)
-def test_both_ways_of_asking_agree_to_the_last_bit(name: str) -> None:
-    """At random poses, and with every limit at the pose's own quantity: an angle rounds where its cosine does not."""
-    machine, rng = MACHINES[name], np.random.default_rng(13)
-    said = set()
-    for _ in range(150):
-        pose = random_pose(rng, machine.home, 0.06, 25.0)
-        said.add(hold_together(machine, machine.limits, pose, strut_lengths(Structure.of(machine), pose)))
-    assert said >= {"", "stroke", "base_cone", "platform_cone"}
-    wide = replace(WIDE, clearance=1e-6 if machine.limits.clearance else 0.0)
-    for _ in range(5):
-        pose = random_pose(rng, machine.home, 0.06, 25.0)
-        lengths, given = strut_lengths(Structure.of(machine), pose), Struct("hc_limits")
-        given.copy_from(machine.limit_numbers)
-        given.view["clearance"] = wide.clearance
-        found = batch.examine(*machine.kernel_joints, given.at, pose.position, pose.rotation)
-        verdicts = [hold_together(machine, limits, pose, lengths) for limits in at_the_edge(wide, lengths, found)]
-        assert set(verdicts) >= {"", "stroke", "base_cone", "platform_cone", "condition"}
 
 
 def compensators_refusal(machine: HexapodGeometry, model: MachineModel, tool: Pose) -> tuple[str, int | None] | None:
