@@ -507,14 +507,7 @@ def assess(args: argparse.Namespace) -> Result:
         most = MOST_RESULTS // len(poses)
         raise CommandError("usage", f"--machines: at most {most} at {len(poses)} poses, not {args.machines}")
     geometry, _ = results.load_machine(args)
-    bounds = ImperfectionBounds(
-        joint=args.joint_um * 1e-6,
-        strut_offset=args.strut_um * 1e-6,
-        pitch=args.pitch_ppm * 1e-6,
-        wave=(0.0, args.wave_um * 1e-6),
-        wave_period=args.wave_period_mm * 1e-3,
-        shared_platform_joints=not args.separate_platform_joints,
-    )
+    bounds = ImperfectionBounds(joint=args.joint_um * 1e-6, strut_offset=args.strut_um * 1e-6)
     names = [results.where(row) for row in rows]
     with results.progress_bar(args.machines, " machines") as bar:
         result = assess(geometry, poses, bounds, args.seed, args.machines, names, bar.update)
@@ -542,11 +535,9 @@ def assess(args: argparse.Namespace) -> Result:
     distance, angle = float(result.round_trip[..., 0].max()), float(result.round_trip[..., 1].max())
 
     def text() -> str:
-        shown = [f"joints ±{args.joint_um:g} µm, struts ±{args.strut_um:g} µm"]
-        shown += [f"pitch ±{args.pitch_ppm:g} ppm"] * bool(args.pitch_ppm)
-        shown += [f"waves up to {args.wave_um:g} µm"] * bool(args.wave_um)
+        drawn = f"joints ±{args.joint_um:g} µm, struts ±{args.strut_um:g} µm"
         last = f"…{result.seeds[-1]}" if len(result.seeds) > 1 else ""
-        lines = [f"machine {geometry.name}, {', '.join(shown)}; seed {result.seeds[0]}{last}"]
+        lines = [f"machine {geometry.name}, {drawn}; seed {result.seeds[0]}{last}"]
         lengths, of_tool = (
             tuple(f"L{i}_mm" for i in range(1, 7)),
             "pose of the tool in work that the real machine takes",
@@ -571,10 +562,9 @@ def assess(args: argparse.Namespace) -> Result:
             digits = {name: 6 for name in body[0] if name.endswith("deg")}
             what = "largest strut change, tool displacement and rotation under ideal lengths:"
             lines += ["", f"over {len(result.seeds)} machines: {what}", Table(body).text(digits=digits)]
-        largest = f"largest strut change {abs(result.strut_changes).max() * 1e6:.3f} µm"
-        if not (args.pitch_ppm or args.wave_um):
-            bound = 2.0 * math.sqrt(3.0) * args.joint_um + args.strut_um
-            largest += f" (two joints in a corner of their cubes and a strut allow {bound:.3f} µm)"
+        bound = 2.0 * math.sqrt(3.0) * args.joint_um + args.strut_um
+        largest = f"largest strut change {abs(result.strut_changes).max() * 1e6:.3f} µm (two joints in a corner of "
+        largest += f"their cubes and a strut allow {bound:.3f} µm)"
         trip = f"round trip of the real structure, pose → lengths → pose: within {distance:.1e} m and {angle:.1e} rad"
         return "\n".join([*lines, "", largest, trip, "(exact to rounding; the paper's own Table 5 left up to 5 µm)"])
 
@@ -582,9 +572,7 @@ def assess(args: argparse.Namespace) -> Result:
         return {
             "machine": geometry.name,
             "frame": "work",
-            "bounds": {
-                name: getattr(args, name) for name in ("joint_um", "strut_um", "pitch_ppm", "wave_um", "wave_period_mm")
-            },
+            "bounds": {name: getattr(args, name) for name in ("joint_um", "strut_um")},
             "seeds": list(result.seeds),
             "commanded": [{name: pose[name] for name in POSE_COLUMNS} for pose in commanded],
             "percentiles": list(PERCENTILES.values()),

@@ -55,14 +55,6 @@ TRACKER = value(
     default="tool_pose_true",
 )
 
-# Default bounds of the machines that assess draws
-DRAWN = {
-    "--joint-um": (10.0, "every coordinate of every joint, µm"),
-    "--strut-um": (10.0, "every strut's length offset, µm"),
-    "--pitch-ppm": (0.0, "every screw's pitch error, ppm"),
-    "--wave-um": (0.0, "every screw's periodic error (its amplitude, drawn from 0 up), µm"),
-}
-
 # Bounds of an imagined machine, by the names of ImperfectionBounds; defaults are those of `random`
 BOUNDED = (
     ("--joints-um", bound, 1e-6, "joint", "every coordinate of every joint, ± µm (default 50)"),
@@ -662,10 +654,8 @@ example:
         (
             reads("poses", "CSV file of poses (mm, degrees; default: Table 1 of Song, Mou & King); - for standard "
                   "input", "POSES.csv", "poses", nargs="?", default="table1.csv"),
-            *(value(n, bound, "BOUND", f"bound of {what} (default {usual:g})", default=usual)
-              for n, (usual, what) in DRAWN.items()),
-            value("--wave-period-mm", bound, "MM", "period of that error (default 10)", default=10.0),
-            flag("--separate-platform-joints", "struts that nominally share a platform joint get separate ones"),
+            value("--joint-um", bound, "UM", "bound of each coordinate of each joint, ± µm (default 10)", default=10.0),
+            value("--strut-um", bound, "UM", "bound of each strut's length, ± µm (default 10)", default=10.0),
             value("--machines", count, "N", "how many to draw (default 1)", default=1),
             seed_of("the first machine"),
             MACHINE,

@@ -108,10 +108,10 @@ def test_mutated_files(folder: Path, number: int, changes: list) -> None:
 
 # Verbs and options that are given nonsense; a file that does not exist keeps the long ones from starting
 OPTIONS = {
-    "ik": ("--pose", "--x-mm", "--y-mm", "--z-mm", "--alpha-deg", "--machine", "--model", "--out", "--json"),
+    "ik": ("--pose", "--line", "--step-mm", "--direction", "--machine", "--model", "--out", "--json"),
     "fk": ("--lengths", "--guess", "--cold", "--all-modes", "--machine", "--model", "--json"),
     "check": ("--stream", "--rate-hz", "--machine", "--model", "--json"),
-    "assess": ("--joint-um", "--strut-um", "--pitch-ppm", "--wave-um", "--wave-period-mm", "--seed", "--json"),
+    "assess": ("--joint-um", "--strut-um", "--seed", "--json"),
     "iso230": ("--probe-mm", "--columns", "--targets", "--machine"),
     "plan": ("--lead-mm", "--blocks", "--tolerance-um", "--expansion-ppm", "--seed", "--machine"),
     "imagine": ("--joints-um", "--wave-um", "--backlash-um", "--box", "--seed", "--name", "--machine", "--out"),
