@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> Result:
     rows, poses = read_poses(args.poses)
     session.refuse_broken_limits(args.poses, geometry, model, rows, poses)
     started = nullcontext(()) if args.attach else session.simulated(args.machine, model, truth)
-    compare = not (args.attach or args.no_compare)  # a real machine's compensation is not switched off as a side effect
+    compare = not args.attach  # a real machine's compensation is not switched off as a side effect
     with results.ended_in_order(), started as nodes:
         result = session.run_poses(geometry, nodes, poses, rate, compare, args.namespace)
     errors, unanswered = result.errors(), result.lost + result.refused
@@ -210,7 +210,7 @@ def move(args: argparse.Namespace) -> Result:
                 if signals:
                     machine.stop()
 
-            machine.move(Pose.from_angles(*args.pose), args.frame, args.relative, args.timeout_s, shown)
+            machine.move(Pose.from_angles(*args.pose), args.frame, args.relative, progress=shown)
         state = machine.last
     content = {"state": state.state, "text": state.text, "stopped_by": state.stopped_by}
     return Result(lambda: f"{state.state}: {state.text}", lambda: content)

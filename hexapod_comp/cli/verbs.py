@@ -206,7 +206,6 @@ example:
             pictures(),
             flag("--attach", "use nodes that already run; one pass, without changing them"),
             value("--namespace", None, "NAME", "namespace of those nodes", default=""),
-            flag("--no-compare", "leave out the simulated pass without compensation"),
         ),
         """The tool moves from pose to pose within the machine's limits and rests at each; its error (µm, µrad) is read
 from tool_pose_true, from six poses on also with the datum aligned. Poses are the tool's in the work frame; columns as
@@ -227,7 +226,6 @@ example:
                   "also tool", default="work"),
             flag("--relative", "move relative to the tool's present pose, along and about the frame's axes"),
             flag("--stop", "brake the present move, within the struts' limits"),
-            value("--timeout-s", above_zero, "S", "stop a move that takes longer (default 3600)", default=3600.0),
             NAMESPACE,
             JSON,
         ),
