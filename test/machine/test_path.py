@@ -129,6 +129,15 @@ def test_a_stop_keeps_every_limit_stays_on_the_way_and_is_never_later_than_the_e
             assert np.allclose(stop.positions, start.position + share[:, None] * way, atol=1e-12)
 
 
+def test_a_stop_from_full_speed_is_early() -> None:
+    """In the middle of a long way: at most three times as long as by the largest acceleration throughout."""
+    geometry = paper_geometry()
+    home = geometry.tool_pose(geometry.home)
+    (motion,) = plan_motion(geometry, [home, Pose(home.position + np.array([0.0, 0.0, 0.15]), home.rotation)], RATES)
+    stop = motion.stop(motion.duration / 2.0, 1000.0)
+    assert len(stop) < 1000.0 * 3.0 * RATES.speed / RATES.acceleration < 1000.0 * motion.duration / 2.0
+
+
 def test_a_program_rests_at_each_way_point_and_skips_equal_ones() -> None:
     geometry = paper_geometry()
     a, b, c = random_targets(geometry, 3, 2)

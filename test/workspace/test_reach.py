@@ -175,6 +175,11 @@ def test_shares_and_regions():
         "bottom": {FINDINGS[2]: 1.0},
         "side 180…240°": {FINDINGS[3]: 1.0},
     }
+    apart = np.ones((5, 5, 5), np.int8)
+    apart[[0, 4], 2, 2] = Status.OK  # the centroid between these two is not within reach
+    two = Reach(unit(), LEVEL, (np.linspace(-1.0, 1.0, 5),) * 3, apart, boundary)
+    assert two.parts == 2
+    assert two.centre.tolist() == [-1.0, 0.0, 0.0]
 
 
 # Refused.
