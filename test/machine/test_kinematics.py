@@ -38,6 +38,7 @@ from hexapod_comp.machine.assembly import (
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import (
     Structure,
+    condition_number,
     jacobian,
     solve_one,
     solve_pose,
@@ -135,6 +136,21 @@ def test_motions_between_poses_against_rotations_by_their_vectors(angle: float, 
     batch.motions(positions, rotations, positions + shifts, turned, point, axes.as_matrix(), motions)
     np.testing.assert_allclose(motions[:3].T, axes.inv().apply(carried), rtol=0.0, atol=tolerance)
     np.testing.assert_allclose(motions[3:].T, axes.inv().apply(vectors), rtol=0.0, atol=tolerance)
+
+
+@machines
+def test_condition_number_and_sign_against_linear_algebra(machine: HexapodGeometry) -> None:
+    """NumPy's inverse and determinant of the Jacobian, whose own test is above; 1e-11 covers κ²·1e-16."""
+    structure = Structure.of(machine)
+    unit = np.array([1.0, 1.0, 1.0, *[1.0 / structure.characteristic_length] * 3])
+    for position, rotation in zip(*poses_about(machine.home, 50, seed=5, tilt_deg=15.0), strict=True):
+        pose = Pose(position, rotation)
+        matrix = jacobian(structure, pose) * unit
+        expected = np.linalg.norm(matrix) * np.linalg.norm(np.linalg.inv(matrix)) / 6.0
+        condition, sign = condition_number(structure, pose)
+        assert condition == pytest.approx(expected, rel=1e-11)
+        assert sign == np.sign(np.linalg.det(matrix))
+        assert 1.0 <= condition <= np.linalg.cond(matrix) * (1 + 1e-12) <= 6.0 * condition * (1 + 1e-11)
 
 
 # --- batches -----------------------------------------------------------------------------------------------

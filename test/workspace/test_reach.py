@@ -20,6 +20,7 @@ from hexapod_comp.machine import kinematics
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.measurements.campaign import load_campaign
 from hexapod_comp.pose import Pose
+from hexapod_comp.workspace.overview import overview
 from hexapod_comp.workspace.reach import (
     FACES,
     FINDINGS,
@@ -325,3 +326,17 @@ def test_show_draws_and_says_in_which_frame(tmp_path: Path):
     assert shown["largest_box"]["frame"] == shown["campaign_box"]["frame"] == "work"
     assert any("joint_axes are missing" in text for text in shown["look_again"])
     np.testing.assert_allclose(shown["home_lengths_m"], 0.509192, atol=5e-7)  # Table 2 of Song et al., pose 1
+
+
+def test_tilts_stop_where_a_limit_does():
+    """One step of a quarter of a degree further, a strut or a joint is beyond its limit."""
+    geometry = load_geometry("example_6_6")
+    tilts = overview(geometry, cells=8).tilts
+    home = geometry.tool_pose(geometry.home)
+    for axis, (backward, forward) in enumerate(tilts):
+        assert backward < 0.0 < forward
+        for angle, within in ((forward, True), (forward + np.radians(0.26), False), (backward, True)):
+            turned = Pose.from_angles(np.zeros(3), angle * np.eye(3)[axis])
+            pose = geometry.platform_pose(Pose(home.position, home.rotation @ turned.rotation))
+            found = lengths(geometry, home.position[None], home.rotation @ turned.rotation)[0]
+            assert (geometry.refusal(pose.position, pose.rotation, found) is None) == within
