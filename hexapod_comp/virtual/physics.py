@@ -36,6 +36,7 @@ LIGHTEST = 1e-9  # kg: bodies that MuJoCo moves need a mass
 THICK = 0.02  # m: a platform's thickness, and a payload's radius, for their inertia
 STEP, LONGEST_STEP = 0.25, 2.5e-4  # MuJoCo's, in radians of the fastest oscillation, stable below 2; and at most, s
 MOST_STEPS = 60  # of Newton's method; struts that are never slack take three
+SOFT_AFTER, NEARBY = 8, 1e-8  # steps after which its derivatives are differences of forces, at this distance, m and rad
 SETTLED = 1e-13  # m
 
 
@@ -242,12 +243,17 @@ class PhysicalMachine(RealMachine):
 
         force, jacobian, carry = forces(position, quaternion)
         arm = self.geometry.characteristic_length
-        for _ in range(MOST_STEPS):
-            carried = jacobian * np.where(carry, stiffness, 0.01 * stiffness)[:, None]
-            step = np.linalg.solve(jacobian.T @ carried, force)
+        for n in range(MOST_STEPS):
+            if n >= SOFT_AFTER:  # five struts carry: what else resists is how the struts' forces turn with them
+                changes = [forces(*moved(h, 1.0))[0] - forces(*moved(h, -1.0))[0] for h in NEARBY * np.eye(6)]
+                curvatures, ways = np.linalg.eigh(np.array(changes + np.transpose(changes)) / (-4.0 * NEARBY))
+                step = ways @ (ways.T @ force / np.abs(curvatures))  # downhill also where the weight topples it
+            else:
+                resisting = jacobian.T @ (jacobian * np.where(carry, stiffness, 0.01 * stiffness)[:, None])
+                step = np.linalg.solve(resisting, force)
             small = max(np.abs(step[:3]).max(), arm * np.abs(step[3:]).max()) < SETTLED
             share, low, high = 1.0, 0.0, math.inf
-            if half.any() and not small:  # the potential is convex: on the line, its slope is zero once
+            if half.any() and not small:  # springs' potential is convex: on the line, its slope is zero once
                 first = abs(force @ step)
                 for _ in range(40):
                     slope = forces(*moved(step, share))[0] @ step

@@ -127,6 +127,35 @@ def test_it_rests_where_forces_balance(name: str, given: dict[str, Any], tmp_pat
         assert turn < 1e-11
 
 
+@pytest.mark.parametrize("name", MACHINES)
+def test_it_rests_where_one_strut_has_no_force(name: str, tmp_path: Path):
+    """A payload so far out that by statics strut 1 has no force in the middle of its clearance. Against its motion
+    only the turning of the others' forces resists, 10⁵ times less than a spring, or it topples the platform to an end
+    of the clearance: at rest the springs, with their clearance, balance the weight."""
+    geometry = geometry_of(name, tmp_path)
+    commands, pose, clearance = strut_lengths(geometry, geometry.home), geometry.home, 40e-6
+    up, outward = np.array([0.0, 0.0, 9.80665]), np.array([1.0, 0.0, 0.0])
+
+    def statics(pose: Pose, x: float) -> tuple[np.ndarray, np.ndarray]:
+        ends = geometry.platform_joints @ pose.rotation.T
+        along = pose.position + ends - geometry.base_joints
+        along /= np.linalg.norm(along, axis=1)[:, None]
+        weight = np.concatenate([30.0 * up, np.cross(pose.rotation @ (x * outward), 10.0 * up)])
+        return np.hstack([along, np.cross(ends, along)]).T, weight
+
+    for _ in range(5):
+        middle, out = (np.linalg.solve(*statics(pose, x)) for x in (0.0, 1.0))
+        x = middle[0] / (middle[0] - out[0])
+        forces = middle + x * (out - middle)
+        pose = solve_pose(geometry, commands - 0.5 * clearance * np.sign(forces.round(6)) - forces / 20e6, pose)
+    physics = Physics(clearance=clearance, payload=Payload(10.0, x * outward))
+    settled, _ = PhysicalMachine(RealMachine(geometry, MachineModel(geometry.name)), physics).pose_for(commands)
+    slack = commands - strut_lengths(geometry, settled)
+    arms, weight = statics(settled, x)
+    carried = arms @ (20e6 * (slack - np.clip(slack, -0.5 * clearance, 0.5 * clearance)))
+    assert carried == pytest.approx(weight, abs=1e-5)  # N: 1e-13 m of six springs
+
+
 MOVED: dict[str, tuple[dict[str, Any], float]] = {
     "weight": ({}, 2e-8),
     "heavy struts, tilted": ({"strut_mass": 4.0, "base_tilt": (0.5, 0.2)}, 2e-9),
