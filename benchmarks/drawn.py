@@ -12,6 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TypeVar
 
+import numpy as np
 from tqdm import tqdm
 
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
@@ -20,6 +21,8 @@ from . import table
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
 from foreign_machines import Machine, machines
+
+BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])  # that the paper's machine is measured in, m
 
 Case = TypeVar("Case")
 Result = TypeVar("Result")
@@ -41,21 +44,25 @@ def options(doc: str | None, machines: int, first: int = 1, of: str = "case") ->
     return parser
 
 
+def each(run: Callable[..., Result], tasks: Sequence[tuple], workers: int) -> Iterator[Result]:
+    """Yield what comes of each task in its order, one process a core, with the progress."""
+    # A library's own threads would only be in each other's way.
+    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+    with pool, tqdm(total=len(tasks), disable=None) as bar:
+        for result in pool.map(run, *zip(*tasks, strict=True)) if tasks else ():
+            yield result
+            bar.update()
+
+
 def results(
     of_machine: Callable[[Case, int], Result], cases: Sequence[Case], args: argparse.Namespace
 ) -> Iterator[tuple[Case, list[Result]]]:
     """Yield each case with what came of its machines, as soon as all of them are done."""
-    # One process per core: a library's own threads would only be in each other's way.
-    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
     seeds = range(args.first, args.first + args.machines)
-    pool = ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn"))
-    with pool, tqdm(total=len(cases) * len(seeds), disable=None) as bar:
-        for case in cases:
-            done = []
-            for result in pool.map(of_machine, [case] * len(seeds), seeds):
-                done.append(result)
-                bar.update()
-            yield case, done
+    found = each(of_machine, [(case, seed) for case in cases for seed in seeds], args.workers)
+    for case in cases:
+        yield case, [next(found) for _ in seeds]
 
 
 class Table:

@@ -1,18 +1,21 @@
-"""A long run at 1 kHz: is anything lost, does memory grow, and what were the longest gaps?
+"""A long run at 1 kHz: is anything lost, does memory grow, how much is it, and what were the longest gaps?
 
 Compensator and simulated drive run as processes of their own, the drive's readings go back to the compensator,
 and the tool goes round a circle. Their stderr goes into a pipe that nobody reads, as when a terminal was stopped
 with Ctrl-S. Latency is from just before a command is published to its strut commands' arrival here. For the longest
 ones the system says how long each process had been waiting for a processor in the second around
-it (/proc/PID/task/*/schedstat).
+it (/proc/PID/task/*/schedstat). Before that each node's resident memory is measured at rest, and at most while
+somebody sends it messages of 10 MB by all its topics in turn. 1 MB is 2²⁰ bytes.
 
-Usage: python -m benchmarks.soak [--minutes 30] [--rate-hz 1000]
+Usage: python -m benchmarks.soak [--minutes 30] [--rate-hz 1000] [--messages 30]
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
+import re
 import subprocess
 import sys
 import time
@@ -28,40 +31,40 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.experimental import EventsExecutor
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import JointState, Temperature
 from std_msgs.msg import UInt64
 
+from benchmarks import judged
 from hexapod_comp.loop.processes import PrivateDomain
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.base import COMMAND_QOS, EVENT_QOS
 from hexapod_comp.ros.messages import nanoseconds_of, pose_message
-from hexapod_comp.ros.process import SPIN_PERIOD
+from hexapod_comp.ros.process import SPIN_PERIOD, RosSession
 
 NODES = ("compensator", "strut_drive")
 
 RADIUS, TURN_TIME = 0.012, 4.0  # Circle about home, m, and time of one turn, s: 19 mm/s
-
-# Commands are sent, and not counted, for this long first, s: until DDS has made everybody known to everybody
-RUN_IN = 3.0
-
-WARM_UP = 0.1  # Share of the run after which memory should be flat; at least :data:`LEAST_WARM_UP`, s
-
-LEAST_WARM_UP = 5.0
-
+RUN_IN = 3.0  # Commands are sent, and not counted, for this long first, s: until DDS has made everybody known
+WARM_UP, LEAST_WARM_UP = 0.1, 5.0  # Share of the run after which memory should be flat, and at least, s
 WORST_KEPT = 8
-
 # Edges of the latency histogram, s: 0.23 % apart, so that the client's own memory stays flat
 BINS = np.geomspace(1e-5, 10.0, 6001)
-
 BAR_GROWTH = 1.0  # MB an hour
+
+BAR_AT_REST, BAR_AT_MOST = 100.0, 200.0  # Resident memory, MB
+LENGTH = 10_000_000  # Of a message, byte
+SETTLED = 3.0  # What does not change for so long stays, s
+HEARD = {
+    "compensator": {"tool_pose_command": PoseStamped, "strut_states": JointState, "temperatures": Temperature},
+    "strut_drive": {"strut_commands": JointState},
+}
 
 
 @dataclass
 class Gap:
     """One late answer."""
 
-    at: float  # When the command left, s: CLOCK_MONOTONIC, and since the start of the run
-    elapsed: float
+    elapsed: float  # when the command left since the start of the run, s
     latency: float  # s
     # How long each process waited for a processor in the second around it, s
     waiting: dict[str, float] = field(default_factory=dict)
@@ -186,7 +189,7 @@ class Commander:
         found.histogram[np.searchsorted(BINS, latency)] += 1
         found.longest = max(found.longest, latency)
         if len(found.worst) < WORST_KEPT or latency > found.worst[-1].latency:
-            found.worst.append(Gap(sent, sent - self._start, latency))
+            found.worst.append(Gap(sent - self._start, latency))
             found.worst.sort(key=lambda gap: -gap.latency)
             del found.worst[WORST_KEPT:]
 
@@ -219,6 +222,34 @@ class Commander:
 def _resident(pid: int) -> int:
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def memory(messages: int) -> bool:
+    """Print the nodes' memory at rest, and at most while long messages come; return whether they keep the bars."""
+    kept = True
+    with nodes() as pids, RosSession("stranger") as session:
+        for name, topics in HEARD.items():
+            pid, kinds, before = pids[name], list(topics.values()), math.inf
+            make = session.node.create_publisher
+            publishers = [make(kind, topic, QoSProfile(depth=1)) for topic, kind in topics.items()]
+            while not all(publisher.get_subscription_count() for publisher in publishers):
+                session.spin_once(SPIN_PERIOD)
+            while abs((rest := _resident(pid) / 2**20) - before) >= 1.0:
+                before = rest
+                time.sleep(SETTLED)
+            Path(f"/proc/{pid}/clear_refs").write_text("5", encoding="ascii")  # forget the largest so far
+            for number in range(messages):
+                message = kinds[number % len(kinds)]()
+                message.header.frame_id = "x" * LENGTH
+                publishers[number % len(kinds)].publish(message)
+                end = time.monotonic() + 0.2
+                while time.monotonic() < end:
+                    session.spin_once(SPIN_PERIOD)
+            status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
+            most = int(re.findall(r"VmHWM:\s+(\d+) kB", status)[0]) / 1024.0
+            print(f"{name}: {rest:.0f} MB at rest, with messages of 10 MB {most:.0f} MB at most", flush=True)
+            kept &= rest <= BAR_AT_REST and most <= BAR_AT_MOST
+    return kept
 
 
 @contextmanager
@@ -278,17 +309,22 @@ def report(found: Soak) -> list[str]:
 
 
 def main() -> int:
-    """Print the account; exit 1 when something was lost or memory grew."""
+    """Print the account; exit 1 when something was lost or memory grew or is too large."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--minutes", type=float, default=30.0, help="of the run; 0: memory alone")
     parser.add_argument("--rate-hz", type=float, default=1000.0)
+    parser.add_argument("--messages", type=int, default=30, help="of 10 MB to each node; 0: the run alone")
     args = parser.parse_args()
-    found = soak(args.minutes * 60.0, args.rate_hz)
-    print("\n".join(report(found)))
-    grows = [found.growth(i)[0] > BAR_GROWTH for i in (0, 1)]
-    verdict = "MISSED" if found.lost or found.heartbeats_lost or any(grows) else "kept"
-    print(f"bars (nothing lost, memory grows by less than {BAR_GROWTH:g} MB/h): {verdict}", file=sys.stderr)
-    return int(verdict == "MISSED")
+    problems = []
+    if args.messages and not memory(args.messages):
+        problems.append(f"a node has more than {BAR_AT_REST:g} MB at rest or {BAR_AT_MOST:g} MB at most")
+    if args.minutes:
+        found = soak(args.minutes * 60.0, args.rate_hz)
+        print("\n".join(report(found)))
+        problems += ["something was lost"] if found.lost or found.heartbeats_lost else []
+        if any(found.growth(i)[0] > BAR_GROWTH for i in (0, 1)):
+            problems.append(f"memory grows by more than {BAR_GROWTH:g} MB/h")
+    return judged(problems)
 
 
 if __name__ == "__main__":

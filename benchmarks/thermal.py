@@ -151,7 +151,7 @@ def stated(args: argparse.Namespace) -> bool:
 
 # ---- fitted expansions, judged on another day ----
 
-BOX, INCH = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]]), 0.0254
+INCH = 0.0254
 RISE, TAU = np.array([3.0] * 6 + [2.0, 2.5]), np.array([1500.0] * 6 + [5400.0, 3000.0])  # struts, base, platform; K, s
 APART = 0.1  # How much each strut differs in rise and time constant (standard deviation)
 SENSORS = {"a sensor on each part": ("", 0.95), "one sensor in the base": ("base", 0.85)}  # and the bars
@@ -167,12 +167,12 @@ def one_fitted(sensors: str, seed: int, args: argparse.Namespace) -> tuple[float
     rise, time_constants = np.append(RISE * apart[:, 0], 0.0), np.append(TAU * apart[:, 1], 1.0)
     places = (thermometer,) if thermometer else PARTS
     warm_up = WarmUp(rise, time_constants, sensors=places, noise=(args.noise, 0.0), cold_rounds=0)
-    campaign = warm_up.campaign(Campaign(BOX, 8.0 * INCH, 2.0 * INCH, "5-D", 4))
+    campaign = warm_up.campaign(Campaign(drawn.BOX, 8.0 * INCH, 2.0 * INCH, "5-D", 4))
     readings = warm_up.measured(template(campaign, geometry), campaign, RealMachine(geometry, model), seed)
     fit = fit_model(readings, FitSettings(lead=LEAD, blocks=("pitch", "wave", "backlash", "expansion", "late")))
 
     rng, points = np.random.default_rng([seed, 18]), args.points
-    passes = random_passes(geometry, BOX, points, 0.0, rng)
+    passes = random_passes(geometry, drawn.BOX, points, 0.0, rng)
     true = warm_up.course(DAY, OFF)
     sensed, heard = warm_up.sensed(true, rng), Temperatures()
     cold = tool_at(RealMachine(geometry, model), passes, fit.model, None)

@@ -8,31 +8,25 @@ left of the tool's error is judged at points that nothing was fitted to, the dat
 
 Usage: python -m benchmarks.upkeep [--machines 100] [--foreign 5] [--drifting 20] [--workers 2] [--save FILE]
 
-``--save`` keeps each machine's results as they come, and goes on from those that are there; a run that is broken off
-prints what it has, and ``--machines 0 --foreign 0 --save FILE`` prints what a file has. Exits 1 when a bar is missed:
-no more than 5 % false alarms, a strut moved by 20 µm named in 95 %, repaired to 1.5 times what the calibration had
-left, a bend in space or a moved joint taken for what it is not in no more than 10 %, and of all that is named 90 %
-rightly.
+``--save`` keeps each machine's results as they come, and goes on from those that are there; ``--machines 0 --foreign 0
+--save FILE`` prints what a file has. Exits 1 when a bar is missed: no more than 5 % false alarms, a strut moved by 20
+µm named in 95 %, repaired to 1.5 times what the calibration had left, a bend in space or a moved joint taken for what
+it is not in no more than 10 %, and of all that is named 90 % rightly.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import multiprocessing
-import os
 import sys
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
-from tqdm import tqdm
 
-from benchmarks import table
+from benchmarks import drawn, table
 from benchmarks.calibration import LARGE, LEAD
 from benchmarks.smooth_imperfections import with_wavy_field
 from hexapod_comp.calibration.changes import AGEING, DATUM, OTHER, STRUT, TEMPERATURE
@@ -58,7 +52,6 @@ from hexapod_comp.measurements.readings import AXES, CHANNELS, FORWARD, Measurem
 from hexapod_comp.virtual.imperfections import draw_model
 from hexapod_comp.virtual.instruments import measure
 
-ROOT = Path(__file__).resolve().parents[1]
 # Machines of test/foreign_machines.py: 6-6 with turned frames, hanging, in inches, wide struts from afar,
 # screws that turn
 FOREIGN = ("framed", "hanging", "inches", "mirror", "left-hand")
@@ -68,8 +61,6 @@ CRASH, POINTS = 20e-6, 200
 CHOSEN = "12 chosen"
 # Check readings: twelve that the package chooses, twelve and twenty-four by the rule of thumb above
 SETS = (CHOSEN, "12", "24")
-BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])
-
 CHANGES = {"nothing": None, "strut": STRUT, "datum": DATUM, "temperature": TEMPERATURE, "ageing": AGEING,
            "two struts": STRUT}  # fmt: skip
 # What parameters can follow, and what is in no hypothesis that is named; with their kinds. Lines cannot see the
@@ -82,18 +73,6 @@ SHARES = (0.0, 0.5, 0.7, 0.9, 0.99, 1.0)
 FALSE_ALARMS, NAMED_RIGHTLY, REPAIRED, CONFIDENTLY_WRONG, RIGHT_OF_NAMED = 0.05, 0.95, 1.5, 0.10, 0.90
 
 DRIFT, CHECK_EVERY, CHECKS = 20e-6, 0.5, 6  # Struts that grow by so much an hour, m, checked so often, h
-
-
-def machine_of(name: str) -> tuple[HexapodGeometry, np.ndarray]:
-    """Return a machine and the box that is measured, m in its work frame."""
-    if name == "paper":
-        return load_geometry(ROOT / "config" / "paper.yaml"), BOX
-    sys.path.insert(0, str(ROOT / "test"))
-    from foreign_machines import machines
-
-    with TemporaryDirectory() as folder:
-        machine = machines()[name]
-        return load_geometry(machine.write(Path(folder) / "machine.yaml")), machine.box
 
 
 def changed(truth: MachineModel, what: str, geometry: HexapodGeometry, box: np.ndarray, seed: int) -> MachineModel:
@@ -141,7 +120,11 @@ class Machine:
     """A machine that was measured and fitted."""
 
     def __init__(self, name: str, seed: int) -> None:
-        self.geometry, self.box = machine_of(name)
+        if name == "paper":
+            self.geometry, self.box = load_geometry(name), drawn.BOX
+        else:
+            self.geometry, machine = drawn.of_zoo(name)
+            self.box = machine.box
         side = float(np.ptp(self.box, axis=0).min())
         self.campaign = Campaign(self.box, side, 0.25 * side, "5-D", 4)
         self.truth = draw_model(self.geometry, LARGE, seed)
@@ -201,7 +184,7 @@ def answer(verification: Verification, what: str, truth: MachineModel, before: M
     }
 
 
-def one_machine(name: str, seed: int, drifting: bool) -> dict:
+def one_machine(name: str, seed: int, drifting: int) -> dict:
     """Return everything about one machine."""
     machine = Machine(name, seed)
     result: dict = {"machine": name, "seed": seed, "fresh": machine.left(machine.truth, machine.model), "checks": []}
@@ -216,7 +199,7 @@ def one_machine(name: str, seed: int, drifting: bool) -> dict:
                 if not refusal(verification):
                     renewed = update_model(machine.model, machine.fitted, readings, verification)
                     result[f"repaired, {count}"] = machine.left(truth, renewed.model)
-    if drifting:
+    if seed <= drifting and name == "paper":
         result["drift"] = drift(machine)
     return result
 
@@ -307,38 +290,26 @@ def report(title: str, results: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def run(tasks: list[tuple[str, int, bool]], workers: int, results: list[dict], save: Path | None) -> None:
-    """Add each machine's results to those that there are, and to the file, as they come; until broken off."""
-    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        waiting = [pool.submit(one_machine, *task) for task in tasks]
-        try:
-            for done in tqdm(as_completed(waiting), total=len(tasks), disable=None):
-                results.append(done.result())
-                if save is not None:
-                    with save.open("a", encoding="utf-8") as file:
-                        file.write(json.dumps(results[-1]) + "\n")
-        except KeyboardInterrupt:
-            pool.shutdown(cancel_futures=True)
-
-
 def main() -> int:
     """Run all machines and print what came out."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--machines", type=int, default=100, help="of the paper's kind (default 100)")
+    parser = drawn.options(__doc__, 100, of="the paper's kind")
     parser.add_argument("--foreign", type=int, default=5, help="of each other kind (default 5)")
     parser.add_argument("--drifting", type=int, default=20, help="of the first, that drift as well (default 20)")
-    parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
     parser.add_argument("--save", type=Path, metavar="FILE", help="keep results as they come; go on from those there")
     args = parser.parse_args()
-    tasks = [("paper", seed, seed <= args.drifting) for seed in range(1, args.machines + 1)]
-    tasks += [(name, seed, False) for name in FOREIGN for seed in range(1, args.foreign + 1)]
-    results = []
-    if args.save is not None and args.save.exists():
-        results = [json.loads(line) for line in args.save.read_text(encoding="utf-8").splitlines()]
-    there = {(result["machine"], result["seed"]) for result in results}
-    run([task for task in tasks if task[:2] not in there], args.workers, results, args.save)
-    of = {name: [r for r in results if r["machine"] == name] for name in ("paper", *FOREIGN)}
+    saved = args.save.read_text(encoding="utf-8").splitlines() if args.save and args.save.exists() else []
+    of: dict[str, list[dict]] = {name: [] for name in ("paper", *FOREIGN)}
+    for result in map(json.loads, saved):
+        of[result["machine"]].append(result)
+    tasks = [
+        (n, s) for n in of for s in range(args.first, args.first + (args.machines if n == "paper" else args.foreign))
+    ]
+    tasks = [(name, seed) for name, seed in tasks if seed not in {result["seed"] for result in of[name]}]
+    for result in drawn.each(partial(one_machine, drifting=args.drifting), tasks, args.workers):
+        of[result["machine"]].append(result)
+        if args.save is not None:
+            with args.save.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(result) + "\n")
     print("\n\n".join(report(name, found) for name, found in of.items() if found))
     met = bars(of["paper"]) if of["paper"] else []
     for name, value, bar, good in met:
