@@ -3,7 +3,7 @@
 The same commands, a small circle that turns and comes back, go through compensators that differ by one block; they
 take turns, and a block's cost is what it adds to a command, and to an estimate of the pose from strut readings, of
 the ideal machine: all called from Python, processor time of the thread, the least of the rounds, since others on
-the machine can only add. What the ideal machine's command is made of is timed part by part, each with its call.
+the machine can only add.
 
 Run ``python -m benchmarks.blocks``.
 """
@@ -14,15 +14,12 @@ import argparse
 import dataclasses
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.core import ffi, lib
-from hexapod_comp.core.batch import given, written
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.load import Load
@@ -36,8 +33,6 @@ from . import table
 COMMANDS = 500
 PERIOD = 1e-3  # Between two commands, s
 
-INNER = 1000  # Calls of a part between two looks at the clock
-
 LEAD = 5e-3  # Of the screws where their rotation is looked at, m
 
 
@@ -49,14 +44,6 @@ class Block:
     what: str
     command_us: float
     estimate_us: float
-
-
-@dataclass(frozen=True)
-class Part:
-    """What a part of a command takes, µs."""
-
-    name: str
-    us: float
 
 
 def commands(geometry: HexapodGeometry) -> list[tuple[float, ...]]:
@@ -144,65 +131,20 @@ def measure(rounds: int) -> list[Block]:
     return [Block(*names, *row) for names, row in zip(everybody, added.tolist(), strict=True)]
 
 
-# --- parts -------------------------------------------------------------------------------------------------
-
-
-def from_python(call: Callable[[], object]) -> Callable[[], float]:
-    """Return a function that tells what a call from Python takes, µs."""
-
-    def run() -> float:
-        began = time.thread_time()
-        for _ in range(INNER):
-            call()
-        return (time.thread_time() - began) / INNER * 1e6
-
-    call()
-    return run
-
-
-def parts(rounds: int) -> list[Part]:
-    """Return what the parts of the ideal machine's command take, and what comes beside commands."""
-    geometry = load_geometry(config_file("paper.yaml"))
-    spaced = dataclasses.replace(geometry, limits=dataclasses.replace(geometry.limits, clearance=0.1))
-    home, lengths = geometry.home, np.empty(6)
-    joints = [given("joints", part, 6, 3) for part in geometry.kernel_joints]
-    position, rotation = home.position.copy(), home.rotation.copy()
-    pose = written("position", position, 3), written("rotation", rotation, 3, 3)
-    found = written("lengths", lengths, 6)
-    out = ffi.new("int[2]"), ffi.new("double *"), ffi.new("double *")
-    numbers = ffi.new("double[7]", [*home.position.tolist(), 0.0, 0.0, 0.0, 1.0])
-    compensator = Compensator(geometry, load_model(config_file("paper_machine.yaml"), geometry))
-    compensator.step(commands(geometry)[0], 0.0)
-    limits, spaced_limits = geometry.limit_numbers.at, spaced.limit_numbers.at
-    runs = {
-        "a call into the core": from_python(lambda: lib.hc_version()),
-        "quaternion to rotation": from_python(lambda: lib.hc_read_pose(numbers, *pose)),
-        "nominal strut lengths, of eight": from_python(lambda: lib.hc_strut_lengths_many(*joints, 1, *pose, found)),
-        "limits, each of two stages": from_python(lambda: lib.hc_check_stage(*joints, *pose, found, limits, *out)),
-        "the same with a clearance": from_python(
-            lambda: lib.hc_check_stage(*joints, *pose, found, spaced_limits, *out)
-        ),
-        "a temperature reading": from_python(lambda: compensator.set_temperature("strut_1", 20.5)),
-    }
-    return [Part(name, min(run() for _ in range(rounds))) for name, run in runs.items()]
-
-
-def report(blocks: list[Block], pieces: list[Part]) -> str:
-    """Return both tables."""
+def report(blocks: list[Block]) -> str:
+    """Return the table."""
     rows = []
     for b in blocks:
         sign = "" if b.name == "ideal" else "+"
         rows.append([b.name, f"{b.command_us:{sign}.2f}", f"{b.estimate_us:{sign}.2f}", b.what])
-    parts = table(["part", "µs"], ([part.name, f"{part.us:.3f}"] for part in pieces))
-    return "\n\n".join([table(["block", "command, µs", "estimate, µs", ""], rows), parts])
+    return table(["block", "command, µs", "estimate, µs", ""], rows)
 
 
 def main() -> int:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rounds", type=int, default=25, help="runs of everybody (default %(default)s)")
-    rounds = parser.parse_args().rounds
-    print(report(measure(rounds), parts(rounds)))
+    print(report(measure(parser.parse_args().rounds)))
     return 0
 
 

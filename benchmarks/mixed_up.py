@@ -12,9 +12,7 @@ Exits 1 when a cause is named of readings that were taken rightly.
 from __future__ import annotations
 
 import sys
-import tempfile
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -59,8 +57,7 @@ def reversed_sign(m: MeasurementSet, channel: str, family: str) -> MeasurementSe
 
 def first_named(kind: str, seed: int) -> list[str]:
     """Return the first cause that is named of a machine's readings, for each of what was done to them."""
-    with tempfile.TemporaryDirectory() as folder:
-        readings = setting(kind, seed, Path(folder), ("5-D", 4))[-1]
+    readings = setting(kind, seed, ("5-D", 4))[-1]
     settings = FitSettings(blocks=KNOWN, lead=LEAD)
     return [next(iter(mixed_up(change(readings), settings)), "") for change in MADE.values()]
 

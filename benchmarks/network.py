@@ -27,7 +27,7 @@ from hexapod_comp.ros import avoid_shared_memory
 from . import cannot_run
 from .faults import judge
 from .faults.campaign import RUNS_AGAIN_WITHIN, WARM_UP, Episode, Outcome, run_episode, table
-from .faults.kinds import NOT_REPORTED, SILENT, Fault, Meaning
+from .faults.kinds import Fault
 from .faults.record import Happened
 from .faults.rig import Rig
 
@@ -173,7 +173,7 @@ class OnCable(Fault):
 class Cut(OnCable):
     """It is cut for a second."""
 
-    kind, order, meaning = "cut", "cut", SILENT["feedback"]
+    kind, order = "cut", "cut"
     shortest = longest = 1.0
 
 
@@ -188,14 +188,12 @@ class Loss(OnCable):
     """One frame in twenty is lost, either way."""
 
     kind, order = "loss", "loss 0.05"
-    meaning = Meaning("never: a newer message is there before anybody misses one", NOT_REPORTED)
 
 
 class Late(OnCable):
     """All frames take 50 ms, either way."""
 
     kind, order = "delay", "delay 0.05"
-    meaning = Meaning("never: readings come as often as before, only older", NOT_REPORTED)
 
 
 KINDS = {kind.kind: kind for kind in (Cut, Loss, Late, LongCut)}

@@ -9,7 +9,7 @@ drift of 0.5 K that nobody wrote down, gross errors with an instrument that slip
 different along the struts, and all of these together but the last.
 
 With ``--ablate``: what the promise would be with the covariance believed more or less than ``jackknife_prior`` degrees
-of freedom, with and without averaging over the blocks that were left out; and with how much it is most likely believed.
+of freedom, and with how much it is most likely believed.
 The tool's error over its expectation, squared, is Fisher's F with the freedom of the covariance and of that belief.
 
 Usage: python -m benchmarks.promise [--machines 12] [--first 100] [--workers 2] [--kind NAME ...] [--ablate]
@@ -21,9 +21,7 @@ refused.
 from __future__ import annotations
 
 import sys
-import tempfile
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from scipy import stats
@@ -37,7 +35,7 @@ from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import BLOCKS, FitSettings
 from hexapod_comp.calibration.posterior import box_errors, expected_error
 from hexapod_comp.errors import CalibrationError
-from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.passes import Poses, random_passes
 from hexapod_comp.machine.struts import StrutErrors
@@ -46,9 +44,6 @@ from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
 from hexapod_comp.virtual.imperfections import draw_model, with_length_map, with_wear
 from hexapod_comp.virtual.instruments import measure, station_errors
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
-from foreign_machines import machines as zoo
 
 GEOMETRIES = ("paper", "offset", "framed", "hanging", "inches", "mirror")
 OWN = ("A", "B", "D", "G", "worn")
@@ -209,11 +204,10 @@ def left(truth: RealMachine, hidden: Hidden, model: MachineModel, plan: Campaign
 
 
 def setting(
-    kind: str, seed: int, folder: Path, plan_of: tuple[str, int] | None = None
+    kind: str, seed: int, plan_of: tuple[str, int] | None = None
 ) -> tuple[Campaign, RealMachine, Hidden, MeasurementSet]:
     """Return the campaign, one of the :data:`PLANS` or as given, the machine and the readings of a seed."""
-    machine = zoo()[GEOMETRIES[seed % len(GEOMETRIES)]]
-    geometry = load_geometry(machine.write(folder / "geometry.yaml"))
+    geometry, machine = drawn.of_zoo(GEOMETRIES[seed % len(GEOMETRIES)])
     sides = 2.0 * np.array(machine.half)
     instrument, diagonals = plan_of or PLANS[seed // len(GEOMETRIES) % len(PLANS)]
     plan = Campaign(machine.box, min(sides.max() / 2.0, sides.min()), sides.max() / 10.0, instrument, diagonals)
@@ -232,7 +226,7 @@ class Outcome:
     high: float
     refused: str
     freedom: float = np.nan  # of the tool's squared error by the covariance
-    others: tuple[tuple[float, float], ...] = ()  # upper ends for BELIEVED, with and without averaging over blocks
+    others: tuple[float, ...] = ()  # upper ends for BELIEVED
 
     @property
     def width(self) -> float:
@@ -247,8 +241,7 @@ class Outcome:
 
 def one_machine(kind: str, seed: int) -> Outcome:
     """Measure, fit and judge one machine."""
-    with tempfile.TemporaryDirectory() as folder:
-        plan, truth, hidden, measured = setting(kind, seed, Path(folder))
+    plan, truth, hidden, measured = setting(kind, seed)
     try:
         fit = fit_model(measured, FitSettings(blocks=KNOWN, lead=LEAD))
     except CalibrationError as error:
@@ -259,42 +252,30 @@ def one_machine(kind: str, seed: int) -> Outcome:
     return Outcome(left(truth, hidden, fit.model, plan, seed), level.low, level.after, level.high, fit.misfit, *others)
 
 
-def other_promises(fit: ModelFit) -> tuple[float, tuple[tuple[float, float], ...]]:
+def other_promises(fit: ModelFit) -> tuple[float, tuple[float, ...]]:
     """Return the freedom of the tool's squared error by the covariance, and its upper ends for :data:`BELIEVED`."""
     beyond, covariance = fit.verdict.unexplained, physical_covariance(fit.space, fit.solution.posterior)
-    errors = box_errors(fit.space, fit.solution.x)
+    errors, highs = box_errors(fit.space, fit.solution.x), []
     if errors is None:
         return np.nan, ()
+    for believed in BELIEVED:
+        error = expected_error(errors, covariance, beyond=replace(beyond, believed=min(believed, 1e9)))
+        highs.append(np.nan if error is None else error.high)
     product = errors.mean_squares[0] @ covariance
-
-    def high(believed: float, averaged: float) -> float:
-        other = replace(beyond, believed=min(believed, 1e9), averaged=averaged)
-        error = expected_error(errors, covariance, beyond=other)
-        return np.nan if error is None else error.high
-
-    highs = tuple((high(believed, beyond.averaged), high(believed, 1.0)) for believed in BELIEVED)
-    return float(np.trace(product) ** 2 / np.vdot(product.T, product)), highs
+    return float(np.trace(product) ** 2 / np.vdot(product.T, product)), tuple(highs)
 
 
 def show_ablation(outcomes: list[Outcome]) -> None:
     """Print how many promises other beliefs keep, how wide they are, and which belief is the most likely."""
     judged = [o for o in outcomes if o.others and not o.refused]
-    low, left_over = (np.array([getattr(o, name) for o in judged]) for name in ("low", "left"))
-    print("\n| covariance believed as | kept or refused, blocks averaged | upper end / left | not averaged | |")
-    print("|---:|---:|---:|---:|---:|")
-    for believed, highs in zip(BELIEVED, np.moveaxis([o.others for o in judged], 0, 2), strict=True):
-        broken = [int(((left_over < low) | (left_over > high)).sum()) for high in highs]
-        cells = [
-            f"{100.0 * (1.0 - n / len(outcomes)):.1f} % | {np.median(high / left_over):.2f}"
-            for n, high in zip(broken, highs, strict=True)
-        ]
-        print(f"| {believed:g} | {' | '.join(cells)} |")
-    ratios, freedom = (
-        np.array(part) for part in zip(*(((o.left / o.expected) ** 2, o.freedom) for o in judged), strict=True)
-    )
+    low, left_over, expected, freedom = np.array([(o.low, o.left, o.expected, o.freedom) for o in judged]).T
+    found = drawn.Table(["covariance believed as", "kept or refused", "upper end / left"], texts=0)
+    for believed, high in zip(BELIEVED, np.transpose([o.others for o in judged]), strict=True):
+        broken = int(((left_over < low) | (left_over > high)).sum())
+        found.row(f"{believed:g}", f"{1.0 - broken / len(outcomes):.1%}", f"{np.median(high / left_over):.2f}")
     beliefs = np.geomspace(1.0, 1000.0, 301)
-    likely = beliefs[np.argmax([stats.f.logpdf(ratios, freedom, belief).sum() for belief in beliefs])]
-    print(f"\nmost likely believed as {likely:.1f} degrees of freedom ({len(judged)} machines)")
+    likely = np.argmax([stats.f.logpdf((left_over / expected) ** 2, freedom, belief).sum() for belief in beliefs])
+    print(f"\nmost likely believed as {beliefs[likely]:.1f} degrees of freedom ({len(judged)} machines)")
 
 
 COLUMNS = ["kind", "machines", "kept", "refused", "broken", "left", "expected", "upper end", "upper end / left"]

@@ -31,15 +31,13 @@ from scipy.spatial.transform import Rotation
 
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.formats.csv import csv_text
-from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.kinematics import Structure, solve_pose
 from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.outside import OutsideTable, load_outside
 
 from . import cannot_run
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
-from foreign_machines import machines
+from .drawn import of_zoo
 
 TABLES = {"M2": "fitter/zd_m2.txt", "camera": "fitter/zd_camera.txt"}
 POLYNOMIALS = "MTHexapod/v7/laser_rotation_elevation_v23.yaml"
@@ -49,9 +47,9 @@ STEPS = ((5.0, 10.0), (2.5, 5.0), (1.0, 2.0))  # of tables over elevation and ro
 PLACES = 2000  # at random between the nodes
 
 
-def telescope(folder: Path) -> HexapodGeometry:
+def telescope() -> HexapodGeometry:
     """Return a hexapod of the size of M2's, whose corrections may be as large as Rubin's."""
-    geometry = load_geometry(machines()["mirror"].write(folder / "mirror.yaml"))
+    geometry, _ = of_zoo("mirror")
     return replace(geometry, limits=replace(geometry.limits, correction=0.02))
 
 
@@ -167,7 +165,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return cannot_run(f"there is no {', '.join(missing)}; clone {sources}, and name the folders")
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        geometry = telescope(folder)
+        geometry = telescope()
         met = [finite_elements(name, args.folder / file, geometry, folder) for name, file in TABLES.items()]
         if args.config is not None:
             content = yaml.safe_load((args.config / POLYNOMIALS).read_text(encoding="utf-8"))

@@ -1,11 +1,11 @@
-"""A long run at 1 kHz: is anything lost, does memory grow, how much is it, and what were the longest gaps?
+"""A long run at 1 kHz: is anything lost, does memory grow, how much is it, and what were the longest latencies?
 
 Compensator and simulated drive run as processes of their own, the drive's readings go back to the compensator,
 and the tool goes round a circle. Their stderr goes into a pipe that nobody reads, as when a terminal was stopped
-with Ctrl-S. Latency is from just before a command is published to its strut commands' arrival here. For the longest
-ones the system says how long each process had been waiting for a processor in the second around
-it (/proc/PID/task/*/schedstat). Before that each node's resident memory is measured at rest, and at most while
-somebody sends it messages of 10 MB by all its topics in turn. 1 MB is 2²⁰ bytes.
+with Ctrl-S. Latency is from just before a command is published to its strut commands' arrival here; how long each
+process waited for a processor (/proc/PID/task/*/schedstat) tells how much of it is the computer's. Before that each
+node's resident memory is measured at rest, and at most while somebody sends it messages of 10 MB by all its topics in
+turn. 1 MB is 2²⁰ bytes.
 
 Usage: python -m benchmarks.soak [--minutes 30] [--rate-hz 1000] [--messages 30]
 """
@@ -46,7 +46,6 @@ NODES = ("compensator", "strut_drive")
 RADIUS, TURN_TIME = 0.012, 4.0  # Circle about home, m, and time of one turn, s: 19 mm/s
 RUN_IN = 3.0  # Commands are sent, and not counted, for this long first, s: until DDS has made everybody known
 WARM_UP, LEAST_WARM_UP = 0.1, 5.0  # Share of the run after which memory should be flat, and at least, s
-WORST_KEPT = 8
 # Edges of the latency histogram, s: 0.23 % apart, so that the client's own memory stays flat
 BINS = np.geomspace(1e-5, 10.0, 6001)
 BAR_GROWTH = 1.0  # MB an hour
@@ -61,16 +60,6 @@ HEARD = {
 
 
 @dataclass
-class Gap:
-    """One late answer."""
-
-    elapsed: float  # when the command left since the start of the run, s
-    latency: float  # s
-    # How long each process waited for a processor in the second around it, s
-    waiting: dict[str, float] = field(default_factory=dict)
-
-
-@dataclass
 class Soak:
     """What a run found."""
 
@@ -81,7 +70,6 @@ class Soak:
     longest: float = 0.0
     # Answers by latency, in :data:`BINS`
     histogram: np.ndarray = field(default_factory=lambda: np.zeros(len(BINS) + 1, dtype=np.int64))
-    worst: list[Gap] = field(default_factory=list)  # Longest latencies, longest first
     # Time since the start, s, and resident memory of each node, byte
     memory: list[tuple[float, ...]] = field(default_factory=list)
     # How long the threads of each process, together, waited for a processor during the whole run, s
@@ -125,14 +113,14 @@ class Commander:
         self._beat: int | None = None
         self._message = pose_message(Pose(np.array([0.0, 0.0, 0.4]), np.eye(3)), "base")
         self._sent: dict[int, float] = {}
-        self._start, self._turned = 0.0, 0.0
+        self._turned = 0.0
         self.begin()
 
     def begin(self) -> None:
         """Forget what was counted up to now."""
         self.found = Soak(diagnostics=self.found.diagnostics)
         self._sent.clear()
-        self._waiting = self._first_waiting = self._run_queue()
+        self._waited = self._run_queue()
 
     def close(self) -> None:
         """Leave ROS."""
@@ -151,7 +139,7 @@ class Commander:
     def run(self, seconds: float) -> Soak:
         """Send for some seconds, wait for the last answers, and return the account."""
         self.begin()
-        start = due = self._start = time.monotonic()
+        start = due = time.monotonic()
         next_look = start
         while (now := time.monotonic()) < start + seconds:
             self._send()
@@ -166,7 +154,7 @@ class Commander:
             self.executor.spin_once(timeout_sec=SPIN_PERIOD)
         self._look(time.monotonic() - start)
         self.found.lost = len(self._sent)
-        self.found.waited = {k: v - self._first_waiting[k] for k, v in self._run_queue().items()}
+        self.found.waited = {k: v - self._waited[k] for k, v in self._run_queue().items()}
         return self.found
 
     def _send(self) -> None:
@@ -188,10 +176,6 @@ class Commander:
         latency, found = now - sent, self.found
         found.histogram[np.searchsorted(BINS, latency)] += 1
         found.longest = max(found.longest, latency)
-        if len(found.worst) < WORST_KEPT or latency > found.worst[-1].latency:
-            found.worst.append(Gap(sent - self._start, latency))
-            found.worst.sort(key=lambda gap: -gap.latency)
-            del found.worst[WORST_KEPT:]
 
     def _on_heartbeat(self, message: UInt64) -> None:
         self.found.heartbeats += 1
@@ -203,11 +187,7 @@ class Commander:
             self.found.diagnostics[status.name.partition(":")[0]] = {v.key: v.value for v in status.values}
 
     def _look(self, elapsed: float) -> None:
-        """Once a second, as it takes two milliseconds: memory, and who has waited for a processor since then."""
         self.found.memory.append((elapsed, *(_resident(self._pids[name]) for name in NODES)))
-        before, self._waiting = self._waiting, self._run_queue()
-        for gap in self.found.worst:
-            gap.waiting = gap.waiting or {name: now - before[name] for name, now in self._waiting.items()}
 
     def _run_queue(self) -> dict[str, float]:
         """Return how long the threads of each process have waited for a processor up to now, s."""
@@ -301,10 +281,6 @@ def report(found: Soak) -> list[str]:
             f"{slope:+.2f} ± {2 * error:.2f} MB/h after warming up; "
             f"waited {found.waited[node]:.2f} s for a processor"
         )
-    lines.append("longest latencies, ms, and how long each process waited for a processor in the second around them:")
-    for gap in found.worst:
-        waiting = ", ".join(f"{name} {seconds * 1e3:.0f}" for name, seconds in gap.waiting.items())
-        lines.append(f"  {gap.latency * 1e3:7.2f} at {gap.elapsed:.1f} s: {waiting}")
     return lines
 
 

@@ -132,7 +132,7 @@ def main() -> int:
             return cannot_run(str(reason))
     costs = blocks.measure(rounds)
     beside, floor = (loop.measure(max(1, n), 6, 0.4, floor) for n, floor in ((bouts, False), (bouts // 3, True)))
-    parts += [(blocks.report(costs, blocks.parts(rounds)), []), (loop.report(beside), loop.problems(beside))]
+    parts += [(blocks.report(costs), []), (loop.report(beside), loop.problems(beside))]
     parts.append((loop.report(floor), []))
     report, problems = "\n\n".join(text for text, _ in parts), [one for _, missed in parts for one in missed]
     print(where, report, sep="\n\n")

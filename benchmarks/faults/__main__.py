@@ -1,6 +1,6 @@
 """The fault campaign: a moving machine, one or two faults per episode, and a judge.
 
-Usage: python -m benchmarks.faults [--mover] [--episodes 300] [--seed 0] [--only 17,kill_drive] [--definitions]
+Usage: python -m benchmarks.faults [--mover] [--episodes 300] [--seed 0] [--only 17,kill_drive]
 
 Every miss is printed with what runs it alone. Exits with 1 when a bar is missed.
 """
@@ -12,8 +12,6 @@ import sys
 import time
 
 from tqdm import tqdm
-
-from benchmarks import table as markdown
 
 from .campaign import STARVED, Episode, Outcome, campaign, draw, table
 from .judge import REPORT_WITHIN
@@ -35,13 +33,6 @@ def chosen(only: str, episodes: int, seed: int, kinds: tuple[str, ...]) -> list[
     return picked + [e for e in drawn if e.number not in numbers and {f.kind for _, f in e.faults} & set(names)]
 
 
-def definitions() -> str:
-    """Return the table of doc/faults.md: what each fault is, when it is visible, and which node must report what."""
-    columns = ["fault", "what", "visible from the moment at which", "which node must report what"]
-    rows = ([n, " ".join((k.__doc__ or "").split()), k.meaning.visible, k.meaning.said] for n, k in KINDS.items())
-    return markdown(columns, rows, texts=4)
-
-
 def main() -> int:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -49,11 +40,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="numbers of episodes, or kinds of faults, with commas between")
     parser.add_argument("--mover", action="store_true", help="the poses come from the mover node")
-    parser.add_argument("--definitions", action="store_true", help="print when each fault is visible, and to whom")
     args = parser.parse_args()
-    if args.definitions:
-        print(definitions())
-        return 0
     kinds, why_not = kinds_of(args.mover), refusal_to_mount()
     if why_not:
         kinds = tuple(kind for kind in kinds if kind != "log_disk_full")

@@ -1,11 +1,11 @@
-"""The kinds of faults: what each does and undoes, what it touches, when it is visible, and what must be reported."""
+"""The kinds of faults: what each does and undoes, and what it touches. doc/faults.md says what must be reported."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from hexapod_comp.machine.kinematics import Structure, strut_lengths
 from hexapod_comp.ros.messages import message_pose
 
 from . import wire
-from .judge import FOLLOWING_LIMIT, SILENCE, following_error
+from .judge import following_error
 from .record import LINKS, Happened
 from .rig import Rig
 
@@ -26,40 +26,10 @@ OLDEST_COMMAND = 0.5  # Commands older than this are refused, s: the compensator
 MOVES = 2e-4  # Struts that were told to go so far within 80 ms, m, are in motion
 
 
-@dataclass(frozen=True)
-class Meaning:
-    """When a fault is visible and to which node, and what that must report."""
-
-    visible: str
-    said: str
-
-
-_WAITS = f"has been delivered for {SILENCE['pose'][2]:g} s"
-SILENT = {
-    "pose": Meaning(f"no pose command {_WAITS}", "compensator: no new command"),
-    "command": Meaning(
-        f"no strut command {_WAITS}",
-        "strut_drive: no new command, or, started anew, waiting for the first command",
-    ),
-    "feedback": Meaning(f"no reading {_WAITS}", "compensator: feedback lost"),
-}
-REFUSED = {
-    "pose": "compensator: refusing commands: the reason, or following_error while that is latched",
-    "command": "strut_drive: refusing commands: the reason",
-    "feedback": "compensator: bad feedback: the reason, or following_error",
-}
-NOT_REPORTED = "nothing need be reported"
-ASTRAY = Meaning(
-    f"the first reading more than {FOLLOWING_LIMIT * 1e3:g} mm from all commands of the last 0.1 s",
-    "compensator: following_error",
-)
-
-
 class Fault:
     """One fault of an episode, drawn by a generator of its own: done by `begin`, undone by `end` after its duration."""
 
     kind: str
-    meaning: Meaning
     touches: frozenset[str] = frozenset()  # two faults that touch the same are not drawn together
     shortest, longest = 0.4, 1.0  # s
 
@@ -168,8 +138,6 @@ class Reset(Fault):
 class ReloadUnderStream(Fault):
     """`~/reload_model`, again and again, while the controller continues to stream: the changes ramp in."""
 
-    meaning = Meaning("never: the model is good", NOT_REPORTED)
-
     def begin(self, rig: Rig, happened: Happened) -> None:
         rig.controller.heedless = True
         self._left = 3
@@ -193,8 +161,6 @@ class ReloadUnderStream(Fault):
 class ResetInMotion(Fault):
     """`~/reset` while the machine moves, three times; one that arrives at a reversal of the path may be granted."""
 
-    meaning = Meaning("the first refusal is answered", "compensator: reset refused while the machine moves")
-
     def begin(self, rig: Rig, happened: Happened) -> None:
         self._ask(rig, happened, 3)
 
@@ -217,8 +183,6 @@ class ResetInMotion(Fault):
 class SimTime(Fault):
     """`use_sim_time` is set in the running compensator."""
 
-    meaning = Meaning("never: it is refused, and nothing changes", NOT_REPORTED)
-
     def begin(self, rig: Rig, happened: Happened) -> None:
         def answered(taken: bool) -> None:
             if taken:
@@ -229,8 +193,6 @@ class SimTime(Fault):
 
 class FullDisk(Fault):
     """The disk of the logs is full."""
-
-    meaning = Meaning("the last byte is written", "compensator and strut_drive: log disk full")
 
     def begin(self, rig: Rig, happened: Happened) -> None:
         rig.log_disk.fill()
@@ -243,7 +205,6 @@ class FullDisk(Fault):
 class HalfModel(Fault):
     """The model file is half written when the compensator is asked to reload it."""
 
-    meaning = Meaning("the service reload_model has answered", "compensator: the old model stays")
     shortest = longest = 0.5
 
     def begin(self, rig: Rig, happened: Happened) -> None:
@@ -316,8 +277,6 @@ class Latched(Fault):
 class LostEncoder(Fault):
     """A strut's encoder reads NaN."""
 
-    meaning = Meaning("the first reading with NaN is delivered", "compensator: bad feedback: not_finite")
-
     def begin(self, rig: Rig, happened: Happened) -> None:
         strut = int(self.rng.integers(1, 7))
         happened.detail = STRUT_NAMES[strut - 1]
@@ -376,8 +335,6 @@ class Bunched(StreamsOn):
 class Restamped(StreamsOn):
     """Stamps are constant, or a microsecond apart, while the controller continues to stream."""
 
-    meaning = Meaning("the first command that is too fast by its stamp is delivered", "compensator: speed, or step")
-
     def begin(self, rig: Rig, happened: Happened) -> None:
         super().begin(rig, happened)
         apart = int(self.rng.choice([0, 1000]))
@@ -394,8 +351,6 @@ class Restamped(StreamsOn):
 
 class Hurried(StreamsOn):
     """The controller skips poses: at 640 mm/s it asks for more than the machine can do."""
-
-    meaning = Meaning("never for certain: it may be at a reversal of its path", "nobody must")
 
     def begin(self, rig: Rig, happened: Happened) -> None:
         super().begin(rig, happened)
@@ -453,53 +408,39 @@ def corrupted(rng: np.random.Generator, link: str) -> tuple[wire.Rule, str]:
 # ---- all of them ----
 
 
-def _kind(base: type[Fault], kind: str, touches: set[str], meaning: Meaning | None = None, **more: Any) -> type[Fault]:
-    meaning = meaning or base.meaning
-    more = {"__doc__": base.__doc__, "kind": kind, "touches": frozenset(touches), "meaning": meaning, **more}
-    return type(kind, (base,), more)
+def _kind(base: type[Fault], kind: str, touches: set[str], **more: Any) -> type[Fault]:
+    return type(kind, (base,), {"kind": kind, "touches": frozenset(touches), **more})
 
 
-def _on_wire(rule: Callable, kind: str, link: str, meaning: Meaning) -> type[Fault]:
-    return _kind(Wired, kind, {link}, meaning, link=link, rule=staticmethod(rule), __doc__=rule.__doc__)
-
-
-def _of_link(link: str) -> list[type[Fault]]:
-    silent, refused = SILENT[link], REFUSED[link]
-    too_old = Meaning(f"{silent.visible}, or one too old is delivered", f"{silent.said}, or stamp_past")
-    overtaken = Meaning("the first overtaken message is delivered", refused.replace("the reason", "stamp_order"))
-    return [
-        _on_wire(dropped, f"drop_{link}", link, silent),
-        _on_wire(delayed, f"delay_{link}", link, too_old if link == "pose" else silent),
-        _on_wire(duplicated, f"duplicate_{link}", link, Meaning("never: a repetition changes nothing", NOT_REPORTED)),
-        _on_wire(reordered, f"reorder_{link}", link, overtaken),
-        _on_wire(corrupted, f"corrupt_{link}", link, Meaning("the first corrupted message is delivered", refused)),
-    ]
-
-
+WIRED = {"drop": dropped, "delay": delayed, "duplicate": duplicated, "reorder": reordered, "corrupt": corrupted}
 STREAM, DRIVE = {"compensator", *LINKS}, {"drive", "feedback"}
 
 KINDS: dict[str, type[Fault]] = {
     kind.kind: kind
     for kind in (
-        _kind(Kill, "kill_compensator", {"compensator", "command"}, SILENT["command"], name="compensator"),
-        _kind(Stop, "stop_compensator", {"compensator", "command"}, SILENT["command"], name="compensator"),
-        _kind(Kill, "kill_drive", DRIVE, SILENT["feedback"], name="drive"),
-        _kind(Stop, "stop_drive", DRIVE, SILENT["feedback"], name="drive"),
-        _kind(Kill, "kill_mover", {"mover", "pose"}, SILENT["pose"], name="mover"),
-        _kind(Stop, "stop_mover", {"mover", "pose"}, SILENT["pose"], name="mover"),
-        *(kind for link in LINKS for kind in _of_link(link)),
-        _kind(Restart, "restart_under_stream", STREAM, SILENT["command"]),
-        _kind(Reset, "reset_under_stream", STREAM, SILENT["feedback"]),
+        _kind(Kill, "kill_compensator", {"compensator", "command"}, name="compensator"),
+        _kind(Stop, "stop_compensator", {"compensator", "command"}, name="compensator"),
+        _kind(Kill, "kill_drive", DRIVE, name="drive"),
+        _kind(Stop, "stop_drive", DRIVE, name="drive"),
+        _kind(Kill, "kill_mover", {"mover", "pose"}, name="mover"),
+        _kind(Stop, "stop_mover", {"mover", "pose"}, name="mover"),
+        *(
+            _kind(Wired, f"{verb}_{link}", {link}, link=link, rule=staticmethod(rule))
+            for link in LINKS
+            for verb, rule in WIRED.items()
+        ),
+        _kind(Restart, "restart_under_stream", STREAM),
+        _kind(Reset, "reset_under_stream", STREAM),
         _kind(ReloadUnderStream, "reload_under_stream", {"compensator", "pose"}),
-        _kind(StopUnderStream, "stop_under_stream", STREAM, SILENT["command"]),
-        _kind(Bunched, "bunched_pose", STREAM, SILENT["pose"]),
+        _kind(StopUnderStream, "stop_under_stream", STREAM),
+        _kind(Bunched, "bunched_pose", STREAM),
         _kind(Restamped, "stamps_stand", STREAM),
         _kind(Hurried, "too_fast", STREAM),
         _kind(ResetInMotion, "reset_in_motion", STREAM),
         _kind(SimTime, "use_sim_time_set", {"compensator"}),
-        _kind(Stuck, "stuck_strut", DRIVE, ASTRAY),
-        _kind(Jumping, "jumping_strut", DRIVE, ASTRAY),
-        _kind(Latched, "latched_following_error", {*DRIVE, "compensator", "pose"}, ASTRAY),
+        _kind(Stuck, "stuck_strut", DRIVE),
+        _kind(Jumping, "jumping_strut", DRIVE),
+        _kind(Latched, "latched_following_error", {*DRIVE, "compensator", "pose"}),
         _kind(LostEncoder, "encoder_nan", DRIVE),
         _kind(FullDisk, "log_disk_full", {"disk"}),
         _kind(HalfModel, "half_written_model", {"compensator"}),
