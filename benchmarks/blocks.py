@@ -1,11 +1,8 @@
 """What each block of a machine model costs in the compensator's loop, µs.
 
-The same commands, a small circle that turns and comes back, go through compensators that differ by one block; they
-take turns, and a block's cost is what it adds to a command, and to an estimate of the pose from strut readings, of
-the ideal machine: all called from Python, processor time of the thread, the least of the rounds, since others on
-the machine can only add.
-
-Run ``python -m benchmarks.blocks``.
+The same commands, a small circle that turns and comes back, go through compensators that differ by one block, in turn.
+A block's cost is what it adds to a command, and to an estimate of the pose, of the ideal machine: called from Python,
+processor time of the thread, the least of the rounds, since others on the machine can only add.
 """
 
 from __future__ import annotations

@@ -1,13 +1,7 @@
 """How much error calibration removes: virtual machines measured, fitted, and judged at points not used in the fit.
 
-Each machine is drawn from its own seed, measured by the virtual instruments of a campaign (laser lines, or ball bars,
-R-tests and tracking interferometers without any line), and fitted as ``hexapod_comp fit`` does it, with every block of
-parameters allowed. 1,000 random points, passed there and back in random directions, level and tilted by up to 10°, then
-tell what is left after one rotation and shift of the datum.
-
-Usage: python -m benchmarks.calibration [--machines 20] [--first 1] [--workers 2] [--case NAME ...] [--kind ABDG]
-
-Exits 1 when a bar is missed.
+Usage: python -m benchmarks.calibration [--machines 20] [--first 1] [--workers 2] [--case NAME ...] [--kind ABDG];
+campaigns, kinds and bars: doc/benchmarks.md.
 """
 
 from __future__ import annotations

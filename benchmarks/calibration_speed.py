@@ -1,9 +1,5 @@
 """How long a fit of scheme joint takes: the shipped 5-D campaign on the paper's machine, read more and more finely.
 
-The campaign's lines with readings so many times as dense: 10,230 and 105,006. First the fit alone, then the
-whole command ``fit``, from the start of Python to the files that it writes. The processors' time is that of all
-threads, and a busy computer changes it little; the clock's is less where two threads work at once.
-
 Usage: python -m benchmarks.calibration_speed [--dense 1.3 14]
 """
 

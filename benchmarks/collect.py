@@ -1,12 +1,7 @@
 """What ``collect`` reports of readings that were taken wrongly, and whether it ever accuses those taken rightly.
 
-Machines of four designs with hidden errors, every second one with errors that no model contains, are measured by a 5-D
-and a 6-D laser, a ball bar, and trackers in base and anywhere, with noise, 1 % wild readings and broken beams. Each
-mistake is made on every fourth machine: it must be reported before a second line, or a seventh pose, is begun.
-
-Usage: python -m benchmarks.collect [--machines 60] [--workers 2] [--case NAME ...]
-
-Exits 1 when a mistake is not reported, or right readings are accused.
+Usage: python -m benchmarks.collect [--machines 60] [--workers 2] [--case NAME ...]; see doc/benchmarks.md. Exits 1 when
+a mistake is not reported, or right readings are accused.
 """
 
 from __future__ import annotations

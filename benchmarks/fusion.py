@@ -1,12 +1,7 @@
 """A machine warms by 5 K while an instrument on it measures the tool: what fusion leaves of the drift.
 
-The machine is calibrated and cold; struts, base and platform warm as in :mod:`benchmarks.thermal`, by 5, 3.3 and 4.2 K.
-Nobody tells temperatures. Every 10 s the tool is sent to another pose of the box, turned by up to 2 degrees, and
-measured there five times with 2 µm and 10 µrad; 1 % of the readings are wild by 0.05 to 5 mm. Judged is each arrival:
-how far the tool is from where it was sent, by the hidden machine, before it was measured there.
-
-``python -m benchmarks.fusion [--machines N]`` prints a row for each geometry; a row misses the bar when fusion
-leaves more than 25 % (root mean square), or a wild reading counts.
+Usage: python -m benchmarks.fusion [--machines 3]; see doc/benchmarks.md. A row misses its bar when fusion leaves more
+than 25 % (root mean square) on any machine, or a wild reading counts.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
-"""Fuzzing at nightly size: ``python -m benchmarks.fuzz`` runs 100,000 cases and says how many there were.
+"""Fuzzing at nightly size: the tests of ``test/fuzz/test_fuzz_*.py`` with more cases, others for every seed.
 
     python -m benchmarks.fuzz [--cases N] [--seed N] [--jobs N] [-k WORD]
 
-The tests are those of ``test/fuzz/test_fuzz_*.py``, which ``make test`` runs at a bounded size, the same cases every
-time; here every seed makes other cases. ``-k any_content`` sends N messages of any bytes to each node, as processes,
-over DDS. Exit code 1: some case failed; hypothesis has then shrunk it and printed it.
+``-k any_content`` sends N messages of any bytes to each node, as processes, over DDS. Exit code 1: some case failed;
+hypothesis has then shrunk it and printed it.
 """
 
 from __future__ import annotations

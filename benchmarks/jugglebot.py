@@ -1,13 +1,7 @@
 """A real hexapod, judged on poses that the fit has not seen: motion-capture data of the project Jugglebot.
 
-The 108 poses are split six times, each time fitted to five parts and judged on the sixth; `position` is the
-3-D RMS difference between the pose predicted from the leg readings and the pose measured. On the level
-grid every pose is left out in turn and the fit repeated without it; what the model then leaves of the measured
-error is compared with the error itself, and with what the owner's own correction left.
-
-Usage: python -m benchmarks.jugglebot [--data FOLDER] [--workers 2]
-
-The data lie in benchmarks/data/jugglebot, under the MIT licence. Exits 1 when a bar is missed, 2 without the data.
+Usage: python -m benchmarks.jugglebot [--data FOLDER] [--workers 2]; see doc/benchmarks.md. The data lie in
+benchmarks/data/jugglebot, under the MIT licence. Exits 1 when a bar is missed, 2 without the data.
 """
 
 from __future__ import annotations

@@ -1,11 +1,9 @@
 """The compensator against a do-nothing relay: rate and latency, side by side in one run.
 
-Both run as processes of their own at the same time, in one ROS domain and two namespaces; short rounds
-alternate between them, so that whatever else the machine does hits both alike, and a rate's rounds come in several
-bouts spread over the run. Latencies of a bout are put together. A ratio is the compensator's figure divided by
-the relay's of the same bout, and of those the median is told, with the quartiles.
-
 Usage: python -m benchmarks.loop [--bouts 8] [--rounds 6] [--seconds 0.4] [--floor]
+
+Latencies of a bout are put together. A ratio is the compensator's figure divided by the relay's of the same bout; its
+median over the bouts is printed, with the quartiles.
 """
 
 from __future__ import annotations
@@ -14,22 +12,21 @@ import argparse
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped
-from rclpy.experimental import EventsExecutor
 from rclpy.qos import QoSProfile
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
 from hexapod_comp.loop.processes import PrivateDomain
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.base import COMMAND_QOS
 from hexapod_comp.ros.messages import nanoseconds_of, pose_message
+from hexapod_comp.ros.process import RosSession
 
 from . import judged, table
 
@@ -50,14 +47,14 @@ MODEL = "model_file:=paper_machine.yaml"
 
 
 class Line:
-    """Commands to one of the two nodes and its answers."""
+    """Commands on a circle through home to a node, and the latencies of its answers, ns."""
 
-    def __init__(self, node: rclpy.node.Node, namespace: str) -> None:
+    def __init__(self, node: rclpy.node.Node, namespace: str, radius: float = 1e-3, per_turn: float = 628.0) -> None:
         self.sent: dict[int, int] = {}
         self.latencies: list[int] = []
-        self._publisher = node.create_publisher(PoseStamped, f"/{namespace}/tool_pose_command", COMMAND_QOS)
-        node.create_subscription(JointState, f"/{namespace}/strut_commands", self._answer, QoSProfile(depth=100))
-        self._clock = node.get_clock()
+        self._publisher = node.create_publisher(PoseStamped, f"{namespace}/tool_pose_command", COMMAND_QOS)
+        node.create_subscription(JointState, f"{namespace}/strut_commands", self._answer, QoSProfile(depth=1000))
+        self._clock, self._radius, self._angle = node.get_clock(), radius, 2.0 * np.pi / per_turn
         self._message = pose_message(Pose(np.array([0.0, 0.0, 0.4]), np.eye(3)), "base")
         self._count = 0
 
@@ -67,10 +64,10 @@ class Line:
         return self._publisher.get_subscription_count() > 0
 
     def send(self) -> None:
-        """Send the next command of a small circle."""
+        """Send the next command."""
         self._count += 1
-        self._message.pose.position.x = 1e-3 * float(np.sin(0.01 * self._count))
-        self._message.pose.position.y = 1e-3 * float(np.cos(0.01 * self._count))
+        angle, position = self._angle * self._count, self._message.pose.position
+        position.x, position.y = self._radius * (float(np.cos(angle)) - 1.0), self._radius * float(np.sin(angle))
         stamp = self._clock.now()
         self._message.header.stamp = stamp.to_msg()
         self.sent[stamp.nanoseconds] = time.perf_counter_ns()
@@ -131,42 +128,45 @@ def process(module: str, namespace: str, *parameters: str) -> Iterator[subproces
         child.wait(10)
 
 
-def one_round(executor: EventsExecutor, line: Line, rate: float, seconds: float) -> list[int]:
+def one_round(
+    session: RosSession,
+    line: Line,
+    rate: float,
+    seconds: float,
+    patience: float = GIVE_UP,
+    each_second: Callable[[float], object] = lambda elapsed: None,
+) -> list[int]:
     """Send commands for some seconds; return the latencies of the answers, ns."""
     line.sent.clear()
     line.latencies = []
     start = due = time.perf_counter()
-    while time.perf_counter() < start + seconds:
-        if rate == 0.0:
-            _ask(executor, line)
-            continue
+    looked = start
+    while (now := time.perf_counter()) < start + seconds:
+        if now >= looked:
+            each_second(now - start)
+            looked = now + 1.0
+        answered = len(line.latencies)
         line.send()
-        due += 1.0 / rate
+        if rate == 0.0:  # flat out
+            give_up = time.perf_counter() + GIVE_UP
+            while len(line.latencies) == answered and time.perf_counter() < give_up:
+                session.spin_once(0.01)
+            continue
+        due = max(due + 1.0 / rate, now)
         while (left := due - time.perf_counter()) > 0.0:
-            executor.spin_once(timeout_sec=left)
-    end = time.perf_counter() + GIVE_UP
+            session.spin_once(left)
+    end = time.perf_counter() + patience
     while line.sent and time.perf_counter() < end:
-        executor.spin_once(timeout_sec=0.01)
+        session.spin_once(0.01)
     return line.latencies
 
 
-def _ask(executor: EventsExecutor, line: Line) -> None:
-    """Send one command and wait for its answer."""
-    answered = len(line.latencies)
-    line.send()
-    give_up = time.perf_counter() + GIVE_UP
-    while len(line.latencies) == answered and time.perf_counter() < give_up:
-        executor.spin_once(timeout_sec=0.01)
-
-
-def bout(
-    executor: EventsExecutor, lines: dict[str, Line], rate: float, rounds: int, seconds: float
-) -> dict[str, Figures]:
+def bout(session: RosSession, lines: dict[str, Line], rate: float, rounds: int, seconds: float) -> dict[str, Figures]:
     """Return both nodes' figures of some rounds in turn."""
     latencies: dict[str, list[int]] = {name: [] for name in lines}
     for number in range(rounds):
         for name in sorted(lines, reverse=bool(number % 2)):
-            latencies[name] += one_round(executor, lines[name], rate, seconds)
+            latencies[name] += one_round(session, lines[name], rate, seconds)
     return {name: Figures.of(found, rounds * seconds) for name, found in latencies.items()}
 
 
@@ -184,34 +184,19 @@ def measure(bouts: int, rounds: int, seconds: float, floor: bool = False) -> lis
         stack.enter_context(PrivateDomain())
         stack.enter_context(process("hexapod_comp.ros.compensator", OURS, "marker_rate:=0.0", BLIND, MODEL))
         stack.enter_context(process("benchmarks.relay", RELAY, f"serialized:={str(floor).lower()}"))
-        context = rclpy.Context()
-        rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
-        node = rclpy.create_node("bench", context=context)
-        executor = EventsExecutor(context=context)
-        executor.add_node(node)
-        lines = {name: Line(node, name) for name in (OURS, RELAY)}
-        _warm_up(executor, lines)
+        session = stack.enter_context(RosSession("bench"))
+        lines = {name: Line(session.node, f"/{name}") for name in (OURS, RELAY)}
+        session.wait(lambda: all(line.connected for line in lines.values()), START_WITHIN, "both nodes")
+        give_up = time.monotonic() + START_WITHIN
+        for name, line in lines.items():
+            while not one_round(session, line, 250.0, 1.0):
+                if time.monotonic() > give_up:
+                    raise SystemExit(f"{name} did not answer within {START_WITHIN:g} s")
         found: dict[float, list[dict[str, Figures]]] = {rate: [] for rate in RATES}
         for _ in range(bouts):
             for rate in RATES:
-                found[rate].append(bout(executor, lines, rate, rounds, seconds))
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown(context=context)
+                found[rate].append(bout(session, lines, rate, rounds, seconds))
     return [summary(rate, figures) for rate, figures in found.items()]
-
-
-def _warm_up(executor: EventsExecutor, lines: dict[str, Line]) -> None:
-    """Wait until both nodes listen and answer."""
-    give_up = time.monotonic() + START_WITHIN
-    while not all(line.connected for line in lines.values()):
-        executor.spin_once(timeout_sec=0.05)
-        if time.monotonic() > give_up:
-            raise SystemExit(f"the nodes did not come up within {START_WITHIN:g} s")
-    for line in lines.values():
-        while not one_round(executor, line, 250.0, 1.0):
-            if time.monotonic() > give_up:
-                raise SystemExit(f"the nodes did not answer within {START_WITHIN:g} s")
 
 
 def report(rows: list[Row]) -> str:

@@ -1,12 +1,8 @@
 """Is a mix-up in the readings named, also on machines that the model does not know?
 
-Machines as of ``promise``, read by a 5-D laser, rightly and with channels exchanged or signs reversed. Counted: where
-the first cause that is named is the one that was made; of readings that were taken rightly, where any is named. Only
-blocks are chosen and causes are sought, nothing is fitted: what is written or not follows from them.
-
-Usage: python -m benchmarks.mixed_up [--machines 4] [--first 600] [--workers 2] [--kind NAME ...]
-
-Exits 1 when a cause is named of readings that were taken rightly.
+Usage: python -m benchmarks.mixed_up [--machines 4] [--first 600] [--workers 2] [--kind NAME ...]; see doc/benchmarks.md
+Only blocks are chosen and causes are sought, nothing is fitted: what is written or not follows from them. Exits 1 when
+a cause is named of readings that were taken rightly.
 """
 
 from __future__ import annotations

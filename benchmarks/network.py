@@ -18,6 +18,7 @@ import struct
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
@@ -157,69 +158,42 @@ def entering(host: subprocess.Popen) -> list[str]:
 # ---- the episodes ----
 
 
-class OnCable(Fault):
+def on_cable(order: str, fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
     """Something is wrong with the cable."""
-
-    order: str
-    cable: socket.socket
-
-    def begin(self, rig: Rig, happened: Happened) -> None:
-        self.cable.sendall(f"{self.order}\n".encode("ascii"))
-
-    def end(self, rig: Rig, happened: Happened) -> None:
-        self.cable.sendall(b"mend\n")
+    CABLE[0].sendall(f"{order}\n".encode("ascii"))
+    yield
+    CABLE[0].sendall(b"mend\n")
 
 
-class Cut(OnCable):
-    """It is cut for a second."""
-
-    kind, order = "cut", "cut"
-    shortest = longest = 1.0
-
-
-class LongCut(Cut):
-    """It is cut for so long that both sides forget each other."""
-
-    kind = "long_cut"
-    shortest = longest = 13.0
-
-
-class Loss(OnCable):
-    """One frame in twenty is lost, either way."""
-
-    kind, order = "loss", "loss 0.05"
-
-
-class Late(OnCable):
-    """All frames take 50 ms, either way."""
-
-    kind, order = "delay", "delay 0.05"
-
-
-KINDS = {kind.kind: kind for kind in (Cut, Loss, Late, LongCut)}
+CABLE: list[socket.socket] = []
+# Cut for a second; one frame in twenty is lost; all take 50 ms; cut for so long that both sides forget each other. The
+# others last as long as is asked for, s.
+ORDERS = {"cut": ("cut", 1.0), "loss": ("loss 0.05", 0.0), "delay": ("delay 0.05", 0.0), "long_cut": ("cut", 13.0)}
 silent = partial(judge.silence, "feedback")
 judge.VISIBLE.update(cut=silent, long_cut=silent, loss=judge.nothing, delay=judge.nothing)
 
 
 def harness(args: argparse.Namespace, descriptor: int) -> int:
     """Run the episodes, on the compensator's host; the drive's is entered with the words in the environment."""
-    OnCable.shortest = OnCable.longest = args.seconds
-    cable = OnCable.cable = socket.socket(fileno=descriptor)
+    cable = socket.socket(fileno=descriptor)
+    CABLE.append(cable)
     os.environ.update(ROS_DOMAIN_ID="1", ROS_AUTOMATIC_DISCOVERY_RANGE="SUBNET")
     avoid_shared_memory()
-    wanted = [kind for kind in KINDS if kind in args.only.split(",")]
+    wanted = [kind for kind in ORDERS if kind in args.only.split(",")]
     outcomes: list[Outcome] = []
     with cable, Rig(args.seed, domain=False, host=args.far.split()) as rig:
         rig.spin(WARM_UP)
         for number in range(args.rounds * len(wanted)):
-            fault = KINDS[wanted[number % len(wanted)]](np.random.default_rng([args.seed, number]))
+            order, seconds = ORDERS[kind := wanted[number % len(wanted)]]
+            rng = np.random.default_rng([args.seed, number])
+            fault = Fault(kind, frozenset(), rng, seconds or args.seconds, partial(on_cable, order))
             outcomes.append(run_episode(rig, Episode(number, [(0.0, fault)])))
             for miss in outcomes[-1].verdict.misses():
                 busy = f" [no processor for {outcomes[-1].starved:.0%} of the time]"
-                print(f"{fault.kind}, round {number // len(wanted)}: {miss}{busy}", flush=True)
+                print(f"{kind}, round {number // len(wanted)}: {miss}{busy}", flush=True)
             rig.spin(RUNS_AGAIN_WITHIN, rig.running)
             if not rig.running():
-                print(f"{fault.kind}: the machine does not run again")
+                print(f"{kind}: the machine does not run again")
                 return 1
     print(table(outcomes))
     return int(any(outcome.verdict.misses() for outcome in outcomes))
@@ -251,7 +225,7 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=5.0, help="of loss and delay")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default=",".join(KINDS), help="kinds, with commas between")
+    parser.add_argument("--only", default=",".join(ORDERS), help="kinds, with commas between")
     parser.add_argument("--far", default="", help=argparse.SUPPRESS)
     args = parser.parse_args()
     role = os.environ.get(INSIDE, "")

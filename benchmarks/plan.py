@@ -1,13 +1,6 @@
 """What proposed campaigns are worth: twenty goals on five machines, beside ``campaign_full`` evenly thinned.
 
-For each goal a campaign is proposed, written, read back, and its expected error laid beside that of as many readings
-of ``campaign_full`` with the same instruments, thinned to every n-th station or to every n-th line, whichever is
-better. Then a machine drawn from the prior is measured by the proposed campaign and fitted, and its error with the
-model, the datum aligned, is laid beside the expected one and beside what the fit itself promises.
-
-Usage: python -m benchmarks.plan [--goals 20] [--no-fits]
-
-Exits 1 when a bar is missed.
+Usage: python -m benchmarks.plan [--goals 20] [--no-fits]; see doc/benchmarks.md. Exits 1 when a bar is missed.
 """
 
 from __future__ import annotations

@@ -1,21 +1,11 @@
 """Does the fit keep what it promises, also on machines that its model does not know?
 
-Machines of several geometries and kinds are measured, fitted as ``hexapod_comp fit`` does it, and judged at random
-points, the datum aligned. Kept: the error that is left is not above the upper end of the promised interval. Refused:
-the fit says that nothing may be written without force. Kinds of the model's own class (±10 and ±100 µm, length maps,
-fields, worn screws) show that neither is bought by widening everything; the others carry what no block of the model
-describes: higher harmonics of the screws, joints whose error of 20 µm depends on their angle, beams 1.5 mrad off, a
-drift of 0.5 K that nobody wrote down, gross errors with an instrument that slips, a lost motion by friction that is
-different along the struts, and all of these together but the last.
+Usage: python -m benchmarks.promise [--machines 12] [--first 100] [--workers 2] [--kind NAME ...] [--ablate]; kinds and
+bars: doc/benchmarks.md.
 
 With ``--ablate``: what the promise would be with the covariance believed more or less than ``jackknife_prior`` degrees
-of freedom, and with how much it is most likely believed.
-The tool's error over its expectation, squared, is Fisher's F with the freedom of the covariance and of that belief.
-
-Usage: python -m benchmarks.promise [--machines 12] [--first 100] [--workers 2] [--kind NAME ...] [--ablate]
-
-Exits 1 when a bar is missed: 95 % kept or refused, median upper end at most twice what is left, none of the own class
-refused.
+of freedom, and with how much it is most likely believed. The tool's error over its expectation, squared, is Fisher's F
+with the freedom of the covariance and of that belief.
 """
 
 from __future__ import annotations

@@ -1,18 +1,8 @@
 """The tables by which Rubin Observatory corrects its hexapods, of M2 and of the camera, put through ours.
 
-Two sources that nobody here wrote. Finite elements: offsets by zenith distance, 19 rows for each hexapod, in the folder
-`fitter` of its control software, lsst-ts/ts_mthexapod. Laser tracker and sky: polynomials over elevation and camera
-rotation, in its configuration, lsst-ts/ts_config_mttcs. Neither is kept here: fetch them, and name the folders.
-
-Each table becomes a CSV file, is read as `hexapod_comp outside` reads it, and stands in the model of a machine of that
-size. At each node the compensator commands a pose, and the nominal machine with these strut lengths must stand off by
-what the table has there: compensation, ramp, limits, model and kinematics together, held to the last digit that the
-source prints. Then what bilinear interpolation leaves between nodes: rows that the table was not given, the waves by
-which weight bends an elastic structure, and the polynomials at random places.
-
-Usage: python -m benchmarks.rubin FOLDER [--config FOLDER]
-
-Exits 1 when a node is missed by more than the bar, 2 without the data.
+Usage: python -m benchmarks.rubin FOLDER [--config FOLDER]; see doc/benchmarks.md. At each node the compensator commands
+a pose, and the nominal machine with these strut lengths must stand off by what the table has there. Exits 1 when a node
+is missed by more than the bar, 2 without the data.
 """
 
 from __future__ import annotations

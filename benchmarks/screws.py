@@ -1,12 +1,6 @@
 """The screws' periodic errors: is the lead read off the readings, and what do harmonics leave?
 
-Virtual machines are drawn and measured as ``hexapod_comp demo`` does it. First the lead alone is looked for: in the
-shipped campaigns, and on random machines with leads from 2 to 20 mm, some with waves of hundredths of a micrometre, one
-in five without any. Then machines whose screws repeat their errors two, three and four times a turn too are fitted,
-their lead unknown, and judged at points that nothing was fitted to, and the fit timed beside that of the same machine
-without harmonics, for which none are tried and the lead is given.
-
-Run ``python -m benchmarks.screws``. Exits 1 when a bar is missed.
+Usage: python -m benchmarks.screws [--machines 20] [--only-leads]; see doc/benchmarks.md. Exits 1 when a bar is missed.
 """
 
 from __future__ import annotations

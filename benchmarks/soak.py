@@ -1,13 +1,9 @@
 """A long run at 1 kHz: is anything lost, does memory grow, how much is it, and what were the longest latencies?
 
-Compensator and simulated drive run as processes of their own, the drive's readings go back to the compensator,
-and the tool goes round a circle. Their stderr goes into a pipe that nobody reads, as when a terminal was stopped
-with Ctrl-S. Latency is from just before a command is published to its strut commands' arrival here; how long each
-process waited for a processor (/proc/PID/task/*/schedstat) tells how much of it is the computer's. Before that each
-node's resident memory is measured at rest, and at most while somebody sends it messages of 10 MB by all its topics in
-turn. 1 MB is 2²⁰ bytes.
-
 Usage: python -m benchmarks.soak [--minutes 30] [--rate-hz 1000] [--messages 30]
+
+Latency is from just before a command is published to its strut commands' arrival here; how long each process waited for
+a processor (/proc/PID/task/*/schedstat) tells how much of it is the computer's. 1 MB is 2²⁰ bytes.
 """
 
 from __future__ import annotations
@@ -25,20 +21,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from rclpy.experimental import EventsExecutor
 from rclpy.qos import QoSProfile
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState, Temperature
 from std_msgs.msg import UInt64
 
 from benchmarks import judged
+from benchmarks.loop import Line, one_round
 from hexapod_comp.loop.processes import PrivateDomain
-from hexapod_comp.pose import Pose
-from hexapod_comp.ros.base import COMMAND_QOS, EVENT_QOS
-from hexapod_comp.ros.messages import nanoseconds_of, pose_message
+from hexapod_comp.ros.base import EVENT_QOS
 from hexapod_comp.ros.process import SPIN_PERIOD, RosSession
 
 NODES = ("compensator", "strut_drive")
@@ -46,8 +38,6 @@ NODES = ("compensator", "strut_drive")
 RADIUS, TURN_TIME = 0.012, 4.0  # Circle about home, m, and time of one turn, s: 19 mm/s
 RUN_IN = 3.0  # Commands are sent, and not counted, for this long first, s: until DDS has made everybody known
 WARM_UP, LEAST_WARM_UP = 0.1, 5.0  # Share of the run after which memory should be flat, and at least, s
-# Edges of the latency histogram, s: 0.23 % apart, so that the client's own memory stays flat
-BINS = np.geomspace(1e-5, 10.0, 6001)
 BAR_GROWTH = 1.0  # MB an hour
 
 BAR_AT_REST, BAR_AT_MOST = 100.0, 200.0  # Resident memory, MB
@@ -63,26 +53,18 @@ HEARD = {
 class Soak:
     """What a run found."""
 
-    commands: int = 0  # Sent, and never answered
-    lost: int = 0
-    heartbeats: int = 0  # Of the compensator: heard, and missing between them
-    heartbeats_lost: int = 0
-    longest: float = 0.0
-    # Answers by latency, in :data:`BINS`
-    histogram: np.ndarray = field(default_factory=lambda: np.zeros(len(BINS) + 1, dtype=np.int64))
-    # Time since the start, s, and resident memory of each node, byte
-    memory: list[tuple[float, ...]] = field(default_factory=list)
+    latencies: list[int]  # of the answers, ns
+    lost: int  # commands that were never answered
+    beats: list[int]  # numbers of the compensator's heartbeats
+    memory: list[tuple[float, ...]]  # time since the start, s, and resident memory of each node, byte
     # How long the threads of each process, together, waited for a processor during the whole run, s
     waited: dict[str, float] = field(default_factory=dict)
     diagnostics: dict[str, dict[str, str]] = field(default_factory=dict)
 
-    def quantile(self, share: float) -> float:
-        """Return the latency, s, below which a share of the answers lies, to the width of a bin."""
-        counts = np.cumsum(self.histogram)
-        if not counts[-1]:
-            return float("nan")
-        index = int(np.searchsorted(counts, share * counts[-1]))
-        return float(min(BINS[min(index, len(BINS) - 1)], self.longest))
+    @property
+    def heartbeats_lost(self) -> int:
+        """How many heartbeats are missing between those that were received."""
+        return self.beats[-1] - self.beats[0] + 1 - len(self.beats) if self.beats else 0
 
     def growth(self, node: int) -> tuple[float, float]:
         """Return slope and its standard error of a node's resident memory after warming up, MB/h."""
@@ -96,107 +78,14 @@ class Soak:
         return float(slope), float(np.sqrt(covariance[0, 0] * residual.var()))
 
 
-class Commander:
-    """Sends a circle at a fixed rate and keeps account of the answers."""
-
-    def __init__(self, rate: float, pids: dict[str, int]) -> None:
-        self.found, self._rate, self._pids = Soak(), rate, pids
-        self.context = rclpy.Context()
-        rclpy.init(args=[], context=self.context, signal_handler_options=SignalHandlerOptions.NO)
-        self.node = rclpy.create_node("soak", context=self.context)
-        self.executor = EventsExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        self._publisher = self.node.create_publisher(PoseStamped, "tool_pose_command", COMMAND_QOS)
-        self.node.create_subscription(JointState, "strut_commands", self._on_answer, QoSProfile(depth=1000))
-        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
-        self.node.create_subscription(UInt64, "compensator/heartbeat", self._on_heartbeat, QoSProfile(depth=1000))
-        self._beat: int | None = None
-        self._message = pose_message(Pose(np.array([0.0, 0.0, 0.4]), np.eye(3)), "base")
-        self._sent: dict[int, float] = {}
-        self._turned = 0.0
-        self.begin()
-
-    def begin(self) -> None:
-        """Forget what was counted up to now."""
-        self.found = Soak(diagnostics=self.found.diagnostics)
-        self._sent.clear()
-        self._waited = self._run_queue()
-
-    def close(self) -> None:
-        """Leave ROS."""
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
-
-    def wait_until_ready(self, timeout: float = 180.0) -> None:
-        """Return when both nodes are connected."""
-        end = time.monotonic() + timeout
-        while not (self._publisher.get_subscription_count() and set(NODES) <= set(self.found.diagnostics)):
-            self.executor.spin_once(timeout_sec=SPIN_PERIOD)
-            if time.monotonic() > end:
-                raise SystemExit(f"the nodes did not come up within {timeout:g} s")
-
-    def run(self, seconds: float) -> Soak:
-        """Send for some seconds, wait for the last answers, and return the account."""
-        self.begin()
-        start = due = time.monotonic()
-        next_look = start
-        while (now := time.monotonic()) < start + seconds:
-            self._send()
-            if now >= next_look:
-                self._look(now - start)
-                next_look = now + 1.0
-            due = max(due + 1.0 / self._rate, now)
-            while (left := due - time.monotonic()) > 0.0:
-                self.executor.spin_once(timeout_sec=left)
-        end = time.monotonic() + 2.0
-        while self._sent and time.monotonic() < end:
-            self.executor.spin_once(timeout_sec=SPIN_PERIOD)
-        self._look(time.monotonic() - start)
-        self.found.lost = len(self._sent)
-        self.found.waited = {k: v - self._waited[k] for k, v in self._run_queue().items()}
-        return self.found
-
-    def _send(self) -> None:
-        self._turned += 1.0 / (self._rate * TURN_TIME)
-        angle = 2.0 * np.pi * self._turned
-        position = self._message.pose.position
-        position.x, position.y = RADIUS * float(np.cos(angle)) - RADIUS, RADIUS * float(np.sin(angle))
-        stamp = self.node.get_clock().now()
-        self._message.header.stamp = stamp.to_msg()
-        self._sent[stamp.nanoseconds] = time.monotonic()
-        self.found.commands += 1
-        self._publisher.publish(self._message)
-
-    def _on_answer(self, message: JointState) -> None:
-        now = time.monotonic()
-        sent = self._sent.pop(nanoseconds_of(message.header.stamp), None)
-        if sent is None:
-            return
-        latency, found = now - sent, self.found
-        found.histogram[np.searchsorted(BINS, latency)] += 1
-        found.longest = max(found.longest, latency)
-
-    def _on_heartbeat(self, message: UInt64) -> None:
-        self.found.heartbeats += 1
-        self.found.heartbeats_lost += 0 if self._beat is None else message.data - self._beat - 1
-        self._beat = message.data
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            self.found.diagnostics[status.name.partition(":")[0]] = {v.key: v.value for v in status.values}
-
-    def _look(self, elapsed: float) -> None:
-        self.found.memory.append((elapsed, *(_resident(self._pids[name]) for name in NODES)))
-
-    def _run_queue(self) -> dict[str, float]:
-        """Return how long the threads of each process have waited for a processor up to now, s."""
-        waited = dict.fromkeys((*self._pids, "client"), 0.0)
-        for name, pid in {**self._pids, "client": os.getpid()}.items():
-            for path in Path(f"/proc/{pid}/task").glob("*/schedstat"):
-                with suppress(OSError, IndexError):  # a thread that has just ended
-                    waited[name] += int(path.read_text(encoding="ascii").split()[1]) * 1e-9
-        return waited
+def run_queue(pids: dict[str, int]) -> dict[str, float]:
+    """Return how long the threads of each process have waited for a processor up to now, s."""
+    waited = dict.fromkeys(pids, 0.0)
+    for name, pid in pids.items():
+        for path in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+            with suppress(OSError, IndexError):  # a thread that has just ended
+                waited[name] += int(path.read_text(encoding="ascii").split()[1]) * 1e-9
+    return waited
 
 
 def _resident(pid: int) -> int:
@@ -212,8 +101,7 @@ def memory(messages: int) -> bool:
             pid, kinds, before = pids[name], list(topics.values()), math.inf
             make = session.node.create_publisher
             publishers = [make(kind, topic, QoSProfile(depth=1)) for topic, kind in topics.items()]
-            while not all(publisher.get_subscription_count() for publisher in publishers):
-                session.spin_once(SPIN_PERIOD)
+            session.wait(lambda some=publishers: all(p.get_subscription_count() for p in some), 180.0, f"the {name}")
             while abs((rest := _resident(pid) / 2**20) - before) >= 1.0:
                 before = rest
                 time.sleep(SETTLED)
@@ -255,24 +143,42 @@ def nodes() -> Iterator[dict[str, int]]:
 
 def soak(seconds: float, rate: float) -> Soak:
     """Run everything for some seconds."""
-    with nodes() as pids:
-        commander = Commander(rate, pids)
-        try:
-            commander.wait_until_ready()
-            commander.run(RUN_IN)
-            return commander.run(seconds)
-        finally:
-            commander.close()
+    with nodes() as pids, RosSession("soak") as session:
+        found, line = Soak([], 0, [], []), Line(session.node, "", RADIUS, rate * TURN_TIME)
+
+        def on_diagnostics(message: DiagnosticArray) -> None:
+            for status in message.status:
+                found.diagnostics[status.name.partition(":")[0]] = {v.key: v.value for v in status.values}
+
+        depth = QoSProfile(depth=1000)
+        session.node.create_subscription(DiagnosticArray, "/diagnostics", on_diagnostics, EVENT_QOS)
+        session.node.create_subscription(UInt64, "compensator/heartbeat", lambda m: found.beats.append(m.data), depth)
+        session.wait(lambda: line.connected and set(NODES) <= set(found.diagnostics), 180.0, "the nodes")
+        one_round(session, line, rate, RUN_IN)
+        found.beats.clear()
+        before = run_queue(pids)
+        found.latencies = one_round(
+            session,
+            line,
+            rate,
+            seconds,
+            patience=2.0,
+            each_second=lambda elapsed: found.memory.append((elapsed, *(_resident(pids[name]) for name in NODES))),
+        )
+        found.lost = len(line.sent)
+        found.waited = {name: waited - before[name] for name, waited in run_queue(pids).items()}
+    return found
 
 
 def report(found: Soak) -> list[str]:
     """Return the lines for people."""
-    shares = (0.5, 0.9, 0.99, 0.999, 0.9999)
-    quantiles = "  ".join(f"{100 * share:g} % {found.quantile(share) * 1e6:.0f}" for share in shares)
+    shares = (50.0, 90.0, 99.0, 99.9, 99.99)
+    sizes = np.percentile(found.latencies or [np.nan], shares) * 1e-3
+    quantiles = "  ".join(f"{share:g} % {size:.0f}" for share, size in zip(shares, sizes, strict=True))
     lines = [
-        f"{found.commands} commands, {found.lost} without an answer; "
-        f"{found.heartbeats} heartbeats, {found.heartbeats_lost} lost",
-        f"latency, µs: {quantiles}  largest {found.longest * 1e6:.0f}",
+        f"{len(found.latencies) + found.lost} commands, {found.lost} without an answer; "
+        f"{len(found.beats)} heartbeats, {found.heartbeats_lost} lost",
+        f"latency, µs: {quantiles}  largest {max(found.latencies, default=0) * 1e-3:.0f}",
     ]
     for index, node in enumerate(NODES):
         slope, error = found.growth(index)

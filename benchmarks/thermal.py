@@ -1,24 +1,9 @@
 """What temperature sensors are worth: machines that warm, compensated from noisy readings.
 
-Part `stated`: machines of kind B (see :mod:`benchmarks.calibration`) of steel warm in a straight line over half an hour
-and then stay warm. A sensor on each part that warms reads once a second, with noise; the compensator, whose model is
-exact, gets what the filter makes of it, from the first reading on. The figure is how far the drift has brought the
-tool, at held-out points passed there and back, from where it is at 20 °C: the error in space as it is, since a drift
-moves the datum and no alignment may take that out.
-
-Part `fitted`: one power warms all parts, each through a first-order lag of its own (:data:`RISE`, :data:`TAU`); each
-strut differs from that by 10 % in both, so no two time constants describe them all. The shop measures the machine cold,
-then an x, a y and a z line every ten minutes for three hours from switching on, each time zeroed anew, with a sensor on
-every part or one in the base. The fit is told no expansion, and judged on another day: power on for an hour, off for
-forty minutes, and on again.
-
-Part `pulls`: are the stated deviations true? Machines of the tests' zoo, of kinds of :mod:`benchmarks.promise`, half of
-them with struts that swell while the air turns damp, are measured in fewer places and rounds. What is estimated minus
-what is, over its stated standard deviation, is the pull of each expansion, of the moisture, and of the time constant.
-
 Usage: python -m benchmarks.thermal [--only stated|fitted|pulls] [--machines 20] [--points 1000] [--noise 0.05]
 
-Exits 1 when a bar is missed.
+Drifts, parts and bars: doc/benchmarks.md. What is judged is the error in space as it is, since a drift moves the datum
+and no alignment may take that out. Exits 1 when a bar is missed.
 """
 
 from __future__ import annotations

@@ -1,17 +1,9 @@
 """Does a model stay true? Machines fitted, changed behind the model's back, checked with few readings, repaired.
 
-Each machine is drawn from its own seed (±100 µm on joints and struts, screws that err, backlash), measured by 5-D lines
-on a coarse grid and four diagonals, and fitted. Then it changes, and ``verify`` and ``fit --update`` see nothing but
-the check readings, each of 1 µm or 1 µrad: at both ends of three body diagonals (linear) and of a line along x (linear,
-pitch and yaw), 12 readings, or of a line along x, y and z, 24; or the twelve that ``verify --propose`` chooses. What is
-left of the tool's error is judged at points that nothing was fitted to, the datum aligned.
-
 Usage: python -m benchmarks.upkeep [--machines 100] [--foreign 5] [--drifting 20] [--workers 2] [--save FILE]
 
 ``--save`` keeps each machine's results as they come, and goes on from those that are there; ``--machines 0 --foreign 0
---save FILE`` prints what a file has. Exits 1 when a bar is missed: no more than 5 % false alarms, a strut moved by 20
-µm named in 95 %, repaired to 1.5 times what the calibration had left, a bend in space or a moved joint taken for what
-it is not in no more than 10 %, and of all that is named 90 % rightly.
+--save FILE`` prints what a file has. Changes and bars: doc/benchmarks.md.
 """
 
 from __future__ import annotations

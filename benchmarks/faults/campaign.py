@@ -22,6 +22,7 @@ WARM_UP = 2.0  # The machine moves for so long before the first episode, s
 RUNS_AGAIN_WITHIN = 5.0  # A machine that does not run this long after an episode, s, is replaced
 STARVED = 0.1  # Share of the time that a process waits for a processor above which its times say little of the nodes
 GIVE_UP = 30.0  # A fault that is not over by then never will be, s
+OVER = object()
 
 
 @dataclass
@@ -70,25 +71,21 @@ def run_episode(rig: Rig, episode: Episode) -> Outcome:
     rig.spin(BEFORE)
     began = time.monotonic()
     waiting = [(began + at, fault) for at, fault in episode.faults]
-    under_way: list[tuple[Fault, Happened]] = []
-    ending: list[tuple[Fault, Happened]] = []
-    while (waiting or under_way or ending) and time.monotonic() < began + GIVE_UP:
+    under_way: list[tuple[Fault, Happened, Iterator[None]]] = []
+    while (waiting or under_way) and time.monotonic() < began + GIVE_UP:
         now = time.monotonic()
         for at, fault in [entry for entry in waiting if entry[0] <= now]:
             waiting.remove((at, fault))
             happened = Happened(fault.kind, now)
             record.faults.append(happened)
-            fault.begin(rig, happened)
-            under_way.append((fault, happened))
+            under_way.append((fault, happened, fault.run(fault, rig, happened)))
+            next(under_way[-1][2])
         for entry in [entry for entry in under_way if now >= entry[1].began + entry[0].duration]:
-            under_way.remove(entry)
-            entry[0].end(rig, entry[1])
-            ending.append(entry)
-        for entry in [entry for entry in ending if entry[0].over(rig)]:
-            ending.remove(entry)
-            entry[1].ended = time.monotonic()
+            if next(entry[2], OVER) is OVER:
+                under_way.remove(entry)
+                entry[1].ended = time.monotonic()
         rig.spin(0.005)
-    for _, happened in ending:
+    for _, happened, _ in under_way:
         happened.ended = math.inf
     recovery = MOVER_RECOVERS_WITHIN if rig.has_mover else RECOVER_WITHIN
     rig.spin(recovery + AFTER)
