@@ -19,11 +19,12 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from hexapod_comp.cli import main
-from hexapod_comp.compensation.compensator import NO_SHIFT, Compensator
+from hexapod_comp.compensation.compensator import Compensator, pack_pose
 from hexapod_comp.compensation.guards import Sample
 from hexapod_comp.errors import CommandError, KinematicsError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
+from hexapod_comp.pose import Pose
 from hexapod_comp.ros.compensator import CompensatorNode
 from hexapod_comp.ros.interface import STRUTS, StrutInput
 from hexapod_comp.ros.status import ERROR, OK, WARN
@@ -55,7 +56,7 @@ def test_lengths_and_the_pose_they_belong_to_are_answered_alike(name: str, tmp_p
         tips, tools.as_quat(), machine.lengths(*machine.platform_poses(tips, tools.as_matrix())), strict=True
     ):
         given.read(serialize_message(setpoints(length)), sample := Sample(0.0))
-        answer = by_struts.step(sample.values, math.nan, NO_SHIFT)
+        answer = by_struts.step(sample.values, math.nan, pack_pose(Pose.identity()))
         np.testing.assert_allclose(answer, by_pose.step((*tip, *tool), math.nan), rtol=0.0, atol=SAME)
         np.testing.assert_allclose(by_struts.nominal, length, rtol=0.0, atol=SAME)
 
