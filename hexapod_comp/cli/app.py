@@ -152,12 +152,7 @@ def make_parser() -> argparse.ArgumentParser:
         help="VERB --help gives its options, units and an example",
     )
     for name, verb in VERBS.items():
-        own = subparsers.add_parser(
-            name,
-            description=verb.summary,
-            epilog=verb.text,
-            formatter_class=raw,
-        )
+        own = subparsers.add_parser(name, description=verb.summary, epilog=verb.text, formatter_class=raw)
         groups: dict[str, Any] = {"": own}
         for option in verb.options:
             if option.heading not in groups:

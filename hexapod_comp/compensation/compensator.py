@@ -124,12 +124,7 @@ class Phase(Enum):
     RUNNING = "at the last command"
 
 
-_ALWAYS = {
-    "reset": Phase.FIRST,
-    "reset to struts": Phase.RESUMED,
-    "command": Phase.RUNNING,
-    "ramped": Phase.RAMPING,
-}
+_ALWAYS = {"reset": Phase.FIRST, "reset to struts": Phase.RESUMED, "command": Phase.RUNNING, "ramped": Phase.RAMPING}
 # The phase after each event. ``change``: of model, temperature, humidity, or the switch; ``command``: an
 # accepted one after which no change is ramping; ``ramped``: one after which a change is still ramping. A refused
 # command changes nothing. doc/states.md shows this table, and tests compare the core with it.

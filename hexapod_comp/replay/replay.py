@@ -92,9 +92,7 @@ class Replay:
 
 
 def replay_recording(
-    recording: Recording,
-    files: Files | None = None,
-    progress: Progress = lambda commands: None,
+    recording: Recording, files: Files | None = None, progress: Progress = lambda commands: None
 ) -> Replay:
     """Run a recording through the compensator again.
 

@@ -248,12 +248,7 @@ class TravelReports:
         geometry = compensator.geometry.using(work=work)
         pose = geometry.tool_pose(platform)
         where = f"tool {geometry.tool_name} in {status.frame_ids[work]} at {pose_text(pose)}"
-        asked = {
-            "pose": pose,
-            "work": work,
-            "enabled": compensator.enabled,
-            "now": situation(compensator),
-        }
+        asked = {"pose": pose, "work": work, "enabled": compensator.enabled, "now": situation(compensator)}
         self._busy = True
         self._worker.ask(
             Job(

@@ -104,10 +104,7 @@ class Bench:
     """Nodes under test on one executor in a private context, and a witness that receives and sends everything."""
 
     def __init__(
-        self,
-        context: Context,
-        capture: pytest.CaptureFixture[str] | None = None,
-        namespace: str = "",
+        self, context: Context, capture: pytest.CaptureFixture[str] | None = None, namespace: str = ""
     ) -> None:
         self.context, self.namespace = context, namespace
         self._capture, self._log = capture, ""
