@@ -34,20 +34,14 @@ SET_UP_WITHIN = Duration(seconds=2)  # Who sets instruments up by topic hears of
 
 
 class WatchedMachine(Machine):
-    """A machine with a mover, and instruments that publish on topics.
+    """A machine with a mover, and instruments that publish on topics: poses of the tool (PoseStamped) on `topic`, in
+    ``base``, or in any frame where `tracker_frame` is ``free``; single ones (JointState: channels, m or rad) on
+    `readings`: lines, lengths and displacements then come from there, and NaN says that a beam is broken and its zero
+    lost.
 
     At each stop the median of `samples` readings that came after the tool had settled is taken, so that single wild
-    ones count for nothing; fewer than half within `patience`, s, count as a broken beam.
-
-    Parameters
-    ----------
-    topic : str
-        Poses of the tool, PoseStamped, in ``base``; in any frame where ``tracker_frame`` is ``free``.
-    readings : str, optional
-        Topic of single readings, JointState: a name is a channel, its position what is read of it, m or rad. Lines,
-        lengths and displacements then come from there; NaN says that a beam is broken and its zero lost.
-    confirm : callable, optional
-        Called with each run that an instrument of single readings is set up for; returns when it is.
+    ones count for nothing; fewer than half within `patience`, s, count as a broken beam. `confirm` is called with each
+    run that an instrument of single readings is set up for, and returns when it is.
     """
 
     def __init__(
