@@ -127,13 +127,20 @@ def test_rows_name_the_error_and_the_tools_pose():
 # --- combined ----------------------------------------------------------------------------------------------
 
 
-def test_the_worst_case_of_shared_joints_is_the_largest_over_all_signs():
+SHARED = {"platform_joint_xy": 10e-6, "platform_joint_z": 8e-6, "strut_length": 5e-6}
+
+
+@pytest.mark.parametrize(
+    ("make", "sizes", "chosen"),
+    [(small.paper, SHARED, range(12)), (tooled, MIXED, [0, 1, 6, 7, 9, 12, 19, 20, 22, 24, 26])],
+    ids=["shared joints", "tool"],
+)
+def test_the_worst_case_is_the_largest_over_all_signs(make, sizes, chosen):
     # All 2^12 combinations; a shared joint's three errors have directions of their own. At home the paper's machine is
-    # as symmetrical as can be: directions lie in common planes.
-    geometry = small.paper()
-    sizes = {"platform_joint_xy": 10e-6, "platform_joint_z": 8e-6, "strut_length": 5e-6}
-    errors = Budget("paper", sizes).single_errors(geometry)
-    errors = errors.select(np.arange(len(errors)) < 12)
+    # as symmetrical as can be: directions lie in common planes. Of the tooled unit: several on a strut, two on the tool.
+    geometry = make()
+    errors = Budget(geometry.name, sizes).single_errors(geometry)
+    errors = errors.select(np.isin(np.arange(len(errors)), chosen))
     positions, rotations = poses_about(geometry.home, 4, seed=2, reach=0.05, tilt_deg=10.0)
     positions[0], rotations[0] = geometry.home.position, np.eye(3)
     vectors = effect_vectors(geometry, errors, positions, rotations, LINEAR)
