@@ -137,7 +137,7 @@ SHARED = {"platform_joint_xy": 10e-6, "platform_joint_z": 8e-6, "strut_length": 
 )
 def test_the_worst_case_is_the_largest_over_all_signs(make, sizes, chosen):
     # All 2^12 combinations; a shared joint's three errors have directions of their own. At home the paper's machine is
-    # as symmetrical as can be: directions lie in common planes. Of the tooled unit: several on a strut, two on the tool.
+    # as symmetrical as can be: directions lie in common planes. The tooled unit: two on the tool.
     geometry = make()
     errors = Budget(geometry.name, sizes).single_errors(geometry)
     errors = errors.select(np.isin(np.arange(len(errors)), chosen))
