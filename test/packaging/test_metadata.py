@@ -101,24 +101,15 @@ def test_the_stable_abi_is_what_pythons_own_header_declares(tmp_path: Path):
     assert done.returncode == 0, done.stderr
 
 
-@pytest.fixture
-def no_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Take every command away: PATH leads to an empty folder, and no variable names a compiler."""
+def test_pip_asks_for_a_compiler_where_none_is_and_setup_py_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Neither the machine's nor PyPI's: PATH leads to an empty folder, no variable names one. One sentence then."""
+    assert "ziglang" not in building.compiler_from_pypi()  # this machine's compiler has built the core under test
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
-
-
-@pytest.mark.usefixtures("no_compiler")
-def test_pip_asks_for_a_compiler_where_none_is(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(building.build_meta, "get_requires_for_build_wheel", lambda settings: ["wheel"])
     assert building.get_requires_for_build_wheel() == ["wheel", "ziglang"]
-    monkeypatch.undo()
-    assert "ziglang" not in building.compiler_from_pypi()  # this machine's compiler has built the core under test
-
-
-@pytest.mark.usefixtures("no_compiler")
-def test_a_build_without_a_compiler_says_what_to_install(tmp_path: Path):
-    """Neither the machine's nor PyPI's: one sentence, and no traceback."""
     words = [sys.executable, "setup.py", "--quiet", "build_ext", "--build-lib", tmp_path, "--build-temp", tmp_path]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 1
@@ -312,7 +303,11 @@ def test_the_source_archive_carries_all_that_its_checks_need(wheel: Path):
     assert needed <= held
 
 
-def test_ros_finds_executables_and_what_is_shared(installed: Path):
+def test_every_module_is_installed_and_ros_finds_executables_and_what_is_shared(installed: Path):
+    package = next(installed.glob("**/hexapod_comp/__init__.py")).parent
+    modules = {path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py")}
+    assert {path.relative_to(package) for path in package.rglob("*.py")} == modules
+    assert (package / "core" / "_core.abi3.so").is_file()
     for name in ("compensator", "strut_drive", "mover", "instrument", "adapter", "hexapod_comp"):
         assert os.access(installed / "lib" / "hexapod_comp" / name, os.X_OK), name
     for name in (
@@ -333,13 +328,6 @@ def test_a_sourced_workspace_has_the_command(installed: Path, tmp_path: Path):
     found = subprocess.check_output(["sh", "-c", script], env=environment, cwd=tmp_path, text=True, timeout=60)
     folder = prefix / "hexapod_comp" / "lib" / "hexapod_comp"
     assert found.split() == [str(folder / name) for name in ("hexapod_comp", "compensator")]
-
-
-def test_every_module_is_installed(installed: Path):
-    package = next(installed.glob("**/hexapod_comp/__init__.py")).parent
-    modules = {path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py")}
-    assert {path.relative_to(package) for path in package.rglob("*.py")} == modules
-    assert (package / "core" / "_core.abi3.so").is_file()
 
 
 def test_installed_command_runs_and_finds_its_own_config(installed: Path, tmp_path: Path):
