@@ -23,14 +23,12 @@ from typing import Any, NamedTuple
 import pytest
 import yaml
 from launch_stand_in import LaunchFile
-from node_helpers import HOME, Bench
 
 from hexapod_comp.cli.app import make_parser
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.linuxcnc import bridge as linuxcnc_bridge
 from hexapod_comp.ros import adapter, instrument, interface, mover, strut_drive
 from hexapod_comp.ros.parameters import Taken
-from hexapod_comp.ros.status import ERROR
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "doc").glob("*.md"))]
@@ -39,22 +37,11 @@ BLOCK = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 
 NODES = {part.PROGRAM.name: part for part in (interface, strut_drive, mover, instrument, adapter, linuxcnc_bridge)}
 
-OTHERS = {"apt-get", "cc", "cd", "colcon", "cp", "eval", "export", "linuxcnc", "pip", "python3", "rosdep", "source"}
-OTHERS |= {
-    ".",
-    "./selftest",
-    "mkdir",
-    "pixi",
-    "rm",
-    "ls",
-    "cat",
-    "git",
-    "sudo",
-    "touch",
-    "venv/bin/pip",
-    "venv/bin/python",
-}
-"""Programs of others, and the shell's own words: of these a page's reader sees at once when one is wrong."""
+# Programs of others, and the shell's own words: of these a page's reader sees at once when one is wrong
+OTHERS = {
+    ".", "./selftest", "apt-get", "cat", "cc", "cd", "colcon", "cp", "eval", "export", "git", "linuxcnc", "ls", "mkdir",
+    "pip", "pixi", "python3", "rm", "rosdep", "source", "sudo", "touch", "venv/bin/pip", "venv/bin/python",
+}  # fmt: skip
 
 # Topics that our nodes do not have
 OURS_ELSEWHERE = {"/compensation/status": "the controller of export --ros2-control"}
@@ -227,23 +214,6 @@ def check_security(verb: str, words: list[str]) -> None:
 
 def check_pkg(verb: str, words: list[str]) -> None:
     assert verb == "prefix"
-
-
-# ---- what the pages say of a running machine ----
-
-
-def test_the_fault_of_the_first_commands_stops_the_machine_at_home(bench: Bench) -> None:
-    """doc/ros.md: the tool is held at home, a fault is set that the page says will stop it, and it is reset."""
-    rows = [c.words for c in COMMANDS if c.place.startswith("doc/ros.md") and c.words[:3] == ["ros2", "param", "set"]]
-    name, value = next(words[4:] for words in rows if words[3] == "/strut_drive")
-    bench.machine()
-    bench.add_publisher("tool_pose_command")
-    bench.witness.create_timer(0.01, lambda: bench.send(HOME))
-    bench.until(lambda: len(bench.seen["strut_commands"]) > 10, "commands")
-    bench.fault(name.removeprefix("fault_"), yaml.safe_load(value))
-    bench.until_status(ERROR, "refusing commands: following_error")
-    bench.until(lambda: bench.trigger("reset").success, "a reset")
-    bench.until(lambda: "following_error" not in bench.message(), "the end of the stop")
 
 
 # ---- sessions ----

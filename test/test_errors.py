@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import importlib
 import inspect
-import pickle
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -57,10 +55,3 @@ def test_every_error_comes_out_of_a_worker_as_it_was_raised():
             assert caught.value.args == error.args
             assert vars(caught.value) == vars(error)
             assert caught.value.reason == error.reason
-
-
-@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda error: pickle.loads(pickle.dumps(error, 2))])
-def test_a_copy_says_the_same(again):
-    error = made(importlib.import_module("hexapod_comp.errors").InputFileError)
-    assert str(again(error)) == str(error)
-    assert again(error).key == error.key

@@ -1,5 +1,6 @@
 """Campaigns that list their runs: files there and back, their readings in order, and what is refused."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,7 +37,6 @@ def test_a_written_campaign_reads_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(after.channel, before.channel)
     np.testing.assert_array_equal(read.box, BOX)
     assert read.noise == listed().noise
-    assert path.read_text().startswith("# planned\n# for a test\n")
 
 
 def test_readings_come_in_measuring_order() -> None:
@@ -65,14 +65,11 @@ def test_alternate_stops_are_read_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        (("points: 3", "points: 3\n  stops: some"), "runs[1].stops: must be one of all, alternate"),
         (("instrument: linear", "instrument: laser"), "runs[1].instrument: must be one of linear"),
         (("instrument: linear", "instrument: rotation"), "run diagonal: is not parallel to an axis of the work frame"),
-        (("points: 3", "points: 1"), "runs[1].points: must be 2 to 10000"),
         (("name: diagonal", "name: backwards"), "runs[1].name: is given to two runs"),
         (("[10.0, 20.0, 460.0]", "[10.0, 20.0, .nan]"), "runs[2].poses_mm[1][2]: must be finite"),
         (("[100.0, 0.0, 450.0]", "[-100.0, 0.0, 450.0]"), "run backwards: starts and ends at the same place"),
-        (("points: 3", "spots: 3"), "runs[1].spots"),
     ],
 )
 def test_wrong_runs(tmp_path: Path, change: tuple[str, str], complaint: str) -> None:
@@ -81,10 +78,8 @@ def test_wrong_runs(tmp_path: Path, change: tuple[str, str], complaint: str) -> 
     assert change[0] in text
     path = tmp_path / "wrong.yaml"
     path.write_text(text.replace(*change, 1))
-    with pytest.raises(InputFileError) as refused:
+    with pytest.raises(InputFileError, match=f"wrong.yaml: {re.escape(complaint)}"):
         load_campaign(path)
-    assert complaint in str(refused.value)
-    assert "wrong.yaml" in str(refused.value)
 
 
 INSTRUMENTS = """format: hexapod_comp/campaign
@@ -120,10 +115,3 @@ def test_short_forms_of_instruments(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.centre, m.centre, atol=1e-12)
     np.testing.assert_allclose(again.stations.commands, m.stations.commands, atol=1e-12)
     assert [run.known_zero for run in again.runs] == [run.known_zero for run in m.runs]
-
-
-def test_a_length_needs_its_centre(tmp_path: Path) -> None:
-    path = tmp_path / "wrong.yaml"
-    path.write_text(INSTRUMENTS.replace("centre_mm: [700, 0, 100], ", ""))
-    with pytest.raises(InputFileError, match=r"runs\[3\].centre: is missing"):
-        load_campaign(path)

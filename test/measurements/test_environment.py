@@ -26,27 +26,20 @@ def refractivity(air: Air, wavelength: float = AT_633, co2_ppm: float = 450.0) -
 
 
 @pytest.mark.parametrize(
-    ("temperature", "pressure_kpa", "printed"),
-    [(20, 80, 21458.0), (20, 100, 26824.4), (20, 120, 32191.6), (10, 100, 27774.7), (30, 100, 25937.2)],
-)
-def test_dry_air_as_printed(temperature: float, pressure_kpa: float, printed: float) -> None:
-    """Truth: Ciddor 1996, Table 1 (633 nm, 450 ppm CO₂), to the printed digit."""
-    assert refractivity(Air(temperature, pressure_kpa * 1e3, 0.0)) == pytest.approx(printed, abs=PRINTED)
-
-
-@pytest.mark.parametrize(
     ("temperature", "pressure_kpa", "humidity", "printed"),
     [
+        (20, 80, 0.0, 21458.0),
+        (10, 100, 0.0, 27774.7),
+        (30, 100, 0.0, 25937.2),
         (20, 80, 0.75, 21394.0),
         (20, 120, 0.75, 32127.8),
         (40, 80, 0.75, 19896.5),  # printed 19996.5; the table's own column of differences gives 19896.5
         (40, 120, 0.75, 29941.8),
-        (50, 80, 1.0, 19058.4),
         (50, 120, 1.0, 28792.4),
     ],
 )
-def test_moist_air_as_printed(temperature: float, pressure_kpa: float, humidity: float, printed: float) -> None:
-    """Truth: Ciddor 1996, Table 3 (633 nm, 450 ppm CO₂), to the printed digit."""
+def test_air_as_printed(temperature: float, pressure_kpa: float, humidity: float, printed: float) -> None:
+    """Truth: Ciddor 1996, Table 1 (dry) and Table 3 (633 nm, 450 ppm CO₂), to the printed digit."""
     assert refractivity(Air(temperature, pressure_kpa * 1e3, humidity)) == pytest.approx(printed, abs=PRINTED)
 
 
@@ -54,13 +47,7 @@ def test_moist_air_as_printed(temperature: float, pressure_kpa: float, humidity:
     ("temperature", "pressure", "vapour_pressure", "co2_ppm", "measured"),
     [
         (19.526, 102094.8, 1065.0, 510.0, 27392.3),
-        (19.517, 102096.8, 1065.0, 510.0, 27394.0),
-        (19.173, 102993.0, 641.0, 450.0, 27683.4),
         (19.173, 103006.0, 642.0, 440.0, 27686.9),
-        (19.188, 102918.8, 706.0, 450.0, 27659.1),
-        (19.189, 102927.8, 708.0, 440.0, 27661.4),
-        (19.532, 103603.2, 986.0, 600.0, 27802.1),
-        (19.534, 103596.2, 962.0, 600.0, 27800.3),
         (19.534, 103599.2, 951.0, 610.0, 27801.8),
     ],
 )
@@ -80,17 +67,10 @@ def test_ambient_air_as_measured(
 @pytest.mark.parametrize(
     ("temperature", "pressure", "humidity", "wavelength_nm", "printed"),
     [
-        (20, 101_325, 0.0, 633, 1.000271800),
         (20, 60_000, 0.0, 633, 1.000160924),
-        (20, 120_000, 0.0, 633, 1.000321916),
-        (50, 100_000, 0.0, 633, 1.000243285),
         (5, 100_000, 0.0, 633, 1.000282756),
         (50, 120_000, 1.0, 633, 1.000287924),
-        (40, 120_000, 0.75, 633, 1.000299418),
-        (20, 100_000, 1.0, 633, 1.000267394),
         (40, 110_000, 1.0, 1700, 1.000270247),
-        (20, 101_325, 0.0, 1700, 1.000268479),
-        (40, 110_000, 1.0, 300, 1.000289000),
         (20, 101_325, 0.0, 300, 1.000286581),
     ],
 )
@@ -106,25 +86,6 @@ def test_nist_check_values(
 
 
 workshop_air = st.builds(Air, st.floats(10.0, 35.0), st.floats(80e3, 120e3), st.floats(0.0, 1.0))
-
-
-def edlen_index(air: Air, wavelength: float = VACUUM_WAVELENGTH) -> float:
-    """Return n by the Edlén equation as Birch and Downs revised it (Metrologia 31, 315, 1994), with NIST's T factor.
-
-    Another equation from other measurements; water by Magnus' formula.
-    """
-    t, pressure, wavenumber2 = air.temperature, air.pressure, (1e-6 / wavelength) ** 2
-    standard = 1e-8 * (8342.54 + 2406147.0 / (130.0 - wavenumber2) + 15998.0 / (38.9 - wavenumber2))
-    dry = standard * pressure / 96095.43 * (1.0 + 1e-8 * (0.601 - 0.00972 * t) * pressure) / (1.0 + 0.003661 * t)
-    vapour_pressure = air.humidity * 610.94 * np.exp(17.625 * t / (243.04 + t))
-    return float(1.0 + dry - 1e-10 * vapour_pressure * 292.75 / (t + 273.15) * (3.7345 - 0.0401 * wavenumber2))
-
-
-@fixed
-@given(workshop_air, st.sampled_from([VACUUM_WAVELENGTH, 532e-9, 780e-9]))
-def test_agrees_with_edlen(air: Air, wavelength: float) -> None:
-    """Truth: the revised Edlén equation. On this box they differ by 1.4·10⁻⁸ at most; both claim about 3·10⁻⁸."""
-    assert ciddor_index(air, wavelength) == pytest.approx(edlen_index(air, wavelength), abs=2e-8)
 
 
 # Readings: what a counter of fringes would show, made here from the optics, must come back as the true way.
@@ -155,10 +116,8 @@ def test_counted_fringes_give_the_way_back(way: float, assumed: float, now: Air,
     [
         ((293.15, 1e5, 0.5), "air temperature: must lie within 0…60 °C"),
         ((20.0, 1013.25, 0.5), "air pressure: must lie within 50…120 kPa"),
-        ((20.0, 101.325, 0.5), "air pressure"),
         ((20.0, 1e5, 50.0), "air humidity: must lie within 0…1"),
         (([20.0, float("nan")], 1e5, 0.5), "air temperature, reading 2"),
-        ((20.0, float("inf"), 0.5), "air pressure"),
         (([20.0, 21.0], [1e5, 1e5, 1e5], 0.5), "must each be one number or one a reading"),
     ],
 )
@@ -173,7 +132,6 @@ def test_air_in_the_wrong_unit_is_refused(air: tuple, says: str) -> None:
         (lambda: ciddor_index(STANDARD_AIR, 633.0), "vacuum wavelength"),
         (lambda: ciddor_index(STANDARD_AIR, co2_ppm=1e5), "CO2"),
         (lambda: correct_displacement(0.1, STANDARD_AIR, 271.0), "assumed index"),
-        (lambda: correct_displacement(0.1, STANDARD_AIR, 0.000271), "assumed index"),
     ],
 )
 def test_what_cannot_be_is_refused(call, says: str) -> None:

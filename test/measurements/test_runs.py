@@ -1,4 +1,4 @@
-"""Readings gathered: which are one station, which way the machine came, and sets that become one.
+"""Readings gathered: lines, stations, which way the machine came, sets that become one, and w of displaced poses.
 
 The truth is what the readings say themselves, and closed-form strut lengths from the paper's two hexagons
 (plane geometry, written down here), not the package's kinematics.
@@ -6,23 +6,22 @@ The truth is what the readings say themselves, and closed-form strut lengths fro
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_machines import Machine, machines
+from foreign_machines import Machine, machine_names, machines
+from scipy.spatial.transform import Rotation
 from strategies import paper_geometry
 
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.machine.passes import Passes
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.files import read_measurements
 from hexapod_comp.measurements.readings import (
-    AXES,
     BACKWARD,
+    CHANNELS,
     FORWARD,
     FROM_PREVIOUS,
     UNKNOWN,
@@ -31,17 +30,74 @@ from hexapod_comp.measurements.readings import (
     Reading,
 )
 from hexapod_comp.measurements.runs import assemble, joined
-from hexapod_comp.measurements.tidy import read_tidy, write_measurements
-from hexapod_comp.pose import Pose
+from hexapod_comp.measurements.tidy import read_tidy
+from hexapod_comp.pose import Pose, attitude_error
+
+
+def geometry_with(work: Pose | None = None, tool: Pose | None = None) -> HexapodGeometry:
+    """Return the paper's machine with a work frame and a tool."""
+    paper = paper_geometry()
+    frames = {"work": work or Pose.identity(), "tool": tool or Pose.identity()}
+    return HexapodGeometry("paper", paper.base_joints, paper.platform_joints, paper.home, paper.limits, **frames)
+
+
+def line(start: list[float], stop: list[float], count: int = 5, direction: int = FORWARD) -> list[Reading]:
+    """Return linear readings on a line, m."""
+    points = np.linspace(start, stop, count).round(9)
+    return [
+        Reading("line", 1, direction, Pose(p, np.eye(3)), "linear", 0.0, source=FileLine("f", n + 2))
+        for n, p in enumerate(points)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "axis", "base_axis"),
+    [
+        ([-0.1, 0.0, 0.4], [0.1, 0.0, 0.4], [1, 0, 0], 0),
+        ([0.1, 0.0, 0.4], [-0.1, 0.0, 0.4], [1, 0, 0], 0),  # measured from the far end first
+        ([0.1, 0.0, 0.5], [-0.1, 0.1, 0.4], [2 / 3**0.5 / 2**0.5, -1 / 6**0.5, 1 / 6**0.5], None),
+    ],
+)
+def test_forward_is_along_the_first_axis_that_moves(start, stop, axis, base_axis) -> None:
+    run = assemble(paper_geometry(), line(start, stop)).runs[0]
+    np.testing.assert_allclose(run.axis, axis, atol=1e-12)
+    assert run.base_axis == base_axis
+    assert run.is_line
+
+
+def test_w_is_what_a_displaced_pose_shows() -> None:
+    """Truth: the probe's place and the tool's attitude before and after a small displacement, in the work frame.
+
+    Rotations compose to first order only, so 1e-6 rad leave up to 1e-12; measured 2e-13.
+    """
+    work = Pose.from_angles([0.02, -0.01, 0.03], np.deg2rad([5.0, -8.0, 30.0]))
+    tool = Pose.from_angles([0.01, 0.02, -0.05], np.deg2rad([4.0, 3.0, -20.0]))
+    geometry = geometry_with(work, tool)
+    pose = work.inverse() @ Pose([0.01, -0.02, 0.42], np.eye(3)) @ tool
+    channels = [c for c in CHANNELS if c.startswith(("position", "attitude"))]
+    found = assemble(geometry, [Reading("p", 1, UNKNOWN, pose, c, 0.0) for c in channels])
+    e = 1e-6 * np.array([3.0, -2.0, 1.0, 0.4, -0.7, 0.5])
+    platform = found.stations.pose(0)
+    rotation = Rotation.from_rotvec(e[3:]).as_matrix() @ platform.rotation
+    point = platform.position + platform.rotation @ found.probe + e[:3]  # e displaces the measured point
+    moved = work.inverse() @ Pose(point - rotation @ found.probe, rotation) @ tool
+    expected = [*(moved.position - pose.position), *attitude_error(moved.rotation, pose.rotation)]
+    np.testing.assert_allclose(found.directions() @ e, expected, rtol=0.0, atol=2e-12)
+
+
+def test_swapped_directions_are_flagged() -> None:
+    there = line([-0.1, 0.0, 0.4], [0.1, 0.0, 0.4], 3, BACKWARD)
+    back = line([0.1, 0.0, 0.4], [-0.1, 0.0, 0.4], 3, FORWARD)
+    assert "swapped?" in assemble(paper_geometry(), there + back).notes[0]
+    right = [r._replace(direction=-r.direction) for r in there + back]
+    assert assemble(paper_geometry(), right).notes == ()
+
 
 PAPER = paper_geometry()
 LEVEL = np.eye(3)
-
 PER_READING = ("station", "run", "cycle", "direction", "channel", "value", "uncertainty")
 PER_STATION = ("positions", "rotations", "commands", "sense", "temperatures")
-
 HEADER = "run,direction,x_mm,y_mm,z_mm,channel,value,unit,temperature_degC\n"
-
 FIRST = HEADER + (
     "x line,forward,-100,0,400,linear,0,um,20\n"
     "x line,forward,0,0,400,linear,3,um,20\n"
@@ -101,12 +157,8 @@ def assert_same(one: MeasurementSet, other: MeasurementSet) -> None:
         np.testing.assert_array_equal(run.axis, same.axis)
         np.testing.assert_array_equal(run.origin, same.origin)
     np.testing.assert_array_equal(one.probe, other.probe)
-    np.testing.assert_array_equal(one.points(), other.points())
-    np.testing.assert_array_equal(one.along(), other.along())
-    np.testing.assert_array_equal(one.directions(), other.directions())
-
-
-# Sets that become one.
+    for name in ("points", "along", "directions"):
+        np.testing.assert_array_equal(getattr(one, name)(), getattr(other, name)(), err_msg=name)
 
 
 def test_two_sets_are_one_file_with_both(tmp_path: Path) -> None:
@@ -129,26 +181,6 @@ def test_runs_of_equal_names_stay_apart(tmp_path: Path) -> None:
     assert list(together.run) == [0, 0, 0, 0, 1, 1, 1, 2, 2]
     np.testing.assert_allclose([run.origin[0] for run in together.runs], [-0.1, 0.01, 0.05], atol=1e-15)
     assert_same(together, read_tidy(paths, PAPER))
-
-
-def test_stations_of_several_sets_are_found_again() -> None:
-    """A reading of each part still points to its own command, direction and temperature."""
-    parts = [tracked(at((0, 0, 400), (10, 0, 400))), tracked(at((0, 50, 450))), tracked(at((5, 5, 405), (0, 5, 405)))]
-    together = joined(parts)
-    rows = [(p, n) for p in range(3) for n in range(len(parts[p]))]
-    assert len(together) == len(rows) == 5
-    for n, (part, row) in enumerate(rows):
-        mine, theirs = together.station[n], parts[part].station[row]
-        for name in PER_STATION:
-            found, wanted = getattr(together.stations, name)[mine], getattr(parts[part].stations, name)[theirs]
-            np.testing.assert_array_equal(found, wanted)
-    assert list(together.run) == [0, 0, 1, 2, 2]
-
-
-def test_notes_are_kept_and_one_set_is_itself() -> None:
-    one, two = (replace(tracked(at((0, 0, z))), notes=(f"at {z}",)) for z in (400, 410))
-    assert joined([one, two]).notes == ("at 400", "at 410")
-    assert joined([one]) is one
 
 
 def test_sets_of_different_points_are_refused() -> None:
@@ -178,9 +210,6 @@ def test_one_door_for_tidy_and_wide_files(tmp_path: Path) -> None:
     assert len(read_measurements(paths[:1], PAPER, columns)) == 6
 
 
-# Which way the machine came.
-
-
 def test_directions_of_a_sequence_follow_from_the_row_before() -> None:
     """Axes from the commanded positions, struts from closed-form lengths; the first row's is not known."""
     points = np.array([[0, 0, 400], [10, 0, 400], [10, -20, 430], [0, 0, 400], [0, 0, 380]]) * 1e-3
@@ -201,15 +230,6 @@ def test_a_strut_that_turns_on_the_way_has_the_direction_in_which_it_arrives() -
     lengths = lengths_at(np.array([[*first, 420.0], [*last, 420.0]]) * 1e-3)[:, 0]
     assert lengths[1] < lengths[0] - 1e-5, "shorter in all"
     assert found.stations.sense[1, 3] == 1.0
-
-
-def test_at_the_point_where_it_turns_a_strut_has_the_direction_in_which_it_came() -> None:
-    """Both ways across the middle of a line that is at right angles to it: shorter and shorter until there."""
-    joint = PAPER.base_joints[0] - PAPER.platform_joints[0]
-    across = np.array([-joint[1], joint[0], 0.0]) / np.linalg.norm(joint[:2])
-    middle = np.array([[0.2 * joint[0], 0.2 * joint[1], 0.42]])
-    passes = Passes(PAPER, np.repeat(middle, 2, axis=0), np.tile(np.eye(3), (2, 1, 1)), np.array([across, -across]))
-    np.testing.assert_array_equal(passes.senses()[:, 3], [-1.0, -1.0])
 
 
 def test_a_place_reached_from_both_sides_is_two_stations() -> None:
@@ -249,9 +269,6 @@ def test_directions_of_a_line_are_those_of_its_axis() -> None:
     np.testing.assert_array_equal(axes[4:], 0.0)
 
 
-# Stations.
-
-
 def test_repeated_passes_share_stations_and_temperatures_part_them() -> None:
     """Two cycles over three places, both ways: six stations. The same with another temperature: two more."""
     plan = Campaign(np.array([[-0.1, -0.1, 0.4], [0.1, 0.1, 0.6]]), 0.2, 0.1, "1-D", 0, cycles=2)
@@ -260,36 +277,9 @@ def test_repeated_passes_share_stations_and_temperatures_part_them() -> None:
     assert len(found.stations) == 2 * 3 * 12
     first = found.station[(found.run == 0) & (found.cycle == 1)]
     np.testing.assert_array_equal(first, found.station[(found.run == 0) & (found.cycle == 2)])
-    poses = at((0, 0, 400), (10, 0, 400))
-    warm = (21.0,) * 8
-    cold = [Reading("line", 1, FORWARD, pose, "linear", 0.0) for pose in poses]
-    assert len(assemble(PAPER, cold + [replace_temperatures(r, warm) for r in cold]).stations) == 4
-
-
-def replace_temperatures(reading: Reading, temperatures: tuple[float, ...]) -> Reading:
-    """Return the same reading of the next cycle, taken under other temperatures."""
-    return reading._replace(cycle=reading.cycle + 1, temperatures=temperatures)
-
-
-def test_lines_that_cross_have_their_own_stations() -> None:
-    """At the crossing one line travels along x, the other along y: backlash differs."""
-    across = [Reading("x", 1, FORWARD, pose, "linear", 0.0) for pose in at((-10, 0, 400), (0, 0, 400))]
-    along = [Reading("y", 1, FORWARD, pose, "linear", 0.0) for pose in at((0, 0, 400), (0, 10, 400))]
-    found = assemble(PAPER, across + along)
-    assert len(found.stations) == 4
-    np.testing.assert_array_equal(found.stations.sense[1, :3], [1.0, 0.0, 0.0])
-    np.testing.assert_array_equal(found.stations.sense[2, :3], [0.0, 1.0, 0.0])
-
-
-def test_a_joined_set_survives_its_file(tmp_path: Path) -> None:
-    """Written and read back: directions from the rows before, stations and values to the last bit."""
-    parts = [tracked(at((0, 0, 400), (10, 5, 400), (0, 0, 410)), run="a"), tracked(at((0, 0, 400)), run="b")]
-    together = joined(parts)
-    write_measurements(together, tmp_path / "joined.csv")
-    assert_same(read_tidy(tmp_path / "joined.csv", PAPER), together)
-
-
-# What cannot be.
+    cold = [Reading("line", 1, FORWARD, pose, "linear", 0.0) for pose in at((0, 0, 400), (10, 0, 400))]
+    warm = [reading._replace(cycle=2, temperatures=(21.0,) * 8) for reading in cold]
+    assert len(assemble(PAPER, cold + warm).stations) == 4
 
 
 @pytest.mark.parametrize(
@@ -330,32 +320,22 @@ def in_box(machine: Machine) -> np.ndarray:
     return machine.box[0] + np.random.default_rng(1).random((20, 3)) * np.ptp(machine.box, axis=0)
 
 
-@pytest.mark.parametrize("name", machines())
-@pytest.mark.parametrize("order", [(1, 0, 2), (2, 1, 0), (0, 2, 1)], ids=["x and y", "x and z", "y and z"])
-def test_exchanged_axes_are_named(name: str, order: tuple[int, ...], tmp_path: Path) -> None:
-    machine = machines()[name]
-    geometry, tips = load_geometry(machine.write(tmp_path / "machine.yaml")), in_box(machine)
-    one, other = (axis for axis, place in enumerate(order) if axis != place)
-    way = f"with {AXES[one]} and {AXES[other]} exchanged"
-    with pytest.raises(InputFileError, match=f"are refused; none would be .*{way}"):
-        assemble(geometry, went(machine, tips, tips[:, order]))
-
-
 @pytest.mark.parametrize(
-    ("name", "change", "way"),
+    ("name", "change", "way", "counted_from"),
     [
-        ("unit", lambda tips: tips / 25.4, "with coordinates in inches"),
-        ("mirror", lambda tips: tips * [1.0, 1.0, -1.0], "with the sign of z reversed"),
-        ("framed", lambda tips: tips[:, [2, 1, 0]], "with x and z exchanged"),
+        *((name, lambda tips: tips[:, [1, 0, 2]], "with x and y exchanged", 0.0) for name in machine_names()),
+        ("framed", lambda tips: tips[:, [2, 1, 0]], "with x and z exchanged", None),
+        ("hanging", lambda tips: tips[:, [0, 2, 1]], "with y and z exchanged", 0.0),
+        ("unit", lambda tips: tips / 25.4, "with coordinates in inches", None),
+        ("mirror", lambda tips: tips * [1.0, 1.0, -1.0], "with the sign of z reversed", None),
     ],
 )
-def test_what_poses_may_mean_is_named_without_commanded_lengths(
-    name: str, change: Callable[[np.ndarray], np.ndarray], way: str, tmp_path: Path
-) -> None:
+def test_what_poses_may_mean_is_named(name, change, way: str, counted_from: float | None, tmp_path: Path) -> None:
+    """With the lengths that were commanded, and without."""
     machine = machines()[name]
     geometry, tips = load_geometry(machine.write(tmp_path / "machine.yaml")), in_box(machine)
-    with pytest.raises(InputFileError, match=f"out of the machine's reach: .* are refused; none would be .*{way}"):
-        assemble(geometry, went(machine, tips, change(tips), counted_from=None))
+    with pytest.raises(InputFileError, match=f"are refused; none would be .*{way}"):
+        assemble(geometry, went(machine, tips, change(tips), counted_from))
 
 
 def test_another_machines_poses_name_it() -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +28,6 @@ from examples.papers.comparing import (
     records,
     values,
 )
-from examples.papers.page import page_text
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.virtual.assessment import assess
@@ -59,9 +57,6 @@ def verdict(exhibit: Exhibit, what: str) -> str:
     return found
 
 
-# What is printed.
-
-
 def test_shipped_tables_are_those_of_the_other_copy():
     np.testing.assert_array_equal(values(2) * 1e-3, table_lengths())
     for row, pose in zip(values(1), table_poses(), strict=True):
@@ -69,9 +64,6 @@ def test_shipped_tables_are_those_of_the_other_copy():
         np.testing.assert_allclose(np.radians(row[:3]), pose.angles(), atol=1e-15)
     changes = values(4) - values(2)  # the seeds' README: within −6…+2 µm
     np.testing.assert_allclose([changes.min(), changes.max()], [-6e-3, 2e-3], atol=1e-9)
-
-
-# Song, Mou & King.
 
 
 def test_tables_2_and_3(run):
@@ -108,13 +100,6 @@ def test_table_5_is_the_ideal_structure_on_table_4(run):
     assert (arctan[[4, 6], [1, 2]] > 5e-4).all()
 
 
-def test_a_real_structure_that_does_not_come_back_is_noticed(run):
-    """Lengths that are 1 µm too long: the machine no longer comes back to Table 1, which is no fault of the paper."""
-    off = tuple(replace(one, real_lengths=one.real_lengths + MICRON) for one in run.drawn)
-    as_described = song_mou_king.table_5(replace(run, drawn=off)).tables[0]
-    assert (as_described.verdicts == MISSED).any(axis=1).all()
-
-
 def test_table_4_is_possible_and_hardly_probable(run):
     exhibit = song_mou_king.table_4(run)
     assert (exhibit.tables[0].verdicts == OPEN).all()
@@ -146,26 +131,10 @@ def test_bounds_of_a_change_are_reached_in_the_corners_and_never_passed():
         assert (np.linalg.norm(end - start) - ideal) * 1e6 + 10.0 == pytest.approx(bounds[strut], abs=1e-3)
 
 
-def test_errors_that_give_a_row_are_found():
-    """Changes made by errors of ±4 µm need no more; those of a corner need the whole bound, less the rounding."""
-    matrix = song_mou_king._change_matrix(PAPER, table_poses()[2])
-    errors = np.random.default_rng(1).uniform(-4.0, 4.0, 33)
-    assert song_mou_king._least_bound(matrix, matrix @ errors) <= 4.0
-    corner = 10.0 * np.abs(matrix[0]).sum()
-    needed = song_mou_king._least_bound(matrix, np.array([corner, 0, 0, 0, 0, 0]))
-    assert 9.0 < needed <= 10.0 + 1e-6
-    miss, found = song_mou_king._nearest(matrix, matrix @ errors)
-    assert miss < 1e-9
-    np.testing.assert_allclose(matrix @ found, matrix @ errors, atol=1e-8)
-
-
 def test_the_rest_of_the_paper(run):
     assert set(song_mou_king.drawings(run).verdicts()) == {MET, SHOWN}
     assert set(song_mou_king.random_poses(run).verdicts()) == {MET}
     assert set(song_mou_king.wrong().verdicts()) == {WRONG}
-
-
-# Mou & King.
 
 
 def test_printed_weights_reproduce_what_is_bilinear():
@@ -190,9 +159,6 @@ def test_the_1_d_scheme_does_what_the_paper_says(one_d, truth):
     assert [one.what for one in curves.statements] == [f"strut_{n}" for n in range(1, 7)]
 
 
-# V. Daake, Vetter, Böhm & Zirn.
-
-
 def test_ranking_and_iteration():
     study = daake.study(cells=16)
     exhibit = daake.ranking(study)
@@ -206,38 +172,7 @@ def test_ranking_and_iteration():
     assert set(daake.iteration(study).verdicts()) == {MET}
 
 
-# What is shown.
-
-
-class Links(HTMLParser):
-    """Collects what a page refers to, and its anchors."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.links: list[str] = []
-        self.anchors: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.links += [value for name, value in attrs if name in ("href", "src") and value]
-        self.anchors += [value for name, value in attrs if name == "id" and value]
-
-
-def test_the_page_holds_everything_and_loads_nothing(run):
-    exhibits = (song_mou_king.drawings(run), song_mou_king.table_3(run))
-    text = page_text([Paper("A & <B>", "Title", exhibits)], "a note")
-    page = Links()
-    page.feed(text)
-    assert all(link.startswith(("#", "data:image/png;base64,")) for link in page.links)
-    assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.anchors)
-    assert "default-src 'none'" in text
-    assert "<script" not in text
-    assert "A &amp; &lt;B&gt;" in text
-    assert text.count("<img ") == 1
-    for cell in ("4.99998", "9.99937", "7.78E-26"):  # as printed
-        assert f"<b>{cell}</b>" in text
-
-
-@pytest.mark.parametrize(("given", "code"), [(MET, 0), (WRONG, 0), (OPEN, 0), (MISSED, 1)])
+@pytest.mark.parametrize(("given", "code"), [(WRONG, 0), (MISSED, 1)])
 def test_the_program(given: str, code: int, run, tmp_path: Path, monkeypatch, capsys):
     """The exit code is about what can be met; the three modules themselves are tried above."""
     small = Paper("A", "Title", (song_mou_king.table_2(run), Exhibit("S", "", (), (Statement("x", "1", "2", given),))))

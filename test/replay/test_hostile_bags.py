@@ -65,11 +65,8 @@ ALIASES = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     ("content", "said"),
     [
         (ALIASES, r"metadata\.yaml: line 2: is not valid YAML: reference \*a"),
-        ("- " * 100_000, "nested more than 32 deep"),
         ("[]", "must be a mapping"),
-        ("[" + "[]," * 100_000 + "]", "holds more than the allowed 100000 values"),
         ("a: !!python/object/apply:os.system ['true']", "tag"),
-        ("", "is empty"),
         (None, "larger than the allowed 4 MB"),
     ],
 )
@@ -84,17 +81,7 @@ def test_metadata_that_stand_for_more_than_they_say(bag: Path, content: str | No
         read_recording(bag)
 
 
-def test_references_inside_of_a_texts_yaml(bag: Path) -> None:
-    """Older recorders put the topics' QoS into the metadata as text that is YAML by itself."""
-    file = bag / "metadata.yaml"
-    tree = yaml.safe_load(file.read_text())
-    for topic in tree["rosbag2_bagfile_information"]["topics_with_message_count"]:
-        topic["topic_metadata"]["offered_qos_profiles"] = ALIASES
-    file.write_text(yaml.safe_dump(tree))
-    assert len(read_recording(bag).commands)  # what replay does not need is not read
-
-
-@pytest.mark.parametrize("place", ["metadata.yaml", "run.mcap", "more.mcap", "alone.mcap"])
+@pytest.mark.parametrize("place", ["metadata.yaml", "run.mcap", "alone.mcap"])
 def test_nothing_is_waited_for_in_a_fifo(bag: Path, place: str) -> None:
     """As the metadata, as the storage, beside it; or given by itself."""
     file = bag / place
