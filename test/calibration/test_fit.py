@@ -1,9 +1,9 @@
-"""The joint fit: rows, nuisances, evidence and linear solver by the textbook, whole fits against the truth."""
+"""The joint fit: rows, nuisances, evidence, solver, the screws' lead by the textbook, whole fits against the truth."""
+
+from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
-from types import SimpleNamespace
 
 import calibration_helpers as small
 import numpy as np
@@ -26,9 +26,10 @@ from hexapod_comp.calibration.estimator import (
     whitened_precision,
 )
 from hexapod_comp.calibration.fit import ModelFit, fit_model
+from hexapod_comp.calibration.lead import ScrewLead, detect_lead
 from hexapod_comp.calibration.observations import Zeros
 from hexapod_comp.calibration.parameters import BLOCKS, FitSettings, ParameterSpace
-from hexapod_comp.calibration.selection import log_bayes_factor, select
+from hexapod_comp.calibration.selection import log_bayes_factor
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.measurements.readings import CHANNELS, KINDS, FileLine, MeasurementSet
@@ -72,59 +73,6 @@ def test_rows_in_parts_are_the_whole_matrix(rows: DesignMatrix):
     rows.project_out(Zeros([members], np.full(40, np.nan)).unknowns(np.ones(40)))
     whole[members] -= whole[members].mean(axis=0)
     close(rows.dense(), whole)
-
-
-SIZES = {"structure": 3, "map": 12}
-FOLDS, CELLS = 8, 3
-
-
-def two_blocks() -> SimpleNamespace:
-    """Return a space of a structure and a map, both of tolerance 1, as far as a linear problem asks it."""
-    ends = np.cumsum([0, *SIZES.values()]).tolist()
-    blocks = [SimpleNamespace(name=name, part=slice(a, b)) for name, (a, b) in zip(SIZES, pairwise(ends), strict=True)]
-    return SimpleNamespace(
-        blocks=blocks,
-        parts=[block.part for block in blocks],
-        spread=lambda tolerances: np.repeat(tolerances, list(SIZES.values())),
-        start_tolerances=lambda: np.ones(len(SIZES)),
-    )
-
-
-def drawn(rng: np.random.Generator, size_of_map: float) -> LinearProblem:
-    """Return readings of a drawn machine, of noise 0.3."""
-    rows = rng.standard_normal((FOLDS * CELLS, sum(SIZES.values())))
-    truth = rng.standard_normal(rows.shape[1]) * np.repeat([1.0, size_of_map], list(SIZES.values()))
-    every = np.arange(len(rows))
-    return problem_of(rows, rows @ truth + 0.3 * rng.standard_normal(len(rows)), 0 * every, every // CELLS)
-
-
-def test_evidence_is_that_of_the_readings_distribution() -> None:
-    """Truth: scipy's normal density of covariance A·T²·Aᵀ + noise², to rounding; differences, since the density's
-    constant is left out. With and without the map its ratio is what Savage and Dickey take from the posterior alone."""
-    space, problem = two_blocks(), drawn(np.random.default_rng(2), 1.0)
-    cases = [
-        (np.array(t), np.full(len(KINDS), noise)) for t, noise in (((1.0, 0.5), 0.3), ((2.0, 0), 0.7), ((1.0, 0), 0.3))
-    ]
-    ours = [log_evidence(problem, solve(space, problem, *case, rounds=0)) for case in cases]
-    truth = [dense_evidence(space, problem, *case) for case in cases]
-    np.testing.assert_allclose(np.diff(ours), np.diff(truth), rtol=1e-9)
-    posterior = solve(space, problem, *cases[0], rounds=0)
-    assert log_bayes_factor(space, posterior, "map") == pytest.approx(truth[0] - truth[2], rel=1e-9)
-
-
-def test_few_readings_keep_what_is_there_and_let_go_what_is_not() -> None:
-    """Eight folds of three readings, fifteen parameters: of 40 machines each, nine of ten with a map keep it.
-
-    One of ten without may: two standard errors, from one side, let 2 % pass. The folds alone keep 31 of 40.
-    """
-    space, rng = two_blocks(), np.random.default_rng(4)
-
-    def kept(size_of_map: float) -> bool:
-        (decision,), _, _ = select(space, drawn(rng, size_of_map), ONES, lambda text: None)
-        return decision.kept
-
-    assert sum(kept(1.0) for _ in range(40)) >= 36
-    assert sum(kept(0.0) for _ in range(40)) <= 4
 
 
 FEW = small.FEW
@@ -306,6 +254,19 @@ def dense_evidence(space: ParameterSpace, problem: LinearProblem, tolerances: np
     return float(multivariate_normal.logpdf(problem.target, cov=covariance))
 
 
+def test_evidence_is_that_of_the_readings_distribution():
+    """Differences, since the density's constant is left out. With and without waves its ratio is what Savage and
+    Dickey take from the posterior alone."""
+    space, problem, noise = random_problem()
+    start, of_waves = space.start_tolerances(), [block.name for block in space.blocks].index("wave")
+    without = np.where(np.arange(len(start)) == of_waves, 0.0, start)
+    cases = (start, noise), (1.5 * start, 0.7 * noise), (without, noise)
+    posteriors = [solve(space, problem, *case, rounds=0) for case in cases]
+    truth = [dense_evidence(space, problem, *case) for case in cases]
+    np.testing.assert_allclose(np.diff([log_evidence(problem, p) for p in posteriors]), np.diff(truth), rtol=1e-8)
+    assert log_bayes_factor(space, posteriors[0], "wave") == pytest.approx(truth[0] - truth[2], rel=1e-6)
+
+
 @pytest.fixture
 def exact(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let rounds of hyperparameters go on to the fixed point."""
@@ -484,3 +445,76 @@ def test_a_channel_that_never_changes_is_refused():
     stuck = ours.with_values(np.where(straightness, 3e-6, ours.value))
     with pytest.raises(CalibrationError, match=r"^straightness: the \d+ readings never change within a run"):
         fit_model(stuck, FEW)
+
+
+MM = 1e-3
+# What machine B has, and its waves' harmonics
+HARMONICS = replace(small.SETTINGS, lead=None, blocks=("pitch", "wave", "wave 2", "wave 3", "wave 4", "backlash"))
+
+
+@cache
+def of_waves(seed: int, **changes: object) -> MeasurementSet:
+    """Return a small campaign's readings of machine B, changed."""
+    return small.measured(small.virtual_machine(seed, replace(small.BOUNDS, **changes)), small.campaign(), seed)
+
+
+def lead_of(measured: MeasurementSet, settings: FitSettings = HARMONICS) -> ScrewLead:
+    estimation = Estimation(measured, ParameterSpace(measured, settings))
+    problem, _ = estimation.linearise(np.zeros(estimation.space.size), np.ones(len(measured)))
+    return detect_lead(estimation, problem)
+
+
+@pytest.mark.parametrize(("seed", "true"), [(1, 2.0), (2, 3.7), (5, 19.3)])
+def test_leads_of_all_sizes_are_read_off(seed: int, true: float):
+    """Six standard errors, six decades of odds beyond the threshold's; readings stand 2 inches apart."""
+    lead = lead_of(of_waves(seed, wave_period=true * MM))
+    assert lead.shown == pytest.approx(true * MM, abs=6.0 * lead.error)
+    assert lead.error < 1e-3 * lead.shown
+    assert lead.used == pytest.approx(true * MM, rel=1e-3)
+
+
+def test_round_leads_are_taken_as_such():
+    """10 mm, and 0.5 in: leads are made so. 3.7 mm is taken as it is shown, as is what is not known well enough."""
+    shown = [ScrewLead(None, value * MM, 2e-6, 100.0).used for value in (10.0031, 12.6985, 3.7)]
+    assert shown == [pytest.approx(10.0 * MM), pytest.approx(12.7 * MM), 3.7 * MM]
+    assert ScrewLead(None, 10.03 * MM, 20e-6, 100.0).used == 10.03 * MM
+
+
+@pytest.mark.parametrize("bounds", [{"wave": (1e-9, 2e-9)}, {"wave": (0.0, 0.0), "length_map": 5e-6}])
+def test_what_is_not_there_is_not_shown(bounds: dict):
+    """With waves far below the noise, and with smooth errors of length that the space does not have."""
+    lead = lead_of(of_waves(6, **bounds))
+    assert (lead.shown, lead.used) == (None, None)
+
+
+def test_a_wave_twice_a_turn_alone_agrees_with_the_lead():
+    """A cardan joint turns its screw unevenly twice a turn: 5 mm are shown, and 10 mm given explain it."""
+    lead = lead_of(of_waves(3, wave_period=5.0 * MM), replace(HARMONICS, lead=10.0 * MM))
+    assert lead.shown == pytest.approx(5.0 * MM, rel=1e-3)
+    assert lead.agrees
+    assert lead.used == 10.0 * MM
+
+
+def test_the_lead_is_the_fundamental_though_a_harmonic_be_larger():
+    """Waves of 1 µm once, 3 to 4 µm two to four times a turn."""
+    lead = lead_of(of_waves(7, wave=(1e-6, 1e-6), harmonics=(3e-6, 4e-6)))
+    assert lead.shown == pytest.approx(10.0 * MM, rel=1e-3)
+
+
+def test_a_given_lead_that_disagrees_is_remarked_on():
+    fit = fit_model(of_waves(1), replace(HARMONICS, lead=9.0 * MM))
+    assert not fit.lead.agrees
+    assert fit.model.struts.period == pytest.approx(9.0 * MM)
+    assert any("repeat every 10 mm by the readings, not with the given lead of 9 mm" in note for note in fit.notes)
+
+
+def test_harmonics_are_fitted_and_only_those_that_are_there():
+    """Second and third of 1 to 2 µm: left are some hundredths of a micrometre, the fourth is left out."""
+    truth = small.virtual_machine(8, replace(small.BOUNDS, harmonics=(1e-6, 2e-6)))
+    struts = replace(truth.model.struts, cosine=truth.model.struts.cosine[:, :3], sine=truth.model.struts.sine[:, :3])
+    truth = type(truth)(truth.geometry, replace(truth.model, struts=struts))
+    fit = fit_model(small.measured(truth, small.campaign(), 8), HARMONICS)
+    assert [b.name for b in fit.space.blocks if "wave" in b.name] == ["wave", "wave 2", "wave 3"]
+    assert np.abs(fit.model.struts.cosine - struts.cosine).max() < 0.5e-6
+    after, _ = small.tool_error(truth, fit.model)
+    assert after < 0.5e-6

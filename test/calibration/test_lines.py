@@ -163,16 +163,6 @@ def test_the_figures_of_a_straight_line_are_scipys(geometry):
         assert line.adjusted_r2 == pytest.approx(1.0 - variance / line.values.var(ddof=1), abs=1e-12)
 
 
-def test_cycles_are_averaged_and_their_spread_is_told(geometry, linear_truth):
-    """Two cycles 0.7 µm above and below the true values: mean exact, standard deviation 0.7 µm · √2."""
-    blank = template(replace(QUIET, cycles=2), geometry)
-    measured = measure(blank, QUIET, linear_truth, 0)
-    spread = measured.with_values(measured.value + 0.7e-6 * np.where(measured.cycle == 1, 1.0, -1.0))
-    fit = fit_lines(spread, 4)
-    assert fit.model.field.lines[0] == pytest.approx(linear_truth.model.field.lines[0], abs=1e-12)
-    assert [line.repeat_std for line in fit.lines] == pytest.approx([0.7e-6 * np.sqrt(2.0)] * len(fit.lines), rel=1e-4)
-
-
 def test_zeros_and_beam_slopes_change_nothing(five, real):
     """Invariance: other zeros of every run and channel, other slopes of every straightness beam."""
     campaign = replace(QUIET, instrument="5-D")

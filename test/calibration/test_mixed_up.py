@@ -68,19 +68,6 @@ def test_the_cause_is_named(readings, cause):
     assert named[0].startswith(cause) or ("of 25 runs" in cause and "12 of 25 runs" in named[0])
 
 
-def test_runs_with_a_reversed_channel_are_named_where_screws_turn(tmp_path):
-    """Nominal lengths then leave errors of their own, whose sign nobody has reversed: they must not hide the runs'."""
-    machine, settings = machines()["left-hand"], FitSettings(blocks=("pitch",))
-    geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
-    side = float(np.ptp(machine.box, axis=0).min())
-    truth = RealMachine(geometry, draw_model(geometry, ImperfectionBounds(joint=500e-6), 3))
-    m = measured(truth, Campaign(machine.box, side, 0.5 * side, "5-D", 4), 3)
-    assert mixed_up(m, settings) == []
-    named = mixed_up(reversed_where(m, (m.channel == ROTATION_X) & (m.run % 2 == 0)), settings)
-    assert named[0].startswith("rotation_x of ")
-    assert " runs (" in named[0]
-
-
 def test_exchanged_channels_are_named_where_the_plain_model_lacks_much(tmp_path):
     """Length maps leave rotations off by 54 times their noise: an exchange adds a quarter of that."""
     settings = FitSettings(blocks=("pitch", "map", "field displacement", "field rotation"))

@@ -55,18 +55,6 @@ def test_what_sensors_add_within_a_burst_is_taken_off() -> None:
     assert np.abs(jitter).max() < 4.0 * 0.5 * NOISE / 60.0 * 4.0
 
 
-@pytest.mark.parametrize(("step", "every", "share"), [(0.1, 200.0, 0.4), (0.5, 600.0, 0.8)])
-def test_what_is_rounded_is_no_staircase(step: float, every: float, share: float) -> None:
-    """Without pauses, and in bursts. As read, a temperature stays still and then jumps by a step, within a burst too;
-    a course takes most of that off, and less where two thirds of it are pauses, in which it may do anything."""
-    times = every * (np.arange(COUNT) // 50) + 4.0 * (np.arange(COUNT) % 50)
-    true = warmed(times)[:, None] + 0.01 * np.arange(8)
-    rounded = np.round(true / step) * step
-    course = with_courses(read(times, rounded)).stations.temperatures
-    whole = [np.sqrt(((values - true) ** 2).mean()) for values in (rounded, course)]
-    assert whole[1] < share * whole[0]
-
-
 def test_without_times_each_run_has_a_course() -> None:
     """A step from run to run, as of one temperature written beside each, is no slope within them."""
     run = np.zeros(COUNT, dtype=int)

@@ -18,7 +18,6 @@ from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import Structure, strut_lengths
 from hexapod_comp.measurements.campaign import Campaign, circle_run, line_run, template
-from hexapod_comp.measurements.iso230 import linear_runs
 from hexapod_comp.measurements.readings import CHANNELS, MeasurementSet
 from hexapod_comp.measurements.tidy import read_tidy, write_measurements
 from hexapod_comp.measurements.wide_csv import read_wide
@@ -28,7 +27,6 @@ JUGGLEBOT = Path(__file__).resolve().parents[2] / "benchmarks" / "data" / "juggl
 HEADER = "run,direction,x_mm,y_mm,z_mm,channel,value,unit"
 BAD_CHANNEL = "line 2, column channel: must be one of linear, .*'liner'"
 AGAIN = "line 4: reads linear again at the place of line 3"
-TEMPERATURE = "line 2, column temperature_degC"
 TRACKER = "t,,0,0,400,position_x,0,mm,20,100,50,1\n"
 LINE = "a,forward,-10,0,400,linear,1.5,um\na,forward,10,0,400,linear,2.5,um\n"
 
@@ -242,23 +240,6 @@ def test_round_trip_of_sequences_and_of_another_point(tmp_path: Path) -> None:
     write_measurements(expected, tmp_path / "c.csv")
     assert (tmp_path / "c.csv").read_text().startswith("# measured point in the platform frame, mm: 10, 0, -50\n")
     assert_same(read_tidy(tmp_path / "c.csv", paper_geometry(), probe), expected)
-
-
-def test_iso_230_2_runs(tmp_path: Path) -> None:
-    """Targets rise, forward first; a run of one cycle and one with a gap are left out."""
-    rows = ""
-    for cycle in (1, 2):
-        for direction, targets in (("forward", (-10, 0, 10)), ("backward", (10, 0, -10))):
-            for target in targets:
-                value = 100 * cycle + (10 if direction == "backward" else 0) + target / 10
-                rows += f"a,{direction},0,{target},400,linear,{value},um,{cycle}\n"
-                rows += f"gap,{direction},0,{target},400,linear,1,um,{cycle}\n" * (target != 0 or cycle == 1)
-                rows += f"once,{direction},0,{target},400,linear,1,um,1\n" * (cycle == 1)
-    runs = linear_runs(read(tmp_path, rows, f"{HEADER},cycle"))
-    assert [run.name for run in runs] == ["a"]
-    np.testing.assert_array_equal(runs[0].targets, [-0.01, 0.0, 0.01])
-    expected = [[[99, 100, 101], [199, 200, 201]], [[109, 110, 111], [209, 210, 211]]]
-    np.testing.assert_allclose(runs[0].deviations, np.array(expected) * 1e-6, rtol=1e-14)
 
 
 WIDE = "l1,l2,l3,l4,l5,l6,mx,my,mz,qx,qy,qz,qw,cx,cy,cz,note\n"
