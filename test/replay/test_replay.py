@@ -315,6 +315,15 @@ def test_what_the_recorder_has_lost_is_never_called_a_difference(run, tmp_path, 
     assert f"the recorder has lost answers that the journal counts: {result.lost}" in capsys.readouterr().out
 
 
+def test_a_journal_without_its_end_is_noticed(run, tmp_path, capsys):
+    """The node is killed: what it took since its last page is on the topic, and not in the journal."""
+    last = of_topic(run.messages, "journal")[-1]
+    bag = write_bag(tmp_path / "run", without(run.messages, last))
+    assert counted(opened(bag)[1]) == {IDENTICAL: 1180}
+    assert call(bag) == 0
+    assert "1181 commands taken, 1180 answered, 1 refused; 1201 recorded" in capsys.readouterr().out
+
+
 def test_pages_that_come_twice_or_late_do_no_harm(run, tmp_path):
     """A recorder that joins twice is given old pages again; two recordings may have been put together."""
     pages = of_topic(run.messages, "journal")
