@@ -7,13 +7,12 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from calibration_helpers import FEW, campaign, measured, virtual_machine
 
-from hexapod_comp.calibration import certificate, pictures
+from hexapod_comp.calibration import certificate
 from hexapod_comp.calibration.certificate import Details, Filed, certificate_text, left_out, load_details
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.posterior import UnseenError
@@ -141,14 +140,3 @@ def test_wrong_details_are_refused(tmp_path: Path, text: str, complaint: str) ->
     (tmp_path / "d.yaml").write_text(text)
     with pytest.raises(InputFileError, match=complaint):
         load_details(tmp_path / "d.yaml")
-
-
-def test_the_maps_promise_no_more_than_the_report(fit: ModelFit) -> None:
-    """What a promise allows for beside the parameters, here 5 µm, is in the picture too."""
-    assert fit.level is not None
-    wider = SimpleNamespace(**{name: getattr(fit, name) for name in ("model", "space", "solution", "covariance")})
-    wider.level = replace(fit.level, after=5e-6)
-    figure = pictures.before_after_figure(wider)  # type: ignore[arg-type]
-    after = [axes.collections[0].get_array() for axes in figure.axes if axes.get_title().startswith("after")]
-    assert len(after) == 3
-    assert np.sqrt(np.mean(np.square(after))) == pytest.approx(5.0, rel=1e-6)

@@ -21,10 +21,10 @@ from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import ErrorPredictor, FittedParameters
 from hexapod_comp.calibration.posterior_file import load_posterior, save_with_posterior
-from hexapod_comp.errors import CalibrationError, InputFileError, ModelError
+from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.machine.model import Datum, MachineModel, RealMachine, tool_move
-from hexapod_comp.machine.model_file import load_model, model_text, parse_model, save_model
+from hexapod_comp.machine.model import Datum, RealMachine, tool_move
+from hexapod_comp.machine.model_file import load_model, save_model
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import KINDS
 from hexapod_comp.pose import Pose
@@ -120,18 +120,3 @@ def test_holding_the_datum_leaves_the_deviations_as_they_were_but_for_what_it_mo
     assert aligned is not None
     assert before is not None
     np.testing.assert_allclose(aligned.deviations, before.deviations, rtol=1e-3)
-
-
-def test_the_model_file_keeps_it_and_older_ones_have_none() -> None:
-    model = MachineModel("paper", base_axes_turn=np.array([1e-4, 0.0, -2e-4]))
-    origin = replace(model.origin, date="2026-01-31", datum=Datum((0.01, 0.0, 0.45), (0.1, 0.0, -0.2), 3))
-    text = model_text(replace(model, origin=origin))
-    again = parse_model(text, "paper")
-    assert again.origin.datum == origin.datum
-    np.testing.assert_array_equal(again.base_axes_turn, model.base_axes_turn)
-    older = model_text(replace(model, origin=replace(origin, datum=None)))
-    assert parse_model(older, "paper").origin.datum is None
-    with pytest.raises(InputFileError, match=r"datum\.held"):
-        parse_model(text.replace("held: 3", "held: 7"), "paper")
-    with pytest.raises(ModelError, match="base_axes_turn"):
-        MachineModel("paper", base_axes_turn=np.full(3, np.nan))

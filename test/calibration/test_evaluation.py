@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.calibration.evaluation import INCH, held_out, paper_metric
-from hexapod_comp.errors import ModelError
+from hexapod_comp.calibration.evaluation import held_out, paper_metric
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
@@ -129,12 +128,3 @@ def test_paper_metric_of_backlash(geometry):
     found = paper_metric(truth, MachineModel(geometry.name), BOX)
     assert found.before == pytest.approx(8e-6 / 2 * 16 / 40, rel=1e-6)
     assert found.after == pytest.approx(found.before, rel=1e-9)  # an ideal model changes nothing
-
-
-def test_what_is_refused(truth, geometry):
-    with pytest.raises(ModelError, match="points: must be at least three"):
-        held_out(truth, None, BOX, 2)
-    with pytest.raises(ModelError, match="step: leaves no reading"):
-        paper_metric(truth, truth.model, BOX, step=40 * INCH)
-    with pytest.raises(ModelError, match="another"):
-        held_out(truth, MachineModel("another"), BOX)

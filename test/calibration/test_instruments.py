@@ -31,7 +31,6 @@ from hexapod_comp.measurements.readings import AXES, CHANNELS, KINDS, LENGTH, UN
 from hexapod_comp.measurements.runs import assemble
 from hexapod_comp.measurements.tidy import read_tidy
 from hexapod_comp.pose import Pose
-from hexapod_comp.virtual.instruments import measure
 
 pytestmark = pytest.mark.usefixtures("unsuspected")
 UM, MM = 1e-6, 1e-3
@@ -279,13 +278,3 @@ def test_squareness_shows_where_two_faces_share_a_slope(slope, seen):
     dx, dy = (m.directions()[:, a] * 1e-3 for a in (0, 1))
     assert left_beside(m, dy * point[:, 0] - dx * point[:, 1]) < 1e-12
     assert left_beside(m, dy * point[:, 0] + dx * point[:, 1]) == pytest.approx(1e-4 if seen else 0.0, abs=1e-12)
-
-
-def test_a_virtual_square_lies_askew_as_one():
-    """What its turn adds to a nominal machine, no noise: the fit explains all of it by one slope about each axis."""
-    truth = virtual_machine(3)
-    plan, nominal = faces("square"), template(faces("square"), truth.geometry)
-    askew = measure(nominal, plan, truth, 1).value
-    straight = measure(nominal, Campaign(**{**vars(plan), "beam_slope": 0.0}), truth, 1).value
-    assert np.abs(askew - straight).max() > 1e-6
-    assert left_beside(nominal, askew - straight) < 1e-12

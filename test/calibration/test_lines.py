@@ -118,15 +118,6 @@ def test_what_the_screws_turning_does_is_not_counted_twice(tmp_path, instrument)
         assert np.abs(family).max(initial=0.0) < 1e-12
 
 
-def test_every_line_is_zero_at_home_in_the_mean_of_both_directions(geometry, real_fit):
-    """The datum that the docstring promises, for displacements along lines and for rotations' first families."""
-    home = geometry.home.position
-    for axis, component in ((0, 0), (1, 1), (2, 2), (0, 4), (0, 5), (1, 3)):
-        family = real_fit.model.field.lines[axis][:, :, :, component]
-        powers = parameter(axis, home[axis]) ** np.arange(family.shape[-1])
-        assert (family @ powers).mean(axis=0) == pytest.approx(0.0, abs=1e-12)
-
-
 def noisy_lines(geometry: HexapodGeometry, seed: int = 0) -> MeasurementSet:
     """Return 1-D readings of 20 µm·u² on every line with noise of 0.5 µm."""
     rng = np.random.default_rng(seed)
@@ -161,18 +152,6 @@ def test_the_figures_of_a_straight_line_are_scipys(geometry):
         assert line.r2 == pytest.approx(truth.rvalue**2, abs=1e-12)
         assert line.residual_std == pytest.approx(np.sqrt(variance), rel=1e-9)
         assert line.adjusted_r2 == pytest.approx(1.0 - variance / line.values.var(ddof=1), abs=1e-12)
-
-
-def test_zeros_and_beam_slopes_change_nothing(five, real):
-    """Invariance: other zeros of every run and channel, other slopes of every straightness beam."""
-    campaign = replace(QUIET, instrument="5-D")
-    measured = measure(five, replace(campaign, beam_slope=0.0), real, 0)
-    other = measure(five, campaign, real, 1)
-    rng = np.random.default_rng(2)
-    zeros = rng.uniform(-1e-3, 1e-3, (len(five.runs), 16))[five.run, five.channel]
-    first, second = (fit_lines(m, 2).model.field for m in (measured, other.with_values(other.value + zeros)))
-    for a, b in zip(first.lines, second.lines, strict=True):
-        assert a == pytest.approx(b, abs=2e-12)
 
 
 def test_families_do_not_count_twice(geometry, five):

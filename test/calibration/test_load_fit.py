@@ -26,14 +26,14 @@ from hexapod_comp.calibration.posterior_file import load_posterior, save_with_po
 from hexapod_comp.calibration.sensitivity import derivatives, predict
 from hexapod_comp.cli import main
 from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.errors import CalibrationError, InputFileError
+from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.load import Load, Loading, Payload
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import FORWARD, MeasurementSet
 from hexapod_comp.measurements.runs import joined
-from hexapod_comp.measurements.tidy import read_tidy, write_measurements
+from hexapod_comp.measurements.tidy import write_measurements
 from hexapod_comp.virtual.instruments import measure, station_errors
 
 SPINDLE, LIGHT = Payload(10.0, (0.01, 0.0, 0.08)), Payload(5.0, (0.0, 0.0, 0.06))
@@ -165,22 +165,6 @@ def test_the_model_says_for_which_loads_and_the_compensator_warns_outside(tmp_pa
     assert heavy.outside_load == "the tool weighs 20 kg, measured with 0…10 kg"
     heavy.set_load(Loading.of([0.0, 9.8 * np.sin(0.5), -9.8 * np.cos(0.5)]))
     assert heavy.outside_load.endswith("; gravity is 29° from the nearest direction that was measured")
-
-
-def test_readings_carry_their_load_through_files(tmp_path: Path) -> None:
-    """Written and read again it is the same; half a load, or a negative one, is refused with line and column."""
-    for readings in (under(LIGHT, 2, DOWN), under(SPINDLE, 1)):
-        write_measurements(readings, tmp_path / "one.csv")
-        again = read_tidy(tmp_path / "one.csv", truth().geometry)
-        np.testing.assert_array_equal(again.stations.loads[again.station], readings.stations.loads[readings.station])
-    text = (tmp_path / "one.csv").read_text()
-    for wrong, problem in (
-        (",10,10,,80", "line 2: has a load without its payload_y"),
-        (",-10,10,0,80", "must be within 0"),
-    ):
-        (tmp_path / "wrong.csv").write_text(text.replace(",10,10,0,80", wrong, 1))
-        with pytest.raises(InputFileError, match=problem):
-            read_tidy(tmp_path / "wrong.csv", truth().geometry)
 
 
 @long_test

@@ -222,15 +222,6 @@ def test_one_run_is_held_by_the_priors(readings):
     assert fit.misfit in "; ".join(fit.verdict.refusals)
 
 
-def test_a_backlash_that_no_reading_tells_is_promised(readings):
-    """Half of it moves every strut either way, whatever the model says; the lower end is without it."""
-    still = replace(readings.stations, sense=np.zeros_like(readings.stations.sense))
-    fit = fit_model(replace(readings, direction=np.zeros_like(readings.direction), stations=still), FEW)
-    left = held_out(virtual_machine(3), fit.model, BOX).aligned.rms
-    assert fit.space.block("backlash") is None
-    assert fit.level.low < left < fit.level.high
-
-
 def test_a_fit_that_does_not_settle_names_the_runs_that_pull(readings, monkeypatch):
     """It does not settle with run 3, then with nothing left out either: that is refused, but can be forced."""
     always = False

@@ -20,10 +20,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import gmean
 
 from hexapod_comp.calibration.estimator import DesignMatrix, Estimation, LinearProblem, Posterior, solve
-from hexapod_comp.calibration.parameters import TOLERANCES, FitSettings, ParameterSpace
+from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import (
     MACHINE_ERRORS,
-    POINTS,
     ErrorPredictor,
     FittedParameters,
     Observability,
@@ -308,19 +307,6 @@ def test_the_measurement_that_is_recommended_does_what_is_foretold(result: Remai
     assert again.left[1].rms[0] == pytest.approx(foretold, rel=0.25)
 
 
-def test_what_is_left_is_what_the_prediction_knows(lines: Known, result: Remaining) -> None:
-    """Standard deviations that :mod:`test_prediction` draws; RMS over poses. A drawn machine's worst is beyond."""
-    poses = tilted()
-    standing, aligned = ErrorPredictor(*lines).predict(poses)
-    assert aligned is not None
-    for found, expected in ((result.left[1].rms[0], aligned), (result.left[1].standing, standing)):
-        assert expected.deviations is not None
-        assert found == pytest.approx(np.sqrt((expected.deviations[:, :3] ** 2).sum(axis=1).mean()), rel=1e-6)
-    assert [part.poses for part in result.left] == [POINTS, 200]
-    for part in result.left:
-        assert part.rms[0] < part.worst < part.most < 10.0 * part.worst
-
-
 def test_known_and_measured_are_the_textbooks(lines: Known, result: Remaining) -> None:
     """Known: the conditional covariance. Measured: the inverse of the sum of both informations. In SI units."""
     machine, parameters = lines
@@ -404,27 +390,6 @@ def test_machine_errors_that_leave_no_trace(instrument: str, diagonals: int, uns
     slopes swallow; on a body diagonal it is not. Roll needs a roll channel."""
     errors = without_trace(read(instrument, diagonals, FIELD))
     assert {error.name for error in errors} == unseen
-
-
-def test_what_is_below_the_noise_was_read() -> None:
-    """Attitudes at random places, of 1 mrad; a roll of the field's tolerance turns about x by up to that at the faces.
-
-    So all of them together change by tolerance/noise · √(Σu²) standard deviations.
-    """
-    turns = Rotation.from_rotvec(np.radians(8.0) * np.random.default_rng(4).uniform(-1.0, 1.0, (54, 3))).as_matrix()
-    places = np.random.default_rng(3).uniform(*small.BOX, (54, 3))
-    readings = small.scattered(small.paper(), [Pose(p, turn) for p, turn in zip(places, turns, strict=True)])
-    assert np.degrees(readings.tilt()) == pytest.approx(np.degrees(Rotation.from_matrix(turns).magnitude()).max())
-    readings = replace(readings, uncertainty=np.full(len(readings), 1e-3))
-    known = replace(FIELD, tracker_frame="known")
-    estimation = Estimation(readings, ParameterSpace(readings, known))
-    found = {error.name: error for error in without_trace(estimation)}
-    field, low, high = estimation.space.field, *estimation.space.box[:, 0]
-    u = 2.0 * (places[:, 0] - low) / (high - low) - 1.0
-    largest = TOLERANCES["field rotation"] * field.prior[field.terms.index("x1")]
-    wanted = largest / 1e-3 * np.sqrt((u**2).sum())
-    assert found["roll of x"].trace == pytest.approx(wanted, rel=1e-6)
-    assert found["roll of x"].reason.startswith(f"below the noise: it changes all readings together by {wanted:.2g} σ")
 
 
 def readings_of(instrument: str, diagonals: int, model: MachineModel) -> Estimation:

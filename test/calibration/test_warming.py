@@ -181,14 +181,6 @@ def test_without_a_warm_up_nothing_is_invented():
     assert "expansion is not determined" in warming_text(cold.warming)
 
 
-def test_a_part_that_stayed_cold_keeps_what_was_stated():
-    """Struts alone warm, by sensors of their own: base and platform stay at 20 °C, and show nothing."""
-    struts = fit_model(measured(parts=tuple(range(6))), replace(SETTINGS, base_expansion=11e-6))
-    assert struts.model.base_expansion == pytest.approx(11e-6, abs=1e-12)
-    assert "base: 11.00" in warming_text(struts.warming)
-    assert warming_text(struts.warming).count("these readings do not determine it") == 2
-
-
 MOISTURE = 3e-4  # 3 ppm per %, m/m
 DAMP = FitSettings(blocks=("moisture",), strut_moisture=1e-4)
 

@@ -163,6 +163,13 @@ BAD = {
     "temperature": (LINE.replace("um\n", "um,293\n"), f"{HEADER},base_degC", "line 2, column base_degC: .*120 °C"),
     "no pressure": (LINE.replace("um\n", "um,1\n"), f"{HEADER},instrument_index", "line 2: .*needs temperature_degC"),
     "pressure in hPa": (LINE.replace("um\n", "um,20,1000,50,1\n"), AIR, "line 2, column pressure_kPa: .*120 kPa"),
+    "half a load": (
+        LINE.replace("um\n", "um,5,0,,60\n"), f"{HEADER},payload_kg,payload_x_mm,payload_y_mm,payload_z_mm",
+        "line 2: has a load without its payload_y"),
+    "gravity in g": (
+        LINE.replace("um\n", "um,0,0,-1\n"), f"{HEADER},gravity_x_m_s2,gravity_y_m_s2,gravity_z_m_s2",
+        "line 2: gravity: must be three numbers, 9…10.6"),
+    "humidity": (LINE.replace("um\n", "um,140\n"), f"{HEADER},humidity_percent", "line 2, column humidity_percent: .*0…100"),
     "three of four": (
         "".join(f"t,,0,0,400,quaternion_{c},0.5,\n" for c in "xyz"), HEADER, "line 2: .*quaternion_w is missing"),
     "five struts": (
