@@ -16,7 +16,7 @@ from helpers import ALL_TESTS, long_test
 from scipy.spatial.transform import Rotation
 
 from benchmarks.live_machine import LiveMachine
-from hexapod_comp.errors import HexapodError, InputFileError, LimitError
+from hexapod_comp.errors import InputFileError, LimitError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import strut_lengths
 from hexapod_comp.machine.load import Payload
@@ -355,18 +355,6 @@ def test_a_run_whose_zero_was_lost_begins_anew_and_comes_out_the_same(tmp_path: 
     )
 
 
-def test_an_interrupted_run_begins_anew_and_finished_ones_stay(tmp_path: Path) -> None:
-    geometry, campaign, path = load_geometry("paper"), campaign_of(load_geometry("paper")), tmp_path / "out.csv"
-    first = live(geometry)
-    collect(campaign, geometry, first, path, going_on=lambda: first.observed < 30)
-    again = live(geometry)
-    done = collect(campaign, geometry, again, path)
-    assert done.resumed == 20, "two lines of five places, there and back"
-    assert len(done.measurements) == len(template(campaign, geometry))
-    whole = collect(campaign, geometry, live(geometry), tmp_path / "whole.csv").measurements
-    assert np.abs(done.measurements.value - whole.value).max() < 1e-9
-
-
 @pytest.mark.parametrize("name", ["hanging"])
 def test_a_tracker_that_stands_anywhere_reads_what_one_in_base_reads_up_to_a_motion(name: str, tmp_path: Path) -> None:
     """The motion that is left between both files is one rigid motion: four stations cannot know it better."""
@@ -411,23 +399,6 @@ def test_gravity_and_payload_stand_in_the_file(tmp_path: Path) -> None:
     machine = Tilted(geometry, find_model("random:3", geometry), LiveInstrument(geometry, "tracker", flaws=QUIET))
     collect(campaign_of(geometry, instrument=None, poses=3), geometry, machine, tmp_path / "out.csv")
     assert (read_tidy([tmp_path / "out.csv"], geometry).stations.loads == [2.5, 0.0, 0.01, 0.02, 1.0, 0.0, -9.7]).all()
-
-
-def test_limits_that_leave_no_room_for_the_small_moves_are_named(tmp_path: Path) -> None:
-    geometry = load_geometry("paper")
-    machine, campaign = live(geometry), campaign_of(geometry)
-    go = machine.move
-
-    def move(pose: Pose) -> None:
-        if abs(pose.position[2] - campaign.box[0, 2]) > 1e-6:
-            error: HexapodError = LimitError("stroke", "too long", 0.7, 0.6, 0, "nominal")
-            error.reason = "limit"
-            raise error
-        go(pose)
-
-    machine.move = move  # type: ignore[method-assign]
-    with pytest.raises(SetUpError, match="no room to move along straightness_z at x line"):
-        collect(campaign, geometry, machine, tmp_path / "out.csv")
 
 
 def test_a_centre_that_is_known_to_5_mm_is_no_mistake_and_one_far_off_is_named(tmp_path: Path) -> None:

@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foreign_machines import machines
-from hypothesis import given
-from strategies import fixed, seeds
 
 from hexapod_comp.errors import InputFileError, ModelError
 from hexapod_comp.formats.paths import config_file
@@ -103,28 +101,8 @@ def test_figures_by_symbol(example: PositioningTest) -> None:
     assert example.figures == pytest.approx({k: v * MICROMETRE for k, v in expected.items()}, **EXACT)
 
 
-def drawn(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return targets and deviations of a test with systematic, reversing and random parts."""
-    rng = np.random.default_rng(seed)
-    cycles, count = rng.integers(2, 7), rng.integers(1, 12)
-    systematic, reversal = rng.normal(0.0, 10e-6, count), rng.normal(0.0, 3e-6, count)
-    noise = rng.normal(0.0, 2e-6, (2, cycles, count)) * rng.uniform(0.0, 2.0, (2, 1, count))
-    return np.sort(rng.uniform(0.0, 0.5, count)), systematic + noise + np.array([[reversal], [-reversal]]) / 2.0
-
-
 def same(figures: dict[str, float], scale: float = 1.0) -> object:
     return pytest.approx({name: scale * value for name, value in figures.items()}, abs=1e-18)
-
-
-@fixed
-@given(seeds)
-def test_seen_from_the_other_end(seed: int) -> None:
-    """With the axis pointing the other way, up is down and deviations change sign; 1e-18 m is a hundred roundings."""
-    targets, deviations = drawn(seed)
-    figures = evaluate(targets, deviations).figures
-    swapped = {"_up": "_down", "_down": "_up"}
-    expected = {name[0] + swapped.get(name[1:], name[1:]): value for name, value in figures.items()}
-    assert evaluate(-targets, -deviations[::-1]).figures == same(expected)
 
 
 def notes(targets: object, deviations: np.ndarray) -> str:

@@ -16,7 +16,6 @@ from test_runs import geometry_with
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.machine.kinematics import Structure, strut_lengths
 from hexapod_comp.measurements.campaign import Campaign, circle_run, line_run, template
 from hexapod_comp.measurements.readings import CHANNELS, MeasurementSet
 from hexapod_comp.measurements.tidy import read_tidy, write_measurements
@@ -95,16 +94,6 @@ def test_the_measured_point_may_be_another_than_the_tools_tip(tmp_path: Path) ->
     rows = "t,,0,0,400,0,0,30,position_x,86.60254037844386,mm\nt,,0,0,400,0,0,30,position_y,50.001,mm\n"
     found = read_tidy(written(tmp_path, rows, header), paper_geometry(), probe=np.array([0.1, 0.0, 0.0]))
     np.testing.assert_allclose(found.value, [0.0, 1e-6], atol=1e-15)
-
-
-def test_strut_rows_are_commands_of_their_pose(tmp_path: Path) -> None:
-    lengths = [516.5, 502.5, 507.5, 508.5, 505.5, 512.5]
-    rows = "".join(f"a,forward,-10,0,400,strut_{i},{v},mm\n" for i, v in enumerate(lengths, start=1))
-    found = read(tmp_path, rows + LINE)
-    np.testing.assert_array_equal(found.stations.commands[0], [0.5165, 0.5025, 0.5075, 0.5085, 0.5055, 0.5125])
-    nominal = strut_lengths(Structure.of(paper_geometry()), Pose([0.01, 0.0, 0.4], np.eye(3)))
-    np.testing.assert_array_equal(found.stations.commands[1], nominal)
-    assert len(found) == 2
 
 
 def test_temperatures(tmp_path: Path) -> None:

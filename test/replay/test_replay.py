@@ -53,7 +53,6 @@ from hexapod_comp.compensation.journal import (
 from hexapod_comp.errors import HexapodError, InputFileError, ModelError
 from hexapod_comp.formats.files import MEGABYTE
 from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.model_file import load_model, save_model
 from hexapod_comp.pose import Pose
 from hexapod_comp.replay import storage
@@ -246,7 +245,6 @@ def test_snapshot_takes_another_compensator_to_the_same_place():
     before, whole = repr(other.snapshot()), one.compensator.snapshot()
     for change, complaint in (
         ({"nominal": [1.0]}, r"snapshot\.nominal: must be 6 numbers"),
-        ({"platform_rotation": np.eye(3)}, r"snapshot\.platform_rotation: must be 9 numbers"),
         ({"speed": [1.0]}, r"snapshot\.speed: is unknown to this release"),
         ({"temperatures": {"strut_7": 20.0}}, "temperature: must be of one of"),
     ):
@@ -562,18 +560,6 @@ def test_without_rosbags_the_error_says_how_to_get_it(monkeypatch, tmp_path):
     (tmp_path / "run.mcap").touch()
     with pytest.raises(HexapodError, match=r"pip install rosbags.*python3-rosbags-pip"):
         read_recording(tmp_path / "run.mcap")
-
-
-def test_ideal_model_is_recorded_as_none(tmp_path):
-    machine = RecordedMachine(model=offset_model(tmp_path, 0.0))
-    from hexapod_comp.compensation.journal import Source
-
-    machine.sources["model"] = Source.of("ideal", "")
-    machine.compensator.set_model(MachineModel(machine.geometry.name))
-    machine.wave(10)
-    machine.page()
-    _, result = opened(write_bag(tmp_path / "run", machine.messages))
-    assert counted(result) == {IDENTICAL: 10}
 
 
 COMPRESSED = [
