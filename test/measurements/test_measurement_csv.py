@@ -158,7 +158,7 @@ BAD = {
     "gravity in g": (
         LINE.replace("um\n", "um,0,0,-1\n"), f"{HEADER},gravity_x_m_s2,gravity_y_m_s2,gravity_z_m_s2",
         "line 2: gravity: must be three numbers, 9…10.6"),
-    "humidity": (LINE.replace("um\n", "um,140\n"), f"{HEADER},humidity_percent", "line 2, column humidity_percent: .*0…100"),
+    "humidity": (LINE.replace("um\n", "um,140\n"), f"{HEADER},humidity_percent", "line 2, column humidity.*0…100"),
     "three of four": (
         "".join(f"t,,0,0,400,quaternion_{c},0.5,\n" for c in "xyz"), HEADER, "line 2: .*quaternion_w is missing"),
     "five struts": (
