@@ -308,6 +308,9 @@ def test_check_follows_a_stream_like_the_compensator(monkeypatch: pytest.MonkeyP
     rotations = Rotation.from_rotvec(0.05 * np.stack([np.sin(angle)] * 3, axis=1)).as_matrix()
     result = check(geometry, model, (positions, rotations), mode="stream", progress=done.append)
     assert (result.examined, sum(done)) == (700, 700)
+    done.clear()
+    check(geometry, model, (positions[:20], rotations[:20]), mode="moves", progress=done.append)
+    assert sum(done) == 20
     compensator = Compensator(geometry, model)
     records = [
         compensator.correct(Pose(p, r), n / 250) for n, (p, r) in enumerate(zip(positions, rotations, strict=True))

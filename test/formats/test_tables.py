@@ -29,6 +29,9 @@ def test_mm_and_degrees_become_m_and_rotations(tmp_path: Path) -> None:
     turns = [Rotation.from_euler(axis, angle, degrees=True) for axis, angle in (("y", 20), ("x", 10), ("z", 30))]
     expected = turns[0] * turns[1] * turns[2]
     np.testing.assert_allclose(poses[0].rotation, expected.as_matrix(), atol=1e-15)
+    quaternion = ",".join(map(repr, expected.as_quat().tolist()))
+    _, poses = read_poses(written(tmp_path, f"x_m,y_m,z_m,qx,qy,qz,qw\n0,0,0.4,{quaternion}\n"))
+    np.testing.assert_allclose(poses[0].rotation, expected.as_matrix(), atol=1e-15)
 
 
 def test_comments_blank_lines_spaces_bom_and_windows_line_ends(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from foreign_machines import machines, with_frames
-from strategies import PAPER_FILE, paper_geometry
+from strategies import PAPER_FILE, paper_geometry, skewed_geometry
 
 from hexapod_comp.errors import FrameError, GeometryError, InputFileError
 from hexapod_comp.machine.doubts import doubts, joint_doubts, twist_per_lead
@@ -136,6 +136,13 @@ def test_refused(old, new, said):
     with pytest.raises(InputFileError) as caught:
         parse_geometry(text.replace(old, new, 1))
     assert all(part in str(caught.value) for part in said)
+
+
+def test_struts_at_home_are_the_cones_axes_where_the_file_gives_none():
+    """A home turned by degrees breaks no cone of a ten-thousandth of a degree."""
+    skewed, narrow = skewed_geometry(), np.full(6, 2e-6)
+    limits = replace(skewed.limits, base_cone=narrow, platform_cone=narrow)
+    replace(skewed, limits=limits, base_cone_axes=None, platform_cone_axes=None)
 
 
 def test_clearance():
