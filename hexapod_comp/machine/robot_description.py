@@ -144,14 +144,17 @@ def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
       <site name="{name}" {_place(pose.position, pose.rotation)} />"""
     struts = ties = drives = ""
     force = _numbers([-push, push])
-    rows = zip(joint_names, lengths, geometry.limits.stroke, geometry.base_joints, foot_frames(geometry), strict=True)
-    for n, (given, length, stroke, joint, foot) in enumerate(rows, 1):
+    feet, at_rest = foot_frames(geometry), joint_positions(geometry, home)
+    bent = [at_rest[f"{name}_foot_2"] for name in STRUT_NAMES]
+    rows = zip(joint_names, lengths, geometry.limits.stroke, geometry.base_joints, feet, bent, strict=True)
+    for n, (given, length, stroke, joint, foot, angle) in enumerate(rows, 1):
         name, short, reach = _text(given), stroke[0], _numbers(stroke)
-        # MuJoCo adds a joint's position to the place of its body: `ref` makes it the length
+        # MuJoCo adds a joint's position to the place of its body: `ref` makes it the length, or the angle
+        c, s = np.cos(angle), np.sin(angle)
         struts += f"""
-    <body name="{name}_body" {_place(joint, foot)}>
-      <joint name="{name}_foot_1" axis="0 1 0" armature="{HINGE_INERTIA}" />
-      <joint name="{name}_foot_2" axis="1 0 0" armature="{HINGE_INERTIA}" />
+    <body name="{name}_body" {_place(joint, foot @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]))}>
+      <joint name="{name}_foot_1" axis="{_numbers([0.0, c, -s])}" armature="{HINGE_INERTIA}" />
+      <joint name="{name}_foot_2" axis="1 0 0" ref="{_number(angle)}" armature="{HINGE_INERTIA}" />
       <geom type="cylinder" size="{STRUT_RADIUS * 1.5}" fromto="0 0 0 0 0 {_number(0.5 * short)}" />
       <site name="base_joint_{n}" />
       <body name="{name}_rod" {_place([0.0, 0.0, length], np.eye(3))}>
@@ -166,7 +169,7 @@ armature="{SCREW_INERTIA}" damping="{DAMPING}" />
         drives += f"""
     <position name="{name}" joint="{name}" kp="{STIFFNESS}" ctrlrange="{reach}" forcerange="{force}" />"""
     at_home = f"{_numbers(home.position)} {_quaternion(home.rotation)}"
-    at_home += "".join(f" 0.0 0.0 {_number(length)}" for length in lengths)
+    at_home += "".join(f" 0.0 {_number(angle)} {_number(length)}" for angle, length in zip(bent, lengths, strict=True))
     # Damping is integrated implicitly: explicit steps would have to be shorter than a light body's settling time.
     # Struts begin and end inside each other's joints and the plate: nothing collides
     return f"""\
@@ -195,14 +198,21 @@ armature="{SCREW_INERTIA}" damping="{DAMPING}" />
 
 
 def foot_frames(geometry: HexapodGeometry) -> np.ndarray:
-    """Return a frame at each base joint, (6, 3, 3), its z along the strut at home: far from the hinges' singularity."""
+    """Return a frame at each base joint, (6, 3, 3): y along the first hinge, z nearest to the strut at home.
+
+    The hinge is the cardan joint's axis in the base where the geometry states it, else one across the strut, far from
+    the hinges' singularity.
+    """
     home = geometry.home
     along = home.position + geometry.platform_joints @ home.rotation.T - geometry.base_joints
     z = along / np.linalg.norm(along, axis=1)[:, None]
-    least = np.eye(3)[np.abs(z).argmin(axis=1)]
-    x = np.cross(least, z)
+    if geometry.base_axes is None:
+        x = np.cross(np.eye(3)[np.abs(z).argmin(axis=1)], z)
+    else:
+        x = np.cross(geometry.base_axes, z)
     x /= np.linalg.norm(x, axis=1)[:, None]
-    return np.stack([x, np.cross(z, x), z], axis=2)
+    y = np.cross(z, x) if geometry.base_axes is None else geometry.base_axes
+    return np.stack([x, y, np.cross(x, y)], axis=2)
 
 
 HEAD = "<?xml version='1.0' encoding='utf-8'?>\n"

@@ -190,14 +190,15 @@ def test_friction_leaves_the_tool_behind_on_both_sides():
 def test_the_model_s_friction_is_that_of_cardan_joints(name: str, tmp_path: Path):
     """MuJoCo's bearings about the axes that the geometry states, against the core; both with clearance and weight.
 
-    Within 1 % of 2 µm: bearings that turn by less than 5 µrad on the last 0.2 mm resist in part, in the core by its
+    Within 2 % of 2 µm: bearings that turn by less than 5 µrad on the last 0.2 mm resist in part, in the core by its
     own rule. Without its axes a joint counts as a ball joint, which resists along the motion: a third may differ.
     """
     plain = replace(geometry_of(name, tmp_path), screw_lead=np.zeros(6), base_axes=None, platform_axes=None)
-    cardan = replace(plain, base_axes=foot_frames(plain)[:, :, 1])
+    axes = foot_frames(plain) @ np.array([0.2, 1.0, 0.3])  # neither across the strut nor MuJoCo's own choice
+    cardan = replace(plain, base_axes=axes / np.linalg.norm(axes, axis=1)[:, None])
     bending = {"mass": 30.0, "lost_motion": np.full(6, 4e-6), "stiffness": np.full(6, 2e7), "take_up": 1e-3}
     physics = Physics(2e7, clearance=4e-6, friction=1.0, mass=30.0, payload=Payload())
-    truth = PhysicalMachine(RealMachine(plain, MachineModel(plain.name)), physics)
+    truth = PhysicalMachine(RealMachine(cardan, MachineModel(plain.name)), physics)
     differences = []
     for geometry, friction in ((cardan, 1.0), (plain, 1.27), (plain, 0.0)):
         model = MachineModel(plain.name, load=Load(**bending, friction=np.full(6, friction)))
@@ -209,7 +210,7 @@ def test_the_model_s_friction_is_that_of_cardan_joints(name: str, tmp_path: Path
             left.append(off(truth.pose_for(commands, sense, pose)[0], machine.pose_for(commands, sense, pose)[0])[0])
         differences.append(max(left))
     exact, ball, none = differences
-    assert exact < 2e-8
+    assert exact < 4e-8
     assert exact < ball < 0.5 * none
 
 
