@@ -83,6 +83,7 @@ def compensators(geometry: HexapodGeometry) -> dict[tuple[str, str], Compensator
     for one in (bent, beside):
         one.set_outside({"elevation": 0.7, "rotation": 0.1})
     turning, weight = cardan(geometry), Load(stiffness=np.full(6, 20e6), lost_motion=np.full(6, 1e-6), mass=30.0)
+    rubbing = dataclasses.replace(weight, friction=np.full(6, 0.5))
     return {
         ("ideal", "the whole command, or estimate, without errors"): with_block(),
         ("structure", "twelve joints where they really are"): with_block(**joints),
@@ -93,6 +94,7 @@ def compensators(geometry: HexapodGeometry) -> dict[tuple[str, str], Compensator
         ("thermal", "struts, base and platform at their temperatures"): warm,
         ("field", "three families of lines, cubic, six components"): with_block(field=whole.field),
         ("load", "stiffness and lost motion under weight"): with_block(load=weight),
+        ("load, friction", "the same, and bearings that rub"): with_block(load=rubbing),
         ("outside", "a table over elevation and rotation"): bent,
         ("field, outside", "both"): beside,
         ("all of them", "the shipped model: structure, scale, waves, field"): Compensator(geometry, whole),

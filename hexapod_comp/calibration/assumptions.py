@@ -49,9 +49,10 @@ class Assumptions:
     least_damping: float = assumed(
         0.1, "", "change of humidity that determines swelling", "5 µm on 0.5 m of carbon fibre"
     )
-    alike: float = assumed(0.75, "", "correlation of the struts' clearances, and frictions", "0 to twice the mean")
+    alike: float = assumed(
+        0.75, "", "correlation of the struts' stiffnesses, clearances, and frictions", "0 to twice the mean"
+    )
     stated_stiffness: float = assumed(0.1, "", "error of a stated stiffness, 1 σ", "catalogues of ball screws: ±10 %")
-    least_load: float = assumed(10.0, "N", "change of weight that determines a stiffness", "0.5 µm on 20 N/µm")
 
     # Posterior (posterior.py, datum.py)
     seen: float = assumed(1.0, "σ", "change of all readings above which a direction is observable", "one σ of noise")

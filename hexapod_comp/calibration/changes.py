@@ -209,7 +209,7 @@ def reading_noise(fitted: FittedParameters) -> np.ndarray:
 def unsettled_cells(space: ParameterSpace, prediction: Prediction, stations: Stations, cells: Cells) -> np.ndarray:
     """Return the effect on cells, (C, k), of struts whose lost motion may be at either end, by standard deviations."""
     linkage = Linkage(prediction, space.probe, stations)
-    deviation = unsettled_lengths(space.geometry, linkage)
+    deviation = unsettled_lengths(linkage)
     station, strut = np.nonzero(deviation)
     gains = linkage.errors(cells.station, cells.directions, np.arange(6)).gains
     effect: np.ndarray = gains[:, strut] * deviation[station, strut] * (cells.station[:, None] == station)
@@ -244,7 +244,7 @@ class CheckReadings:
         if len(cells.kind) > MOST_READINGS:
             problem = f"{len(cells.kind)} readings at distinct places are no check"
             raise CalibrationError("measurements", f"{problem} (at most {MOST_READINGS}); fit them")
-        linear, _ = estimation.linearise(fitted.x if x is None else x, np.ones(len(measurements)))
+        linear, _ = estimation.linearise(fitted.x if x is None else x, np.ones(len(measurements)), unsettled=False)
         free, sizes, _ = np.linalg.svd(estimation.free_of_nuisance(np.eye(len(cells.kind))))
         seen = free[:, sizes > ROUNDING * sizes.max(initial=0.0)].T
         if not len(seen):

@@ -36,10 +36,11 @@ from .changes import (
     widened,
 )
 from .datum import hold, unseen_part
-from .design import Settling, settle
+from .design import Settling, settle, um
 from .estimator import Estimation
 from .mistakes import mistakes_of_check
-from .posterior import ErrorPredictor, FittedParameters
+from .posterior import ErrorPredictor, FittedParameters, box_errors, expected_error
+from .promise import Unexplained
 
 VALID, NAMED, UNDECIDED, UNEXPLAINED = "valid", "named", "undecided", "unexplained"  # verdicts
 
@@ -160,7 +161,7 @@ def verify_model(
     if not 0.0 < false_alarms < 1.0:
         raise ModelError("false_alarms", "must be above 0 and below 1", false_alarms)
     wide = widened(fitted)
-    measurements = replace(measurements, notes=(*measurements.notes, *_beyond_loads(model, measurements)))
+    measurements = replace(measurements, notes=(*measurements.notes, *_beyond_loads(model, fitted, measurements)))
     check = CheckReadings.of(wide, measurements)
     changes = possible_changes(wide.space, [block.name for block in fitted.space.blocks])
     evidence = Evidence(check.covariance(wide.covariance), check.effects(changes, wide.covariance))
@@ -186,11 +187,16 @@ def verify_model(
     return replace(result, tool=tool, settling=settling, doubts=doubts)
 
 
-def _beyond_loads(model: MachineModel, readings: MeasurementSet) -> list[str]:
-    """Return notes on readings taken under loads outside the model's."""
-    loads = measured_loads(model.load, readings.geometry, readings.stations)
-    said = (beyond_loads(model.origin.loads, Payload(row[0], (row[1], row[2], row[3])), row[4:]) for row in loads)
-    return [f"read under another load than the model: {text}" for text in dict.fromkeys(said) if text]
+def _beyond_loads(model: MachineModel, fitted: FittedParameters, readings: MeasurementSet) -> list[str]:
+    """Return notes on readings taken under loads outside the model's, with the tool error predicted there."""
+    found, usual = dict[str, str](), Unexplained(believed=ASSUMED.jackknife_prior)
+    for row in measured_loads(model.load, readings.geometry, readings.stations):
+        said = beyond_loads(model.origin.loads, Payload(row[0], (row[1], row[2], row[3])), row[4:])
+        if said and said not in found:
+            errors = box_errors(fitted.space, fitted.x, load=row) if model.load.stiffness.all() else None
+            there = expected_error(errors, fitted.covariance, beyond=usual)
+            found[said] = "" if there is None else f"; there the model, told so, leaves up to {um(there.high)} (95 %)"
+    return [f"read under another load than the model: {said}{promised}" for said, promised in found.items()]
 
 
 def _misread(

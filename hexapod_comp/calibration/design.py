@@ -20,6 +20,7 @@ from ..machine.geometry import STRUT_NAMES
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..measurements.campaign import Campaign, CampaignRun, template
 from ..measurements.readings import ABSOLUTE_KINDS, BACKWARD, CHANNELS, DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
+from .blocks.load import stated_load
 from .candidates import TILTS, MeasuringBox, candidates, laid_out, places
 from .changes import (
     HEAVIER,
@@ -44,6 +45,7 @@ from .posterior import (
     Observability,
     ToolError,
     UnseenError,
+    about_other_loads,
     box_errors,
     expected_error,
     observe,
@@ -192,6 +194,7 @@ class Plan:
     level: ToolError | None  # after a fit, repeatability included; `before`: machines within the tolerances
     tilted: ToolError | None
     stops: float  # the machine's repeatability as stated, RMS over all three axes, m; 0 where none is
+    elsewhere: str  # what is expected under loads that no reading will have
 
 
 def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings) -> Plan:
@@ -207,7 +210,8 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
     level, tilted = (expected_error(errors, covariance, prior, beyond) for errors in boxes)
     sight = observe(space, problem, posterior, measurements.tilt())
     unseen = unseen_errors(measurements, settings)
-    return Plan(measurements, space, sight, unseen, level, tilted, campaign.stops)
+    elsewhere = about_other_loads(space, x, covariance, beyond)
+    return Plan(measurements, space, sight, unseen, level, tilted, campaign.stops, elsewhere)
 
 
 def noise_factors(campaign: Campaign) -> np.ndarray:
@@ -257,6 +261,8 @@ class Goal:
     instruments: tuple[str, ...] = ("linear",)  # available instruments, of TIMES
     seconds: float = 4.0 * 3600.0  # available time
     times: Mapping[str, Times] = field(default_factory=lambda: TIMES)
+    # under which the goal must hold too when the model is told, and readings may be made: as in Surroundings.loads
+    loads: tuple[tuple[float, ...], ...] = ()
 
     def __post_init__(self) -> None:
         largest = 60.0  # degrees: no hexapod tilts further
@@ -291,6 +297,7 @@ class Proposal:
     unseen: float  # and after enough repeats of them that noise no longer counts
     shares: dict[str, float]  # of blocks, and of the repeatability, in the remaining mean square error
     needed: float | None  # seconds in which the goal would be met; None if these candidates do not meet it
+    loads: tuple[str, ...]  # load of each run, empty for that of the machine file
 
     @property
     def worst(self) -> float:
@@ -311,7 +318,8 @@ class Proposal:
     def each(self) -> list[float]:
         """Duration of each run, the instrument's set-up included in its first, s."""
         runs = self.campaign.runs
-        first = [n == 0 or run.instrument != runs[n - 1].instrument for n, run in enumerate(runs)]
+        set_up = [(run.instrument, load) for run, load in zip(runs, self.loads, strict=True)]
+        first = [n == 0 or one != set_up[n - 1] for n, one in enumerate(set_up)]
         times = [self.goal.times[run.instrument] for run in runs]
         return [t.of(run, self.campaign.cycles) + t.first * new for t, run, new in zip(times, runs, first, strict=True)]
 
@@ -319,16 +327,20 @@ class Proposal:
 class Aim:
     """The tool error of the goal, by parameters z of unit prior."""
 
-    def __init__(self, space: ParameterSpace, tilt: float, stops: float = 0.0) -> None:
+    def __init__(self, space: ParameterSpace, goal: Goal, stops: float = 0.0) -> None:
         self.stops = stops  # repeatability, RMS over all three axes, m: no model reduces it
-        tilts = {"level": 0.0} | ({"tilted": tilt} if tilt > 0.0 else {})
-        self.parts = {name: self._square(space, angle) for name, angle in tilts.items()}
+        tilts = {"level": 0.0} | ({"tilted": goal.tilt} if goal.tilt > 0.0 else {})
+        self.parts = {
+            name + load_text(load): self._square(space, angle, load)
+            for load in (None, *goal.loads)
+            for name, angle in tilts.items()
+        }
         self.square = np.mean(list(self.parts.values()), axis=0)
 
     @staticmethod
-    def _square(space: ParameterSpace, tilt: float) -> np.ndarray:
+    def _square(space: ParameterSpace, tilt: float, load: tuple[float, ...] | None) -> np.ndarray:
         """Return M, shape (size, size), m²: the mean square tool error with the datum aligned is tr(M·C)."""
-        errors = box_errors(space, np.zeros(space.size), tilt)
+        errors = box_errors(space, np.zeros(space.size), tilt, load)
         reached = 0.0 if errors is None else len(errors.places) / (2.0 * POINTS)
         if errors is None or reached < LEAST_REACHED:
             problem = f"{np.degrees(tilt):g}° is within the limits at {100.0 * reached:.0f} % of the box only"
@@ -385,35 +397,51 @@ def propose(
     space = ParameterSpace((place.geometry, region(place, runs)), settings)
     side = float(np.ptp(place.box, axis=0).min())
     base = base or Campaign(place.box, side, side, runs=tuple(runs[:1]))
-    aim = Aim(space, goal.tilt, base.stops)
+    if goal.loads and not stated_load(settings).stiffness.all():
+        raise CalibrationError("loads", "need the stiffness of the struts (--load)")
+    aim = Aim(space, goal, base.stops)
     base = replace(
         base, instrument=None, diagonals=0, poses=0, box=place.box, cell=side, step=side, runs=tuple(runs[:1])
     )
-    seen: list[np.ndarray] = []
+    seen, read_under = list[np.ndarray](), list[str]()
     together = 40  # runs laid out at once: bounds the memory
-    for start in range(0, len(runs), together):
-        progress(f"what {len(runs)} runs would show: {start}")
-        part = (replace(run, name=f"{n}") for n, run in enumerate(runs[start : start + together]))
-        batch = replace(base, runs=tuple(part))
-        seen += seen_by(space, batch, template(batch, place.geometry))
+    for load in (None, *goal.loads):
+        for start in range(0, len(runs), together):
+            progress(f"what {len(runs)} runs would show{load_text(load)}: {start}")
+            part = (replace(run, name=f"{n}") for n, run in enumerate(runs[start : start + together]))
+            batch = replace(base, runs=tuple(part))
+            laid = template(batch, place.geometry)
+            if load is not None:
+                loads = np.tile(load, (len(laid.stations), 1))
+                laid = replace(laid, stations=replace(laid.stations, loads=loads))
+            seen += seen_by(space, batch, laid)
+        read_under += [load_text(load)] * len(runs)
 
+    runs = runs * (1 + len(goal.loads))
     costs = np.array([goal.times[run.instrument].of(run, base.cycles) for run in runs])
-    needs, putting_up = [run.instrument for run in runs], {name: goal.times[name].first for name in goal.instruments}
+    # Another load means that the instrument is set up anew
+    needs = [run.instrument + load for run, load in zip(runs, read_under, strict=True)]
+    putting_up = {need: goal.times[run.instrument].first for run, need in zip(runs, needs, strict=True)}
 
     def left(choice: Greedy[ErrorLeft]) -> float:
         return max(aim.errors(choice.criterion.covariance).values())
 
-    def chosen(instruments: Sequence[str]) -> Greedy[ErrorLeft]:
-        progress(f"choosing runs of {', '.join(instruments)}")
+    def chosen(set_ups: Sequence[str]) -> Greedy[ErrorLeft]:
+        progress(f"choosing runs of {', '.join(set_ups)}")
         nothing = np.zeros((0, space.size))
-        of_these = [rows if name in instruments else nothing for rows, name in zip(seen, needs, strict=True)]
+        of_these = [rows if need in set_ups else nothing for rows, need in zip(seen, needs, strict=True)]
         choice = Greedy(ErrorLeft(of_these, aim.square), costs, needs, putting_up)
         choice.extend(goal.seconds, lambda: left(choice) <= goal.error)
         return choice
 
-    # All instruments, or one of them alone, which saves setting up the others.
+    # All instruments, or one of them alone, and all loads, or fewer: that saves setting up the others.
+    first, *others = dict.fromkeys(read_under)
+    fewer = [(first, *others), *((first, other)[: 1 + bool(other)] for other in ("", *others))]
     alone = [(name,) for name in goal.instruments] if len(goal.instruments) > 1 and any(putting_up.values()) else []
-    tries = [chosen(names) for names in dict.fromkeys([tuple(goal.instruments), *alone])]
+    ways = [
+        [name + load for load in loads for name in names] for loads in fewer for names in (goal.instruments, *alone)
+    ]
+    tries = [chosen(way) for way in dict.fromkeys(map(tuple, ways))]
     best = min(tries, key=lambda t: (left(t) > goal.error, t.spent if left(t) <= goal.error else left(t)))
     if not best.picks:
         raise CalibrationError("hours", f"are too few: the shortest run takes {best.totals().min() / 3600.0:.2g} h")
@@ -426,8 +454,10 @@ def propose(
     if needed is None and all_of_them <= goal.error:  # continued, to report the time that the goal would take
         tries[0].extend(np.inf, lambda: left(tries[0]) <= goal.error, most=25)
         needed = tries[0].spent if left(tries[0]) <= goal.error else None
-    picks = sorted(picks, key=lambda n: (goal.instruments.index(needs[n]), n))
-    named = tuple(replace(runs[n], name=f"{k}: {runs[n].name}") for k, n in enumerate(picks, start=1))
+    picks = sorted(
+        picks, key=lambda n: (n // (len(runs) // (1 + len(goal.loads))), goal.instruments.index(runs[n].instrument), n)
+    )
+    named = tuple(replace(runs[n], name=f"{k}: {runs[n].name}{read_under[n]}") for k, n in enumerate(picks, start=1))
     of_parameter, total = (aim.square * covariance).sum(axis=1), (aim.square * covariance).sum() + aim.stops**2
     shares = {block.name: float(of_parameter[block.part].sum() / total) for block in space.blocks}
     shares["repeatability"] = aim.stops**2 / total
@@ -442,6 +472,7 @@ def propose(
         unseen=unseen,
         shares=dict(sorted(shares.items(), key=lambda item: -item[1])),
         needed=needed,
+        loads=tuple(read_under[n] for n in picks),
     )
 
 
@@ -608,6 +639,14 @@ def _divergence(difference: np.ndarray, right: np.ndarray, wrong: np.ndarray) ->
 # What a proposal prints
 
 
+def load_text(load: Sequence[float] | None) -> str:
+    """Return the load of a run as the end of its name; empty for that of the machine file."""
+    if load is None:
+        return ""
+    gravity = "" if np.isnan(load[4]) else f", gravity ({', '.join(f'{g:g}' for g in load[4:])}) m/s²"
+    return f", tool of {load[0]:g} kg{gravity}"
+
+
 def stops_text(stops: float) -> str:
     """Return the part of a planned tool error that is the machine's repeatability: RMS over all three axes, m."""
     if stops:
@@ -619,10 +658,15 @@ def proposal_report(plan: Proposal) -> str:
     """Return the report of a proposed plan: goal, prediction, limiting factor, runs in their order."""
     expected = ["expected tool error at random points of the box, both directions, the datum aligned:"]
     for name, after in plan.expected.items():
-        shown = "level tool: " if name == "level" else f"tilted {np.degrees(plan.goal.tilt):g}°:"
+        tilt, _, load = name.partition(", ")
+        shown = "level tool" if tilt == "level" else f"tilted {np.degrees(plan.goal.tilt):g}°"
+        shown = f"{shown}{f' ({load})' if load else ''}:"
         before = plan.before[name]
-        expected.append(f"  {shown}  {um(before)} → {um(after)} RMS, {100.0 * (1.0 - after / before):.1f} % less")
+        expected.append(f"  {shown:12} {um(before)} → {um(after)} RMS, {100.0 * (1.0 - after / before):.1f} % less")
     expected.append(f"  {stops_text(plan.campaign.stops)}")
+    if plan.goal.loads:
+        under = ", ".join(load.removeprefix(", ") or "as in the machine file" for load in dict.fromkeys(plan.loads))
+        expected.append(f"loads to read under: {len(set(plan.loads))} of {1 + len(plan.goal.loads)} ({under})")
     rows = [
         [run.name, str(len(run.positions)), str(run.count(plan.campaign.cycles)), number(seconds / 60.0, 0), "min"]
         for run, seconds in zip(plan.campaign.runs, plan.each, strict=True)
@@ -657,6 +701,7 @@ def proposal_json(plan: Proposal) -> dict[str, Any]:
         "unseen_m": plan.unseen,
         "repeatability_m": plan.campaign.stops,
         "shares": plan.shares,
+        "loads": len(set(plan.loads)),
         "readings": plan.readings,
         "runs": [
             {**run.content(), "takes_s": seconds} for run, seconds in zip(plan.campaign.runs, plan.each, strict=True)

@@ -20,6 +20,8 @@ from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs
 from ..errors import CalibrationError, KinematicsError, ModelError
 from ..measurements.readings import KINDS, LEAST_NOISE, MeasurementSet, refuse_absurd
 from .assumptions import ASSUMED
+from .blocks.block import Linkage
+from .blocks.load import unsettled_lengths
 from .observations import Cells, Nuisance, of_square
 from .parameters import Components, ParameterSpace
 from .sensitivity import Prediction, Slopes, predict
@@ -194,6 +196,8 @@ class LinearProblem:
     # (C, 6): Derivatives by the struts' lengths, scaled as the rows, with the instruments' unknowns still in them
     per_length: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
     unknowns: tuple[Nuisance, ...] = ()  # What that is
+    # (C,): One over the standard deviation of the cells' values at unit noise factors
+    scale: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -287,12 +291,12 @@ def _noise(
 def _tolerances(space: ParameterSpace | Components, posterior: Posterior, z: np.ndarray) -> np.ndarray:
     """Return new tolerances: MacKay's fixed point, squared parameters over how many are determined.
 
-    The first guess counts as a tenth of a parameter, which keeps an empty block from collapsing.
+    The first guess counts as a tenth of a parameter, which keeps an empty block from collapsing; a stated one stays.
     """
     result, start = posterior.tolerances.copy(), space.start_tolerances()
     for n, part in enumerate(space.parts):
         members = (posterior.used >= part.start) & (posterior.used < part.stop)
-        if members.any():
+        if members.any() and not space.stated[n]:
             first = ASSUMED.hyperprior * (start[n] / result[n]) ** 2
             factor = np.sqrt(
                 (z[members] @ z[members] + first) / (posterior.determined[members].sum() + ASSUMED.hyperprior)
@@ -374,14 +378,21 @@ class Estimation:
             problem = f"{len(measurements)} readings at {len(self.cells.station)} distinct places leave {free} "
             raise CalibrationError("measurements", problem + f"numbers for the structure's {needed} parameters")
 
-    def linearise(self, x: np.ndarray, reading_weights: np.ndarray) -> tuple[LinearProblem, np.ndarray]:
-        """Return the linear problem at a parameter vector, and each reading's residual there, m or rad."""
+    def linearise(
+        self, x: np.ndarray, reading_weights: np.ndarray, unsettled: bool = True
+    ) -> tuple[LinearProblem, np.ndarray]:
+        """Return the linear problem at a parameter vector, and each reading's residual there, m or rad.
+
+        The cells' variance includes that of `unsettled` lost motions.
+        """
         c, m = self.cells, self.measurements
         weights = reading_weights / self.uncertainty**2
         total = np.bincount(c.of_reading, weights)
-        scale = np.sqrt(total)
         values = np.bincount(c.of_reading, weights * m.value) / total
         prediction, directions = self._predicted(x), c.directions.copy()
+        variances = self._variances_of_unsettled(prediction) * unsettled
+        allowed, shown = 1.0 + total * variances
+        scale = np.sqrt(total / allowed)
         expected, unknowns = self.unknowns(directions, prediction.errors[c.station], values, scale)
         misfit = m.value - expected[c.of_reading]
         mean = np.bincount(c.of_reading, weights * misfit) / total
@@ -397,9 +408,12 @@ class Estimation:
         scatter = np.bincount(m.kind, weights * (misfit - mean[c.of_reading]) ** 2, len(KINDS))
         # Huber's proposal 2: noise is estimated from clipped residuals, weight² · residual², since outliers would
         # enlarge it.
-        beyond = np.bincount(m.kind, weights * (1.0 - reading_weights) * residuals**2, len(KINDS))
+        clipped = weights * (1.0 - reading_weights) / allowed[c.of_reading]
+        beyond = np.bincount(m.kind, clipped * residuals**2, len(KINDS))
         problem = self._problem(target + moved, rows, scatter - beyond, unknowns)
-        return replace(problem, per_length=per_length, unknowns=tuple(unknowns)), residuals
+        freedom = problem.freedom - np.bincount(c.kind, 1.0 - shown / allowed, len(KINDS))
+        problem = replace(problem, freedom=freedom, per_length=per_length, unknowns=tuple(unknowns), scale=scale)
+        return problem, residuals
 
     def _rows(self, x: np.ndarray, prediction: Prediction, directions: np.ndarray) -> tuple[DesignMatrix, np.ndarray]:
         """Return each cell's derivatives by y, and the effect of all parameters together, (C,).
@@ -475,6 +489,20 @@ class Estimation:
             expected[n], directions[n], part = frame.seen(directions[n], errors[n], values[n], scale[n])
             unknowns.append(part)
         return expected, unknowns
+
+    def _variances_of_unsettled(self, prediction: Prediction) -> np.ndarray:
+        """Return variances of cells' values by lost motions that may be at either end, (2, C): allowed, and expected.
+
+        An error of the forces is common to all n cells of a strut's unsettled stations: each is allowed n times its
+        own variance, so that together they count as one.
+        """
+        c = self.cells
+        if not prediction.load.lost_motion.any():
+            return np.zeros((2, len(c.station)))
+        linkage = Linkage(prediction, self.space.probe, self.measurements.stations)
+        deviations = unsettled_lengths(linkage)[c.station]
+        squares = (linkage.errors(c.station, c.directions, np.arange(6)).gains * deviations) ** 2
+        return np.stack([squares @ np.count_nonzero(deviations, axis=0), squares.sum(axis=1)])
 
     def _problem(
         self, target: np.ndarray, rows: DesignMatrix, scatter: np.ndarray, unknowns: list[Nuisance]

@@ -12,6 +12,7 @@ from scipy.special import expit
 
 from ..errors import CalibrationError, HexapodError
 from ..machine.arrays import rms
+from ..machine.load import Payload
 from ..machine.model import MachineModel, ModelOrigin
 from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementSet, refuse_unmoved
@@ -40,8 +41,9 @@ from .posterior import (
     Observability,
     ToolError,
     UnseenError,
-    about_stiffness,
+    about_other_loads,
     box_errors,
+    expected_error,
     listed,
     observe,
     without_trace,
@@ -113,6 +115,13 @@ class ModelFit:
     def tilted(self) -> ToolError | None:
         """The same for a tool tilted by :data:`~.trust.TILT`; None if nothing can be predicted."""
         return self.verdict.tilted
+
+    def under(self, payload: Payload, gravity: Sequence[float] | None = None) -> ToolError | None:
+        """Return the expected tool error with this model where it is told another load, for a level tool."""
+        load = payload.mass, *payload.centre, *(gravity or [np.nan] * 3)
+        covariance = physical_covariance(self.space, self.solution.posterior)
+        errors = box_errors(self.space, self.solution.x, load=load)
+        return expected_error(errors, covariance, beyond=self.verdict.unexplained)
 
     @property
     def covariance(self) -> np.ndarray:
@@ -233,7 +242,6 @@ def _fit(
     solution = residuals.solution
     channels = tuple(_channels(residuals))
     notes = [
-        *_about_loads(measurements, space, solution),
         *_about_lead(lead),
         *_ignored(measurements, space),
         *_check_backlash(space, solution),
@@ -247,6 +255,7 @@ def _fit(
     no_trace = unseen_errors(measurements, settings)
     if rolls := [error for error in no_trace if error.name.startswith("roll")]:
         verdict = verdict.without_rotation(listed(rolls))
+    notes = [*_about_loads(measurements, space, solution, verdict), *notes]
     as_solved = _named(space, solution, measurements, channels, len(decisions), verdict.level)
     unseen = unseen_part(estimation, solution.posterior.tolerances[0], solution.posterior.noise, datum)
     model, held = hold(measurements.geometry, as_solved, datum, unseen)
@@ -299,7 +308,7 @@ def _choose(
 ) -> tuple[list[Decision], Posterior, Estimation, Solution]:
     """Return the decisions on blocks, the posterior with all blocks, and the fit with those kept."""
     space, trust = everything.space, np.ones(len(everything.measurements))
-    if space.block("friction") is not None:  # the sign of a strut's force depends on it
+    if {"lost motion", "friction"} & {block.name for block in space.blocks}:  # what forces do depends on them
         for _ in range(2):
             first = solve(space, problem, space.start_tolerances(), np.ones(len(KINDS)), ROUNDS)
             y = np.zeros(space.size)
@@ -409,8 +418,10 @@ def _about_lead(lead: ScrewLead | None) -> list[str]:
     return []
 
 
-def _about_loads(measurements: MeasurementSet, space: ParameterSpace, solution: Solution) -> list[str]:
-    """Return the loads for which the predicted error holds, if any is stated."""
+def _about_loads(
+    measurements: MeasurementSet, space: ParameterSpace, solution: Solution, verdict: Verdict
+) -> list[str]:
+    """Return the loads for which the predicted error holds, if any is stated, and what it is under others."""
     load = stated_load(space.settings)
     loads = np.array(measured_loads(load, space.geometry, measurements.stations))
     if not len(loads):
@@ -420,11 +431,9 @@ def _about_loads(measurements: MeasurementSet, space: ParameterSpace, solution: 
     directions = len(np.unique(loads[:, 4:], axis=0))
     gravity = "one direction of gravity" if directions == 1 else f"{directions} directions of gravity"
     text = f"read with {masses} and {gravity}: the promise holds for these"
-    if not load.bends:
-        return [f"{text}, for no struts' stiffness is stated (--load)"]
-    if space.block("compliance") is None:
-        return ["; ".join(filter(None, (text, about_stiffness(space, solution.x))))]
-    return [f"{text}, and between them; the stiffness was refined by them"]
+    covariance = physical_covariance(space, solution.posterior)
+    elsewhere = about_other_loads(space, solution.x, covariance, verdict.unexplained)
+    return [f"{text}; {elsewhere}" if elsewhere else f"{text}, for no struts' stiffness is stated (--load)"]
 
 
 def _ignored(measurements: MeasurementSet, space: ParameterSpace) -> list[str]:

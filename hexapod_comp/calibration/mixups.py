@@ -141,7 +141,7 @@ class _Fitted:
         self.bases = _principal(self.space, problem) if bases is None else bases
         ends = np.cumsum([0, *(self._basis(n).shape[1] for n in range(len(self.space.blocks)))]).tolist()
         parts = tuple(slice(start, stop) for start, stop in pairwise(ends))
-        self.components = Components(parts, self.space.start_tolerances())
+        self.components = Components(parts, self.space.start_tolerances(), self.space.stated)
         self.problem = _with(problem, problem.target, ALIKE, self._reduced(problem.rows.dense()))
         self.kinds = np.unique(problem.kind)
 
@@ -506,7 +506,7 @@ def common_modes(estimation: Estimation, space: ParameterSpace) -> Iterator[Mode
     """Yield what readings may have in common: rigid motions of platform and base, scales of instruments, all screws."""
     m, cells = estimation.measurements, estimation.cells
     stations, directions = m.stations, cells.directions
-    points, place = m.points(), max(TOLERANCES["structure"], dict(space.settings.tolerances)["structure"])
+    points, place = m.points(), max(TOLERANCES["structure"], space.start_tolerances()[0])
 
     def read(motions: np.ndarray) -> np.ndarray:
         """Return what motions of the measured points, (M, 6), add to cells."""

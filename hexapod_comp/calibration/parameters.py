@@ -14,9 +14,10 @@ import numpy as np
 
 from ..core import MOST_HARMONICS
 from ..errors import CalibrationError, ModelError
+from ..machine.arrays import different_rows
 from ..machine.geometry import HexapodGeometry, first_of_same
 from ..machine.kinematics import Structure, strut_lengths
-from ..machine.load import Load, reciprocal
+from ..machine.load import MOST_LOADS, Load, reciprocal
 from ..machine.model import MachineModel
 from ..machine.region import Region
 from ..machine.struts import StrutErrors
@@ -65,7 +66,7 @@ class FitSettings:
         What is stated of struts that give under weight (:meth:`hexapod_comp.machine.load.Load.numbers`); empty: they
         are rigid. Where readings were taken under several loads, the fit starts from it.
     tolerances : dict
-        Standard deviations to start from, by block.
+        Standard deviations to start from, by block, where they are not the blocks' own.
     robust : bool
         Give readings that disagree with the rest less weight.
     tracker_frame : str
@@ -87,7 +88,7 @@ class FitSettings:
     thermometer: str = ""
     time_constants: tuple[float, ...] | None = None
     load: tuple[float, ...] = ()
-    tolerances: tuple[tuple[str, float], ...] = tuple(TOLERANCES.items())
+    tolerances: tuple[tuple[str, float], ...] = ()
     robust: bool = True
     scale: float | None = None
     alignment: float | None = None
@@ -155,6 +156,7 @@ class Components(NamedTuple):
 
     parts: tuple[slice, ...]  # of each block
     first: np.ndarray  # (blocks,): tolerances to start from
+    stated: tuple[bool, ...]  # (blocks,): whether these stay
 
     def start_tolerances(self) -> np.ndarray:
         """Return the blocks' first tolerances, shape (blocks,)."""
@@ -168,15 +170,19 @@ class Components(NamedTuple):
 class ParameterSpace:
     """All parameters of a joint fit, in SI, block by block, and the machine of a vector of them.
 
-    `blocks` are in the order of the vector, `size` is its length; `region` is the measured one.
+    `blocks` are in the order of the vector, `size` is its length; `region` is the measured one; `loads`, (n, 7), are
+    those of the readings as in :attr:`.Surroundings.loads`, NaN in a space that is made without any.
     """
 
     def __init__(self, measurements: MeasurementSet | tuple[HexapodGeometry, Extent], settings: FitSettings) -> None:
+        self.loads = np.full((1, 7), np.nan)
         if isinstance(measurements, MeasurementSet):
             thermometer, hidden = growth.as_warmed(settings, measurements.stations)
             hidden |= as_loaded(settings, measurements.geometry, measurements.stations)
             shown = tuple(name for name in settings.blocks if name not in hidden)
             settings = replace(settings, thermometer=thermometer, blocks=shown)
+            loads = measurements.stations.loads
+            self.loads = loads[np.sort(different_rows(np.nan_to_num(loads))[0])[:MOST_LOADS]]
             measurements = measurements.geometry, Extent.of(measurements)
         self.geometry, self.region = geometry, region = measurements
         self.settings = settings
@@ -207,6 +213,11 @@ class ParameterSpace:
         return tuple(block.part for block in self.blocks)
 
     @property
+    def stated(self) -> tuple[bool, ...]:
+        """Whether each block's tolerance is stated."""
+        return tuple(block.stated for block in self.blocks)
+
+    @property
     def measured(self) -> Region | None:
         """The region of models with these parameters; None if no box was measured."""
         return Region.of(self.work_box, self.probe, self.geometry.work) if spans(self.work_box) else None
@@ -223,8 +234,8 @@ class ParameterSpace:
 
     def start_tolerances(self) -> np.ndarray:
         """Return the blocks' first tolerances, shape (number of blocks,)."""
-        known = {**TOLERANCES, **dict(self.settings.tolerances)}
-        return np.array([known[b.name] for b in self.blocks])
+        known = dict(self.settings.tolerances)
+        return np.array([known.get(b.name, b.tolerance) for b in self.blocks])
 
     def spread(self, tolerances: np.ndarray) -> np.ndarray:
         """Return each parameter's tolerance from its block's, shape (size,)."""

@@ -11,8 +11,8 @@ Mou & King (1998): "predict the linear displacement errors of any point within d
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -29,7 +29,6 @@ from ..machine.temperatures import HUMIDITY, Temperatures
 from ..measurements.readings import AXES, Stations
 from ..pose import attitude_error, rotation_from_angles
 from .assumptions import ASSUMED
-from .blocks.block import Linkage
 from .blocks.load import stated_load
 from .datum import HeldDatum
 from .estimator import Estimation, LinearProblem, physical_covariance
@@ -46,6 +45,9 @@ COMPONENTS = ("x", "y", "z", "rx", "ry", "rz")
 
 POINTS, DRAWS, SEED = 300, 300, 7
 """Random points and draws of the parameters behind an expected tool error."""
+
+OTHER_MASS = 10.0
+"""By how much a tool is heavier for which a fit predicts its error too, kg."""
 
 CHUNK = 256
 """Poses handled together: bounds the memory of their derivatives."""
@@ -225,7 +227,7 @@ class ErrorPredictor:
             stations = Stations(warmth, *air, loads, *at)
             there = modelled[0][solved], modelled[1][solved]
             base, platform = (np.tile(j, (reached, 1, 1)) for j in (structure.base_joints, structure.platform_joints))
-            found = Prediction(np.zeros((reached, 6)), *there, base, platform, machine.model.load)
+            found = Prediction(np.zeros((reached, 6)), *there, base, platform, machine.model.load, geometry)
             rows = derivatives(space, found, stations)
             rows = carried(rows, there[1] @ (geometry.tool.position - space.probe))
             columns[solved, :, 1:] = np.concatenate([work.T @ rows[:, :3], work.T @ rows[:, 3:]], axis=1)
@@ -277,11 +279,12 @@ class ToolError:
     rotation_unknown: str = ""  # why they are None
 
 
-def box_stations(space: ParameterSpace, tilt: float = 0.0) -> Stations | None:
+def box_stations(space: ParameterSpace, tilt: float = 0.0, load: Sequence[float] | None = None) -> Stations | None:
     """Return random reachable stations in the measured box, in the work frame, each passed in both directions.
 
     First all forward, then all backward. The tool is tilted by `tilt`, rad, from level, each time about another
-    horizontal axis of the work frame.
+    horizontal axis of the work frame. The machine carries a `load`, as in :attr:`.Surroundings.loads`; by default
+    those of the readings in turn.
     """
     rng = np.random.default_rng(SEED)
     points = space.places(rng.uniform(space.work_box[0], space.work_box[1], (POINTS, 3)))
@@ -292,7 +295,10 @@ def box_stations(space: ParameterSpace, tilt: float = 0.0) -> Stations | None:
     rotations = work @ rotation_from_angles(angles) @ work.T @ space.level
     every = Passes(space.geometry, points - rotations @ space.probe, rotations, directions)
     reachable = every.reachable()
-    return stations_of(every.select(reachable).both_ways()) if reachable.any() else None
+    if not reachable.any():
+        return None
+    loads = np.resize(space.loads if load is None else load, (int(reachable.sum()), 7))
+    return replace(stations_of(every.select(reachable).both_ways()), loads=np.tile(loads, (2, 1)))
 
 
 def stations_of(passes: Passes) -> Stations:
@@ -306,30 +312,38 @@ def stations_of(passes: Passes) -> Stations:
     )
 
 
-def box_errors(space: ParameterSpace, x: np.ndarray, tilt: float = 0.0) -> FirstOrder | None:
+def box_errors(
+    space: ParameterSpace, x: np.ndarray, tilt: float = 0.0, load: Sequence[float] | None = None
+) -> FirstOrder | None:
     """Return the errors at :func:`box_stations`, the datum aligned; None where no machine takes such poses."""
-    stations = box_stations(space, tilt)
+    stations = box_stations(space, tilt, load)
     return None if stations is None else FirstOrder.of(space, predict(space, x, stations), stations).aligned()
 
 
-def about_stiffness(space: ParameterSpace, x: np.ndarray) -> str:
-    """Return by how much a stated stiffness that no reading refines adds to the tool's error under other weights.
+def other_loads(space: ParameterSpace) -> dict[str, tuple[float, ...]]:
+    """Return loads that a machine may be told in place of the first of the readings, by name."""
+    load, (mass, *centre, _, _, _) = stated_load(space.settings), space.loads[0]
+    if math.isnan(mass):
+        mass, centre = space.geometry.payload.mass, list(space.geometry.payload.centre)
+    down = load.gravity if np.isnan(space.loads[0, 4:]).any() else space.loads[0, 4:]
+    heavier = mass + OTHER_MASS
+    found = {f"{heavier:g} kg": (heavier, *(mass * np.array(centre) / heavier), *down)}
+    if mass > 0.0:
+        found = {"no tool": (0.0, 0.0, 0.0, 0.0, *down), **found}
+    across = np.linalg.svd(down[None])[2][1] * np.linalg.norm(down)
+    return {**found, "gravity turned by 90°": (mass, *centre, *across)}
 
-    RMS in the box, datum aligned, with the stiffness off by one standard deviation, in the worst direction of weight.
-    """
-    stations = box_stations(space)
-    if stations is None or space.block("compliance") is not None or not stated_load(space.settings).stiffness.all():
+
+def about_other_loads(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, beyond: Unexplained) -> str:
+    """Return the predicted tool error under loads that no reading had; empty if no stiffness is stated."""
+    if not stated_load(space.settings).stiffness.all():
         return ""
-    linkage, sizes = Linkage(predict(space, x, stations), space.probe, stations), []
-    for force in 10.0 * np.eye(6)[:3]:
-        tension = linkage.tensions(np.tile(force, (len(stations), 1)))
-        moved = linkage.per_length @ (ASSUMED.stated_stiffness * linkage.load.compliance * tension)[..., None]
-        sizes.append(math.sqrt(3.0) * rms(FirstOrder(linkage.points, moved).aligned().values[:, :3]))
-    return (
-        f"under other loads it depends on the stated stiffness: off by {100.0 * ASSUMED.stated_stiffness:.0f} %, "
-        f"that adds {1e6 * max(sizes):.2g} µm for each 10 N by which the weight differs in size or direction; the same "
-        "readings at a second load, which should differ most, such as without the tool, determine it"
-    )
+    found = []
+    for name, load in other_loads(space).items():
+        error = expected_error(box_errors(space, x, load=load), covariance, beyond=beyond)
+        if error is not None:
+            found.append(f"{name} {1e6 * error.after:.2g} µm (95 %: up to {1e6 * error.high:.2g})")
+    return f"told another load, a level tool is expected to err by: {', '.join(found)}" if found else ""
 
 
 def expected_error(

@@ -16,7 +16,7 @@ from .estimator import SETTLED
 from .fit import ChannelFit, ModelFit, Outlier
 from .lead import ScrewLead
 from .lines import LineFit, LinesFit
-from .posterior import BlockSight, Observability, ToolError, UnseenError, about_stiffness, listed
+from .posterior import BlockSight, Observability, ToolError, UnseenError, listed
 from .thermal import warming_json, warming_text
 from .trust import TILT
 
@@ -279,8 +279,12 @@ def plan_report(plan: Plan) -> str:
         f"{part}\n  {stops_text(plan.stops)}" for part in _expected(plan.level, plan.tilted, plan.observability)
     ]
     seen = observability_text(plan.observability, plan.unseen_errors)
-    stiffness = about_stiffness(plan.space, np.zeros(plan.space.size))
-    parts = [head, *expected, seen, *([f"holds for the load of the readings; {stiffness}"] if stiffness else [])]
+    parts = [
+        head,
+        *expected,
+        seen,
+        *([f"that holds for the loads of the readings; {plan.elsewhere}"] * bool(plan.elsewhere)),
+    ]
     return "\n\n".join(parts) + "\n"
 
 

@@ -34,18 +34,25 @@ class Decision:
 def select(
     space: ParameterSpace, problem: LinearProblem, noise: np.ndarray, progress: Callable[[str], object]
 ) -> tuple[list[Decision], Posterior, Posterior]:
-    """Return a decision for each block but the structure; the posterior with all blocks in, and with those kept."""
+    """Return a decision for each block but the structure; the posterior with all blocks in, and with those kept.
+
+    What is stated with its error is known to be there.
+    """
     everything = fit = solve(space, problem, space.start_tolerances(), noise, ROUNDS)
     silent = everything.used[everything.determined < SILENT]
     kept = [block.name for block in space.blocks[1:]]
     evidence: dict[str, float] = {}
+    doubtful = [block.name for block in space.blocks[1:] if not block.stated]
     while kept:
         evidence |= {name: log_bayes_factor(space, fit, name) for name in kept}
-        least = min(kept, key=lambda name: evidence[name])
+        if not doubtful:
+            break
+        least = min(doubtful, key=lambda name: evidence[name])
         if evidence[least] >= ASSUMED.least_evidence:
             break
         progress(f"without {least}: its evidence is {evidence[least]:.1f}")
         kept.remove(least)
+        doubtful.remove(least)
         kept_in = np.array([block.name in ("structure", *kept) for block in space.blocks])
         fit = solve(space, problem, kept_in * fit.tolerances, fit.noise, FEW_ROUNDS, silent)
     return [Decision(b.name, b.name in kept, evidence[b.name]) for b in space.blocks[1:]], everything, fit

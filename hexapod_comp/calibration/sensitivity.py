@@ -27,7 +27,7 @@ def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Predict
     number: dict[RealMachine, int] = {}
     which = np.array([number.setdefault(machine, len(number)) for machine in machines])
     base, platform = (np.array([getattr(m.structure, name) for m in number])[which] for name in JOINTS)
-    return Prediction(errors, *driven.actual, base, platform, model.load)
+    return Prediction(errors, *driven.actual, base, platform, model.load, space.geometry)
 
 
 class Slopes:

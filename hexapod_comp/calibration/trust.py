@@ -297,8 +297,8 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
     points = m.points()[cells.station]
     growth = np.where(lengths, np.einsum("ci,ci->c", cells.directions[:, :3], points - points.mean(axis=0)), 0.0)
     legendre = np.polynomial.legendre.legvander(time, DRIFT_TERMS)[:, 1:]
-    trust = np.bincount(cells.of_reading, solution.weights * estimation.uncertainty**-2)
-    trust = np.sqrt(trust / np.bincount(cells.of_reading, estimation.uncertainty**-2)) / posterior.noise[cells.kind]
+    trust = problem.scale / np.sqrt(np.bincount(cells.of_reading, estimation.uncertainty**-2))
+    trust /= posterior.noise[cells.kind]
     columns = trust[:, None] * estimation.free_of_nuisance(ASSUMED.drift * growth[:, None] * legendre)
     cross = r.rows.transposed_times(columns) / posterior.spread[:, None]
     gain = posterior.covariance @ cross
@@ -312,11 +312,10 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
     change = r.rows.times(moved / posterior.spread) + columns @ values
     y, x = posterior.y + moved, np.zeros(estimation.space.size)
     x[posterior.used] = y
-    scale = np.sqrt(np.bincount(cells.of_reading, solution.weights * estimation.uncertainty**-2))
     known = replace(posterior, y=y, covariance=posterior.covariance + gain @ covariance @ gain.T)
     of_cells = posterior.noise[problem.kind]
     target = problem.target - of_cells * (columns @ values)
-    residuals = solution.residuals - (of_cells * change / scale)[cells.of_reading]
+    residuals = solution.residuals - (of_cells * change / problem.scale)[cells.of_reading]
     settled = replace(
         solution,
         problem=replace(problem, target=target),

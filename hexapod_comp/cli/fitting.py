@@ -25,7 +25,7 @@ from ..calibration.check import (
 from ..calibration.evaluation import ModelEvaluation, evaluate_model, evaluation_json, evaluation_text
 from ..calibration.fit import ModelFit, fit_model
 from ..calibration.lines import fit_lines
-from ..calibration.parameters import TOLERANCES, FitSettings
+from ..calibration.parameters import FitSettings
 from ..calibration.posterior import FittedParameters
 from ..calibration.posterior_file import SUFFIX, load_posterior, save_with_posterior
 from ..calibration.report import as_json, fit_report, lines_json, lines_report, plan_json, plan_report
@@ -35,6 +35,7 @@ from ..formats.outputs import write_text
 from ..formats.paths import input_file
 from ..formats.texts import number
 from ..machine.geometry import HexapodGeometry, load_geometry
+from ..machine.load import Payload, check_gravity
 from ..machine.model import MachineModel, RealMachine
 from ..machine.model_file import load_model, read_load
 from ..machine.region import region_json, region_text
@@ -75,7 +76,7 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
     if args.load is not None:
         given["load"] = read_load(args.load).numbers()
     if args.tolerance_um is not None:
-        given["tolerances"] = tuple({**TOLERANCES, "structure": args.tolerance_um * 1e-6}.items())
+        given["tolerances"] = (("structure", args.tolerance_um * 1e-6),)
     robust = not getattr(args, "not_robust", False)
     return FitSettings(shared_platform_joints=not args.separate_joints, robust=robust, **given)
 
@@ -106,6 +107,11 @@ def plan(args: argparse.Namespace) -> Result:
         times[name] = Times(*numbers)
     given: dict[str, Any] = {"instruments": tuple(args.instruments.split(","))} if args.instruments is not None else {}
     given |= {"seconds": args.hours * 3600.0} if args.hours is not None else {}
+    tool = geometry.payload
+    tools = [Payload(mass, tool.centre) for mass in args.tools_kg or ()]
+    loads = [(other.mass, *other.centre, *[np.nan] * 3) for other in tools]
+    loads += [(tool.mass, *tool.centre, *check_gravity("--gravity", vector)) for vector in args.gravity or ()]
+    given["loads"] = tuple(loads)
     goal = Goal(args.goal_um * 1e-6, float(np.radians(args.tilt_deg or 0.0)), times=times, **given)
     place = MeasuringBox(geometry, campaign.box, campaign.level, goal.tilt)
     with results.stage_line() as say:

@@ -160,6 +160,10 @@ def outside_numbers(text: str) -> dict[str, float]:
     return {name.strip(): finite(number) for name, _, number in parts}
 
 
+def vector(text: str) -> tuple[float, ...]:
+    return numbers(text, (3,), "three numbers")
+
+
 def finite(text: str) -> float:
     if "," in text:
         raise wrong(f"must be finite numbers{number_hint(text)}, not {text!r}")

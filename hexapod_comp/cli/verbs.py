@@ -9,9 +9,9 @@ from .options import (
     COMPENSATED, DIRECTION, ESTIMATION, FRAMES, JSON, LINE_HELP, LINE_SHAPE, MACHINE, MODEL, NAMESPACE, OUTSIDE,
     POSE_HELP, SEPARATE, SHAPE, TRUTH, WORDS, Assumptions, Option, Rule,
     above_zero, bound, box, choice, count, csv_file, excluded_by,
-    exactly_one, finite, flag, folder, html_file, joint_names, lengths, line, machine, needed_by, outside_numbers,
-    pictures, pose, readings, reads, scaled, seed_of, some_of, span, table_out, tilts, times, under, value,
-    whole, writes,
+    exactly_one, finite, flag, folder, html_file, joint_names, lengths, line, machine, needed_by, numbers,
+    outside_numbers, pictures, pose, readings, reads, scaled, seed_of, some_of, span, table_out, tilts, times, under,
+    value, vector, whole, writes,
 )  # fmt: skip
 
 
@@ -390,6 +390,11 @@ example:
                 value("--goal-um", above_zero, "UM", "allowed RMS tool error, the datum aligned: propose a campaign "
                                                      "that reaches it"),
                 value("--tilt-deg", bound, "DEG", "tilt of the tool at which the goal must also hold (default 0)"),
+                value("--tools-kg", numbers, "KG,…", "masses of other tools that the model will be told, for which the "
+                                                    "goal must also hold, and with which readings may be taken (with "
+                                                    "--load)"),
+                value("--gravity", vector, "X,Y,Z", "the same for another direction of gravity in base, m/s²; may be "
+                                                     "repeated", action="append"),
                 value("--instruments", None, "A,B,…", f"available instruments: {', '.join(INSTRUMENTS)} (default "
                                                       "linear)"),
                 value("--hours", above_zero, "H", "time available for measuring (default 4)"),
@@ -411,7 +416,8 @@ example:
   $ hexapod_comp plan --goal-um 3 --tilt-deg 10 --instruments linear,tracker_6d --hours 4 --out mine.yaml""",
         (
             some_of("campaign", "--goal-um"),
-            needed_by("--goal-um", "--tilt-deg", "--instruments", "--hours", "--time", "--out"),
+            needed_by("--goal-um", "--tilt-deg", "--tools-kg", "--gravity", "--instruments", "--hours", "--time",
+                      "--out"),
         ),
     ),
     "imagine": Verb(

@@ -6,7 +6,6 @@ tools that no reading has seen.
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -19,9 +18,16 @@ from helpers import long_test
 from hexapod_comp.calibration.blocks.load import as_loaded, refuse_half_stated
 from hexapod_comp.calibration.changes import PAYLOAD, TEMPERATURE, CheckReadings, payload_changes, widened
 from hexapod_comp.calibration.check import NAMED, VALID, refusal, verification_report, verify_model
+from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
-from hexapod_comp.calibration.posterior import FirstOrder, FittedParameters, about_stiffness, box_stations
+from hexapod_comp.calibration.posterior import (
+    FirstOrder,
+    FittedParameters,
+    box_errors,
+    box_stations,
+    expected_error,
+)
 from hexapod_comp.calibration.posterior_file import load_posterior, save_with_posterior
 from hexapod_comp.calibration.sensitivity import derivatives, predict
 from hexapod_comp.cli import main
@@ -74,39 +80,41 @@ def left(fitted: ModelFit, payload: Payload) -> float:
 
 
 def test_a_stated_stiffness_holds_for_tools_that_no_reading_has_seen() -> None:
-    """The bar: at most 1.3 times what it leaves with the tool as calibrated. Blind, the same machine leaves more."""
+    """The bar: at most 1.3 times what it leaves with the tool as calibrated, and within the promise for that tool.
+
+    Blind, the same machine leaves more. One load shows something of a stiffness by the places where it is read.
+    """
     told, blind = fit(TOLD), fit(BLIND)
     as_calibrated = left(told, SPINDLE)
     for payload in (LIGHT, HEAVY):
-        assert left(told, payload) < 1.3 * as_calibrated
+        promise = told.under(payload)
+        assert promise is not None
+        assert left(told, payload) < min(1.3 * as_calibrated, promise.high)
         assert left(blind, payload) > 3.0 * as_calibrated
-    assert told.space.block("compliance") is None, "one load cannot show it"
-    np.testing.assert_array_equal(told.model.load.stiffness, STATED.stiffness)
-    assert any(
-        "the promise holds for these; under other loads it depends on the stated stiffness" in note
-        for note in told.notes
-    )
+    block = told.space.block("compliance")
+    assert block is not None
+    assert (np.abs(told.model.load.compliance - TRUE.compliance) < 4.0 * told.standard_errors[block.part]).all()
+    said = "the promise holds for these; told another load, a level tool is expected to err by: no tool "
+    assert any(said in note for note in told.notes)
     assert any("no struts' stiffness is stated" in note for note in blind.notes)
 
 
-def test_a_fit_says_what_a_stiffness_that_is_off_adds_under_another_load() -> None:
-    """Against the core: 10 N more along each axis on struts that are a tenth softer, as gravity of 50 kg more."""
-    space = fit(TOLD).space
-    stated = float(re.findall(r"that adds ([\d.]+) µm for each 10 N", about_stiffness(space, np.zeros(space.size)))[0])
-    stations, errors = box_stations(space), []
+def test_a_fit_promises_for_another_load_what_the_machines_of_its_posterior_err_there() -> None:
+    """Forty machines drawn, driven by the core with 20 kg; the mean of as many squares is known to a tenth."""
+    space, x, covariance = fit(TOLD).space, fit(TOLD).solution.x, fit(TOLD).covariance
+    load = HEAVY.mass, *HEAVY.centre, *DOWN
+    stations, rng, squares = box_stations(space, load=load), np.random.default_rng(1), []
     assert stations is not None
-    for axis in np.eye(3):
-        row = [*[np.nan] * 4, *(DOWN + 10.0 / STATED.mass * axis)]
-        shifts = []
-        for soft in (1.0, 1.1):
-            told = replace(TOLD, load=replace(STATED, stiffness=STATED.stiffness / soft).numbers())
-            one = ParameterSpace((space.geometry, space.region), replace(told, blocks=()))
-            at = [replace(stations, loads=np.tile(r, (len(stations), 1))) for r in (row, [*[np.nan] * 4, *DOWN])]
-            shifts.append(np.subtract(*(predict(one, np.zeros(one.size), each).errors for each in at)))
-        columns = (shifts[1] - shifts[0])[..., None]
+    np.testing.assert_array_equal(stations.loads, np.tile(load, (len(stations), 1)))
+    fitted = predict(space, x, stations).errors
+    for other in rng.multivariate_normal(x, covariance, 40):
+        columns = (predict(space, other, stations).errors - fitted)[..., None]
         aligned = FirstOrder(stations.positions + stations.rotations @ space.probe, columns).aligned()
-        errors.append(1e6 * np.sqrt((aligned.values[:, :3] ** 2).sum(axis=1).mean()))
-    assert max(errors) == pytest.approx(stated, rel=0.05)
+        squares.append((aligned.values[:, :3] ** 2).sum(axis=1).mean())
+    promise = expected_error(box_errors(space, x, load=load), covariance)
+    assert promise is not None
+    assert np.sqrt(np.mean(squares)) == pytest.approx(promise.after, rel=0.2)
+    assert expected_error(box_errors(space, x), covariance).after < promise.after  # type: ignore[union-attr]
 
 
 def test_readings_at_two_loads_refine_the_stiffness() -> None:
@@ -118,7 +126,7 @@ def test_readings_at_two_loads_refine_the_stiffness() -> None:
     assert np.abs(off).mean() < 0.75 * np.abs(STATED.compliance - TRUE.compliance).mean()
     assert (np.abs(off) < 4.0 * fitted.standard_errors[block.part]).all()
     assert left(fitted, HEAVY) < 1.3 * left(fitted, SPINDLE)
-    assert any("between them; the stiffness was refined" in note for note in fitted.notes)
+    assert any("read with tools of 0 to 10 kg" in note for note in fitted.notes)
 
 
 @pytest.mark.parametrize("axes", [None, np.roll(np.eye(3), 1, 0)[[0, 1, 0, 1, 0, 1]]], ids=["ball", "cardan"])
@@ -286,4 +294,11 @@ def test_lost_motion_and_friction_are_fitted_where_forces_change_their_sign() ->
     checked = laid.select(np.isin(laid.station, near) | (np.arange(len(laid)) % 20 == 0))
     check = CheckReadings.of(wide, measure(checked, plan, at_once, 5))
     assert len(near) >= 5
+    weighed, all_alike = (
+        Estimation(laid, wide.space).linearise(wide.x, np.ones(len(laid)), unsettled)[0].scale
+        for unsettled in (True, False)
+    )
+    at_its_end = np.isin(Estimation(laid, wide.space).cells.station, near)
+    assert (weighed[at_its_end] < 0.3 * all_alike[at_its_end]).mean() > 0.6, "the fit hardly counts what they move"
+    assert (weighed == all_alike).mean() > 0.7
     assert check.chi_square(wide.covariance) < 1.0 + 4.0 * np.sqrt(2.0 / len(check.residuals))

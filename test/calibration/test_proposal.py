@@ -1,5 +1,6 @@
 """Proposed campaigns: gains by plain linear algebra, expectations by another way, the limits of each machine."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import calibration_helpers as small
@@ -15,12 +16,14 @@ from hexapod_comp.calibration.design import (
     Proposal,
     Times,
     plan,
+    proposal_report,
     propose,
     verdict,
 )
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.load import Load
 from hexapod_comp.measurements.campaign import Campaign, campaign_text, load_campaign, template
 
 HOUR = 3600.0
@@ -146,3 +149,29 @@ def test_instruments_that_shops_own(instrument: str, tmp_path: Path) -> None:
 def test_wrong_goals(change: dict, complaint: str) -> None:
     with pytest.raises(CalibrationError, match=complaint):
         Goal(**{"error": 1.0 * UM, **change})
+
+
+def test_a_goal_under_other_loads_says_under_how_many_to_read() -> None:
+    """Two loads where the readings of one leave more than the goal under the other; one where they do not.
+
+    Struts of 5 N/µm under 60 kg, stated to 10 %: the machine lies on its side. Truth: the fewer loads, by the planner's
+    own expectation for the campaign of the wider goal.
+    """
+    load = Load(stiffness=np.full(6, 5e6), mass=60.0).numbers()
+    settings = replace(small.FEW, blocks=("pitch", "wave", "compliance"), load=load)
+    place = MeasuringBox(small.paper(), small.BOX, np.eye(3), 0.0)
+    aside = ((0.0, 0.0, 0.0, 0.0, 9.80665, 0.0, 0.0),)
+    few, many = (
+        propose(place, Goal(error, instruments=("linear",), seconds=20 * HOUR, loads=aside), settings)
+        for error in (20.0 * UM, 0.8 * UM)
+    )
+    names = ["level", "level, tool of 0 kg, gravity (9.80665, 0, 0) m/s²"]
+    for plan_of, loads in ((few, 1), (many, 2)):
+        assert list(plan_of.expected) == names
+        assert plan_of.met
+        assert len(set(plan_of.loads)) == loads
+        assert f"loads to read under: {loads} of 2" in proposal_report(plan_of)
+    first = [load == "" for load in many.loads]
+    assert first == sorted(first, reverse=True), "the load is changed once"
+    with pytest.raises(CalibrationError, match="need the stiffness of the struts"):
+        propose(place, Goal(UM, loads=aside), small.FEW)

@@ -237,7 +237,7 @@ def test_calibrations_derivatives_are_effects_of_single_errors():
     readings = small.scattered(small.paper(), poses, None, probe)
     space = ParameterSpace(readings, FitSettings(lead=small.LEAD, field_degree=2))
     base, platform = (np.tile(each, (len(poses), 1, 1)) for each in (geometry.base_joints, geometry.platform_joints))
-    nominal = Prediction(np.zeros((len(poses), 6)), positions, rotations, base, platform, Load())
+    nominal = Prediction(np.zeros((len(poses), 6)), positions, rotations, base, platform, Load(), geometry)
     rows = derivatives(space, nominal, readings.stations)[:, :, space.block("structure").part][:, :, :18]
     found = root_sum_of_squares(covariance_vectors(rows, 10e-6**2 * np.eye(18)))
     budget = Budget(geometry.name, {"base_joint_xy": 10e-6, "base_joint_z": 10e-6})

@@ -69,6 +69,7 @@ class Prediction:
     base_joints: np.ndarray  # (M, 6, 3): real joints at each station's temperatures, m
     platform_joints: np.ndarray
     load: Load
+    geometry: HexapodGeometry
 
 
 class Linkage:
@@ -76,7 +77,7 @@ class Linkage:
 
     def __init__(self, prediction: Prediction, probe: np.ndarray, stations: Stations) -> None:
         self.stations, self.rotations, self.base_joints = stations, prediction.rotations, prediction.base_joints
-        self.load = prediction.load
+        self.load, self.geometry = prediction.load, prediction.geometry
         self.arms = np.einsum("nij,nkj->nki", self.rotations, prediction.platform_joints)  # from the platform's origin
         struts = prediction.positions[:, None] + self.arms - self.base_joints
         self.lengths = np.linalg.norm(struts, axis=2)
@@ -107,7 +108,8 @@ class Block(ABC):
 
     name: ClassVar[str]
     unit: ClassVar[str]  # SI
-    tolerance: ClassVar[float]  # first guess of the prior's standard deviation; the fit estimates it
+    tolerance: float  # first guess of the prior's standard deviation; the fit estimates it
+    stated: ClassVar[bool] = False  # whether the tolerance is known, and the block with it in every fit
     labels: tuple[str, ...]  # names of the parameters
     root: np.ndarray  # (n, n): root of the prior's correlation
     part = slice(0, 0)  # its slice of the parameter vector

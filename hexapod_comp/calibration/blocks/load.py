@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from functools import lru_cache
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from ...core import SLIDING
 from ...errors import CalibrationError
+from ...machine.arrays import rms
 from ...machine.geometry import STRUT_NAMES, HexapodGeometry
 from ...machine.load import MOST_LOADS, Load
 from ...measurements.readings import MeasurementSet, Stations
@@ -62,12 +64,12 @@ def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) ->
     return tuple(map(tuple, different[kept].tolist()))
 
 
-def bearing_forces(geometry: HexapodGeometry, linkage: Linkage) -> np.ndarray:
+def bearing_forces(linkage: Linkage) -> np.ndarray:
     """Return the forces on the platform of bearings that resist with 1 N m, by each strut's, (M, 6, 3), N."""
-    u, motion = linkage.directions, linkage.stations.sense[:, None, :3]
+    u, motion, axes = linkage.directions, linkage.stations.sense[:, None, :3], linkage.geometry.base_axes
     slow = SLIDING * np.maximum(np.linalg.norm(motion, axis=2), 1.0)
-    if geometry.base_axes is not None:  # two bearings of a cardan joint turn
-        yoke = np.cross(geometry.base_axes, u)
+    if axes is not None:  # two bearings of a cardan joint turn
+        yoke = np.cross(axes, u)
         share = np.linalg.norm(yoke, axis=2, keepdims=True)
         first = yoke / np.maximum(share, SLIDING)
         sides = (first, first / np.maximum(share, SLIDING)), (np.cross(first, u),) * 2
@@ -78,56 +80,57 @@ def bearing_forces(geometry: HexapodGeometry, linkage: Linkage) -> np.ndarray:
     return -force / linkage.lengths[..., None]
 
 
-def by_friction(geometry: HexapodGeometry, linkage: Linkage) -> np.ndarray:
+@lru_cache(maxsize=1)  # three blocks ask for the same linkage's
+def by_friction(linkage: Linkage) -> np.ndarray:
     """Return the struts' tensions by 1 N m in the bearings of each strut, (M, 6, 6), N."""
-    forces = bearing_forces(geometry, linkage)
+    forces = bearing_forces(linkage)
     wrenches = np.concatenate([forces, np.cross(linkage.arms, forces)], axis=2)
     return np.stack([linkage.tensions(wrenches[:, n]) for n in range(6)], axis=2)
 
 
-def tensions(geometry: HexapodGeometry, linkage: Linkage) -> np.ndarray:
+@lru_cache(maxsize=1)
+def tensions(linkage: Linkage) -> np.ndarray:
     """Return what the struts pull with under weight and friction at a linkage's stations, (M, 6), N."""
     load = linkage.load
-    mass, moment, gravity = weights(load, geometry, linkage.stations)
+    mass, moment, gravity = weights(load, linkage.geometry, linkage.stations)
     torque = np.cross(np.einsum("mij,mj->mi", linkage.rotations, moment), gravity)
     pulled = linkage.tensions(np.concatenate([mass[:, None] * gravity, torque], axis=1))
-    return pulled + by_friction(geometry, linkage) @ load.friction if load.friction.any() else pulled
+    return pulled + by_friction(linkage) @ load.friction if load.friction.any() else pulled
 
 
-def taken_up(geometry: HexapodGeometry, linkage: Linkage) -> np.ndarray:
+def taken_up(linkage: Linkage) -> np.ndarray:
     """Return the share of half its lost motion by which each strut is longer at a linkage's stations, (M, 6), −1…1."""
-    return np.clip(tensions(geometry, linkage) / linkage.load.take_up, -1.0, 1.0)
+    return np.clip(tensions(linkage) / linkage.load.take_up, -1.0, 1.0)
 
 
-def unsettled_lengths(geometry: HexapodGeometry, linkage: Linkage) -> np.ndarray:
+def unsettled_lengths(linkage: Linkage) -> np.ndarray:
     """Return the standard deviation of the struts' lengths where the take-up exceeds their tension, (M, 6), m.
 
     A clearance goes to one of its ends, to which depends on a force that is known to no better than the take-up; the
     line between the ends, by which the model lengthens the strut, is the mean of both, weighted by their probabilities.
+    A strut whose own clearance hardly shows has the usual one of the six.
     """
-    deviation: np.ndarray = 0.5 * linkage.load.lost_motion * np.sqrt(1.0 - taken_up(geometry, linkage) ** 2)
+    usual = np.maximum(linkage.load.lost_motion, rms(linkage.load.lost_motion))
+    deviation: np.ndarray = 0.5 * usual * np.sqrt(1.0 - taken_up(linkage) ** 2)
     return deviation
 
 
 def as_loaded(settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> set[str]:
-    """Return the blocks of load that stations cannot show: at one load, or with forces of one sign, struts look longer.
+    """Return the blocks of load that stations cannot show: with forces of one sign, struts look longer.
 
     Forces are those of the nominal machine.
     """
     load, hidden = stated_load(settings), {"compliance", "lost motion", "friction"}
     if not settings.load or not len(stations):
         return hidden
-    mass, _, gravity = weights(load, geometry, stations)
-    forces = mass[:, None] * gravity
     if load.stiffness.all():
-        if np.linalg.norm(np.ptp(forces, axis=0)) >= ASSUMED.least_load:
-            hidden.remove("compliance")
+        hidden.remove("compliance")
         if stations.sense[:, :3].any():
             hidden.remove("friction")
     base, platform = (np.tile(each, (len(stations), 1, 1)) for each in (geometry.base_joints, geometry.platform_joints))
     errors = np.zeros((len(stations), 6))
-    nominal = Prediction(errors, stations.positions, stations.rotations, base, platform, load)
-    pulled = tensions(geometry, Linkage(nominal, np.zeros(3), stations))
+    nominal = Prediction(errors, stations.positions, stations.rotations, base, platform, load, geometry)
+    pulled = tensions(Linkage(nominal, np.zeros(3), stations))
     if ((pulled.min(axis=0) < -load.take_up) & (pulled.max(axis=0) > load.take_up)).any():
         hidden.remove("lost motion")
     return hidden
@@ -137,17 +140,15 @@ class LoadBlock(Block):
     """A term of the load block, one number a strut, beyond what is stated; those of one machine's struts are alike."""
 
     term: ClassVar[str]  # its name in Draft.load
-    alike: ClassVar[float] = 0.0  # correlation of the struts' numbers
 
-    def __init__(self, geometry: HexapodGeometry) -> None:
-        self._geometry = geometry
+    def __init__(self, facts: Facts) -> None:
         self.labels = tuple(f"{strut} {self.name}" for strut in STRUT_NAMES)
-        self.root = np.linalg.cholesky(self.alike + (1.0 - self.alike) * np.eye(6))
+        self.root = np.linalg.cholesky(ASSUMED.alike + (1.0 - ASSUMED.alike) * np.eye(6))
 
     @classmethod
     def of(cls, facts: Facts) -> LoadBlock | None:
         """If a stiffness is stated; the settings' blocks report whether readings show it."""
-        return cls(facts.geometry) if stated_load(facts.settings).stiffness.all() else None
+        return cls(facts) if stated_load(facts.settings).stiffness.all() else None
 
     @abstractmethod
     def stretched(self, linkage: Linkage) -> np.ndarray:
@@ -166,11 +167,17 @@ class LoadBlock(Block):
 class Compliance(LoadBlock):
     """c of each strut, m/N: δl = c · its tension."""
 
-    name, unit, tolerance, term = "compliance", "m/N", 15e-9, "compliance"
+    name, unit, tolerance, term, stated = "compliance", "m/N", 15e-9, "compliance", True
+
+    def __init__(self, facts: Facts) -> None:
+        super().__init__(facts)
+        compliance = stated_load(facts.settings).compliance
+        self.tolerance = ASSUMED.stated_stiffness * compliance.mean()
+        self.root = compliance[:, None] / compliance.mean() * self.root
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
         """The struts' tensions."""
-        return tensions(self._geometry, linkage)[..., None] * np.eye(6)
+        return tensions(linkage)[..., None] * np.eye(6)
 
 
 class LostMotion(LoadBlock):
@@ -180,27 +187,25 @@ class LostMotion(LoadBlock):
     """
 
     name, unit, tolerance, term = "lost motion", "m", 3e-6, "lost_motion"
-    alike = ASSUMED.alike
 
     @classmethod
     def of(cls, facts: Facts) -> LoadBlock | None:
         """Where it is stated what the struts carry, be they rigid."""
-        return cls(facts.geometry) if facts.settings.load else None
+        return cls(facts) if facts.settings.load else None
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
         """Half the sign of the struts' tensions."""
-        return 0.5 * taken_up(self._geometry, linkage)[..., None] * np.eye(6)
+        return 0.5 * taken_up(linkage)[..., None] * np.eye(6)
 
 
 class Friction(LoadBlock):
     """Torque of each bearing of a strut against its turning, N m: it changes all tensions by the motion's direction."""
 
     name, unit, tolerance, term = "friction", "N m", 0.5, "friction"
-    alike = ASSUMED.alike
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
         """Stretch by the struts' tensions, and the reversal of lost motions."""
         load = linkage.load
-        turning = np.abs(taken_up(self._geometry, linkage)) < 1.0
+        turning = np.abs(taken_up(linkage)) < 1.0
         per_newton = load.compliance + 0.5 * load.lost_motion / load.take_up * turning
-        return per_newton[..., None] * by_friction(self._geometry, linkage)
+        return per_newton[..., None] * by_friction(linkage)
