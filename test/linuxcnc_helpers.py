@@ -43,12 +43,6 @@ ALONE_WITHIN = 120.0
 START_WITHIN, STOP_WITHIN = 180.0, 30.0
 """For a machine under load, s."""
 
-AXES = slice(1, 7)
-STRUTS = slice(7, 13)
-CORRECTIONS = slice(13, 19)
-ALIVE, STATUS = 19, 20
-"""Columns of a record by halsampler -t, see recorder.hal; column 0 is the number of the servo cycle."""
-
 DELAY = 3
 """Servo cycles by which the struts follow the commanded axes: motion's cubic interpolation of joints, and the drive.
 
@@ -76,16 +70,9 @@ def why_not() -> str | None:
 
 
 def as_ordinary_user() -> list[str]:
-    """Return the words before a command that run it as an ordinary user who can read interpreter and sources.
-
-    Root becomes nobody. An interpreter or a checkout under /root, say, takes the capability to read
-    everything with it, which does not make a root of nobody.
-
-    Raises
-    ------
-    RuntimeError
-        No way was found.
-    """
+    """Return the words before a command that run it as an ordinary user who can read interpreter and sources."""
+    # Root becomes nobody. An interpreter or a checkout under /root, say, takes the capability to read everything with
+    # it, which does not make a root of nobody.
     if os.geteuid() != 0:
         return []
     nobody = pwd.getpwnam("nobody")
@@ -151,13 +138,7 @@ def segments() -> list[Segment]:
 
 
 def clean_up_after_a_crash() -> None:
-    """Remove what a LinuxCNC of our user has left that nobody uses any more.
-
-    Raises
-    ------
-    RuntimeError
-        Another LinuxCNC runs on this machine, or somebody else's has crashed.
-    """
+    """Remove what a LinuxCNC of our user has left that nobody uses any more."""
     end = time.monotonic() + ALONE_WITHIN
     while any(segment.attached for segment in segments()):
         if time.monotonic() > end:
@@ -256,12 +237,7 @@ def until(condition: Callable[[], Any], what: str, timeout: float, log: Callable
 class Linuxcnc:
     """A LinuxCNC with the shipped configuration, steered through console.py.
 
-    Parameters
-    ----------
-    changes : dict of str to str, optional
-        What is replaced in hexapod.inc: text by text.
-    files : dict of str to str, optional
-        Further files of the configuration, or others in place of shipped ones.
+    `changes`: what is replaced in hexapod.inc, text by text; `files`: further files of it, or others in place of them.
     """
 
     def __init__(self, changes: dict[str, str] | None = None, files: dict[str, str] | None = None) -> None:
@@ -404,7 +380,7 @@ class Linuxcnc:
             until(lambda: self.get("sampler.0.curr-depth", "sampler.1.curr-depth") == [0, 0], "the record", 10.0)
             for reader in readers:
                 reader.end(signal.SIGINT)
-        record.rows, record.side = (np.loadtxt(path, comments="overrun", ndmin=2) for path in paths)
+        record.fill(*(np.loadtxt(path, comments="overrun", ndmin=2) for path in paths))
         assert self.get("sampler.0.overruns", "sampler.1.overruns") == [0, 0]
 
     def close(self) -> None:
@@ -448,51 +424,14 @@ class Linuxcnc:
 
 
 class Record:
-    """What the realtime sampler has seen in each servo cycle; lengths in mm, angles in degrees.
+    """What the realtime sampler has seen in each servo cycle; lengths in mm, angles in degrees."""
 
-    Attributes
-    ----------
-    rows : ndarray, shape (N, 21)
-        See :data:`AXES` and the other columns.
-    side : ndarray, shape (M, 10)
-        Cycle, six following errors, accepted and refused corrections, whether the machine is on and homed.
-    """
-
-    rows: np.ndarray
-    side: np.ndarray
-
-    @property
-    def axes(self) -> np.ndarray:
-        """X, Y, Z (mm), A, B, C (degrees) that LinuxCNC means the tool to be at, shape (N, 6)."""
-        return self.rows[np.maximum(np.arange(len(self.rows)) - DELAY, 0), AXES]
-
-    @property
-    def struts(self) -> np.ndarray:
-        """Lengths at the drives, mm, shape (N, 6)."""
-        return self.rows[:, STRUTS]
-
-    @property
-    def corrections(self) -> np.ndarray:
-        """Corrections in force, mm, shape (N, 6)."""
-        return self.rows[:, CORRECTIONS]
-
-    @property
-    def status(self) -> np.ndarray:
-        """The bridge's pin ``status``, shape (N,)."""
-        return self.rows[:, STATUS]
-
-    @property
-    def alive(self) -> np.ndarray:
-        """Whether the bridge's heart beats, shape (N,)."""
-        return self.rows[:, ALIVE] > 0.5
-
-    @property
-    def following_error(self) -> float:
-        """Largest following error, mm."""
-        return float(np.abs(self.side[:, 1:7]).max())
-
-    @property
-    def largest_step(self) -> float:
-        """Largest change of a correction from one servo cycle to the next, mm."""
-        assert (np.diff(self.rows[:, 0]) == 1.0).all(), "cycles are missing"
-        return float(np.abs(np.diff(self.corrections, axis=0)).max())
+    def fill(self, rows: np.ndarray, side: np.ndarray) -> None:
+        """Take the columns of recorder.hal; of `side` too, whose cycle comes first, then six following errors."""
+        self.side, delayed = side, np.maximum(np.arange(len(rows)) - DELAY, 0)
+        self.axes = rows[delayed, 1:7]  # X, Y, Z, A, B, C that LinuxCNC means the tool to be at
+        self.struts, self.corrections = rows[:, 7:13], rows[:, 13:19]  # lengths at the drives; corrections in force
+        self.alive, self.status = rows[:, 19] > 0.5, rows[:, 20]  # the bridge's heart beats; its pin `status`
+        self.following_error = float(np.abs(side[:, 1:7]).max())
+        assert (np.diff(rows[:, 0]) == 1.0).all(), "cycles are missing"
+        self.largest_step = float(np.abs(np.diff(self.corrections, axis=0)).max())  # from one servo cycle to the next

@@ -104,7 +104,7 @@ class Voice:
         self.rig.matched_anew(self.topic_name)
 
     def get_subscription_count(self) -> int:
-        return sum(end.topic_name == self.topic_name for node in self.rig.nodes for end in node.subscriptions)
+        return self.rig.audience(self.topic_name)
 
 
 class Stranger:
@@ -135,7 +135,7 @@ class Stranger:
         return len(self._rig.speakers("/" + topic.lstrip("/")))
 
     def count_subscribers(self, topic: str) -> int:
-        return sum(end.topic_name == f"/{topic}" for node in self._rig.nodes for end in node.subscriptions)
+        return self._rig.audience(f"/{topic}", listeners=False)
 
 
 class Messages(list[Any]):
@@ -233,9 +233,7 @@ class Rig(Bench):
         patch.setattr(Node, "get_clock", lambda node: self.ros_clock)
         patch.setattr(Node, "count_publishers", lambda node, topic: len(self.speakers(topic)))
         patch.setattr(Subscription, "get_publisher_count", lambda end: len(self.speakers(end.topic_name)))
-        patch.setattr(
-            Publisher, "get_subscription_count", lambda end: sum(topic == end.topic_name for topic, _ in self.listeners)
-        )
+        patch.setattr(Publisher, "get_subscription_count", lambda end: self.audience(end.topic_name))
         patch.setattr(Publisher, "publish", lambda end, message: self._published(end, message))
         patch.setattr(Service, "send_response", lambda service, response, header: header.append(response))
         for topic in SENT.keys() - {"strut_commands", "strut_setpoints"}:
@@ -251,6 +249,11 @@ class Rig(Bench):
         """Return the full name of each publisher's node."""
         ours = [f"/{node.get_name()}" for node in self.nodes for end in node.publishers if end.topic_name == topic]
         return ours + [voice.name for voice in self.voices if voice.topic_name == topic]
+
+    def audience(self, topic: str, listeners: bool = True) -> int:
+        """Return how many subscribe to a topic: nodes, and what the test listens to."""
+        nodes = sum(end.topic_name == topic for node in self.nodes for end in node.subscriptions)
+        return nodes + listeners * sum(name == topic for name, _ in self.listeners)
 
     def add_publisher(self, topic: str) -> None:
         self._publishers[topic] = Voice(self, topic, SENT[topic], "/witness")

@@ -13,16 +13,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from node_helpers import HOME, Bench, model_file, near
-from node_recorder import Recorder
-from replay_helpers import RecordedMachine, write_bag
+from node_helpers import HOME, Bench, near
+from replay_helpers import RecordedMachine
 
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.pose import Pose
 from hexapod_comp.replay.bag import Recording, read_recording
 from hexapod_comp.replay.replay import BEFORE, IDENTICAL, Replay, replay_recording
 from hexapod_comp.ros import recorder
-from hexapod_comp.ros.messages import pose_message
 from hexapod_comp.ros.recorder import RESERVE, BagRecorder, BagWriter
 
 
@@ -37,43 +35,6 @@ def along(n: int) -> Pose:
     return near(
         HOME, (6e-4 * np.sin(0.1 * n), 4e-4 * np.sin(0.13 * n), 2e-4 * np.sin(0.07 * n)), 0.06 * np.sin(0.1 * n)
     )
-
-
-def test_a_run_with_everything_is_replayed_bit_for_bit(bench, tmp_path):
-    """Ramps in and out and at another rate, a temperature, another model, a reset to measured struts, refusals."""
-    model = model_file(tmp_path, struts={"offset_um": 30.0, "backlash_um": 8.0, "expansion_ppm_per_K": 11.0})
-    bench.compensator(model_file=model, temperature_time_constant_s=0.0)
-    recorder = Recorder(bench)
-    answers = [bench.ask(along(n)) for n in range(40)]
-    bench.warm("strut_3", 24.7)
-    answers += [bench.ask(along(n)) for n in range(40, 60)]
-    bench.enable(False)
-    answers += [bench.ask(along(n)) for n in range(60, 70)]
-    assert bench.set_parameter("compensator", "ramp_rate", 2.5e-3).successful
-    answers += [bench.ask(along(n)) for n in range(70, 80)]
-    other = model_file(tmp_path, "other.yaml", struts={"offset_um": -20.0, "pitch_ppm": 40.0})
-    assert bench.set_parameter("compensator", "model_file", other).successful
-    assert bench.trigger("reload_model").success
-    bench.enable(True)
-    answers += [bench.ask(along(n)) for n in range(80, 120)]
-    bench.send(near(HOME, (0.1, 0.0, 0.0)))  # too far in one step
-    bench.barrier()
-    bench.send(pose_message(HOME, "nowhere"))
-    bench.feed(answers[-1].lengths + 5e-6)
-    bench.until(lambda: bench.trigger("reset").success, "a machine that stands")
-    bench.feed(answers[-1].lengths + 5e-6)
-    bench.barrier()
-    answers += [bench.ask(along(n)) for n in range(119, 150)]
-    recorder.stop()
-    recording, result = replayed(write_bag(tmp_path / "run", recorder.messages))
-    assert (result.outcome == IDENTICAL).all()
-    assert len(result.outcome) == len(answers)
-    sent = np.array([answer.lengths for answer in answers])
-    assert result.lengths[:, 0].tobytes() == sent.tobytes(), "the truth is what the node sent, not what the bag says"
-    assert not result.states_differ
-    assert {event.entry.what for event in result.changes} == {"temperature", "enable", "ramp_rate", "model", "reset"}
-    assert [event.entry.values["reason"] for event in result.refused] == ["step", "frame_id"]
-    assert len(recording.sources) >= 3, "geometry and both models"
 
 
 def wait_for_page(rig: Bench) -> None:
@@ -127,7 +88,7 @@ def machine() -> RecordedMachine:
     return made
 
 
-@pytest.mark.parametrize("room", [0.5, 17.0, 33.0])
+@pytest.mark.parametrize("room", [0.5, 17.0])
 def test_a_recording_ends_while_its_disk_has_room_to_close_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, machine: RecordedMachine, room: float
 ) -> None:

@@ -43,7 +43,6 @@ from node_stories import (
     says,
     seen,
     send,
-    setting,
     shows,
     struts,
     tell,
@@ -623,15 +622,6 @@ def test_somebody_else_sends_strut_commands(rig):
     assert rig.values(DRIVE)["commanded_by"] == "/compensator"
 
 
-def test_a_drive_without_readings_and_with_them_again(rig):
-    """Compensation goes on; the estimate comes from the commands; with the readings it recovers."""
-    loop(rig, command_timeout=0.0)
-    rig.settle(HOME)
-    play(rig, [says(OK, "running"), setting("fault_feedback_drop", 1.0, DRIVE)])
-    play(rig, [says(WARN, "feedback lost, pose estimated from own commands"), ask(z=0.2)])
-    play(rig, [setting("fault_feedback_drop", 0.0, DRIVE), says(OK, "running")])
-
-
 @pytest.mark.parametrize("active", [True, False], ids=["active", "inactive"])
 def test_after_a_shutdown_nothing_is_published(rig, active):
     """Before, heartbeats, journal, diagnostics and readings went on. Without a timer nothing comes by itself."""
@@ -802,16 +792,4 @@ def test_a_model_that_cannot_be_reloaded_leaves_the_old_one(rig, tmp_path, case)
     assert text in rig.until_status(WARN, "the old model stays")["last_failed_reload"]
     assert rig.values()["failed_reloads"] == "1"
     rig.until_status(OK, "running")
-    np.testing.assert_allclose(rig.ask(HOME).corrections, -100e-6, rtol=0.0, atol=ROUNDING)
-
-
-def test_a_model_by_name_comes_from_the_model_folder_alone(rig, tmp_path):
-    folder = tmp_path / "models"
-    folder.mkdir()
-    outside = model_file(tmp_path, name="outside.yaml")
-    model_file(folder, name="mine.yaml", struts={"offset_um": 100.0})
-    rig.compensator(start=False, model_folder=str(folder), model_file=f"{folder}/../outside.yaml").trigger_configure()
-    (line,) = rig.logged("cannot configure")
-    assert f"leads to {outside}" in line
-    play(rig, [setting("model_file", "mine.yaml"), change("configure", "activate")])
     np.testing.assert_allclose(rig.ask(HOME).corrections, -100e-6, rtol=0.0, atol=ROUNDING)

@@ -11,11 +11,10 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import yaml
 from launch_stand_in import LaunchFile
-from node_helpers import CONFIG, HOME, Bench
+from node_helpers import CONFIG, Bench
 from rclpy.qos import ReliabilityPolicy
 
 from hexapod_comp.machine.geometry import load_geometry
@@ -234,28 +233,3 @@ def test_misspelt_arguments_are_refused(launch_file: LaunchFile) -> None:
 
 
 # ---- two machines ----
-
-
-def test_two_machines_in_one_graph_keep_to_their_frames(ros_context: Any, capfd: Any, tmp_path: Path) -> None:
-    """As the launch file starts them: each takes commands in its own frames alone, and speaks in them."""
-    here = (ros_context, capfd)
-    with Bench(*here, "/left") as left, Bench(*here, "/right") as right:
-        for rig, side in ((left, "left"), (right, "right")):
-            frames = {"base_frame": f"{side}/base", "work_frame": f"{side}/work"}
-            rig.drive(base_frame=f"{side}/base")
-            rig.compensator(**frames)
-        for rig, side, other in ((left, "left", "right"), (right, "right", "left")):
-            answer = rig.ask(HOME, f"{side}/work")
-            assert rig.estimate(answer.command).header.frame_id == f"{side}/base"
-            rig.until(lambda rig=rig: rig.seen["tool_pose_true"], "the true pose")
-            assert rig.seen["tool_pose_true"][-1].header.frame_id == f"{side}/base"
-            rig.until(lambda rig=rig: rig.seen["compensator/markers"], "markers")
-            markers = rig.seen["compensator/markers"][-1].markers
-            assert {marker.header.frame_id for marker in markers} == {f"{side}/base"}
-            for frame in (f"{other}/base", "base"):
-                before = len(rig.seen["strut_commands"])
-                rig.send(HOME, frame)
-                rig.until(lambda rig=rig, frame=frame: repr(frame) in rig.values().get("last_refusal", ""), frame)
-                assert len(rig.seen["strut_commands"]) == before
-            assert rig.status().hardware_id == f"{side}/paper"
-        np.testing.assert_allclose(left.seen["strut_commands"][-1].position, right.seen["strut_commands"][-1].position)
