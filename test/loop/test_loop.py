@@ -8,19 +8,39 @@ from the package. The reversal bands, ticks and Newton steps add 1e-9 m, which i
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from helpers import central_difference, moved, table_poses, twist_between
+from foreign_machines import machines
+from helpers import central_difference, long_test, moved, table_poses, twist_between
 from node_helpers import CONFIG, HOME, Rig, closed_form_lengths
+from strategies import paper_geometry
 
+from hexapod_comp import cli
+from hexapod_comp.compensation.checks import check
 from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.errors import NoAnswerError
+from hexapod_comp.formats.csv import Row
+from hexapod_comp.formats.figures import save
+from hexapod_comp.formats.json import plain
+from hexapod_comp.loop import report, session, story
+from hexapod_comp.loop.pictures import session_figure
+from hexapod_comp.loop.report import ALIGNED, AS_IT_IS, PoseRecord, SessionResult, busy_text, error_table, pose_block
+from hexapod_comp.machine.arrays import rms
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.machine.model import RealMachine
+from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.trajectory import move
-from hexapod_comp.pose import Pose
+from hexapod_comp.pose import Pose, rotation_from_angles
 from hexapod_comp.ros.messages import message_pose
 from hexapod_comp.virtual.machine import DriveParameters, StrutDrive
+from hexapod_comp.workspace.reach import machine_box
 
 STEP = ENCODER = 0.1e-6  # motor step of a fine drive, the shipped default, and encoder count, m
 NOISE = 0.05e-6  # standard deviation of an encoder reading, m
@@ -92,3 +112,180 @@ def test_only_quantisation_stands_between_the_model_and_the_tool(rig: Rig, model
         bound = tool_bound(TARGETS[-1], ENCODER / 2.0 + 6.0 * NOISE)
         for message in rig.seen["tool_pose_estimate"][-20:]:
             assert (np.abs(twist_between(found[-1], message_pose(message))) <= bound).all()
+
+
+# ---- what run says ----
+
+TURNED_WORK = Pose(np.array([0.03, -0.02, 0.35]), rotation_from_angles(np.radians([4.0, -7.0, 90.0])))
+TURNED_TOOL = Pose(np.array([0.01, 0.02, 0.05]), rotation_from_angles(np.radians([10.0, 5.0, -60.0])))
+GIVEN = Pose(np.array([0.012, -0.034, 0.056]), rotation_from_angles(np.radians([1.0, -2.0, 3.0])))
+OFF = np.array([30e-6, -40e-6, 0.0])  # in the work frame: 50 µm
+
+
+@pytest.fixture
+def result(monkeypatch: pytest.MonkeyPatch) -> SessionResult:
+    """Return what a loop would tell of one pose: it hears and answers in ``base``, the tool ends up 50 µm off."""
+    told: list[Pose] = []
+
+    def run_session(client: object, geometry: object, targets: list[Pose], *rest: object) -> SessionResult:
+        told.extend(targets)
+        true = TURNED_WORK @ Pose(GIVEN.position + OFF, GIVEN.rotation)
+        return SessionResult([PoseRecord(target, np.zeros(6), np.zeros(6), target, None, true) for target in targets])
+
+    client = SimpleNamespace(close=lambda: None)
+    for name, stand_in in (("connect", lambda *_: None), ("run_session", run_session)):
+        monkeypatch.setattr(session, name, stand_in)
+    monkeypatch.setattr(session, "loop_client", lambda _: client)
+    geometry = replace(paper_geometry(), work=TURNED_WORK, tool=TURNED_TOOL)
+    found = session.run_poses(geometry, (), [GIVEN], 100.0, False)
+    in_base = TURNED_WORK.position + TURNED_WORK.rotation @ GIVEN.position
+    np.testing.assert_allclose(told[0].position, in_base, rtol=0, atol=1e-15)
+    return found
+
+
+def test_json_says_the_frame_and_gives_back_the_users_own_numbers(result: SessionResult):
+    content = plain(report.as_json([Row(2, "1")], result, {}))
+    assert content["frame"] == "work"
+    (pose,) = content["poses"]
+    given = {"x_mm": 12.0, "y_mm": -34.0, "z_mm": 56.0, "alpha_deg": 1.0, "beta_deg": -2.0, "gamma_deg": 3.0}
+    assert pose["commanded"] == pytest.approx(given, abs=1e-9)  # some roundings of 1e-13 mm, a thousandfold
+    assert pose["estimated"] == pytest.approx(given, abs=1e-9)
+    assert pose["true"] == pytest.approx(given | {"x_mm": 12.030, "y_mm": -34.040}, abs=1e-9)
+    assert pose["error_with"]["position_um"] == pytest.approx(50.0, abs=1e-6)
+
+
+def test_text_says_the_frame_and_gives_back_the_users_own_numbers(result: SessionResult):
+    title, commanded, *rest = pose_block("pose 1", result.poses[0]).splitlines()
+    assert title == "pose 1: tool in work"
+    assert [float(word) for word in commanded.split()[2:7:2]] == [12.0, -34.0, 56.0]
+    (true,) = (line for line in rest if line.split()[0] == "true")
+    assert [float(word) for word in true.split()[2:7:2]] == [12.03, -34.04, 56.0]
+
+
+# The datum: one rigid motion of everything that the tool does.
+
+DATUM = Pose(np.array([90e-6, -40e-6, 10e-6]), rotation_from_angles(np.array([2e-4, -1e-4, 3e-4])))
+
+
+def shifted(count: int = 8) -> SessionResult:
+    """Return poses that a machine meets but for its datum, with compensation, and without it also 20 µm."""
+    rng = np.random.default_rng(1)
+    targets = [Pose(place, np.eye(3)) for place in rng.uniform(-0.1, 0.1, (count, 3))]
+
+    def seen(datum: Pose, pose: Pose, noise: float) -> Pose:
+        there = datum @ pose
+        return Pose(there.position + noise * rng.standard_normal(3), there.rotation)
+
+    poses = [
+        PoseRecord(pose, true_without=seen(DATUM, pose, 2e-5), true_with=seen(DATUM, pose, 0.0)) for pose in targets
+    ]
+    return SessionResult(poses)
+
+
+def test_a_datum_is_aligned() -> None:
+    """Shifted and turned by 100 µm and 0.4 mrad alone: nothing is left; 20 µm of noise without compensation stay."""
+    errors = shifted().errors()
+    assert list(errors) == [ALIGNED, AS_IT_IS]
+    assert rms(errors[AS_IT_IS][1]) == pytest.approx(np.linalg.norm(DATUM.position), rel=0.3)
+    before, left = errors[ALIGNED]
+    assert left.max() < 1e-12
+    assert rms(before) == pytest.approx(2e-5 * np.sqrt(3.0 - 6.0 / 8.0), rel=0.4)  # six of 24 numbers are the datum's
+    table = error_table(errors).splitlines()
+    assert len(table) == 3
+    assert "datum aligned" in table[1]
+
+
+def test_too_few_poses_are_not_aligned() -> None:
+    """Five poses are fifteen numbers, of which a datum takes six: what is left would flatter."""
+    few, line = shifted(5), shifted(8)
+    for record in line.poses:
+        record.target = Pose([record.target.position[0], 0.0, 0.0], np.eye(3))
+    for result in (few, line):
+        assert {*result.errors()} == {AS_IT_IS}
+
+
+def test_what_nobody_saw_has_no_rows() -> None:
+    assert SessionResult([PoseRecord(GIVEN)]).errors() == {}
+
+
+def test_a_busy_computer_is_named() -> None:
+    latencies = np.full(1000, 1e-3)
+    assert busy_text(latencies, 250.0) == ""
+    latencies[:40] = 0.81
+    said = busy_text(latencies, 250.0)
+    assert said.startswith("the computer was busy: 40 of 1000 answers came after the next command was due, the longest")
+
+
+def test_the_picture_of_a_run_needs_no_truth(tmp_path: Path) -> None:
+    """What nobody saw is not drawn, and nothing breaks: an attached machine tells no true pose."""
+    save(session_figure(SessionResult([PoseRecord(Pose.identity())]), "nothing seen"), tmp_path / "run.png")
+    assert (tmp_path / "run.png").stat().st_size > 1_000
+
+
+def test_a_busy_computer_is_named_when_an_answer_does_not_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The session ends with an error then, and there is no report."""
+
+    def run_session(*_: object) -> SessionResult:
+        raise NoAnswerError("no answer to a command within 5 s")
+
+    sent = {n: SimpleNamespace(sent_at=0.0, answered_at=0.9 if n < 50 else 1e-3) for n in range(100)}
+    for name, stand_in in (("connect", lambda *_: None), ("run_session", run_session)):
+        monkeypatch.setattr(session, name, stand_in)
+    monkeypatch.setattr(session, "loop_client", lambda _: SimpleNamespace(close=lambda: None, sent=sent))
+    with pytest.raises(NoAnswerError, match="within 5 s; the computer was busy: 50 of 100"):
+        session.run_poses(paper_geometry(), (), [GIVEN], 100.0, False)
+
+
+# ---- the story of the demonstration ----
+
+
+def test_the_box_is_about_this_machines_home(tmp_path: Path) -> None:
+    """Or as near to it as the ends of the machine's own largest box allow."""
+    for machine in machines().values():
+        geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
+        box = story.demo_place(geometry).box
+        home = machine.tips(np.array([machine.home]), np.eye(3)[None])[0]
+        largest, middle = machine_box(geometry).box, box.mean(axis=0)
+        low, high = np.abs(box - largest) < 1e-6  # where the boxes end together
+        assert (np.isclose(middle, home, atol=1e-9) | (low & (middle > home)) | (high & (middle < home))).all()
+        assert ((home >= box[0]) & (home <= box[1])).all()
+
+
+def test_a_tool_that_cannot_be_level_stays_as_at_home() -> None:
+    """A spindle whose frame looks down, in a work frame that looks up: the box's corners are within the limits."""
+    paper = load_geometry("paper")
+    geometry = replace(paper, tool=Pose([0.0, 0.0, 0.1], rotation_from_angles(np.radians([180.0, 0.0, 0.0]))))
+    place = story.demo_place(geometry)
+    np.testing.assert_allclose(place.attitude, geometry.tool.rotation, atol=1e-12)
+    assert check(geometry, MachineModel("paper"), [Pose(corner, place.attitude) for corner in place.box]).ok
+
+
+def test_a_warm_machine_has_struts_longer_by_steels_growth() -> None:
+    geometry = load_geometry("paper")
+    warm = story.warmed(geometry, MachineModel("paper"), 5.0).struts
+    home = np.linalg.norm(
+        geometry.home.position + geometry.platform_joints @ geometry.home.rotation.T - geometry.base_joints, axis=1
+    )
+    np.testing.assert_allclose(warm.offset, 57.5e-6 * home, rtol=1e-12)
+    np.testing.assert_allclose(warm.pitch, 57.5e-6)
+
+
+@long_test
+@pytest.mark.timeout(300)
+def test_the_whole_story_on_a_foreign_machine(tmp_path: Path) -> None:
+    """Turned tool and work frames, every kind of error that ``random`` has."""
+    file = machines()["framed"].write(tmp_path / "machine.yaml")
+    words = ["--machine", file, "--truth", "random:5", "--seed", 2, "--pictures", tmp_path / "out"]
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        code = cli.main(["demo", "--json", *map(str, words)])
+    told = json.loads(out.getvalue())
+    assert (code, told["complaints"]) == (0, []), told["chapters"]
+    left = {chapter["title"]: chapter["box_rms_m"] for chapter in told["chapters"]}
+    titles = ["as built", "calibrated", "warmer by 5 K", "renewed", "strut_6 knocked", "repaired"]
+    assert list(left) == titles
+    assert max(left[title] for title in titles[1::2]) <= told["promised_m"] <= story.GOAL
+    assert left["calibrated"] < 0.1 * left["as built"]
+    assert min(left[title] for title in titles[2::2]) > 2.0 * left["calibrated"]
+    for chapter in told["chapters"][1::2]:  # sixteen stops scatter by a tenth, and the drives' steps are 0.1 µm
+        assert chapter["rms_m"] == pytest.approx(left[chapter["title"]], rel=0.4, abs=0.1e-6)
+    assert (tmp_path / "out" / "demo.png").stat().st_size > 20_000

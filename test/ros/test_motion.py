@@ -1,4 +1,4 @@
-"""How fast the nodes let the struts move, by which clock, and when a machine counts as standing.
+"""How fast the nodes let the struts move, and by which clock; what a drive, a PLC or a HAL may watch of them.
 
 The rig's machine may move its struts at 250 mm/s, and by 2 mm from one command to the next. Straight up at home a
 strut lengthens by less than the tool rises, so closed form lengths say how far.
@@ -7,17 +7,31 @@ strut lengthens by less than the tool rises, so closed form lengths say how far.
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import numpy as np
 import pytest
 import rclpy
-from node_helpers import HOME, Bench, closed_form_lengths, near
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from node_helpers import HOME, RELIABLE, Bench, closed_form_lengths, near
+from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.experimental import EventsExecutor
+from rclpy.qos import QoSProfile
+from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState, TimeReference
+from std_msgs.msg import Bool, UInt64
 from std_srvs.srv import SetBool
 
 from hexapod_comp.compensation import guards
+from hexapod_comp.ros import base
+from hexapod_comp.ros.base import LATCHED_QOS
 from hexapod_comp.ros.messages import pose_message
-from hexapod_comp.ros.status import ERROR
+from hexapod_comp.ros.rclpy_compat import Alarm
+from hexapod_comp.ros.status import ERROR, OK, WARN
 
 SPEED = 0.25
 """Largest strut speed of the rig's machine, m/s."""
@@ -183,3 +197,158 @@ def test_a_change_ramps_out_without_stamps_while_simulated_time_stands(rig, cloc
         rig.until(lambda count=count: len(seen) > count, "an answer")
         assert time.monotonic() < began + 10.0
     assert len(seen) > 2, "it has ramped"
+
+
+# ---- what a drive, a PLC or a HAL may watch: heartbeat, validity, stop output, deadlines ----
+
+
+def hear(rig: Bench, kind: type, topic: str, qos: QoSProfile = RELIABLE, **options: Any) -> list[Any]:
+    """Return the list to which a topic's messages are appended from now on."""
+    heard: list[Any] = []
+    rig.witness.create_subscription(kind, topic, heard.append, qos, **options)
+    return heard
+
+
+def test_the_heartbeat_counts_every_beat_as_long_as_the_node_is_configured(rig):
+    rig.compensator(heartbeat_rate=200.0)
+    beats = hear(rig, UInt64, "compensator/heartbeat")
+    rig.until(lambda: len(beats) > 20, "heartbeats")
+    assert rig.change("deactivate")
+    inactive = len(beats)
+    rig.until(lambda: len(beats) > inactive + 20, "heartbeats of an inactive node")
+    assert rig.change("cleanup")
+    rig.barrier()
+    numbers = [beat.data for beat in beats]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    end, ended = time.monotonic() + 0.1, len(beats)
+    rig.until(lambda: time.monotonic() > end, "twenty beats' time")
+    assert len(beats) == ended
+
+
+@pytest.mark.parametrize("timeout", [0.1, 2.5])
+def test_a_command_is_valid_until_its_stamp_and_the_command_timeout(rig, timeout):
+    rig.compensator(command_timeout=timeout)
+    validities = hear(rig, TimeReference, "compensator/validity")
+    for pose in (HOME, near(HOME, (0.0, 0.0, 0.001))):
+        answer = rig.ask(pose)
+        stamp = answer.command.header.stamp
+        rig.until(lambda stamp=stamp: validities and validities[-1].header.stamp == stamp, "the command's validity")
+        lasting = Time.from_msg(validities[-1].time_ref) - Time.from_msg(stamp)
+        assert lasting.nanoseconds == timeout * 1e9
+        assert validities[-1].source == "/strut_commands"
+    stamp = rig.send(near(HOME, (0.0, 0.0, 0.12))).header.stamp
+    rig.until_status(ERROR, "refusing commands: step")
+    assert validities[-1].header.stamp != stamp  # what is refused prolongs nothing
+
+
+def test_the_stop_output_is_repeated_for_who_has_missed_what_is_latched(rig):
+    rig.compensator()
+    stops = hear(rig, Bool, "compensator/stopped", LATCHED_QOS)
+    rig.until(lambda: len(stops) >= 3, "the same once more, and again")
+    assert {stop.data for stop in stops[1:]} == {stops[-1].data}
+
+
+def test_the_stop_output_says_when_commands_are_refused(rig):
+    node = rig.compensator(start_without_feedback_after=0.0)
+    stops = hear(rig, Bool, "compensator/stopped", LATCHED_QOS)
+
+    def until(stopped: bool, why: str) -> None:
+        rig.until(lambda: stops and stops[-1].data is stopped, why)
+
+    until(True, "waiting for struts")
+    rig.feed(closed_form_lengths(HOME))
+    until(False, "the struts are known")
+    rig.ask(HOME)
+    rig.send(near(HOME, (0.0, 0.0, 0.12)))
+    until(True, "a step is refused")
+    until(False, "nothing has been refused for a while")
+    rig.feed(closed_form_lengths(near(HOME, (0.0, 0.0, 0.01))))
+    until(True, "a following error")
+    rig.until(lambda: rig.trigger("reset").success, "the machine to stand and the reset")
+    until(False, "reset")
+    assert rig.change("deactivate")
+    until(True, "inactive")
+    assert rig.change("activate")
+    until(False, "active again")
+    node.publish_last_status()
+    until(True, "the end")
+    assert [stop.data for stop in stops] == [True, False] * (len(stops) // 2) + [True] * (len(stops) % 2)
+
+
+def deadline(node: Any, topic: str) -> int:
+    """Return what a node's publisher offers, ns; 0: nothing."""
+    (publisher,) = (p for p in node.publishers if p.topic_name == topic)
+    return publisher.qos_profile.deadline.nanoseconds
+
+
+def test_who_asks_for_the_deadline_is_told_that_commands_end(bench):
+    """And the witness, which asks for none, hears them as well."""
+    bench.compensator(command_timeout=0.2)
+    missed: list[Any] = []
+    wants = QoSProfile(depth=10, deadline=Duration(seconds=0.2))
+    events = SubscriptionEventCallbacks(deadline=missed.append)
+    heard = {
+        topic: hear(bench, JointState, topic, wants, event_callbacks=events)
+        for topic in ("strut_commands", "strut_corrections")
+    }
+    bench.until(lambda: all(bench.witness.count_subscribers(topic) == 2 for topic in heard), "discovery")
+    bench.ask(HOME)
+    bench.until(lambda: all(heard.values()), "commands")
+    bench.until(lambda: missed, "a missed deadline")
+    bench.until_status(WARN, "no new command")
+
+
+def test_a_deadline_is_asked_for_where_a_parameter_says_so(bench):
+    """Then a controller that offers none is not heard at all; one that does is."""
+    name = "qos_overrides./tool_pose_command.subscription.deadline"
+    bench.compensator(start=False, **{name: 100_000_000})
+    assert bench.change("configure")
+    assert bench.change("activate")
+    bench.until_status(OK, "waiting for the first command")
+    offers = QoSProfile(depth=10, deadline=Duration(seconds=0.1))
+    publisher = bench.witness.create_publisher(PoseStamped, "tool_pose_command", offers)
+    bench.until(publisher.get_subscription_count, "the one that offers it to match")
+    assert bench._publishers["tool_pose_command"].get_subscription_count() == 0
+    bench._publishers["tool_pose_command"] = publisher
+    bench.ask(HOME)
+
+
+def test_a_late_subscriber_gets_the_status_of_every_node_when_it_is_discovered(bench, monkeypatch):
+    monkeypatch.setattr(base, "STATUS_PERIOD", 1e9)  # nothing is published again only because time passes
+    bench.machine()
+    arrays = hear(bench, DiagnosticArray, "/diagnostics")
+    bench.until(lambda: len({array.status[0].name for array in arrays}) == 2, "the status of drive and compensator")
+
+
+# ---- rates ----
+
+
+@pytest.fixture
+def executor(ros_context: Context):
+    executor = EventsExecutor(context=ros_context)
+    yield executor
+    executor.shutdown()
+
+
+def spin(executor: EventsExecutor, seconds: float, each=lambda: None) -> None:
+    """Handle events for a while, and do something every 2 ms."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        each()
+        executor.spin_once(timeout_sec=0.002)
+
+
+def test_a_flood_of_rates_moves_neither_ticks_nor_timers(executor, ros_context):
+    """By timers that are reset, 500 times a second, there were 3 heartbeats a second, and gaps of 4 s."""
+    node = rclpy.create_node("ticking", context=ros_context)
+    executor.add_node(node)
+    ticks, checks = [], []
+    ticker = Alarm(node, lambda: ticks.append(time.monotonic()), 100.0)
+    node.create_timer(0.05, lambda: checks.append(time.monotonic()))
+    began, rates = time.monotonic(), iter(np.random.default_rng(1).uniform(90.0, 110.0, 10_000))
+    spin(executor, 0.5, lambda: ticker.set_rate(next(rates)))
+    ticker.close()
+    assert 35 <= len(ticks) <= 58, "90 to 110 Hz for half a second, on a busy computer"
+    assert np.diff([began, *ticks, time.monotonic()]).max() < 0.1
+    assert len(checks) >= 6
+    node.destroy_node()

@@ -4,23 +4,34 @@ Truth: what the node has sent; a disk whose room is counted here; what rosbags r
 
 from __future__ import annotations
 
+import json
+import math
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Vector3
 from node_helpers import HOME, Bench, near
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from replay_helpers import RecordedMachine
+from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
+from std_msgs.msg import Float64MultiArray, String
 
+from hexapod_comp import cli
 from hexapod_comp.errors import InputFileError
+from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.pose import Pose
 from hexapod_comp.replay.bag import Recording, read_recording
 from hexapod_comp.replay.replay import BEFORE, IDENTICAL, Replay, replay_recording
 from hexapod_comp.ros import recorder
+from hexapod_comp.ros.echo import MessageIntervals, message_fields
 from hexapod_comp.ros.recorder import RESERVE, BagRecorder, BagWriter
 
 
@@ -138,3 +149,149 @@ def test_a_folder_that_was_moved_keeps_a_whole_file(tmp_path: Path, machine: Rec
     bag.close()
     assert "metadata.yaml could not be written" in bag.problem
     assert replay_recording(read_recording(tmp_path / "elsewhere")).identical
+
+
+# ---- the verb echo ----
+
+
+def keyed(topic: str, message: object) -> dict[str, object]:
+    return {row.key: row.value for row in message_fields(topic, message)}
+
+
+def struts(*lengths: float) -> JointState:
+    return JointState(name=list(STRUT_NAMES), position=list(lengths), velocity=[0.0] * 6)
+
+
+def test_struts_are_in_mm_and_corrections_in_um():
+    message = struts(0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+    assert keyed("/strut_commands", message)["strut_2_mm"] == pytest.approx(600.0)
+    message = struts(1e-6, 2e-6, -3e-6, 0.0, 0.0, 0.0)
+    assert keyed("/m1/strut_corrections", message)["strut_3_um"] == pytest.approx(-3.0)
+    assert len(keyed("/strut_corrections", message)) == 6  # struts at rest have no speeds to show
+    message.velocity = [0.0, 0.012, 0.0, 0.0, 0.0, 0.0]
+    assert keyed("/strut_commands", message)["strut_2_speed_mm_s"] == pytest.approx(12.0)
+    others = JointState(name=["strut_1", "strut_1_universal"], position=[0.5, 0.1])
+    assert keyed("/joint_states", others)["position[1]"] == 0.1
+    assert keyed("/strut_commands_array", Float64MultiArray(data=[0.5] * 6))["strut_6_mm"] == pytest.approx(500.0)
+
+
+def test_a_pose_is_in_mm_and_the_papers_angles():
+    message = PoseStamped()
+    message.header.frame_id = "work"
+    message.pose.position.x = -0.0125
+    half = math.radians(5.0) / 2.0
+    message.pose.orientation.x, message.pose.orientation.w = math.sin(half), math.cos(half)  # α: about x
+    rows = keyed("/tool_pose_estimate", message)
+    assert rows["frame"] == "work"
+    assert rows["x_mm"] == pytest.approx(-12.5)
+    assert rows["alpha_deg"] == pytest.approx(5.0)
+    message.pose.orientation.w = 3.0  # no rotation at all: shown as it was sent
+    assert keyed("/tool_pose_estimate", message)["qw"] == 3.0
+
+
+def test_a_predicted_error_is_a_vector_with_deviations():
+    message = PoseWithCovarianceStamped()
+    message.pose.pose.position.y = 7e-6
+    message.pose.pose.orientation.z, message.pose.pose.orientation.w = math.sin(-10e-6), math.cos(-10e-6)
+    message.pose.covariance[7] = (2e-6) ** 2
+    message.pose.covariance[35] = math.nan
+    rows = keyed("/compensator/predicted_error", message)
+    assert rows["y_um"] == pytest.approx(7.0)
+    assert rows["y_sigma_um"] == pytest.approx(2.0)
+    assert rows["rz_urad"] == pytest.approx(-20.0)
+    assert math.isnan(rows["rz_sigma_urad"])
+
+
+def test_what_has_no_unit_of_ours_is_named_by_its_fields():
+    assert keyed("/x", Vector3(y=2.0)) == {"x": 0.0, "y": 2.0, "z": 0.0}
+    assert keyed("/temperatures", Temperature(temperature=21.5)) == {"temperature_degC": 21.5}
+    assert keyed("/humidity", RelativeHumidity(relative_humidity=0.45))["humidity_percent"] == pytest.approx(45.0)
+    status = DiagnosticStatus(
+        level=b"\x02", name="compensator: state", message="stopped", values=[KeyValue(key="refused", value="3")]
+    )
+    rows = keyed("/diagnostics", DiagnosticArray(status=[status]))
+    assert rows == {"compensator: state": "ERROR: stopped", "  refused": "3"}
+
+
+def test_the_rate_is_of_the_last_messages_and_the_mean_of_all():
+    """Ten a second for 5 s, then two a second: the last 2 s have five messages."""
+    intervals = MessageIntervals()
+    assert math.isnan(intervals.recent_rate)
+    for time in (0.0, 0.1, 0.4):
+        intervals.add(time)
+    assert intervals.text() == "messages: 3, 5.00 Hz, 100.0 to 300.0 ms apart"
+    intervals = MessageIntervals()
+    for time in [0.1 * n for n in range(51)] + [5.0 + 0.5 * n for n in range(1, 7)]:
+        intervals.add(time)
+    assert intervals.recent_rate == pytest.approx(2.0)
+    assert intervals.rate == pytest.approx(56 / 8.0)
+
+
+def test_what_cannot_be_read_is_said_and_does_not_end_it(ros_context):
+    """Bytes of none of the type, and a text of 1 MB: each is a message all the same."""
+    import rclpy
+    from rclpy.serialization import serialize_message
+
+    from hexapod_comp.ros.echo import Echo
+
+    node, received = rclpy.create_node("echoing", context=ros_context), []
+    node.create_publisher(String, "said", 1)
+    try:
+        echo = Echo(node, lambda seconds: None, "said", received.append)
+        for data in (
+            b"\x00",
+            bytes(serialize_message(String(data="x" * 1_000_000))),
+            serialize_message(String(data="x")),
+        ):
+            echo._on_message(bytes(data))
+    finally:
+        node.destroy_node()
+    assert "cannot be read" in received[0].text()
+    assert "must not have more than 262144 bytes" in received[1].record()["problem"]
+    assert received[2].record()["data"] == "x"
+    assert echo.intervals.count == 3
+
+
+@pytest.mark.parametrize("latched", [False, True], ids=["best_effort", "latched"])
+def test_the_verb_prints_what_is_published(ros_context, capfd, latched):
+    """Best effort or latched: the subscription follows what is offered, or nothing would come."""
+    import rclpy
+
+    node = rclpy.create_node("publisher_of_strut_states", context=ros_context)
+    qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    if latched:
+        qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    publisher = node.create_publisher(String, "named", qos)
+    publisher.publish(String(data="probe"))
+    done = threading.Event()
+
+    def repeat() -> None:
+        while not (latched or done.wait(0.02)):
+            publisher.publish(String(data="probe"))
+
+    thread = threading.Thread(target=repeat)
+    thread.start()
+    try:
+        assert cli.main(["echo", "named", "--count", "1", "--seconds", "20", "--json"]) == 0
+    finally:
+        done.set()
+        thread.join()
+        node.destroy_node()
+    assert json.loads(capfd.readouterr().out)["data"] == "probe"
+
+
+def test_a_topic_that_nobody_publishes_is_refused_with_a_close_one(ros_context, capfd, monkeypatch):
+    import rclpy
+
+    monkeypatch.setattr("hexapod_comp.ros.echo.DISCOVERY_TIME", 1.0)
+    node = rclpy.create_node("publisher_of_commands", context=ros_context)
+    node.create_publisher(String, "strut_commands", 1)
+    try:
+        assert cli.main(["echo", "strut_comands"]) == 2
+    finally:
+        node.destroy_node()
+    error = capfd.readouterr().err
+    assert "nobody publishes /strut_comands" in error
+    assert "did you mean /strut_commands" in error
+    assert cli.main(["echo", "strut commands"]) == 2
+    assert "'strut commands' is not a valid topic name" in capfd.readouterr().err
