@@ -24,7 +24,7 @@ import yaml
 from fuzzing import PLAIN, UNITS, Refused, cases, check_document, edits, finite, mutated, reader_of
 from helpers import assert_equal
 from hypothesis import example, given
-from strategies import paper_geometry, random_model, skewed_geometry
+from strategies import paper_geometry, random_model
 from test_measurement_csv import STRUTS, WIDE, WIDE_COLUMNS
 
 from hexapod_comp.compensation.compensator import Compensator
@@ -48,41 +48,6 @@ BOX = np.array([[-0.04, -0.04, 0.38], [0.04, 0.04, 0.46]])
 
 
 # Files.
-
-
-def general_geometry() -> bytes:
-    """Return the file of a machine with everything that a geometry file may hold."""
-    machine = skewed_geometry(0.01)
-
-    def rows(values: np.ndarray | None, scale: float = 1.0) -> list:
-        assert values is not None
-        return (values * scale).round(6).tolist()
-
-    tree = {
-        "format": "hexapod_comp/geometry",
-        "version": 1,
-        "machine": "general",
-        "base": {
-            "joints_mm": rows(machine.base_joints, 1e3),
-            "joint_axes": rows(machine.base_axes),
-            "cone_axes": [[0, 0, 2 + i] for i in range(6)],
-        },
-        "platform": {"joints_in": rows(machine.platform_joints, 1 / 0.0254), "joint_axes": rows(machine.platform_axes)},
-        "home": {"position_m": [0.01, -0.02, 0.42], "rotation_deg": [2, -3, 4]},
-        "tool": {"position_mm": [1, 2, 30], "rotation_mrad": [10, 0, -20]},
-        "work": {"position_mm": [0, 5, -40], "rotation_deg": [0, 0, 90]},
-        "screw": {"lead_mm": [10, 10, 10, 5, 5, 0]},
-        "limits": {
-            "stroke_mm": [[200, 900 + i] for i in range(6)],
-            "base_cone_deg": [80, 81, 82, 83, 84, 85],
-            "platform_cone_rad": 1.5,
-            "condition_number": 20,
-            "correction_um": 2000,
-            "step_mm": 2,
-            "speed_m_min": 15,
-        },
-    }
-    return yaml.safe_dump(tree, default_flow_style=None, sort_keys=False).encode()
 
 
 def full_model() -> bytes:
@@ -143,7 +108,11 @@ TIDY = (
 ).encode()
 WIDE_ROWS = (WIDE + "0,0,0,0,0,0,1,0,16,0,0,0,1,25.39,0,300,x\n1,1,1,1,1,1,1,0,16.1,0,0,0,1,25,0,302,\n").encode()
 FROM_STRUTS = WIDE_COLUMNS[: WIDE_COLUMNS.index("commanded")] + WIDE_COLUMNS[WIDE_COLUMNS.index("measured") :] + STRUTS
-GEOMETRIES = ((CONFIG / "paper.yaml").read_bytes(), (CONFIG / "positioning_unit.yaml").read_bytes(), general_geometry())
+GEOMETRIES = (
+    (CONFIG / "paper.yaml").read_bytes(),
+    (CONFIG / "positioning_unit.yaml").read_bytes(),
+    (CONFIG / "example_6_6.yaml").read_bytes(),
+)
 
 
 # The same, written plainly.

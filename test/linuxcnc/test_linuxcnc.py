@@ -30,7 +30,6 @@ from hexapod_comp.machine.model_file import save_model
 
 pytestmark = [pytest.mark.skipif(bool(why_not()), reason=f"LinuxCNC: {why_not()}"), pytest.mark.timeout(600)]
 
-DATA = Path(__file__).resolve().parents[1] / "data"
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 
 # Lasers see everything but where the machine stands as a whole; the tracker's poses see that
@@ -160,28 +159,6 @@ def assert_undisturbed(linuxcnc: Linuxcnc, record: Record) -> None:
     assert record.largest_step <= RAMP + DIGITS
 
 
-def table(name: str) -> list[list[float]]:
-    """Read a table of the paper without its first column."""
-    with (DATA / name).open(newline="") as file:
-        return [[float(word) for word in row[1:]] for row in list(csv.reader(file))[1:]]
-
-
-def test_table_2(controller: Linuxcnc) -> None:
-    """Rows of Table 1 that turn about one axis only give Table 2's lengths, to its last digit."""
-    # LinuxCNC turns about other axes in another order; with one angle there is no order.
-    controller.enable(False)
-    tried = 0
-    for angles_first, lengths in zip(table_1(), table("table2_strut_lengths_ideal.csv"), strict=True):
-        alpha, beta, gamma, x, y, z = angles_first
-        if np.count_nonzero([alpha, beta, gamma]) > 1:
-            continue
-        controller.ask("mdi", f"G0 X{x} Y{y} Z{z} A{alpha} B{beta} C{gamma}")
-        np.testing.assert_allclose(controller.struts(), lengths, rtol=0.0, atol=0.5e-3 + 1e-6)
-        tried += 1
-    assert tried == 5
-    assert controller.ask("errors") == []
-
-
 def table_1() -> list[list[float]]:
     """Return α, β, γ, degrees, x, y, z, mm, of Table 1's rows."""
     with (CONFIG / "table1.csv").open(newline="") as file:
@@ -201,16 +178,6 @@ def test_a_fitted_model_takes_the_error_away(controller: Linuxcnc, calibrated: C
     assert after <= 0.05 * before
     assert_undisturbed(controller, without)
     assert_undisturbed(controller, compensated)
-
-
-def test_updates_keep_up_with_the_servo_thread(controller: Linuxcnc) -> None:
-    """Bar: 200 corrections per second while the servo thread runs at 1 kHz."""
-    controller.enable(True)
-    record = run_program(controller)
-    updates = record.side[:, 7]
-    rate = (updates[-1] - updates[0]) / (len(updates) - 1) * 1000.0
-    print(f"\n{rate:.0f} corrections per second")
-    assert rate >= 200.0
 
 
 def test_a_killed_compensator(controller: Linuxcnc, calibrated: Calibrated) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from linuxcnc_helpers import Linuxcnc, Record, why_not
+from linuxcnc_helpers import Linuxcnc, why_not
 from test_linuxcnc import (
     CONFIG,
     DIGITS,
@@ -32,7 +32,6 @@ from hexapod_comp import cli
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import solve_pose
-from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 
 MODULES = Path("/usr/lib/linuxcnc/modules")
@@ -90,31 +89,6 @@ def test_the_error_goes_away_at_every_feed(controller: Linuxcnc, calibrated: Cal
     assert_undisturbed(controller, compensated)
 
 
-def nominal_lengths(record: Record) -> np.ndarray:
-    """Return what LinuxCNC tells the drives, corrections left out, mm: the drive is a cycle behind."""
-    return record.struts[1:] - record.corrections[:-1]
-
-
-def test_the_correction_belongs_to_its_own_cycle(controller: Linuxcnc, calibrated: Calibrated) -> None:
-    """Corrections worked out afterwards in Python fit those of the same cycle best, not of one before or after."""
-    controller.enable(True)
-    record = run_program(controller, FAST)
-    geometry = load_geometry(CONFIG / "paper.yaml")
-    machine = RealMachine(geometry, load_model(calibrated.model_file, geometry))
-    lengths, guess, expected = nominal_lengths(record), geometry.home, []
-    for row in lengths:
-        guess = solve_pose(geometry, row * 1e-3, guess)
-        expected.append(machine.commands_for(guess)[0] * 1e3 - row)
-    there = slice(500, len(lengths) - 500)
-    wanted = np.array(expected)
-    misfit = {
-        lag: float(np.sqrt(((np.roll(record.corrections[:-1], -lag, axis=0) - wanted)[there] ** 2).mean()))
-        for lag in range(-4, 5)
-    }
-    print("\nmisfit by delay, nm: " + ", ".join(f"{lag}: {value * 1e6:.1f}" for lag, value in misfit.items()))
-    assert min(misfit, key=lambda lag: misfit[lag]) == 0
-
-
 def test_jogging_tool_change_abort_and_emergency_stop(controller: Linuxcnc, calibrated: Calibrated) -> None:
     """After each the corrections are those of where the machine stands; never a step, never a following error."""
     controller.enable(True)
@@ -144,13 +118,3 @@ def assert_where_it_stands(controller: Linuxcnc, calibrated: Calibrated, name: s
     model = load_model(calibrated.model_file, geometry)
     expected = Compensator(geometry, model).correct(geometry.tool_pose(pose)).correction * 1e3
     np.testing.assert_allclose(corrections, expected, rtol=0.0, atol=2e-6, err_msg=name)
-
-
-def test_the_tool_is_where_the_struts_say(controller: Linuxcnc) -> None:
-    """The estimate's pins: with the corrections in force the model's tool is at LinuxCNC's axes."""
-    controller.enable(True)
-    controller.ask("mdi", "G0 X10 Y-20 Z410 A0 B0 C0")
-    time.sleep(0.3)
-    assert controller.get("hexapod-rt.tool-valid")
-    at = controller.get("hexapod-rt.tool-x", "hexapod-rt.tool-y", "hexapod-rt.tool-z")
-    np.testing.assert_allclose(at, [10.0, -20.0, 410.0], rtol=0.0, atol=1e-5)
