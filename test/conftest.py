@@ -111,11 +111,3 @@ def stranger(rig: Rig) -> Stranger:
     from node_helpers import Stranger
 
     return Stranger(rig, "stranger")
-
-
-@pytest.fixture
-def twin(rig: Rig) -> Stranger:
-    """Give another node with the name of the one that sends commands and readings."""
-    from node_helpers import Stranger
-
-    return Stranger(rig, "witness")

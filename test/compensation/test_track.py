@@ -293,16 +293,6 @@ def test_unnamed_counts_as_another():
     assert sender.names == ()
 
 
-def test_who_cannot_be_told_is_refused():
-    graph = Graph("/a", unknown="a node's name is not UTF-8")
-    graph.sender.update(0.0)
-    assert reason(graph.sender, Sample(0.0)) == "unknown_publisher"
-    assert graph.sender.problem == "who publishes /commands cannot be told: a node's name is not UTF-8"
-    graph.unknown = ""
-    graph.sender.update(0.1)
-    assert reason(graph.sender, Sample(0.1)) == ""
-
-
 def test_another_on_an_own_topic_is_a_problem_and_one_of_the_same_name_is_not():
     graph = Graph("/me", own="/me")
     graph.sender.update(0.0)

@@ -137,28 +137,6 @@ def test_pose_is_the_axes_in_metres_and_a_quaternion(rig, units, metres, angles)
     assert before <= stamped(message) <= time.time()
 
 
-def test_tool_length_is_taken_off(rig):
-    """genhexkins with a tool T: struts |P − T·ẑ + R·(a + T·ẑ) − b|, so the platform is at P − T·ẑ + R·T·ẑ."""
-    machine = Machine(rig)
-    for name, value in zip("xyzabc", (1.0, 2.0, 400.0, 20.0, -10.0, 5.0), strict=True):
-        machine.hal[name] = value
-    machine.hal["tool-offset"] = 50.0
-    p = machine.start().until_sent().pose.position
-    turn = Rotation.from_euler("ZYX", [5.0, -10.0, 20.0], degrees=True)
-    expected = np.array([1.0, 2.0, 350.0]) + turn.apply([0.0, 0.0, 50.0])
-    np.testing.assert_allclose([p.x, p.y, p.z], expected * 1e-3, rtol=0.0, atol=1e-15)
-
-
-@pytest.mark.parametrize(("units", "metres"), [("mm", 1e-3), ("inch", 0.0254)])
-def test_measured_struts_are_named_and_in_metres(rig, units, metres):
-    Machine(rig, metres, units=units).start()
-    rig.until(lambda: len(rig.seen["strut_states"]) > 2, "strut_states")
-    states = rig.seen["strut_states"][-1]
-    assert states.name == [f"strut_{n}" for n in range(1, 7)]
-    np.testing.assert_allclose(states.position, closed_form_lengths(HOME), rtol=1e-15)
-    assert list(states.velocity) == [0.0] * 6
-
-
 def test_struts_that_move_are_told_only_to_a_compensator_that_follows(rig, speak):
     """One that starts would take their lag for a correction; once they stand, or it speaks, it is told."""
     machine = Machine(rig)
@@ -592,19 +570,6 @@ def test_enabling_and_disabling_ramp():
     assert loop.guard.status is GuardStatus.RETURNING
     assert loop.run(2)[-1] == [0.0] * 6
     assert loop.guard.status is GuardStatus.OFF
-
-
-def test_a_lost_compensator_lets_it_return_to_zero():
-    """It stays for the timeout (100 cycles), then ramps out in 100 more."""
-    loop = Loop("zero")
-    loop.run(200)
-    loop.alive = False
-    assert loop.run(99)[-1] == TARGET
-    assert loop.guard.status is GuardStatus.COMPENSATING
-    falling = loop.run(103)
-    assert largest_step([TARGET, *falling]) == pytest.approx(1e-6)
-    assert falling[-1] == [0.0] * 6
-    assert loop.guard.status is GuardStatus.WAITING
 
 
 def test_a_lost_compensator_lets_it_hold():
