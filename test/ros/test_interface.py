@@ -29,7 +29,6 @@ from std_msgs.msg import UInt64
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
 from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.machine.robot_description import urdf
 from hexapod_comp.ros import described
 from hexapod_comp.ros.adapter import AdapterNode
 from hexapod_comp.ros.client import LoopClient
@@ -352,19 +351,6 @@ def test_nobody_else_may_move_the_machine() -> None:
         assert may == allowed, topic
 
 
-def test_operators_and_thermometers_hear_and_ask_only_what_there_is() -> None:
-    """A misspelt name in a policy is a right that nobody has, or a refusal that nobody understands."""
-    policy = read_policy()
-    nodes = [policy[name].allowed for name in ("compensator", "strut_drive", "linuxcnc_bridge", "commander")]
-    heard = {name for allowed in nodes for right in ("publish", "subscribe") for name in allowed[right]}
-    answered = {name for allowed in nodes for name in allowed["reply"]}
-    for name in ("operator", "thermometers"):
-        allowed = policy[name].allowed
-        assert allowed["publish"] | allowed["subscribe"] <= heard
-        assert allowed["request"] <= answered
-        assert all(reply.startswith(f"/{TOOLS}/") for reply in allowed["reply"])
-
-
 @pytest.mark.parametrize("name", ["compensator", "strut_drive", "mover", "instrument", "adapter", "linuxcnc_bridge"])
 def test_lifecycle_nodes_open_what_the_policy_allows(name: str, rig: Rig) -> None:
     """Nothing more, nothing less, with every optional topic switched on."""
@@ -498,18 +484,6 @@ def test_views_name_what_the_nodes_publish(rig: Bench) -> None:
             assert (kind, parts[:2]) == ("PoseStamped", ["pose", "position"])
 
 
-def test_views_name_frames_of_the_description() -> None:
-    """And RViz looks from the frame that the markers are in, by the node's own default."""
-    links = {link.get("name") for link in ET.fromstring(urdf(load_geometry("paper"))).iter("link")}
-    assert links >= FRAMES
-    shown = next(display["Frames"] for display in rviz()["Displays"] if "Frames" in display)
-    assert set(shown) - {"All Enabled"} == FRAMES
-    assert rviz()["Global Options"]["Fixed Frame"] == "base"
-    scene = json.loads((VIEWS / "foxglove.json").read_text(encoding="utf-8"))["configById"]["3D!machine"]
-    assert {name.removeprefix("frame:") for name in scene["transforms"]} == FRAMES
-    assert scene["followTf"] == scene["layers"]["grid"]["frameId"] == "base"
-
-
 def test_the_aggregator_waits_for_what_the_nodes_say(rig: Bench) -> None:
     """From the first status, before the node knows its machine, to the last: one name."""
     rig.machine()
@@ -554,14 +528,6 @@ def shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def parameters(node: dict[str, Any]) -> dict[str, Any]:
     return node["parameters"][-1]
-
-
-def test_what_is_not_given_stays_at_the_nodes_own_default(launch_file: LaunchFile) -> None:
-    """So that a parameter file counts: what launch gives comes after it."""
-    nodes = launch_file.start(f"params_file:={CONFIG / 'fastdds.xml'}")
-    assert set(nodes) == {"compensator", "strut_drive"}
-    for node in nodes.values():
-        assert node["parameters"] == [str(CONFIG / "fastdds.xml"), {}]
 
 
 @pytest.mark.usefixtures("shown")

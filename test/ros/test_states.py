@@ -37,7 +37,6 @@ from node_stories import (
     moisten,
     other,
     passes,
-    place,
     play,
     poses,
     refuses,
@@ -525,23 +524,6 @@ def test_the_page_has_every_text_of_the_diagnostics(function: Callable[..., obje
 
 
 # ---- cases of numbers ----
-
-
-@pytest.mark.parametrize("feedback", ["never", "stale"])
-@pytest.mark.parametrize("way", ["reset", "deactivate, activate", "deactivate, cleanup, configure, activate"])
-def test_without_fresh_feedback_no_start_is_further_than_a_step_from_the_last_command(rig, way, feedback):
-    """Published 1 mm above home: the struts are on their way there, if not there, whatever has been forgotten."""
-    rig.compensator()
-    if feedback == "stale":
-        rig.estimate(rig.feed(closed_form_lengths(HOME)))
-    rig.ask(HOME)
-    before = rig.settle(place(z=1))
-    rig.until_status(WARN, "no new command; feedback lost" if feedback == "stale" else "no new command")
-    play(rig, [reset if way == "reset" else change(*way.split(", ")), send(z=120), refuses("step")])
-    first = rig.ask(place(z=2))
-    assert np.abs(first.lengths - before.lengths).max() <= 2e-3 + ROUNDING
-    last_two = [m.header.stamp for m in rig.seen["strut_commands"]][-2:]
-    assert last_two == [before.command.header.stamp, first.command.header.stamp]
 
 
 @pytest.mark.parametrize("hours", [-1.0, 1.0])
