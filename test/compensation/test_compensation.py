@@ -1,4 +1,5 @@
-"""The compensator: commands that close the loop, refusals that leave no trace, changes that ramp."""
+"""The compensator: commands that close the loop, refusals that leave no trace, changes that ramp; its phases, and its
+limits of speed and acceleration by stamps, by receipt and by publication."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""What the track of the struts answers: can they stand so, do they follow, do they stand, where does a start begin."""
+"""What the track of the struts answers: can they stand so, do they follow, do they stand, where does a start begin;
+and what each guard refuses, on a clock of the test's own. Stamps: test_stamps.py, temperatures: test_thermal.py."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The LinuxCNC bridge, with a stand-in for LinuxCNC's ``hal`` module and a real compensator.
+"""The LinuxCNC bridge and its guard, with a stand-in for LinuxCNC's ``hal`` module and a real compensator.
 
 The stand-in does what the component API of ``hal`` does: typed pins, an error for a name taken twice. What the
 real one does is tested with LinuxCNC itself. Poses are compared with SciPy's rotations, struts with a closed form of

@@ -1,4 +1,4 @@
-"""Compensator and strut drive together: does the tool go where it was told? Over DDS: test_processes, test_story, zoo.
+"""Compensator and strut drive together: does the tool go where it was told? And what ``run`` and ``demo`` say of it.
 
 The truth is the virtual machine's true tool pose. What may remain when the model is the true one follows
 from the drive alone: every motor stands on a step, so each strut is off by at most half a step δ, and the

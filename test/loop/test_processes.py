@@ -1,4 +1,4 @@
-"""The two nodes as operating-system processes: start, the loop between them, every way to end."""
+"""The nodes as operating-system processes: start, the loop between them, every way to end, a log that nobody reads."""
 
 from __future__ import annotations
 

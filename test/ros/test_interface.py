@@ -1,4 +1,4 @@
-"""What the nodes offer: parameters, quality of service, and the security policy against what they really open.
+"""What the nodes offer: parameters, quality of service, policy, views and launch against what they really open.
 
 Truth: the tables of parameters and what rcl makes of the files; the request-and-offer rule of DDS; the ROS graph of
 nodes with everything switched on. The policy's form is that of sros2's policy.xsd, version 0.2.0."""

@@ -1,6 +1,6 @@
-"""Recordings: of the real node, replayed to the same bits; on a disk that gets full, and in a folder that goes.
+"""What only listens: recordings, on a disk that gets full and in a folder that goes, and the verb ``echo``.
 
-Truth: what the node has sent; a disk whose room is counted here; what rosbags reads back."""
+Truth: what the node has sent; a disk whose room is counted here; what rosbags reads back; units by hand."""
 
 from __future__ import annotations
 

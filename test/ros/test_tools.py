@@ -1,4 +1,7 @@
-"""Tools, work frames and travel at the node. Truth: the zoo's own frames; ``travel`` for what is published of it."""
+"""Tools, work frames and travel at the node; and nominal strut lengths as its commands.
+
+Truth: the zoo's own frames and kinematics; ``travel`` for what is published of it; closed-form lengths.
+"""
 
 from __future__ import annotations
 
