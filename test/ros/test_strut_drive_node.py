@@ -190,6 +190,14 @@ def test_lost_encoder_reads_nan_and_the_machine_goes_on(machine):
     until_tool_at(machine, TARGET.position)
 
 
+def test_dropped_feedback(rig):
+    rig.drive(fault_feedback_drop=1.0, **EXACT)
+    rig.until(lambda: len(rig.seen["tool_pose_true"]) > 10, "true poses")
+    assert not rig.seen["strut_states"]
+    play(rig, [setting("fault_feedback_drop", 0.0, NODE)])
+    rig.until(lambda: rig.seen["strut_states"], "readings")
+
+
 def test_delayed_feedback_is_old(rig):
     """With a delay of 100 ms, the encoders still read home when the tool has long begun to move."""
     rig.drive(fault_feedback_delay=0.1, **EXACT)
