@@ -87,7 +87,7 @@ COMMANDS = (
 @pytest.mark.parametrize("number", range(len(COMMANDS)))
 @given(changes=edits)
 @example(changes=[])
-@cases(8, 0.002)
+@cases(4, 0.002)
 def test_mutated_files(folder: Path, number: int, changes: list) -> None:
     verb, name, rest = COMMANDS[number]
     original = (folder / name).read_bytes()
@@ -133,7 +133,7 @@ words = st.one_of(
 
 @pytest.mark.parametrize("verb", OPTIONS)
 @given(place=st.integers(0, 20), value=words, other=st.one_of(st.none(), st.tuples(st.integers(0, 20), words)))
-@cases(8, 0.001)
+@cases(4, 0.001)
 def test_nonsense_options(folder: Path, verb: str, place: int, value: str, other: tuple[int, str] | None) -> None:
     options = OPTIONS[verb]
     arguments = [verb, options[place % len(options)], value]
