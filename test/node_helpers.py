@@ -60,6 +60,12 @@ class Bench(BareBench):
         defaults = {"model_file": "paper_machine.yaml", "start_without_feedback_after": AT_ONCE}
         return super().compensator(start, **{**defaults, **parameters})
 
+    def listen(self, kind: type, topic: str, qos: Any = RELIABLE, **options: Any) -> list[Any]:
+        """Return the list to which a topic's messages are appended from now on."""
+        received: list[Any] = []
+        self.witness.create_subscription(kind, topic, received.append, qos, **options)
+        return received
+
 
 class FakeTime:
     """Stands for the module ``time``: a clock of the test's own."""

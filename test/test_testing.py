@@ -19,7 +19,11 @@ def test_the_documented_example_passes_and_a_wrong_controller_fails(tmp_path: Pa
     page = (ROOT / "doc" / "testing.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.S)
     (tmp_path / "test_right.py").write_text(example, encoding="utf-8")
-    wrong = example.partition("def test_a_stuck_strut")[0].replace("0.395", "0.396", 1).replace('at 395 mm")', 'at 395 mm", 1.0)')
+    wrong = (
+        example.partition("def test_a_stuck_strut")[0]
+        .replace("0.395", "0.396", 1)
+        .replace('at 395 mm")', 'at 395 mm", 1.0)')
+    )
     (tmp_path / "test_wrong.py").write_text(wrong, encoding="utf-8")
     command = [sys.executable, "-m", "pytest", "-q", "-p", "hexapod_comp.testing", "-p", "no:cacheprovider"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}

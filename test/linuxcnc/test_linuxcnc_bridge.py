@@ -52,8 +52,7 @@ class Machine:
         self.node = rig.add(LinuxcncBridgeNode, False, {**SLOW, **parameters}, hal=self.hal)
         for topic in ("tool_pose_command", "strut_states"):  # the compensator hears no two publishers
             rig.remove_publisher(topic)
-        self.poses: list[PoseStamped] = []
-        rig.witness.create_subscription(PoseStamped, "tool_pose_command", self.poses.append, RELIABLE)
+        self.poses = rig.listen(PoseStamped, "tool_pose_command")
         self.place(HOME)
 
     def start(self, on: bool = True) -> Machine:

@@ -114,8 +114,7 @@ def test_what_cannot_be_does_not_start(rig, kind, parameters, text):
 
 def test_rates_and_timeouts_change_at_once(rig):
     rig.compensator(heartbeat_rate=0.0, command_timeout=0.0)
-    beats: list[UInt64] = []
-    rig.witness.create_subscription(UInt64, "compensator/heartbeat", beats.append, 10)
+    beats = rig.listen(UInt64, "compensator/heartbeat")
     rig.until(rig.matched, "discovery")
     rig.ask(HOME)
     rig.barrier()

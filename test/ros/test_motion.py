@@ -14,7 +14,7 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from node_helpers import HOME, RELIABLE, Bench, closed_form_lengths, near
+from node_helpers import HOME, Bench, closed_form_lengths, near
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile
@@ -24,7 +24,6 @@ from sensor_msgs.msg import JointState, TimeReference
 from std_msgs.msg import Bool, UInt64
 from std_srvs.srv import SetBool
 
-from hexapod_comp.compensation import guards
 from hexapod_comp.ros import base
 from hexapod_comp.ros.base import LATCHED_QOS
 from hexapod_comp.ros.messages import pose_message
@@ -33,12 +32,6 @@ from hexapod_comp.ros.status import ERROR, OK, WARN
 
 SPEED = 0.25
 """Largest strut speed of the rig's machine, m/s."""
-
-
-@pytest.fixture(autouse=True)
-def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What colours a status for a second does so for 0.3 s."""
-    monkeypatch.setattr(guards, "SHOWN_FOR", 0.3)
 
 
 def risen(rig: Bench, millimetres: float, seconds: float | None = None):
@@ -200,16 +193,9 @@ def test_a_change_ramps_out_without_stamps_while_simulated_time_stands(rig, cloc
 # ---- what a drive, a PLC or a HAL may watch: heartbeat, validity, stop output, deadlines ----
 
 
-def hear(rig: Bench, kind: type, topic: str, qos: QoSProfile = RELIABLE, **options: Any) -> list[Any]:
-    """Return the list to which a topic's messages are appended from now on."""
-    heard: list[Any] = []
-    rig.witness.create_subscription(kind, topic, heard.append, qos, **options)
-    return heard
-
-
 def test_the_heartbeat_counts_every_beat_as_long_as_the_node_is_configured(rig):
     rig.compensator(heartbeat_rate=200.0)
-    beats = hear(rig, UInt64, "compensator/heartbeat")
+    beats = rig.listen(UInt64, "compensator/heartbeat")
     rig.until(lambda: len(beats) > 20, "heartbeats")
     assert rig.change("deactivate")
     inactive = len(beats)
@@ -226,7 +212,7 @@ def test_the_heartbeat_counts_every_beat_as_long_as_the_node_is_configured(rig):
 @pytest.mark.parametrize("timeout", [0.1, 2.5])
 def test_a_command_is_valid_until_its_stamp_and_the_command_timeout(rig, timeout):
     rig.compensator(command_timeout=timeout)
-    validities = hear(rig, TimeReference, "compensator/validity")
+    validities = rig.listen(TimeReference, "compensator/validity")
     for pose in (HOME, near(HOME, (0.0, 0.0, 0.001))):
         answer = rig.ask(pose)
         stamp = answer.command.header.stamp
@@ -241,14 +227,14 @@ def test_a_command_is_valid_until_its_stamp_and_the_command_timeout(rig, timeout
 
 def test_the_stop_output_is_repeated_for_who_has_missed_what_is_latched(rig):
     rig.compensator()
-    stops = hear(rig, Bool, "compensator/stopped", LATCHED_QOS)
+    stops = rig.listen(Bool, "compensator/stopped", LATCHED_QOS)
     rig.until(lambda: len(stops) >= 3, "the same once more, and again")
     assert {stop.data for stop in stops[1:]} == {stops[-1].data}
 
 
 def test_the_stop_output_says_when_commands_are_refused(rig):
     node = rig.compensator(start_without_feedback_after=0.0)
-    stops = hear(rig, Bool, "compensator/stopped", LATCHED_QOS)
+    stops = rig.listen(Bool, "compensator/stopped", LATCHED_QOS)
 
     def until(stopped: bool, why: str) -> None:
         rig.until(lambda: stops and stops[-1].data is stopped, why)
@@ -286,7 +272,7 @@ def test_who_asks_for_the_deadline_is_told_that_commands_end(bench):
     wants = QoSProfile(depth=10, deadline=Duration(seconds=0.2))
     events = SubscriptionEventCallbacks(deadline=missed.append)
     heard = {
-        topic: hear(bench, JointState, topic, wants, event_callbacks=events)
+        topic: bench.listen(JointState, topic, wants, event_callbacks=events)
         for topic in ("strut_commands", "strut_corrections")
     }
     bench.until(lambda: all(bench.witness.count_subscribers(topic) == 2 for topic in heard), "discovery")
@@ -314,7 +300,7 @@ def test_a_deadline_is_asked_for_where_a_parameter_says_so(bench):
 def test_a_late_subscriber_gets_the_status_of_every_node_when_it_is_discovered(bench, monkeypatch):
     monkeypatch.setattr(base, "STATUS_PERIOD", 1e9)  # nothing is published again only because time passes
     bench.machine()
-    arrays = hear(bench, DiagnosticArray, "/diagnostics")
+    arrays = bench.listen(DiagnosticArray, "/diagnostics")
     bench.until(lambda: len({array.status[0].name for array in arrays}) == 2, "the status of drive and compensator")
 
 

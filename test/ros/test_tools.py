@@ -62,13 +62,6 @@ def started(rig: Bench, file: str, **parameters: object) -> None:
     rig.compensator(geometry_file=file, model_file="ideal", **parameters)
 
 
-def heard(rig: Bench, kind: type, topic: str, qos: QoSProfile = RELIABLE) -> list:
-    """Return a list of what is published from now on."""
-    messages: list = []
-    rig.witness.create_subscription(kind, topic, messages.append, qos)
-    return messages
-
-
 # ---- frames ----
 
 
@@ -109,7 +102,7 @@ def test_two_frames_of_one_name_are_refused(rig: Bench, file: str) -> None:
 
 def test_the_parameter_changes_the_tool_and_nothing_moves(rig: Bench, machine: Machine, file: str) -> None:
     started(rig, file)
-    tools = heard(rig, String, "compensator/tool", LATCHED)
+    tools = rig.listen(String, "compensator/tool", LATCHED)
     before = rig.ask(at_home(machine), "work")
     assert rig.set_parameter("compensator", "tool", "probe").successful
     rig.send(at_home(machine), "work")
@@ -198,7 +191,7 @@ def test_travel_is_answered_and_published_with_names_and_units(rig: Bench, machi
     assert answer.message.startswith("tool probe in fixture at x, y, z ")
     geometry = load_geometry(file).using("probe", "fixture")
     ways = travel(RealMachine(geometry, MachineModel("framed")), at_home(machine, "probe", "fixture"))
-    reports = heard(rig, DiagnosticStatus, "compensator/travel")
+    reports = rig.listen(DiagnosticStatus, "compensator/travel")
     rig.until(lambda: reports, "a report")
     values = {entry.key: entry.value for entry in reports[0].values}
     for way in ways:
@@ -336,8 +329,7 @@ def test_joints_go_by_the_machine_s_own_names(rig: Bench):
 def test_joint_states_show_the_machine_where_its_struts_are(rig: Bench):
     """Truth: closed-form lengths, and the pose that they belong to."""
     rig.compensator(model_file="ideal", marker_rate=10.0)
-    seen: list[JointState] = []
-    rig.witness.create_subscription(JointState, "joint_states", seen.append, 10)
+    seen = rig.listen(JointState, "joint_states")
     pose = near(HOME, (0.003, -0.002, 0.01), 1.0)
     rig.feed(closed_form_lengths(pose))
     rig.until(lambda: seen and abs(seen[-1].position[list(seen[-1].name).index("platform_z")] - 0.41) < SAME, "pose")
@@ -360,8 +352,7 @@ def test_before_ros2_control_arrays_are_in_joint_order(rig: Bench, tmp_path: Pat
     words = ["--ros-args", "--params-file", str(tmp_path / "config" / "before.yaml")]
     words += ["-r", "strut_commands_array:=forward_command_controller/commands", "-r", "strut_states:=joint_states"]
     rig.add(CompensatorNode, True, {"enable_compensation": False}, cli_args=words)
-    told: list[Float64MultiArray] = []
-    rig.witness.create_subscription(Float64MultiArray, "forward_command_controller/commands", told.append, 10)
+    told = rig.listen(Float64MultiArray, "forward_command_controller/commands")
     publisher = rig.witness.create_publisher(JointState, "joint_states", 10)
     # As joint_state_broadcaster publishes them: by name, in its own order, beside other joints.
     message = setpoints([12.0, *closed_form_lengths(ASKEW)[::-1]], ("spindle", *STRUT_NAMES[::-1]))
