@@ -12,16 +12,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import FittedParameters
 from hexapod_comp.calibration.posterior_file import save_with_posterior
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine
-from hexapod_comp.machine.passes import Passes
+from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import AXES, FROM_PREVIOUS, KINDS, FileLine, MeasurementSet, Reading
 from hexapod_comp.measurements.runs import assemble
@@ -93,33 +92,10 @@ def true_parameters(space: ParameterSpace, truth: MachineModel) -> np.ndarray:
     return np.concatenate([part for block in space.blocks for part in known[block.name]])
 
 
-def tool_error(
-    truth: RealMachine, model: MachineModel | None, box: np.ndarray = BOX, seed: int = 5, count: int = 300
-) -> tuple[float, float]:
-    """Return the RMS tool error that a model's compensation leaves on the machine itself.
-
-    Displacement of the platform's origin (m) and rotation (rad) at random level poses in the box, passed
-    there and back in a random direction; shift and rotation of the datum aligned with Kabsch's method.
-    """
-    rng = np.random.default_rng(seed)
-    wanted = np.tile(rng.uniform(*box, (count, 3)), (2, 1))
-    ways = rng.standard_normal((count, 3))
-    believed = RealMachine(truth.geometry, model or MachineModel(truth.geometry.name))
-    passed = zip(wanted, np.vstack([ways, -ways]), strict=True)
-    actual = [_reached(truth, believed, Pose(p, np.eye(3)), way) for p, way in passed]
-    points = np.array([pose.position for pose in actual])
-    centred, around = wanted - wanted.mean(axis=0), points - points.mean(axis=0)
-    turn, _ = Rotation.align_vectors(centred, around)
-    left = turn.apply(around) - centred
-    turns = Rotation.from_matrix([pose.rotation for pose in actual]).as_rotvec()
-    turns -= turns.mean(axis=0)
-    return float(np.sqrt((left**2).sum(axis=1).mean())), float(np.sqrt((turns**2).sum(axis=1).mean()))
-
-
-def _reached(truth: RealMachine, believed: RealMachine, target: Pose, way: np.ndarray) -> Pose:
-    sense = Passes(truth.geometry, target.position[None], target.rotation[None], way[None]).senses()[0]
-    commands, _, _ = believed.commands_for(target, MotionState(sense=sense.copy()))
-    return truth.pose_for(commands, sense, target)[0]
+def tool_error(truth: RealMachine, model: MachineModel | None) -> tuple[float, float]:
+    """Return the RMS tool error that a model's compensation leaves on the machine itself, m and rad, datum aligned."""
+    found = held_out(truth, model, BOX, 300, seed=5)
+    return found.aligned.rms, found.rotation.rms
 
 
 def scattered(
