@@ -23,13 +23,12 @@ from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import ModelFit, fit_model, unseen_errors
 from hexapod_comp.calibration.observations import Lengths
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
-from hexapod_comp.errors import CalibrationError, InputFileError
+from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import save_model
 from hexapod_comp.measurements.campaign import Campaign, circle_run, line_run, template
 from hexapod_comp.measurements.readings import AXES, CHANNELS, KINDS, LENGTH, UNKNOWN, MeasurementSet, Reading
 from hexapod_comp.measurements.runs import assemble
-from hexapod_comp.measurements.tidy import read_tidy
 from hexapod_comp.pose import Pose
 
 pytestmark = pytest.mark.usefixtures("unsuspected")
@@ -86,9 +85,6 @@ def test_a_centre_at_another_place_is_refused() -> None:
     read = np.linalg.norm(points - centre - [0.05, 0.0, 0.0], axis=1)
     with pytest.raises(CalibrationError, match=r"run bar 3 put their centre .* must be known to 25 mm"):
         left_of(lengths, np.zeros((30, 3)), read - 0.2)
-
-
-# ---------------------------------------------------------------- fits of machines that are not the package's
 
 
 def lengths_from(machine: Machine, name: str, tips: np.ndarray, tools: np.ndarray, centre: np.ndarray) -> list[Reading]:
@@ -166,43 +162,10 @@ def test_what_circles_and_lengths_cannot_see() -> None:
     seen = {}
     for known in (False, True):
         chosen = [reading._replace(known_zero=known) for reading in readings]
-        seen[known] = {error.name for error in unseen_errors(assemble(small_paper(), chosen), FitSettings())}
+        seen[known] = {error.name for error in unseen_errors(assemble(small.paper(), chosen), FitSettings())}
     assert "size" in seen[False]
     assert "size" not in seen[True]
     assert {"roll of x", "roll of y", "roll of z"} <= set(seen[True])
-
-
-def small_paper():  # type: ignore[no-untyped-def]
-    """Return the shipped geometry of the paper's machine."""
-    return load_geometry(Path(__file__).resolve().parents[2] / "config" / "paper.yaml")
-
-
-# ---------------------------------------------------------------- files
-
-
-HEAD = "run,direction,x_mm,y_mm,z_mm,channel,value,unit,centre_x_mm,centre_y_mm,centre_z_mm,zero\n"
-TOUCH = "a,,0,0,450,length,0,um,0,0,400,"
-
-
-@pytest.mark.parametrize(
-    ("row", "complaint"),
-    [
-        ("a,,0,0,450,length,0,um,,,,", "line 2: a length needs the place of its centre"),
-        ("a,,0,0,450,length,0,um,0,0,,", "line 2: has a centre without its centre_z"),
-        ("a,,0,0,450,length,0,um,0,0,450,", "line 2: the commanded point must be 1 mm or more from the centre"),
-        ("a,,0,0,450,length,0,urad,0,0,400,", "column unit: must be m or mm"),
-        ("a,,0,0,450,length,0,um,0,0,400,yes", "column zero: must be known or empty"),
-        ("a,,0,0,450,displacement_x,0,um,,,,known", "only lengths have a centre or a known zero"),
-        (f"{TOUCH}\na,,0,0,451,length,0,um,0,0,400,known", "one zero cannot be known and unknown"),
-        (f"{TOUCH}\n{TOUCH}", "reads length again"),
-    ],
-)  # fmt: skip
-def test_what_is_wrong_in_a_file_is_named(row: str, complaint: str, tmp_path: Path) -> None:
-    (tmp_path / "wrong.csv").write_text(HEAD + row + "\n")
-    with pytest.raises(InputFileError) as refused:
-        read_tidy(tmp_path / "wrong.csv", small_paper())
-    assert complaint in str(refused.value)
-    assert "wrong.csv" in str(refused.value)
 
 
 FRAMES = ((0.5 * MM, 1e-3), (1.0, 0.3))  # How far a tracker's frame is off, m and rad

@@ -138,6 +138,9 @@ def test_runs_of_the_same_name_in_two_files_are_two(tmp_path: Path) -> None:
         read_tidy([two, two], paper_geometry())
 
 
+LENGTHS = f"{HEADER},centre_x_mm,centre_y_mm,centre_z_mm,zero"
+TOUCH = "a,,0,0,450,length,0,um,0,0,400,"
+
 BAD = {
     "no value": (LINE, HEADER.replace("value", "valeu"), "header: column value is missing"),
     "unknown column": (LINE.replace("um\n", "um,1\n"), f"{HEADER},wind_m_s", "header: is not a known column .*wind"),
@@ -152,6 +155,12 @@ BAD = {
     "temperature": (LINE.replace("um\n", "um,293\n"), f"{HEADER},base_degC", "line 2, column base_degC: .*120 °C"),
     "no pressure": (LINE.replace("um\n", "um,1\n"), f"{HEADER},instrument_index", "line 2: .*needs temperature_degC"),
     "pressure in hPa": (LINE.replace("um\n", "um,20,1000,50,1\n"), AIR, "line 2, column pressure_kPa: .*120 kPa"),
+    "no centre": ("a,,0,0,450,length,0,um,,,,\n", LENGTHS, "line 2: a length needs the place of its centre"),
+    "half a centre": ("a,,0,0,450,length,0,um,0,0,,\n", LENGTHS, "line 2: has a centre without its centre_z"),
+    "at the centre": ("a,,0,0,450,length,0,um,0,0,450,\n", LENGTHS, "line 2: the commanded point must be 1 mm or more"),
+    "zero": ("a,,0,0,450,length,0,um,0,0,400,yes\n", LENGTHS, "line 2, column zero: must be known or empty"),
+    "no zero": ("a,,0,0,450,displacement_x,0,um,,,,known\n", LENGTHS, "only lengths have a centre or a known zero"),
+    "two zeros": (f"{TOUCH}\n{TOUCH.replace('450', '451')}known\n", LENGTHS, "one zero cannot be known and unknown"),
     "half a load": (
         LINE.replace("um\n", "um,5,0,,60\n"), f"{HEADER},payload_kg,payload_x_mm,payload_y_mm,payload_z_mm",
         "line 2: has a load without its payload_y"),
