@@ -159,18 +159,6 @@ def test_prior_of_the_map_is_matern(space: ParameterSpace):
     assert not (root @ root.T)[:n, n:].any()
 
 
-def test_priors_drawn_have_their_size(space: ParameterSpace):
-    """x = root·y with y ~ N(0, tolerance²): 4,000 draws know a standard deviation to 1.1 %; five of that."""
-    rng = np.random.default_rng(6)
-    spread = space.spread(space.start_tolerances())
-    drawn = space.physical(spread[:, None] * rng.standard_normal((space.size, 4000))).std(axis=1)
-    for block, tolerance in zip(space.blocks, space.start_tolerances(), strict=True):
-        priors = {"field displacement": space.field.prior, "field rotation": space.field.prior,
-                  "field reversal": space.field.reversal_prior}  # fmt: skip
-        relative = np.resize(priors.get(block.name, [1.0]), len(block.labels))
-        np.testing.assert_allclose(drawn[block.part], tolerance * relative, rtol=0.055, atol=0)
-
-
 def test_model_says_what_the_vector_says(readings: MeasurementSet):
     """A drawn machine goes into the vector by its own attributes and comes back."""
     few = ParameterSpace(readings, replace(small.SETTINGS, blocks=("pitch", "wave", "backlash")))
