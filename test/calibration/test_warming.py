@@ -21,38 +21,31 @@ from hexapod_comp.measurements.campaign import Campaign, CampaignRun, template
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
 from hexapod_comp.virtual.instruments import measure
 
-NOISE = 0.0065  # What the compensator's filter of 30 s leaves of 0.05 K, K
 PLAN = template(small.campaign("1-D"), small.paper())
 COUNT = len(PLAN.stations)
-# Fifty stations every ten minutes, one in four seconds
-BURSTS = 600.0 * (np.arange(COUNT) // 50) + 4.0 * (np.arange(COUNT) % 50)
 
 
-def warmed(times: np.ndarray, wait: float = 0.0) -> np.ndarray:
-    """Return a temperature that goes up by 3 K, °C."""
-    return 20.0 - 3.0 * np.expm1(-np.maximum(times - wait, 0.0) / 1500.0)
-
-
-def read(times: np.ndarray, temperatures: np.ndarray) -> MeasurementSet:
-    """Return a plan whose stations have these times, s, and all parts' temperatures (COUNT, 8), °C."""
-    return replace(PLAN, stations=replace(PLAN.stations, times=times, temperatures=temperatures))
-
-
-def noise() -> np.ndarray:
-    """Return what sensors of which the filter has made 30 s alike read beside, (COUNT, 8), K."""
-    white = np.random.default_rng(7).standard_normal((COUNT + 30, 8))
-    alike = np.array([white[n : n + 8].mean(axis=0) for n in range(COUNT)])
-    return NOISE * alike / alike.std(axis=0)
+def course(times: np.ndarray, temperatures: np.ndarray) -> np.ndarray:
+    """Return the courses behind what all parts' sensors read (COUNT, 8), °C, at times of the plan's stations, s."""
+    return with_courses(
+        replace(PLAN, stations=replace(PLAN.stations, times=times, temperatures=temperatures))
+    ).stations.temperatures
 
 
 def test_what_sensors_add_within_a_burst_is_taken_off() -> None:
-    """Of fifty readings of which eight are alike, six are independent; a level and a slope are two of them. What is
-    left changes from reading to reading by no more than a slope that is known from half of the noise over a minute."""
-    true = np.tile(warmed(BURSTS)[:, None], 8)
-    course = with_courses(read(BURSTS, true + noise())).stations.temperatures
-    assert ((course - true).std(axis=0) < NOISE * np.sqrt(2.0 / 6.0) * 1.3).all()
-    jitter = np.diff(course, axis=0)[np.diff(BURSTS) < 5.0] - np.diff(true, axis=0)[np.diff(BURSTS) < 5.0]
-    assert np.abs(jitter).max() < 4.0 * 0.5 * NOISE / 60.0 * 4.0
+    """Fifty stations every ten minutes, one in four seconds, warm by 3 K; a filter of 30 s leaves 6.5 mK of noise.
+
+    Of fifty readings of which eight are alike, six are independent; a level and a slope are two of them. What is left
+    changes from reading to reading by no more than a slope that is known from half of the noise over a minute.
+    """
+    left, times = 0.0065, 600.0 * (np.arange(COUNT) // 50) + 4.0 * (np.arange(COUNT) % 50)
+    true = np.tile(20.0 - 3.0 * np.expm1(-times / 1500.0)[:, None], 8)
+    white = np.random.default_rng(7).standard_normal((COUNT + 30, 8))
+    alike = np.array([white[n : n + 8].mean(axis=0) for n in range(COUNT)])
+    found = course(times, true + left * alike / alike.std(axis=0))
+    assert ((found - true).std(axis=0) < left * np.sqrt(2.0 / 6.0) * 1.3).all()
+    jitter = np.diff(found - true, axis=0)[np.diff(times) < 5.0]
+    assert np.abs(jitter).max() < 4.0 * 0.5 * left / 60.0 * 4.0
 
 
 def test_without_times_each_run_has_a_course() -> None:
@@ -60,8 +53,7 @@ def test_without_times_each_run_has_a_course() -> None:
     run = np.zeros(COUNT, dtype=int)
     run[PLAN.station] = PLAN.run
     steps = np.tile(20.0 + 0.5 * (run[:, None] % 3), 8)
-    unknown = np.full(COUNT, np.nan)
-    np.testing.assert_allclose(with_courses(read(unknown, steps)).stations.temperatures, steps, atol=1e-9)
+    np.testing.assert_allclose(course(np.full(COUNT, np.nan), steps), steps, atol=1e-9)
 
 
 pytestmark = pytest.mark.usefixtures("unsuspected")
