@@ -251,19 +251,14 @@ def test_evidence_is_that_of_the_readings_distribution():
     assert log_bayes_factor(space, posteriors[0], "wave") == pytest.approx(truth[0] - truth[2], rel=1e-6)
 
 
-@pytest.fixture
-def exact(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let rounds of hyperparameters go on to the fixed point."""
-    monkeypatch.setattr("hexapod_comp.calibration.estimator.ROUNDS_SETTLED", 1e-6)
-
-
-def test_tolerances_and_noise_are_the_most_probable_ones(exact: None):
+def test_tolerances_and_noise_are_the_most_probable_ones(monkeypatch: pytest.MonkeyPatch):
     """At the fixed point the evidence has no slope along any log tolerance or log noise factor.
 
     Each tolerance t has the prior t^−h · exp(−h·(t₀/t)²/2), h = ASSUMED.hyperprior, written from the rule
     that the first guess counts as h of a parameter. Slopes by central differences; the largest one away
     from the optimum is about 60.
     """
+    monkeypatch.setattr("hexapod_comp.calibration.estimator.ROUNDS_SETTLED", 1e-6)  # on to the fixed point
     space, problem, _ = random_problem()
     answer = solve(space, problem, space.start_tolerances(), ONES, 400)
     start, kinds = space.start_tolerances(), np.array([LINEAR, STRAIGHTNESS, ROTATION])

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.evaluation import held_out
-from hexapod_comp.calibration.fit import ModelFit, fit_model, unseen_errors
+from hexapod_comp.calibration.fit import fit_model, unseen_errors
 from hexapod_comp.calibration.observations import Lengths
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.errors import CalibrationError
@@ -131,11 +131,6 @@ def measured(machine: Machine, truth: Errors, path: Path, what: str) -> Measurem
     return m.with_values(value + zeros + 0.5 * UM * rng.standard_normal(len(value)))
 
 
-def fitted(machine: Machine, truth: Errors, folder: Path, what: str) -> ModelFit:
-    """Return the fit of structure and pitch, which is all that these machines err by."""
-    return fit_model(measured(machine, truth, folder / "machine.yaml", what), FitSettings(blocks=("pitch",)))
-
-
 @pytest.mark.parametrize("what", ["stations", "circles and R-tests"])
 @pytest.mark.parametrize("name", foreign_machines.machine_names())
 def test_instruments_mend_machines_of_all_kinds(name: str, what: str, tmp_path: Path) -> None:
@@ -145,7 +140,8 @@ def test_instruments_mend_machines_of_all_kinds(name: str, what: str, tmp_path: 
     """
     machine = foreign_machines.machines()[name]
     truth = Errors.drawn(machine, 3)
-    fit = fitted(machine, truth, tmp_path, what)
+    readings = measured(machine, truth, tmp_path / "machine.yaml", what)
+    fit = fit_model(readings, FitSettings(blocks=("pitch",)))  # all that these machines err by, with structure
     save_model(fit.model, tmp_path / "model.yaml")
     tips = machine.middle + np.random.default_rng(9).uniform(-0.8, 0.8, (100, 3)) * np.array(machine.half)
     error = partial(tool_errors, machine, truth)

@@ -123,13 +123,9 @@ def noisy_lines(geometry: HexapodGeometry, seed: int = 0) -> MeasurementSet:
     rng = np.random.default_rng(seed)
     blank = template(QUIET, geometry)
     axis = np.array([run.base_axis for run in blank.runs])[blank.run]
-    u = parameter_of(blank, axis)
+    points = blank.points()[blank.station]
+    u = np.array([parameter(a, point[a]) for a, point in zip(axis, points, strict=True)])
     return blank.with_values(20e-6 * u**2 + 0.5e-6 * rng.standard_normal(len(u)))
-
-
-def parameter_of(readings: MeasurementSet, axis: np.ndarray) -> np.ndarray:
-    points = readings.points()[readings.station]
-    return np.array([parameter(a, point[a]) for a, point in zip(axis, points, strict=True)])
 
 
 def test_both_criteria_find_a_parabola(geometry):

@@ -25,7 +25,6 @@ from hexapod_comp.calibration.posterior import (
     MACHINE_ERRORS,
     ErrorPredictor,
     FittedParameters,
-    Observability,
     box_errors,
     box_stations,
     expected_error,
@@ -358,10 +357,6 @@ def problem_of(measurements: MeasurementSet, settings: FitSettings) -> tuple[Par
     return space, estimation.linearise(np.zeros(space.size), np.ones(len(measurements)))[0]
 
 
-def sight(space: ParameterSpace, problem: LinearProblem) -> Observability:
-    return observe(space, problem, solve(space, problem, space.start_tolerances(), ONES, 0))
-
-
 def rank(space: ParameterSpace, problem: LinearProblem) -> int:
     """Return how many structure parameters readings of 1 µm tell from ±100 µm, by NumPy's singular values."""
     singular = np.linalg.svd(problem.rows.dense()[:, space.blocks[0].part] * 100e-6, compute_uv=False)
@@ -372,7 +367,7 @@ def test_level_lines_see_14_of_33_structure_parameters():
     """The issue's count, on the shipped campaign without its diagonals: 33 parameters, 14 of them seen."""
     plan = replace(load_campaign(config_file("campaign_5d.yaml")), diagonals=0)
     space, problem = problem_of(template(plan, small.paper()), STRUCTURE)
-    seen = sight(space, problem)
+    seen = observe(space, problem, solve(space, problem, space.start_tolerances(), ONES, 0))
     assert (seen.structure_rank, seen.structure_size) == (14, 33)
     assert rank(space, problem) == 14
 
@@ -463,7 +458,7 @@ def test_expected_error_of_one_known_parameter():
     x[offset] = sigma
     moved = predict(space, x, stations).errors
     points = stations.positions - stations.positions.mean(axis=0)
-    datum = np.vstack([np.hstack([np.eye(3), -cross(p)]) for p in points])
+    datum = np.vstack([np.hstack([np.eye(3), -np.cross(np.eye(3), p).T]) for p in points])
     flat = moved[:, :3].ravel()
     left = flat - datum @ np.linalg.lstsq(datum, flat, rcond=None)[0]
     assert found.after == pytest.approx(np.sqrt((left**2).sum() / len(points)), rel=0.13)
@@ -471,8 +466,3 @@ def test_expected_error_of_one_known_parameter():
     assert found.rotation_after == pytest.approx(np.sqrt((turned**2).sum(axis=1).mean()), rel=0.13)
     assert found.before == pytest.approx(0.0, abs=1e-12)
     assert found.low < found.after < found.high
-
-
-def cross(v: np.ndarray) -> np.ndarray:
-    """Return the matrix of v × ."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

@@ -157,17 +157,12 @@ def altered(messages: Messages, number: int, change: Callable[[dict], None]) -> 
     return messages
 
 
-def answers_of(page: dict) -> np.ndarray:
-    """Return a copy of the answers of a page's content."""
-    return np.frombuffer(base64.b64decode(page["answers"]), COMMAND).copy()
-
-
 @pytest.mark.parametrize(("kind", "name"), [(0, "command"), (1, "correction")])
 def test_replay_sees_a_difference_of_one_bit(run, tmp_path, capsys, kind, name):
     """One number is moved to its neighbouring float; nothing else may be called different."""
 
     def move(page: dict) -> None:
-        answers = answers_of(page)
+        answers = np.frombuffer(base64.b64decode(page["answers"]), COMMAND).copy()
         value = answers["lengths"][7, kind, 3]
         answers["lengths"][7, kind, 3] = np.nextafter(value, 1.0)
         page["answers"] = base64.b64encode(answers.tobytes()).decode()
@@ -591,21 +586,11 @@ def test_bag_that_unpacks_to_too_much_is_refused(run, tmp_path, monkeypatch, kin
     bag = write_bag(tmp_path / "run", messages, kind, mode)
     monkeypatch.setattr(storage, "RATIO", 1)
     monkeypatch.setattr(storage, bound, 2 * MEGABYTE)
-    unpacked = []
-    monkeypatch.setattr(storage.Allowance, "charge", spied(storage.Allowance.charge, unpacked))
+    unpacked, charge = [], storage.Allowance.charge
+    monkeypatch.setattr(storage.Allowance, "charge", lambda self, n: (unpacked.append(n), charge(self, n)))
     with pytest.raises(InputFileError, match=message):
         read_recording(bag)
     assert sum(unpacked) <= 4 * MEGABYTE or mode == CompressionMode.FILE  # files go to the disk first
-
-
-def spied(charge: Callable, seen: list[int]) -> Callable:
-    """Return `charge` that notes what it counts."""
-
-    def noting(self: object, count: int) -> None:
-        seen.append(count)
-        charge(self, count)
-
-    return noting
 
 
 def test_chunks_packed_by_lz4_are_bounded_too(monkeypatch):
