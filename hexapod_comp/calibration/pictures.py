@@ -45,12 +45,13 @@ def strut_length_errors(
     return np.array(errors)
 
 
-def strut_error_figure(geometry: HexapodGeometry, models: Mapping[str, MachineModel]) -> Figure:
+def strut_error_figure(geometry: HexapodGeometry, models: Mapping[str, MachineModel], y: float | None = None) -> Figure:
     """Show Mou & King's Figures 3 and 4: the six struts' length errors along x, forward (a) and backward (b)."""
     if not models or any(model.measured is None for model in models.values()):
         raise CalibrationError("picture of strut errors", "needs models, each with the box in which it holds")
     box = commanded_box(geometry, next(iter(models.values())))
     line = box.mean(axis=0)[1:]
+    line[0] = line[0] if y is None else y
     along = np.linspace(box[0, 0], box[1, 0], SAMPLES)
     figure = Figure(figsize=(11, 3.8 * len(models)), layout="constrained")
     rows = figure.subplots(len(models), 2, squeeze=False, sharex=True, sharey="row")
