@@ -182,9 +182,8 @@ def test_what_a_fit_knows_comes_back_from_its_file(tmp_path: Path) -> None:
     assert found.space.settings == fitted.space.settings
 
 
-def rewritten(path: Path, noise: np.ndarray | None = None, arrays_now: dict | None = None, **head: object) -> None:
-    """Replace noise and other arrays, and entries of the head, None: without it, in the file beside a model; the model
-    knows its hash."""
+def rewritten(path: Path, noise: np.ndarray | None = None, **head: object) -> None:
+    """Replace noise and entries of the head, None: without it, in the file beside a model, which has its hash."""
     beside = path.with_name("after the crash.posterior.npz")
     with np.load(beside) as archive:
         arrays = dict(archive)
@@ -192,7 +191,7 @@ def rewritten(path: Path, noise: np.ndarray | None = None, arrays_now: dict | No
     arrays["head"] = np.array(json.dumps({name: value for name, value in changed.items() if value is not None}))
     before = hashlib.sha256(beside.read_bytes()).hexdigest()
     arrays |= {} if noise is None else {"noise": noise}
-    np.savez(beside, **(arrays | (arrays_now or {})))
+    np.savez(beside, **arrays)
     path.write_text(path.read_text().replace(before, hashlib.sha256(beside.read_bytes()).hexdigest()))
 
 
@@ -266,7 +265,6 @@ def test_any_value_in_a_posteriors_head_is_read_or_refused_in_words(tmp_path: Pa
         assert (found is None) == bool(why)
 
 
-Known = tuple[RealMachine, FittedParameters]
 TRACKER = "tracker, 20 poses, tilted up to 10°"
 
 
@@ -277,27 +275,23 @@ def tilted() -> Poses:
     return rng.uniform(*small.BOX, (200, 3)), rotation_from_angles(angles)
 
 
-def fitted(poses: int = 0) -> Known:
+def fitted(poses: int = 0) -> tuple[RealMachine, FittedParameters]:
     """Return a machine fitted to a 5-D laser's lines, with so many of a tracker's poses."""
     of_lines = small.fitted(poses)
     return RealMachine(small.paper(), of_lines.model), of_lines.known
 
 
-@pytest.fixture(scope="module")
-def lines() -> Known:
-    return fitted()
+@cache
+def left_by_lines() -> Remaining:
+    return remaining(*fitted(), tilted(), "tilted")
 
 
-@pytest.fixture(scope="module")
-def result(lines: Known) -> Remaining:
-    return remaining(*lines, tilted(), "tilted")
-
-
-def test_the_measurement_that_is_recommended_does_what_is_foretold(result: Remaining) -> None:
+def test_the_measurement_that_is_recommended_does_what_is_foretold() -> None:
     """Lines of a level tool leave its tilting open; a tracker sees it. Fitted with its poses, that much is left.
 
     Noise and tolerances are found anew, and other poses of the same number are drawn: a quarter is allowed.
     """
+    result = left_by_lines()
     shares = {share.name: share for share in result.measurements}
     assert TRACKER in [share.name for share in result.measurements[:2]]
     foretold, now = shares[TRACKER].left[1], result.left[1].rms[0]
@@ -306,9 +300,9 @@ def test_the_measurement_that_is_recommended_does_what_is_foretold(result: Remai
     assert again.left[1].rms[0] == pytest.approx(foretold, rel=0.25)
 
 
-def test_known_and_measured_are_the_textbooks(lines: Known, result: Remaining) -> None:
+def test_known_and_measured_are_the_textbooks() -> None:
     """Known: the conditional covariance. Measured: the inverse of the sum of both informations. In SI units."""
-    machine, parameters = lines
+    result, (machine, parameters) = left_by_lines(), fitted()
     sigma = parameters.covariance
     _, _, slopes, _ = ErrorPredictor(machine, parameters).slopes(tilted())
 
@@ -337,12 +331,9 @@ FIELD = FitSettings(blocks=("field displacement", "field rotation"), field_degre
 
 
 @cache
-def linearised(
-    instrument: str, diagonals: int, settings: FitSettings, poses: int = 0, tilt: float = 0.0
-) -> tuple[ParameterSpace, LinearProblem]:
+def linearised(instrument: str, diagonals: int, settings: FitSettings) -> tuple[ParameterSpace, LinearProblem]:
     """Return space and linear problem of a campaign on the nominal machine: what it sees needs no readings."""
-    plan = small.campaign(instrument, diagonals, poses=poses, tilt=tilt)
-    return problem_of(template(plan, small.paper()), settings)
+    return problem_of(template(small.campaign(instrument, diagonals), small.paper()), settings)
 
 
 def read(instrument: str, diagonals: int, settings: FitSettings) -> Estimation:
