@@ -120,14 +120,12 @@ def adapt(args: argparse.Namespace) -> Result:
         box, level = np.array(begun.get("box_m", box)), np.array(begun.get("level", level))
         if args.box is not None:
             box = np.array(args.box)
-    instruments = ("6-D",) if args.instruments is None else tuple(args.instruments.split(","))
     goal = None if args.goal_um is None else args.goal_um * 1e-6
     if goal is None and campaign is None:
         goal = begun.get("goal_m")
-    hours = 4.0 if args.hours is None else args.hours
     every = 600.0 if args.every_min is None else 60.0 * args.every_min
     checks = None if args.checks is None and args.every_min is not None else args.checks or 0
-    task = Task(box, level, goal, campaign, instruments, 3600.0 * hours, fit_settings(args), every)
+    task = Task(box, level, goal, campaign, fit_settings(args), every)
     signals = received_signals()
 
     def going_on() -> bool:

@@ -255,8 +255,6 @@ example:
             value("--every-min", bound, "MIN", "time from one check to the next (default 10)"),
             value("--box", box, CORNERS, "lowest and highest tool position that counts, mm (default: the "
                   "folder's, the campaign's, else the largest that the machine reaches)"),
-            value("--instruments", None, "A,B,…", "what to plan for, read from the poses (default 6-D: lines)"),
-            value("--hours", above_zero, "H", "how long a planned campaign may take (default 4)"),
             TRACKER,
             value("--samples", whole(3, 10_000), "N", "poses of which the median is taken, three times at each stop "
                   "(default 25)", default=25),
@@ -276,7 +274,7 @@ example:
   $ hexapod_comp adapt --goal-um 3 --folder adapted --reload --every-min 30
   $ hexapod_comp adapt --folder adapted --reload --verify""",
         (
-            excluded_by("--campaign", "--goal-um", "--box", "--instruments", "--hours"),
+            excluded_by("--campaign", "--goal-um", "--box"),
             excluded_by("--verify", "--anew", "--checks", "--every-min"),
         ),
     ),

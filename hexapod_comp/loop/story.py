@@ -102,7 +102,9 @@ class Told:
         ]
         table = aligned(["tool error, µm RMS, datum aligned", "stops", "at the stops", "in the whole box"], rows)
         promised = f"promised after the calibration: up to {self.promised * 1e6:.3f} µm (95 %)"
-        verdict = "\n".join(f"NOT AS IT SHOULD BE: {text}" for text in self.complaints) or "all as it should be"
+        verdict = (
+            "\n".join(f"FAILED: {text}" for text in self.complaints) or "PASSED: both changes named, every promise kept"
+        )
         return f"{table}\n{promised}\n{verdict}"
 
     def as_json(self) -> dict[str, Any]:
@@ -163,7 +165,7 @@ def tell(
 
 
 def _complaints(events: list[dict[str, Any]], promised: float, left: dict[str, float], strut: int) -> Iterator[str]:
-    """Yield what is not as it should be."""
+    """Yield each change that no repair names, and each promise that is not kept."""
     repairs = [e["text"] for e in events if e["event"] == "repaired"]
     for wanted in ("a temperature acts", f"a strut's offset has changed: {STRUT_NAMES[strut]}"):
         if not any(text.startswith(wanted) for text in repairs):

@@ -53,12 +53,11 @@ GIVEN = "given"  # in place of the name of a planned campaign
 IN_USE = "model.yaml"  # the adopted model, always under this name, its posterior beside it
 PROPOSED = "proposed.yaml"  # a later one, until somebody permits that it is run
 
-CAMPAIGNS = (
-    3  # of a calibration, each planned where the fit of those before does not reach the goal; then it is refused
-)
+CAMPAIGNS = 3  # of a calibration, each planned where the fits before have not reached the goal; then it is refused
 PASSES = 3  # over a campaign, for stops at which the instrument read nothing
 PLANNED_SHARE = 0.7  # of the goal is planned for: a plan expects the RMS error, and the goal is the end of its interval
 FURTHER = 0.5  # of what was planned for before, where the readings have not been enough
+POSES, LONGEST = "6-D", 4 * 3600.0  # What a tracker's poses are to a plan, and how long a planned campaign may be, s
 STOP = 5.0  # A stop takes it, s: a move, its settling and three looks; whatever it reads, nothing is put up for it
 CHECKS_OF_A_READING = 3  # checks in a row that a single wrong reading spoils: then the instrument is to be looked after
 
@@ -79,8 +78,6 @@ class Task:
     level: np.ndarray  # (3, 3): the tool's attitude there, in the work frame
     goal: float | None = None  # the promised RMS tool error may reach this at most, with 95 %, m; None: any promise
     campaign: Campaign | None = None  # to begin with, in place of a planned one; with neither it can only be checked
-    instruments: tuple[str, ...] = ("6-D",)  # that may be planned for
-    seconds: float = 4 * 3600.0  # that a planned campaign may take
     settings: FitSettings = field(default_factory=FitSettings)
     every: float = 600.0  # time from one check of the model in use to the next, s
 
@@ -406,8 +403,8 @@ class Adaptation:
     def _proposal(self, share: float) -> Proposal:
         """Return the plan for a share of the goal."""
         task = self._task
-        times = dict.fromkeys(task.instruments, Times(0.0, 0.0, STOP))
-        goal = Goal(share * (task.goal or 0.0), seconds=task.seconds, instruments=task.instruments, times=times)
+        times = {POSES: Times(0.0, 0.0, STOP)}
+        goal = Goal(share * (task.goal or 0.0), seconds=LONGEST, instruments=(POSES,), times=times)
         place = MeasuringBox(self._geometry, task.box, task.level, 0.0)
         return propose(place, goal, task.settings, progress=self._say_or_stop)
 
