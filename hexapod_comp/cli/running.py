@@ -102,7 +102,7 @@ def demo(args: argparse.Namespace) -> Result:
 def adapt(args: argparse.Namespace) -> Result:
     """Calibrate a running machine, or check the model that came of it; 0 when a model is borne out by its checks."""
     from ..ros import received_signals
-    from ..ros.adapting import AdaptedMachine
+    from ..ros.collector import AdaptedMachine
     from ..upkeep.journal import sole_user
     from ..upkeep.loop import IN_USE, Adaptation, Task, begun_with
     from ..workspace.reach import machine_box

@@ -1,19 +1,24 @@
 """A running machine that :func:`~hexapod_comp.measurements.collect.collect` measures: moved by the mover, watched on a
-topic of poses, a topic of single readings, or both."""
+topic of poses, a topic of single readings, or both; and one that calibrates itself."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable, Collection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, Vector3Stamped
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.duration import Duration
 from sensor_msgs.msg import JointState, Temperature
+from std_srvs.srv import Trigger
 
 from ..errors import CommandError, HexapodError, NoAnswerError, shorten
+from ..formats.paths import folder_of
 from ..machine.geometry import STRUT_NAMES
 from ..machine.load import EARTH
 from ..machine.temperatures import TEMPERATURE_RANGE, Temperatures
@@ -30,6 +35,8 @@ MEDIAN_TO_SIGMA = 1.4826  # Standard deviation of a normal distribution over the
 OF_A_MEDIAN = math.sqrt(math.pi / 2.0)  # Its standard deviation, times √n, over that of a reading
 ASKED_AGAIN = 2  # How often a refused move is: a busy computer's commands come late
 LEAST_SAMPLES = 3  # of which a median is taken
+PATIENCE = 2.0  # Fewer than half of a stop's readings within this time, s, are a broken beam
+ANSWERED_WITHIN = 60.0  # A model is read within 30 s, or refused
 SET_UP_WITHIN = Duration(seconds=2)  # Who sets instruments up by topic hears of a run within this time
 
 
@@ -40,7 +47,7 @@ class WatchedMachine(Machine):
     lost.
 
     At each stop the median of `samples` readings that came after the tool had settled is taken, so that single wild
-    ones count for nothing; fewer than half within `patience`, s, count as a broken beam. `confirm` is called with each
+    ones count for nothing; fewer than half within PATIENCE count as a broken beam. `confirm` is called with each
     run that an instrument of single readings is set up for, and returns when it is.
     """
 
@@ -48,21 +55,19 @@ class WatchedMachine(Machine):
         self,
         topic: str,
         namespace: str = "",
-        mover: str = "mover",
         samples: int = 25,
-        patience: float = 2.0,
         readings: str = "",
         tracker_frame: str = KNOWN,
         confirm: Callable[[RunSetUp], object] = lambda run: None,
     ) -> None:
-        self._samples, self._patience, self._problem = samples, patience, ""
+        self._samples, self._problem = samples, ""
         self._frame_id, self._confirm = "base" if tracker_frame == KNOWN else "", confirm
         self._poses, self._struts = list[tuple[Pose, float]](), list[np.ndarray]()
         self._read, self._zero_lost = list[tuple[list[float], float]](), False
         self._own, self._wants_pose = tuple[str, ...](), True  # channels that are read themselves in this run
         self._warmth: dict[str, float] = {}
         self._gravity: tuple[float, ...] | None = None
-        super().__init__(namespace, mover)
+        super().__init__(namespace)
         node = self.node
         node.create_subscription(PoseStamped, topic, self._on_pose, SENSOR_QOS)
         node.create_subscription(JointState, "strut_states", self._on_struts, NEWEST_QOS)
@@ -153,7 +158,7 @@ class WatchedMachine(Machine):
         for heard in (self._poses, self._struts, self._read):
             heard.clear()
         self._problem = ""
-        end = time.monotonic() + self._patience
+        end = time.monotonic() + PATIENCE
         while time.monotonic() < end and not self._problem:
             self.spin_once(0.02)
             if self._enough(self._samples):
@@ -187,6 +192,115 @@ class WatchedMachine(Machine):
     def _enough(self, count: int) -> bool:
         """Return whether everything that this run needs has been read so often."""
         return (not self._wants_pose or len(self._poses) >= count) and (not self._own or len(self._read) >= count)
+
+
+class AdaptedMachine(WatchedMachine):
+    """A machine with mover, compensator and an instrument that publishes poses of its tool; `going_on` false brakes."""
+
+    def __init__(
+        self,
+        topic: str,
+        namespace: str = "",
+        samples: int = 25,
+        going_on: Callable[[], bool] = lambda: True,
+    ) -> None:
+        super().__init__(topic, namespace, samples)
+        self._going_on = going_on
+        self._arrived: MoveState | None = None  # at the target of the newest move,
+        self._target: tuple[Pose, tuple[Any, ...], dict[str, Any]]  # which was asked for so
+        services = (Trigger, "reload_model"), (SetParameters, "set_parameters"), (GetParameters, "get_parameters")
+        self._reload_model, self._set, self._get = (
+            self.node.create_client(kind, f"compensator/{name}") for kind, name in services
+        )
+
+    def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
+        """Move the tool and return when it has arrived; brake when it shall not go on: a MoveError, ``person``.
+
+        Where another client has the tool moved, wait until that has ended, and ask again.
+        """
+        braked = False
+
+        def watch(state: MoveState) -> None:
+            nonlocal braked
+            if not braked and not self._going_on():
+                braked = True
+                self._stop.call_async(Trigger.Request())
+
+        while True:
+            try:
+                self._arrived = super().move(pose, *arguments, **{"progress": watch, **options})
+            except MoveError as error:
+                if error.reason != "replaced":
+                    raise
+                self._wait_for_others()
+            else:
+                self._target = pose, arguments, options
+                return self._arrived
+
+    def _wait_for_others(self) -> None:
+        self.node.get_logger().warning("another client moves the tool: waiting until it stands")
+        while self.last.state not in ("idle", "arrived", "stopped"):
+            if not self._going_on():
+                raise MoveError("person", "stopped while another client moved the tool")
+            self.spin_once(0.02)
+
+    def observe(self) -> Observation | None:
+        """Observe as a watched machine; anew where another client has moved the tool meanwhile."""
+        while True:
+            seen = super().observe()
+            if self._arrived is None or self.last.request == self._arrived.request:
+                return seen
+            self._wait_for_others()
+            pose, arguments, options = self._target
+            self.move(pose, *arguments, **options)
+
+    def reload(self, path: Path) -> None:
+        """Have the compensator run a model file, by its ramp; where it refuses, the old model and its name stay."""
+        (before,) = self._parameters("model_file")
+        for client in (self._reload_model, self._set):
+            self.wait(client.service_is_ready, 10.0, "the services of the compensator")
+        wanted = str(path.resolve())
+        self._name_model(wanted)
+        answer = self._call(self._reload_model, Trigger.Request())
+        if not answer.success:
+            self._name_model(before)
+            raise CommandError("reload", f"the compensator did not take {wanted}: {answer.message}")
+
+    def refuse_unreadable(self, path: Path) -> None:
+        """Refuse a model file that the compensator would not open, before anything is measured for it.
+
+        Whether names that are relative to its own folder lead there is not known here: then its reload tells.
+        """
+        folder, model = self._parameters("model_folder", "model_file")
+        name = folder or model
+        own = Path(folder).expanduser() if folder else folder_of(model)
+        if own is not None and (
+            not Path(name).expanduser().is_absolute() or path.resolve().is_relative_to(own.resolve())
+        ):
+            return
+        places = "shipped models alone" if own is None else f"models in {own} alone"
+        advice = f"start it with -p model_folder:=FOLDER, in which {path.resolve()} and its geometry file are"
+        raise CommandError("reload", f"the compensator reads {places}: {advice}")
+
+    def runs(self, path: Path) -> bool:
+        """Return whether the compensator's model is the one of a file."""
+        return self._parameters("model_file") == [str(path.resolve())]
+
+    def _parameters(self, *names: str) -> list[str]:
+        self.wait(self._get.service_is_ready, 10.0, "the services of the compensator")
+        return [str(value.string_value) for value in self._call(self._get, GetParameters.Request(names=names)).values]
+
+    def _name_model(self, name: str) -> None:
+        value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=name)
+        request = SetParameters.Request(parameters=[Parameter(name="model_file", value=value)])
+        (result,) = self._call(self._set, request).results
+        if not result.successful:
+            raise CommandError("reload", f"the compensator keeps its model_file: {result.reason}")
+
+    def _call(self, client: Any, request: Any) -> Any:
+        future = client.call_async(request)
+        self.wait(future.done, ANSWERED_WITHIN, f"the answer of {client.srv_name}")
+        return future.result()
 
 
 def _median(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

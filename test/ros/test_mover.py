@@ -34,9 +34,8 @@ from hexapod_comp.measurements.collect import Collected, collect
 from hexapod_comp.measurements.readings import KINDS
 from hexapod_comp.pose import Pose, best_motion
 from hexapod_comp.ros.adapter import AdapterNode
-from hexapod_comp.ros.adapting import AdaptedMachine
 from hexapod_comp.ros.client import LoopClient, Machine, MoveError, MoveState, Sent
-from hexapod_comp.ros.collector import WatchedMachine
+from hexapod_comp.ros.collector import AdaptedMachine, WatchedMachine
 from hexapod_comp.ros.instrument import InstrumentNode
 from hexapod_comp.ros.messages import message_pose, nanoseconds_of, pose_message
 from hexapod_comp.ros.mover import MoverNode
@@ -581,7 +580,7 @@ def test_a_model_is_named_to_the_compensator_and_runs_by_its_ramp_or_the_old_one
     below, elsewhere = tmp_path / "adapted" / "model.yaml", tmp_path.parent / "model.yaml"
     assert asked(bench, lambda machine: machine.refuse_unreadable(below)) is None
     error = asked(bench, lambda machine: machine.refuse_unreadable(elsewhere))
-    assert f"compensator reads models in {tmp_path} alone: start it with -p model_folder:=FOLDER" in str(error)
+    assert f"the compensator reads models in {tmp_path} alone: start it with -p model_folder:=FOLDER" in str(error)
 
 
 def test_a_loop_that_shall_not_go_on_brakes_the_move(bench: Bench) -> None:
