@@ -337,14 +337,19 @@ def test_heart_beats_every_cycle(rig, monkeypatch):
     assert beats[55][0] - beats[5][0] == pytest.approx(0.5, abs=0.01)
 
 
-def test_deactivating_ramps_out_and_the_heart_goes_on(rig, speak):
-    machine = Machine(rig).start()
+def until_compensating(machine: Machine, speak: Any) -> None:
+    """Correct all struts by 50 µm until that is in."""
 
-    def compensating() -> bool:
+    def there() -> bool:
         speak.steadily([50e-6] * 6)
         return machine.hal["status"] == GuardStatus.COMPENSATING
 
-    rig.until(compensating, "compensation")
+    machine.rig.until(there, "compensation")
+
+
+def test_deactivating_ramps_out_and_the_heart_goes_on(rig, speak):
+    machine = Machine(rig).start()
+    until_compensating(machine, speak)
     assert rig.change("deactivate", NODE)
     machine.until_status(GuardStatus.OFF)
     assert not machine.hal.corrections.any()
@@ -353,19 +358,14 @@ def test_deactivating_ramps_out_and_the_heart_goes_on(rig, speak):
     assert rig.change("cleanup", NODE)
     assert rig.change("configure", NODE)
     assert rig.change("activate", NODE)
-    rig.until(compensating, "compensation again")
+    until_compensating(machine, speak)
 
 
 @pytest.mark.parametrize(("ramp_rate", "left"), [(1e-3, 0.0), (10e-6, 0.05)])
 def test_end_ramps_out_what_is_quick(rig, speak, ramp_rate, left):
     """50 µm: 0.05 s at 1 mm/s; at 10 µm/s they would take 5 s, so they stay (LinuxCNC's watchdog sees to them)."""
     machine = Machine(rig, ramp_rate=1e-3, timeout=30.0).start()
-
-    def compensating() -> bool:
-        speak.steadily([50e-6] * 6)
-        return machine.hal["status"] == GuardStatus.COMPENSATING
-
-    rig.until(compensating, "compensation")
+    until_compensating(machine, speak)
     assert rig.set_parameter(NODE, "ramp_rate", ramp_rate).successful
     machine.node.publish_last_status()
     np.testing.assert_allclose(machine.hal.corrections, left, rtol=1e-9)
