@@ -34,7 +34,7 @@ from hexapod_comp.ros.status import ERROR
 FORGED = "base\n[INFO] [1.0] [compensator]: all is well\r\x1b[2J\x1b[31m\u202e"
 """A text that begins a line of its own, clears the terminal, colours it, and turns what follows around."""
 
-HUGE = FORGED + 10_000_000 * "x"
+HUGE = FORGED + 200_000 * "x"  # a longer message is refused unread: test_wire.py
 
 
 def bridge(rig: Bench) -> LinuxcncBridgeNode:
@@ -230,7 +230,7 @@ def test_text_in_a_request_neither_forges_a_line_nor_is_shown_whole(rig):
     request = ChangeState.Request()
     request.transition.label = FORGED
     assert not rig.call(ChangeState, "compensator/change_state", request).success
-    for name, text in ((FORGED, "x"), ("fault_jump", FORGED), ("fault_jump", HUGE[:200_000])):
+    for name, text in ((FORGED, "x"), ("fault_jump", FORGED), ("fault_jump", HUGE)):
         parameter = ParameterMessage(name=name)
         parameter.value.type, parameter.value.string_value = 4, text
         answer = rig.call(SetParameters, "strut_drive/set_parameters", SetParameters.Request(parameters=[parameter]))
