@@ -78,7 +78,7 @@ class AdapterNode(MachineNode):
     def _forget(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         self._output: IO[bytes] | None = None  # what the process prints: its result
-        self._stopping = False  # it was told to end
+        self._stopping, self._reason = False, ""  # it was told to end; why it was interrupted
         self._state, self._text, self._step, self._model = IDLE, "nothing was asked for yet", "", ""
         self._ended, self._size = time.monotonic(), -1  # when, and how large the journal was when it was read
 
@@ -193,11 +193,12 @@ class AdapterNode(MachineNode):
         except (HexapodError, OSError):
             return  # it is being made; the process says what is wrong with it
         if events and events[-1]["event"] != self._step:
-            self._step = events[-1]["event"]
+            self._step, self._reason = events[-1]["event"], str(events[-1].get("reason", ""))
             self._change(self._state, self._step)
 
     def _finish(self, code: int) -> None:
         """Publish how a process ended."""
+        self._read_journal()  # with what it wrote last
         output, self._process, self._output = self._output, None, None
         self._ended = time.monotonic()
         content: dict[str, Any] = {}
@@ -213,6 +214,8 @@ class AdapterNode(MachineNode):
             self._change(str(content["state"]), str(content["text"]))
         elif self._stopping:
             self._change("stopped", "before anything was done")
+        elif self._step == "interrupted":
+            self._change(FAILED, self._reason)
         else:
             self._change(FAILED, f"the process ended with {code}; its last words are in the log")
 

@@ -655,3 +655,8 @@ def test_a_process_that_ends_without_a_result_is_reported(bench: Bench, tmp_path
     assert bench.call(Trigger, "adapter/verify").success
     bench.until(lambda: node._state == "failed", "its end", timeout=60.0)
     assert node._text.startswith("the process ended with 2")
+    assert bench.call(Trigger, "adapter/verify").success
+    line = '{"event": "interrupted", "reason": "refusal: several_publishers: /mover, /other"}\n'
+    (tmp_path / "journal.jsonl").write_text(line, encoding="utf-8")
+    bench.until(lambda: node._state == "failed", "its end", timeout=60.0)
+    assert node._text == "refusal: several_publishers: /mover, /other"
