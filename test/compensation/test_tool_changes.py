@@ -1,22 +1,31 @@
 """A change of tool: the struts stay, and the next command must be where they are.
 
-Truth: the zoo's own frames say which pose of the new tool is where the struts stand.
+Truth: the zoo's own frames say which pose of the new tool is where the struts stand. How far a tool may go: the public
+check, pose by pose, bisected here. Both stop within a billionth of a step; 1e-9 is far above that and far below any
+limit's meaning.
 """
 
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_machines import Errors, Machine, with_frames
+from foreign_machines import Errors, Machine, rotation, with_frames
 
+from hexapod_comp.compensation import travel as module
+from hexapod_comp.compensation.checks import check
 from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.compensation.travel import travel, travel_text
 from hexapod_comp.core.batch import quaternion_of
 from hexapod_comp.errors import FrameError, LimitError, PoseError
-from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.field import GridField
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.pose import Pose
 
 ROUNDING = 1e-12
 """m; commands are found to that."""
@@ -123,3 +132,135 @@ def test_an_unknown_tool_changes_nothing(machine: Machine, compensator: Compensa
     np.testing.assert_equal(compensator.snapshot(), state)
     compensator.set_tool("stub")
     assert changes == [("tool", "stub")]
+
+
+# ---- travel: how far a tool may go ----
+
+CLOSE = 1e-9
+"""m and rad."""
+
+WAYS = [(axis, sign) for axis in range(6) for sign in (1, -1)]
+
+
+def poses(start: np.ndarray, axis: int, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return x, y, z, m, and rotations where one of six coordinates (m, degrees) has gone on by some ways, SI."""
+    at = np.tile(start, (len(ways), 1))
+    at[:, axis] += ways if axis < 3 else np.degrees(ways)
+    return at[:, :3], np.array([rotation(*angles) for angles in at[:, 3:]])
+
+
+def allowed(geometry: HexapodGeometry, model: MachineModel, start: np.ndarray, ways: np.ndarray) -> np.ndarray:
+    """Return which poses the check allows; `ways`, (12, n), SI, go from a pose (m, degrees) as in WAYS."""
+    listed = [poses(start, axis, sign * row) for (axis, sign), row in zip(WAYS, ways, strict=True)]
+    result = check(geometry, model, tuple(np.concatenate(part) for part in zip(*listed, strict=True)), "poses")
+    good = np.ones(ways.size, dtype=bool)
+    good[[breach.row for breach in result.breaches]] = False
+    return good.reshape(ways.shape)
+
+
+def by_check(geometry: HexapodGeometry, model: MachineModel, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return for each way the last pose that the check allows and the first that it does not, shape (12,), SI.
+
+    Steps of 4 mm and 1° find them, until half a turn; halving them does the rest.
+    """
+    step = np.array([4e-3 if axis < 3 else np.radians(1.0) for axis, _ in WAYS])
+    low, ended, ahead = np.zeros(12), np.zeros(12, dtype=bool), 8
+    while not ended.all():
+        good = allowed(geometry, model, start, low[:, None] + step[:, None] * np.arange(1, ahead + 1))
+        reached = np.where(good.all(axis=1), ahead, good.argmin(axis=1))
+        low += np.where(ended, 0.0, reached * step)
+        ended |= reached < ahead
+    high = low + step
+    while (high - low).max() > 0.01 * CLOSE:
+        middle = 0.5 * (low + high)
+        good = allowed(geometry, model, start, middle[:, None])[:, 0]
+        low, high = np.where(good, middle, low), np.where(good, high, middle)
+    return low, high
+
+
+def compare(geometry: HexapodGeometry, model: MachineModel, start: np.ndarray) -> set[str]:
+    """Hold every way from a pose (m, degrees) against the check; return the limits met."""
+    found = travel(RealMachine(geometry, model), Pose(start[:3], rotation(*start[3:])))
+    names = ("x", "y", "z", "alpha", "beta", "gamma")
+    assert [one.way for one in found] == [f"{sign}{name}" for name in names for sign in "+-"]
+    low, high = by_check(geometry, model, start)
+    np.testing.assert_allclose([one.distance for one in found], low, rtol=0.0, atol=CLOSE)
+    for one, (axis, sign), beyond in zip(found, WAYS, high, strict=True):
+        broken = check(geometry, model, poses(start, axis, sign * np.array([beyond + CLOSE])), "poses").breaches
+        assert one.error is not None
+        assert one.error.reason in {breach.limit for breach in broken}
+    return {one.error.reason for one in found if one.error is not None}
+
+
+def somewhere(machine: Machine) -> np.ndarray:
+    """Return a tool pose in work, m and degrees, a little off home: the tool's attitude there is some turned one."""
+    level = machine.work.matrix.T @ rotation(1.0, -2.0, 3.0) @ machine.tool.matrix
+    alpha = np.arcsin(-level[1, 2])
+    beta, gamma = np.arctan2(level[0, 2], level[2, 2]), np.arctan2(level[1, 0], level[1, 1])
+    tip = machine.tips(np.array([machine.home]) + 0.004, rotation(1.0, -2.0, 3.0)[None])[0]
+    return np.array([*tip, *np.degrees([alpha, beta, gamma])])
+
+
+@pytest.mark.parametrize("name", ["framed", "hanging", "inches", "mirror", "left-hand"])
+def test_every_way_ends_where_the_check_says(name: str, tmp_path: Path) -> None:
+    machine = with_frames(name)
+    limits = {"clearance_mm": 40} if name == "framed" else {}
+    geometry = load_geometry(replace(machine, limits=limits).write(tmp_path / "machine.yaml"))
+    model = load_model(Errors.drawn(machine, 5).write(tmp_path / "model.yaml", machine), geometry)
+    compare(geometry.using("probe", "fixture"), model, somewhere(machine.using("probe", "fixture")))
+
+
+def test_every_limit_is_met() -> None:
+    """The example has all limits of single poses; tightened one at a time each of them stands first somewhere."""
+    geometry = load_geometry("example_6_6.yaml")
+    model, start = MachineModel(geometry.name), np.array([0.01, 0.02, 0.38, 1.0, 2.0, 15.0])
+    met = set()
+    for tight in ({}, {"base_cone": np.radians(np.full(6, 20.0))}, {"clearance": 0.128}, {"condition": 1.75}):
+        limited = replace(geometry, limits=replace(geometry.limits, **tight))
+        met |= compare(limited, model, start)
+    assert met >= {"stroke", "base_cone", "platform_cone", "clearance", "condition", "correction"}
+
+
+@pytest.mark.parametrize("outside", ["refuse", "hold"])
+def test_the_end_of_a_field_counts_where_the_model_refuses_it(outside: str) -> None:
+    """A field of no error in a box of ±30 mm about the measured point at home, which is the platform's origin."""
+    geometry = load_geometry("paper.yaml")
+    nodes = tuple(np.array([-0.03, 0.03]) + middle for middle in geometry.home.position)
+    field = GridField(nodes, tuple(np.zeros((2, 2, 2, 6, 1)) for _ in "xyz"), outside=outside)
+    model = MachineModel(geometry.name, field=field)
+    ways = {one.way: one for one in travel(RealMachine(geometry, model), geometry.tool_pose(geometry.home))}
+    assert (ways["+x"].error.reason == "outside_field") == (outside == "refuse")
+    if outside == "refuse":
+        for name in ("+x", "-x", "+y", "-y", "+z", "-z"):
+            assert ways[name].distance == pytest.approx(0.03, abs=CLOSE)
+            assert ways[name].error.reason == "outside_field"
+
+
+def test_a_turn_without_limit_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No limit of the paper's machine stands within 5° of home."""
+    monkeypatch.setattr(module, "LONGEST_TURN", np.radians(5.0))
+    geometry = load_geometry("paper.yaml")
+    found = travel(RealMachine(geometry, MachineModel("paper")), geometry.tool_pose(geometry.home))
+    assert [(one.distance, one.error) for one in found[6:]] == [(np.radians(5.0), None)] * 6
+    assert travel_text(found).splitlines()[-1].split() == ["-gamma", "5.000", "deg", "no", "limit"]
+
+
+def test_with_compensation_off_the_model_does_not_count(tmp_path: Path) -> None:
+    """Truth: the machine without a model. Where the model's screws have no lead, its corrections are all there is."""
+    machine = with_frames("framed")
+    geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
+    model = load_model(Errors.drawn(machine, 5).write(tmp_path / "model.yaml", machine), geometry)
+    pose = geometry.tool_pose(geometry.home)
+    off = travel(RealMachine(geometry, model), pose, compensates=False)
+    ideal = travel(RealMachine(geometry, MachineModel(geometry.name)), pose)
+    on = travel(RealMachine(geometry, model), pose)
+    differences = [abs(a.distance - b.distance) for a, b in zip(off, ideal, strict=True) if "nominal" in str(a.error)]
+    assert differences
+    assert max(differences) < CLOSE
+    assert any(abs(a.distance - b.distance) > 1e-6 for a, b in zip(on, ideal, strict=True))
+
+
+def test_a_pose_that_is_not_allowed_has_no_travel() -> None:
+    geometry = load_geometry("paper.yaml")
+    with pytest.raises(LimitError, match="stroke"):
+        travel(RealMachine(geometry, MachineModel("paper")), Pose([0.0, 0.0, 1.2], np.eye(3)))
