@@ -29,7 +29,7 @@ from ..pose import Pose, middle_pose
 from .base import LATCHED_QOS, NEWEST_QOS, SENSOR_QOS
 from .client import Machine, MoveError, MoveState
 from .instrument import SET_UP_TOPIC
-from .messages import message_pose, nanoseconds_of, pose_message, stamp_of
+from .messages import message_pose, nanoseconds_of, pose_message, pose_numbers, stamp_of
 
 MEDIAN_TO_SIGMA = 1.4826  # Standard deviation of a normal distribution over the median of its absolute values
 OF_A_MEDIAN = math.sqrt(math.pi / 2.0)  # Its standard deviation, times √n, over that of a reading
@@ -87,6 +87,8 @@ class WatchedMachine(Machine):
         if frame_id != self._frame_id:
             self._problem = f"{self._topic}: frame_id must be {self._frame_id}, not {shorten(frame_id)}"
             return
+        if not all(map(math.isfinite, pose_numbers(message))):
+            return  # its beam is broken
         try:
             self._poses.append((message_pose(message), nanoseconds_of(message.header.stamp) * 1e-9))
         except HexapodError as error:

@@ -454,6 +454,15 @@ def test_a_move_that_a_busy_computer_had_refused_is_asked_for_again(
     assert (caught.value.reason, left) == (ends, [])
 
 
+def test_poses_of_a_tracker_whose_beam_is_broken_are_none_and_of_another_frame_a_problem() -> None:
+    machine = object.__new__(WatchedMachine)
+    machine._topic, machine._frame_id, machine._problem, machine._poses = "/pose", "base", "", []
+    machine._on_pose(BAD_REQUESTS[2][1])
+    assert (machine._poses, machine._problem) == ([], "")
+    machine._on_pose(pose_message(HOME, "tracker"))
+    assert (machine._poses, machine._problem) == ([], "/pose: frame_id must be base, not 'tracker'")
+
+
 def collected(bench: Bench, path: Path, campaign: Campaign, kind: str, frame: str = "known", **options: Any) -> Any:
     """Run collect on a bench's machine; return what it returned or raised."""
     ended: list[Any] = []
