@@ -269,7 +269,10 @@ def test_check_names_row_and_limit(tmp_path: Path, options: tuple, limit: str, h
     assert not report["within_limits"]
     assert {(entry["limit"], entry["line"]) for entry in report["broken"]} >= {(limit, 3)}
     smallest = next(entry for entry in report["smallest_margins"] if entry["limit"] == limit)
-    assert smallest["margin"] < 0.0
+    length = np.hypot(np.sqrt(509.192**2 - 400.0**2), height)  # 000, Table 2: 509.192 mm long at a height of 400 mm
+    value = {"stroke": length, "step": length - 509.192, "speed": 250.0 * (length - 509.192)}[limit]
+    assert smallest["value"] == pytest.approx(value, rel=1e-3)
+    assert smallest["margin"] == pytest.approx(smallest["allowed"] - smallest["value"])
     assert smallest["line"] == 3
 
 
