@@ -251,7 +251,7 @@ def test_nodes_hold_the_models_own_corrections() -> None:
     """Truth: the model's commands at a node with every strut growing; half the backlash column is then added."""
     geometry, model = paper_geometry(), paper_machine()
     table, left_out = make_table(geometry, model, PAPER_BOX, 0.12)
-    assert "10 mm period" in left_out[0]
+    assert "10 mm period and up to 4.00 µm" in left_out[0]
     smooth = replace(model.struts, cosine=np.zeros(6), sine=np.zeros(6))
     machine = RealMachine(geometry, replace(model, struts=smooth))
     for way, sign in enumerate((1.0, -1.0)):
