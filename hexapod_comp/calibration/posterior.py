@@ -29,7 +29,8 @@ from ..machine.temperatures import HUMIDITY, Temperatures
 from ..measurements.readings import AXES, Stations
 from ..pose import attitude_error, rotation_from_angles
 from .assumptions import ASSUMED
-from .blocks.load import stated_load
+from .blocks.block import Linkage
+from .blocks.load import stated_load, unsettled_lengths
 from .datum import HeldDatum
 from .estimator import Estimation, LinearProblem, physical_covariance
 from .estimator import Posterior as Estimate
@@ -92,13 +93,19 @@ class FirstOrder:
 
     places: np.ndarray  # (N, 3)
     columns: np.ndarray  # (N, 6, 1 + size): displacement and rotation vector, then their derivatives
+    # RMS of displacement and of rotation by struts whose lost motion may be at either end: no parameter describes them
+    unsettled: tuple[float, float] = (0.0, 0.0)
 
     @staticmethod
     def of(space: ParameterSpace, prediction: Prediction, stations: Stations) -> FirstOrder:
         """Return the errors of the measured point at predicted stations, in ``base``."""
-        slopes = derivatives(space, prediction, stations)
+        slopes, unsettled = derivatives(space, prediction, stations), (0.0, 0.0)
         places = stations.positions + stations.rotations @ space.probe
-        return FirstOrder(places, np.concatenate([prediction.errors[:, :, None], slopes], axis=2))
+        if prediction.load.lost_motion.any():
+            linkage = Linkage(prediction, space.probe, stations)
+            squares = ((linkage.per_length * unsettled_lengths(linkage)[:, None]) ** 2).sum(axis=2).mean(axis=0)
+            unsettled = math.sqrt(squares[:3].sum()), math.sqrt(squares[3:].sum())
+        return FirstOrder(places, np.concatenate([prediction.errors[:, :, None], slopes], axis=2), unsettled)
 
     @property
     def values(self) -> np.ndarray:
@@ -112,7 +119,7 @@ class FirstOrder:
 
     def select(self, chosen: np.ndarray | slice) -> FirstOrder:
         """Return some of the places."""
-        return FirstOrder(self.places[chosen], self.columns[chosen])
+        return FirstOrder(self.places[chosen], self.columns[chosen], self.unsettled)
 
     def datum(self) -> Datum:
         """Return the motion that explains the displacements best, by least squares, and the mean rotation."""
@@ -127,7 +134,7 @@ class FirstOrder:
         datum = self.datum() if datum is None else datum
         whole = carried(datum.motion[None], self.places - datum.centre)
         whole[:, 3:] = datum.rotation
-        return FirstOrder(self.places, self.columns - whole)
+        return FirstOrder(self.places, self.columns - whole, self.unsettled)
 
     @cached_property
     def mean_squares(self) -> tuple[np.ndarray, np.ndarray]:
@@ -359,7 +366,11 @@ def expected_error(
     """
     if errors is None:
         return None
-    beyond, squares, drawn = beyond or Unexplained(), errors.mean_squares, _drawn(covariance)
+    beyond, squares, drawn = (
+        (beyond or Unexplained()).beside(*errors.unsettled),
+        errors.mean_squares,
+        _drawn(covariance),
+    )
     if prior is None:
         parts = errors.values[:, :3], errors.values[:, 3:]
         before = [float(np.sqrt((part**2).sum(axis=1).mean())) for part in parts]

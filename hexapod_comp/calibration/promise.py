@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +24,11 @@ class Scatter(NamedTuple):
     lack: float = 0.0  # of an error that no parameter describes: the discrepancy
     stops: float = 0.0  # of the stops from visit to visit, by repeats, if the instruments scatter as stated
     most_stops: float = 0.0  # its upper bound
+
+    def beside(self, other: float) -> Scatter:
+        """Return the same with another scatter from visit to visit, of a known standard deviation."""
+        stops, most = (float(np.hypot(*pair)) for pair in ((self.stops, other), (self.most_stops, TWICE * other)))
+        return self._replace(stops=stops, most_stops=most)
 
 
 NO_SCATTER = Scatter()
@@ -53,6 +58,11 @@ class Unexplained:
     ratio: float = 1.0  # ratio of the tool's squared changes to the expected ones, as runs are left out in turn
     freedom: float = 0.0  # degrees of freedom of that
     averaged: float = 1.0  # factor on the tool's error, by averaging over the presence of blocks
+
+    def beside(self, displacement: float, rotation: float) -> Unexplained:
+        """Return the same with a scatter from visit to visit of the tool, RMS, m and rad."""
+        parts = self.displacement.beside(displacement), self.rotation.beside(rotation)
+        return replace(self, displacement=parts[0], rotation=parts[1])
 
     def promised(self, left: np.ndarray, points: np.ndarray) -> Promise:
         """Return the predicted interval of the tool's displacement; unexplained errors raise the upper end.

@@ -294,6 +294,9 @@ def test_lost_motion_and_friction_are_fitted_where_forces_change_their_sign() ->
     checked = laid.select(np.isin(laid.station, near) | (np.arange(len(laid)) % 20 == 0))
     check = CheckReadings.of(wide, measure(checked, plan, at_once, 5))
     assert len(near) >= 5
+    there = FirstOrder.of(wide.space, predict(wide.space, wide.x, laid.stations), laid.stations)
+    size = np.sqrt((away[:, :3] ** 2).sum(axis=1).mean())
+    assert size < there.unsettled[0] < 2.0 * size, "√2 more, if the force's sign were known: the mean of (1 − |t|)²"
     weighed, all_alike = (
         Estimation(laid, wide.space).linearise(wide.x, np.ones(len(laid)), unsettled)[0].scale
         for unsettled in (True, False)
