@@ -367,6 +367,12 @@ def test_assess_prints_the_papers_tables() -> None:
     np.testing.assert_allclose(ideal * 1e-3, table_lengths(), atol=0.5001e-6)
     np.testing.assert_allclose((real - ideal) * 1e3, change, atol=1.6e-3)  # three roundings: 0.5 nm, 0.5 nm, 0.5 nm
     assert "round trip of the real structure" in blocks[-1]
+    told = json.loads(hexapod("assess", "--machines", 5, "--seed", 5, "--json")[1])
+    assert told["seeds"] == list(range(5, 10))
+    assert told["round_trip_m"] <= 1e-13
+    largest = max(row["displacement_um"][2] for row in told["statistics"])
+    found = [np.linalg.norm([record[f"error_{axis}_um"] for axis in "xyz"]) for record in told["records"]]
+    assert (len(found), max(found)) == (50, pytest.approx(largest, rel=1e-9))
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
