@@ -21,7 +21,7 @@ from .record import LINKS, Happened, Record, Sent, Status, Struts, Told
 
 REPORT_WITHIN = 0.2  # A fault is in diagnostics this long after it is visible, s,
 RECOVER_WITHIN = 1.0  # and all is well again this long after the last fault has ended, s;
-MOVER_RECOVERS_WITHIN = 3.0  # with a mover, which starts a process and plans before it sends anything again
+MOVER_RECOVERS_WITHIN = 5.0  # with a mover, which starts a process and plans before it sends anything again
 ANSWER_WITHIN = 0.2  # A command without an answer for this long is lost, s
 FOLLOWS_WITHIN = 1e-3  # A machine that follows has its measured struts this near to their commands, m,
 LATELY = 0.05  # of the last so many seconds: drives lag, and readings are on their way
