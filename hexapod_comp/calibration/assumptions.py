@@ -56,7 +56,6 @@ class Assumptions:
 
     # Posterior (posterior.py, datum.py)
     seen: float = assumed(1.0, "σ", "change of all readings above which a direction is observable", "one σ of noise")
-    weak: float = assumed(5.0, "σ", "observable directions below are listed as weak", "known to a fifth")
 
     # Lead (lead.py)
     lead_odds: float = assumed(

@@ -82,7 +82,7 @@ def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[Campaign
                 for points in ALTERNATE_POINTS.get(instrument, ()):
                     runs.append(replace(line_run(title, instrument, ends, points, rotation), alternate=True))
     if not runs:
-        raise GeometryError("limits", "leave nothing to be measured in the box", place.box.tolist())
+        raise GeometryError("limits", "allow none of the candidate runs in the box", place.box.tolist())
     return runs
 
 

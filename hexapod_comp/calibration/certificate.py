@@ -6,13 +6,14 @@ import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
 from ..formats.files import MAX_ARCHIVE_BYTES, read_bytes
 from ..formats.pages import render
 from ..formats.paths import input_file, version
+from ..formats.schema import Names, Text, read_whole
 from ..formats.texts import number
 from ..formats.yaml import read_yaml
 from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
@@ -41,56 +42,27 @@ if TYPE_CHECKING:
 
 FORMAT, VERSION = "hexapod_comp/certificate", 1
 COVERAGE = 2.0  # coverage factor k of expanded uncertainties: about 95 %
-# Information that readings do not contain: keys of a details file, and their titles. Missing entries are left to be
-# written by hand.
-DETAILS = {
-    "number": "certificate number",
-    "customer": "customer",
-    "machine": "machine's maker, type and serial number",
-    "place": "place",
-    "measured_on": "measured on",
-    "operator": "measured by",
-    "environment": "environment",
-}
-
-# Instrument of each kind of channel
-INSTRUMENTS = {
-    "linear": "linear laser",
-    "straightness": "straightness optics",
-    "rotation": "angle optics, or level",
-    "position": "tracker, position",
-    "attitude": "tracker, attitude",
-    "length": "length from a point: ball bar, probe, station",
-    "displacement": "displacement at a ball: R-test",
-}
-
 MOST_RUNS = 200  # runs beyond these are counted, not listed
 
 
 @dataclass(frozen=True)
 class Details:
-    """Information that the readings do not contain."""
+    """Information that the readings do not contain: a details file; what is missing is left to be written by hand."""
 
-    texts: dict[str, str]  # by the keys of DETAILS
-    instruments: tuple[str, ...] = ()  # type, serial number and calibration of each
-    remarks: tuple[str, ...] = ()
+    number: Annotated[str, Text()] = ""
+    customer: Annotated[str, Text()] = ""
+    machine: Annotated[str, Text()] = ""
+    place: Annotated[str, Text()] = ""
+    measured_on: Annotated[str, Text()] = ""
+    operator: Annotated[str, Text()] = ""
+    environment: Annotated[str, Text()] = ""
+    instruments: Annotated[tuple[str, ...], Names(what="texts")] = ()  # type, serial number, calibration of each
+    remarks: Annotated[tuple[str, ...], Names(what="texts")] = ()
 
 
 def load_details(path: str | Path) -> Details:
-    """Read a details file: YAML, every entry text and optional, ``instruments`` and ``remarks`` lists of texts."""
-    section = read_yaml(input_file(path, "details"), FORMAT, VERSION)
-
-    def texts(key: str) -> tuple[str, ...]:
-        given = section.require(key) if key in section else []
-        if not isinstance(given, list) or not all(isinstance(text, str) and text.strip() for text in given):
-            raise section.error(key, "must be a list of texts", given)
-        return tuple(given)
-
-    details = Details(
-        {key: section.text(key) for key in DETAILS if key in section}, texts("instruments"), texts("remarks")
-    )
-    section.finish()
-    return details
+    """Read a details file (YAML)."""
+    return read_whole(Details, read_yaml(input_file(path, "details"), FORMAT, VERSION))
 
 
 @dataclass(frozen=True)
@@ -104,7 +76,7 @@ class Filed:
 
 def certificate_text(fit: ModelFit, filed: Filed, details: Details | None = None) -> str:
     """Return the certificate of a fit of scheme ``joint``, as HTML; model file and report must have been written."""
-    m, details = fit.measurements, details or Details({})
+    m, details = fit.measurements, details or Details()
     seen = fit.observability
     unseen = f"{seen.structure_rank} of {seen.structure_size} parameters of the structure are seen by these readings."
     if fit.unseen_errors:
@@ -125,11 +97,9 @@ def certificate_text(fit: ModelFit, filed: Filed, details: Details | None = None
         named_instruments=[(n, text) for n, text in enumerate(details.instruments or ("",) * len(fit.channels), 1)],
         temperatures=_temperatures(fit),
         humidity=_humidity(fit),
-        measured=_measured(fit),
         tests=list(_tests(before, after)) if before else [],
         circles=_circles(before.circles, after.circles) if before and before.circles else None,
         figures=_figures(fit),
-        runs=_runs(fit),
         unseen=unseen,
         datum=fit.held.report(),
         files=files + [("readings", name, digest) for name, digest in m.files],
@@ -142,9 +112,18 @@ Rows = list[tuple[object, ...]]
 
 
 def _identity(fit: ModelFit, filed: Filed, details: Details) -> Rows:
-    rows: Rows = [(label, details.texts.get(key, "")) for key, label in DETAILS.items()]
-    rows[3:3] = [("machine in these files", fit.measurements.geometry.name), ("model", filed.model)]
-    rows += [("remarks", text) for text in details.remarks]
+    rows: Rows = [
+        ("certificate number", details.number),
+        ("customer", details.customer),
+        ("machine's maker, type and serial number", details.machine),
+        ("machine in these files", fit.measurements.geometry.name),
+        ("model", filed.model),
+        ("place", details.place),
+        ("measured on", details.measured_on),
+        ("measured by", details.operator),
+        ("environment", details.environment),
+        *(("remarks", text) for text in details.remarks),
+    ]
     made = f"hexapod_comp {version()}, scheme joint, {fit.model.origin.date}"
     return [*rows, ("evaluated with", made)]
 
@@ -174,7 +153,7 @@ def _instruments(fit: ModelFit) -> Rows:
     for channel in fit.channels:
         sizes = [number(v * 1e6, 2) for v in (channel.stated, COVERAGE * channel.stated, channel.estimated)]
         unit = "µrad" if channel.kind in ANGULAR_KINDS else "µm"
-        rows.append((INSTRUMENTS.get(channel.kind, channel.kind), str(channel.readings), *sizes, unit))
+        rows.append((channel.kind, str(channel.readings), *sizes, unit))
     return rows
 
 
@@ -196,16 +175,6 @@ def _humidity(fit: ModelFit) -> Rows:
         return []
     ends = [number(100.0 * v, 1) for v in (np.nanmin(humidity), np.nanmax(humidity))]
     return [("relative humidity", *ends, number(1e4 * fit.model.struts.moisture.max(), 2))]
-
-
-def _measured(fit: ModelFit) -> Rows:
-    """Return the number of readings on each kind of run."""
-    m = fit.measurements
-    lines = sum(run.is_line for run in m.runs)
-    counts = {"lines": lines, "other runs": len(m.runs) - lines}
-    rows: Rows = [(name, str(count)) for name, count in counts.items() if count]
-    rows += [("places, by direction", str(len(m.stations))), ("readings", str(len(m)))]
-    return [*rows, ("readings that disagreed and got little weight", str(len(fit.outliers)))]
 
 
 def _tests(before: Judged, after: Judged) -> Iterator[dict[str, object]]:
@@ -261,15 +230,3 @@ def _figures(fit: ModelFit) -> list[tuple[str, Figure]]:
         figures.append((text, before_after_figure(fit)))
     text = "Residual of each reading, over its stated standard uncertainty; the band is ± U (k = 2)"
     return [*figures, (text, residuals_by_run_figure(fit))]
-
-
-def _runs(fit: ModelFit) -> Rows:
-    """Return each run with its residuals."""
-    sigmas = fit.solution.residuals / fit.measurements.stated
-    rows: Rows = []
-    for n, run in enumerate(fit.measurements.runs):
-        own = sigmas[fit.measurements.run == n]
-        if len(own):
-            sizes = number(float(np.sqrt((own**2).mean())), 2), number(float(np.abs(own).max()), 1)
-            rows.append((f"{n + 1}: {run.name}", str(len(own)), *sizes))
-    return rows

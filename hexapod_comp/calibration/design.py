@@ -51,6 +51,7 @@ from .posterior import (
     observe,
 )
 from .promise import Scatter, Unexplained
+from .report import expected_json, expected_text, observability_text
 from .trust import TILT
 
 FAINT = 0.05  # directions with a smaller effect on readings are omitted, σ
@@ -636,7 +637,34 @@ def _divergence(difference: np.ndarray, right: np.ndarray, wrong: np.ndarray) ->
     return 0.5 * float(np.trace(solved[:, :-1]) - len(right) + difference @ solved[:, -1] + logs)
 
 
-# What a proposal prints
+# What plans and proposals print
+
+
+def plan_report(plan: Plan) -> str:
+    """Return the report of a plan."""
+    m = plan.measurements
+    head = (
+        f"machine {m.geometry.name}: {len(m)} readings of {len(m.runs)} runs at {len(m.stations)} stations, "
+        f"{plan.space.size} parameters"
+    )
+    expected = [
+        f"{part}\n  {stops_text(plan.stops)}" for part in expected_text(plan.level, plan.tilted, plan.observability)
+    ]
+    seen = observability_text(plan.observability, plan.unseen_errors)
+    elsewhere = [f"that holds for the loads of the readings; {plan.elsewhere}"] if plan.elsewhere else []
+    parts = [head, *expected, seen, *elsewhere]
+    return "\n\n".join(parts) + "\n"
+
+
+def plan_json(plan: Plan) -> dict:
+    """Return a plan as plain numbers; units as in a fit's."""
+    return {
+        "machine": plan.measurements.geometry.name,
+        "readings": len(plan.measurements),
+        "parameters": plan.space.size,
+        "repeatability_m": plan.stops,
+        **expected_json(plan.level, plan.tilted, plan.observability, plan.unseen_errors),
+    }
 
 
 def load_text(load: Sequence[float] | None) -> str:

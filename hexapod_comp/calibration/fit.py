@@ -35,7 +35,7 @@ from .estimator import (
     solve,
 )
 from .lead import ScrewLead, detect_lead
-from .mixups import SWAPPED, mixups, swapped_directions
+from .mixups import SWAPPED, mixups
 from .parameters import FitSettings, ParameterSpace
 from .posterior import (
     Observability,
@@ -52,9 +52,9 @@ from .selection import Decision, select
 from .thermal import ThermalEvidence, TimeConstants, estimate_time_constants, with_courses
 from .trust import LeftOut, Residuals, Verdict, judge, with_drift
 
-LARGEST_NOISE = 0.02  # Residual above which the fitted machine is not the measured one, m or rad
 # Readings further than this from the reference temperature, K, need an expansion: 1 µm on half a metre
 WARM = 0.2
+NEGLIGIBLE = 1e-5  # probability of blocks that were left out, whatever they would do to the tool
 MOST_LEFT_OUT = 3  # runs left out of a fit that does not converge; more are a bad campaign
 
 
@@ -171,9 +171,9 @@ def fit_model(
         except NotSettled as error:
             return _drop_outlier_runs(measurements, begun, error, progress, datum)
     except HexapodError as error:
-        blocks = [block.name for block in begun.everything.space.blocks]
-        named = mixups(begun.everything, blocks, progress)
-        if swapped_directions(begun.everything, begun.problem, blocks):
+        space = begun.everything.space
+        named = mixups(begun.everything, [block.name for block in space.blocks], progress)
+        if _swapped(space, solve(space, begun.problem, space.start_tolerances(), np.ones(len(KINDS)))):
             named.append(SWAPPED)
         if named:
             error.with_lines("\n".join(f"  {cause}" for cause in named))
@@ -373,7 +373,9 @@ def _averaged(
 
     By the blocks' Bayes factors, with even prior odds; at the same answer.
     """
-    absent = np.prod([expit(-d.evidence) for d in decisions if not d.kept])
+    present = 1.0 - float(np.prod([expit(-d.evidence) for d in decisions if not d.kept]))
+    if present < NEGLIGIBLE:
+        return LeftOut()
     x, _, _ = _carried_over((space, solution.x, solution.posterior.tolerances, solution.posterior.noise), everything)
     errors, y = box_errors(everything, x), np.zeros(everything.size)
     if errors is None:
@@ -381,7 +383,7 @@ def _averaged(
     y[possible.used] = possible.y
     metric, shift = errors.mean_squares[0], everything.physical(y) - x
     square = np.vdot(metric, physical_covariance(everything, possible)) + shift @ metric @ shift
-    return LeftOut(1.0 - float(absent), float(square))
+    return LeftOut(present, float(square))
 
 
 def unseen_errors(measurements: MeasurementSet, settings: FitSettings) -> tuple[UnseenError, ...]:
@@ -390,19 +392,29 @@ def unseen_errors(measurements: MeasurementSet, settings: FitSettings) -> tuple[
     return without_trace(Estimation(measurements, space))
 
 
-def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
-    """Return notes on negative backlash; refuse the fit if most struts have it."""
+def _negative_backlash(space: ParameterSpace, posterior: Posterior) -> np.ndarray:
+    """Return the struts whose backlash is clearly below zero: no nut leads its screw."""
     block = space.block("backlash")
     if block is None:
-        return []
-    values = solution.x[block.part]
-    sigmas = values / np.sqrt(np.diag(physical_covariance(space, solution.posterior))[block.part])
-    negative = np.flatnonzero(sigmas < -ASSUMED.surely)
-    if len(negative) > 3:
-        listed = ", ".join(f"{v * 1e6:.2f}" for v in values)
-        problem = f"{SWAPPED}: the struts would have a backlash of {listed} µm"
+        return np.zeros(0, dtype=int)
+    members = np.isin(posterior.used, np.arange(space.size)[block.part])
+    deviations = np.sqrt(np.diag(posterior.covariance)[members])
+    return np.flatnonzero(posterior.y[members] < -ASSUMED.surely * deviations)
+
+
+def _swapped(space: ParameterSpace, posterior: Posterior) -> bool:
+    """Return whether most struts have a negative backlash."""
+    return len(_negative_backlash(space, posterior)) > 3
+
+
+def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
+    """Return notes on negative backlash; refuse the fit if most struts have it."""
+    negative = _negative_backlash(space, solution.posterior)
+    values = [f"{v * 1e6:.2f}" for block in [space.block("backlash")] if block for v in solution.x[block.part]]
+    if _swapped(space, solution.posterior):
+        problem = f"{SWAPPED}: the struts would have a backlash of {', '.join(values)} µm"
         raise CalibrationError("direction", problem)
-    return [f"strut_{i + 1}: backlash of {values[i] * 1e6:.2f} µm found, taken as none" for i in negative]
+    return [f"strut_{i + 1}: backlash of {values[i]} µm found, taken as none" for i in negative]
 
 
 def _about_lead(lead: ScrewLead | None) -> list[str]:
@@ -448,14 +460,7 @@ def _ignored(measurements: MeasurementSet, space: ParameterSpace) -> list[str]:
 
 
 def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:
-    """Return notes on readings that scatter more than stated; refuse those that no machine explains."""
-    for c in channels:
-        if c.estimated > LARGEST_NOISE:
-            unit = "rad" if c.kind in ANGULAR_KINDS else "m"
-            problem = (
-                f"{c.kind} readings are off by {c.estimated:.3g} {unit} (allowed {LARGEST_NOISE:g}); do units fit?"
-            )
-            raise CalibrationError("measurements", problem)
+    """Return a note on readings that scatter more than stated."""
     noisy = [
         f"{c.kind} {c.estimated / c.stated:.1f} times" for c in channels if c.estimated > ASSUMED.misfit[0] * c.stated
     ]

@@ -72,18 +72,21 @@ class ScrewLead:
 def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
     """Return the lead that readings show, with the given one; `problem` is at the nominal machine.
 
-    With many readings a random part is tried first.
+    With many readings a random part is tried first; that is enough to check a given lead.
     """
     space, measurements = estimation.space, estimation.measurements
     given = float(space.periods[0]) if np.isfinite(space.periods).all() else None
-    odds = 0.0
+    every = estimation, problem
     if len(measurements) > MOST_READINGS:
         some = np.zeros(len(measurements), dtype=bool)
         some[np.random.default_rng(0).choice(len(measurements), MOST_READINGS, replace=False)] = True
-        few = Estimation(measurements.select(some), space, alone=False)
-        odds, best, posterior = _strongest(few, few.linearise(np.zeros(space.size), np.ones(MOST_READINGS))[0])
-    if odds < ASSUMED.lead_odds:
-        odds, best, posterior = _strongest(estimation, problem)
+        estimation = Estimation(measurements.select(some), space, alone=False)
+        problem, _ = estimation.linearise(np.zeros(space.size), np.ones(MOST_READINGS))
+    odds, best, posterior = _strongest(estimation, problem)
+    if given is None and len(measurements) > MOST_READINGS:
+        estimation, problem = every
+        if odds < ASSUMED.lead_odds:
+            odds, best, posterior = _strongest(estimation, problem)
     if best is None or odds < ASSUMED.lead_odds:
         return ScrewLead(given, None, np.inf, odds)
     # Until here the waves counted as noise, which gave the priors too much weight.

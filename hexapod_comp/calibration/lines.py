@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import date as calendar
 from itertools import product
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import Legendre, Polynomial, legendre
@@ -35,8 +35,6 @@ from ..pose import Pose
 from ..virtual.instruments import station_errors
 from .assumptions import ASSUMED
 from .datum import HeldDatum, hold
-
-OrderRule = Literal["adjusted-r2", "aicc"] | int  # how the order of a polynomial is chosen, or the order itself
 
 # Commands further off the nominal lengths than this, m, are a compensation's; than that, worth a note
 COMPENSATED, FOLLOWED = 10e-6, 0.1e-6
@@ -85,14 +83,12 @@ class LinesFit:
 
 def fit_lines(
     measurements: MeasurementSet,
-    order: OrderRule = "adjusted-r2",
+    order: int | None = None,
     date: str = "",
     name: str = "",
     datum: Pose | None = None,
 ) -> LinesFit:
-    """Fit Mou & King's polynomials to the readings on a rectangular grid of lines."""
-    if not (order in ("adjusted-r2", "aicc") or (isinstance(order, int) and order >= 1)):
-        raise CalibrationError("order", f"must be adjusted-r2, aicc or a whole number from 1, not {order!r}")
+    """Fit Mou & King's polynomials to a rectangular grid of lines; None: of the orders with the largest adjusted R²."""
     readings, notes = _grid_readings(measurements)
     grid = _grid_of(readings)
     readings = readings._replace(node=_nearest_nodes(readings.point, grid))
@@ -106,7 +102,7 @@ def fit_lines(
     left = measurements.value - means[groups]
     if np.abs(left).max() <= LEAST_NOISE:  # one kind without noise among others does not harm this scheme
         refuse_unmoved(measurements, left)
-    chosen = f"of order {order}" if isinstance(order, int) else f"of an order chosen by {order}"
+    chosen = "of an order chosen by adjusted-r2" if order is None else f"of order {order}"
     note = (
         f"Scheme lines (Mou & King 1998): polynomials {chosen} along grid lines. Datum: displacements and rotations "
         "are zero (mean of both directions) at home's coordinate along each line; straightness without its straight "
@@ -317,7 +313,7 @@ def _priority(component: int, readings: Readings) -> list[int]:
 
 
 def _fit_families(
-    readings: Readings, empty: GridField, order: OrderRule, datum: np.ndarray
+    readings: Readings, empty: GridField, order: int | None, datum: np.ndarray
 ) -> tuple[GridField, list[LineFit]]:
     """Return the field and its polynomials: component by component, the family that it belongs to first."""
     field, fits = empty, []
@@ -331,7 +327,7 @@ def _fit_families(
 
 
 def _fit_family(
-    readings: Readings, component: int, axis: int, field: GridField, order: OrderRule, datum: np.ndarray
+    readings: Readings, component: int, axis: int, field: GridField, order: int | None, datum: np.ndarray
 ) -> list[LineFit]:
     """Return the polynomials of the lines along an axis for one component; `field` has the families before this one."""
     family = readings.select(readings.axis == axis)
@@ -348,14 +344,14 @@ def _fit_family(
     return fits
 
 
-def _fit_notes(fits: Sequence[LineFit], order: OrderRule) -> list[str]:
+def _fit_notes(fits: Sequence[LineFit], order: int | None) -> list[str]:
     """Return notes on lines that were read in one direction only, or with too few points for the requested order."""
     notes = []
     one_way = list(dict.fromkeys(fit.name for fit in fits if fit.direction == 0))
     if one_way:
         what = "not read in both directions; what was read is used for both"
         notes.append(f"{len(one_way)} lines were {what} (first: {one_way[0]})")
-    short = [fit for fit in fits if isinstance(order, int) and fit.order < order]
+    short = [fit for fit in fits if order is not None and fit.order < order]
     if short:
         what = f"too few points for order {order} and got the highest that they carry"
         notes.append(f"{len(short)} polynomials have {what} (first: {short[0].name}, order {short[0].order})")
@@ -390,7 +386,7 @@ def _groups(
 
 
 def _fit_line(
-    group: Readings, name: str, nodes: tuple[tuple[int, int], ...], along: np.ndarray, order: OrderRule, datum: float
+    group: Readings, name: str, nodes: tuple[tuple[int, int], ...], along: np.ndarray, order: int | None, datum: float
 ) -> list[LineFit]:
     """Return the polynomials of a line's directions: two, or one when it was read in one direction only."""
     axis, component = int(group.axis[0]), int(group.component[0])
@@ -481,7 +477,7 @@ def _zeroed(fits: list[LineFit], u: float) -> list[LineFit]:
 
 
 def _regress(
-    u: np.ndarray, values: np.ndarray, order: OrderRule, name: str, reach: float
+    u: np.ndarray, values: np.ndarray, order: int | None, name: str, reach: float
 ) -> tuple[np.ndarray, float, float, float]:
     """Return coefficients in powers of u, R², adjusted R² and the standard deviation of the residuals."""
     count = len(u)
@@ -490,10 +486,9 @@ def _regress(
         wanted = f"{FEWEST_POINTS} are needed: one every {1e3 * reach / (FEWEST_POINTS - 1):.4g} mm or closer"
         raise CalibrationError(name, f"has {span}; {wanted} (step_mm of a campaign)")
     most = count // POINTS_PER_COEFFICIENT - 1
-    orders = [min(order, most)] if isinstance(order, int) else range(most + 1)
+    orders = range(most + 1) if order is None else [min(order, most)]
     candidates = [_polynomial(u, values, k) for k in orders]
-    # The first of equals: the lowest order.
-    best = max(candidates, key=lambda fit: -_aicc(fit, count) if order == "aicc" else fit[2])
+    best = max(candidates, key=lambda fit: fit[2])  # the first of equals: the lowest order
     return legendre.leg2poly(best[0].coef), *best[1:]
 
 
@@ -505,15 +500,6 @@ def _polynomial(u: np.ndarray, values: np.ndarray, order: int) -> tuple[Legendre
     freedom = len(u) - order - 1
     r2 = 1.0 - rest / total if total > 0.0 else 1.0
     return fit, r2, 1.0 - (1.0 - r2) * (len(u) - 1) / freedom, float(np.sqrt(rest / freedom))
-
-
-def _aicc(fit: tuple[Legendre, float, float, float], count: int) -> float:
-    """Return Akaike's information criterion, corrected for small samples; the variance is a parameter too."""
-    parameters = len(fit[0].coef) + 1
-    variance = fit[3] ** 2 * (count - len(fit[0].coef)) / count
-    # A line without any residual has no logarithm; a femtometre (or femtoradian) is as good as none.
-    likelihood = count * np.log(max(variance, 1e-30))
-    return float(likelihood + 2 * parameters * (1.0 + (parameters + 1) / (count - parameters - 1)))
 
 
 # From polynomials to the field

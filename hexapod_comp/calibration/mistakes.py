@@ -1,27 +1,24 @@
 """Mistakes in how readings are taken: what may have been mixed up, and what readings are if it was.
 
 One table: a row is a mistake's name and the readings without it. Signs, units and labels of channels change readings
-alone; other frames, orders of angles and machines change the poses at which they were taken.
+alone; other frames and orders of angles change the poses at which they were taken.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from itertools import combinations, permutations, product
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..formats.paths import config_file
-from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import MachineModel
 from ..machine.passes import Passes
 from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_KINDS, MeasurementSet, Run
-from ..measurements.runs import GEOMETRIES
 from ..pose import angles_from_rotation
 from ..virtual.instruments import compensated
 
@@ -73,14 +70,14 @@ def mistakes_of_check(m: MeasurementSet, model: MachineModel) -> Iterator[Mistak
         yield Mistake("taken with this model running (--compensated)", partial(compensated, m, model))
         yield from (mistake for mistake in mistakes_of_place(m) if mistake.name.endswith(": exchanged"))
     else:
-        off = replace(m.stations, commands=_nominal(m.geometry, m))
+        off = replace(m.stations, commands=_nominal(m))
         yield Mistake("taken with the compensation off", partial(replace, m, stations=off))
     yield Mistake("all readings: sign reversed", partial(m.with_values, -m.value))
     yield from mistakes(m)
 
 
 def mistakes_of_place(m: MeasurementSet) -> Iterator[Mistake]:
-    """Yield where else the machine may have stood: frames exchanged, mirrored and turned, angles, other machines."""
+    """Yield where else the machine may have stood: frames exchanged, mirrored and turned, other orders of angles."""
     for a, b in combinations(range(3), 2):
         order = np.eye(3)
         order[[a, b]] = order[[b, a]]
@@ -96,14 +93,6 @@ def mistakes_of_place(m: MeasurementSet) -> Iterator[Mistake]:
         if axes != ("y", "x", "z"):  # R = Ry(β)·Rx(α)·Rz(γ)
             title = f"angles: turned about {', '.join(axes)} in turn"
             yield Mistake(title, partial(_in_order, m, "".join(axes).upper()))
-    for geometry in _shipped():
-        yield Mistake(f"the geometry of {geometry.name}", partial(_of_machine, m, geometry))
-
-
-@cache
-def _shipped() -> tuple[HexapodGeometry, ...]:
-    """Return the machines whose files come with the package."""
-    return tuple(load_geometry(config_file(name)) for name in GEOMETRIES)
 
 
 def sign_reversed(m: MeasurementSet, members: np.ndarray) -> MeasurementSet:
@@ -113,11 +102,11 @@ def sign_reversed(m: MeasurementSet, members: np.ndarray) -> MeasurementSet:
 
 def has_nominal_commands(m: MeasurementSet) -> bool:
     """Return whether the struts' lengths are those of the nominal machine at the poses: nobody measured them."""
-    return np.allclose(m.stations.commands, _nominal(m.geometry, m), rtol=0.0, atol=1e-9)
+    return np.allclose(m.stations.commands, _nominal(m), rtol=0.0, atol=1e-9)
 
 
-def _nominal(geometry: HexapodGeometry, m: MeasurementSet) -> np.ndarray:
-    return strut_lengths_batch(Structure.of(geometry), m.stations.positions, m.stations.rotations)
+def _nominal(m: MeasurementSet) -> np.ndarray:
+    return strut_lengths_batch(Structure.of(m.geometry), m.stations.positions, m.stations.rotations)
 
 
 def _parts(m: MeasurementSet) -> Iterator[tuple[str, np.ndarray]]:
@@ -190,7 +179,7 @@ def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> Measu
     centre = work.position + (m.centre - work.position) @ in_base.T
     value = factor[m.channel] * m.value
     renamed = replace(m, channel=channel[m.channel], value=value, centre=centre, runs=_turned_runs(m, in_base))
-    return _sent(renamed, m.geometry, *m.geometry.platform_poses(tips @ frame.T, turned), in_base)
+    return _sent(renamed, *m.geometry.platform_poses(tips @ frame.T, turned), in_base)
 
 
 def _in_order(m: MeasurementSet, order: str) -> MeasurementSet | None:
@@ -201,28 +190,16 @@ def _in_order(m: MeasurementSet, order: str) -> MeasurementSet | None:
         return None
     by_axis = angles[:, ["XYZ".index(axis) for axis in order]]
     turned = Rotation.from_euler(order, by_axis).as_matrix()
-    return _sent(m, m.geometry, *m.geometry.platform_poses(tips, turned), np.eye(3))
-
-
-def _of_machine(m: MeasurementSet, geometry: HexapodGeometry) -> MeasurementSet | None:
-    """Return a set as if another machine's tool had gone the same way in its work frame."""
-    if geometry.name == m.geometry.name:
-        return None
-    tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
-    turn = geometry.work.rotation @ m.geometry.work.rotation.T
-    sent = _sent(replace(m, runs=_turned_runs(m, turn)), geometry, *geometry.platform_poses(tips, tools), turn)
-    return replace(sent, geometry=geometry, probe=geometry.tool.position)
+    return _sent(m, *m.geometry.platform_poses(tips, turned), np.eye(3))
 
 
 def _turned_runs(m: MeasurementSet, turn: np.ndarray) -> tuple[Run, ...]:
     return tuple(replace(run, axis=turn @ run.axis) for run in m.runs)
 
 
-def _sent(
-    m: MeasurementSet, geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, turn: np.ndarray
-) -> MeasurementSet:
+def _sent(m: MeasurementSet, positions: np.ndarray, rotations: np.ndarray, turn: np.ndarray) -> MeasurementSet:
     """Return a set with other poses and directions turned alike; lengths of struts that were measured stay."""
-    moving = Passes(geometry, positions, rotations, m.stations.sense[:, :3] @ turn.T)
+    moving = Passes(m.geometry, positions, rotations, m.stations.sense[:, :3] @ turn.T)
     commands = moving.nominal_commands() if has_nominal_commands(m) else m.stations.commands
     stations = replace(m.stations, positions=positions, rotations=rotations, commands=commands, sense=moving.senses())
     return replace(m, stations=stations)

@@ -111,18 +111,6 @@ def mixups(
     return [n.text or f"{n.name} fits {n.better:.3g} times better" for n in sorted(named, key=lambda n: -n.gain)]
 
 
-def swapped_directions(everything: Estimation, problem: LinearProblem, blocks: Collection[str]) -> bool:
-    """Return whether most struts have a backlash clearly below zero: no nut leads its screw."""
-    space, block = everything.space, everything.space.block("backlash")
-    if block is None:
-        return False
-    kept = np.array([b.name in ("structure", "backlash", *blocks) for b in space.blocks])
-    posterior = solve(space, problem, np.where(kept, space.start_tolerances(), 0.0), ALIKE)
-    members = np.searchsorted(posterior.used, np.arange(space.size)[block.part])
-    deviations = np.sqrt(np.diag(posterior.covariance)[members])
-    return bool((posterior.y[members] < -ASSUMED.surely * deviations).sum() > len(members) // 2)
-
-
 class _Way(NamedTuple):
     """A common mode under one prior."""
 
@@ -181,7 +169,7 @@ class _Fitted:
         return directions, self._along(np.arange(len(directions)), directions)
 
     def _basis(self, block: int) -> np.ndarray:
-        """Return the components of a block's parameters; all of them where a machine of another kind has others."""
+        """Return the components of a block's parameters; all of them where other commands give a map other knots."""
         name, size = self.space.blocks[block].name, len(self.space.blocks[block].labels)
         basis = self.bases.get(name, np.eye(size))
         return basis if len(basis) == size else np.eye(size)
@@ -270,10 +258,12 @@ class _Fitted:
         alone = replace(self.space.settings, blocks=tuple(b for b in self.space.settings.blocks if b in EXPECTED))
         few = _some_runs(m)
         as_read = _elsewhere_fitted(few, alone, {})
+        if as_read is None or (as_read.early.noise[as_read.kinds] < ASSUMED.misfit[0]).all():
+            return []  # nothing is left to be explained
         everywhere = {mistake.name: mistake for mistake in mistakes_of_place(m)}
         for mistake in mistakes_of_place(few):
             there = _elsewhere_fitted(mistake.undone(), alone, {})
-            if there is None or as_read is None:
+            if there is None:
                 continue
             gain = log_evidence(there.problem, there.early) - log_evidence(as_read.problem, as_read.early)
             if gain > np.log(ASSUMED.mixup_odds):

@@ -103,26 +103,13 @@ def _line_panel(axes: Axes, line: LineFit, grid: Sequence[np.ndarray]) -> None:
 
 
 def fit_figure(fit: ModelFit) -> Figure:
-    """Show a joint fit: its residuals, the struts' errors, what the data determine, and the expected tool error."""
-    figure = Figure(figsize=(11, 7.6), layout="constrained")
-    panels = figure.subplots(2, 2)
-    _residual_panel(panels[0, 0], fit)
-    _strut_panel(panels[0, 1], fit)
-    _sight_panel(panels[1, 0], fit)
-    _tool_error_panel(panels[1, 1], fit)
+    """Show a joint fit: its residuals, and the struts' errors."""
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _residual_panel(left, fit)
+    _strut_panel(right, fit)
     figure.suptitle(f"{picture_text(fit.measurements.geometry.name)}: scheme joint, {len(fit.measurements)} readings")
     return figure
-
-
-def _sight_panel(axes: Axes, fit: ModelFit) -> None:
-    """Show how many parameters of each block the data determine."""
-    blocks = fit.observability.blocks
-    names = [block.name for block in blocks]
-    axes.barh(names, [block.parameters for block in blocks], color="#d0d0d0", label="parameters")
-    axes.barh(names, [block.determined for block in blocks], height=0.5, color=WITH, label="determined by data")
-    axes.invert_yaxis()
-    axes.set(title="what the readings determine", xlabel="parameters")
-    axes.legend(fontsize=7)
 
 
 def _residual_panel(axes: Axes, fit: ModelFit) -> None:
@@ -154,25 +141,8 @@ def _strut_panel(axes: Axes, fit: ModelFit) -> None:
     axes.legend(ncols=2, fontsize=7)
 
 
-def _tool_error_panel(axes: Axes, fit: ModelFit) -> None:
-    """Show the expected tool error, before and after, for a level and for a tilted tool."""
-    cases = {"level": fit.level, "tilted 10°": fit.tilted}
-    known = {name: error for name, error in cases.items() if error is not None}
-    places = np.arange(len(known))
-    before = [error.before * 1e6 for error in known.values()]
-    after = np.array([error.after * 1e6 for error in known.values()])
-    low, high = (np.array([getattr(error, end) * 1e6 for error in known.values()]) for end in ("low", "high"))
-    axes.bar(places - 0.2, before, 0.35, color=WITHOUT, label="as the machine is")
-    spread = [np.maximum(after - low, 0.0), np.maximum(high - after, 0.0)]
-    axes.bar(places + 0.2, after, 0.35, color=WITH, yerr=spread, capsize=4, label="with the model (95 %)")
-    axes.set_xticks(places, list(known))
-    axes.set(title="tool error to expect, datum aligned", ylabel="RMS in space, µm", yscale="log")
-    axes.set_ylim(top=4.0 * max(before))  # room for the legend
-    axes.legend(fontsize=7)
-
-
-def _maps(fit: ModelFit) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return x, y, three heights, m in work, and errors before and after, µm, shape (3, y, x), in the measured box."""
+def before_after_figure(fit: ModelFit) -> Figure:
+    """Map the error in space before compensation, and what is expected after it, at three heights of the box."""
     if fit.model.region is None:
         raise CalibrationError("picture of the error in space", "needs readings that span a box")
     low, high = fit.space.work_box
@@ -183,27 +153,7 @@ def _maps(fit: ModelFit) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     before, left = (part.reshape(3, MAP_NODES, MAP_NODES) * 1e6 for part in errors)
     # The allowance for errors without a parameter has no place, so it is added everywhere.
     beside = 0.0 if fit.level is None else (fit.level.after * 1e6) ** 2 - np.nanmean(left**2)
-    return x, y, heights, before, np.sqrt(left**2 + max(beside, 0.0))
-
-
-def left_error_figure(fit: ModelFit) -> Figure:
-    """Show the expected residual error (RMS) in the measured box at three heights."""
-    x, y, heights, _, left = _maps(fit)
-    figure = Figure(figsize=(11, 3.9), layout="constrained")
-    panels = figure.subplots(1, 3, sharex=True, sharey=True)
-    levels = np.linspace(np.nanmin(left), np.nanmax(left), 13)
-    for axes, height, values in zip(panels, heights, left, strict=True):
-        drawn = axes.contourf(x * 1e3, y * 1e3, np.ma.masked_invalid(values), levels, cmap="viridis")
-        axes.set(title=f"z in work = {height * 1e3:.0f} mm", xlabel="x in work, mm", aspect="equal")
-    panels[0].set_ylabel("y in work, mm")
-    figure.colorbar(drawn, ax=panels, label="RMS error in space to expect, µm")
-    figure.suptitle("what is left after compensation, level tool, datum aligned")
-    return figure
-
-
-def before_after_figure(fit: ModelFit) -> Figure:
-    """Map the error in space before and after compensation at three heights, in the same colours, by powers of ten."""
-    x, y, heights, *maps = _maps(fit)
+    maps = before, np.sqrt(left**2 + max(beside, 0.0))
     figure = Figure(figsize=(11, 7.2), layout="constrained")
     rows = figure.subplots(2, 3, sharex=True, sharey=True)
     sizes = np.maximum(np.array(maps), NOTHING)

@@ -436,7 +436,7 @@ class BlockSight:
 
 @dataclass(frozen=True)
 class Observability:
-    """What the data determine: rank, condition number, indices, weak and unseen directions."""
+    """What the data determine: rank, condition number, indices, unseen parameters of the structure."""
 
     blocks: tuple[BlockSight, ...]
     structure_rank: int  # directions of the structure that the data see, of structure_size
@@ -445,7 +445,6 @@ class Observability:
     size: int
     condition: float  # largest over smallest singular value of the observable part, each parameter in its tolerance
     indices: dict[str, float]  # O1 … O4, of the seen directions
-    weak: tuple[tuple[float, str], ...]  # strength, in σ, and main parameters of barely observable directions
     unseen: tuple[str, ...]  # structure parameters that the data do not see
     tilt: float  # largest tilt of the tool from level in the readings, rad
 
@@ -458,20 +457,16 @@ def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, t
     """
     spread = space.spread(estimate.tolerances)
     information = spread[:, None] * np.tensordot(estimate.noise**-2, problem.normal, 1) * spread
-    singular, vectors = _singular(information)
+    singular, _ = _singular(information)
     seen = singular[singular > ASSUMED.seen]
     errors = np.sqrt(np.diag(physical_covariance(space, estimate)))
-    structure, labels = space.blocks[0], space.labels
+    structure = space.blocks[0]
     alone, directions = _singular(information[structure.part, structure.part])
     hidden = (directions[:, alone <= ASSUMED.seen] ** 2).sum(axis=1) > 0.5
     indices = {}
     if len(seen):
         indices["O1"] = float(np.exp(np.log(seen).mean()) / np.sqrt(len(problem.target)))
         indices |= {"O2": float(seen[-1] / seen[0]), "O3": float(seen[-1]), "O4": float(seen[-1] ** 2 / seen[0])}
-    weak = []
-    for n in np.flatnonzero((singular > ASSUMED.seen) & (singular < ASSUMED.weak))[::-1][:5]:
-        main = np.argsort(-np.abs(vectors[:, n]))[:3]
-        weak.append((float(singular[n]), ", ".join(f"{vectors[i, n]:+.2f} {labels[i]}" for i in main)))
     blocks = tuple(
         BlockSight(
             name=block.name,
@@ -491,7 +486,6 @@ def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, t
         size=space.size,
         condition=float(seen[0] / seen[-1]) if len(seen) else np.inf,
         indices=indices,
-        weak=tuple(weak),
         unseen=tuple(label for label, is_hidden in zip(structure.labels, hidden, strict=True) if is_hidden),
         tilt=tilt,
     )

@@ -22,7 +22,7 @@ import numpy as np
 from ..errors import HexapodError, InputFileError, ModelError, PoseError
 from ..formats.files import MAX_ARCHIVE_BYTES, MEGABYTE, Opener, parsing, read_bytes
 from ..formats.json import json_content
-from ..formats.outputs import new_file
+from ..formats.outputs import new_file, write_text
 from ..formats.paths import input_file
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
@@ -58,12 +58,12 @@ def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, pa
     if fitted is None or (file.exists() and not file.is_file()):
         save_model(model, path)
         return []
-    unnamed = model_text(replace(model, origin=replace(model.origin, posterior=None)))
-    beside, content = file.with_name(file.stem + SUFFIX), _content(fitted, text_sha256(unnamed))
+    beside, unknown = file.with_name(file.stem + SUFFIX), hashlib.sha256(FORMAT.encode()).hexdigest()
+    text = model_text(replace(model, origin=replace(model.origin, posterior=(beside.name, unknown))))
+    content = _content(fitted, text_sha256(text))  # of all but the posterior's name and hash
     with new_file(beside, "wb") as stream:  # first: a model file never names a missing file
         stream.write(content)
-    posterior = beside.name, hashlib.sha256(content).hexdigest()
-    save_model(replace(model, origin=replace(model.origin, posterior=posterior)), path)
+    write_text(path, text.replace(unknown, hashlib.sha256(content).hexdigest()))
     return [beside]
 
 

@@ -14,7 +14,7 @@ from ..machine.model import RealMachine, measured_region
 from ..machine.passes import Poses
 from ..machine.region import region_json, region_text
 from ..measurements.readings import CHANNELS, DEFAULT_UNCERTAINTY
-from ..workspace.combined import NORMAL, covariance_factor, monte_carlo, root_sum_of_squares
+from ..workspace.combined import covariance_factor, monte_carlo, root_sum_of_squares
 from .candidates import TILTS, laid_out
 from .design import ErrorLeft, information_of_fit
 from .posterior import POINTS, ErrorPredictor, FittedParameters
@@ -97,7 +97,7 @@ def _left(predictor: ErrorPredictor, poses: Poses, factor: np.ndarray, where: st
     tips, effects = tips[reached], np.swapaxes(slopes[reached] @ factor, 1, 2)
     sizes = root_sum_of_squares(effects)
     as_it_stands = np.concatenate([standing[reached] @ factor, given_up[reached, :, None]], axis=2)[:, :3]
-    drawn = monte_carlo(effects, MACHINES_DRAWN, percentiles=(95.0,), distribution=NORMAL)
+    drawn = monte_carlo(effects, MACHINES_DRAWN, percentiles=(95.0,), normal=True)
     worst = int(sizes[:, 0].argmax())
     left = ErrorOverPoses(
         where=where,
@@ -105,7 +105,7 @@ def _left(predictor: ErrorPredictor, poses: Poses, factor: np.ndarray, where: st
         rms=np.sqrt((sizes**2).mean(axis=0)),
         worst=float(sizes[worst, 0]),
         at=tips[worst],
-        most=float(drawn.worst_values[0, 0]),
+        most=float(drawn.values[0, 0]),
         standing=float(np.sqrt((as_it_stands**2).sum(axis=(1, 2)).mean())),
     )
     return left, np.einsum("npc,nqc->pq", effects[..., :3], effects[..., :3], optimize=True) / len(tips)

@@ -1,4 +1,4 @@
-"""Reports of fits, as text and as JSON: scheme ``joint``, or a plan for one, and scheme ``lines``."""
+"""Reports of fits, as text and as JSON: scheme ``joint``, and scheme ``lines``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 from ..formats.texts import aligned, number
 from ..machine.field import COMPONENTS
 from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, SAME_ATTITUDE
-from .design import Plan, stops_text
 from .estimator import SETTLED
 from .fit import ChannelFit, ModelFit, Outlier
 from .lead import ScrewLead
@@ -35,7 +34,7 @@ def fit_report(fit: ModelFit) -> str:
         *_gross_errors(fit),
         *(["IN DOUBT:\n" + "\n".join(f"  {doubt}" for doubt in doubts)] if doubts else []),
         _headline(fit),
-        *_expected(fit.level, fit.tilted, fit.observability),
+        *expected_text(fit.level, fit.tilted, fit.observability),
         fit.held.report(),
         *(["\n".join(f"note: {note}" for note in fit.notes)] if fit.notes else []),
         _channel_table(fit),
@@ -59,7 +58,7 @@ def _headline(fit: ModelFit) -> str:
     )
 
 
-def _expected(level: ToolError | None, tilted: ToolError | None, seen: Observability) -> Iterator[str]:
+def expected_text(level: ToolError | None, tilted: ToolError | None, seen: Observability) -> Iterator[str]:
     """Yield the tool error with the model, and whether it can be trusted with a tilted tool."""
     if level is None:
         return
@@ -130,7 +129,7 @@ def _decision_table(fit: ModelFit) -> str:
 
 
 def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ...]) -> str:
-    """Return what the data determine: block by block, rank, indices, weak and unseen directions."""
+    """Return what the data determine: block by block, rank, indices, unseen parameters."""
     header = ("block", "parameters", "determined", "tolerance", "median error", "")
     lines = [aligned(header, [_sight_row(b) for b in seen.blocks])]
     lines.append(
@@ -139,7 +138,6 @@ def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ..
     )
     if seen.indices:
         lines.append("observability indices: " + ", ".join(f"{k} {v:.3g}" for k, v in seen.indices.items()))
-    lines += [f"weak ({strength:.1f} σ): {names}" for strength, names in seen.weak]
     if seen.unseen:
         lines.append("not seen (left near nominal): " + ", ".join(seen.unseen))
     if unseen_errors:
@@ -209,7 +207,7 @@ def as_json(fit: ModelFit) -> dict:
         "blocks": fit.decisions,
         "screw_lead": _lead_json(fit.lead),
         "channels": [_channel_json(c) for c in fit.channels],
-        **_expected_json(fit.level, fit.tilted, fit.observability, fit.unseen_errors),
+        **expected_json(fit.level, fit.tilted, fit.observability, fit.unseen_errors),
         "datum": fit.held.as_json(),
         "settled": fit.solution.change < SETTLED,
         "doubts": (*fit.verdict.refusals, *fit.verdict.doubts),
@@ -246,7 +244,7 @@ def _unit(kind: str) -> str:
     return "rad" if kind in ANGULAR_KINDS else "m"
 
 
-def _expected_json(
+def expected_json(
     level: ToolError | None, tilted: ToolError | None, seen: Observability, unseen_errors: tuple[UnseenError, ...]
 ) -> dict:
     """Return the keys that a fit and a plan for one share."""
@@ -268,44 +266,13 @@ def _expected_json(
     }
 
 
-def plan_report(plan: Plan) -> str:
-    """Return the report of a plan."""
-    m = plan.measurements
-    head = (
-        f"machine {m.geometry.name}: {len(m)} readings of {len(m.runs)} runs at {len(m.stations)} stations, "
-        f"{plan.space.size} parameters"
-    )
-    expected = [
-        f"{part}\n  {stops_text(plan.stops)}" for part in _expected(plan.level, plan.tilted, plan.observability)
-    ]
-    seen = observability_text(plan.observability, plan.unseen_errors)
-    parts = [
-        head,
-        *expected,
-        seen,
-        *([f"that holds for the loads of the readings; {plan.elsewhere}"] * bool(plan.elsewhere)),
-    ]
-    return "\n\n".join(parts) + "\n"
-
-
-def plan_json(plan: Plan) -> dict:
-    """Return a plan as plain numbers; units as in :func:`as_json`."""
-    return {
-        "machine": plan.measurements.geometry.name,
-        "readings": len(plan.measurements),
-        "parameters": plan.space.size,
-        "repeatability_m": plan.stops,
-        **_expected_json(plan.level, plan.tilted, plan.observability, plan.unseen_errors),
-    }
-
-
 # Scheme lines
 
 WAYS = {1: "forward", -1: "backward", 0: "both"}
 
 
-def lines_report(fit: LinesFit, every_line: bool = False) -> str:
-    """Return the report of a fit of scheme ``lines``: a row for each family and component, or each polynomial too."""
+def lines_report(fit: LinesFit) -> str:
+    """Return the report of a fit of scheme ``lines``: a row for each family and component."""
     field = fit.model.field
     nodes = " × ".join(str(len(along)) for along in field.grid)
     header = ("lines along", "of", "polynomials", "order", "R² least", "adjusted R² median", "σ median", "largest", "")
@@ -320,19 +287,8 @@ def lines_report(fit: LinesFit, every_line: bool = False) -> str:
         cells = (number(worst, 3), number(median, 3), f"{np.median(spread):.2f}", f"{spread.max():.2f}")
         rows.append((AXES[axis], COMPONENTS[component], str(len(members)), order, *cells, _micro(component)))
     blocks = [f"{fit.model.name}: {len(fit.lines)} polynomials on a grid of {nodes} nodes", aligned(header, rows)]
-    if every_line:
-        titles = ("of", "direction", "points", "order", "R²", "adjusted R²", "σ", "σ repeated", "unit", "")
-        blocks.append(aligned(titles, map(_line_row, fit.lines)))
     blocks += [fit.held.report(), *(f"note: {note}" for note in fit.notes)]
     return "\n\n".join(blocks) + "\n"
-
-
-def _line_row(line: LineFit) -> tuple[str, ...]:
-    """Return a polynomial, σ of its residuals, and of repeated readings where there are any."""
-    repeated = "–" if np.isnan(line.repeat_std) else f"{line.repeat_std * 1e6:.2f}"
-    sizes = number(line.r2, 4), number(line.adjusted_r2, 4), f"{line.residual_std * 1e6:.2f}", repeated
-    counts = str(len(line.values)), str(line.order)
-    return COMPONENTS[line.component], WAYS[line.direction], *counts, *sizes, _micro(line.component), line.name
 
 
 def _micro(component: int) -> str:

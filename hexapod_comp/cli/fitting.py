@@ -12,23 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..calibration.blocks import HARMONICS
-from ..calibration.check import (
-    VALID,
-    Verification,
-    refusal,
-    update_model,
-    update_report,
-    verification_json,
-    verification_report,
-    verify_model,
-)
 from ..calibration.evaluation import ModelEvaluation, evaluate_model, evaluation_json, evaluation_text
 from ..calibration.fit import ModelFit, fit_model
 from ..calibration.lines import fit_lines
 from ..calibration.parameters import FitSettings
 from ..calibration.posterior import FittedParameters
 from ..calibration.posterior_file import SUFFIX, load_posterior, save_with_posterior
-from ..calibration.report import as_json, fit_report, lines_json, lines_report, plan_json, plan_report
+from ..calibration.report import as_json, fit_report, lines_json, lines_report
 from ..compensation.checks import check
 from ..errors import CalibrationError, CommandError
 from ..formats.outputs import write_text
@@ -52,6 +42,8 @@ from .results import Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from ..calibration.check import Verification
 
 REFUSED = "NOT WRITTEN: this model is not to be trusted"
 # First line of the report where the readings contradict the model
@@ -87,7 +79,18 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
 def plan(args: argparse.Namespace) -> Result:
     """Predict what a campaign determines, or propose one for a goal; 1 when the goal cannot be met."""
     from ..calibration.candidates import MeasuringBox
-    from ..calibration.design import TIMES, Goal, Times, plan, proposal_json, proposal_report, propose, remarks
+    from ..calibration.design import (
+        TIMES,
+        Goal,
+        Times,
+        plan,
+        plan_json,
+        plan_report,
+        proposal_json,
+        proposal_report,
+        propose,
+        remarks,
+    )
 
     geometry = load_geometry(args.machine)
     campaign = results.load_campaign(args, geometry)
@@ -195,11 +198,11 @@ def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSett
     fitted = FittedParameters.of(fit)
 
     def pictures() -> dict[str, Figure]:
-        from ..calibration.pictures import fit_figure, left_error_figure, predicted_error_figure, strut_error_figure
+        from ..calibration.pictures import before_after_figure, fit_figure, predicted_error_figure, strut_error_figure
 
         made = {"fit.png": fit_figure(fit)}
         if fit.model.region is not None:
-            made["left.png"] = left_error_figure(fit)
+            made["left.png"] = before_after_figure(fit)
             machine = RealMachine(measured.geometry, fit.model)
             made["predicted_error.png"] = predicted_error_figure(machine, fitted)
             made["strut_errors.png"] = strut_error_figure(measured.geometry, {"scheme joint": fit.model})
@@ -210,7 +213,7 @@ def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSett
 
 
 def _lines(args: argparse.Namespace, measured: MeasurementSet, datum: Pose | None) -> Fitted:
-    fit = fit_lines(measured, args.order or "adjusted-r2", name=args.name or "", datum=datum)
+    fit = fit_lines(measured, name=args.name or "", datum=datum)
 
     def pictures() -> dict[str, Figure]:
         from ..calibration.pictures import fitted_lines_figure, predicted_error_figure, strut_error_figure
@@ -219,8 +222,7 @@ def _lines(args: argparse.Namespace, measured: MeasurementSet, datum: Pose | Non
         predicted = predicted_error_figure(RealMachine(measured.geometry, fit.model), None)
         return {"lines.png": fitted_lines_figure(fit), "strut_errors.png": of_struts, "predicted_error.png": predicted}
 
-    text = lines_report(fit, every_line=args.every_line)
-    return Fitted(fit.model, text, lambda: lines_json(fit), pictures, fit.misfit)
+    return Fitted(fit.model, lines_report(fit), lambda: lines_json(fit), pictures, fit.misfit)
 
 
 def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
@@ -293,6 +295,8 @@ def _listed(beside: list[Path]) -> str:
 
 def _renew(args: argparse.Namespace) -> Result:
     """Write a model renewed from few readings; 1 when they do not allow it."""
+    from ..calibration.check import refusal, update_model, update_report, verification_json, verification_report
+
     old, new = input_file(args.update), Path(args.out)
     if new.resolve().with_name(new.stem + SUFFIX) == old.resolve().with_name(old.stem + SUFFIX):
         raise CommandError("--out", f"{new} would replace the fit's result for {old}; write to another name")
@@ -319,6 +323,8 @@ def _renew(args: argparse.Namespace) -> Result:
 
 def verify(args: argparse.Namespace) -> Result:
     """Check whether a model still holds, 1 when the machine has changed; or propose check readings."""
+    from ..calibration.check import VALID, verification_json, verification_report
+
     if args.propose is None:
         *_, result = checked(args, args.model)
         code = 0 if result.verdict == VALID else 1
@@ -343,6 +349,8 @@ def verify(args: argparse.Namespace) -> Result:
 
 def checked(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedParameters, MeasurementSet, Verification]:
     """Return a model, its fit's result, the check readings that the options name, and what they say of it."""
+    from ..calibration.check import verify_model
+
     model, fitted = _known(args, path)
     geometry, probe = fitted.space.geometry, args.probe_mm
     if probe is None and not np.allclose(fitted.space.probe, geometry.tool.position, rtol=0.0, atol=1e-12):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from ..compensation.checks import check as check_limits
 from ..errors import CommandError, KinematicsError, NotConvergedError, NotFiniteError, UnreachableError
 from ..formats import texts
 from ..formats.csv import Row
-from ..machine.assembly import ORIENTATIONS, assembly_modes, is_six_three, mode_objections, working_mode
+from ..machine.assembly import ORIENTATIONS, assembly_modes, mode_objections, working_mode
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry, Limits, load_geometry, pose_text
 from ..machine.kinematics import Structure, solve_pose, solve_poses
 from ..machine.model import DIRECTIONS, FOLLOWED, MachineModel, RealMachine
@@ -230,13 +230,13 @@ def fk(args: argparse.Namespace) -> Result:
     else:
         rows, lengths = [Row(0, "1")], np.array([args.lengths])
     geometry, model = results.load_machine(args)
-    if (args.cold or args.all_modes) and not is_six_three(Structure.of(geometry)):
+    notes = []
+    if args.cold or args.all_modes:
         sets = "these lengths" if len(rows) == 1 else "each row's lengths"
         how = f"Newton sought the poses of {sets} from home and {2 * ORIENTATIONS} starts all around"
-        proof = "each closes the loops, but nothing proves that there are no others"
-        results.print_notes([f"machine {geometry.name} is no 6-3 machine: {how}; {proof}"])
+        notes = [f"{how}; each closes the loops, but nothing proves that there are no others"]
     if args.all_modes:
-        return _all_modes(args, geometry, lengths[0])
+        return replace(_all_modes(args, geometry, lengths[0]), notes=notes)
     poses = zip(rows, _solved(args, geometry, model, rows, lengths), strict=True)
     table = [{"sequence": row.label, **geometry.tool_pose(pose).as_columns()} for row, pose in poses]
     content = results.about(geometry, model)
@@ -250,7 +250,7 @@ def fk(args: argparse.Namespace) -> Result:
         title += f", {_moved(args.direction)}" if args.direction else ""
         return "" if args.out is not None else f"{title}\n{Table(table).text(list(table[0])[1:])}"
 
-    return Result(text, lambda: {**content, "rows": table}, table)
+    return Result(text, lambda: {**content, "rows": table}, table, notes=notes)
 
 
 def _solved(

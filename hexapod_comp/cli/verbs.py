@@ -141,8 +141,8 @@ example:
         ),
         """Columns of the file: L1_mm … L6_mm (or _m, _um, _in), optionally sequence or name; CSV in gives CSV out,
 which ik and check read. With --model the lengths are commands, and the pose is that of the real machine. Newton starts
-at home, or at --guess; --cold finds every pose with these lengths (of a machine that is not 6-3: those that Newton
-finds from 4000 starts all around) and selects the one in which the machine can work.
+at home, or at --guess; --cold takes the poses with these lengths that Newton finds from 4000 starts all around, and
+selects the one in which the machine can work.
 
 example:
   $ hexapod_comp fk --lengths 519.494,519.808,509.192,509.192,499.282,498.955
@@ -546,9 +546,6 @@ example:
                       "1 σ, mrad (scheme joint; default 0.5)", dest="alignment"),
                 flag("--not-robust", "give full weight to readings that disagree with the rest (scheme joint)"),
             ),
-            choice("--order", ("adjusted-r2", "aicc"), "criterion for the polynomials' order (scheme lines; default "
-                                                       "adjusted-r2)"),
-            flag("--every-line", "report order, R² and residual of each line (scheme lines)"),
         ),
         """Reads tidy CSV (one reading a row, as simulate writes it), or with --columns the wide CSV files of other
 laboratories. --scheme joint fits structure, struts and field to all readings at once, and keeps only blocks that
@@ -563,7 +560,6 @@ example:
         (
             needed_by("--certificate", "--details"),
             needed_by("--update", "--compensated"),
-            excluded_by("--scheme joint", "--order", "--every-line"),
             excluded_by("--scheme lines", *(o.name for o in ESTIMATION), "--scale-ppm", "--alignment-mrad",
                         "--not-robust", "--certificate"),
             excluded_by("--update", "--scheme", *(o.name for o in ESTIMATION), "--not-robust", "--pictures", "--truth",

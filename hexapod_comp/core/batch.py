@@ -112,7 +112,6 @@ screw_twists = entry("hc_screw_twists", f"{JOINTS} base_axes[6,3] platform_axes[
 rotate = entry("hc_rotate", "!rotation[3,3] x y z")
 rotation_flaw = entry("hc_rotation_flaw", "rotation[3,3]")
 solve_linear = entry("hc_solve_linear", "!matrix[6,6] !right[6]")
-settle = entry("hc_settle_many", "circles[3,3,3] sides[3] N !angles[N,3] !points[N,3,3] !errors[N]")
 
 # --- the model ---
 

@@ -9,5 +9,4 @@
 #include "batch.c"
 #include "examine.c"
 #include "travel.c"
-#include "assembly.c"
 #include "drives.c"

@@ -24,11 +24,9 @@ that gives it: the same inverse of the strut's errors that the compensator takes
 
 from __future__ import annotations
 
-import configparser
-import hashlib
 import re
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +34,6 @@ from scipy.interpolate import make_lsq_spline
 
 from ..core.batch import screw_twists, strut_commands
 from ..errors import GeometryError, InputFileError
-from ..formats.csv import number_in
 from ..formats.files import read_text
 from ..formats.outputs import write_text
 from ..formats.schema import UNITS
@@ -56,7 +53,7 @@ HAL_FILE, INI_FILE = "genhexkins.hal", "comp.ini"
 COMP_FILES = tuple(f"{name}.comp" for name in STRUT_NAMES)
 COMP_TYPE = 1
 PINS = {"base": "base_joints", "platform": "platform_joints", "base-n": "base_axes", "platform-n": "platform_axes"}
-SETP = re.compile(r"setp\s+genhexkins\.(\S+)\s+(\S+)\s*")
+SETP = re.compile(r"^setp genhexkins\.(\S+) (\S+)$", re.MULTILINE)
 SAMPLES = 16  # Samples of the strut's errors between two points of its table
 
 
@@ -235,8 +232,7 @@ def write_genhexkins(
     titles = [" ".join(title.split()) for title in titles]  # a line break would end the comment
     bodies = {HAL_FILE: _hal_lines(genhexkins, size), INI_FILE: _ini_lines()}
     bodies |= {name: _comp_lines(table, size) for name, table in zip(COMP_FILES, genhexkins.tables, strict=True)}
-    mark = hashlib.sha256(repr(sorted(bodies.items())).encode()).hexdigest()[:16]
-    titles = [f"set {mark}", *titles, f"machine unit: {unit}"]
+    titles = [*titles, f"machine unit: {unit}"]
     for name, body in bodies.items():
         about = {HAL_FILE: HAL_ABOUT, INI_FILE: INI_ABOUT}.get(name) or _comp_about(misfit[COMP_FILES.index(name)])
         comments = [f"# {line}" for line in [*titles, *about]]
@@ -299,82 +295,17 @@ def _ini_lines() -> list[str]:
 
 
 def read_genhexkins(folder: str | Path, unit: str) -> Genhexkins:
-    """Read a written set as LinuxCNC would."""
+    """Read a written set as LinuxCNC does: the pins, and points up to the first line that is not three numbers."""
     folder, size = Path(folder), MACHINE_UNITS[unit]
-    texts = {name: read_text(folder / name) for name in (HAL_FILE, INI_FILE, *COMP_FILES)}
-    _refuse_mixed(folder, texts)
-    pins = _read_pins(folder / HAL_FILE, texts[HAL_FILE])
-    vectors: dict[str, np.ndarray] = {name: np.zeros((6, 3)) for name in PINS.values()}
+    pins = {pin: float(value) for pin, value in SETP.findall(read_text(folder / HAL_FILE))}
+    vectors = {}
     for pin, name in PINS.items():
-        if not pin.endswith("-n") or pins["screw-lead"] != 0.0:
-            vectors[name] = _vectors(folder / HAL_FILE, pins, pin) * (1.0 if pin.endswith("-n") else size)
-    names = _comp_names(folder / INI_FILE, texts[INI_FILE])
-    tables = tuple(_read_table(folder / name, read_text(folder / name), size) for name in names)
-    return Genhexkins(**vectors, lead=pins["screw-lead"] * size, tables=tables)
-
-
-def _refuse_mixed(folder: Path, texts: dict[str, str]) -> None:
-    """Raise when the files do not all carry the same mark."""
-    marks = {name: re.findall(r"^# set ([0-9a-f]{16})$", text, re.MULTILINE) for name, text in texts.items()}
-    for name, mark in marks.items():
-        if not mark or mark != marks[HAL_FILE]:
-            raise InputFileError(folder / name, "# set", f"must be that of {HAL_FILE}: files of two exports", mark)
-
-
-def _read_pins(path: Path, text: str) -> dict[str, float]:
-    """Return the pins that a HAL file sets."""
-    pins: dict[str, float] = {}
-    for number, line in enumerate(text.split("\n"), 1):
-        if not line or line.startswith("#"):
-            continue
-        match = SETP.fullmatch(line)
-        if not match:
-            raise InputFileError(path, f"line {number}", "is not setp of a genhexkins pin", line)
-        if match[1] in pins:
-            raise InputFileError(path, f"line {number}", "sets a pin again", line)
-        pins[match[1]] = number_in(path, f"line {number}", match[2])
-    return {"screw-lead": 0.0} | pins
-
-
-def _vectors(path: Path, pins: dict[str, float], pin: str) -> np.ndarray:
-    names = [[f"{pin}.{joint}.{axis}" for axis in "xyz"] for joint in range(6)]
-    missing = next((name for row in names for name in row if name not in pins), None)
-    if missing:
-        raise InputFileError(path, f"genhexkins.{missing}", "is not set")
-    return np.array([[pins[name] for name in row] for row in names])
-
-
-def _comp_names(path: Path, text: str) -> list[str]:
-    """Return the compensation files that the ini lines name, in the order of the joints."""
-    parser = configparser.ConfigParser()
-    try:
-        parser.read_string(text)
-        sections = [parser[f"JOINT_{joint}"] for joint in range(6)]
-        wrong = next((s for s in sections if s["COMP_FILE_TYPE"] != str(COMP_TYPE)), None)
-        names = [section["COMP_FILE"] for section in sections]
-    except (configparser.Error, KeyError) as error:
-        raise InputFileError(path, "", f"reads back otherwise than written: {str(error).splitlines()[0]}") from error
-    if wrong is not None:
-        raise InputFileError(path, f"[{wrong.name}]COMP_FILE_TYPE", f"must be {COMP_TYPE}", wrong["COMP_FILE_TYPE"])
-    for section, name in zip(sections, names, strict=True):
-        if name not in COMP_FILES:
-            raise InputFileError(path, f"[{section.name}]COMP_FILE", f"must be one of {', '.join(COMP_FILES)}", name)
-    return names
-
-
-def _read_table(path: Path, text: str, size: float) -> ScrewTable:
-    """Read a compensation file up to the first line that does not begin with three numbers."""
-    rows: list[list[float]] = []
-    for number, line in enumerate(text.split("\n"), 1):
-        words = line.split()[:3]
-        if len(words) < 3 or line.startswith("#"):
-            break
-        rows.append([number_in(path, f"line {number}", word) for word in words])
-        if len(rows) > MOST_POINTS:
-            raise InputFileError(path, f"line {number}", f"LinuxCNC takes at most {MOST_POINTS} points")
-        if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
-            raise InputFileError(path, f"line {number}", "joint commands must increase", rows[-1][0])
-    if not rows:
-        raise InputFileError(path, "line 1", "has no points: LinuxCNC stops at a line that is not three numbers")
-    values = np.array(rows) * size
-    return ScrewTable(values[:, 0], values[:, 1:].T)
+        rows = [[pins.get(f"{pin}.{joint}.{axis}", 0.0) for axis in "xyz"] for joint in range(6)]
+        vectors[name] = np.array(rows) * (1.0 if pin.endswith("-n") else size)
+    tables = []
+    for name in COMP_FILES:
+        lines = (line.split() for line in read_text(folder / name).splitlines())
+        points = takewhile(lambda words: len(words) == 3 and words[0] != "#", lines)
+        values = np.array([list(map(float, words)) for words in points]) * size
+        tables.append(ScrewTable(values[:, 0], values[:, 1:].T))
+    return Genhexkins(**vectors, lead=pins["screw-lead"] * size, tables=tuple(tables))

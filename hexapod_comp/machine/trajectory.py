@@ -1,4 +1,4 @@
-"""Streams of poses for a machine: smooth moves between poses that keep its limits, and milling paths."""
+"""Streams of poses for a machine: smooth moves between poses that keep its limits, and circles."""
 
 from __future__ import annotations
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
-
-from ..errors import ModelError
 
 Values: TypeAlias = "float | np.ndarray"  # one number, or one a reading
 
@@ -22,48 +19,19 @@ AIR_RANGES = {
     "humidity": (0.0, 1.0, "0…1, as a fraction"),
 }
 
-WAVELENGTH_RANGE = (300e-9, 1700e-9)  # vacuum wavelengths for which Ciddor's equation holds, m
-CO2_RANGE = (0.0, 2000.0)  # CO₂ for which Ciddor's equation holds, 10⁻⁶
 LARGEST_INDEX = 1.001  # no air of :data:`AIR_RANGES` comes near it: an index above is a mistake
 
 
-@dataclass(frozen=True, eq=False)
-class Air:
-    """State of the air along a laser's beam, for one reading or for many."""
+class Air(NamedTuple):
+    """State of the air along a laser's beam, for one reading or for many, within :data:`AIR_RANGES`."""
 
     temperature: Values  # °C
     pressure: Values  # pressure at the place, not reduced to sea level, Pa
     humidity: Values  # relative, as a fraction 0…1
 
-    def __post_init__(self) -> None:
-        for name, (low, high, allowed) in AIR_RANGES.items():
-            values = np.array(getattr(self, name), dtype=float)
-            _check_range(f"air {name}", values, low, high, allowed)
-            values.flags.writeable = False
-            object.__setattr__(self, name, values)
-        shapes = [np.shape(getattr(self, name)) for name in AIR_RANGES]
-        try:
-            np.broadcast_shapes(*shapes)
-        except ValueError as error:
-            problem = "temperature, pressure and humidity must each be one number or one a reading"
-            raise ModelError("air", problem, shapes) from error
-
-
-def _check_range(key: str, values: Values, low: float, high: float, allowed: str) -> None:
-    """Raise on the first value outside its range, NaN included."""
-    array = np.asarray(values, dtype=float)
-    wrong = ~((array >= low) & (array <= high))
-    if wrong.any():
-        index = int(wrong.argmax())
-        where = f"{key}, reading {index + 1}" if array.ndim else key
-        raise ModelError(where, f"must lie within {allowed}; is the unit right?", float(array.flat[index]))
-
 
 def ciddor_index(air: Air, vacuum_wavelength: float = VACUUM_WAVELENGTH, co2_ppm: float = USUAL_CO2_PPM) -> np.ndarray:
     """Return the phase refractive index of air after Ciddor."""
-    low, high = WAVELENGTH_RANGE
-    _check_range("vacuum wavelength", vacuum_wavelength, low, high, f"{low:g}…{high:g} m")
-    _check_range("CO2", co2_ppm, *CO2_RANGE, f"{CO2_RANGE[0]:g}…{CO2_RANGE[1]:g} ppm")
     vapour = _vapour_fraction(air)
     density = _molar_density(air.pressure, air.temperature, vapour)
     of_dry_air = density * (1.0 - vapour) / _molar_density(101_325.0, 15.0, 0.0)
@@ -104,5 +72,4 @@ def _molar_density(pressure: Values, temperature: Values, vapour: Values) -> Val
 
 def correct_displacement(raw: Values, air: Air, assumed_index: Values = 1.0) -> np.ndarray:
     """Return the displacement L that an interferometer measured, from its displayed value."""
-    _check_range("assumed index", assumed_index, 1.0, LARGEST_INDEX, f"1…{LARGEST_INDEX:g}")
     return np.asarray(raw) * (assumed_index / ciddor_index(air))

@@ -140,37 +140,14 @@ def collect(
     going_on: Callable[[], bool] = lambda: True,
     tracker_frame: str = KNOWN,
 ) -> Collected:
-    """Visit a campaign's stations in its order and write what is read there as tidy CSV.
+    """Visit a campaign's stations in its order and write what is read there as tidy CSV; `seed` draws scattered poses.
 
-    Parameters
-    ----------
-    campaign : Campaign
-        What is read where; ``seed`` draws its scattered poses.
-    geometry : HexapodGeometry
-        The machine, with the tool that carries the target.
-    machine : MeasuredMachine
-        Moves and watches.
-    path : path
-        The file; where it is there already it must hold readings of this campaign, and is completed.
-    attempts : int, optional
-        How often an instrument that reads nothing is asked at a station before the station is left out, and how often
-        a run is begun whose zero is lost on the way.
-    progress : callable, optional
-        Called at each stop with the number of those done, of all, and where it is.
-    going_on : callable, optional
-        Asked before each stop; false ends the run, with what was collected in the file.
-    tracker_frame : str, optional
-        ``known``: poses are measured in the base; ``free``: in a frame that stands anywhere, which is estimated from
-        the first stations, and which the file says.
-
-    Raises
-    ------
-    SetUpError
-        A mistake in sign, unit, channel, frame or target; what was read is in the file.
-    InputFileError
-        A file of another campaign.
-    HexapodError
-        As ``machine.move`` raises it; what was read is in the file.
+    A file that is there already must hold readings of this campaign, and is completed. An instrument that reads nothing
+    is asked `attempts` times, and a run whose zero is lost on the way is begun as often. `progress` is told, at each
+    stop, the number of those done, of all, and where it is; `going_on` ends the run before a stop. With
+    `tracker_frame` ``free`` poses are measured in a frame that is estimated from the first stations. A SetUpError is a
+    mistake in sign, unit, channel, frame or target, an InputFileError a file of another campaign; what was read is in
+    the file.
     """
     work = _Collecting(geometry, machine, list(campaign_readings(campaign, seed)), path, attempts, tracker_frame)
     work.progress, work.going_on = progress, going_on

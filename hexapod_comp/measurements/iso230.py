@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import linprog
 
-from ..errors import ModelError
 from ..formats.texts import aligned, number
 from .readings import BACKWARD, CHANNELS, FORWARD, LEAST_TRAVEL, LENGTH, MeasurementSet
 
@@ -36,10 +35,8 @@ class PositioningTest:
     notes: tuple[str, ...]  # where the test departs from the standard's, and what looks wrong: one sentence each
 
 
-def evaluate(targets: np.ndarray, deviations: np.ndarray) -> PositioningTest:
-    """Return the figures of ISO 230-2:2014 for one line; deviations (up and down, cycles, targets), m."""
-    positions = _checked_targets(targets)
-    readings = _checked_deviations(deviations, len(positions))
+def evaluate(positions: np.ndarray, readings: np.ndarray) -> PositioningTest:
+    """Return the figures of ISO 230-2:2014 for one line; readings (up and down, two or more cycles, targets), m."""
     mean, s = readings.mean(axis=1), readings.std(axis=1, ddof=1)
     low, high = mean - 2.0 * s, mean + 2.0 * s
     reversal = mean[0] - mean[1]
@@ -54,39 +51,6 @@ def evaluate(targets: np.ndarray, deviations: np.ndarray) -> PositioningTest:
     notes = _design_notes(positions, readings.shape[1]) + _swap_notes(reversal, s, readings.shape[1])
     figures = {name: float(value) for name, value in figures.items()}
     return PositioningTest(positions, readings.shape[1], mean, s, reversal, repeatability, figures, tuple(notes))
-
-
-def _checked_targets(targets: np.ndarray) -> np.ndarray:
-    """Return a private read-only copy of targets that are finite and distinct."""
-    positions = np.array(targets, dtype=float)
-    if positions.ndim != 1 or not len(positions) or not np.isfinite(positions).all():
-        raise ModelError("targets", "must be a list of finite positions, m", positions.tolist())
-    values, counts = np.unique(positions, return_counts=True)
-    if (counts > 1).any():
-        raise ModelError("targets", "each target may be there once", float(values[counts.argmax()]))
-    positions.flags.writeable = False
-    return positions
-
-
-def _checked_deviations(deviations: np.ndarray, count: int) -> np.ndarray:
-    """Return the deviations as an array (2 directions, cycles, targets) in which every reading is there."""
-    try:
-        readings = np.asarray(deviations, dtype=float)
-    except ValueError as error:  # ragged lists
-        problem = "every target needs the same number of readings from each direction"
-        raise ModelError("deviations", problem) from error
-    if readings.ndim != 3 or readings.shape[0] != 2 or readings.shape[2] != count:
-        problem = f"must have the shape (2 directions, cycles, {count} targets)"
-        raise ModelError("deviations", problem, readings.shape)
-    if readings.shape[1] < 2:
-        problem = "a standard deviation needs at least two cycles"
-        raise ModelError("deviations", problem, readings.shape[1])
-    wrong = np.argwhere(~np.isfinite(readings))
-    if len(wrong):
-        direction, cycle, target = wrong[0]
-        where = f"deviations, {DIRECTIONS[direction]}, cycle {cycle + 1}, target {target + 1}"
-        raise ModelError(where, "must be a finite number, m", float(readings[direction, cycle, target]))
-    return readings
 
 
 def _design_notes(targets: np.ndarray, cycles: int) -> list[str]:
@@ -176,47 +140,24 @@ class CircularTest:
 
 def evaluate_circle(
     radius: float, angles: np.ndarray, deviations: np.ndarray, senses: np.ndarray, length_known: bool = True
-) -> CircularTest:
-    """Return the figures of ISO 230-4:2005 for one circle."""
-    path = _checked(radius, angles, deviations, senses)
-    parts = {name: [column[path[2] == sense] for column in path[:2]] for name, sense in SENSES.items()}
+) -> CircularTest | None:
+    """Return the figures of ISO 230-4:2005 for one circle; None where readings of one sense are too few to tell."""
+    path = angles, deviations
+    parts = {name: [column[senses == sense] for column in path] for name, sense in SENSES.items()}
     parts = {name: part for name, part in parts.items() if len(part[0])}
+    if any(len(part[0]) < FEWEST or 2.0 * np.pi - _largest_gap(part[0]) < SHORTEST for part in parts.values()):
+        return None
     figures = {f"G_{name}": _separation(radius, *part) for name, part in parts.items()}
     if len(parts) == 2:
-        figures["G_b"] = _separation(radius, *path[:2])
+        figures["G_b"] = _separation(radius, *path)
     full = all(_largest_gap(part[0]) <= FULL for part in parts.values())
     if full and length_known:
         for name, part in parts.items():
             radial = _from_least_squares_centre(radius, *part)
             figures |= {f"F_max_{name}": float(radial.max()), f"F_min_{name}": float(radial.min())}
         if len(parts) == 2:
-            figures["D"] = float(_from_least_squares_centre(radius, *path[:2]).mean())
+            figures["D"] = float(_from_least_squares_centre(radius, *path).mean())
     return CircularTest(radius, {n: len(p[0]) for n, p in parts.items()}, figures, _notes(parts, full, length_known))
-
-
-def _checked(
-    radius: float, angles: np.ndarray, deviations: np.ndarray, senses: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return angles, deviations and senses as arrays that can be judged."""
-    columns = [np.asarray(values, dtype=float) for values in (angles, deviations, senses)]
-    if columns[0].ndim != 1 or any(column.shape != columns[0].shape for column in columns):
-        problem = "angles, deviations and senses must be lists of one length"
-        raise ModelError("circle", problem, [column.shape for column in columns])
-    if not (np.isfinite(radius) and radius > 0.0):
-        raise ModelError("radius", "must be finite and above zero, m", radius)
-    for name, column in zip(("angles", "deviations"), columns, strict=False):
-        if not np.isfinite(column).all():
-            raise ModelError(name, "must be finite", float(column[~np.isfinite(column)][0]))
-    wrong = ~np.isin(columns[2], list(SENSES.values()))
-    if wrong.any():
-        raise ModelError("senses", f"must be {FORWARD} or {BACKWARD}", float(columns[2][wrong][0]))
-    for name, sense in SENSES.items():
-        members = columns[0][columns[2] == sense]
-        if 0 < len(members) < FEWEST or not len(columns[0]):
-            raise ModelError(f"circle, {name}", f"needs at least {FEWEST} readings", len(members))
-        if len(members) and 2.0 * np.pi - _largest_gap(members) < SHORTEST:
-            raise ModelError(f"circle, {name}", f"readings must span at least {np.degrees(SHORTEST):g}°")
-    return columns[0], columns[1], columns[2]
 
 
 def _largest_gap(angles: np.ndarray) -> float:
@@ -268,7 +209,9 @@ def _notes(parts: dict[str, list[np.ndarray]], full: bool, length_known: bool) -
     if len(parts) < 2:
         notes.append(f"run {next(iter(parts))} only: no G(b), no D; the standard's test runs both senses")
     if not full:
-        notes.append("no full circle: F and D need one, and G of an arc is smaller")
+        notes.append(
+            "the readings do not close a circle: F and D are not computed, and G of an arc is smaller than its circle's"
+        )
     if full and not length_known:
         notes.append("the instrument's length is not calibrated: no F, no D")
     return tuple(notes)
@@ -297,7 +240,7 @@ CIRCLE_COLUMNS = {
 
 @dataclass(frozen=True)
 class LinearRun:
-    """A linear run as ISO 230-2 and 230-6 want it."""
+    """A linear run that ISO 230-2 or 230-6 judges: every target from both sides, in every cycle."""
 
     name: str  # of the run
     axes: tuple[int, ...]  # along which axes of the work frame it travels: one, or more for a diagonal
@@ -377,10 +320,9 @@ def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
         lengths = measurements.value[chosen] + np.linalg.norm(points[chosen] - centres, axis=1)
         height = float(circle.axis @ (centres[0] - circle.middle))
         given = lengths - np.hypot(circle.radius, height), _senses(circle.angles, measurements.cycle[chosen])
-        try:
-            tests[run.name] = evaluate_circle(circle.radius, circle.angles, *given, length_known=run.known_zero)
-        except ModelError:  # too few readings of one sense
-            continue
+        test = evaluate_circle(circle.radius, circle.angles, *given, length_known=run.known_zero)
+        if test is not None:
+            tests[run.name] = test
     return tests
 
 

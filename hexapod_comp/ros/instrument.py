@@ -49,7 +49,7 @@ angle_noise | 1.0e-6 | 0 to 0.01 rad | always | of an angle
 beam_slope | 1.0e-4 | 0 to 0.1 rad | always | 1 σ of how a laser's beam lies off its line, from the next run on
 centre_off | 3.0e-4 | 0 to 0.1 m | always | 1 σ of a ball bar's centre beside its place, from the next run on
 wild_share | 0.0 | 0 to 1 | always | share of readings that are wild
-wild_size | 0.001 | 0 to 1 | always | by so much, m or rad
+wild_size | 0.001 | 0 to 1 | always | error of a wild reading, m or rad
 fault_break | 0.0 | 0 to 3600 s | always | each setting breaks the beam for this long: readings are NaN, and those after
     it start from a new zero
 fault_silent | false |  | always | publishes nothing, and keeps its zero

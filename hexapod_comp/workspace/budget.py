@@ -174,11 +174,8 @@ def load_budget(path: str | Path) -> Budget:
     top.finish()
     sizes = {}
     for source in SOURCE_TYPES:
-        if (key := section.quantity_key(source.name, source.dimension)) is not None:
-            size = float(section.quantity(source.name, source.dimension))
-            if not 0.0 < size < LARGEST:
-                raise section.error(key, f"must be above zero and below {LARGEST:g} in SI units", size)
-            sizes[source.name] = size
+        if section.quantity_key(source.name, source.dimension) is not None:
+            sizes[source.name] = float(section.quantity(source.name, source.dimension))
     if unknown := section.left():
         known = ", ".join(source.name for source in SOURCE_TYPES)
         problem = f"is no error type with its unit; types are {known}"

@@ -1,8 +1,8 @@
-"""All errors together: worst case, root sum of squares, Monte Carlo; and the allowed size of each error."""
+"""All errors together: worst case and Monte Carlo; and the allowed size of each error."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +12,7 @@ from scipy.stats import binom
 from ..errors import CalibrationError, ModelError
 from .budget import SingleErrors
 
-RSS, WORST_CASE = "rss", "worst_case"  # How an allocation adds the errors up
-UNIFORM, NORMAL = "uniform", "normal"  # Distributions of u: uniform within ±1, or normal with a standard deviation of 1
+CONFIDENCE = 0.95  # of the bounds of percentiles
 CHUNK = 512  # Poses handled together: bounds the memory of all combinations of signs
 LARGEST_FACTOR = 1e9  # A source that may grow by more has no significant effect
 
@@ -24,7 +23,7 @@ def worst_case(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
 
 
 def root_sum_of_squares(vectors: np.ndarray) -> np.ndarray:
-    """Return the root sum of squares of all effects, shape (N, 2)."""
+    """Return the standard deviation of the sum of independent effects of one sigma each, shape (N, 2)."""
     squares = (vectors**2).sum(axis=1)
     return np.sqrt(np.stack([squares[:, :3].sum(axis=1), squares[:, 3:].max(axis=1)], axis=1))
 
@@ -44,75 +43,46 @@ def covariance_factor(covariance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MonteCarlo:
-    """Percentiles of the combined error over many machines, with their confidence bounds."""
+    """Percentiles of machines' largest errors over all poses (machines differ in their worst place), with bounds."""
 
     percentiles: tuple[float, ...]  # Q percentages
-    # (Q, N, 2): at each pose: percentile, and bounds between which the true one lies with the confidence asked for
-    values: np.ndarray
-    low: np.ndarray
+    values: np.ndarray  # (Q, 2): m, and rad about the worst axis
+    low: np.ndarray  # (Q, 2): bounds between which the true percentile lies with CONFIDENCE
     high: np.ndarray
-    # (Q, 2): the same for each machine's largest error over all poses: machines differ in their worst place
-    worst_values: np.ndarray
-    worst_low: np.ndarray
-    worst_high: np.ndarray
     draws: int  # How many machines
-    confidence: float  # Of the bounds, 0…1
 
 
 def monte_carlo(
-    vectors: np.ndarray,
-    draws: int = 10_000,
-    percentiles: Sequence[float] = (50.0, 95.0, 99.0),
-    confidence: float = 0.95,
-    seed: int = 1,
-    distribution: str = UNIFORM,
-) -> MonteCarlo:
-    """Draw machines within their errors and return percentiles of the tool's error."""
-    ranks = np.array([_ranks(draws, percentile, confidence) for percentile in percentiles])
-    deviates = _deviates(vectors.shape[1], draws, distribution, seed)
+    vectors: np.ndarray, draws: int, percentiles: Sequence[float] = (50.0, 95.0, 99.0), seed: int = 1,
+    normal: bool = False,
+) -> MonteCarlo:  # fmt: skip
+    """Draw machines whose errors are uniform within ±1 of their effects (N, E, 6), or `normal` with that deviation."""
+    rng, size = np.random.default_rng(seed), (vectors.shape[1], draws)
+    deviates = rng.standard_normal(size) if normal else rng.uniform(-1.0, 1.0, size)
     worst = np.zeros((2, draws))
-    drawn = np.empty((len(vectors), 2, *ranks.shape))
-    for n, effects in enumerate(vectors):
+    for effects in vectors:
         errors = effects.T @ deviates
         sizes = np.stack([np.sqrt((errors[:3] ** 2).sum(axis=0)), np.abs(errors[3:]).max(axis=0)])
         np.maximum(worst, sizes, out=worst)
-        drawn[n] = np.partition(sizes, np.unique(ranks), axis=1)[:, ranks]
-    values, low, high = np.transpose(drawn, (3, 2, 0, 1))
-    of_worst = np.transpose(np.sort(worst, axis=1)[:, ranks], (2, 1, 0))
-    return MonteCarlo(tuple(percentiles), values, low, high, of_worst[0], of_worst[1], of_worst[2], draws, confidence)
+    ranks = np.array([_ranks(draws, percentile) for percentile in percentiles])
+    values, low, high = np.transpose(np.sort(worst, axis=1)[:, ranks], (2, 1, 0))
+    return MonteCarlo(tuple(percentiles), values, low, high, draws)
 
 
-def _deviates(count: int, draws: int, distribution: str, seed: int) -> np.ndarray:
-    """Return each machine's errors in units of their sizes, shape (count, draws)."""
-    rng = np.random.default_rng(seed)
-    if distribution == UNIFORM:
-        return rng.uniform(-1.0, 1.0, (count, draws))
-    if distribution == NORMAL:
-        return rng.standard_normal((count, draws))
-    raise ModelError("distribution", f"must be {UNIFORM} or {NORMAL}", distribution)
-
-
-def _ranks(draws: int, percentile: float, confidence: float) -> tuple[int, int, int]:
+def _ranks(draws: int, percentile: float) -> tuple[int, int, int]:
     """Return the indices, in ascending order of draws, of a percentile and of its confidence bounds."""
-    if not 0.0 < percentile < 100.0:
-        raise ModelError("percentiles", "must lie within (0, 100)", percentile)
-    if not 0.0 < confidence < 1.0:
-        raise ModelError("confidence", "must lie within (0, 1)", confidence)
-    if draws < 1:
-        raise ModelError("draws", "must be at least 1", draws)
-    share, rest = 0.01 * percentile, 0.5 * (1.0 - confidence)
+    share, rest = 0.01 * percentile, 0.5 * (1.0 - CONFIDENCE)
     low, high = (int(binom.ppf(q, draws, share)) for q in (rest, 1.0 - rest))
     if low < 1 or high >= draws:
-        problem = f"are too few for bounds of the {percentile:g}th percentile with {confidence:.0%} confidence"
+        problem = f"are too few for bounds of the {percentile:g}th percentile with {CONFIDENCE:.0%} confidence"
         raise ModelError("draws", problem, draws)
     return min(draws - 1, int(np.ceil(share * draws)) - 1), low - 1, high
 
 
 @dataclass(frozen=True)
 class Allocation:
-    """The allowed errors, given the allowed error of the tool."""
+    """The allowed errors, given the allowed error of the tool; errors add up in the worst way."""
 
-    method: str  # ``rss`` or ``worst_case``
     allowed: float  # Allowed error of the tool at the worst pose, m
     combined: float  # combined error of the unchanged budget there, m
     pose: int  # number of the worst pose
@@ -129,61 +99,48 @@ class Allocation:
     equal: np.ndarray
 
 
-def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float, method: str = RSS) -> Allocation:
+def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Allocation:
     """Return the allowed size of each source so that the tool's displacement stays within what is allowed, m, at every
     pose."""
     if not 0.0 < allowed < np.inf:
         raise ModelError("allowed", "must be above zero", allowed)
-    if method not in (RSS, WORST_CASE):
-        raise ModelError("method", f"must be {RSS} or {WORST_CASE}", method)
     if not len(vectors):
         raise ModelError("poses", "there are none: the workspace is empty", 0)
-    types = len(errors.kinds)
-    if method == RSS:
-        parts = (vectors[..., :3] ** 2).sum(axis=2) @ np.eye(types)[errors.kind]  # squared, (N, K)
-    else:
-        parts = _along_struts(errors, vectors)
+    types, parts = len(errors.kinds), _along_struts(errors, vectors)
 
     def combined(factors: np.ndarray) -> np.ndarray:
         """Return the combined error at each pose with each type's size multiplied, shape (N,)."""
-        if method == RSS:
-            return np.sqrt(parts @ factors**2)
         return _worst(parts @ factors)[:, 0]
 
+    def largest_factor(kind: int) -> float:
+        """Return the factor of one type at which the combined error, which increases with it, is what is allowed."""
+
+        def excess(factor: float) -> float:
+            return float(combined(np.where(np.arange(types) == kind, factor, 1.0)).max()) - allowed
+
+        if excess(0.0) > 0.0:
+            return np.nan
+        high = 1.0
+        while excess(high) < 0.0:
+            high *= 4.0
+            if high > LARGEST_FACTOR:
+                return np.inf
+        return float(brentq(excess, 0.0, high, rtol=1e-10))
+
     now = combined(np.ones(types))
-    pose = int(np.argmax(now))
-    alone = np.array([_alone(combined, types, k, allowed) for k in range(types)])
-    scale = allowed / float(now[pose]) if now[pose] > 0.0 else np.inf
+    most, pose = float(now.max()), int(np.argmax(now))
     only, without = (np.array([combined(row).max() for row in rows]) for rows in (np.eye(types), 1.0 - np.eye(types)))
-    return Allocation(
-        method, allowed, float(now[pose]), pose, scale, alone, only, without, _equal_parts(only, allowed, method)
-    )
-
-
-def _equal_parts(only: np.ndarray, allowed: float, method: str) -> np.ndarray:
-    """Return the factors (K,) with which types, given their sums alone, use the same part."""
     acting = only > 0.0
-    part = allowed / (np.sqrt(acting.sum()) if method == RSS else acting.sum())
-    return np.where(acting, part / np.where(acting, only, 1.0), np.inf)
-
-
-def _alone(combined: Callable[[np.ndarray], np.ndarray], types: int, kind: int, allowed: float) -> float:
-    """Return the largest factor of one type: the combined error increases with it, so that a bracket is easily
-    found."""
-
-    def excess(factor: float) -> float:
-        factors = np.ones(types)
-        factors[kind] = factor
-        return float(combined(factors).max()) - allowed
-
-    if excess(0.0) > 0.0:
-        return np.nan
-    high = 1.0
-    while excess(high) < 0.0:
-        high *= 4.0
-        if high > LARGEST_FACTOR:
-            return np.inf
-    return float(brentq(excess, 0.0, high, rtol=1e-10))
+    return Allocation(
+        allowed=allowed,
+        combined=most,
+        pose=pose,
+        scale=allowed / most if most > 0.0 else np.inf,
+        alone=np.array([largest_factor(kind) for kind in range(types)]),
+        only=only,
+        without=without,
+        equal=np.where(acting, allowed / max(acting.sum(), 1) / np.where(acting, only, 1.0), np.inf),
+    )
 
 
 def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:

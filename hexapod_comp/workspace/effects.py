@@ -53,7 +53,6 @@ def effect_vectors(
 ) -> np.ndarray:
     """Return displacement of the tool, m, and rotation vector, rad, by every error at every pose, shape (N, E, 6)."""
     positions, rotations = batch_poses(positions, rotations)
-    refuse_other_methods(method)
     result = np.empty((len(positions), len(errors), 6))
 
     def run(rows: slice) -> None:
@@ -82,7 +81,6 @@ def extremes(
 ) -> Extremes:
     """Return the largest and smallest effects of each error type over some poses (v. Daake et al., Table 1)."""
     positions, rotations = batch_poses(positions, rotations)
-    refuse_other_methods(method)
     parts = {}
 
     def run(rows: slice) -> None:
@@ -151,12 +149,6 @@ def merged(parts: Iterable[Extremes]) -> Extremes:
     if result is None:
         raise KinematicsError("no poses: the workspace is empty", 0)
     return result
-
-
-def refuse_other_methods(method: str) -> None:
-    """Raise for a method other than exact and linear."""
-    if method not in METHODS:
-        raise KinematicsError(f"method must be one of {', '.join(METHODS)}, not {method!r}", method)
 
 
 def _vectors(

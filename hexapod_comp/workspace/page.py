@@ -37,12 +37,6 @@ class PageData:
     values: np.ndarray  # (F, E, Q, S, H, A): SI
 
     def __post_init__(self) -> None:
-        counts = tuple(len(part) for part in (self.frames, self.errors, QUANTITIES, self.layers))
-        wanted = (*counts, *self.points.shape[2:4])
-        if 0 in counts or self.points.shape != (counts[0], counts[3], *wanted[4:], 3) or self.values.shape != wanted:
-            shapes = f"points {self.points.shape}, values {self.values.shape}"
-            problem = f"has {counts} frames, errors, quantities and layers, which does not fit"
-            raise GeometryError("page", problem, shapes)
         size = 2 * self.values.size + 4 * self.points.size
         if size > MOST_BYTES:
             raise GeometryError("page", f"may have at most {MOST_BYTES} bytes of data; take a coarser mesh", size)

@@ -153,8 +153,6 @@ def _box_edges(box: np.ndarray) -> np.ndarray:
 
 def ranking_figure(rows: Sequence[tuple[str, np.ndarray]], title: str) -> Figure:
     """Show names and figures of a ranking, as :meth:`.RankingRow.figures`, as bars from smallest to largest effect."""
-    if not rows:
-        raise GeometryError("rows", "of a ranking must be at least one")
     figure = Figure(figsize=(10.0, 1.9 + 0.42 * len(rows)), layout="constrained")
     figure.suptitle(picture_text(title))
     left, right = figure.subplots(1, 2, sharey=True)
@@ -181,8 +179,6 @@ def _bars(axes: Axes, low: np.ndarray, high: np.ndarray, quantity: Quantity, col
 
 
 def _finite_values(layers: Sequence[Layer]) -> np.ndarray:
-    if not layers:
-        raise GeometryError("layers", "of a picture must be at least one")
     values = np.concatenate([layer.values.ravel() for layer in layers])
     if not np.isfinite(values).all():
         raise GeometryError("values", "of a mesh must be finite", int((~np.isfinite(values)).sum()))

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core import Status
-from ..errors import GeometryError
 from ..machine.geometry import HexapodGeometry
 from .reach import Examiner, Reach, poses_at
 
@@ -18,11 +17,6 @@ class Layer:
 
     points: np.ndarray  # (H, A, 3): m in the work frame
     values: np.ndarray  # (H, A): SI
-
-    def __post_init__(self) -> None:
-        if self.points.ndim != 3 or self.points.shape[2] != 3 or self.points.shape[:2] != self.values.shape:
-            problem = f"must be (H, A, 3) points and (H, A) values, not {self.points.shape} and {self.values.shape}"
-            raise GeometryError("layer", problem)
 
 
 @dataclass(frozen=True)
@@ -43,7 +37,6 @@ TRANSLATION = Quantity("translation of the tool", "µm", 1e6)
 ROTATION = Quantity("rotation of the tool, largest of three", "m°", 1e3 * 180.0 / np.pi)
 # Points along a ray at which gaps are looked for: one smaller than a hundredth of the reach can stay unseen
 SAMPLES = 96
-LEAST_RINGS, LEAST_SECTORS = 5, 8  # A coarser mesh is no picture of a body
 
 
 @dataclass(frozen=True)
@@ -66,8 +59,6 @@ class Shell:
 
     def scaled(self, fraction: float) -> np.ndarray:
         """Return the mesh shrunk towards the centre, shape (H, A, 3), m in the work frame."""
-        if not 0.0 < fraction <= 1.0:
-            raise GeometryError("fraction", "of the reach must lie in (0, 1]", fraction)
         return self.centre + fraction * (self.points - self.centre)
 
     def platform_poses(self, fraction: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -75,11 +66,8 @@ class Shell:
         return poses_at(self.geometry, self.scaled(fraction).reshape(-1, 3), self.rotation)
 
 
-def shell(reach: Reach, rings: int = 37, sectors: int = 72) -> Shell:
+def shell(reach: Reach, rings: int, sectors: int) -> Shell:
     """Find the boundary of a reach along rays from its centre."""
-    for name, count, least in (("rings", rings, LEAST_RINGS), ("sectors", sectors, LEAST_SECTORS)):
-        if count < least:
-            raise GeometryError(name, f"must be at least {least}", count)
     ends, findings, struts, folded = _cast(reach, reach.centre, _directions(reach, rings, sectors))
     points = _closed(ends.reshape(rings, -1, 3))
     return Shell(

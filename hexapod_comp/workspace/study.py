@@ -13,30 +13,20 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import HexapodError
+from ..errors import HexapodError, ModelError
 from ..formats.texts import aligned, number
 from ..machine.geometry import HexapodGeometry
 from .budget import BY_NAME, Budget, SingleErrors
-from .combined import RSS, WORST_CASE, Allocation, MonteCarlo, allocate, monte_carlo, root_sum_of_squares, worst_case
-from .effects import EXACT, LINEAR, Extremes, effect_vectors, effects, extremes, merged
+from .combined import CONFIDENCE, Allocation, MonteCarlo, allocate, monte_carlo, worst_case
+from .effects import EXACT, LINEAR, METHODS, Extremes, effect_vectors, effects, extremes, merged
 from .ranking import RankingRow, ranked, ranking_rows, ranking_text
 from .reach import Reach, poses_at, reach
 from .shells import Shell, shell
 
 COMBINED_POSES = 500  # Random poses of the workspace at which budgets are combined
-WAYS = (RSS, WORST_CASE)  # How errors add up where tolerances are allocated
 DRAWS = 4000  # Machines of the Monte Carlo
 LAYERS = (0.4, 0.7, 1.0)  # Nested shells, as shares of the way from the centre to the boundary
 RINGS, SECTORS = 19, 36  # Mesh of a shell
-
-
-@dataclass(frozen=True)
-class Combined:
-    """What the whole budget does at random poses of the workspace; columns are m and rad."""
-
-    worst_case: np.ndarray  # (2,): largest over the poses
-    root_sum_of_squares: np.ndarray  # (2,): largest over the poses
-    monte_carlo: MonteCarlo  # Uniform errors within the budget's bounds
 
 
 @dataclass(frozen=True)
@@ -57,10 +47,12 @@ class Study:
         Largest and smallest effects.
     rows : tuple of RankingRow
         The ranked table.
-    combined : Combined
-        The budget as a whole.
-    allocations : tuple of Allocation
-        What the errors may be, by both methods; empty when no tool error is given.
+    worst_case : ndarray
+        The budget as a whole, the largest effect at random poses of the workspace, shape (2,), m and rad.
+    monte_carlo : MonteCarlo
+        The same of machines with uniform errors within the budget's bounds.
+    allocation : Allocation or None
+        What the errors may be; None when no tool error is given.
     """
 
     geometry: HexapodGeometry
@@ -69,8 +61,9 @@ class Study:
     reaches: tuple[Reach, ...]
     extremes: Extremes
     rows: tuple[RankingRow, ...]
-    combined: Combined
-    allocations: tuple[Allocation, ...]
+    worst_case: np.ndarray
+    monte_carlo: MonteCarlo
+    allocation: Allocation | None
 
 
 def classify(
@@ -103,8 +96,10 @@ def classify(
     Raises
     ------
     ModelError
-        The budget is another machine's, or the allowed error is not above zero.
+        The budget is another machine's, the method is unknown, or the allowed error is not above zero.
     """
+    if method not in METHODS:
+        raise ModelError("method", f"must be one of {', '.join(METHODS)}", method)
     errors = budget.single_errors(geometry, shared_platform_joints)
     reaches = (reach(geometry),) if reaches is None else reaches
     extremes = survey(reaches, errors, method, workers, scheduler, progress)
@@ -112,12 +107,9 @@ def classify(
     return Study(
         *(geometry, budget, errors, reaches, extremes),
         rows=tuple(ranked(extremes, geometry)),
-        combined=Combined(
-            worst_case=worst_case(errors, vectors).max(axis=0),
-            root_sum_of_squares=root_sum_of_squares(vectors).max(axis=0),
-            monte_carlo=monte_carlo(vectors, DRAWS, seed=seed),
-        ),
-        allocations=() if allowed is None else tuple(allocate(errors, vectors, allowed, way) for way in WAYS),
+        worst_case=worst_case(errors, vectors).max(axis=0),
+        monte_carlo=monte_carlo(vectors, DRAWS, seed=seed),
+        allocation=None if allowed is None else allocate(errors, vectors, allowed),
     )
 
 
@@ -255,7 +247,7 @@ def report(study: Study, names: Sequence[str]) -> str:
     counts = f"{len(study.errors)} single errors of {len(study.errors.kinds)} types at {study.extremes.poses} poses"
     headline = f"machine {study.geometry.name}: {counts}"
     parts = [headline, _reach_table(study, names), ranking, _combined_text(study)]
-    parts += [_allocation_text(study, allocation) for allocation in study.allocations]
+    parts += [] if study.allocation is None else [_allocation_text(study, study.allocation)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -272,15 +264,10 @@ def _reach_table(study: Study, names: Sequence[str]) -> str:
 
 def _combined_text(study: Study) -> str:
     """Return the combined errors of the whole budget."""
-    combined, drawn = study.combined, study.combined.monte_carlo
-    rows = [
-        ("worst case", *_both(combined.worst_case), ""),
-        ("root sum of squares", *_both(combined.root_sum_of_squares), ""),
-    ]
+    drawn, rows = study.monte_carlo, [("worst case", *_both(study.worst_case), "")]
     for n, percentile in enumerate(drawn.percentiles):
-        low, high = drawn.worst_low[n], drawn.worst_high[n]
-        cells = _both(drawn.worst_values[n])
-        bounds = f"({_both(low)[0]}…{_both(high)[0]} µm with {100.0 * drawn.confidence:.0f} %)"
+        cells = _both(drawn.values[n])
+        bounds = f"({_both(drawn.low[n])[0]}…{_both(drawn.high[n])[0]} µm with {100.0 * CONFIDENCE:.0f} %)"
         rows.append((f"{percentile:g} % of {drawn.draws} machines", *cells, bounds))
     head = ("whole budget, worst pose", "transl. µm", "rot. m°", "")
     return aligned(head, rows) + "\nmachines: all errors uniform within their bounds, each machine's worst pose"
@@ -292,11 +279,11 @@ def _both(values: np.ndarray) -> tuple[str, str]:
 
 def _allocation_text(study: Study, allocation: Allocation) -> str:
     """Return the largest size of each error."""
-    how = {"rss": "root sum of squares", "worst_case": "worst case"}[allocation.method]
     head = (
-        f"allowed {allocation.allowed * 1e6:g} µm, {how}: the budget adds up to {allocation.combined * 1e6:.2f} µm; "
-        f"all errors may be {allocation.scale:.3g} times as large.\nFor each type: its sum alone, the "
-        "sum of the others, and its largest size with the others unchanged or with equal shares:"
+        f"allowed {allocation.allowed * 1e6:g} µm, worst case: the budget adds up to "
+        f"{allocation.combined * 1e6:.2f} µm; all errors may be {allocation.scale:.3g} times as large.\n"
+        "For each type: its sum alone, the sum of the others, and its largest size with the others unchanged or with "
+        "equal shares:"
     )
     header = ("type", "now ±", "alone µm", "the others µm", "may be, the others as now", "may be, equal parts", "")
     rows = []
@@ -316,7 +303,11 @@ def _may_be(now: float, factor: float, none: str = "") -> str:
 
 def as_json(study: Study) -> dict[str, Any]:
     """Return a study as plain numbers; units are in the keys."""
-    drawn = study.combined.monte_carlo
+    drawn, allocated = study.monte_carlo, study.allocation
+    allocations = []
+    if allocated is not None:
+        by_type = {name: dict(zip(study.errors.kinds, getattr(allocated, name), strict=True)) for name in EACH}
+        allocations.append({"method": "worst_case", **vars(allocated), **by_type})
     return {
         "machine": study.geometry.name,
         "frame": "work",
@@ -328,12 +319,8 @@ def as_json(study: Study) -> dict[str, Any]:
             for item in study.reaches
         ],
         "combined_m_rad": {
-            "worst_case": study.combined.worst_case,
-            "root_sum_of_squares": study.combined.root_sum_of_squares,
-            "percentiles": dict(zip(drawn.percentiles, drawn.worst_values, strict=True)),
+            "worst_case": study.worst_case,
+            "percentiles": dict(zip(drawn.percentiles, drawn.values, strict=True)),
         },
-        "allocations_m": [
-            {**vars(item), **{name: dict(zip(study.errors.kinds, getattr(item, name), strict=True)) for name in EACH}}
-            for item in study.allocations
-        ],
+        "allocations_m": allocations,
     }

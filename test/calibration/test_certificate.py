@@ -73,7 +73,7 @@ def test_strangers_names_are_text(fit: ModelFit, filed: Filed) -> None:
     sources = tuple(FileLine(HOSTILE, 1) for _ in m.sources)
     hostile = replace(m, runs=runs, sources=sources, files=((HOSTILE, HOSTILE),))
     stranger = replace(fit, measurements=hostile, notes=(HOSTILE,), unseen_errors=(UnseenError(HOSTILE, 0.0),))
-    details = Details({"customer": HOSTILE}, (HOSTILE,), (HOSTILE,))
+    details = Details(customer=HOSTILE, instruments=(HOSTILE,), remarks=(HOSTILE,))
     text = certificate_text(stranger, replace(filed, model=HOSTILE, report=HOSTILE), details)
     assert "<script" not in text
     assert all(source.startswith("data:image/png;base64,") for source in re.findall(r"<[^>]* src=\"?([^\s\">]*)", text))

@@ -63,14 +63,11 @@ def test_everything_is_written_printed_and_told(tmp_path: Path, monkeypatch: pyt
         assert 1e-4 < found["volume_m3"] < 1e-3
         assert sum(found["limits"].values()) == pytest.approx(1.0)
         assert {"top", "bottom"} < set(found["regions"])
-    by_method = {allocation["method"]: allocation for allocation in content["allocations_m"]}
-    assert set(by_method) == {"rss", "worst_case"}
-    combined = content["combined_m_rad"]
-    for method, name in (("rss", "root_sum_of_squares"), ("worst_case", "worst_case")):
-        assert by_method[method]["scale"] == pytest.approx(50e-6 / combined[name][0])
+    combined, (allocated,) = content["combined_m_rad"], content["allocations_m"]
+    assert allocated["scale"] == pytest.approx(50e-6 / combined["worst_case"][0])
     drawn = [combined["percentiles"][p][0] for p in ("50.0", "95.0", "99.0")]
     assert drawn == sorted(drawn)
-    assert combined["root_sum_of_squares"][0] < drawn[2] < combined["worst_case"][0]
+    assert drawn[2] < combined["worst_case"][0]
 
 
 def test_without_plotly_the_rest_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

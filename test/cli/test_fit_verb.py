@@ -207,7 +207,7 @@ def test_certificate(fitted: Calibration) -> None:
 
 def test_scheme_lines(done: Calibration, tmp_path: Path) -> None:
     """Polynomials, a model whose field is the measured box, no covariance; JSON alone on stdout."""
-    written = ("--order", "aicc", "--out", tmp_path / "lines.yaml", "--pictures", tmp_path / "pictures")
+    written = ("--out", tmp_path / "lines.yaml", "--pictures", tmp_path / "pictures")
     with quick_pictures():
         code, out, err = hexapod("fit", done.measured, "--scheme", "lines", "--json", *written)
     assert code == 0

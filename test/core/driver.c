@@ -240,29 +240,6 @@ static void ways(void)
     }
 }
 
-static void triangles(void)
-{
-    static double angles[POSES * 3], points[POSES * 9], errors[POSES];
-    double circles[27], sides[3], axes[9];
-    int i, k;
-    for (i = 0; i < 3; i++) {
-        turned_to(3.0, axes);
-        for (k = 0; k < 3; k++) {
-            circles[9 * i + k] = 0.3 * drawn();
-            circles[9 * i + 3 + k] = 0.4 * axes[k];
-            circles[9 * i + 6 + k] = 0.4 * axes[3 + k];
-        }
-        sides[i] = 0.35 + 0.1 * drawn();
-    }
-    for (i = 0; i < POSES * 3; i++) {
-        angles[i] = 3.0 * drawn();
-    }
-    hc_settle_many(circles, sides, POSES, angles, points, errors);
-    show("angles", angles, POSES * 3);
-    show("points", points, POSES * 9);
-    show("errors", errors, POSES);
-}
-
 static void drives(void)
 {
     const double probe[3] = {0.0, 0.0, 0.1};
@@ -302,7 +279,6 @@ int main(int words, char **word)
     kinematics();
     model();
     ways();
-    triangles();
     drives();
     return 0;
 }

@@ -118,7 +118,7 @@ def test_reader_agrees_with_linuxcnc(tmp_path: Path) -> None:
     for i, name in enumerate(COMP_FILES):
         table = "\n".join(hand_made_table(i))
         text = (tmp_path / name).read_text()
-        (tmp_path / name).write_text(table + "\n" + text[text.index("# set") :])
+        (tmp_path / name).write_text(table + "\n" + text[text.index("# a test") :])
     told = read_genhexkins(tmp_path, "mm")
     for pose, joints, *corrections in LINUXCNC:
         rotation = Rotation.from_euler("xyz", pose[3:], degrees=True).as_matrix()  # roll, pitch, yaw: Rz·Ry·Rx

@@ -116,7 +116,7 @@ OPTIONS = {
     "plan": ("--lead-mm", "--blocks", "--tolerance-um", "--expansion-ppm", "--seed", "--machine"),
     "imagine": ("--joints-um", "--wave-um", "--backlash-um", "--box", "--seed", "--name", "--machine", "--out"),
     "simulate": ("--seed", "--truth", "--campaign", "--out", "--model"),
-    "fit": ("--scheme", "--lead-mm", "--blocks", "--probe-mm", "--order", "--columns", "--out", "--truth"),
+    "fit": ("--scheme", "--lead-mm", "--blocks", "--probe-mm", "--columns", "--out", "--truth"),
     "export": ("--units", "--box", "--step-mm", "--poses", "--tilt-deg", "--seed", "--table"),
     "classify": ("--cells", "--clearance-mm", "--tilt-deg", "--allow-um", "--workers", "--budget"),
     "run": ("--rate-hz", "--machine", "--model", "--truth", "--pictures"),

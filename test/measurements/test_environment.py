@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import fixed
 
-from hexapod_comp.errors import ModelError
 from hexapod_comp.measurements.air import VACUUM_WAVELENGTH, Air, ciddor_index, correct_displacement
 
 AT_633 = 633e-9  # The wavelength of the papers' tables, m
@@ -86,21 +85,3 @@ def test_counted_fringes_give_the_way_back(way: float, assumed: float, now: Air,
     shown = sense * fringes * half_wave / assumed
     corrected = correct_displacement(shown, now, assumed)
     assert corrected == pytest.approx(way, abs=3e-15)
-
-
-@pytest.mark.parametrize(
-    ("call", "says"),
-    [
-        (lambda: Air(293.15, 1e5, 0.5), "air temperature: must lie within 0…60 °C"),
-        (lambda: Air(20.0, 1013.25, 0.5), "air pressure: must lie within 50…120 kPa"),
-        (lambda: Air(20.0, 1e5, 50.0), "air humidity: must lie within 0…1"),
-        (lambda: Air([20.0, float("nan")], 1e5, 0.5), "air temperature, reading 2"),
-        (lambda: Air([20.0, 21.0], [1e5, 1e5, 1e5], 0.5), "must each be one number or one a reading"),
-        (lambda: ciddor_index(Air(20.0, 1e5, 0.5), 633.0), "vacuum wavelength"),
-        (lambda: ciddor_index(Air(20.0, 1e5, 0.5), co2_ppm=1e5), "CO2"),
-        (lambda: correct_displacement(0.1, Air(20.0, 1e5, 0.5), 271.0), "assumed index"),
-    ],
-)
-def test_what_is_in_the_wrong_unit_is_refused(call, says: str) -> None:
-    with pytest.raises(ModelError, match=says):
-        call()

@@ -107,8 +107,10 @@ class SmoothField:
             return np.zeros((len(grid[first]), len(grid[second]), 6, 1))
         across = [legendre.legvander(np.linspace(-1.0, 1.0, len(grid[a])), degree) for a in (first, second)]
         weights = np.einsum("nt,mt->nmt", across[0][:, powers[:, first]], across[1][:, powers[:, second]])
-        along = np.array([_monomials(n, degree) for n in powers[:, axis]])
-        return np.einsum("nmt,ct,tp->nmcp", weights, coefficients, along)
+        monomials = np.zeros((degree + 1, degree + 1))  # P_n in powers of u
+        for n, row in enumerate(monomials):
+            row[: n + 1] = legendre.leg2poly([0.0] * n + [1.0])
+        return np.einsum("nmt,ct,tp->nmcp", weights, coefficients, monomials[powers[:, axis]])
 
 
 class _Field(Block):
@@ -207,9 +209,3 @@ def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray,
 
 def _names(powers: np.ndarray) -> tuple[str, ...]:
     return tuple("".join(f"{a}{n}" for a, n in zip("xyz", p, strict=True) if n) or "1" for p in powers)
-
-
-def _monomials(n: int, degree: int) -> np.ndarray:
-    """Return P_n in powers of u, shape (degree + 1,)."""
-    series = legendre.leg2poly(np.eye(degree + 1)[n])
-    return np.append(series, np.zeros(degree + 1 - len(series)))
