@@ -288,5 +288,3 @@ REFUSED = {
 def test_lines_that_make_no_field_are_refused(quiet, what):
     with pytest.raises(CalibrationError, match=what):
         fit_lines(REFUSED[what](quiet))
-    with pytest.raises(CalibrationError, match="order: must be adjusted-r2, aicc or a whole number"):
-        fit_lines(quiet, 2.5)
