@@ -4,27 +4,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibration_helpers import BOUNDS, BOX, paper
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.calibration.evaluation import held_out, paper_metric
-from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.field import GridField
-from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine
 from hexapod_comp.machine.passes import random_passes
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.temperatures import Temperatures
 from hexapod_comp.machine.trial import Trial
 from hexapod_comp.pose import Pose
-from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
-
-BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])
-BOUNDS = ImperfectionBounds(joint=1e-4, strut_offset=1e-4, pitch=1e-4, wave=(4e-6, 4e-6), backlash=(3e-6, 5e-6))
+from hexapod_comp.virtual.imperfections import draw_model
 
 
 @pytest.fixture(scope="module")
 def geometry() -> HexapodGeometry:
-    return load_geometry(config_file("paper.yaml"))
+    return paper()
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibration_helpers import BOUNDS, BOX, INCH, paper
 from foreign_machines import machines
 from scipy.stats import linregress
 
@@ -11,7 +12,6 @@ from hexapod_comp.calibration.evaluation import PaperMetric, paper_metric
 from hexapod_comp.calibration.lines import LinesFit, fit_lines
 from hexapod_comp.calibration.pictures import fitted_lines_figure, strut_error_figure, strut_length_errors
 from hexapod_comp.errors import CalibrationError
-from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.field import CROSS_AXES, GridField
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import Structure, jacobian
@@ -20,22 +20,19 @@ from hexapod_comp.machine.region import Region
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import FORWARD, MeasurementSet
 from hexapod_comp.pose import Pose
-from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
+from hexapod_comp.virtual.imperfections import draw_model
 from hexapod_comp.virtual.instruments import compensated, measure
 
-INCH = 0.0254
-BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])
 GRID = tuple(np.round(np.linspace(low, high, n), 9) for low, high, n in zip(*BOX, (5, 5, 3), strict=True))
 POWERS = (5, 5, 3)  # A third of 17, 17 and 9 points
 
 QUIET = Campaign(BOX, 4 * INCH, INCH, instrument="1-D", diagonals=0, noise=(0.0,) * 7, beam_slope=1e-3)
 LASER = replace(QUIET, noise=(1e-6,) * 7)
-BOUNDS = ImperfectionBounds(joint=1e-4, strut_offset=1e-4, pitch=1e-4, wave=(4e-6, 4e-6), backlash=(3e-6, 5e-6))
 
 
 @pytest.fixture(scope="module")
 def geometry() -> HexapodGeometry:
-    return load_geometry(config_file("paper.yaml"))
+    return paper()
 
 
 def machine_of(geometry: HexapodGeometry, lines) -> RealMachine:
