@@ -33,6 +33,7 @@ STEEL = 11.5e-6  # 1/K, of a strut that is warmer than its thermometer says
 APPROACH = 2e-4  # m: at the end of its way to a pose the platform moves this far in the direction of its pass
 PRESLIDING = 5e-6  # rad: a bearing deflects by this, like a spring, before it slides
 LIGHTEST = 1e-9  # kg: bodies that MuJoCo moves need a mass
+LEAST_INERTIA = 1e-11  # kg·m²: and a hundredth of this about their axis, which short struts without mass have not
 THICK = 0.02  # m: a platform's thickness, and a payload's radius, for their inertia
 STEP, LONGEST_STEP = 0.25, 2.5e-4  # MuJoCo's, in radians of the fastest oscillation, stable below 2; and at most, s
 MOST_STEPS = 60  # of Newton's method; struts that are never slack take three
@@ -152,7 +153,7 @@ class PhysicalMachine(RealMachine):
         weigh(spec.body("platform"), self.mass, centre, inertia)
         half = max(0.5 * physics.strut_mass, LIGHTEST)
         for n, length in enumerate(strut_lengths(self.structure, geometry.home), start=1):
-            slender = half * (0.5 * length) ** 2 / 12.0 * np.diag([1.0, 1.0, 0.01])
+            slender = max(half * (0.5 * length) ** 2 / 12.0, LEAST_INERTIA) * np.diag([1.0, 1.0, 0.01])
             for body, height in ((f"strut_{n}_body", 0.25 * length), (f"strut_{n}_rod", -0.25 * length)):
                 weigh(spec.body(body), half, np.array([0.0, 0.0, height]), slender)
         self._mj: Any = spec.compile()
