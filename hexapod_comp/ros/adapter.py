@@ -47,7 +47,8 @@ goal | 3.0e-6 | 1e-9 to 0.01 m | configure | RMS tool error that may be left, wi
 topic | tool_pose_true |  | configure | poses of the tool in base, from a tracker or motion capture
 samples | 25 | 3 to 10000 | configure | poses of which the median is taken, three times at each stop
 reload | false |  | always | have the compensator run each model that its checks bear out; else they are proposed
-check_every | 0.0 | 0 to 1e7 s | always | check the model this long after the last run; 0 = when it is asked for
+check_every | 0.0 | 0 to 1e7 s | always | check the model, or go on with what was interrupted, this long after the last
+    run; 0 = when it is asked for
 """)
 
 TOPICS = """
@@ -80,6 +81,7 @@ class AdapterNode(MachineNode):
         self._output: IO[bytes] | None = None  # what the process prints: its result
         self._stopping, self._reason = False, ""  # it was told to end; why it was interrupted
         self._state, self._text, self._step, self._model = IDLE, "nothing was asked for yet", "", ""
+        self._next = ""  # what is due when `check_every` is over: a check, or what was interrupted
         self._ended, self._size = time.monotonic(), -1  # when, and how large the journal was when it was read
 
     # ---- lifecycle ----
@@ -173,8 +175,8 @@ class AdapterNode(MachineNode):
             self._read_journal()
             if (code := self._process.poll()) is not None:
                 self._finish(code)
-        elif self._active and self._state in GOOD and 0.0 < self._options["check_every"] < now - self._ended:
-            self._start(VERIFYING)
+        elif self._active and self._next and 0.0 < self._options["check_every"] < now - self._ended:
+            self._start(self._next)
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
         running = self._process is not None
@@ -200,7 +202,7 @@ class AdapterNode(MachineNode):
         """Publish how a process ended."""
         self._read_journal()  # with what it wrote last
         output, self._process, self._output = self._output, None, None
-        self._ended = time.monotonic()
+        self._ended, begun = time.monotonic(), self._state
         content: dict[str, Any] = {}
         if output is not None:
             with output:
@@ -218,6 +220,8 @@ class AdapterNode(MachineNode):
             self._change(FAILED, self._reason)
         else:
             self._change(FAILED, f"the process ended with {code}; its last words are in the log")
+        again = self._state == FAILED and self._step == "interrupted"
+        self._next = VERIFYING if self._state in GOOD else begun if again else ""
 
     def _change(self, state: str, text: str) -> None:
         self._state, self._text = state, text[:LONGEST_TEXT]

@@ -238,7 +238,11 @@ class MoverNode(MachineNode):
     # ---- what is asked for ----
 
     def _on_move_to(self, message: PoseStamped) -> None:
-        self._ask(message, lambda: self._absolute(message))
+        def request() -> Request:
+            pose = self._frame(message.header.frame_id) @ message_pose(message)
+            return Request(nanoseconds_of(message.header.stamp), [pose])
+
+        self._ask(message, request)
 
     def _on_move_by(self, message: PoseStamped) -> None:
         def request() -> Request:
@@ -279,10 +283,6 @@ class MoverNode(MachineNode):
             )
             return
         self._pivot = point
-
-    def _absolute(self, message: PoseStamped) -> Request:
-        frame = self._frame(message.header.frame_id)
-        return Request(nanoseconds_of(message.header.stamp), [frame @ message_pose(message)])
 
     def _frame(self, frame_id: str, also_tool: bool = False) -> Pose:
         if frame_id not in self._frames:

@@ -334,13 +334,10 @@ class Adaptation:
         if state.stuck:
             return Outcome("changed", state.stuck, path)
         name = "in use" if state.reloaded else "proposed"
-        promise = f"{self._promise(state.kept)}; borne out by {state.checks} later checks"
+        kept = f"tool error up to {state.kept * 1e6:.2f} µm RMS (95 %), datum aligned"
+        promise = f"{'no promise' if np.isnan(state.kept) else kept}; borne out by {state.checks} later checks"
         last = next((e for e in reversed(self.events) if e["event"] == "checked"), {})
         return Outcome(name, promise + moved_text(last), path)
-
-    @staticmethod
-    def _promise(size: float) -> str:
-        return "no promise" if np.isnan(size) else f"tool error up to {size * 1e6:.2f} µm RMS (95 %), datum aligned"
 
     def _model_path(self) -> Path | None:
         return self._folder / (PROPOSED if self._has(PROPOSED) else IN_USE) if self.state.in_use else None

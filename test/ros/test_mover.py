@@ -669,3 +669,5 @@ def test_a_process_that_ends_without_a_result_is_reported(bench: Bench, tmp_path
     (tmp_path / "journal.jsonl").write_text(line, encoding="utf-8")
     bench.until(lambda: node._state == "failed", "its end", timeout=60.0)
     assert node._text == "refusal: several_publishers: /mover, /other"
+    node._options["check_every"] = 0.01
+    bench.until(lambda: node._state == "verifying", "another check: one that was interrupted is not the last")
