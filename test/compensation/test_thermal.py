@@ -111,6 +111,9 @@ def test_what_is_stale_is_no_measure_for_others() -> None:
     assert made.stale(59.0) == ()
     assert made.stale(61.0) == ("base",)
     assert made.update("platform", 45.0, 61.0) == 45.0
+    never = thermometers(timeout=0.0)
+    never.update("base", 20.0, 0.0)
+    assert never.stale(1e9) == ()
 
 
 def late_model() -> MachineModel:
