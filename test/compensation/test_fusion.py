@@ -211,6 +211,15 @@ def test_a_drift_that_is_none_is_refused(paper, wrong):
         compensator.restore({**compensator.snapshot(), "drift": wrong.tolist()})
 
 
+@pytest.mark.parametrize("before", [0.0, 0.11], ids=["0.2 s around it", "none before it"])
+def test_a_reading_needs_struts_of_its_moment(paper, before):
+    fusion, struts = Fusion(Compensator(paper, MachineModel(paper.name)), RULES), lengths(paper, paper.home)
+    fusion.add_struts(struts, before)
+    reading = PoseReading(paper.home @ paper.tool, 0.1, RULES.covariance())
+    (error,) = [*fusion.add(reading), *fusion.add_struts(struts, 0.2)]
+    assert (error.reason, fusion.count) == ("no_struts", 0)
+
+
 def test_a_machine_that_moves_makes_its_own_reading_uncertain(paper):
     """A millisecond between the clocks is 0.1 mm at 100 mm/s: no wild reading, and hardly a weight."""
     fusion = Fusion(Compensator(paper, MachineModel(paper.name)), RULES)

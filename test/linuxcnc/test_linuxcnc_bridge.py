@@ -141,6 +141,12 @@ def test_pose_is_the_axes_in_metres_and_a_quaternion(rig, units, metres, angles)
     assert before <= stamped(message) <= time.time()
 
 
+def test_measured_struts_are_in_metres(rig):
+    Machine(rig, 0.0254, units="inch").start()
+    rig.until(lambda: len(rig.seen["strut_states"]) > 2, "strut_states")
+    np.testing.assert_allclose(rig.seen["strut_states"][-1].position, closed_form_lengths(HOME), rtol=1e-15)
+
+
 def test_struts_that_move_are_told_only_to_a_compensator_that_follows(rig, speak):
     """One that starts would take their lag for a correction; once they stand, or it speaks, it is told."""
     machine = Machine(rig)
