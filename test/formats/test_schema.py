@@ -193,6 +193,8 @@ def test_both_micro_signs_are_the_u_of_um(tmp_path, micro):
 
 def test_every_unit_ends_its_key_in_one_way():
     """A key must not fit two units of one kind: a_m_min is not the length a_m in min."""
+    si = {unit for units in UNITS.values() for unit, factor in units.items() if factor == 1.0}
+    assert " ".join(sorted(si)) == "K N N_m Pa degC kg m m_s m_s2 m_s3 rad s"
     for units in UNITS.values():
         assert all(not one.endswith(f"_{other}") for one in units for other in units)
 
