@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
@@ -163,6 +164,20 @@ def test_table_of_offset_pitch_and_backlash_is_exact(tmp_path: Path) -> None:
         wanted = (lengths - o + p * c0 + half) / (1.0 + p) - lengths
         for table in back.tables:
             np.testing.assert_allclose(table.correction(lengths, np.full(500, up)), wanted, atol=2e-11, rtol=0.0)
+
+
+def test_waves_are_followed_as_well_as_256_points_can() -> None:
+    """Truth: a straight line through points h apart leaves at most h²/8·A·k² of a wave A of wavenumber k."""
+    geometry, model = paper_geometry(), paper_machine()
+    machine = RealMachine(geometry, model)
+    told = make_genhexkins(machine, PAPER_BOX)
+    for i, (rms, largest) in enumerate(table_misfit(machine, told, PAPER_BOX)):
+        nominal = told.tables[i].nominal
+        assert len(nominal) == 256
+        assert (nominal[0], nominal[-1]) == pytest.approx((0.33, 0.88), abs=1e-12)
+        bound = np.median(np.diff(nominal)) ** 2 / 8.0 * 4e-6 * (2.0 * math.pi / 0.01) ** 2
+        assert largest < bound
+        assert rms < 0.5 * bound
 
 
 def test_inches_and_millimetres_say_the_same(tmp_path: Path) -> None:
