@@ -127,7 +127,7 @@ fuzz: $(VENV)/with-ros,test $(CORE)
 	ALL_TESTS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 test/test_zoo.py
 
 fuzz-core: $(VENV)/with-ros
-	@$(BIN)/python -m benchmarks.fuzz_core
+	@$(BIN)/python -m benchmarks.fuzz --core
 
 linuxcnc:
 	@$(BESIDE_LINUXCNC) ros

@@ -1,23 +1,8 @@
 """A machine that moves and calibrates itself: how its parts keep what they promise, on all machines of the tests' zoo.
 
-Part ``moves``: random straight moves, of 10 µm to 100 mm and up to 10°, each judged by differentiating the strut
-lengths of the poses that are sent. Its time without a limit of jerk is held against toppra's optimum under the same
-limits of speed and acceleration (pip install '.[bench]'), and the price of the jerk is shown. From a random moment of
-each move a stop is judged alike.
-
-Part ``warmup``: :mod:`benchmarks.fusion`.
-
-Part ``unattended``: machines of the zoo with errors drawn from fresh seeds, in this process (compensator's core,
-drives, tracker; no DDS), calibrated by the loop of ``adapt`` for a goal of 3 µm: 1 % of observations wild by 0.2 mm,
-2 % with a broken beam; before two random stops the loop is killed, or a node of the machine, and the loop started
-again. What a model leaves is judged at points that nothing was fitted to. Then each adopted model is checked while
-nothing has changed, one of its machine's struts is knocked by 20 µm, and the next check round names and repairs it.
-
 Usage: python -m benchmarks.adapt [--part moves|warmup|unattended] [--moves 1000] [--machines 4] [--first 1]
 
-Exits 1 when a bar is missed: no strut above its limits, moves and stops; no move longer than 1.02 times toppra's; every
-promise kept, or refused with its reason; a knock named in 95 %, false alarms in no more than 5 %, repaired to 1.5 times
-of before.
+Parts and bars: doc/benchmarks.md; ``warmup`` is :mod:`benchmarks.fusion`.
 """
 
 from __future__ import annotations
@@ -39,12 +24,13 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from benchmarks import fusion
+from benchmarks.drawn import Table, of_zoo
 from benchmarks.drawn import machines as zoo
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.compensation.checks import check
 from hexapod_comp.errors import NoAnswerError
 from hexapod_comp.loop.story import demo_place
-from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.path import Motion, StrutRates, plan_motion
@@ -162,21 +148,16 @@ def moves(args: argparse.Namespace) -> bool:
     machines = zoo()
     each = -(-args.moves // len(machines))
     print(f"limits: {RATES.speed} m/s, {RATES.acceleration} m/s², {RATES.jerk} m/s³; {each} moves of each machine\n")
-    print("| machine | moves | over toppra | largest | over 1.02 | of a limit | stops | with jerk | plan |")
-    print("|---|---:|---:|---:|---:|---:|---:|---:|---:|")
-    met = True
+    columns = ["machine", "moves", "over toppra", "largest", "over 1.02", "of a limit", "stops", "with jerk", "plan"]
+    table = Table(columns)
     for name in tqdm(machines, disable=None):
-        with tempfile.TemporaryDirectory() as folder:
-            geometry = load_geometry(machines[name].write(Path(folder) / "geometry.yaml"))
-        found = judged(geometry, each, args.first)
-        ratio = np.array(found.over_optimum)
-        met &= bool((ratio <= OPTIMUM).all()) and max(found.worst, found.stops_worst) <= KEPT
-        tqdm.write(
-            f"| {name} | {each} | {np.median(ratio):.4f} | {ratio.max():.4f} | {int((ratio > OPTIMUM).sum())} "
-            f"| {found.worst:.4f} | {found.stops_worst:.4f}, {np.median(found.stopped_within) * 1e3:.0f} ms "
-            f"| {np.median(found.over_jerkless):.2f} × | {np.median(found.planning) * 1e3:.0f} ms |"
-        )
-    return met
+        found = judged(of_zoo(name)[0], each, args.first)
+        ratio, stop = np.array(found.over_optimum), np.median(found.stopped_within) * 1e3
+        met = bool((ratio <= OPTIMUM).all()) and max(found.worst, found.stops_worst) <= KEPT
+        over = [f"{np.median(ratio):.4f}", f"{ratio.max():.4f}", int((ratio > OPTIMUM).sum()), f"{found.worst:.4f}"]
+        ends = [f"{found.stops_worst:.4f}, {stop:.0f} ms", f"{np.median(found.over_jerkless):.2f} ×"]
+        table.row(name, each, *over, *ends, f"{np.median(found.planning) * 1e3:.0f} ms", met=met)
+    return table.met
 
 
 GOAL, KNOCK = 3e-6, 20e-6  # m
@@ -208,7 +189,7 @@ class Adapted:
 def adapted(name: str, seed: int, folder: Path) -> Adapted:
     """Calibrate a machine with everything that goes wrong, check it, knock it, and have it repaired."""
     began, rng = time.process_time(), np.random.default_rng([seed, 31])
-    geometry = load_geometry(zoo()[name].write(folder / "geometry.yaml"))
+    geometry, _ = of_zoo(name)
     place = demo_place(geometry)
     machine = VirtualMachine(geometry, imagine(geometry, seed), FAULTS, seed)
     task = Task(place.box, place.attitude, goal=GOAL, every=0.0)
@@ -256,19 +237,17 @@ def adapted(name: str, seed: int, folder: Path) -> Adapted:
 def unattended(args: argparse.Namespace) -> bool:
     """Print a row for each machine; return whether the bars are met."""
     print(f"goal {GOAL * 1e6:g} µm (95 %, datum aligned); sizes in µm RMS\n")
-    print("| machine | seed | ended | stops | left | kept | false alarm | knocked | named | repaired | s |")
-    print("|---|---:|---|---:|---:|---|---|---:|---|---:|---:|")
-    names, found = list(zoo()), list[Adapted]()
+    columns = ["machine", "seed", "ended", "stops", "left", "kept", "false alarm", "knocked", "named", "repaired", "s"]
+    table, names, found = Table(columns), list(zoo()), list[Adapted]()
     for n in tqdm(range(args.machines), disable=None):
         name, seed = names[n % len(names)], args.first + n
         with tempfile.TemporaryDirectory() as folder:
             one = adapted(name, seed, Path(folder))
         found.append(one)
         words = ["yes" if flag else "no" for flag in (one.kept, one.alarm, one.named)]
-        tqdm.write(
-            f"| {name} | {seed} | {one.state} | {one.stops} | {one.left:.3f} | {words[0]} | {words[1]} "
-            f"| {one.knocked:.3f} | {words[2]} | {one.repaired:.3f} | {one.seconds:.0f} |"
-        )
+        sizes = [f"{size:.3f}" for size in (one.left, one.knocked, one.repaired)]
+        cells = [sizes[0], words[0], words[1], sizes[1], words[2], sizes[2], f"{one.seconds:.0f}"]
+        table.row(name, seed, one.state, one.stops, *cells)
         if one.state != "in use":
             tqdm.write(f"  {one.text}")
     used = [one for one in found if one.state == "in use"]

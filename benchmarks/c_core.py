@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -32,13 +32,15 @@ from hexapod_comp import core
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.core.build import FLAGS
 from hexapod_comp.export.c_code import write_c
-from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import Structure
+from hexapod_comp.machine.load import Load
+from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.temperatures import Temperatures
 
 from . import cannot_run, judged, table
-from .blocks import commands, compensators
 from .genhexkins import Genhexkins, NotHere, emc_poses
 
 DRIVER = Path(__file__).resolve().parents[1] / "test" / "core" / "driver.c"
@@ -49,6 +51,7 @@ SANITIZED = ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover
 
 # Bars: of the whole model's command, µs; beside genhexkins' inverse; of a warm estimate, µs
 LARGEST_US, LARGEST_RATIO, LARGEST_ESTIMATE_US = 1.5, 8.0, 1.5
+POSES = 500
 INNER = 20  # Times that the poses are run through between two readings of the clock
 
 
@@ -134,6 +137,58 @@ def bits(machine: str, model: str, commands: int) -> list[str]:
 # ---- what it takes ----
 
 
+def commands(geometry: HexapodGeometry) -> list[tuple[float, ...]]:
+    """Return tool poses as messages have them: a circle of 10 mm about home, tilted by ±3°, there and back."""
+    angles = np.linspace(0.0, np.pi, POSES // 2)
+    turns = Rotation.from_euler("xyz", np.deg2rad(3.0) * np.column_stack([np.sin(angles), np.cos(angles), angles]))
+    circle = np.column_stack([np.sin(angles), np.cos(angles), 0.2 * np.sin(2.0 * angles)])
+    tool = geometry.tool_pose(geometry.home)
+    rows = np.hstack([tool.position + 0.01 * circle, (turns * Rotation.from_matrix(tool.rotation)).as_quat()])
+    return [tuple(row) for row in np.vstack([rows, rows[::-1]]).tolist()]
+
+
+def cardan(geometry: HexapodGeometry) -> HexapodGeometry:
+    """Return a machine whose screws turn with their cardan joints."""
+    across = np.cross(geometry.platform_joints - geometry.base_joints, [0.0, 0.0, 1.0])
+    axes = across / np.linalg.norm(across, axis=1, keepdims=True)
+    return replace(geometry, base_axes=axes, platform_axes=axes, screw_lead=np.full(6, 5e-3))
+
+
+def compensators(geometry: HexapodGeometry) -> dict[str, Compensator]:
+    """Return one compensator per block; first the ideal machine's, last the whole model's.
+
+    A table over outside numbers is not among them: an export has none.
+    """
+    whole, ideal = load_model("paper_machine", geometry), MachineModel(geometry.name)
+    errors, knots = whole.struts, np.linspace(0.42, 0.62, 21)
+    waves = replace(StrutErrors(), cosine=errors.cosine, sine=errors.sine, period=errors.period)
+    scale = replace(StrutErrors(), offset=errors.offset, pitch=errors.pitch, backlash=errors.backlash)
+    values = 5e-6 * np.sin(np.outer(np.arange(1.0, 7.0), 40.0 * knots))
+    curved = replace(StrutErrors(), map_knots=knots, map_values=values)
+    grown = replace(StrutErrors(), expansion=np.full(6, 11.5e-6))
+    joints = {"base_deviation": whole.base_deviation, "platform_deviation": whole.platform_deviation}
+
+    def with_block(**changes: object) -> Compensator:
+        return Compensator(geometry, replace(ideal, **changes))
+
+    warm = with_block(struts=grown, base_expansion=11.5e-6, platform_expansion=11.5e-6)
+    for name in ("strut_1", "strut_4", "base", "platform"):
+        warm.set_temperature(name, 23.0)
+    turning, weight = cardan(geometry), Load(stiffness=np.full(6, 20e6), lost_motion=np.full(6, 1e-6), mass=30.0)
+    return {
+        "ideal": with_block(),
+        "structure": with_block(**joints),
+        "struts: scale": with_block(struts=scale),
+        "struts: waves": with_block(struts=waves),
+        "struts: map": with_block(struts=curved),
+        "screw rotation": Compensator(turning, ideal),
+        "thermal": warm,
+        "field": with_block(field=whole.field),
+        "load": with_block(load=weight),
+        "all of them": Compensator(geometry, whole),
+    }
+
+
 class Timed:
     """A model's exported core, with the loops of c_core.c around it."""
 
@@ -176,10 +231,12 @@ def genhexkins_inverse(poses: np.ndarray) -> Callable[[], float]:
     return lambda: module.inverse(told, lengths, codes) / len(told)
 
 
-def times(rounds: int, single: int) -> list[str]:
-    """Print what each block costs, medians of rounds in turn, and how single commands spread; return bars missed."""
-    every = compensators(load_geometry("paper")).items()  # of these, tables over outside numbers are not in an export
-    everybody = {name: Timed(one) for (name, _), one in every if "outside" not in name}
+def times(rounds: int) -> tuple[dict[str, np.ndarray], str, list[str]]:
+    """Return what a command and a warm estimate take, µs, and the command beside genhexkins, medians of rounds in turn.
+
+    By block, with the table and the bars that are missed.
+    """
+    everybody = {name: Timed(one) for name, one in compensators(load_geometry("paper")).items()}
     whole = everybody["all of them"]
     beside, count = genhexkins_inverse(whole.poses), len(whole.poses)
     glance = whole.library.clock_cost(ctypes.c_long(100_000))
@@ -189,22 +246,28 @@ def times(rounds: int, single: int) -> list[str]:
         for timed in everybody.values():
             command = timed.run("commands_many", INNER) / (INNER * count)
             estimate = timed.run("estimates_many", 1) / count - glance
-            rows.append((command * 1e6, command / inverse, estimate * 1e6))
+            rows.append((command * 1e6, estimate * 1e6, command / inverse))
     medians = np.median(np.reshape(rows, (rounds, len(everybody), 3)), axis=0)
-    cells = ([name, f"{c:.3f}", f"{r:.2f}", f"{e:.3f}"] for name, (c, r, e) in zip(everybody, medians, strict=True))
-    print(table(["block", "command, µs", "× genhexkins", "warm estimate, µs"], cells))
-    bins = np.zeros(4000, np.int64)  # of 10 ns
-    largest = whole.run("each_command", max(1, single // count), bins.ctypes.data_as(ctypes.c_void_p))
-    median, tail = np.searchsorted(np.cumsum(bins) / bins.sum(), (0.5, 0.9999)) * 0.01
-    print(f"\n{bins.sum():,} single commands of the whole model by the clock on the wall:")
-    print(f"median {median:.2f} µs, 99.99 % {tail:.2f} µs, largest {largest * 1e6:.0f} µs")
-    command, ratio, estimate = medians[list(everybody).index("all of them")]
+    found = dict(zip(everybody, medians, strict=True))
+    cells = ([name, f"{c:.3f}", f"{e:.3f}", f"{r:.2f}"] for name, (c, e, r) in found.items())
+    text = table(["block", "command, µs", "warm estimate, µs", "command × genhexkins"], cells)
+    command, estimate, ratio = found["all of them"]
     kept = {
         f"whole model within {LARGEST_US} µs": command <= LARGEST_US,
         f"within {LARGEST_RATIO:g} × genhexkins": not ratio > LARGEST_RATIO,
         f"warm estimate within {LARGEST_ESTIMATE_US} µs": estimate <= LARGEST_ESTIMATE_US,
     }
-    return [bar for bar, held in kept.items() if not held]
+    return found, text, [bar for bar, held in kept.items() if not held]
+
+
+def spread(single: int) -> str:
+    """Return how single commands of the whole model spread by the clock on the wall."""
+    geometry, bins = load_geometry("paper"), np.zeros(4000, np.int64)  # of 10 ns
+    whole = Timed(Compensator(geometry, load_model("paper_machine", geometry)))
+    largest = whole.run("each_command", max(1, single // len(whole.poses)), bins.ctypes.data_as(ctypes.c_void_p))
+    median, tail = np.searchsorted(np.cumsum(bins) / bins.sum(), (0.5, 0.9999)) * 0.01
+    text = f"{bins.sum():,} single commands of the whole model by the clock on the wall: "
+    return text + f"median {median:.2f} µs, 99.99 % {tail:.2f} µs, largest {largest * 1e6:.0f} µs"
 
 
 def main() -> int:
@@ -219,7 +282,10 @@ def main() -> int:
     if shutil.which("gcc") is None:
         return cannot_run("no gcc")
     problems = bits(args.machine, args.model, args.commands) if args.only != "times" else []
-    problems += times(args.rounds, args.single) if args.only != "bits" else []
+    if args.only != "bits":
+        _, text, missed = times(args.rounds)
+        print(text, spread(args.single), sep="\n\n")
+        problems += missed
     return judged(problems)
 
 

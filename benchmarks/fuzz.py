@@ -1,9 +1,12 @@
-"""Fuzzing at nightly size: the tests of ``test/fuzz/test_fuzz_*.py`` with more cases, others for every seed.
+"""Fuzzing at nightly size: the tests of ``test/fuzz`` with more cases, others for every seed; or the core.
 
     python -m benchmarks.fuzz [--cases N] [--seed N] [--jobs N] [-k WORD]
+    python -m benchmarks.fuzz --core [--seconds 600]
 
-``-k any_content`` sends N messages of any bytes to each node, as processes, over DDS. Exit code 1: some case failed;
-hypothesis has then shrunk it and printed it.
+``-k any_content`` sends N messages of any bytes to each node, as processes, over DDS. Hypothesis shrinks and prints a
+case that fails. ``--core`` compiles ``test/core/fuzz.c`` by clang, once for each entry, under libFuzzer with
+sanitizers; what it found lies in out/fuzz-core, and is tried first the next time. Exits 1 where something breaks, 2
+without clang.
 """
 
 from __future__ import annotations
@@ -11,6 +14,8 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -19,59 +24,87 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+from benchmarks import cannot_run, table
+from hexapod_comp import core
+from hexapod_comp.core.build import FLAGS
+from hexapod_comp.export.c_code import write_c
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.model_file import load_model
 
-# Endings of counts that are not cases: how many were accepted, and what a case of a node consists of
-NOT_CASES = (" accepted", " messages")
+ROOT = Path(__file__).resolve().parents[1]
+NOT_CASES = (" accepted", " messages")  # Endings of counts of what was accepted, and of what a node's case consists of
+ENTRIES = ("command", "estimate", "model")
+SANITIZERS = ["-g", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
+
+
+def tests(args: argparse.Namespace) -> list[str]:
+    """Run the tests and print a table of what was run; return the files that failed."""
+    began, counts, failed = time.monotonic(), Counter[str](), []
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "HEXAPOD_FUZZ_CASES": str(args.cases), "HEXAPOD_FUZZ_COUNTS": folder}
+        environment.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: more threads only wait for each other
+        command = [sys.executable, "-m", "pytest", "-q", "--tb=short", "-p", "no:cacheprovider", "-o", "timeout=0"]
+        command += [f"--hypothesis-seed={args.seed}", *(["-k", args.k] if args.k else [])]
+
+        def run(file: Path) -> None:
+            """Run one file's tests in a process of its own; print what it prints when it is done."""
+            done = subprocess.run([*command, str(file)], cwd=ROOT, env=environment, capture_output=True, check=False)
+            passed = done.returncode in (0, 5)  # 5: -k left none
+            said = (done.stdout + done.stderr).decode("utf-8", "replace").strip()
+            print(f"== {file.name}\n{said.splitlines()[-1] if passed else said}", flush=True)
+            if not passed:
+                failed.append(file.name)
+
+        with ThreadPoolExecutor(max(1, args.jobs)) as pool:
+            list(pool.map(run, sorted((ROOT / "test" / "fuzz").glob("test_fuzz_*.py"))))
+        for path in Path(folder).glob("*.json"):
+            counts.update(json.loads(path.read_text()))
+    cases = {name: count for name, count in sorted(counts.items()) if not name.endswith(NOT_CASES)}
+    rows = [[name, f"{count:,}", counts.get(f"{name} accepted", "–")] for name, count in cases.items()]
+    print(table(["", "cases", "accepted"], [*rows, ["together", f"{sum(cases.values()):,}", ""]]))
+    messages = sum(count for name, count in counts.items() if name.endswith(" messages"))
+    print(f"in {time.monotonic() - began:.0f} s; the nodes' cases are of {messages:,} messages, requests and timers")
+    return failed
+
+
+def core_entries(seconds: int) -> list[str]:
+    """Run each entry of the core at low priority; return those that broke."""
+    geometry, sources, broken = load_geometry("paper"), Path(core.__file__).parent, []
+    for entry in ENTRIES:
+        folder = ROOT / "out" / "fuzz-core" / entry
+        (folder / "inputs").mkdir(parents=True, exist_ok=True)
+        write_c(folder, geometry, load_model("paper_machine", geometry), ("", ""))
+        program = str(folder / f"fuzz-{entry}")
+        words = ["clang", *FLAGS, "-O1", *SANITIZERS, f"-D{entry.upper()}", f"-I{folder}", f"-I{sources}"]
+        words += [str(ROOT / "test" / "core" / "fuzz.c"), str(sources / "hexapod_comp.c"), "-lm", "-o", program]
+        subprocess.run(words, check=True)
+        words = ["nice", "-n", "10", program, str(folder / "inputs"), f"-max_total_time={seconds}"]
+        words += ["-max_len=4096", "-print_final_stats=1", f"-artifact_prefix={folder}/"]
+        done = subprocess.run(words, capture_output=True, text=True, errors="replace")
+        (folder / "log").write_text(done.stderr, encoding="utf-8")
+        runs = re.search(r"number_of_executed_units: (\d+)", done.stderr)
+        covered = re.findall(r"cov: (\d+)", done.stderr)
+        said = f"{int(runs[1]):,} inputs, {covered[-1]} branches" if runs and covered else "did not end well"
+        print(f"{entry:10} {said}: {f'BROKE, see {folder}/log' if done.returncode else 'nothing broke'}", flush=True)
+        broken += [entry] if done.returncode else []
+    return broken
 
 
 def main() -> int:
-    """Run the tests and print a table of what was run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=100_000, metavar="N", help="about how many (default 100000)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of all that is random (default 0)")
     cores = os.cpu_count() or 1
     parser.add_argument("--jobs", type=int, default=cores, metavar="N", help="processes (default: as many as cores)")
     parser.add_argument("-k", default="", metavar="WORD", help="only tests with this word in their name")
+    parser.add_argument("--core", action="store_true", help="the core under libFuzzer instead")
+    parser.add_argument("--seconds", type=int, default=600, help="for each entry of the core (default 600)")
     args = parser.parse_args()
-    began = time.monotonic()
-    with tempfile.TemporaryDirectory() as folder:
-        files = sorted((ROOT / "test" / "fuzz").glob("test_fuzz_*.py"))
-        with ThreadPoolExecutor(max(1, args.jobs)) as pool:
-            codes = list(pool.map(lambda file: run(file, args, folder), files))
-        counts: Counter[str] = Counter()
-        for path in Path(folder).glob("*.json"):
-            counts.update(json.loads(path.read_text()))
-    print(report(counts, time.monotonic() - began))
-    failed = [file.name for file, code in zip(files, codes, strict=True) if code not in (0, 5)]  # 5: -k left none
+    if args.core and shutil.which("clang") is None:
+        return cannot_run("no clang here (Debian: apt install clang)")
+    failed = core_entries(args.seconds) if args.core else tests(args)
     print(f"FAILED: {', '.join(failed)}" if failed else "all passed")
     return 1 if failed else 0
-
-
-def run(file: Path, args: argparse.Namespace, folder: str) -> int:
-    """Run one file's tests in a process of its own; print what it says when it is done."""
-    environment = {**os.environ, "HEXAPOD_FUZZ_CASES": str(args.cases), "HEXAPOD_FUZZ_COUNTS": folder}
-    environment.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: more threads only wait for each other
-    command = [sys.executable, "-m", "pytest", "-q", "--tb=short", "-p", "no:cacheprovider", "-o", "timeout=0"]
-    command += [f"--hypothesis-seed={args.seed}", *(["-k", args.k] if args.k else []), str(file)]
-    both = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-    done = subprocess.run(command, cwd=ROOT, env=environment, check=False, **both)
-    said = done.stdout.decode("utf-8", "replace").strip() or "nothing was said"
-    print(f"== {file.name}\n{said if done.returncode not in (0, 5) else said.splitlines()[-1]}", flush=True)
-    return done.returncode
-
-
-def report(counts: Counter[str], seconds: float) -> str:
-    """Return the table of cases, and of what was accepted of them."""
-    cases = {name: count for name, count in counts.items() if not name.endswith(NOT_CASES)}
-    lines = [f"{'':22}{'cases':>9}{'accepted':>10}"]
-    for name, count in sorted(cases.items()):
-        accepted = counts.get(f"{name} accepted")
-        lines.append(f"{name:22}{count:9,}{'–' if accepted is None else f'{accepted:,}':>10}")
-    messages = sum(count for name, count in counts.items() if name.endswith(" messages"))
-    lines.append(f"{'together':22}{sum(cases.values()):9,}  in {seconds:.0f} s")
-    lines.append(f"the nodes' cases are sequences: {messages:,} messages, requests and timers")
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from hexapod_comp.formats.figures import WITH, WITHOUT, save
 from hexapod_comp.formats.outputs import write_text
 
-from . import blocks, cannot_run, genhexkins, judged, kinematics, loop
+from . import c_core, cannot_run, genhexkins, judged, kinematics, loop
 from .kinematics import INVERSE, NEAR, OURS, WIDE
 
 DOC = Path(__file__).resolve().parents[1] / "doc"
@@ -57,7 +57,7 @@ def renewed(page: str, where: str, report: str, problems: list[str]) -> str:
 
 
 def picture(
-    timed: list[kinematics.Result], shares: list[list[float]], costs: list[blocks.Block], beside: list[loop.Row]
+    timed: list[kinematics.Result], shares: list[list[float]], costs: dict[str, np.ndarray], beside: list[loop.Row]
 ) -> Figure:
     """Show kinematics, convergence, cost of blocks, and latency beside the relay."""
     figure = Figure(figsize=(12, 9.5), layout="constrained")
@@ -71,10 +71,10 @@ def picture(
         above.plot(kinematics.YAWS, 100.0 * solved, f"{line}-", color=colour, label=who)
     above.legend(loc="center left")
     rows = np.arange(len(costs))
-    middle.barh(rows - 0.2, [b.command_us for b in costs], 0.4, color=WITH, label="command")
-    middle.barh(rows + 0.2, [b.estimate_us for b in costs], 0.4, color=OTHERS, label="estimate")
-    middle.set_yticks(rows, [b.name if b.name == "ideal" else f"+ {b.name}" for b in costs], fontsize=8)
-    middle.set(title="A command and an estimate, and what blocks add", xlabel="µs, called from Python")
+    middle.barh(rows - 0.2, [cost[0] for cost in costs.values()], 0.4, color=WITH, label="command")
+    middle.barh(rows + 0.2, [cost[1] for cost in costs.values()], 0.4, color=OTHERS, label="estimate")
+    middle.set_yticks(rows, [*costs], fontsize=8)
+    middle.set(title="A command and a warm estimate, with one block each", xlabel="µs, in C")
     middle.invert_yaxis()
     middle.legend(loc="lower right")
     places = np.arange(len(beside))
@@ -130,9 +130,10 @@ def main() -> int:
     except genhexkins.NotHere as reason:
         if options.doc:
             return cannot_run(str(reason))
-    costs = blocks.measure(rounds)
+    costs, text, problems = c_core.times(3 if options.quick else 15)
+    parts.append((text, problems))
     beside, floor = (loop.measure(max(1, n), 6, 0.4, floor) for n, floor in ((bouts, False), (bouts // 3, True)))
-    parts += [(blocks.report(costs), []), (loop.report(beside), loop.problems(beside))]
+    parts += [(loop.report(beside), loop.problems(beside))]
     parts.append((loop.report(floor), []))
     report, problems = "\n\n".join(text for text, _ in parts), [one for _, missed in parts for one in missed]
     print(where, report, sep="\n\n")

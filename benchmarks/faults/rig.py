@@ -17,7 +17,7 @@ import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +115,7 @@ class Rig:
         self._starting: dict[str, float] = {}
         self.wires: dict[str, Wire] = {}
         self._estimate: PoseStamped | None = None
-        self._reset_answer: Any = None
+        self._resetting: Iterator[None] = iter(())
 
     # ---- coming and going ----
 
@@ -346,29 +346,21 @@ class Rig:
     # ---- the controller's reset ----
 
     def _ask_for_reset(self, then: Callable[[Pose | None], None]) -> None:
-        began = time.monotonic()
-        self._reset_answer = (began, then, None)
-        if self._reset.service_is_ready():
-            future = self._reset.call_async(Trigger.Request())
-            self._reset_answer = (began, then, future)
+        self._resetting = self._reset_steps(then)
 
-    def _look_for_reset(self, now: float) -> None:
-        if self._reset_answer is None:
-            return
-        began, then, future = self._reset_answer
-        if isinstance(future, Future) and future.done() and not future.result().success:
-            self._reset_answer = None
-            then(None)
-        elif isinstance(future, Future) and future.done():
-            self.record.fresh_starts.append(now)
-            # Estimates come every few ms; the next one is from the measured struts.
-            self._reset_answer, self._estimate = (began, then, now), None
-        elif isinstance(future, float) and self._estimate is not None and now > future:
-            self._reset_answer = None
-            then(message_pose(self._estimate))
-        elif now - began > 0.5:
-            self._reset_answer = None
-            then(None)
+    def _reset_steps(self, then: Callable[[Pose | None], None]) -> Iterator[None]:
+        """Reset within 0.5 s, and call with the first estimate after that, which is from the measured struts."""
+        end = time.monotonic() + 0.5
+        future = self._reset.call_async(Trigger.Request()) if self._reset.service_is_ready() else Future()
+        while not future.done() and time.monotonic() < end:
+            yield
+        if not (future.done() and future.result().success):
+            return then(None)
+        self.record.fresh_starts.append(time.monotonic())
+        self._estimate = None
+        while self._estimate is None and time.monotonic() < end:
+            yield
+        then(None if self._estimate is None else message_pose(self._estimate))
 
     # ---- time ----
 
@@ -380,7 +372,7 @@ class Rig:
             if now - looked > 0.02:
                 looked = now
                 self._look_for_ready(now)
-            self._look_for_reset(now)
+            next(self._resetting, None)
             for wire in self.wires.values():
                 wire.release(now)
             self.controller.tick(now, self._stuck())
