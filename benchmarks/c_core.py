@@ -45,10 +45,8 @@ from .genhexkins import Genhexkins, NotHere, emc_poses
 
 DRIVER = Path(__file__).resolve().parents[1] / "test" / "core" / "driver.c"
 SOURCES = Path(core.__file__).parent
-
 STRICT = ["-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic"]
 SANITIZED = ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-
 # Bars: of the whole model's command, µs; beside genhexkins' inverse; of a warm estimate, µs
 LARGEST_US, LARGEST_RATIO, LARGEST_ESTIMATE_US = 1.5, 8.0, 1.5
 POSES = 500
@@ -231,11 +229,8 @@ def genhexkins_inverse(poses: np.ndarray) -> Callable[[], float]:
     return lambda: module.inverse(told, lengths, codes) / len(told)
 
 
-def times(rounds: int) -> tuple[dict[str, np.ndarray], str, list[str]]:
-    """Return what a command and a warm estimate take, µs, and the command beside genhexkins, medians of rounds in turn.
-
-    By block, with the table and the bars that are missed.
-    """
+def times(rounds: int) -> tuple[str, list[str]]:
+    """Return a table of what a command and a warm estimate take, medians of rounds in turn, and the bars missed."""
     everybody = {name: Timed(one) for name, one in compensators(load_geometry("paper")).items()}
     whole = everybody["all of them"]
     beside, count = genhexkins_inverse(whole.poses), len(whole.poses)
@@ -257,7 +252,7 @@ def times(rounds: int) -> tuple[dict[str, np.ndarray], str, list[str]]:
         f"within {LARGEST_RATIO:g} × genhexkins": not ratio > LARGEST_RATIO,
         f"warm estimate within {LARGEST_ESTIMATE_US} µs": estimate <= LARGEST_ESTIMATE_US,
     }
-    return found, text, [bar for bar, held in kept.items() if not held]
+    return text, [bar for bar, held in kept.items() if not held]
 
 
 def spread(single: int) -> str:
@@ -283,7 +278,7 @@ def main() -> int:
         return cannot_run("no gcc")
     problems = bits(args.machine, args.model, args.commands) if args.only != "times" else []
     if args.only != "bits":
-        _, text, missed = times(args.rounds)
+        text, missed = times(args.rounds)
         print(text, spread(args.single), sep="\n\n")
         problems += missed
     return judged(problems)

@@ -29,7 +29,6 @@ from hexapod_comp.virtual.instruments import measure
 CONFIG = Path(__file__).resolve().parents[1] / "config"
 LEAD = 0.01
 TILT = np.radians(10.0)
-
 SMALL = ImperfectionBounds(
     joint=10e-6, strut_offset=10e-6, pitch=50e-6, wave=(4e-6, 4e-6), wave_period=LEAD, backlash=(3e-6, 5e-6)
 )

@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 from benchmarks import drawn
 from benchmarks.live_machine import LiveMachine
 from benchmarks.smooth_imperfections import with_wavy_field
-from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.measurements.campaign import Campaign, circle_run
@@ -35,7 +34,6 @@ DESIGNS = ("paper", "example_6_6", "positioning_unit", "jugglebot")
 LENGTH_MAP, FIELD = 50e-6, (100e-6, 500e-6)  # Errors that no model contains, RMS, m, m and rad
 ASIDE = Pose.from_angles([2.0, -1.0, 0.5], [0.3, 1.0, 2.5])  # Where a tracker stands that stands anywhere
 FIRST_POSES = 6
-
 Readings = dict[str, float]
 Change = Callable[[Readings], Readings]
 
@@ -93,9 +91,7 @@ OF_LASERS: dict[str, Change] = {
 }
 OF_BARS: dict[str, Change] = {
     "reversed": partial(scaled, ("length",), -1.0),
-    "mm as m": partial(scaled, ("length",), 1e3),
-    "µm as m": partial(scaled, ("length",), 1e6),
-    "inches as mm": partial(scaled, ("length",), 25.4),
+    **{name: OF_LASERS[name] for name in ("mm as m", "µm as m", "inches as mm")},
 }
 TURN = Rotation.from_euler("x", 5.0, degrees=True).as_matrix()
 OF_TRACKERS: dict[str, Callable[[Pose], Pose]] = {
@@ -177,7 +173,7 @@ def campaign_of(case: Case, geometry: HexapodGeometry) -> Campaign:
 def outcomes(number: int, seed: int) -> Counter[str]:
     """Return what was accused rightly or wrongly, or not reported, by its name, of a case by its number."""
     case = CASES[number]
-    geometry = load_geometry(config_file(f"{DESIGNS[seed % len(DESIGNS)]}.yaml"))
+    geometry = load_geometry(DESIGNS[seed % len(DESIGNS)])
     truth, campaign, counts = truth_of(geometry, seed), campaign_of(case, geometry), Counter[str]()
     for name, change in (("", None), *[*case.mistakes.items()][seed % 4 :: 4]):
         stands = ASIDE if case.frame == "free" else Pose.from_angles([0.002, -0.003, 0.001], [0.005, -0.005, 0.005])
@@ -188,14 +184,9 @@ def outcomes(number: int, seed: int) -> Counter[str]:
         machine.broken, machine.silent = ({*rng.integers(10, 300, 3).tolist()} for _ in range(2))
         with TemporaryDirectory() as folder:
             try:
-                collect(
-                    campaign,
-                    geometry,
-                    machine,
-                    Path(folder) / "out.csv",
-                    progress=lambda done, of, where, visited=visited: visited.append(where),
-                    tracker_frame=case.frame,
-                )
+                note = lambda done, of, where, visited=visited: visited.append(where)  # noqa: E731
+                file = Path(folder) / "out.csv"
+                collect(campaign, geometry, machine, file, progress=note, tracker_frame=case.frame)
             except SetUpError as error:
                 at_once = len({where.partition(",")[0] for where in visited}) == 1
                 at_once &= case.kind != "tracker" or len(visited) <= FIRST_POSES
@@ -213,20 +204,16 @@ def main() -> int:
     names = [case.name for case in CASES]
     parser.add_argument("--case", choices=names, action="append", help="this instrument only (default: all)")
     args = parser.parse_args()
-    failed = False
-    drawn.show(
-        "| instrument | machines | mistakes made | reported at once | right readings accused |\n|---|---|---|---|---|"
-    )
+    table = drawn.Table(["instrument", "machines", "mistakes made", "reported at once", "right readings accused"])
     for number, results in drawn.results(outcomes, [names.index(name) for name in args.case or names], args):
-        case = CASES[number]
         counts = sum(results, Counter[str]())
         made = counts.total() - sum(counts[name] for name in counts if name.startswith(("accused", "right")))
+        met = counts["reported"] >= made and not counts["accused"]
         right = f"{counts['accused']} of {counts['accused'] + counts['right']}"
-        drawn.show(f"| {case.name} | {len(results)} | {made} | {counts['reported']} | {right} |")
+        table.row(names[number], len(results), made, counts["reported"], right, met=met)
         for name in sorted(counts.keys() - {"accused", "right", "reported"}):
             drawn.show(f"  {name}: {counts[name]}")
-        failed |= counts["reported"] < made or counts["accused"] > 0
-    return int(failed)
+    return 0 if table.met else 1
 
 
 if __name__ == "__main__":

@@ -23,7 +23,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
 from foreign_machines import Machine, machines
 
 BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])  # that the paper's machine is measured in, m
-
 Case = TypeVar("Case")
 Result = TypeVar("Result")
 

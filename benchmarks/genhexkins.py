@@ -24,14 +24,11 @@ from hexapod_comp.machine.kinematics import Structure
 NAME = "LinuxCNC genhexkins"
 # Where Debian puts it; another one by the environment variable GENHEXKINS
 MODULE = Path("/usr/lib/linuxcnc/modules/genhexkins.so")
-
 MM = 1e-3
 # Its own default: it ends when every strut was right to this, mm, before the last step. Its steps shrink by a
 # constant factor each, so its answers are about as good as this; ours converges quadratically.
 CRITERION = 1e-9
-
 ANY_ERROR = 1e9  # Its default refuses a guess whose struts are off by 500 mm altogether; here it may try
-
 POSE, STRUTS = 9, 6
 
 

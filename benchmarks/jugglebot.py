@@ -7,11 +7,9 @@ benchmarks/data/jugglebot, under the MIT licence. Exits 1 when a bar is missed, 
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import os
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,6 +25,7 @@ from hexapod_comp.measurements.readings import AXES, CHANNELS, KINDS, Measuremen
 from hexapod_comp.measurements.wide_csv import read_wide
 
 from . import cannot_run
+from .drawn import each
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(__file__).parent / "data" / "jugglebot"
@@ -67,13 +66,13 @@ def zeroed_without(measured: MeasurementSet, out: np.ndarray) -> MeasurementSet:
     return replace(measured, stations=replace(s, commands=s.commands + zero))
 
 
-def left_out(measured: MeasurementSet, out: np.ndarray, settings: FitSettings) -> tuple[np.ndarray, list[str]]:
-    """Fit without some stations; return their squared position misfits, m², and the blocks that the fit kept."""
+def left_out(measured: MeasurementSet, out: np.ndarray, settings: FitSettings) -> np.ndarray:
+    """Fit without some stations; return their squared position misfits, m²."""
     is_out = np.isin(measured.station, out)
     fit = fit_model(measured.select(~is_out), settings)
     # Everything that the parameters' meaning hangs on (knots, box) comes from the stations that were fitted.
     errors = predict(fit.space, fit.solution.x, measured.stations).errors
-    return position_squares(measured, errors)[out], [block.name for block in fit.space.blocks]
+    return position_squares(measured, errors)[out]
 
 
 def rms(squares: np.ndarray) -> float:
@@ -81,7 +80,7 @@ def rms(squares: np.ndarray) -> float:
     return float(np.sqrt(np.mean(squares)))
 
 
-def poses(folder: Path, pool: ProcessPoolExecutor) -> bool:
+def poses(folder: Path, workers: int) -> bool:
     """Print the cross-validation of the 108 poses; return whether the bar is met."""
     measured = read(folder, "108_calibration_poses.csv", "jugglebot_columns.yaml")
     count = len(measured.stations)
@@ -90,15 +89,14 @@ def poses(folder: Path, pool: ProcessPoolExecutor) -> bool:
     for seed in range(SPLITS):
         fold = np.random.default_rng(seed).permutation(count) % FOLDS
         parts = [np.flatnonzero(fold == k) for k in range(FOLDS)]
-        zeroed = [zeroed_without(measured, part) for part in parts]
-        results = list(pool.map(left_out, zeroed, parts, [KNOWN] * FOLDS))
-        found.append(rms(np.concatenate([squares for squares, _ in results])))
+        tasks = [(zeroed_without(measured, part), part, KNOWN) for part in parts]
+        found.append(rms(np.concatenate([*each(left_out, tasks, workers)])))
         print(f"108 poses, split {seed + 1}: {raw * 1e3:.2f} -> {found[-1] * 1e3:.3f} mm RMS", flush=True)
     print(f"108 poses, mean of {SPLITS} splits: {np.mean(found) * 1e3:.3f} mm RMS (bar {POSES_BAR * 1e3:.2f})")
     return float(np.mean(found)) <= POSES_BAR
 
 
-def grid(folder: Path, pool: ProcessPoolExecutor) -> bool:
+def grid(folder: Path, workers: int) -> bool:
     """Print the leave-one-out test of the level grid; return whether the bar is met."""
     measured = read(folder, "grid180.csv", "jugglebot_grid_columns.yaml")
     own = read(folder, "grid180_ff_correction.csv", "jugglebot_grid_columns.yaml")
@@ -107,9 +105,7 @@ def grid(folder: Path, pool: ProcessPoolExecutor) -> bool:
     # Which blocks help is decided once, with all poses; leaving one out hardly changes that.
     whole = fit_model(measured, KNOWN)
     kept = replace(KNOWN, blocks=tuple(block.name for block in whole.space.blocks))
-    parts = [np.array([n]) for n in range(count)]
-    results = list(pool.map(left_out, [measured] * count, parts, [kept] * count, chunksize=5))
-    left = rms(np.concatenate([squares for squares, _ in results]))
+    left = rms(np.concatenate([*each(left_out, [(measured, np.array([n]), kept) for n in range(count)], workers)]))
     print(
         f"grid180, leave-one-out: {raw * 1e3:.2f} -> {left * 1e3:.3f} mm RMS, {100 * (1 - left / raw):.1f} % less "
         f"(bar {100 * GRID_BAR:.0f} %); the owner's own correction: {corrected * 1e3:.2f} mm, "
@@ -127,9 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     missing = [name for name in FILES if not (args.data / name).is_file()]
     if missing:
         return cannot_run(f"{args.data} has no {', '.join(missing)}; name the folder of the data by --data")
-    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-    with ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        met = [poses(args.data, pool), grid(args.data, pool)]
+    met = [poses(args.data, args.workers), grid(args.data, args.workers)]
     return 0 if all(met) else 1
 
 

@@ -42,7 +42,6 @@ OURS, THEIRS = "hexapod_comp", "LinuxCNC genhexkins"
 LOOSE = f"{THEIRS}, to 1e-8 m"
 INVERSE, WIDE, NEAR = "inverse", "forward", "forward, near"  # near: within 1 mm and 1° of home, as in a control cycle
 STEP_TOLERANCE = 1e-8  # Where the core's Newton stops, m and rad: the others get the same criterion
-
 # Largest difference of a peer's numbers to ours, m or rotation matrix entries; and of those told to end early
 TOLERANCE, LOOSE_TOLERANCE = 1e-9, 1e-6
 # How many times faster than genhexkins ours must be, with either of its criteria
@@ -359,55 +358,34 @@ def contenders(singles: int, many: int) -> tuple[list[Contender], list[str]]:
     return found, missing
 
 
-@dataclass(frozen=True)
-class Result:
-    """Median time per pose, how many times ours that is, and the largest difference to our numbers."""
-
-    task: str
-    name: str
-    shape: str
-    us_per_pose: float
-    times_ours: float
-    max_difference: float
-
-
-def measure(everybody: list[Contender], repeats: int) -> list[Result]:
-    """Run everybody in turn, `repeats` times, so that a busy second hits all alike; medians of processor time."""
+def times(singles: int, many: int, repeats: int) -> tuple[str, list[str]]:
+    """Run everybody in turn, so that a busy second hits all alike; return a table of medians, and the bars missed."""
 
     def timed(one: Contender) -> float:
         start = time.thread_time()
         own = one.run()
         return (own if isinstance(own, float) else time.thread_time() - start) / one.poses * 1e6
 
+    everybody, missing = contenders(singles, many)
     runs = [(one, one.run()) for one in everybody]
     found = [run if one.numbers is None else one.numbers() for one, run in runs]
     rounds = np.array([[timed(one) for one in everybody] for _ in range(repeats)])
     ours = {(one.task, one.shape): i for i, one in enumerate(everybody) if one.name == OURS}
-    results = []
+    rows, problems = [], []
     for i, one in enumerate(everybody):
         reference = ours[one.task, one.shape]
         ratio = statistics.median(rounds[:, i] / rounds[:, reference])
         difference = float(np.abs(found[i] - found[reference]).max())
-        results.append(Result(one.task, one.name, one.shape, statistics.median(rounds[:, i]), ratio, difference))
-    return sorted(results, key=lambda result: (result.task, result.shape, result.times_ours))
-
-
-def times(singles: int, many: int, repeats: int) -> tuple[list[Result], str, list[str]]:
-    """Return results, their table with what is missing, and the bars missed."""
-    everybody, missing = contenders(singles, many)
-    results, problems = measure(everybody, repeats), []
-    rows = (
-        (r.task, r.shape, r.name, f"{r.us_per_pose:.3f}", f"{r.times_ours:.2f}", f"{r.max_difference:.1e}")
-        for r in results
-    )
-    for r in results:
-        if not r.max_difference <= (LOOSE_TOLERANCE if r.name == LOOSE else TOLERANCE):
-            problems.append(f"{r.task}, {r.shape}: the numbers of {r.name} differ from ours by {r.max_difference:.1e}")
-        bar = BARS.get((r.task, r.shape), 0.0) if r.name in (LOOSE, THEIRS) else 0.0
-        if r.times_ours < bar:
-            problems.append(f"{r.task}, {r.shape}: {r.times_ours:.2f} × {r.name}, bar {bar:g} ×")
-    text = table(["task", "shape", "who", "µs/pose", "× ours", "max difference"], rows, texts=3)
-    return results, "\n\n".join([text, *missing]), problems
+        rows.append((one.task, one.shape, ratio, one.name, statistics.median(rounds[:, i]), difference))
+        which = f"{one.task}, {one.shape}"
+        if not difference <= (LOOSE_TOLERANCE if one.name == LOOSE else TOLERANCE):
+            problems.append(f"{which}: the numbers of {one.name} differ from ours by {difference:.1e}")
+        bar = BARS.get((one.task, one.shape), 0.0) if one.name in (LOOSE, THEIRS) else 0.0
+        if ratio < bar:
+            problems.append(f"{which}: {ratio:.2f} × {one.name}, bar {bar:g} ×")
+    cells = ([*names, who, f"{us:.3f}", f"{ratio:.2f}", f"{off:.1e}"] for *names, ratio, who, us, off in sorted(rows))
+    text = table(["task", "shape", "who", "µs/pose", "× ours", "max difference"], cells, texts=3)
+    return "\n\n".join([text, *missing]), problems
 
 
 # ---- batches on all cores ----
@@ -450,7 +428,6 @@ def batches(most: int = SIZES[-1], seconds: float = 4.0) -> tuple[str, list[str]
 # ---- where forward kinematics converges, and what answers are worth; each pair is ours, then genhexkins' ----
 
 YAWS = np.array([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 55.0, 60.0, 65.0, 70.0, 75.0, 80.0, 85.0])  # degrees
-
 Answers = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Where success was reported, positions (m) and rotations."""
 
@@ -544,8 +521,8 @@ def traps() -> list[tuple[str, str, str]]:
     return rows
 
 
-def convergences() -> tuple[list[list[float]], str, list[str]]:
-    """Return the shares that converge by yaw, three tables, and whether ours misses a bar."""
+def convergences() -> tuple[str, list[str]]:
+    """Return three tables, and whether ours misses a bar."""
     shares, worth = convergence(YAWS), honesty()
     pair = ["hexapod_comp", "genhexkins"]
     by_who = ([name, *(f"{100.0 * row[n]:.0f} %" for row in shares)] for n, name in enumerate(pair))
@@ -559,7 +536,7 @@ def convergences() -> tuple[list[list[float]], str, list[str]]:
     failed = any(row[0] < 1.0 for yaw, row in zip(YAWS, shares, strict=True) if 60.0 <= yaw <= 80.0)
     problems = ["forward kinematics fails at a yaw of 60–80°"] if failed else []
     problems += ["forward kinematics reports as solved what is not"] if worth[1:, 0].any() else []
-    return shares, text, problems
+    return text, problems
 
 
 def main() -> int:
@@ -578,9 +555,9 @@ def main() -> int:
     for part in options.only or parts:
         try:
             if part == "times":
-                found = times(options.single, options.batch, options.repeats)[1:]
+                found = times(options.single, options.batch, options.repeats)
             else:
-                found = batches(options.most, options.seconds) if part == "batches" else convergences()[1:]
+                found = batches(options.most, options.seconds) if part == "batches" else convergences()
         except NotHere as reason:
             if options.only == ["convergence"]:
                 return cannot_run(str(reason))

@@ -32,17 +32,11 @@ from . import judged, table
 
 # Commands per second; 0 is flat out: the next one leaves when the last was answered
 RATES = (250.0, 500.0, 1000.0, 0.0)
-
 BAR_RATE, BAR_MEDIAN, BAR_P99 = 0.95, 1.10, 1.25
-
 GIVE_UP = 0.05  # An answer that takes longer, s, is not waited for
-
 START_WITHIN = 180.0  # The nodes may have to compile first, s
-
 BLIND = "start_without_feedback_after:=0.1"  # There are no struts here
-
 OURS, RELAY = "ours", "relay"
-
 MODEL = "model_file:=paper_machine.yaml"
 
 
@@ -81,32 +75,13 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Figures:
-    """One node's answers in one bout."""
-
-    rate: float  # Answers per second
-    median: float  # Latency's median and 99th percentile, µs
-    p99: float
-
-    @staticmethod
-    def of(latencies: list[int], seconds: float) -> Figures:
-        """Return the figures of latencies, ns."""
-        if not latencies:
-            return Figures(0.0, float("nan"), float("nan"))
-        median, p99 = np.percentile(np.array(latencies) * 1e-3, [50.0, 99.0])
-        return Figures(len(latencies) / seconds, float(median), float(p99))
-
-
-@dataclass(frozen=True)
 class Row:
-    """What is told of one rate: medians over the bouts, and quartiles (25, 50, 75 %) of the bouts' ratios."""
+    """One rate; figures are answers per second, and median and 99th percentile of the latency, µs."""
 
     rate_hz: float
-    ours: Figures
-    relay: Figures
-    rate_ratio: tuple[float, float, float]
-    median_ratio: tuple[float, float, float]
-    p99_ratio: tuple[float, float, float]
+    ours: np.ndarray  # (3,), medians over the bouts
+    relay: np.ndarray
+    ratios: np.ndarray  # (3, 3), quartiles (25, 50, 75 %) of the bouts' ratios of ours to the relay's
 
     @property
     def name(self) -> str:
@@ -161,21 +136,16 @@ def one_round(
     return line.latencies
 
 
-def bout(session: RosSession, lines: dict[str, Line], rate: float, rounds: int, seconds: float) -> dict[str, Figures]:
-    """Return both nodes' figures of some rounds in turn."""
+def bout(session: RosSession, lines: dict[str, Line], rate: float, rounds: int, seconds: float) -> list[list[float]]:
+    """Return our figures and the relay's of some rounds in turn."""
     latencies: dict[str, list[int]] = {name: [] for name in lines}
     for number in range(rounds):
         for name in sorted(lines, reverse=bool(number % 2)):
             latencies[name] += one_round(session, lines[name], rate, seconds)
-    return {name: Figures.of(found, rounds * seconds) for name, found in latencies.items()}
-
-
-def summary(rate: float, bouts: list[dict[str, Figures]]) -> Row:
-    """Return a rate's row."""
-    ours, relay = (np.array([[f.rate, f.median, f.p99] for f in (b[who] for b in bouts)]) for who in (OURS, RELAY))
-    quartiles = np.nanpercentile(ours / relay, [25.0, 50.0, 75.0], axis=0)
-    ratios = [tuple(quartiles[:, i].tolist()) for i in range(3)]
-    return Row(rate, Figures(*np.nanmedian(ours, axis=0)), Figures(*np.nanmedian(relay, axis=0)), *ratios)
+    return [
+        [len(found) / (rounds * seconds), *(np.percentile(found or [np.nan], [50.0, 99.0]) * 1e-3)]
+        for found in (latencies[OURS], latencies[RELAY])
+    ]
 
 
 def measure(bouts: int, rounds: int, seconds: float, floor: bool = False) -> list[Row]:
@@ -192,11 +162,16 @@ def measure(bouts: int, rounds: int, seconds: float, floor: bool = False) -> lis
             while not one_round(session, line, 250.0, 1.0):
                 if time.monotonic() > give_up:
                     raise SystemExit(f"{name} did not answer within {START_WITHIN:g} s")
-        found: dict[float, list[dict[str, Figures]]] = {rate: [] for rate in RATES}
+        found: dict[float, list[list[list[float]]]] = {rate: [] for rate in RATES}
         for _ in range(bouts):
             for rate in RATES:
                 found[rate].append(bout(session, lines, rate, rounds, seconds))
-    return [summary(rate, figures) for rate, figures in found.items()]
+    rows = []
+    for rate, figures in found.items():
+        ours, relay = np.moveaxis(figures, 1, 0)
+        ratios = np.nanpercentile(ours / relay, [25.0, 50.0, 75.0], axis=0)
+        rows.append(Row(rate, np.nanmedian(ours, axis=0), np.nanmedian(relay, axis=0), ratios))
+    return rows
 
 
 def report(rows: list[Row]) -> str:
@@ -206,10 +181,10 @@ def report(rows: list[Row]) -> str:
         columns += [f"{figure}: relay", "ours", "ratio"]
     lines = []
     for r in rows:
-        middle, tail = (f"{q[1]:.3f} ({q[0]:.2f}–{q[2]:.2f})" for q in (r.median_ratio, r.p99_ratio))
-        pairs = [(r.relay.rate, r.ours.rate), (r.relay.median, r.ours.median), (r.relay.p99, r.ours.p99)]
-        both = [[f"{value:.0f}" for value in pair] for pair in pairs]
-        lines.append([r.name, *both[0], f"{r.rate_ratio[1]:.3f}", *both[1], middle, *both[2], tail])
+        low, middle, high = r.ratios
+        cells = [f"{middle[0]:.3f}", *(f"{middle[n]:.3f} ({low[n]:.2f}–{high[n]:.2f})" for n in (1, 2))]
+        three = zip(r.relay, r.ours, cells, strict=True)
+        lines.append([r.name, *(cell for x, y, ratio in three for cell in (f"{x:.0f}", f"{y:.0f}", ratio))])
     return table(columns, lines)
 
 
@@ -217,7 +192,7 @@ def problems(rows: list[Row]) -> list[str]:
     """Return the rates at which the compensator misses a bar."""
     found = []
     for r in rows:
-        rate, median, p99 = r.rate_ratio[1], r.median_ratio[1], r.p99_ratio[1]
+        rate, median, p99 = r.ratios[1]
         if not (rate >= BAR_RATE and median <= BAR_MEDIAN and p99 <= BAR_P99):
             bars = f"{BAR_RATE} / {BAR_MEDIAN} / {BAR_P99}"
             ratios = f"{rate:.3f} / {median:.3f} / {p99:.3f}, bars {bars}"

@@ -34,10 +34,8 @@ from .faults.rig import Rig
 
 # Set where this program runs again, in a namespace of its own: to ``cable``, or to the descriptor for orders
 INSIDE = "HEXAPOD_COMP_NETWORK_BENCHMARK"
-
 OWN_NETWORK = ("unshare", "--map-root-user", "--net")  # A network namespace, in which we are root and may set it up
 APPEARS_WITHIN = 5.0  # A namespace that is not there after this long, s, will not be
-
 ALL_PROTOCOLS, OUTGOING, LONGEST_FRAME = 3, 4, 65_536  # ETH_P_ALL and PACKET_OUTGOING, our own frames, of Linux
 IPV4, UDP = 0x0800, 17
 

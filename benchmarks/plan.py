@@ -32,9 +32,7 @@ from hexapod_comp.virtual.instruments import measure
 
 LEAD = 0.01
 DEGREE = 4  # Of the field, which keeps twenty fits short
-
 TILT = np.radians(5.0)  # All five machines tilt so far in most of their box
-
 NAMES = ("paper", "framed", "hanging", "inches", "mirror")
 
 # Instruments, tilt, goal and readings; the last is more than anybody gets with so many
@@ -48,11 +46,9 @@ GOALS = (
 COUNTED = {"linear": Times(0.0, 0.0, 1.0), "5-D": Times(0.0, 0.0, 5.0), "6-D": Times(0.0, 0.0, 6.0)}
 # A reading counts a second, and nothing else takes any time: plans and what they are compared with pay the same
 COUNTED["tracker_6d"] = COUNTED["6-D"]
-
 # Bars: less expected error than thinned on the mean; seconds of a plan; achieved over expected, root mean
 # square over all goals; share of machines within the 95 % intervals, of the plan and of the fit
 LESS, SECONDS, RATIO, INSIDE = 0.20, 30.0, (0.8, 1.25), 0.9
-
 DRAWS = 1000
 
 

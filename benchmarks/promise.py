@@ -39,32 +39,21 @@ GEOMETRIES = ("paper", "offset", "framed", "hanging", "inches", "mirror")
 OWN = ("A", "B", "D", "G", "worn")
 FOREIGN = ("harmonics", "joints", "beams", "drift", "outliers", "friction", "all")
 PLANS = (("5-D", 4), ("5-D", 16), ("1-D", 16))  # Instrument on lines, and diagonals
-
 # Blocks that a fit may use: harmonics of the screws are withheld
 KNOWN = tuple(block for block in BLOCKS if block not in WAVES or WAVES[block] == 1)
-
 BAR, WIDTH_BAR = 0.95, 2.0
-
 # Degrees of freedom with which the covariance is believed, for ``--ablate``
 BELIEVED = (2.0, 3.0, 5.0, 8.0, 12.0, 24.0, 70.0, np.inf)
-
 HARMONICS = {2: (0.5e-6, 2e-6), 3: (0.3e-6, 1e-6)}  # Lowest and highest amplitude by waves per turn, m
-
 # Amplitude, m, and wave, in direction cosines, of the error of a joint with its angle
 JOINTS, JOINT_WAVE = 20e-6, 0.7
-
 # Amplitude of a lost motion by friction, by the sign of a strut's speed, and its wave along the strut, m
 FRICTION, FRICTION_WAVE = 3e-6, 80e-3
-
 BEAM = 1.5e-3  # Standard deviation of a beam's direction across its line, rad
-
 DRIFT, EXPANSION = 0.5, (10e-6, 12e-6)  # Warming during the campaign, K, and expansion, 1/K
-
 WARMTH = np.array([1.0] * 6 + [0.6, 0.8])  # Share of it that struts, base and platform take
-
 # Sizes, m or rad, and share of gross errors, and by what one run's instrument slips, m
 GROSS, GROSS_SHARE, SLIP = (5e-6, 100e-6), 0.01, (3e-6, 15e-6)
-
 POINTS = 500
 
 

@@ -22,9 +22,7 @@ from hexapod_comp.ros.parameters import Program, read_table
 from hexapod_comp.ros.process import run
 
 STAMP = slice(4, 12)  # Where a message's stamp stands among its bytes
-
 ESTIMATE_PERIOD = 0.02  # The compensator's, s
-
 PARAMETERS = read_table("serialized | false | | start | take and publish bytes")
 
 

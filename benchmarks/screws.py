@@ -34,17 +34,13 @@ from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
 from hexapod_comp.virtual.instruments import measure
 
 LARGEST_LEFT = 0.25e-6  # Bar of the tool error that machines with harmonics keep, RMS, m, the datum aligned
-
 LARGEST_COST = 1.3  # Bar of a fit's time to one without harmonics and without looking for the lead
-
 MACHINE = ImperfectionBounds(
     joint=100e-6, strut_offset=100e-6, pitch=100e-6, wave=(2e-6, 4e-6), harmonics=(1e-6, 2e-6), backlash=(3e-6, 5e-6)
 )
 # A lead counts as right within so many of its standard errors; as a part of the true one, a harmonic's, too
 AGREE = 5.0
-
 HARMONICS_OF_LEAD = (1, 2, 3, 4)
-
 LARGEST_PULL = 1.3  # Bar of how far leads are off, RMS, in their standard errors
 
 

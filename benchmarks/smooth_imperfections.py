@@ -15,7 +15,6 @@ from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.virtual.imperfections import seeded
 
 FIELD_WAVES = 6  # Waves added up in each component of a field
-
 FIELD_NODES, FIELD_POWERS = 17, 12  # Lines of a wavy field along y and z, and coefficients along x
 
 

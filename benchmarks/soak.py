@@ -34,12 +34,10 @@ from hexapod_comp.ros.base import EVENT_QOS
 from hexapod_comp.ros.process import SPIN_PERIOD, RosSession
 
 NODES = ("compensator", "strut_drive")
-
 RADIUS, TURN_TIME = 0.012, 4.0  # Circle about home, m, and time of one turn, s: 19 mm/s
 RUN_IN = 3.0  # Commands are sent, and not counted, for this long first, s: until DDS has made everybody known
 WARM_UP, LEAST_WARM_UP = 0.1, 5.0  # Share of the run after which memory should be flat, and at least, s
 BAR_GROWTH = 1.0  # MB an hour
-
 BAR_AT_REST, BAR_AT_MOST = 100.0, 200.0  # Resident memory, MB
 LENGTH = 10_000_000  # Of a message, byte
 SETTLED = 3.0  # What does not change for so long stays, s

@@ -47,9 +47,7 @@ from hexapod_comp.virtual.instruments import measure
 # Machines of test/foreign_machines.py: 6-6 with turned frames, hanging, in inches, wide struts from afar,
 # screws that turn
 FOREIGN = ("framed", "hanging", "inches", "mirror", "left-hand")
-
 CRASH, POINTS = 20e-6, 200
-
 CHOSEN = "12 chosen"
 # Check readings: twelve that the package chooses, twelve and twenty-four by the rule of thumb above
 SETS = (CHOSEN, "12", "24")
@@ -58,12 +56,9 @@ CHANGES = {"nothing": None, "strut": STRUT, "datum": DATUM, "temperature": TEMPE
 # What parameters can follow, and what is in no hypothesis that is named; with their kinds. Lines cannot see the
 # datum.
 UNKNOWN = dict.fromkeys(("platform joint", "base joint", "bend", "backlash"), OTHER)
-
 # The probability of the likeliest kind falls between two of these; how often it is the right one?
 SHARES = (0.0, 0.5, 0.7, 0.9, 0.99, 1.0)
-
 FALSE_ALARMS, NAMED_RIGHTLY, REPAIRED, CONFIDENTLY_WRONG, RIGHT_OF_NAMED = 0.05, 0.95, 1.5, 0.10, 0.90
-
 DRIFT, CHECK_EVERY, CHECKS = 20e-6, 0.5, 6  # Struts that grow by so much an hour, m, checked so often, h
 
 

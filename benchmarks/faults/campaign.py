@@ -11,7 +11,7 @@ import numpy as np
 
 from hexapod_comp.formats.texts import aligned
 
-from .judge import MOVER_RECOVERS_WITHIN, RECOVER_WITHIN, Limits, Verdict, judge
+from .judge import MOVER_RECOVERS_WITHIN, RECOVER_WITHIN, Verdict, judge
 from .kinds import KINDS, Fault, kinds_of
 from .record import Happened
 from .rig import Rig
@@ -91,7 +91,7 @@ def run_episode(rig: Rig, episode: Episode) -> Outcome:
     rig.spin(recovery + AFTER)
     record.ended = time.monotonic()
     longest = max(time_now - waited.get(pid, 0.0) for pid, time_now in rig.waited().items())
-    verdict = judge(record, Limits.of(rig.geometry), recovery)
+    verdict = judge(record, rig.geometry.limits, recovery)
     return Outcome(episode, verdict, record.faults, longest / (record.ended - first))
 
 

@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from hexapod_comp.machine.geometry import HexapodGeometry
+from hexapod_comp.machine.limits import Limits
 from hexapod_comp.ros import compensator, strut_drive
 
 from .record import LINKS, Happened, Record, Sent, Status, Struts, Told
@@ -33,22 +33,6 @@ CLOCK_ROUNDING = 1e-6  # Times of this century in seconds are doubles to 0.24 µ
 NOTICED_WITHIN = 0.05  # What a node must not do from a moment on, it may still do for this long, s
 ROUNDING = 1e-9  # Allowed beyond a limit, m: the limits are decimal fractions
 LOOKED_AT = 0.1  # Silence must last so much longer than its limit, s: less may lie between two checks of a node
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What may be published: stroke (6, 2), largest step and largest correction, m, largest speed, m/s."""
-
-    stroke: np.ndarray
-    step: float
-    correction: float
-    speed: float
-
-    @staticmethod
-    def of(geometry: HexapodGeometry) -> Limits:
-        """Return a machine's."""
-        limits = geometry.limits
-        return Limits(limits.stroke, limits.step, limits.correction, limits.speed)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ import numpy as np
 NOTHING, SPOILT, LATE = range(3)  # What is wrong with a message; it is late only if another has overtaken it
 REORDERED_BY = 0.15  # s, overtakes: the controller repeats after 0.1 s, the others publish every few ms
 NANOSECONDS = 1_000_000_000
-
 Rule = Callable[[Any, float], list[tuple[float, Any, int]]]
 """From a message and the time, s: when which message is delivered, and what is wrong with it."""
 

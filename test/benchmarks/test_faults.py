@@ -19,13 +19,13 @@ pytest.importorskip("rclpy")
 
 from benchmarks.faults import wire
 from benchmarks.faults.campaign import STARVED, draw, run_episode
-from benchmarks.faults.judge import VISIBLE, Limits, judge
+from benchmarks.faults.judge import VISIBLE, judge
 from benchmarks.faults.kinds import KINDS, kinds_of
 from benchmarks.faults.record import Happened, Record, Sent, Status, Struts
 from benchmarks.faults.rig import Rig, refusal_to_mount
 from hexapod_comp.ros.status import log_problem
 
-LIMITS = Limits(np.tile([0.33, 0.88], (6, 1)), 2e-3, 2e-3, 0.25)
+LIMITS = SimpleNamespace(stroke=np.tile([0.33, 0.88], (6, 1)), step=2e-3, correction=2e-3, speed=0.25)
 
 PERIOD = 0.004
 """Of the commands in the records made here, s."""
