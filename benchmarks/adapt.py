@@ -1,8 +1,8 @@
 """A machine that moves and calibrates itself: how its parts keep what they promise, on all machines of the tests' zoo.
 
-Usage: python -m benchmarks.adapt [--part moves|warmup|unattended] [--moves 1000] [--machines 4] [--first 1]
+Usage: python -m benchmarks.adapt [--part moves|unattended] [--moves 1000] [--machines 4] [--first 1]
 
-Parts and bars: doc/benchmarks.md; ``warmup`` is :mod:`benchmarks.fusion`.
+Parts and bars: doc/benchmarks.md.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from benchmarks import fusion
 from benchmarks.drawn import Table, of_zoo
 from benchmarks.drawn import machines as zoo
 from hexapod_comp.calibration.evaluation import held_out
@@ -115,7 +114,6 @@ def targets(geometry: HexapodGeometry, rng: np.random.Generator) -> Iterator[tup
 
 
 def judged(geometry: HexapodGeometry, count: int, seed: int) -> Judged:
-    """Plan, sample, differentiate and stop a machine's moves."""
     rng, found = np.random.default_rng([seed, 30]), Judged([], [], 0.0, 0.0, [], [])
     jerkless = replace(RATES, jerk=np.inf)
     for (start, end), _ in zip(targets(geometry, rng), range(count), strict=False):
@@ -269,19 +267,15 @@ def unattended(args: argparse.Namespace) -> bool:
 PARTS = {
     "unattended": unattended,
     "moves": moves,
-    "warmup": lambda args: not fusion.main(["--machines", str(args.machines)]),
 }
 """By name: a part prints what it finds and returns whether its bars are met."""
 
 
 def main() -> int:
-    """Run the parts that are asked for, all of them by default."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--part", choices=PARTS, action="append", help="only this; may be repeated")
     parser.add_argument("--moves", type=int, default=1000, help="moves in all (default 1000)")
-    parser.add_argument(
-        "--machines", type=int, default=4, help="that warm up, of each geometry; that are adapted, in all (default 4)"
-    )
+    parser.add_argument("--machines", type=int, default=4, help="that are adapted (default 4)")
     parser.add_argument("--first", type=int, default=1, help="seed of the first machine (default 1)")
     args = parser.parse_args()
     met = []

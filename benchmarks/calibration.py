@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import drawn
-from benchmarks.smooth_imperfections import with_wavy_field
+from benchmarks.drawn import with_wavy_field
 from hexapod_comp.calibration.evaluation import evaluate_model, held_out
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.lines import fit_lines
@@ -36,12 +36,10 @@ LARGE = replace(SMALL, joint=100e-6, strut_offset=100e-6, pitch=100e-6)
 
 
 def five(**changes: object) -> Campaign:
-    """Return the 5-D campaign, changed."""
     return replace(load_campaign(CONFIG / "campaign_5d.yaml"), **changes)
 
 
 def one(**changes: object) -> Campaign:
-    """Return the 1-D campaign, changed."""
     return replace(load_campaign(CONFIG / "campaign_1d.yaml"), **changes)
 
 
@@ -127,7 +125,6 @@ CASES = (
 
 
 def truth_of(geometry: HexapodGeometry, kind: str, seed: int, box: np.ndarray) -> MachineModel:
-    """Draw a machine of a kind."""
     model = draw_model(geometry, SMALL if kind == "A" else LARGE, seed)
     if kind == "D":
         return with_length_map(model, geometry, seed)
@@ -145,7 +142,6 @@ class Machine:
 
 
 def one_machine(number: int, seed: int) -> Machine:
-    """Measure, fit and judge one machine of a case."""
     case, geometry = CASES[number], load_geometry(CONFIG / "paper.yaml")
     campaign = case.campaign()
     truth = RealMachine(geometry, truth_of(geometry, case.machine, seed, campaign.box))
@@ -194,7 +190,6 @@ def show(found: drawn.Table, case: Case, machines: list[Machine], figure: str) -
 
 
 def main() -> int:
-    """Run the cases and print the table."""
     parser = drawn.options(__doc__, 20)
     parser.add_argument("--case", action="append", help="only cases whose name starts so; may be repeated")
     parser.add_argument("--kind", help="only these kinds of machine, such as AB")

@@ -61,7 +61,6 @@ def command(readings: MeasurementSet) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Print a line for each density."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     text = "times as many readings (default 1.3 14)"
     parser.add_argument("--dense", type=float, nargs="+", default=[1.3, 14], help=text)

@@ -18,8 +18,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks import drawn
+from benchmarks.drawn import with_wavy_field
 from benchmarks.live_machine import LiveMachine
-from benchmarks.smooth_imperfections import with_wavy_field
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.measurements.campaign import Campaign, circle_run
@@ -136,7 +136,6 @@ class Wrong(LiveMachine):
     change: Callable | None = None
 
     def observe(self) -> Observation | None:
-        """Return what is read, changed."""
         seen = super().observe()
         if seen is None or self.change is None:
             return seen
@@ -199,7 +198,6 @@ def outcomes(number: int, seed: int) -> Counter[str]:
 
 
 def main() -> int:
-    """Print a row for each instrument; return 1 where a mistake was missed or right readings were accused."""
     parser = drawn.options(__doc__, 60)
     names = [case.name for case in CASES]
     parser.add_argument("--case", choices=names, action="append", help="this instrument only (default: all)")

@@ -92,11 +92,9 @@ class Genhexkins:
         self.solved(np.full((1, STRUTS), structure.characteristic_length), guess)  # the first call after loading fails
 
     def criterion(self, largest: float) -> None:
-        """Set when it ends, mm."""
         self.set("convergence-criterion", largest)
 
     def set(self, pin: str, value: float) -> None:
-        """Set a pin, as setp does."""
         address = self.stand_in.pin_value(f"genhexkins.{pin}".encode())
         if address is None:
             raise NotHere(f"{NAME}: has no pin {pin}")

@@ -36,7 +36,6 @@ POSES_BAR, GRID_BAR = 1.08e-3, 0.96  # m: what an independent fit of 48 paramete
 
 
 def read(folder: Path, name: str, columns: str) -> MeasurementSet:
-    """Return one of the owner's files."""
     geometry = load_geometry(ROOT / "config" / "jugglebot.yaml")
     return read_wide(folder / name, ROOT / "config" / columns, geometry)
 
@@ -76,7 +75,6 @@ def left_out(measured: MeasurementSet, out: np.ndarray, settings: FitSettings) -
 
 
 def rms(squares: np.ndarray) -> float:
-    """Return the root of a mean."""
     return float(np.sqrt(np.mean(squares)))
 
 
@@ -115,7 +113,6 @@ def grid(folder: Path, workers: int) -> bool:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run both tests."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the three files")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: all cores)")

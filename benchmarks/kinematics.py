@@ -540,7 +540,6 @@ def convergences() -> tuple[str, list[str]]:
 
 
 def main() -> int:
-    """Print the tables; exit 1 when a bar is missed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parts = ("times", "batches", "convergence")
     parser.add_argument("--only", choices=parts, action="append", help="this part; may be repeated (default: all)")

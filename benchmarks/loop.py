@@ -54,11 +54,9 @@ class Line:
 
     @property
     def connected(self) -> bool:
-        """Whether the node listens."""
         return self._publisher.get_subscription_count() > 0
 
     def send(self) -> None:
-        """Send the next command."""
         self._count += 1
         angle, position = self._angle * self._count, self._message.pose.position
         position.x, position.y = self._radius * (float(np.cos(angle)) - 1.0), self._radius * float(np.sin(angle))
@@ -85,7 +83,6 @@ class Row:
 
     @property
     def name(self) -> str:
-        """The rate, for a table."""
         return f"{self.rate_hz:.0f}" if self.rate_hz else "flat out"
 
 
@@ -175,7 +172,6 @@ def measure(bouts: int, rounds: int, seconds: float, floor: bool = False) -> lis
 
 
 def report(rows: list[Row]) -> str:
-    """Return the table of rates and latencies."""
     columns = ["rate, Hz"]
     for figure in ("answers/s", "median, µs", "99 %, µs"):
         columns += [f"{figure}: relay", "ours", "ratio"]
@@ -201,7 +197,6 @@ def problems(rows: list[Row]) -> list[str]:
 
 
 def main() -> int:
-    """Print the table; exit 1 when a bar is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bouts", type=int, default=8)
     parser.add_argument("--rounds", type=int, default=6)

@@ -39,14 +39,12 @@ def of_family(m: MeasurementSet, family: str) -> np.ndarray:
 
 
 def exchanged(m: MeasurementSet, one: str, other: str, family: str = "") -> MeasurementSet:
-    """Return readings with two channels exchanged."""
     a, b = CHANNELS.index(one), CHANNELS.index(other)
     where = np.isin(m.channel, (a, b)) & of_family(m, family)
     return replace(m, channel=np.where(where, a + b - m.channel, m.channel))
 
 
 def reversed_sign(m: MeasurementSet, channel: str, family: str) -> MeasurementSet:
-    """Return readings with the sign of a channel reversed."""
     where = (m.channel == CHANNELS.index(channel)) & of_family(m, family)
     return m.with_values(np.where(where, -m.value, m.value))
 
@@ -59,7 +57,6 @@ def first_named(kind: str, seed: int) -> list[str]:
 
 
 def main() -> int:
-    """Run the kinds and print the table."""
     parser = drawn.options(__doc__, 4, 600, "kind")
     parser.add_argument("--kind", action="append", choices=(*OWN, *FOREIGN), help="only this; may be repeated")
     args = parser.parse_args()

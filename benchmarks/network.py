@@ -157,7 +157,6 @@ def entering(host: subprocess.Popen) -> list[str]:
 
 
 def on_cable(order: str, fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """Something is wrong with the cable."""
     CABLE[0].sendall(f"{order}\n".encode("ascii"))
     yield
     CABLE[0].sendall(b"mend\n")
@@ -218,7 +217,6 @@ def between_hosts(args: argparse.Namespace) -> int:
 
 
 def main() -> int:
-    """Run what this process is there for: it runs three times, outside, at the cable, and on a host."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=5.0, help="of loss and delay")

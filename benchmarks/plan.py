@@ -150,7 +150,6 @@ def between(plan: Proposal, campaign: Campaign) -> tuple[float, float]:
 
 
 def one_goal(name: str, number: int, fits: bool) -> Row:
-    """Propose, compare and try one goal."""
     geometry, machine = of_zoo(name)
     instruments, tilt, error, most = GOALS[number]
     goal = Goal(error, tilt, tuple(instruments.split(",")), float(most), COUNTED)
@@ -179,7 +178,6 @@ COLUMNS += ["achieved", "promised", "s"]
 
 
 def cells(row: Row) -> list[object]:
-    """Return a row of the table, after the machine."""
     goal, plan = row.goal, row.plan
     ends = ["" if pair is None else "…".join(f"{end:.2f}" for end in pair) for pair in (row.interval, row.promised)]
     of_goal = [
@@ -222,7 +220,6 @@ def missed(rows: list[Row]) -> list[str]:
 
 
 def main() -> int:
-    """Print the table; exit 1 when a bar is missed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--goals", type=int, default=20, help="how many, machine by machine (default 20)")
     parser.add_argument("--no-fits", action="store_true", help="expected errors only")

@@ -18,7 +18,7 @@ from scipy import stats
 
 from benchmarks import drawn
 from benchmarks.calibration import LARGE, LEAD, SMALL
-from benchmarks.smooth_imperfections import with_wavy_field
+from benchmarks.drawn import with_wavy_field
 from hexapod_comp.calibration.blocks import WAVES
 from hexapod_comp.calibration.estimator import physical_covariance
 from hexapod_comp.calibration.fit import ModelFit, fit_model
@@ -121,7 +121,6 @@ def with_harmonics(struts: StrutErrors, geometry: HexapodGeometry, rng: np.rando
 
 
 def readings_of(plan: Campaign, truth: RealMachine, hidden: Hidden, kind: str, seed: int) -> MeasurementSet:
-    """Return what the instruments read."""
     empty = template(plan, truth.geometry)
     stations = empty.stations
     lengths = hidden.lengths((stations.positions, stations.rotations), stations.sense)
@@ -209,7 +208,6 @@ class Outcome:
 
     @property
     def width(self) -> float:
-        """Upper end over what is left."""
         return self.high / self.left
 
     @property
@@ -219,7 +217,6 @@ class Outcome:
 
 
 def one_machine(kind: str, seed: int) -> Outcome:
-    """Measure, fit and judge one machine."""
     plan, truth, hidden, measured = setting(kind, seed)
     try:
         fit = fit_model(measured, FitSettings(blocks=KNOWN, lead=LEAD))
@@ -261,7 +258,6 @@ COLUMNS = ["kind", "machines", "kept", "refused", "broken", "left", "expected", 
 
 
 def show(found: drawn.Table, kind: str, outcomes: list[Outcome]) -> None:
-    """Print the row of a kind, with medians."""
     refused = sum(bool(o.refused) for o in outcomes)
     kept = sum(o.kept and not o.refused for o in outcomes)
     medians = (1e6 * np.nanmedian([getattr(o, name) for o in outcomes]) for name in ("left", "expected", "high"))
@@ -272,7 +268,6 @@ def show(found: drawn.Table, kind: str, outcomes: list[Outcome]) -> None:
 
 
 def main() -> int:
-    """Run the kinds and print the table."""
     parser = drawn.options(__doc__, 12, 100, "kind")
     parser.add_argument("--kind", action="append", choices=(*OWN, *FOREIGN), help="only this; may be repeated")
     parser.add_argument("--ablate", action="store_true", help="also other promises of the same fits")

@@ -34,7 +34,6 @@ class RelayNode(MachineNode):
         self._serialized = self._options["serialized"]
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Open topics."""
         self._command_pub = self.publish_on(JointState, "strut_commands", COMMAND_QOS)
         self._correction_pub = self.publish_on(JointState, "strut_corrections", COMMAND_QOS)
         self._estimate_pub = self.publish_on(PoseStamped, "tool_pose_estimate", STATE_QOS)

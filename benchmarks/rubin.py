@@ -67,7 +67,6 @@ def commanded_offset(compensator: Compensator, place: np.ndarray) -> np.ndarray:
 
 
 def si(offsets: np.ndarray) -> np.ndarray:
-    """Return offsets in µm and degrees as m and rad."""
     return np.hstack([offsets[..., :3] * 1e-6, np.radians(offsets[..., 3:])])
 
 
@@ -143,7 +142,6 @@ def laser_and_sky(name: str, coefficients: Sequence[Sequence], geometry: Hexapod
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Put all tables through."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, nargs="?", default=Path("ts_mthexapod"), help="clone of ts_mthexapod")
     parser.add_argument("--config", type=Path, help="clone of ts_config_mttcs: elevation and rotation (optional)")

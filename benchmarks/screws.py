@@ -85,12 +85,10 @@ def geometries() -> dict[str, HexapodGeometry]:
 
 
 def readings(geometry: HexapodGeometry, model: MachineModel, campaign: Campaign, seed: int) -> MeasurementSet:
-    """Return what the virtual instruments read."""
     return measure(template(campaign, geometry, seed), campaign, RealMachine(geometry, model), seed)
 
 
 def search(name: str, geometry: HexapodGeometry, model: MachineModel, campaign: Campaign, seed: int) -> Search:
-    """Look for the lead of one machine."""
     measured = readings(geometry, model, campaign, seed)
     lead, _ = lead_of(measured)
     waves = model.struts.cosine.any() or model.struts.sine.any()

@@ -140,7 +140,6 @@ def nodes() -> Iterator[dict[str, int]]:
 
 
 def soak(seconds: float, rate: float) -> Soak:
-    """Run everything for some seconds."""
     with nodes() as pids, RosSession("soak") as session:
         found, line = Soak([], 0, [], []), Line(session.node, "", RADIUS, rate * TURN_TIME)
 
@@ -169,7 +168,6 @@ def soak(seconds: float, rate: float) -> Soak:
 
 
 def report(found: Soak) -> list[str]:
-    """Return the lines for people."""
     shares = (50.0, 90.0, 99.0, 99.9, 99.99)
     sizes = np.percentile(found.latencies or [np.nan], shares) * 1e-3
     quantiles = "  ".join(f"{share:g} % {size:.0f}" for share, size in zip(shares, sizes, strict=True))
@@ -189,7 +187,6 @@ def report(found: Soak) -> list[str]:
 
 
 def main() -> int:
-    """Print the account; exit 1 when something was lost or memory grew or is too large."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=30.0, help="of the run; 0: memory alone")
     parser.add_argument("--rate-hz", type=float, default=1000.0)

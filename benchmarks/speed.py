@@ -23,7 +23,6 @@ PACKAGES = ("numpy", "scipy", "mujoco", "mujoco-core", "pin", "ros-jazzy-rclpy")
 
 
 def surroundings() -> str:
-    """Return what the figures depend on."""
     lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
     found = [f"processor {os.cpu_count()} × {model}", f"Python {platform.python_version()}"]
@@ -50,7 +49,6 @@ def renewed(page: str, where: str, report: str, problems: list[str]) -> str:
 
 
 def main() -> int:
-    """Measure, print, and write what was asked for; exit 1 when a bar is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--doc", action="store_true", help="renew the tables of doc/speed.md")
     parser.add_argument("--quick", action="store_true", help="a tenth of the time, for trying")

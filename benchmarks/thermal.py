@@ -1,6 +1,6 @@
 """What temperature sensors are worth: machines that warm, compensated from noisy readings.
 
-Usage: python -m benchmarks.thermal [--only stated|fitted|pulls] [--machines 20] [--points 1000] [--noise 0.05]
+Usage: python -m benchmarks.thermal [--only stated|fitted|pulls|fused] [--machines 20] [--points 1000] [--noise 0.05]
 
 Drifts, parts and bars: doc/benchmarks.md. What is judged is the error in space as it is, since a drift moves the datum
 and no alignment may take that out. Exits 1 when a bar is missed.
@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from benchmarks import drawn
@@ -23,14 +25,17 @@ from benchmarks.promise import KNOWN, carelessness, hidden_of, truth_of
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.thermal import MEMBERS, SEEN_SHARE
+from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.compensation.fusion import Fusion, FusionRules, PoseReading
 from hexapod_comp.compensation.thermal import DEFAULT_TIME_CONSTANT, TemperatureFilter
-from hexapod_comp.errors import CalibrationError
+from hexapod_comp.errors import CalibrationError, HexapodError
 from hexapod_comp.machine.geometry import STRUT_NAMES, HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.passes import Passes, random_passes
 from hexapod_comp.machine.temperatures import PARTS, REFERENCE_TEMPERATURE, Temperatures
 from hexapod_comp.machine.trial import Trial
 from hexapod_comp.measurements.campaign import Campaign, load_campaign, template
+from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import draw_model
 from hexapod_comp.virtual.instruments import measure
 from hexapod_comp.virtual.warm_up import SENSED, WarmUp
@@ -284,11 +289,107 @@ def pulled(args: argparse.Namespace) -> bool:
     return found.met
 
 
-PARTS_OF_RUN = {"stated": stated, "fitted": fitted, "pulls": pulled}
+# ---- a pose instrument in place of thermometers ----
+
+FUSED = ("paper", "example_6_6", "framed", "hanging", "inches")
+WARMING = 5.0 / RISE[0] * RISE  # K: struts, base, platform
+LASTS, EVERY, READINGS = 10800, 10, 5  # s of warming, s at each pose, readings there
+NOISE, TURN_NOISE = 2e-6, 1e-5  # of the instrument, m and rad
+WILD, WILD_BY = 0.01, (5e-5, 5e-3)  # share of wild readings, and by how much they are off, m
+REACH, TURNS = 0.06, np.radians(2.0)  # how far from home the tool is sent at most, m along each axis, and turned, rad
+LEFT = 0.25  # the bar
+
+
+def geometry_of(name: str) -> HexapodGeometry:
+    return load_geometry(name) if name == "example_6_6" else drawn.of_zoo(name)[0]
+
+
+def one_fused(name: str, seed: int) -> tuple[np.ndarray, np.ndarray, int, int, int]:
+    """Return squared errors at each arrival, m², without and with fusion; wild readings, those that counted, and true
+    ones that were rejected."""
+    seed, geometry = 99 + seed, geometry_of(name)
+    rng, model = np.random.default_rng([seed, 31]), of_steel(draw_model(geometry, LARGE, seed), seed)
+    hidden, blind, fused = (Compensator(geometry, model, 1.0) for _ in range(3))
+    fusion = Fusion(fused, FusionRules(position_deviation=NOISE, rotation_deviation=TURN_NOISE))
+    course = WarmUp(np.append(WARMING, 0.0), np.append(TAU, 1.0)).apart(0.1, seed).course(LASTS)
+    left: tuple[list[float], list[float]] = ([], [])
+    counts = np.zeros(3, dtype=int)
+    for second in range(EVERY, LASTS, EVERY):
+        for part, value in zip(PARTS, course[second], strict=False):
+            hidden.set_temperature(part, float(value))
+        turn = Rotation.from_rotvec(TURNS * rng.uniform(-1.0, 1.0, 3) / np.sqrt(3.0)).as_matrix()
+        place = geometry.home.position + REACH * rng.uniform(-1.0, 1.0, 3)
+        platform = Pose(place, geometry.home.rotation @ turn)
+        wanted = platform @ geometry.tool
+        for kept, compensator in zip(left, (blind, fused), strict=True):
+            compensator.reset()
+            try:
+                for n in range(2):  # the second takes up what is ramped
+                    commands = compensator.correct(geometry.tool_pose(platform), 0.02 * n).command
+            except HexapodError:
+                break
+            hidden.motion.sense[:] = compensator.motion.sense
+            real = hidden.estimate(commands)
+            kept.append(float(np.square(real[:3] - wanted.position).sum()))
+        else:
+            tool = Pose(real[:3].copy(), real[3:].reshape(3, 3).copy())
+            for n in range(READINGS):
+                counts += _measure(fusion, tool, commands, second + 2.0 * n, rng)
+            fusion.feed(compensate=True)
+    return np.array(left[0]), np.array(left[1]), *counts.tolist()
+
+
+def _measure(fusion: Fusion, tool: Pose, struts: np.ndarray, at: float, rng: np.random.Generator) -> tuple[int, ...]:
+    """Measure once; return whether it was wild, whether it counted all the same, whether a true one was rejected."""
+    position, turn = tool.position + NOISE * rng.standard_normal(3), TURN_NOISE * rng.standard_normal(3)
+    wild = rng.random() < WILD
+    if wild:
+        way = rng.standard_normal(3)
+        position = position + np.exp(rng.uniform(*np.log(WILD_BY))) * way / np.linalg.norm(way)
+    pose = Pose(position, Rotation.from_rotvec(turn).as_matrix() @ tool.rotation)
+    fusion.add_struts(struts.tolist(), at - 0.01)
+    fusion.add(PoseReading(pose, at, fusion.rules.covariance()))
+    rejected = bool(fusion.add_struts(struts.tolist(), at + 0.01))
+    return wild, wild and not rejected, rejected and not wild
+
+
+def cost() -> tuple[float, float]:
+    """Return how long a pose estimate takes, s of processor time, without and with the weighing of fusion."""
+    geometry = geometry_of("paper")
+    compensator = Compensator(geometry, of_steel(draw_model(geometry, LARGE, 1), 1))
+    fusion, times = Fusion(compensator, FusionRules()), []
+    fusion.filter.state = np.full(12, 1e-6)
+    struts = tuple(compensator.correct(geometry.tool_pose(geometry.home)).command.tolist())
+    for weigh in (lambda pose: pose, fusion.weighed):
+        began = time.process_time()
+        for _ in range(2000):
+            weigh(compensator.estimate(struts))
+        times.append((time.process_time() - began) / 2000)
+    return times[0], times[1]
+
+
+def fused(args: argparse.Namespace) -> bool:
+    """Print a row for each geometry; each machine keeps the bar, and no wild reading counts."""
+    columns = ["warm-up of 5 K", "machines", "blind, µm", "fused, µm", "left", "worst", "wild, counted"]
+    found = drawn.Table([*columns, "true, rejected", "bar"])
+    some = argparse.Namespace(**{**vars(args), "machines": max(1, args.machines // len(FUSED))})
+    for name, machines in drawn.results(one_fused, FUSED, some):
+        before, after = (np.array([squares.mean() for squares in one]) for one in list(zip(*machines, strict=True))[:2])
+        wild, passed, refused = np.sum([one[2:] for one in machines], axis=0).tolist()
+        share = refused / (READINGS * sum(len(one[0]) for one in machines))
+        left, worst = um(after) / um(before), np.sqrt((after / before).max())
+        met = bool(worst <= LEFT and not passed)
+        cells = [len(machines), f"{um(before):.2f}", f"{um(after):.2f}", f"{left:.1%}", f"{worst:.1%}"]
+        found.row(name, *cells, f"{wild}, {passed}", f"{share:.2%}", drawn.verdict(LEFT, met), met=met)
+    without, weighed = cost()
+    print(f"\npose estimate: {1e6 * without:.1f} µs, weighed {1e6 * weighed:.1f} µs of processor time")
+    return found.met
+
+
+PARTS_OF_RUN = {"stated": stated, "fitted": fitted, "pulls": pulled, "fused": fused}
 
 
 def main() -> int:
-    """Run the drifts and print the tables."""
     parser = drawn.options(__doc__, 20, of="drift")
     parser.add_argument("--points", type=int, default=1000, help="held-out points (default 1000)")
     parser.add_argument("--noise", type=float, default=0.05, help="standard deviation of a reading, K (default 0.05)")

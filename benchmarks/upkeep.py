@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks import drawn, table
 from benchmarks.calibration import LARGE, LEAD
-from benchmarks.smooth_imperfections import with_wavy_field
+from benchmarks.drawn import with_wavy_field
 from hexapod_comp.calibration.changes import AGEING, DATUM, OTHER, STRUT, TEMPERATURE
 from hexapod_comp.calibration.check import (
     NAMED,
@@ -172,7 +172,6 @@ def answer(verification: Verification, what: str, truth: MachineModel, before: M
 
 
 def one_machine(name: str, seed: int, drifting: int) -> dict:
-    """Return everything about one machine."""
     machine = Machine(name, seed)
     result: dict = {"machine": name, "seed": seed, "fresh": machine.left(machine.truth, machine.model), "checks": []}
     for what in CHANGES | UNKNOWN:
@@ -233,7 +232,6 @@ def named(results: list[dict], size: str) -> tuple[int, float]:
 
 
 def bars(results: list[dict]) -> list[tuple[str, float, float, bool]]:
-    """Return the bars: name, figure, bar, met."""
     alarms = max(others(results, "nothing", size, VALID) for size in SETS)
     strut, repaired = said(results, "strut", CHOSEN)[STRUT] / len(results), repair(results, CHOSEN)[2]
     wrong = {what: others(results, what, "24", OTHER, UNDECIDED, VALID) for what in UNKNOWN}
@@ -250,7 +248,6 @@ def bars(results: list[dict]) -> list[tuple[str, float, float, bool]]:
 
 
 def report(title: str, results: list[dict]) -> str:
-    """Return the figures for people."""
     fresh = np.sqrt(np.mean(np.square([r["fresh"] for r in results])))
     lines = [f"{title}: {len(results)} machines; calibration leaves {fresh:.3f} µm RMS", ""]
     rows = (
@@ -278,7 +275,6 @@ def report(title: str, results: list[dict]) -> str:
 
 
 def main() -> int:
-    """Run all machines and print what came out."""
     parser = drawn.options(__doc__, 100, of="the paper's kind")
     parser.add_argument("--foreign", type=int, default=5, help="of each other kind (default 5)")
     parser.add_argument("--drifting", type=int, default=20, help="of the first, that drift as well (default 20)")

@@ -34,7 +34,6 @@ def chosen(only: str, episodes: int, seed: int, kinds: tuple[str, ...]) -> list[
 
 
 def main() -> int:
-    """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)

@@ -65,7 +65,6 @@ def draw(seed: int, number: int, kinds: Sequence[str] = kinds_of(mover=False)) -
 
 
 def run_episode(rig: Rig, episode: Episode) -> Outcome:
-    """Run one episode and judge it."""
     record = rig.new_record()
     waited, first = rig.waited(), time.monotonic()
     rig.spin(BEFORE)

@@ -63,11 +63,9 @@ class Controller:
 
     @property
     def target(self) -> Pose:
-        """Where the path is at present."""
         return self._path.pose(self._index % len(self._path))
 
     def answered(self, stamp: int, now: float) -> None:
-        """Take the answer to a command."""
         if stamp == self._awaited:
             self._awaited, self._answered_at = 0, now
             self._advance()
@@ -88,7 +86,6 @@ class Controller:
             self._awaited, self._sent_at = self._send(self._next_pose()), now
 
     def due(self) -> float:
-        """Return when the next command is due, monotonic, s."""
         if self.mode is Mode.ASK:
             return float("inf")
         return self._sent_at + (REPEAT_AFTER if self._awaited else 1.0 / RATE)
@@ -158,7 +155,6 @@ class MoverController:
         """The mover plans from where the machine stands."""
 
     def due(self) -> float:
-        """Nothing is due: the mover sends."""
         return float("inf")
 
     def tick(self, now: float, stuck: bool) -> None:

@@ -84,7 +84,6 @@ def judge(record: Record, limits: Limits, within: float = RECOVER_WITHIN) -> Ver
 
 
 def _due(record: Record) -> list[Sent]:
-    """Return the commands that had time to be answered."""
     return [entry for entry in record.sent.values() if entry.sent_at < record.ended - ANSWER_WITHIN]
 
 
@@ -160,7 +159,6 @@ def _distance(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def default_of(node, name: str) -> float:
-    """Return the default of a node's parameter."""
     return next(float(p.default) for p in node.PARAMETERS if p.name == name)
 
 

@@ -51,7 +51,6 @@ class Kind:
 
 
 def waiting(seconds: float) -> Iterator[None]:
-    """Yield for some seconds."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         yield
@@ -275,7 +274,6 @@ Drawn = tuple[wire.Rule, str]
 def on_link(
     link: str, draw: Callable[[np.random.Generator, str], Drawn], fault: Fault, rig: Rig, happened: Happened
 ) -> Iterator[None]:
-    """Something is wrong on one of the links."""
     rule, happened.detail = draw(fault.rng, link)
     rig.wires[link].marks, rig.wires[link].rule = happened.marks, rule
     yield

@@ -82,7 +82,6 @@ class Record:
     ended: float = math.inf  # what was sent just before has had no time to be answered
 
     def said(self, node: str) -> list[Status]:
-        """Return the statuses of a node, oldest first."""
         return [status for status in self.statuses if status.node == node]
 
     def continued(self) -> Record:

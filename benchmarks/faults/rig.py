@@ -69,18 +69,15 @@ class LogDisk:
             self.why_not = str(error)
 
     def fill(self) -> None:
-        """Fill it: not one more byte."""
         assert not self.why_not
         with (self.folder / "filler").open("wb", buffering=0) as file, contextlib.suppress(OSError):
             while True:
                 file.write(b"\0" * 4096)
 
     def clear(self) -> None:
-        """Make room again."""
         (self.folder / "filler").unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Unmount it."""
         if not self.why_not:
             subprocess.run(["umount", "--lazy", str(self.folder)], capture_output=True, check=False)
 
@@ -205,7 +202,6 @@ class Rig:
             self.record.fresh_starts.append(time.monotonic())
 
     def start_all(self) -> None:
-        """Start the processes, and wait until the machine moves."""
         for name in MODULES if self.has_mover else ("compensator", "drive"):
             self._down_since[name] = time.monotonic()
             self.start(name)
@@ -232,17 +228,14 @@ class Rig:
     # ---- faults of processes ----
 
     def kill(self, name: str) -> None:
-        """End a process with kill -9."""
         self._down_since[name] = time.monotonic()
         self.processes[name].send(signal.SIGKILL)  # to wait for its end would stop the harness for a while
 
     def freeze(self, name: str) -> None:
-        """Stop a process as Ctrl-Z does."""
         self._down_since[name] = time.monotonic()
         self.processes[name].send(signal.SIGSTOP)
 
     def thaw(self, name: str) -> None:
-        """Let it go on."""
         self.processes[name].send(signal.SIGCONT)
         self._is_up(name, time.monotonic())
 
@@ -380,7 +373,6 @@ class Rig:
             self._executor.spin_once(timeout_sec=max(0.0, due - time.monotonic()))
 
     def new_record(self) -> Record:
-        """Begin the record of another episode."""
         self.record = self.record.continued()
         return self.record
 

@@ -69,7 +69,6 @@ def _to_some(rng: np.random.Generator, share: float, happen: Rule) -> Rule:
 
 
 def drop(rng: np.random.Generator, share: float) -> Rule:
-    """Lose messages."""
     return _to_some(rng, share, lambda message, now: [])
 
 
@@ -91,8 +90,6 @@ def delay(seconds: float, too_old: bool = False) -> Rule:
 
 
 def corrupt(rng: np.random.Generator, share: float, spoil: Callable[[Any], object]) -> Rule:
-    """Spoil messages."""
-
     def happen(message: Any, now: float) -> list[tuple[float, Any, int]]:
         spoil(message)
         return [(now, message, SPOILT)]
