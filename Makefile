@@ -117,7 +117,7 @@ constraints: $(VENV)/made-in
 	$(BIN)/python tools/lock_hashes.py
 
 bench: $(VENV)/with-ros,bench $(CORE)
-	@$(BIN)/python -m benchmarks
+	@$(BIN)/python -m benchmarks.speed
 
 papers: $(VENV)/with-ros $(CORE)
 	@$(BIN)/python -m examples.papers

@@ -1,10 +1,8 @@
 """The core in C: the same bits under every compiler and instruction set that is here, and what a command takes.
 
-``test/core/driver.c`` goes through all that the core does, on a shipped machine, and prints each number in full. It is
-compiled by gcc, clang and zig, for each width of vectors, for 32-bit x86 and for ARM under QEMU (Debian packages:
-clang, gcc-i686-linux-gnu, gcc-arm-linux-gnueabihf, qemu-user; PyPI: ziglang), and with sanitizers. What a build prints
-is compared with gcc's: no C library's sine or exponential is in it. Then one thread times commands and estimates, as a
-servo thread makes them, and LinuxCNC's genhexkins beside them, on the same poses in turn.
+What ``test/core/driver.c`` prints under other compilers (Debian packages: clang, gcc-i686-linux-gnu,
+gcc-arm-linux-gnueabihf, qemu-user; PyPI: ziglang) and sanitizers is compared with gcc's: no C library's sine or
+exponential is in it. Then one thread times commands and estimates, and LinuxCNC's genhexkins on the same poses in turn.
 
 Run ``python -m benchmarks.c_core [--only bits|times]``. Exits 1 when a bit differs, a sanitizer complains or a bar is
 missed, 2 without gcc.

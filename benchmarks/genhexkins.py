@@ -1,8 +1,7 @@
 """LinuxCNC's own compiled hexapod kinematics, as Debian's linuxcnc-uspace installs it, without LinuxCNC.
 
-The module is loaded beside a small stand-in for the HAL (genhexkins.c, ours, compiled into a temporary folder), and
-gets the paper's machine by its pins, in mm and degrees as LinuxCNC has them. Who has no such module, or no C
-compiler, is told so and goes without.
+The module is loaded beside a small stand-in for the HAL, genhexkins.c, and gets the paper's machine by its pins, in mm
+and degrees.
 """
 
 from __future__ import annotations

@@ -3,9 +3,6 @@
 Run ``python -m benchmarks.kinematics [--only times|batches|convergence]``; doc/speed.md explains the tables. MuJoCo,
 Pinocchio and LinuxCNC are optional: a peer that is not installed is reported as missing. Exits 1 when a bar is missed,
 or somebody's numbers differ from ours; 2 where convergence alone is wanted and there is no genhexkins.
-
-genhexkins treats a small rotation as a change of roll, pitch and yaw. At a yaw ψ that turns its steps by ψ, so the
-error left by a step is 2·sin(ψ/2) of the one before: linear convergence, and from 60° on none, however near the guess.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -35,9 +36,9 @@ RATES = (250.0, 500.0, 1000.0, 0.0)
 BAR_RATE, BAR_MEDIAN, BAR_P99 = 0.95, 1.10, 1.25
 GIVE_UP = 0.05  # An answer that takes longer, s, is not waited for
 START_WITHIN = 180.0  # The nodes may have to compile first, s
-BLIND = "start_without_feedback_after:=0.1"  # There are no struts here
 OURS, RELAY = "ours", "relay"
-MODEL = "model_file:=paper_machine.yaml"
+QUIET = "--log-level warn -r __ns:=/"
+ALONE = "-p marker_rate:=0.0 -p start_without_feedback_after:=0.1 -p model_file:=paper_machine.yaml"  # without struts
 
 
 class Line:
@@ -87,17 +88,14 @@ class Row:
 
 
 @contextmanager
-def process(module: str, namespace: str, *parameters: str) -> Iterator[subprocess.Popen]:
-    """Run a node in a namespace until the block ends."""
-    arguments = ["--ros-args", "-r", f"__ns:=/{namespace}", "--log-level", "warn"]
-    for parameter in parameters:
-        arguments += ["-p", parameter]
-    child = subprocess.Popen([sys.executable, "-m", module, *arguments])
+def process(module: str, arguments: str, **options: Any) -> Iterator[subprocess.Popen]:
+    """Run a node with arguments of ROS until the block ends."""
+    child = subprocess.Popen([sys.executable, "-m", module, "--ros-args", *arguments.split()], **options)
     try:
         yield child
     finally:
         child.terminate()
-        child.wait(10)
+        child.wait(20)
 
 
 def one_round(
@@ -149,8 +147,8 @@ def measure(bouts: int, rounds: int, seconds: float, floor: bool = False) -> lis
     """Run everything and return one row per rate; `floor`: against the relay that does not even look at messages."""
     with ExitStack() as stack:
         stack.enter_context(PrivateDomain())
-        stack.enter_context(process("hexapod_comp.ros.compensator", OURS, "marker_rate:=0.0", BLIND, MODEL))
-        stack.enter_context(process("benchmarks.relay", RELAY, f"serialized:={str(floor).lower()}"))
+        stack.enter_context(process("hexapod_comp.ros.compensator", f"{QUIET}{OURS} {ALONE}"))
+        stack.enter_context(process("benchmarks.relay", f"{QUIET}{RELAY} -p serialized:={str(floor).lower()}"))
         session = stack.enter_context(RosSession("bench"))
         lines = {name: Line(session.node, f"/{name}") for name in (OURS, RELAY)}
         session.wait(lambda: all(line.connected for line in lines.values()), START_WITHIN, "both nodes")

@@ -1,9 +1,7 @@
 """Compensator and drive on two hosts: network namespaces, and a cable that is cut, loses frames or delays them.
 
-The controller stands beside the compensator. The cable is one of ours in user space, since not every kernel has netem.
-Exits 2, with the reason, where namespaces are not permitted.
-
-Usage: python -m benchmarks.network [--rounds 3] [--seconds 5] [--seed 0] [--only cut,loss,delay,long_cut]
+Usage: python -m benchmarks.network [--rounds 3] [--seconds 5] [--seed 0] [--only cut,loss,delay,long_cut]; see
+doc/faults.md. Exits 2, with the reason, where namespaces are not permitted.
 """
 
 from __future__ import annotations

@@ -1,10 +1,7 @@
 """A node that does nothing: topics, message types, QoS and number of messages of the compensator, and no thought.
 
-It shows what DDS and rclpy cost by themselves; :mod:`benchmarks.loop` holds the compensator against it. Like the
-compensator it runs in the package's own spin loop, answers every command with two strut messages of six
-positions and six velocities, and fifty times a second, while commands come, tells where the tool is. With the
-parameter ``serialized`` it neither looks at what comes nor makes what goes: the same bytes go out each time, but for
-the stamp. That is what no node can be faster than.
+:mod:`benchmarks.loop` holds the compensator against it: doc/benchmarks.md. With the parameter ``serialized`` it neither
+parses what comes nor makes what goes: the same bytes go out each time, but for the stamp.
 """
 
 from __future__ import annotations

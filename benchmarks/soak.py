@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -28,7 +28,7 @@ from sensor_msgs.msg import JointState, Temperature
 from std_msgs.msg import UInt64
 
 from benchmarks import judged
-from benchmarks.loop import Line, one_round
+from benchmarks.loop import Line, one_round, process
 from hexapod_comp.loop.processes import PrivateDomain
 from hexapod_comp.ros.base import EVENT_QOS
 from hexapod_comp.ros.process import SPIN_PERIOD, RosSession
@@ -122,21 +122,15 @@ def memory(messages: int) -> bool:
 def nodes() -> Iterator[dict[str, int]]:
     """Run both nodes in a private domain, their log into a pipe that nobody reads; give their process ids."""
     unread, sink = os.pipe()
-    children = {}
-    with PrivateDomain():
-        try:
-            for name in NODES:
-                command = [sys.executable, "-m", f"hexapod_comp.ros.{name}", "--ros-args"]
-                command += ["-p", "compensator:model_file:=paper_machine.yaml"]
-                children[name] = subprocess.Popen(command, stderr=sink, stdin=subprocess.DEVNULL)
-            yield {name: child.pid for name, child in children.items()}
-        finally:
-            for child in children.values():
-                child.terminate()
-            for child in children.values():
-                child.wait(20)
-            os.close(unread)
-            os.close(sink)
+    with PrivateDomain(), ExitStack() as stack:
+        stack.callback(os.close, unread)
+        stack.callback(os.close, sink)
+        arguments, options = (
+            "-p compensator:model_file:=paper_machine.yaml",
+            {"stderr": sink, "stdin": subprocess.DEVNULL},
+        )
+        children = [process(f"hexapod_comp.ros.{name}", arguments, **options) for name in NODES]
+        yield {name: stack.enter_context(child).pid for name, child in zip(NODES, children, strict=True)}
 
 
 def soak(seconds: float, rate: float) -> Soak:
