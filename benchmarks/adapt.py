@@ -44,18 +44,6 @@ OPTIMUM, KEPT = 1.02, 1.0 + 1e-3  # the bars: times toppra's optimum, and times 
 GRID = 1000  # sections on which toppra looks for it
 
 
-@dataclass
-class Judged:
-    """What is known of the moves of a machine."""
-
-    over_optimum: list[float]
-    over_jerkless: list[float]  # time with the limit of jerk over that without
-    worst: float  # largest speed, acceleration or jerk, over its limit
-    stops_worst: float  # the same of moves that were stopped
-    stopped_within: list[float]  # s
-    planning: list[float]  # processor's time of a plan, s
-
-
 def struts(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     """Return strut lengths of tool poses in work by vectors alone, shape (N, 6), m."""
     turned = geometry.work.rotation @ rotations @ geometry.tool.rotation.T
@@ -64,18 +52,16 @@ def struts(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarr
     return np.linalg.norm(joints - geometry.base_joints, axis=2)
 
 
-def share_of_limits(
-    geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, rates: StrutRates
-) -> float:
+def share_of_limits(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> float:
     """Return the largest speed, acceleration or jerk of a strut, by differences, over its limit."""
     lengths, worst = struts(geometry, positions, rotations), 0.0
-    for order, limit in enumerate((rates.speed, rates.acceleration, rates.jerk), start=1):
-        if len(lengths) > order and np.isfinite(limit):
+    for order, limit in enumerate((RATES.speed, RATES.acceleration, RATES.jerk), start=1):
+        if len(lengths) > order:
             worst = max(worst, float(np.abs(np.diff(lengths, order, axis=0)).max()) * RATE**order / limit)
     return worst
 
 
-def optimum(motion: Motion, rates: StrutRates) -> float:
+def optimum(motion: Motion) -> float:
     """Return the least time of a leg under limits of speed and acceleration, s, as toppra finds it."""
     import toppra
     from toppra import algorithm, constraint
@@ -84,7 +70,7 @@ def optimum(motion: Motion, rates: StrutRates) -> float:
     lengths = motion.leg.struts(s)[0]
     way = float(np.ptp(lengths, axis=0).max())  # in which toppra counts: its solver's tolerances are absolute
     path = toppra.SplineInterpolator(s, lengths / way)
-    speed, acceleration = (np.tile([-most, most], (6, 1)) / way for most in (rates.speed, rates.acceleration))
+    speed, acceleration = (np.tile([-most, most], (6, 1)) / way for most in (RATES.speed, RATES.acceleration))
     limits = [
         constraint.JointVelocityConstraint(speed),
         constraint.JointAccelerationConstraint(acceleration, constraint.DiscretizationType.Interpolation),
@@ -113,27 +99,28 @@ def targets(geometry: HexapodGeometry, rng: np.random.Generator) -> Iterator[tup
             yield start, end
 
 
-def judged(geometry: HexapodGeometry, count: int, seed: int) -> Judged:
-    rng, found = np.random.default_rng([seed, 30]), Judged([], [], 0.0, 0.0, [], [])
-    jerkless = replace(RATES, jerk=np.inf)
+def judged(geometry: HexapodGeometry, count: int, seed: int) -> np.ndarray:
+    """Plan, sample, differentiate and stop a machine's moves; return a row for each.
+
+    Time over toppra's optimum, and over that without a limit of jerk; the largest share of a limit, and that of the
+    move when it is stopped; the duration of the stop, and the processor's time of the plan, s.
+    """
+    rng, found, jerkless = np.random.default_rng([seed, 30]), [], replace(RATES, jerk=np.inf)
     for (start, end), _ in zip(targets(geometry, rng), range(count), strict=False):
         (quick,) = plan_motion(geometry, [start, end], jerkless)
         began = time.process_time()
         (motion,) = plan_motion(geometry, [start, end], RATES)
-        found.planning.append(time.process_time() - began)
-        found.over_optimum.append(quick.duration / optimum(quick, jerkless))
-        found.over_jerkless.append(motion.duration / quick.duration)
-        sent = motion.sample(RATE)
-        found.worst = max(found.worst, share_of_limits(geometry, sent.positions, sent.rotations, RATES))
+        planning, sent = time.process_time() - began, motion.sample(RATE)
         tick = int(rng.integers(0, len(sent)))
         stop = motion.stop(min(tick / RATE, motion.duration), RATE)
         both = (
             np.concatenate([a[:tick], b])
             for a, b in ((sent.positions, stop.positions), (sent.rotations, stop.rotations))
         )
-        found.stops_worst = max(found.stops_worst, share_of_limits(geometry, *both, RATES))
-        found.stopped_within.append((len(stop) - 1) / RATE)
-    return found
+        shares = share_of_limits(geometry, sent.positions, sent.rotations), share_of_limits(geometry, *both)
+        times = quick.duration / optimum(quick), motion.duration / quick.duration
+        found.append((*times, *shares, (len(stop) - 1) / RATE, planning))
+    return np.array(found)
 
 
 def moves(args: argparse.Namespace) -> bool:
@@ -149,12 +136,11 @@ def moves(args: argparse.Namespace) -> bool:
     columns = ["machine", "moves", "over toppra", "largest", "over 1.02", "of a limit", "stops", "with jerk", "plan"]
     table = Table(columns)
     for name in tqdm(machines, disable=None):
-        found = judged(of_zoo(name)[0], each, args.first)
-        ratio, stop = np.array(found.over_optimum), np.median(found.stopped_within) * 1e3
-        met = bool((ratio <= OPTIMUM).all()) and max(found.worst, found.stops_worst) <= KEPT
-        over = [f"{np.median(ratio):.4f}", f"{ratio.max():.4f}", int((ratio > OPTIMUM).sum()), f"{found.worst:.4f}"]
-        ends = [f"{found.stops_worst:.4f}, {stop:.0f} ms", f"{np.median(found.over_jerkless):.2f} ×"]
-        table.row(name, each, *over, *ends, f"{np.median(found.planning) * 1e3:.0f} ms", met=met)
+        ratio, jerk, share, stopped, duration, planning = judged(of_zoo(name)[0], each, args.first).T
+        met = bool((ratio <= OPTIMUM).all()) and max(share.max(), stopped.max()) <= KEPT
+        over = [f"{np.median(ratio):.4f}", f"{ratio.max():.4f}", int((ratio > OPTIMUM).sum()), f"{share.max():.4f}"]
+        ends = [f"{stopped.max():.4f}, {np.median(duration) * 1e3:.0f} ms", f"{np.median(jerk):.2f} ×"]
+        table.row(name, each, *over, *ends, f"{np.median(planning) * 1e3:.0f} ms", met=met)
     return table.met
 
 

@@ -16,9 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from benchmarks import drawn
-from benchmarks.calibration import LARGE, LEAD, SMALL
-from benchmarks.drawn import with_wavy_field
+from benchmarks import calibration, drawn
+from benchmarks.calibration import LEAD
 from hexapod_comp.calibration.blocks import WAVES
 from hexapod_comp.calibration.estimator import physical_covariance
 from hexapod_comp.calibration.fit import ModelFit, fit_model
@@ -32,7 +31,7 @@ from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.trial import Trial
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
-from hexapod_comp.virtual.imperfections import draw_model, with_length_map, with_wear
+from hexapod_comp.virtual.imperfections import with_wear
 from hexapod_comp.virtual.instruments import measure, station_errors
 
 GEOMETRIES = ("paper", "offset", "framed", "hanging", "inches", "mirror")
@@ -94,11 +93,9 @@ def hidden_of(geometry: HexapodGeometry, kind: str, rng: np.random.Generator) ->
 
 def truth_of(geometry: HexapodGeometry, kind: str, box: np.ndarray, seed: int) -> MachineModel:
     """Draw a machine of a kind, without what :class:`Hidden` adds."""
-    model = draw_model(geometry, SMALL if kind == "A" else LARGE, seed)
-    if kind == "D":
-        return with_length_map(model, geometry, seed)
-    if kind == "G":
-        return with_wavy_field(model, box, seed)
+    model = calibration.truth_of(geometry, kind, seed, box)
+    if kind in ("D", "G"):
+        return model
     if kind == "worn":
         return with_wear(model, geometry, seed)
     if kind in ("harmonics", "all"):
