@@ -171,6 +171,7 @@ def compensators(geometry: HexapodGeometry) -> dict[str, Compensator]:
     for name in ("strut_1", "strut_4", "base", "platform"):
         warm.set_temperature(name, 23.0)
     turning, weight = cardan(geometry), Load(stiffness=np.full(6, 20e6), lost_motion=np.full(6, 1e-6), mass=30.0)
+    rubbing = replace(weight, friction=np.full(6, 0.5))
     return {
         "ideal": with_block(),
         "structure": with_block(**joints),
@@ -181,6 +182,7 @@ def compensators(geometry: HexapodGeometry) -> dict[str, Compensator]:
         "thermal": warm,
         "field": with_block(field=whole.field),
         "load": with_block(load=weight),
+        "load, friction": with_block(load=rubbing),
         "all of them": Compensator(geometry, whole),
     }
 

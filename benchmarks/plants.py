@@ -1,39 +1,23 @@
 """Machines that bend, with MuJoCo as the hidden truth: calibrated under one load, told others, or not told.
 
-Each plant is drawn from its own seed: a geometry of several, ±20 µm on joints and struts, screws that err, a platform
-of 20 kg and a spindle of 10 kg, struts of 20 to 60 N/µm, no two alike, on joints ten times as stiff, and, by the case,
-struts that are up to 6 µm longer when pulled than when pushed, and bearings that rub. It is measured by a 5-D laser or
-a tracker (3 µm, its poses tilted up to 5° and approached one from the other), with the spindle; stated are one
-stiffness for all struts, off by some 10 %, what the platform weighs, and how the cardan joints are mounted. Fitted as
-``hexapod_comp fit --load`` does it, it is judged at random points, both ways, the datum aligned: with the load of the
-readings, with 5 kg less and 10 kg more that the model is told of or not, and with gravity turned to elevations of 20 to
-90°. Then 24 check readings under the other payloads, of which nobody tells, go to ``verify``. The same once more with a
-stiffness that readings without the spindle refine.
-
-With ``--alike``: the readings with the spindle alone, fitted with other correlations of the six struts' stiffnesses,
-clearances, and frictions than the assumed one.
-
-Usage: python -m benchmarks.plants [--machines 5] [--first 300] [--workers 2] [--off 0.1] [--case NAME ...] [--json]
+Usage: python -m benchmarks.plants [--machines 5] [--first 300] [--workers 2] [--off 0.1] [--case NAME ...]
                                    [--alike 0 0.5 0.75 0.95]
 
-Exits 1 when a bar is missed, 2 without MuJoCo: 97 % removed at the load of the readings, 95 % at other elevations, the
-promise kept in 93 %, also that for other loads, at other payloads at most 1.3 times what is left at that of the
-readings, and of the changes of payload that ``verify`` notices 90 % called by that name.
+Plants, fits and bars: doc/benchmarks.md. With ``--alike``: the readings with the spindle alone, fitted with other
+correlations of the six struts' stiffnesses, clearances, and frictions than the assumed one. Exits 2 without MuJoCo.
 """
 
 from __future__ import annotations
 
-import json
 import sys
-import tempfile
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
-from benchmarks import drawn
+from benchmarks import cannot_run, drawn
 from benchmarks.calibration import LEAD, SMALL
 from hexapod_comp.calibration.assumptions import ASSUMED
 from hexapod_comp.calibration.changes import PAYLOAD
@@ -45,7 +29,6 @@ from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.posterior import FittedParameters
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.machine.arrays import rms
-from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.load import STANDARD_GRAVITY, Load, Loading, Payload
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.robot_description import foot_frames
@@ -55,9 +38,6 @@ from hexapod_comp.measurements.runs import assemble, joined
 from hexapod_comp.virtual.imperfections import draw_model
 from hexapod_comp.virtual.instruments import measure
 from hexapod_comp.virtual.physics import PhysicalMachine, Physics, find_mujoco
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
-from foreign_machines import machines as zoo
 
 GEOMETRIES = ("paper", "framed", "hanging", "inches", "mirror")
 KINDS = ("compliance", "clearance", "clearance and friction")
@@ -121,12 +101,8 @@ class Bench:
     """A plant to measure and to judge."""
 
     def __init__(self, kind: str, instrument: str, seed: int) -> None:
-        machine, self.seed = zoo()[GEOMETRIES[seed % len(GEOMETRIES)]], seed
-        with tempfile.TemporaryDirectory() as folder:
-            geometry = load_geometry(machine.write(Path(folder) / "geometry.yaml"))
-        self.geometry = replace(
-            geometry, base_axes=foot_frames(geometry)[:, :, 1]
-        )  # as MuJoCo's cardan joints have them
+        (geometry, machine), self.seed = drawn.of_zoo(GEOMETRIES[seed % len(GEOMETRIES)]), seed
+        self.geometry = replace(geometry, base_axes=foot_frames(geometry)[:, :, 1])  # as of MuJoCo's cardan joints
         sides, rng = 2.0 * np.array(machine.half), np.random.default_rng([seed, 31])
         cell, step = min(sides.max() / 2.0, sides.min()), sides.max() / 10.0
         tracker = instrument == "tracker"
@@ -240,128 +216,62 @@ def one_plant(case: tuple[str, str], seed: int, off: float = 0.1, alike: Sequenc
     return Plant(seed, bench.geometry.name, bench.left(None, SPINDLE), rms(bench.elevated(None)), fits, said)
 
 
-@dataclass(frozen=True)
-class Row:
-    """Plants of a case fitted in one way; lengths in µm, RMS over the plants."""
-
-    case: str
-    fit: str
-    plants: int
-    before_um: float
-    left_um: float
-    removed: float
-    kept: int
-    kept_others: int  # of the told cases
-    others: int
-    refused: int
-    times: dict[str, float]  # what is left under other payloads that are told, beside what is left at that of the fit
-    untold: float  # the most that is left where nobody tells, beside the same
-    elevated: float  # removed at other elevations
-    said: dict[str, int]  # what verify says of other payloads that nobody tells, and how often
+COLUMNS = ["plants", "stiffness", "before, µm", "left, µm", "removed", "promise kept", "at other loads", "refused"]
+COLUMNS += [*(f"{name}, told" for name in OTHERS), "not told", "removed, 20–90°", "not told, `verify` says"]
 
 
-def summed_up(case: str, fit: str, plants: list[Plant]) -> Row:
-    """Return the row of some plants."""
+def row_of(case: str, fit: str, plants: list[Plant]) -> tuple[list[object], list[tuple[str, float, float, bool]]]:
+    """Return a row of plants fitted in one way, sizes RMS over them, and its bars: name, figure, bar, met."""
     fits = [plant.fits[fit] for plant in plants]
-
     before, left = rms([plant.before for plant in plants]), rms([fitted.left for fitted in fits])
-    times, untold = (
-        {name: rms([getattr(fitted, told)[name] for fitted in fits]) / left for name in OTHERS}
-        for told in ("told", "untold")
+    told, untold = (
+        [rms([getattr(fitted, which)[name] for fitted in fits]) / left for name in OTHERS]
+        for which in ("told", "untold")
     )
     elevated = 1.0 - rms([f.elevated for f in fits]) / rms([plant.before_elevated for plant in plants])
-    answers = [word for plant in plants for word in plant.said.values()] if fit == STATED else []
-    said = {word: answers.count(word) for word in sorted(set(answers), key=lambda word: -answers.count(word))}
-    kept, refused = sum(fitted.kept for fitted in fits), sum(bool(fitted.refused) for fitted in fits)
-    others = [kept for fitted in fits for kept in fitted.others]
-    removed = 1.0 - left / before
-    return Row(
-        case,
-        fit,
-        len(plants),
-        1e6 * before,
-        1e6 * left,
-        removed,
-        kept,
-        sum(others),
-        len(others),
-        refused,
-        times,
-        max(untold.values()),
-        elevated,
-        said,
-    )
-
-
-def shown(row: Row) -> str:
-    """Return a row of the table."""
-    times = " | ".join(f"{times:.2f} ×" for times in row.times.values())
-    said = ", ".join(f"{word} {count}" for word, count in row.said.items())
-    cells = f"{row.before_um:.2f} | {row.left_um:.3f} | {100.0 * row.removed:.1f} % | {row.kept} of {row.plants}"
-    cells += f" | {row.kept_others} of {row.others}"
-    times += f" | {'' if np.isnan(row.untold) else f'{row.untold:.2f} ×'} | {100.0 * row.elevated:.1f} %"
-    return f"| {row.case} | {row.fit} | {cells} | {row.refused} | {times} | {said} |"
-
-
-def bars(row: Row) -> list[tuple[str, float, float, bool]]:
-    """Return the bars of a row over all plants: name, figure, bar, met."""
-    times, kept = max(row.times.values()), row.kept / row.plants
-    found = [
-        ("removed at the load of the readings", row.removed, REMOVED, row.removed >= REMOVED),
-        ("promise kept", kept, KEPT, kept >= KEPT),
-        ("promise kept at other loads, told", row.kept_others / row.others, KEPT, row.kept_others >= KEPT * row.others),
+    said = Counter(word for plant in plants for word in plant.said.values() if fit == STATED)
+    removed, kept = 1.0 - left / before, [[f.kept for f in fits], [one for f in fits for one in f.others]]
+    cells = [case, fit, f"{1e6 * before:.2f}", f"{1e6 * left:.3f}", f"{100.0 * removed:.1f} %"]
+    cells += [*(f"{sum(one)} of {len(one)}" for one in kept), sum(bool(fitted.refused) for fitted in fits)]
+    cells += [*(f"{times:.2f} ×" for times in told), "" if np.isnan(max(untold)) else f"{max(untold):.2f} ×"]
+    cells += [f"{100.0 * elevated:.1f} %", ", ".join(f"{word} {count}" for word, count in said.most_common())]
+    shares, times = [sum(one) / len(one) for one in kept], max(told)
+    bars = [
+        ("removed at the load of the readings", removed, REMOVED, removed >= REMOVED),
+        ("promise kept", shares[0], KEPT, shares[0] >= KEPT),
+        ("promise kept at other loads, told", shares[1], KEPT, shares[1] >= KEPT),
         ("left with other payloads, told, times that at the readings'", times, TIMES, times <= TIMES),
-        ("removed at elevations of 20 to 90°, told", row.elevated, ELEVATED, row.elevated >= ELEVATED),
+        ("removed at elevations of 20 to 90°, told", elevated, ELEVATED, elevated >= ELEVATED),
     ]
-    if noticed := sum(count for word, count in row.said.items() if word != VALID):
-        share = row.said.get(PAYLOAD, 0) / noticed
-        found.append(("payload named where a change of it is noticed", share, NAMES, share >= NAMES))
-    return found
-
-
-def as_rows(case: str, plants: list[Plant]) -> list[str]:
-    """Return the rows of a case."""
-    return [shown(summed_up(case, fit, plants)) for fit in plants[0].fits]
-
-
-def as_json(case: tuple[str, str], plants: list[Plant]) -> list[str]:
-    """Return a line for each plant."""
-    return [json.dumps({"kind": case[0], "instrument": case[1], **asdict(plant)}) for plant in plants]
-
-
-HEADER = "| plants | stiffness | before, µm | left, µm | removed | promise kept | at other loads | refused | " + (
-    " | ".join(f"{name}, told" for name in OTHERS) + " | not told | removed, 20–90° | not told, `verify` says |"
-)
+    if noticed := said.total() - said[VALID]:
+        share = said[PAYLOAD] / noticed
+        bars.append(("payload named where a change of it is noticed", share, NAMES, share >= NAMES))
+    return cells, bars
 
 
 def main() -> int:
-    """Run the cases and print the table."""
     parser = drawn.options(__doc__, 5, 300, "case")
     parser.add_argument("--off", type=float, default=0.1, help="1 σ of the stated stiffness, a share (default 0.1)")
     parser.add_argument("--case", action="append", help="only cases whose name starts so; may be repeated")
     parser.add_argument("--alike", type=float, nargs="+", default=(), help="correlations of struts to try")
-    parser.add_argument("--json", action="store_true", help="a line of JSON a plant instead of a table")
     args = parser.parse_args()
     try:
         find_mujoco()
     except HexapodError as error:
-        print(f"plants: {error}", file=sys.stderr)
-        return 2
+        return cannot_run(str(error))
     cases = [case for case in CASES if not args.case or ", ".join(case).startswith(tuple(args.case))]
-    every = []
-    if not args.json:
-        print(HEADER + "\n|---|---" + "|---:" * 10 + "|---|", flush=True)
+    every, table, met = list[Plant](), drawn.Table(COLUMNS, texts=2), True
     for case, plants in drawn.results(partial(one_plant, off=args.off, alike=args.alike), cases, args):
         every += plants
-        for text in as_json(case, plants) if args.json else as_rows(", ".join(case), plants):
-            drawn.show(text)
-    rows = [summed_up("all", fit, every) for fit in every[0].fits]
-    if not args.json:
-        print("\n".join(map(shown, rows)))
-    judged = [(row.fit, *bar) for row in rows for bar in bars(row)]
-    for fit, name, value, bar, met in judged:
-        print(f"{fit}: {name}: {value:.3f}, bar {bar:g}: {'met' if met else 'MISSED'}", file=sys.stderr)
-    return 0 if all(bar[-1] for bar in judged) else 1
+        for fit in plants[0].fits:
+            table.row(*row_of(", ".join(case), fit, plants)[0])
+    for fit in every[0].fits:
+        cells, bars = row_of("all", fit, every)
+        table.row(*cells)
+        for name, value, bar, good in bars:
+            print(f"{fit}: {name}: {value:.3f}, bar {bar:g}: {'met' if good else 'MISSED'}", file=sys.stderr)
+            met &= good
+    return 0 if met else 1
 
 
 if __name__ == "__main__":
