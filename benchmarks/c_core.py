@@ -106,16 +106,16 @@ def missing(build: Build) -> str:
     return ""
 
 
-def bits(machine: str, model: str, commands: int) -> list[str]:
+def bits(commands: int) -> list[str]:
     """Print a line for each build; return what differs."""
-    geometry = load_geometry(machine)
+    geometry = load_geometry("paper")
     expected, failed = "", []
     for build in builds():
         if lacks := missing(build):
             print(f"{build.name:22} not tried: no {lacks} here")
             continue
         with tempfile.TemporaryDirectory() as name:
-            write_c(Path(name), geometry, load_model(model, geometry), ("", ""))
+            write_c(Path(name), geometry, load_model("paper_machine", geometry), ("", ""))
             try:
                 text = printed(build, Path(name), commands)
             except RuntimeError as error:
@@ -268,15 +268,13 @@ def spread(single: int) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.c_core", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--only", choices=("bits", "times"), help="one part alone (default: both)")
-    parser.add_argument("--machine", default="paper", help="whose bits are compared (default paper)")
-    parser.add_argument("--model", default="paper_machine")
     parser.add_argument("--commands", type=int, default=20_000, help="of which the bits are compared (default 20000)")
     parser.add_argument("--single", type=int, default=10_000_000, help="single commands to time (default 10 million)")
     parser.add_argument("--rounds", type=int, default=15, help="of times in turn (default 15)")
     args = parser.parse_args()
     if shutil.which("gcc") is None:
         return cannot_run("no gcc")
-    problems = bits(args.machine, args.model, args.commands) if args.only != "times" else []
+    problems = bits(args.commands) if args.only != "times" else []
     if args.only != "bits":
         text, missed = times(args.rounds)
         print(text, spread(args.single), sep="\n\n")

@@ -86,12 +86,9 @@ class Genhexkins:
                 for axis, value in zip("xyz", joint, strict=True):
                     self.set(f"{pin}.{number}.{axis}", value)
         self.set("max-error", ANY_ERROR)
-        self.criterion(CRITERION)
+        self.set("convergence-criterion", CRITERION)
         guess = np.array([[0.0, 0.0, 1e3 * structure.characteristic_length, *np.zeros(6)]])
         self.solved(np.full((1, STRUTS), structure.characteristic_length), guess)  # the first call after loading fails
-
-    def criterion(self, largest: float) -> None:
-        self.set("convergence-criterion", largest)
 
     def set(self, pin: str, value: float) -> None:
         address = self.stand_in.pin_value(f"genhexkins.{pin}".encode())

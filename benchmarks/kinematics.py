@@ -280,7 +280,7 @@ def linuxcnc(module: Genhexkins, task: str, poses: Poses, shape: str, criterion:
     one, calls = module.one_call(inverse), module.addresses(given, found, flags)
 
     def many() -> float:
-        module.criterion(criterion)
+        module.set("convergence-criterion", criterion)
         return module.inverse(given, found, codes) if inverse else module.forward(given, home, found, codes)
 
     def one_by_one(kept: tuple = (given, flags)) -> None:  # whose addresses are used
@@ -288,7 +288,7 @@ def linuxcnc(module: Genhexkins, task: str, poses: Poses, shape: str, criterion:
             for call in calls:
                 one(*call)
             return
-        module.criterion(criterion)
+        module.set("convergence-criterion", criterion)
         found[:] = home
         codes[:] = [one(*call) for call in calls]
 
@@ -305,7 +305,7 @@ def second_solve(module: Genhexkins, poses: Poses) -> Contender:
     found, codes = np.empty((count, POSE)), np.empty(count, np.int32)
 
     def run() -> float:
-        module.criterion(CRITERION)
+        module.set("convergence-criterion", CRITERION)
         return 0.5 * module.forward(lengths, told, found, codes)
 
     return Contender(NEAR, f"{THEIRS}: second solve", "batch", count, run, lambda: _solved(found, codes))
@@ -425,14 +425,12 @@ def batches(most: int = SIZES[-1], seconds: float = 4.0) -> tuple[str, list[str]
 # ---- where forward kinematics converges, and what answers are worth; each pair is ours, then genhexkins' ----
 
 YAWS = np.array([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 55.0, 60.0, 65.0, 70.0, 75.0, 80.0, 85.0])  # degrees
-Answers = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Where success was reported, positions (m) and rotations."""
 
 
 def answers(
     module: Genhexkins, structure: Structure, lengths: np.ndarray, positions: np.ndarray, rotations: np.ndarray
-) -> tuple[Answers, Answers]:
-    """Solve from one guess each, with our kernel and with genhexkins."""
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Solve from one guess each, ours and theirs; return where success was reported, positions (m) and rotations."""
     count, places, turns = len(lengths), positions.copy(), rotations.copy()  # ours writes its answer there
     outcomes, iterations, conditions = np.empty(count, np.intc), np.empty(count, np.intc), np.empty(count)
     limits = structure.characteristic_length, structure.home_sign, structure.max_condition
@@ -442,7 +440,7 @@ def answers(
     finite = np.isfinite(poses).all(axis=1)
     found, turned = si_poses(np.where(finite[:, None], poses, 0.0))
     found[~finite], turned[~finite] = np.nan, np.nan
-    return (outcomes == Status.OK, places, turns), (codes == 0, found, turned)
+    return [(outcomes == Status.OK, places, turns), (codes == 0, found, turned)]
 
 
 def convergence(yaws: np.ndarray, count: int = 300) -> list[list[float]]:

@@ -2,12 +2,8 @@
 
     python -m benchmarks.mutants [--count 300] [--seed 0] [--jobs 2] [--rooms ROOM ...] [--only N [N ...]]
 
-A mutant is a copy of the sources with one operator, ``not``, number, returned value or statement changed, drawn at
-random from all such places of all rooms; in the C core, whose text is changed and compiled again, one operator, number
-or statement. It is killed where a test fails, also by running out of time. The tests are those that pass its line, by
-the coverage recorded in a run of all tests, the most specific ones first; then those of its room, which start processes
-of their own. ``--only`` repeats mutants by their numbers, as after a new test.
-Exits 1 when fewer than 95 % are killed. What it does is explained in doc/benchmarks.md.
+The tests are those that pass the line, by the coverage recorded in a run of all tests, the most specific ones first;
+then those of its room, which start processes of their own. ``--only`` repeats mutants by their numbers.
 """
 
 from __future__ import annotations
@@ -42,15 +38,11 @@ PACKAGE = ROOT / "hexapod_comp"
 FOLDER = ROOT / "out" / "mutants"
 # Files and folders of what is judged by eye, or not ours
 NOT_DRAWN = {"pictures.py", "page.py", "shell_page.py", "__main__.py", "stable_abi"}
-
 # The tests of the C core, whose lines no Python tool sees
 C_TESTS = ["core", "machine", "compensation", "export", "workspace"]
-
 LONGEST = 120  # Time of a test with a mutant that waits, s
-
 BAR = 0.95
 LIMIT = 20.0  # Processor time of a test with a mutant, s
-
 FAILURES = ("FAILED", "ERROR")  # How the lines of pytest's summary begin that name a test
 
 SWAPS: dict[type, tuple[type, ...]] = {
@@ -62,7 +54,6 @@ SWAPS: dict[type, tuple[type, ...]] = {
 }  # fmt: skip
 
 Mutant = tuple[ast.AST, str, object]  # A node, the name of one of its fields, and what the field holds in the mutant
-
 CMutant = tuple[int, int, str]  # Beginning and end of what is replaced in a C file, and by what
 
 C_SWAPS = {
@@ -254,26 +245,19 @@ class Copy:
         parts = [[f"test/{one}"] for one in C_TESTS] if path.suffix == ".c" else [tests, [room]]
         try:
             place.write_text(text, encoding="utf-8")
-            if path.suffix == ".c" and not self.compiled():
+            command = [sys.executable, "setup.py", "-q", "build_ext", "--inplace", "--force"]
+            if path.suffix == ".c" and subprocess.run(command, cwd=self.folder, capture_output=True).returncode:
                 return "the compiler"
-            return next(
-                filter(
-                    None,
-                    (self.failure(part) for part in parts if part and (ROOT / part[0].partition("::")[0]).exists()),
-                ),
-                "",
-            )
+            for part in parts:
+                if part and (ROOT / part[0].partition("::")[0]).exists() and (failed := self.failure(part)):
+                    return failed
+            return ""
         finally:
             shutil.copy2(path, place)
             if path.suffix == ".c":
                 (library,) = (PACKAGE / "core").glob("*.so")
                 (self.folder / library.relative_to(ROOT)).unlink(missing_ok=True)
                 shutil.copy2(library, self.folder / library.relative_to(ROOT))
-
-    def compiled(self) -> bool:
-        """Compile the core anew; tell whether that went."""
-        command = [sys.executable, "setup.py", "-q", "build_ext", "--inplace", "--force"]
-        return subprocess.run(command, cwd=self.folder, capture_output=True, check=False).returncode == 0
 
 
 def mutated(tree: ast.Module | str, mutant: Mutant | CMutant) -> str:

@@ -44,25 +44,19 @@ KINDS = ("compliance", "clearance", "clearance and friction")
 INSTRUMENTS = ("5-D", "tracker")
 STATED, REFINED = "stated", "refined"
 CASES = tuple((kind, instrument) for kind in KINDS for instrument in INSTRUMENTS)
-
+# Of screws under weight the flanks in contact are chosen by the force, which the clearance is, not by the motion
 ERRORS = replace(SMALL, joint=20e-6, strut_offset=20e-6, backlash=(0.0, 0.0))
-"""Of screws under weight the flanks in contact are chosen by the force, which the clearance is, not by the motion."""
-
 SPINDLE = Payload(10.0, (0.01, 0.0, 0.08))
 OTHERS = {"5 kg less": Payload(5.0, (0.0, 0.0, 0.06)), "10 kg more": Payload(20.0, (0.01, 0.0, 0.1))}
 MASS, STRUT_MASS = 20.0, 1.0
+# Lowest and highest of a strut, N/m; standard deviation of one beside another; a joint's beside the strut's
 STIFFNESS, UNLIKE, JOINTS = (20e6, 60e6), 0.05, 10.0
-"""Lowest and highest of a strut, N/m; standard deviation of one beside another; a joint's beside the strut's."""
-CLEARANCE, FRICTION = (1e-6, 6e-6), (0.2, 1.0)
-"""Of six struts, m; of the bearings of a strut, N·m."""
-
+CLEARANCE, FRICTION = (1e-6, 6e-6), (0.2, 1.0)  # of six struts, m; of the bearings of a strut, N·m
 ELEVATIONS = np.radians([20.0, 50.0, 90.0])
+# Gravity at these, in base, m/s²
 TURNED = [tuple(STANDARD_GRAVITY * np.array([0.6 * np.cos(e), 0.8 * np.cos(e), -np.sin(e)])) for e in ELEVATIONS]
-"""Gravity at these, in base, m/s²."""
 POSES, TILT, POINTS, CHECK = 600, np.radians(5.0), 50, 24
-AVERAGED = {"position": 3e-6}
-"""Standard deviation of a tracker's position that stands near and averages for a second, m."""
-
+AVERAGED = {"position": 3e-6}  # deviation of a tracker's position that stands near and averages for a second, m
 REMOVED, ELEVATED, KEPT, TIMES, NAMES = 0.97, 0.95, 0.93, 1.3, 0.90
 
 
@@ -71,18 +65,12 @@ class Fitted:
     """What came of one way to fit; lengths in m."""
 
     left: float  # at the load of the readings
-    low: float
     high: float
     told: dict[str, float]  # left with other payloads, told
     untold: dict[str, float]  # and not told
     elevated: float  # left at other elevations, told; RMS over all
     others: list[bool]  # whether each of these told cases keeps the promise that the fit makes for it
     refused: str
-
-    @property
-    def kept(self) -> bool:
-        """Whether the error is not above the upper end of the promised interval."""
-        return self.left <= self.high
 
 
 @dataclass(frozen=True)
@@ -180,14 +168,14 @@ class Bench:
             }
             for tell in (True, False)
         )
-        low, high = (np.nan, np.nan) if fit.level is None else (fit.level.low, fit.level.high)
+        high = np.nan if fit.level is None else fit.level.high
         elevated = self.elevated(fit.model)
         promised = [*map(fit.under, OTHERS.values()), *(fit.under(SPINDLE, gravity) for gravity in TURNED)]
         others = [
             promise is not None and left <= promise.high
             for left, promise in zip([*told.values(), *elevated], promised, strict=True)
         ]
-        return Fitted(self.left(fit.model, SPINDLE), low, high, told, not_told, rms(elevated), others, fit.misfit)
+        return Fitted(self.left(fit.model, SPINDLE), high, told, not_told, rms(elevated), others, fit.misfit)
 
     def said(self, fit: ModelFit) -> dict[str, str]:
         """Return what ``verify`` says of payloads that nobody told."""
@@ -230,7 +218,7 @@ def row_of(case: str, fit: str, plants: list[Plant]) -> tuple[list[object], list
     )
     elevated = 1.0 - rms([f.elevated for f in fits]) / rms([plant.before_elevated for plant in plants])
     said = Counter(word for plant in plants for word in plant.said.values() if fit == STATED)
-    removed, kept = 1.0 - left / before, [[f.kept for f in fits], [one for f in fits for one in f.others]]
+    removed, kept = 1.0 - left / before, [[f.left <= f.high for f in fits], [one for f in fits for one in f.others]]
     cells = [case, fit, f"{1e6 * before:.2f}", f"{1e6 * left:.3f}", f"{100.0 * removed:.1f} %"]
     cells += [*(f"{sum(one)} of {len(one)}" for one in kept), sum(bool(fitted.refused) for fitted in fits)]
     cells += [*(f"{times:.2f} ×" for times in told), "" if np.isnan(max(untold)) else f"{max(untold):.2f} ×"]

@@ -204,10 +204,6 @@ class Outcome:
     others: tuple[float, ...] = ()  # upper ends for BELIEVED
 
     @property
-    def width(self) -> float:
-        return self.high / self.left
-
-    @property
     def kept(self) -> bool:
         """Whether the error lies in the promised interval."""
         return self.low <= self.left <= self.high
@@ -258,7 +254,7 @@ def show(found: drawn.Table, kind: str, outcomes: list[Outcome]) -> None:
     refused = sum(bool(o.refused) for o in outcomes)
     kept = sum(o.kept and not o.refused for o in outcomes)
     medians = (1e6 * np.nanmedian([getattr(o, name) for o in outcomes]) for name in ("left", "expected", "high"))
-    width = np.nanmedian([o.width for o in outcomes if not o.refused] or [np.nan])
+    width = np.nanmedian([o.high / o.left for o in outcomes if not o.refused] or [np.nan])
     sizes = [f"{median:.2f} µm" for median in medians]
     counts = [len(outcomes), kept, refused, len(outcomes) - kept - refused]
     found.row(kind, *counts, *sizes, f"{width:.2f}", met=kind not in OWN or not refused)
@@ -275,7 +271,7 @@ def main() -> int:
         show(found, kind, outcomes)
         every += outcomes
     share = float(np.mean([o.kept or bool(o.refused) for o in every]))
-    width = float(np.median([o.width for o in every if not o.refused]))
+    width = float(np.median([o.high / o.left for o in every if not o.refused]))
     bars = f"kept or refused: {share:.1%} (bar {BAR:.0%})"
     print(f"{bars}; upper end / left: {width:.2f} in the median (bar {WIDTH_BAR:g})", file=sys.stderr)
     if args.ablate:

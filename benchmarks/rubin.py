@@ -37,12 +37,6 @@ STEPS = ((5.0, 10.0), (2.5, 5.0), (1.0, 2.0))  # of tables over elevation and ro
 PLACES = 2000  # at random between the nodes
 
 
-def telescope() -> HexapodGeometry:
-    """Return a hexapod of the size of M2's, whose corrections may be as large as Rubin's."""
-    geometry, _ = of_zoo("mirror")
-    return replace(geometry, limits=replace(geometry.limits, correction=0.02))
-
-
 def table_of(folder: Path, names: Sequence[str], places: np.ndarray, offsets: np.ndarray) -> OutsideTable:
     """Return a table of errors that our reader has made of a CSV file of corrections."""
     header = [*(f"{name}_deg" for name in names), *COMPONENTS]
@@ -153,7 +147,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return cannot_run(f"there is no {', '.join(missing)}; clone {sources}, and name the folders")
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        geometry = telescope()
+        geometry, _ = of_zoo("mirror")  # of the size of M2's, whose corrections may be as large as Rubin's
+        geometry = replace(geometry, limits=replace(geometry.limits, correction=0.02))
         met = [finite_elements(name, args.folder / file, geometry, folder) for name, file in TABLES.items()]
         if args.config is not None:
             content = yaml.safe_load((args.config / POLYNOMIALS).read_text(encoding="utf-8"))

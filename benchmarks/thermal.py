@@ -1,6 +1,6 @@
 """What temperature sensors are worth: machines that warm, compensated from noisy readings.
 
-Usage: python -m benchmarks.thermal [--only stated|fitted|pulls|fused] [--machines 20] [--points 1000] [--noise 0.05]
+Usage: python -m benchmarks.thermal [--only stated|fitted|pulls|fused] [--machines 20] [--points 1000]
 
 Drifts, parts and bars: doc/benchmarks.md. What is judged is the error in space as it is, since a drift moves the datum
 and no alignment may take that out. Exits 1 when a bar is missed.
@@ -40,6 +40,7 @@ from hexapod_comp.virtual.imperfections import draw_model
 from hexapod_comp.virtual.instruments import measure
 from hexapod_comp.virtual.warm_up import SENSED, WarmUp
 
+SENSOR_NOISE = 0.05  # standard deviation of a reading, K
 STEEL, SPREAD = 11.5e-6, 1e-6  # Mean expansion; deviation of struts together, base, platform, 1/K; of a strut a fifth
 
 
@@ -102,8 +103,8 @@ def one_stated(drift: str, seed: int, args: argparse.Namespace) -> np.ndarray:
     cold = tool_at(RealMachine(geometry, model), passes, model, None)
     warmth = np.minimum(np.arange(2 * HALF_HOUR + 1) / HALF_HOUR, 1.0)
     true = REFERENCE_TEMPERATURE + np.outer(warmth, final(rng, len(parts)))
-    read = true + args.noise * rng.standard_normal(true.shape)
-    low_pass = TemperatureFilter(args.time_constant)
+    read = true + SENSOR_NOISE * rng.standard_normal(true.shape)
+    low_pass = TemperatureFilter(DEFAULT_TIME_CONSTANT)
     filtered = [
         [low_pass.update(part, value, float(second)) for part, value in zip(parts, row, strict=True)]
         for second, row in enumerate(read)
@@ -156,7 +157,7 @@ def one_fitted(sensors: str, seed: int, args: argparse.Namespace) -> tuple[float
     apart = 1.0 + APART * np.concatenate([rng.standard_normal((6, 2)), np.zeros((2, 2))])
     rise, time_constants = np.append(RISE * apart[:, 0], 0.0), np.append(TAU * apart[:, 1], 1.0)
     places = (thermometer,) if thermometer else PARTS
-    warm_up = WarmUp(rise, time_constants, sensors=places, noise=(args.noise, 0.0), cold_rounds=0)
+    warm_up = WarmUp(rise, time_constants, sensors=places, noise=(SENSOR_NOISE, 0.0), cold_rounds=0)
     campaign = warm_up.campaign(Campaign(drawn.BOX, 8.0 * INCH, 2.0 * INCH, "5-D", 4))
     readings = warm_up.measured(template(campaign, geometry), campaign, RealMachine(geometry, model), seed)
     fit = fit_model(readings, FitSettings(lead=LEAD, blocks=("pitch", "wave", "backlash", "expansion", "late")))
@@ -224,7 +225,15 @@ def pulls_of(kind: str, thermometer: str, seed: int) -> list[Pull]:
     model = truth_of(geometry, kind, machine.box, seed)
     model = of_steel(model, seed, moisture.uniform(*DAMP) if damp else 0.0)
     warm = zoo_warm_up(thermometer, damp, seed)
-    readings = zoo_readings(geometry, machine.box, model, warm, kind, seed)
+    sides, truth = np.ptp(machine.box, axis=0), RealMachine(geometry, model)
+    plan = Campaign(machine.box, min(sides.max() / 2.0, sides.min()), sides.max() / STEPS, "5-D", 4)
+    campaign, hidden = warm.campaign(plan), hidden_of(geometry, kind, np.random.default_rng([seed, 5]))
+    empty = template(campaign, geometry)
+    is_so, is_read = warm.stations(empty, seed)
+    commands = is_so.commands + hidden.lengths((is_so.positions, is_so.rotations), is_so.sense)
+    empty, real = replace(empty, stations=is_read), replace(empty, stations=replace(is_so, commands=commands))
+    values = measure(real, campaign, truth, seed).value + carelessness(empty, real, truth, kind, seed)
+    readings = empty.with_values(values)
     settings = FitSettings(blocks=KNOWN, lead=LEAD, field_degree=DEGREE, strut_moisture=0.0 if damp else None)
     seen = fit_model(readings, settings).warming
     expansion = np.array([*model.struts.expansion, model.base_expansion, model.platform_expansion])
@@ -250,17 +259,6 @@ def zoo_warm_up(thermometer: str, damp: bool, seed: int) -> WarmUp:
         time_constants[PARTS.index("platform")] = TAU[0]
     warm = WarmUp(rise, time_constants, low, sensors, cold_rounds=seed % 2, rounds=ROUNDS, every=EVERY)
     return warm if thermometer else warm.apart(APART, seed)
-
-
-def zoo_readings(geometry: HexapodGeometry, box: np.ndarray, model: MachineModel, warm: WarmUp, kind: str, seed: int):
-    """Return what is read of a machine of a kind that warms."""
-    sides, truth = np.ptp(box, axis=0), RealMachine(geometry, model)
-    campaign = warm.campaign(Campaign(box, min(sides.max() / 2.0, sides.min()), sides.max() / STEPS, "5-D", 4))
-    empty, hidden = template(campaign, geometry), hidden_of(geometry, kind, np.random.default_rng([seed, 5]))
-    is_so, is_read = warm.stations(empty, seed)
-    commands = is_so.commands + hidden.lengths((is_so.positions, is_so.rotations), is_so.sense)
-    empty, real = replace(empty, stations=is_read), replace(empty, stations=replace(is_so, commands=commands))
-    return empty.with_values(measure(real, campaign, truth, seed).value + carelessness(empty, real, truth, kind, seed))
 
 
 def pulled(args: argparse.Namespace) -> bool:
@@ -392,8 +390,6 @@ PARTS_OF_RUN = {"stated": stated, "fitted": fitted, "pulls": pulled, "fused": fu
 def main() -> int:
     parser = drawn.options(__doc__, 20, of="drift")
     parser.add_argument("--points", type=int, default=1000, help="held-out points (default 1000)")
-    parser.add_argument("--noise", type=float, default=0.05, help="standard deviation of a reading, K (default 0.05)")
-    parser.add_argument("--time-constant", type=float, default=DEFAULT_TIME_CONSTANT, help="of the filter, s")
     parser.add_argument("--draws", type=int, default=48, help="machines of the zoo whose pulls are taken (default 48)")
     parser.add_argument("--only", choices=PARTS_OF_RUN, help="one part alone (default: all)")
     args = parser.parse_args()

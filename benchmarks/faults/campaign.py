@@ -117,8 +117,8 @@ def table(outcomes: Sequence[Outcome]) -> str:
     header = ["fault", "episodes", "visible", "worst report, ms", "worst recovery, s", "good commands", "lost"]
     lines: dict[str, list[str]] = {}
     for kind in dict.fromkeys(kind for outcome in outcomes for kind, _ in outcome.verdict.reports):
-        found = [(o.verdict, report) for o in outcomes for name, report in o.verdict.reports if name == kind]
-        delays = [report.delay for _, report in found if report.visible]
+        found = [(o.verdict, delay) for o in outcomes for name, delay in o.verdict.reports if name == kind]
+        delays = [delay for _, delay in found if not math.isnan(delay)]
         sent, lost, breaches = np.sum([[v.sent, v.lost, len(v.breaches)] for v, _ in found], axis=0)
         worst = f"{max(delays) * 1e3:.0f}" if delays else "–"
         recovery = f"{max(verdict.recovery for verdict, _ in found):.2f}"

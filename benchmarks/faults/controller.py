@@ -4,7 +4,7 @@ operator's program that asks the mover node for one move after the other."""
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from enum import Enum
 from typing import Any
 
@@ -202,11 +202,10 @@ def endless_path(geometry: HexapodGeometry) -> Path:
     machine = commanded_in_base(geometry)
     home = geometry.home @ geometry.tool
     ring = circle(home, radius=8e-3, feed=FEED, rate=RATE)
-    ends = [Pose(home.position + np.array([x, 0.0, z]), home.rotation) for x, z in _stroke_ends()]
+    ends = [
+        Pose(home.position + np.array([x, 0.0, z]), home.rotation)
+        for x, z in ((-8e-3, 0.0), (8e-3, 2e-3), (-8e-3, 4e-3))
+    ]
     corner = ring.pose(len(ring) - 1)
     legs = [move(machine, a, b, RATE, FEED) for a, b in zip([corner, *ends], [*ends, corner], strict=True)]
     return join([ring, *legs])
-
-
-def _stroke_ends() -> Iterator[tuple[float, float]]:
-    yield from ((-8e-3, 0.0), (8e-3, 2e-3), (-8e-3, 4e-3))

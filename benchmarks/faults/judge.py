@@ -35,20 +35,13 @@ ROUNDING = 1e-9  # Allowed beyond a limit, m: the limits are decimal fractions
 LOOKED_AT = 0.1  # Silence must last so much longer than its limit, s: less may lie between two checks of a node
 
 
-@dataclass(frozen=True)
-class Reported:
-    """Whether a fault was visible, and how long it took until it was reported, s."""
-
-    visible: bool
-    delay: float = math.nan
-
-
 @dataclass
 class Verdict:
     """What the judge found in one episode."""
 
     breaches: list[str] = field(default_factory=list)  # what was published and must not be
-    reports: list[tuple[str, Reported]] = field(default_factory=list)  # of each fault, by kind
+    # Of each fault, by kind, how long it took until it was reported, s; NaN where it was not visible
+    reports: list[tuple[str, float]] = field(default_factory=list)
     recovery: float = 0.0  # from the end of the last fault until all was well, s; infinite if never
     sent: int = 0  # good commands outside the faults,
     lost: int = 0  # and those of them without an answer
@@ -57,9 +50,9 @@ class Verdict:
     def misses(self) -> list[str]:
         """Return which bars were missed, in words."""
         found = list(self.breaches)
-        for kind, report in self.reports:
-            if report.visible and not report.delay <= REPORT_WITHIN:
-                when = "never" if math.isinf(report.delay) else f"after {report.delay * 1e3:.0f} ms"
+        for kind, delay in self.reports:
+            if delay > REPORT_WITHIN:
+                when = "never" if math.isinf(delay) else f"after {delay * 1e3:.0f} ms"
                 found.append(f"{kind}: reported {when}")
         if not self.recovery <= self.within:
             found.append(f"recovery took {self.recovery:.2f} s")
@@ -268,29 +261,29 @@ VISIBLE: dict[str, Callable[[Record, Happened], Expected]] = {
 }
 
 
-def reported(record: Record, fault: Happened) -> Reported:
-    """Return whether a fault became visible to those who must report it, and the longest time until one did."""
+def reported(record: Record, fault: Happened) -> float:
+    """Return the longest time until a node reported what became visible to it, s; NaN where nothing did."""
     found = [_reported_by(record, fault, *expected) for expected in VISIBLE[fault.kind](record, fault)]
-    return max((r for r in found if r.visible), key=lambda report: report.delay, default=Reported(False))
+    return max((delay for delay in found if not math.isnan(delay)), default=math.nan)
 
 
-def _reported_by(record: Record, fault: Happened, node: str, pattern: str, since: float) -> Reported:
+def _reported_by(record: Record, fault: Happened, node: str, pattern: str, since: float) -> float:
     """Return how long a node, while it ran, took to report a pattern; what it reports already counts as at once."""
     outages = sorted(record.outages[node])
     for start, end in outages:
         if start <= since < end:
             since = end
     if math.isinf(since) or (outages and since > fault.ended):
-        return Reported(False)
+        return math.nan
     said = record.said(node)
     before = [status for status in said if status.time < since]
     if before and _new(before[-1], said, pattern, fault.began):
-        return Reported(True, 0.0)
+        return 0.0
     for status in said:
         if status.time >= since and _new(status, said, pattern, fault.began):
             down = [min(status.time, end) - max(since, start) for start, end in outages]
-            return Reported(True, status.time - since - sum(time for time in down if time > 0.0))
-    return Reported(True, math.inf)
+            return status.time - since - sum(time for time in down if time > 0.0)
+    return math.inf
 
 
 def _new(status: Status, said: list[Status], pattern: str, began: float) -> bool:

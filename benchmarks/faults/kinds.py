@@ -267,12 +267,12 @@ def hurried(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
     yield from stream
 
 
-Drawn = tuple[wire.Rule, str]
-"""What a link does, and how it was drawn."""
-
-
 def on_link(
-    link: str, draw: Callable[[np.random.Generator, str], Drawn], fault: Fault, rig: Rig, happened: Happened
+    link: str,
+    draw: Callable[[np.random.Generator, str], tuple[wire.Rule, str]],
+    fault: Fault,
+    rig: Rig,
+    happened: Happened,
 ) -> Iterator[None]:
     rule, happened.detail = draw(fault.rng, link)
     rig.wires[link].marks, rig.wires[link].rule = happened.marks, rule
@@ -280,23 +280,23 @@ def on_link(
     rig.wires[link].mend(time.monotonic())
 
 
-def dropped(rng: np.random.Generator, link: str) -> Drawn:
+def dropped(rng: np.random.Generator, link: str) -> tuple[wire.Rule, str]:
     share = float(rng.choice([1.0, 1.0, 0.3]))
     return wire.drop(rng, share), f"{share:.0%}"
 
 
-def delayed(rng: np.random.Generator, link: str) -> Drawn:
+def delayed(rng: np.random.Generator, link: str) -> tuple[wire.Rule, str]:
     delay = float(rng.choice([0.03, 0.3, 0.7]))
     return wire.delay(delay, link == "pose" and delay > OLDEST_COMMAND), f"{delay:g} s, reason stamp_past"
 
 
-def corrupted(rng: np.random.Generator, link: str) -> Drawn:
+def corrupted(rng: np.random.Generator, link: str) -> tuple[wire.Rule, str]:
     way = str(rng.choice(sorted(wire.SPOILS[link])))
     spoil, reason = wire.SPOILS[link][way]
     return wire.corrupt(rng, 0.2, spoil), f"{way}, reason {reason}"
 
 
-ON_LINKS: dict[str, Callable[[np.random.Generator, str], Drawn]] = {
+ON_LINKS: dict[str, Callable[[np.random.Generator, str], tuple[wire.Rule, str]]] = {
     "drop": dropped,
     "delay": delayed,
     "duplicate": lambda rng, link: (wire.duplicate(rng, 0.5), ""),

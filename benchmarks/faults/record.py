@@ -57,14 +57,6 @@ class Happened:
     breaches: list[str] = field(default_factory=list)  # what else was done and must not be
 
 
-def _of_links() -> dict[str, list[float]]:
-    return {link: [] for link in LINKS}
-
-
-def _of_nodes() -> dict[str, list[tuple[float, float]]]:
-    return {node: [] for node in NODES}
-
-
 @dataclass
 class Record:
     """One episode."""
@@ -73,10 +65,12 @@ class Record:
     commands: list[Struts] = field(default_factory=list)  # the first may be the last of the episode before
     corrections: list[Struts] = field(default_factory=list)
     measured: list[Struts] = field(default_factory=list)  # as delivered to the compensator
-    delivered: dict[str, list[float]] = field(default_factory=_of_links)  # when each link delivered a message
+    # When each link delivered a message
+    delivered: dict[str, list[float]] = field(default_factory=lambda: {link: [] for link in LINKS})
     statuses: list[Status] = field(default_factory=list)
-    outages: dict[str, list[tuple[float, float]]] = field(default_factory=_of_nodes)  # dead or stopped, until ready
-    killed: dict[str, list[tuple[float, float]]] = field(default_factory=_of_nodes)  # of these, those that were killed
+    # When a node was dead or stopped, until ready; and of these outages those in which it was killed
+    outages: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {node: [] for node in NODES})
+    killed: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {node: [] for node in NODES})
     fresh_starts: list[float] = field(default_factory=list)  # of a compensator, from the measured struts
     faults: list[Happened] = field(default_factory=list)
     ended: float = math.inf  # what was sent just before has had no time to be answered

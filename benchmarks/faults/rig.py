@@ -90,10 +90,6 @@ def refusal_to_mount() -> str:
         return disk.why_not
 
 
-class RigError(RuntimeError):
-    """The machine does not come up."""
-
-
 class Rig:
     """Processes, wires, controller and witness; a context manager.
 
@@ -164,7 +160,8 @@ class Rig:
         if self._host is None:
             self._open_wires(node)
         else:
-            node.create_subscription(JointState, "strut_states", self._on_states, TRACK_QOS)
+            watched = lambda m: self._deliver("feedback", None, m, time.monotonic())  # noqa: E731
+            node.create_subscription(JointState, "strut_states", watched, TRACK_QOS)
         self._set_parameters = node.create_client(SetParameters, "strut_drive/set_parameters")
         self._set_clock = node.create_client(SetParameters, "compensator/set_parameters")
         self._reload = node.create_client(Trigger, "compensator/reload_model")
@@ -210,7 +207,7 @@ class Rig:
         self.spin(STARTS_WITHIN, self.running)
         if not self.running():
             said = "\n".join(process.output() for process in self.processes.values())
-            raise RigError(f"the machine does not come up:\n{said}")
+            raise RuntimeError(f"the machine does not come up:\n{said}")
 
     def running(self) -> bool:
         """Return whether the processes are up, commands are answered and the struts are measured."""
@@ -247,7 +244,7 @@ class Rig:
         for name in list(self._starting):
             process = self.processes[name]
             if process.exit_code() is not None:
-                raise RigError(f"{name} ended with {process.exit_code()}:\n{process.output()}")
+                raise RuntimeError(f"{name} ended with {process.exit_code()}:\n{process.output()}")
             if "ready" in process.output():
                 del self._starting[name]
                 self._is_up(name, now)
@@ -299,7 +296,8 @@ class Rig:
         return stamp
 
     def _deliver(self, link: str, publisher: Any, message: Any, now: float) -> None:
-        publisher.publish(message)
+        if publisher is not None:
+            publisher.publish(message)
         self.record.delivered[link].append(now)
         if link == "feedback":
             self.record.measured.append(Struts(now, lengths_of(message.position)))
@@ -317,11 +315,6 @@ class Rig:
 
     def _on_corrections(self, message: JointState) -> None:
         self.record.corrections.append(Struts(time.monotonic(), lengths_of(message.position)))
-
-    def _on_states(self, message: JointState) -> None:
-        now = time.monotonic()
-        self.record.delivered["feedback"].append(now)
-        self.record.measured.append(Struts(now, lengths_of(message.position)))
 
     def _on_diagnostics(self, array: DiagnosticArray) -> None:
         now = time.monotonic()
