@@ -62,8 +62,7 @@ def command(readings: MeasurementSet) -> tuple[float, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    text = "times as many readings (default 1.3 14)"
-    parser.add_argument("--dense", type=float, nargs="+", default=[1.3, 14], help=text)
+    parser.add_argument("--dense", type=float, nargs="+", default=[1.3, 14], help="times as many readings")
     args = parser.parse_args()
     timed(1)  # compiled and loaded
     columns = ["readings", "parameters", "steps", "fit: processors, s", "clock, s", "expected, µm"]

@@ -48,11 +48,7 @@ def position_squares(measured: MeasurementSet, errors: np.ndarray) -> np.ndarray
 
 
 def zeroed_without(measured: MeasurementSet, out: np.ndarray) -> MeasurementSet:
-    """Return a set whose legs are zeroed by the poses that stay in.
-
-    The columns file takes the legs' zeros from all measured poses: six numbers that the poses left out must
-    not have a part in.
-    """
+    """Return a set whose legs are zeroed by the poses that stay in; the columns file's zeros are by all poses."""
     s = measured.stations
     errors = np.zeros((len(s), 6))
     for kind, first in (("position", 0), ("attitude", 3)):

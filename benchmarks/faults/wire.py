@@ -120,10 +120,6 @@ def restamp(apart: int, lengths: Callable[[Any], np.ndarray], allowed: Callable[
 # ---- ways to spoil a message, and the reason with which it must be refused ----
 
 
-def shift_stamp(message: Any, seconds: int) -> None:
-    message.header.stamp.sec += seconds
-
-
 def _five_struts(message: Any) -> None:
     message.name, message.position, message.velocity = message.name[:5], message.position[:5], message.velocity[:5]
 
@@ -134,8 +130,8 @@ STRUT_SPOILS: dict[str, tuple[Callable[[Any], object], str]] = {
     "five struts": (_five_struts, "strut_names"),
 }
 STAMPS: dict[str, tuple[Callable[[Any], object], str]] = {
-    "5 s old": (lambda m: shift_stamp(m, -5), "stamp_past"),
-    "5 s ahead": (lambda m: shift_stamp(m, 5), "stamp_future"),
+    "5 s old": (lambda m: setattr(m.header.stamp, "sec", m.header.stamp.sec - 5), "stamp_past"),
+    "5 s ahead": (lambda m: setattr(m.header.stamp, "sec", m.header.stamp.sec + 5), "stamp_future"),
 }
 
 
