@@ -114,11 +114,9 @@ def test_benchmarks_are_there(command: Command) -> None:
     module, *options = command.words[2:]
     source = importlib.util.find_spec(module)
     assert source is not None
-    if source.submodule_search_locations:
-        source = importlib.util.find_spec(f"{module}.__main__")
-        assert source is not None
     assert source.origin is not None
-    text = Path(source.origin).read_text(encoding="utf-8")
+    files = Path(source.origin).parent.glob("*.py") if source.submodule_search_locations else [Path(source.origin)]
+    text = "".join(file.read_text(encoding="utf-8") for file in files)
     assert all(f'"{word}"' in text for word in options if word.startswith("--")), options
 
 
