@@ -23,8 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from benchmarks.drawn import Table, of_zoo
-from benchmarks.drawn import machines as zoo
+from benchmarks.drawn import Table, machines, of_zoo
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.compensation.checks import check
 from hexapod_comp.errors import NoAnswerError
@@ -130,12 +129,12 @@ def moves(args: argparse.Namespace) -> bool:
     except ImportError:
         print("part moves is held against toppra, which is not here: pip install '.[bench]'", file=sys.stderr)
         sys.exit(2)
-    machines = zoo()
-    each = -(-args.moves // len(machines))
+    names = [*machines()]
+    each = -(-args.moves // len(names))
     print(f"limits: {RATES.speed} m/s, {RATES.acceleration} m/s², {RATES.jerk} m/s³; {each} moves of each machine\n")
     columns = ["machine", "moves", "over toppra", "largest", "over 1.02", "of a limit", "stops", "with jerk", "plan"]
     table = Table(columns)
-    for name in tqdm(machines, disable=None):
+    for name in tqdm(names, disable=None):
         ratio, jerk, share, stopped, duration, planning = judged(of_zoo(name)[0], each, args.first).T
         met = bool((ratio <= OPTIMUM).all()) and max(share.max(), stopped.max()) <= KEPT
         over = [f"{np.median(ratio):.4f}", f"{ratio.max():.4f}", int((ratio > OPTIMUM).sum()), f"{share.max():.4f}"]
@@ -222,7 +221,7 @@ def unattended(args: argparse.Namespace) -> bool:
     """Print a row for each machine; return whether the bars are met."""
     print(f"goal {GOAL * 1e6:g} µm (95 %, datum aligned); sizes in µm RMS\n")
     columns = ["machine", "seed", "ended", "stops", "left", "kept", "false alarm", "knocked", "named", "repaired", "s"]
-    table, names, found = Table(columns), list(zoo()), list[Adapted]()
+    table, names, found = Table(columns), list(machines()), list[Adapted]()
     for n in tqdm(range(args.machines), disable=None):
         name, seed = names[n % len(names)], args.first + n
         with tempfile.TemporaryDirectory() as folder:
