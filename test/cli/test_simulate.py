@@ -40,6 +40,15 @@ def filled(campaign: Campaign, truth: RealMachine, seed: int = 3) -> Measurement
     return measure(template(campaign, truth.geometry), campaign, truth, seed)
 
 
+def test_a_shifted_base_shows_in_absolute_positions_only() -> None:
+    """All base joints moved by d: the platform moves by d, exactly. Lines are zeroed at their first reading."""
+    d = np.array([20e-6, -30e-6, 50e-6])
+    truth = RealMachine(paper_geometry(), MachineModel("paper", base_deviation=np.tile(d, (6, 1))))
+    found = filled(QUIET, truth)
+    np.testing.assert_allclose(found.value[of_kind(found, "position")].reshape(-1, 3), np.tile(d, (20, 1)), atol=1e-13)
+    np.testing.assert_allclose(found.value[~of_kind(found, "position")], 0.0, atol=1e-12)
+
+
 def test_backlash_separates_the_directions() -> None:
     """Every strut lags half its backlash of 4 µm behind. On vertical lines all struts move alike: going up the
     platform is too low by 2 µm and more (struts lean), going down as much too high; second order: 1e-11."""

@@ -121,6 +121,18 @@ def test_rows_name_the_error_and_the_tools_pose():
     assert np.linalg.norm(again) == pytest.approx(extreme.value, rel=1e-12)
 
 
+def test_joined_rows_hold_the_larger_and_the_smaller_of_their_types():
+    geometry = unit()
+    found = over(geometry, PAPER_SIZES, count=50)
+    single = over(geometry, {"base_joint_xy": 10e-6}, 50), over(geometry, {"platform_joint_xy": 10e-6}, 50)
+    joined = {row.title: row.figures() for row in ranked(found, geometry)}
+    both = np.array([ranked(one, geometry)[0].figures() for one in single])
+    expected = np.where([True, False, True, False], both.max(axis=0), both.min(axis=0))
+    np.testing.assert_array_equal(joined["base-/platform joint (x/y)"], expected)
+    only_base = over(geometry, {"base_joint_xy": 1e-5}, count=5)
+    assert [row.title for row in ranked(only_base, geometry)] == ["base joint x/y"]
+
+
 # --- combined ----------------------------------------------------------------------------------------------
 
 
