@@ -50,7 +50,7 @@ class Assumptions:
         0.1, "", "change of humidity that determines swelling", "5 µm on 0.5 m of carbon fibre"
     )
     alike: float = assumed(
-        0.75, "", "correlation of the struts' stiffnesses, clearances, and frictions", "0 to twice the mean"
+        0.75, "", "correlation of the struts' stiffnesses, clearances, and frictions", "benchmarks.plants --alike"
     )
     stated_stiffness: float = assumed(0.1, "", "error of a stated stiffness, 1 σ", "catalogues of ball screws: ±10 %")
 
