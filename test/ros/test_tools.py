@@ -134,6 +134,18 @@ def test_a_controller_selects_a_tool_by_a_topic(rig: Bench, machine: Machine, fi
     rig.ask(at_home(machine, "stub"), "work")
 
 
+def test_a_stranger_who_selects_a_wrong_tool_stops_nothing(rig: Bench, machine: Machine, file: str, stranger) -> None:
+    """He does not command: what he asks for in vain is said, and the controller's next step is accepted as ever."""
+    started(rig, file)
+    select = stranger.create_publisher(String, "select_tool", RELIABLE)
+    rig.until(select.get_subscription_count)
+    rig.ask(at_home(machine), "work")
+    select.publish(String(data="drill"))
+    values = rig.until_status(WARN, "tool refused: parameter tool: machine framed has no tool 'drill'")
+    assert values["select_tool_by"] == "/stranger"
+    rig.ask(at_home(machine, shift=1e-4), "work")
+
+
 def test_of_two_who_select_tools_none_is_obeyed(rig: Bench, machine: Machine, file: str, stranger) -> None:
     started(rig, file)
     select = rig.witness.create_publisher(String, "select_tool", RELIABLE)
