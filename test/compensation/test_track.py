@@ -221,6 +221,14 @@ def test_steps_beyond_the_limits_of_step_and_speed_are_refused(way, pause, passe
     assert (caught.value.reason, caught.value.strut) == ("step", 4)
 
 
+@pytest.mark.parametrize("value", [np.nan, -np.inf])
+def test_what_is_no_length_is_refused_as_a_step(value):
+    guard = StrutSteps(STEP, SPEED)
+    guard.accept(Sample(1.0, 0, AT))
+    with pytest.raises(LimitError, match="strut_3"):
+        guard.check(Sample(1.004, 0, tuple(value if n == 2 else 0.5 for n in range(6))))
+
+
 def test_the_first_command_is_held_against_where_the_struts_stand_however_long():
     guard = StrutSteps(STEP, SPEED)
     guard.reset(list(AT))
