@@ -86,6 +86,13 @@ def test_a_command_for_another_place_is_refused(way: float, machine: Machine, co
     compensator.step(numbers(machine, "probe"), 1.02)
 
 
+def test_the_old_tool_may_come_back(machine: Machine, compensator: Compensator) -> None:
+    before = compensator.step(numbers(machine, None), 1.0).copy()
+    compensator.set_tool("probe")
+    compensator.set_tool("tool")
+    np.testing.assert_array_equal(compensator.step(numbers(machine, None), 1.01), before)
+
+
 def test_a_reset_starts_anew_with_the_new_tool(machine: Machine, compensator: Compensator) -> None:
     measured = compensator.step(numbers(machine, None), 1.0).copy()
     compensator.set_tool("probe")

@@ -14,6 +14,7 @@ from strategies import fixed
 from hexapod_comp.compensation.guards import (
     SPEAKERS_HELD,
     UNKNOWN_NAME,
+    EventWindow,
     Guard,
     OneSender,
     RateLimit,
@@ -358,3 +359,11 @@ def test_two_of_one_name_are_refused_where_the_middleware_does_not_count():
 
 
 # ---- what all have in common ----
+
+
+def test_what_happened_while_nobody_asked_holds_once():
+    lately = EventWindow()
+    lately.note(1.0)
+    assert lately.holds(6.0)
+    assert lately.holds(6.0)
+    assert not lately.holds(6.05)
