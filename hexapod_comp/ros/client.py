@@ -284,6 +284,7 @@ class Machine(RosSession):
         `timeout`, s, the move is stopped. A MoveError: it was refused or stopped, ``reason`` is the cause. A
         NoAnswerError: the mover did not answer, or the tool had not arrived in time.
         """
+        self.catch_up()
         stamp = self.node.get_clock().now()
         message = pose_message(pose, frame_id)
         message.header.stamp = stamp.to_msg()

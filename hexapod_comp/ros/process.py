@@ -203,6 +203,13 @@ class RosSession:
         """Handle received messages, or the first to arrive within this time, s."""
         self._executor.spin_once(timeout_sec=timeout)
 
+    def catch_up(self) -> None:
+        """Handle all messages received so far, in their order: while a program computes for minutes, a hundred thousand
+        may arrive, and an answer behind them would come too late."""
+        last = self._executor.create_task(lambda: None)
+        while not last.done():
+            self.spin_once(0.02)
+
     def wait(self, condition: Callable[[], object], timeout: float, what: str) -> None:
         """Handle messages until a condition holds; a NoAnswerError if it does not within this time, s."""
         end = time.monotonic() + timeout
