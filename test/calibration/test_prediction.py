@@ -22,7 +22,6 @@ from scipy.stats import gmean
 from hexapod_comp.calibration.estimator import DesignMatrix, Estimation, LinearProblem, Posterior, solve
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import (
-    MACHINE_ERRORS,
     ErrorPredictor,
     FittedParameters,
     box_errors,
@@ -376,30 +375,6 @@ def test_machine_errors_that_leave_no_trace(instrument: str, diagonals: int, uns
     slopes swallow; on a body diagonal it is not. Roll needs a roll channel."""
     errors = without_trace(read(instrument, diagonals, FIELD))
     assert {error.name for error in errors} == unseen
-
-
-def readings_of(instrument: str, diagonals: int, model: MachineModel) -> Estimation:
-    """Return what lasers without noise read on a machine, against the nominal one."""
-    quiet = small.campaign(instrument, diagonals, noise=(0.0,) * len(KINDS), beam_slope=0.0)
-    return Estimation(small.measured(RealMachine(small.paper(), model), quiet, 0), linearised("5-D", 0, FIELD)[0])
-
-
-@pytest.mark.parametrize("name", [SQUARENESS[0], TWISTS[1], ROLLS[2]])
-def test_an_unseen_error_really_changes_no_reading(name: str):
-    """10 µm or 10 µrad of it are put on a machine: 5-D lines differ by zeros and slopes, diagonals and roll do not.
-
-    Readings over 1 µm. What is left of the unseen ones: the grid's interpolation of a term linear in each
-    coordinate, which is exact, and the cosine of 10 µrad.
-    """
-    space, _ = linearised("5-D", 0, FIELD)
-    labels = [label for block in space.blocks for label in block.labels]
-    x = np.zeros(space.size)
-    x[[labels.index(f"{component} {term}") for component, term in MACHINE_ERRORS[name]]] = 1e-5
-    for instrument, diagonals, is_seen in (("5-D", 0, False), ("6-D" if name in ROLLS else "5-D", 4, True)):
-        estimation = readings_of(instrument, diagonals, space.model(x))
-        left, _ = estimation.linearise(np.zeros(space.size), np.ones(len(estimation.measurements)))
-        assert (np.abs(left.target).max() > 1.0) == is_seen
-        assert is_seen or np.abs(left.target).max() < 1e-3
 
 
 def by_hand(singular: np.ndarray) -> tuple[ParameterSpace, LinearProblem, Posterior]:

@@ -281,18 +281,6 @@ def test_wide_files(tmp_path: Path) -> None:
     assert "columns not used: l1, l2, l3, l4, l5, l6, note" in found.notes[0]
 
 
-def test_wide_files_with_struts_but_no_commands(tmp_path: Path) -> None:
-    """All readings zero, lengths at zero those of home: the commanded pose is home, 400 mm up."""
-    columns = WIDE_COLUMNS[: WIDE_COLUMNS.index("commanded")] + WIDE_COLUMNS[WIDE_COLUMNS.index("measured") :] + STRUTS
-    found = wide(tmp_path, columns)
-    np.testing.assert_allclose(found.stations.positions[0], [0.0, 0.0, 0.4], atol=1e-12)
-    np.testing.assert_allclose(found.value[:3], [25.4e-3, 0.0, 6.4e-3], atol=1e-12)
-    up = wide(tmp_path, columns + "  zero: measured\n")
-    np.testing.assert_allclose(up.value, 0.0, atol=1e-12)  # one row: six lengths fit it exactly
-    given = wide(tmp_path, columns + "  zero: given\n  zero_length_mm: [500, 500, 500, 500, 500, 500]\n")
-    np.testing.assert_allclose(given.stations.commands, 0.5, atol=1e-12)
-
-
 BAD_WIDE = {
     "no source of commands": (WIDE_COLUMNS.replace("commanded:", "measurd:"), "measurd|commanded: is missing"),
     "missing column": (WIDE_COLUMNS.replace("[cx,", "[cxx,"), "header: column cxx is missing"),

@@ -232,14 +232,6 @@ def test_a_strut_that_turns_on_the_way_has_the_direction_in_which_it_arrives() -
     assert found.stations.sense[1, 3] == 1.0
 
 
-def test_a_place_reached_from_both_sides_is_two_stations() -> None:
-    """To the middle from the left, from the right, from the left: backlash differs. The first row has no past."""
-    left, middle, right = at((-10, 0, 400), (0, 0, 400), (10, 0, 400))
-    found = tracked([left, middle, right, middle, left, middle])
-    assert list(found.stations.sense[found.station, 0]) == [0.0, 1.0, 1.0, -1.0, -1.0, 1.0]
-    assert found.station[1] != found.station[3]
-
-
 def test_strut_readings_tell_directions_even_where_the_pose_stands_still() -> None:
     """Encoders 1 µm longer at the same pose: struts out, axes nowhere. Closer than 1 nm is the same command."""
     pose = at((0, 0, 400))[0]
@@ -336,14 +328,6 @@ def test_what_poses_may_mean_is_named(name, change, way: str, counted_from: floa
     geometry, tips = load_geometry(machine.write(tmp_path / "machine.yaml")), in_box(machine)
     with pytest.raises(InputFileError, match=f"are refused; none would be .*{way}"):
         assemble(geometry, went(machine, tips, change(tips), counted_from))
-
-
-def test_another_machines_poses_name_it() -> None:
-    """400 mm above the base of the positioning unit, whose struts end at 218 mm; the paper's machine reaches there."""
-    tips = np.array([[0.0, 0.0, 0.4]]) + 0.05 * np.random.default_rng(1).random((20, 3))
-    readings = [Reading("all", 1, FROM_PREVIOUS, Pose(tip, LEVEL), "position_x", 0.0) for tip in tips]
-    with pytest.raises(InputFileError, match=r"20 of 20 commands are refused; none would be .*with --machine paper"):
-        assemble(load_geometry("positioning_unit"), readings)
 
 
 @pytest.mark.parametrize(("counted_from", "fine"), [(-0.0119, True), (-0.0120, False), (0.25, False)])
