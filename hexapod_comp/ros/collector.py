@@ -220,12 +220,12 @@ class AdaptedMachine(WatchedMachine):
 
         Where another client has the tool moved, wait until that has ended, and ask again.
         """
-        braked = False
+        braked = 0  # the request that was: one that is asked for again is a new one
 
         def watch(state: MoveState) -> None:
             nonlocal braked
-            if not braked and not self._going_on():
-                braked = True
+            if state.request != braked and not self._going_on():
+                braked = state.request
                 self._stop.call_async(Trigger.Request())
 
         while True:

@@ -641,6 +641,24 @@ def test_another_clients_move_is_reported_and_waited_for(stopped: bool, monkeypa
     assert (len(asked), len(warned)) == (3, 2)
 
 
+def test_a_stop_brakes_a_move_that_was_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The stop of the first comes too late, as its commands are refused; the second is stopped as well."""
+    machine, requests, stops = object.__new__(AdaptedMachine), iter([1, 2]), list[object]()
+
+    def move(machine: AdaptedMachine, pose: Pose, *_: Any, progress: Callable[[MoveState], object]) -> MoveState:
+        request = next(requests)
+        for state in ("planning", "moving"):
+            progress(MoveState(state, "", 0.0, 1.0, "", request, 0, ""))
+        raise MoveError("refusal" if request == 1 else "person", "stopped")
+
+    monkeypatch.setattr(Machine, "move", move)
+    monkeypatch.setattr(WatchedMachine, "_spin", lambda *_: None)
+    machine._going_on, machine._stop = lambda: False, SimpleNamespace(call_async=stops.append)
+    with pytest.raises(MoveError, match="person"):
+        machine.move(HOME)
+    assert len(stops) == 2
+
+
 def test_the_node_starts_reports_and_stops_a_calibration(bench: Bench, tmp_path: Path) -> None:
     """No machine is there: the process waits for one. The journal is the test's."""
     node = bench.add(AdapterNode, True, {"folder": str(tmp_path)})
