@@ -2,8 +2,8 @@
 
     python -m benchmarks.mutants [--count 300] [--seed 0] [--jobs 2] [--rooms ROOM ...] [--only N [N ...]]
 
-The tests are those that pass the line, by the coverage recorded in a run of all tests, the most specific ones first;
-then those of its room, which start processes of their own. ``--only`` repeats mutants by their numbers.
+The tests are those that pass the line, by the coverage recorded in a run of all tests, the most specific ones first; of
+a line that none passes in its own process, those of the room. ``--only`` repeats mutants by their numbers.
 """
 
 from __future__ import annotations
@@ -38,8 +38,13 @@ PACKAGE = ROOT / "hexapod_comp"
 FOLDER = ROOT / "out" / "mutants"
 # Files and folders of what is judged by eye, or not ours
 NOT_DRAWN = {"pictures.py", "page.py", "shell_page.py", "__main__.py", "stable_abi"}
-# The tests of the C core, whose lines no Python tool sees
-C_TESTS = ["core", "machine", "compensation", "export", "workspace"]
+# Where a room's tests are whose lines no test passes in its own process: they are C, or nodes and commands run them
+TESTS = {
+    "core": ["core", "machine", "compensation", "export", "workspace"],
+    "ros": ["ros", "loop"],
+    "cli": ["cli", "test_doc_commands.py"],
+}
+
 LONGEST = 120  # Time of a test with a mutant that waits, s
 BAR = 0.95
 LIMIT = 20.0  # Processor time of a test with a mutant, s
@@ -191,12 +196,10 @@ class Coverage:
         self.passed = Counter(test for lines in self.tests.values() for tests in lines.values() for test in tests)
 
     def of(self, path: Path, first: int, last: int) -> list[str]:
-        """Return the tests that pass these lines, where none does those that pass the file; the most specific first."""
+        """Return the tests that pass these lines, the most specific first, those of a file together."""
         lines = self.tests.get(str(path), {})
-        found = set[str]().union(*(lines.get(line, ()) for line in range(first, last + 1))) or set[str]().union(
-            *lines.values()
-        )
-        by_file: dict[str, list[str]] = {}  # together, so that a file's fixtures are made once
+        found = set[str]().union(*(lines.get(line, ()) for line in range(first, last + 1)))
+        by_file: dict[str, list[str]] = {}
         for test in sorted(found, key=lambda one: self.passed[one]):
             by_file.setdefault(test.partition("::")[0], []).append(test)
         return [test for tests in by_file.values() for test in tests]
@@ -239,19 +242,16 @@ class Copy:
         os._exit(int(code))
 
     def killed_by(self, path: Path, text: str, tests: list[str]) -> str:
-        """Put a mutant in its file's place, run the tests, then those of its room, and put the file back."""
+        """Put a mutant in its file's place, run the tests, or those of its room, and put the file back."""
         place = self.folder / path.relative_to(ROOT)
-        room = f"test/{path.relative_to(PACKAGE).parts[0]}"
-        parts = [[f"test/{one}"] for one in C_TESTS] if path.suffix == ".c" else [tests, [room]]
+        room = path.relative_to(PACKAGE).parts[0]
+        known = [f"test/{one}" for one in TESTS.get(room, [room]) if (ROOT / "test" / one).exists()]
         try:
             place.write_text(text, encoding="utf-8")
             command = [sys.executable, "setup.py", "-q", "build_ext", "--inplace", "--force"]
             if path.suffix == ".c" and subprocess.run(command, cwd=self.folder, capture_output=True).returncode:
                 return "the compiler"
-            for part in parts:
-                if part and (ROOT / part[0].partition("::")[0]).exists() and (failed := self.failure(part)):
-                    return failed
-            return ""
+            return self.failure(tests or known) if tests or known else ""
         finally:
             shutil.copy2(path, place)
             if path.suffix == ".c":
