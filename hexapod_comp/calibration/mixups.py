@@ -72,6 +72,11 @@ class Alternative:
     better: float  # how many times smaller the noise of the kind that gains most becomes
     text: str = ""  # what to print in place of both
 
+    def words(self) -> str:
+        """Return what is reported of it; the same residuals by a machine with smaller errors are more probable too."""
+        fits = f"{self.better:.3g} times better" if self.better > 1.005 else "as well, by smaller errors of the machine"
+        return self.text or f"{self.name} fits {fits}"
+
 
 class Mode(NamedTuple):
     """What all readings, or all parts of the machine, may have in common, by a mistake rather than by chance."""
@@ -108,7 +113,7 @@ def mixups(
     best = max((other.gain for other in found), default=0.0)
     odds = np.log(ASSUMED.mixup_odds)
     named = [other for other in found if other.gain > max(odds, best - odds)]
-    return [n.text or f"{n.name} fits {n.better:.3g} times better" for n in sorted(named, key=lambda n: -n.gain)]
+    return [other.words() for other in sorted(named, key=lambda other: -other.gain)]
 
 
 class _Way(NamedTuple):
