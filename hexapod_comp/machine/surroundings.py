@@ -18,7 +18,7 @@ NO_LOAD = (math.nan,) * 7
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What acted on the machine at N places. Whatever is added here tells places apart by itself."""
+    """What acted on the machine at N places; two places with a difference in any of these fields are two stations."""
 
     temperatures: np.ndarray  # (N, 8): struts 1–6, base, platform, °C
     times: np.ndarray  # (N,): when these were read, s; NaN where that is not known

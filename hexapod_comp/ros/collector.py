@@ -271,7 +271,7 @@ class AdaptedMachine(WatchedMachine):
     def refuse_unreadable(self, path: Path) -> None:
         """Refuse a model file that the compensator would not open, before anything is measured for it.
 
-        Whether names that are relative to its own folder lead there is not known here: then its reload tells.
+        A name relative to the compensator's own folder cannot be checked from here: its reload will refuse it.
         """
         folder, model = self._parameters("model_folder", "model_file")
         name = folder or model

@@ -139,7 +139,7 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
         alone=np.array([largest_factor(kind) for kind in range(types)]),
         only=only,
         without=without,
-        equal=np.where(acting, allowed / max(acting.sum(), 1) / np.where(acting, only, 1.0), np.inf),
+        equal=np.where(acting, allowed / max(int(acting.sum()), 1) / np.where(acting, only, 1.0), np.inf),
     )
 
 
