@@ -238,6 +238,11 @@ class MoveState:
     refusal: str
     ready: bool = True  # the mover knows the machine, and where its tool stands
 
+    @property
+    def stands(self) -> bool:
+        """Whether no move is planned or under way."""
+        return self.state in ("idle", "arrived", "stopped")
+
 
 class Machine(RosSession):
     """A running machine with a mover: moves its tool and waits until it has arrived.
@@ -308,7 +313,7 @@ class Machine(RosSession):
                         raise MoveError(state.stopped_by, state.text)
                 elif taken:
                     raise MoveError("replaced", "another move was asked for")
-            if not taken and now > answer and (state is None or state.state in ("idle", "arrived", "stopped")):
+            if not taken and now > answer and (state is None or state.stands):
                 raise NoAnswerError(f"the mover has not begun the move within {ANSWER_TIMEOUT:g} s")
             if now > end:
                 self.stop()
@@ -318,7 +323,7 @@ class Machine(RosSession):
         """Brake within the struts' limits; returns when the tool stands."""
         future = self._stop.call_async(Trigger.Request())
         self.wait(future.done, ANSWER_TIMEOUT, "the mover's answer to stop")
-        self.wait(lambda: self.state is not None and self.state.state in ("idle", "arrived", "stopped"), 60.0, "rest")
+        self.wait(lambda: self.state is not None and self.state.stands, 60.0, "rest")
 
     def _connected(self) -> bool:
         found = self._to.get_subscription_count() and self._by.get_subscription_count()

@@ -241,7 +241,7 @@ class AdaptedMachine(WatchedMachine):
 
     def _wait_for_others(self) -> None:
         self.node.get_logger().warning("another client moves the tool: waiting until it stands")
-        while self.last.state not in ("idle", "arrived", "stopped"):
+        while not self.last.stands:
             if not self._going_on():
                 raise MoveError("person", "stopped while another client moved the tool")
             self.spin_once(0.02)
