@@ -337,17 +337,23 @@ def test_modes_are_those_a_multi_start_finds(seed, planar, deviation):
         np.testing.assert_allclose(distances(structure, mode), lengths, rtol=0, atol=CLOSED)
 
 
+def modes_and_the_picked(geometry, structure, pose):
+    """Return the modes at a pose's lengths: they close, the pose is one of them, and the one that is picked."""
+    lengths = distances(structure, pose)
+    modes = assembly_modes(structure, lengths)
+    assert miss(pose, modes) < REGULAR
+    assert miss(pose, [working_mode(geometry, structure, lengths)]) < REGULAR
+    for mode in modes:
+        np.testing.assert_allclose(distances(structure, mode), lengths, rtol=0, atol=CLOSED)
+    return modes
+
+
 @pytest.mark.parametrize("deviation", [0.0, 1e-5, 5e-4])
 def test_every_workspace_pose_is_found_and_picked(geometry, structure, deviation):
     rng = np.random.default_rng(3)
     for pose in workspace_poses(geometry, 20, seed=4):
         real = structure.moved(*rng.uniform(-deviation, deviation, (2, 6, 3)))
-        lengths = distances(real, pose)
-        modes = assembly_modes(real, lengths)
-        assert miss(pose, modes) < REGULAR
-        assert miss(pose, [working_mode(geometry, real, lengths)]) < REGULAR
-        for mode in modes:
-            np.testing.assert_allclose(distances(real, mode), lengths, rtol=0, atol=CLOSED)
+        modes_and_the_picked(geometry, real, pose)
 
 
 def test_sixteen_modes_are_the_most_of_a_6_3_machine(structure):
@@ -369,14 +375,9 @@ def test_other_machines_are_sought_from_all_around(geometry, structure):
     split[::2, 0] += 0.03
     general = replace(structure, platform_joints=split)
     for number, pose in enumerate(workspace_poses(geometry, 10, seed=6)):
-        lengths = distances(general, pose)
-        modes = assembly_modes(general, lengths)
-        assert miss(pose, modes) < REGULAR
-        assert miss(pose, [working_mode(geometry, general, lengths)]) < REGULAR
-        for mode in modes:
-            np.testing.assert_allclose(distances(general, mode), lengths, rtol=0, atol=CLOSED)
+        modes = modes_and_the_picked(geometry, general, pose)
         if number < 2:
-            truth = multi_start(general, lengths, number)
+            truth = multi_start(general, distances(general, pose), number)
             assert len(modes) == len(truth)
             assert max(miss(other, modes) for other in truth) < 1e-8
 
