@@ -20,12 +20,11 @@ from scipy.special import chdtr, chdtrc
 from ..errors import CalibrationError
 from ..machine.geometry import STRUT_NAMES
 from ..machine.load import Load
-from ..measurements.readings import AXES, CHANNELS, KINDS, MeasurementSet, Stations
+from ..measurements.readings import AXES, CHANNELS, KINDS, MeasurementSet
 from .assumptions import ASSUMED
-from .blocks.block import Linkage, Prediction
-from .blocks.load import stated_load, unsettled_lengths
+from .blocks.block import Linkage
+from .blocks.load import stated_load
 from .estimator import Estimation
-from .observations import Cells
 from .parameters import BLOCKS, ParameterSpace
 from .posterior import FittedParameters, box_stations
 from .sensitivity import derivatives, predict
@@ -206,16 +205,6 @@ def reading_noise(fitted: FittedParameters) -> np.ndarray:
     return fitted.noise / np.sqrt(consistency(ASSUMED.huber) if fitted.space.settings.robust else 1.0)
 
 
-def unsettled_cells(space: ParameterSpace, prediction: Prediction, stations: Stations, cells: Cells) -> np.ndarray:
-    """Return the effect on cells, (C, k), of struts whose lost motion may be at either end, by standard deviations."""
-    linkage = Linkage(prediction, space.probe, stations)
-    deviation = unsettled_lengths(linkage)
-    station, strut = np.nonzero(deviation)
-    gains = linkage.errors(cells.station, cells.directions, np.arange(6)).gains
-    effect: np.ndarray = gains[:, strut] * deviation[station, strut] * (cells.station[:, None] == station)
-    return effect
-
-
 @dataclass(frozen=True)
 class CheckReadings:
     """Check readings with the prediction of a model and its fit, as n numbers free of the instruments' unknowns."""
@@ -260,7 +249,10 @@ class CheckReadings:
         residuals = seen @ linear.target - rows @ fitted.x
         noise, prediction = (seen * sigma**2) @ seen.T, predict(space, fitted.x, m.stations)
         if prediction.load.lost_motion.any():
-            unsettled = seen @ estimation.free_of_nuisance(unsettled_cells(space, prediction, m.stations, cells))
+            gains, deviations = estimation.of_unsettled(prediction)
+            at = cells.station[:, None] == np.unique(cells.station)  # a strut's end is one for all cells of a station
+            ends = np.einsum("cn,cs->cns", at, gains * deviations).reshape(len(cells.kind), -1)
+            unsettled = seen @ estimation.free_of_nuisance(ends)
             noise += unsettled @ unsettled.T
 
         def loaded(change: np.ndarray) -> np.ndarray:

@@ -418,7 +418,7 @@ def propose(
             seen += seen_by(space, batch, laid)
         read_under += [load_text(load)] * len(runs)
 
-    runs = runs * (1 + len(goal.loads))
+    each, runs = len(runs), runs * (1 + len(goal.loads))  # under each load the same runs
     costs = np.array([goal.times[run.instrument].of(run, base.cycles) for run in runs])
     # Another load means that the instrument is set up anew
     needs = [run.instrument + load for run, load in zip(runs, read_under, strict=True)]
@@ -437,7 +437,7 @@ def propose(
 
     # All instruments, or one of them alone, and all loads, or fewer: that saves setting up the others.
     first, *others = dict.fromkeys(read_under)
-    fewer = [(first, *others), *((first, other)[: 1 + bool(other)] for other in ("", *others))]
+    fewer = [(first, *others), (first,), *((first, other) for other in others)]
     alone = [(name,) for name in goal.instruments] if len(goal.instruments) > 1 and any(putting_up.values()) else []
     ways = [
         [name + load for load in loads for name in names] for loads in fewer for names in (goal.instruments, *alone)
@@ -455,9 +455,7 @@ def propose(
     if needed is None and all_of_them <= goal.error:  # continued, to report the time that the goal would take
         tries[0].extend(np.inf, lambda: left(tries[0]) <= goal.error, most=25)
         needed = tries[0].spent if left(tries[0]) <= goal.error else None
-    picks = sorted(
-        picks, key=lambda n: (n // (len(runs) // (1 + len(goal.loads))), goal.instruments.index(runs[n].instrument), n)
-    )
+    picks = sorted(picks, key=lambda n: (n // each, goal.instruments.index(runs[n].instrument), n))
     named = tuple(replace(runs[n], name=f"{k}: {runs[n].name}{read_under[n]}") for k, n in enumerate(picks, start=1))
     of_parameter, total = (aim.square * covariance).sum(axis=1), (aim.square * covariance).sum() + aim.stops**2
     shares = {block.name: float(of_parameter[block.part].sum() / total) for block in space.blocks}

@@ -499,10 +499,15 @@ class Estimation:
         c = self.cells
         if not prediction.load.lost_motion.any():
             return np.zeros((2, len(c.station)))
-        linkage = Linkage(prediction, self.space.probe, self.measurements.stations)
-        deviations = unsettled_lengths(linkage)[c.station]
-        squares = (linkage.errors(c.station, c.directions, np.arange(6)).gains * deviations) ** 2
+        gains, deviations = self.of_unsettled(prediction)
+        squares = (gains * deviations) ** 2
         return np.stack([squares @ np.count_nonzero(deviations, axis=0), squares.sum(axis=1)])
+
+    def of_unsettled(self, prediction: Prediction) -> tuple[np.ndarray, np.ndarray]:
+        """Return cells' derivatives by the struts' lengths, and these lengths' deviations by unsettled lost motions, m,
+        both (C, 6)."""
+        c, linkage = self.cells, Linkage(prediction, self.space.probe, self.measurements.stations)
+        return linkage.errors(c.station, c.directions, np.arange(6)).gains, unsettled_lengths(linkage)[c.station]
 
     def _problem(
         self, target: np.ndarray, rows: DesignMatrix, scatter: np.ndarray, unknowns: list[Nuisance]

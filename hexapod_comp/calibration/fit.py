@@ -14,6 +14,7 @@ from ..errors import CalibrationError, HexapodError
 from ..machine.arrays import rms
 from ..machine.load import Payload
 from ..machine.model import MachineModel, ModelOrigin
+from ..machine.surroundings import load_row
 from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementSet, refuse_unmoved
 from ..pose import Pose
@@ -55,6 +56,7 @@ from .trust import LeftOut, Residuals, Verdict, judge, with_drift
 # Readings further than this from the reference temperature, K, need an expansion: 1 µm on half a metre
 WARM = 0.2
 NEGLIGIBLE = 1e-5  # probability of blocks that were left out, whatever they would do to the tool
+MOST_STRUTS = 4  # struts with a negative backlash mean that the directions are swapped
 MOST_LEFT_OUT = 3  # runs left out of a fit that does not converge; more are a bad campaign
 
 
@@ -118,7 +120,7 @@ class ModelFit:
 
     def under(self, payload: Payload, gravity: Sequence[float] | None = None) -> ToolError | None:
         """Return the expected tool error with this model where it is told another load, for a level tool."""
-        load = payload.mass, *payload.centre, *(gravity or [np.nan] * 3)
+        load = load_row(payload) if gravity is None else load_row(payload, gravity)
         covariance = physical_covariance(self.space, self.solution.posterior)
         errors = box_errors(self.space, self.solution.x, load=load)
         return expected_error(errors, covariance, beyond=self.verdict.unexplained)
@@ -173,7 +175,8 @@ def fit_model(
     except HexapodError as error:
         space = begun.everything.space
         named = mixups(begun.everything, [block.name for block in space.blocks], progress)
-        if _swapped(space, solve(space, begun.problem, space.start_tolerances(), np.ones(len(KINDS)))):
+        nominal = solve(space, begun.problem, space.start_tolerances(), np.ones(len(KINDS)))
+        if len(_negative_backlash(space, nominal)) >= MOST_STRUTS:
             named.append(SWAPPED)
         if named:
             error.with_lines("\n".join(f"  {cause}" for cause in named))
@@ -398,20 +401,15 @@ def _negative_backlash(space: ParameterSpace, posterior: Posterior) -> np.ndarra
     if block is None:
         return np.zeros(0, dtype=int)
     members = np.isin(posterior.used, np.arange(space.size)[block.part])
-    deviations = np.sqrt(np.diag(posterior.covariance)[members])
-    return np.flatnonzero(posterior.y[members] < -ASSUMED.surely * deviations)
-
-
-def _swapped(space: ParameterSpace, posterior: Posterior) -> bool:
-    """Return whether most struts have a negative backlash."""
-    return len(_negative_backlash(space, posterior)) > 3
+    below = posterior.y < -ASSUMED.surely * np.sqrt(np.diag(posterior.covariance))
+    return posterior.used[members & below] - block.part.start
 
 
 def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
     """Return notes on negative backlash; refuse the fit if most struts have it."""
-    negative = _negative_backlash(space, solution.posterior)
-    values = [f"{v * 1e6:.2f}" for block in [space.block("backlash")] if block for v in solution.x[block.part]]
-    if _swapped(space, solution.posterior):
+    negative, block = _negative_backlash(space, solution.posterior), space.block("backlash")
+    values = [] if block is None else [f"{value * 1e6:.2f}" for value in solution.x[block.part]]
+    if len(negative) >= MOST_STRUTS:
         problem = f"{SWAPPED}: the struts would have a backlash of {', '.join(values)} µm"
         raise CalibrationError("direction", problem)
     return [f"strut_{i + 1}: backlash of {values[i]} µm found, taken as none" for i in negative]

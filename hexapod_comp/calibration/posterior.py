@@ -366,11 +366,8 @@ def expected_error(
     """
     if errors is None:
         return None
-    beyond, squares, drawn = (
-        (beyond or Unexplained()).beside(*errors.unsettled),
-        errors.mean_squares,
-        _drawn(covariance),
-    )
+    beyond = (beyond or Unexplained()).beside(*errors.unsettled)
+    squares, drawn = errors.mean_squares, _drawn(covariance)
     if prior is None:
         parts = errors.values[:, :3], errors.values[:, 3:]
         before = [float(np.sqrt((part**2).sum(axis=1).mean())) for part in parts]

@@ -29,6 +29,7 @@ from ..machine.load import Payload, check_gravity
 from ..machine.model import MachineModel, RealMachine
 from ..machine.model_file import load_model, read_load
 from ..machine.region import region_json, region_text
+from ..machine.surroundings import load_row
 from ..measurements.campaign import Campaign, campaign_text, template
 from ..measurements.files import read_measurements
 from ..measurements.iso230 import judge, standards_json, standards_text
@@ -111,9 +112,8 @@ def plan(args: argparse.Namespace) -> Result:
     given: dict[str, Any] = {"instruments": tuple(args.instruments.split(","))} if args.instruments is not None else {}
     given |= {"seconds": args.hours * 3600.0} if args.hours is not None else {}
     tool = geometry.payload
-    tools = [Payload(mass, tool.centre) for mass in args.tools_kg or ()]
-    loads = [(other.mass, *other.centre, *[np.nan] * 3) for other in tools]
-    loads += [(tool.mass, *tool.centre, *check_gravity("--gravity", vector)) for vector in args.gravity or ()]
+    loads = [load_row(Payload(mass, tool.centre)) for mass in args.tools_kg or ()]
+    loads += [load_row(tool, check_gravity("--gravity", vector)) for vector in args.gravity or ()]
     given["loads"] = tuple(loads)
     goal = Goal(args.goal_um * 1e-6, float(np.radians(args.tilt_deg or 0.0)), times=times, **given)
     place = MeasuringBox(geometry, campaign.box, campaign.level, goal.tilt)

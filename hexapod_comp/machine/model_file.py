@@ -28,6 +28,7 @@ from .model import Datum, MachineModel, ModelOrigin
 from .outside import OutsideTable, outside_block, read_outside
 from .region import Region
 from .struts import WAVE_PARTS, StrutErrors
+from .surroundings import load_row
 from .temperatures import PARTS, LateGrowth
 from .terms import check_magnitude, check_magnitudes, read_terms, table_text, write_terms
 
@@ -230,7 +231,7 @@ def _read_origin(top: Section) -> ModelOrigin:
             gravity = check_gravity("gravity", entry.quantity("gravity", "acceleration", (3,)))
         except ModelError as error:
             raise entry.error(error.key, error.problem, error.value) from error
-        loads.append((payload.mass, *payload.centre, *gravity))
+        loads.append(load_row(payload, gravity))
         entry.finish()
     if len(loads) > MOST_LOADS:
         raise top.error("measured_loads", f"must be no more than {MOST_LOADS}", len(loads))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,11 @@ from .temperatures import HUMIDITY, PARTS, REFERENCE_TEMPERATURE, Lag, Temperatu
 
 # Load that is not known: NaN, the mass and centre of the tool in use, and the model's gravity
 NO_LOAD = (math.nan,) * 7
+
+
+def load_row(payload: Payload, gravity: Sequence[float] = NO_LOAD[4:]) -> tuple[float, ...]:
+    """Return a payload under gravity, m/s² in base, by default the model's, as a row of :attr:`Surroundings.loads`."""
+    return (payload.mass, *payload.centre, *gravity)
 
 
 @dataclass(frozen=True)
