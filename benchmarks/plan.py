@@ -81,7 +81,7 @@ def thinned(geometry: HexapodGeometry, goal: Goal, plan: Proposal) -> float:
         tilt=goal.tilt,
     )
     every = template(full, geometry)
-    aim = Aim(plan.space, goal.tilt)
+    aim = Aim(plan.space, goal)
     errors = []
     for number in (every.station, every.run):
         poses = np.array([not run.is_line for run in every.runs])[every.run]
@@ -138,7 +138,7 @@ def achieved(campaign: Campaign, plan: Proposal, settings: FitSettings, seed: in
 
 def between(plan: Proposal, campaign: Campaign) -> tuple[float, float]:
     """Return between what the error lies with 95 % by the machines that the plan leaves possible, m."""
-    aim = Aim(plan.space, plan.goal.tilt)
+    aim = Aim(plan.space, plan.goal)
     rows = np.concatenate(seen_by(plan.space, campaign, template(campaign, plan.space.geometry)))
     root = np.linalg.cholesky(np.linalg.inv(np.eye(plan.space.size) + rows.T @ rows))
     z = root @ np.random.default_rng(3).standard_normal((len(root), DRAWS))

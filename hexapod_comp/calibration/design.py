@@ -447,7 +447,7 @@ def propose(
     if not best.picks:
         raise CalibrationError("hours", f"are too few: the shortest run takes {best.totals().min() / 3600.0:.2g} h")
     progress("what limits it")
-    covariance, seconds, picks = best.criterion.covariance, best.spent, best.picks
+    covariance, seconds, picks = best.criterion.covariance, best.spent, tuple(best.picks)
     repeated = 1e4  # repeats after which only errors that the instruments do not see remain
     all_of_them, unseen = (max(aim.errors(tries[0].criterion.after_all(n)).values()) for n in (1.0, repeated))
     needed = seconds if left(best) <= goal.error else None
@@ -455,8 +455,8 @@ def propose(
     if needed is None and all_of_them <= goal.error:  # continued, to report the time that the goal would take
         tries[0].extend(np.inf, lambda: left(tries[0]) <= goal.error, most=25)
         needed = tries[0].spent if left(tries[0]) <= goal.error else None
-    picks = sorted(picks, key=lambda n: (n // each, goal.instruments.index(runs[n].instrument), n))
-    named = tuple(replace(runs[n], name=f"{k}: {runs[n].name}{read_under[n]}") for k, n in enumerate(picks, start=1))
+    order = sorted(picks, key=lambda n: (n // each, goal.instruments.index(runs[n].instrument), n))
+    named = tuple(replace(runs[n], name=f"{k}: {runs[n].name}{read_under[n]}") for k, n in enumerate(order, start=1))
     of_parameter, total = (aim.square * covariance).sum(axis=1), (aim.square * covariance).sum() + aim.stops**2
     shares = {block.name: float(of_parameter[block.part].sum() / total) for block in space.blocks}
     shares["repeatability"] = aim.stops**2 / total
@@ -471,7 +471,7 @@ def propose(
         unseen=unseen,
         shares=dict(sorted(shares.items(), key=lambda item: -item[1])),
         needed=needed,
-        loads=tuple(read_under[n] for n in picks),
+        loads=tuple(read_under[n] for n in order),
     )
 
 

@@ -72,6 +72,11 @@ def test_what_limits_a_goal() -> None:
     assert not short.met
     assert short.needed is not None
     assert short.needed > HOUR
+    # What is proposed fits into the hour, also where the choice went on to find the time that the goal needs
+    runs = short.campaign.runs
+    spent = sum(TIMES[run.instrument].of(run, short.campaign.cycles) for run in runs) + TIMES["linear"].first
+    assert spent == pytest.approx(short.seconds, abs=1e-6)
+    assert spent <= HOUR
     assert proposed(1.5 * UM, 0.0, ("linear",), short.needed / HOUR + 0.01).met
 
 
