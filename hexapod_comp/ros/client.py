@@ -31,6 +31,10 @@ TRACK_QOS = profile(200, reliable=False)
 # A command without an answer after this time is lost, s: a busy computer may delay it by seconds
 ANSWER_TIMEOUT = 5.0
 
+# States of a standing mover, one a second, that do not mention a request: it will never receive it. Clocks do not tell:
+# on a busy computer it may be received a minute later.
+UNMENTIONED = 5
+
 
 @dataclass
 class Sent:
@@ -237,6 +241,7 @@ class MoveState:
     refused_request: int  # stamp of the newest refused message, ns
     refusal: str
     ready: bool = True  # the mover knows the machine, and where its tool stands
+    moves: int = 0  # that the mover has begun since it was started
 
     @property
     def stands(self) -> bool:
@@ -258,7 +263,9 @@ class Machine(RosSession):
         self._to = node.create_publisher(PoseStamped, "move_to", EVENT_QOS)
         self._by = node.create_publisher(PoseStamped, "move_by", EVENT_QOS)
         self._stop = node.create_client(Trigger, f"{mover}/stop")
-        node.create_subscription(DiagnosticStatus, f"{mover}/state", self._on_state, LATCHED_QOS)
+        self._states = node.create_subscription(
+            DiagnosticStatus, f"{mover}/state", self._on_state, LATCHED_QOS
+        ).topic_name
         try:
             self.wait(self._connected, 10.0, f"the node {mover}, with a compensator and its pose estimate")
         except NoAnswerError:
@@ -287,35 +294,39 @@ class Machine(RosSession):
         The target is ``pose_tool_in_work``, m, or in another frame: ``base`` or a named work frame. A `relative` move
         goes on from where the tool stands, along and about the frame's axes; its frame may also be ``tool``. After
         `timeout`, s, the move is stopped. A MoveError: it was refused or stopped, ``reason`` is the cause. A
-        NoAnswerError: the mover did not answer, or the tool had not arrived in time.
+        NoAnswerError: the mover has ended or not received it, or the tool had not arrived in time.
         """
         self.catch_up()
         stamp = self.node.get_clock().now()
         message = pose_message(pose, frame_id)
         message.header.stamp = stamp.to_msg()
-        asked, seen = stamp.nanoseconds, self.state
-        taken = False
+        asked, seen = stamp.nanoseconds, self.last
+        begun, unmentioned = False, 0
         (self._by if relative else self._to).publish(message)
-        end, answer = time.monotonic() + timeout, time.monotonic() + ANSWER_TIMEOUT
+        end = time.monotonic() + timeout
         while True:
             self.spin_once(0.02)
-            state, now = self.state, time.monotonic()
-            if state is not seen and state is not None:
-                seen = state
+            state = self.last
+            if state is not seen:
+                restarted, seen = state.moves < seen.moves, state
                 if state.refused_request == asked:
                     raise MoveError("refused", state.refusal)
                 if state.request == asked:
-                    taken = True
+                    begun = True
                     progress(state)
                     if state.state == "arrived":
                         return state
                     if state.state == "stopped":
                         raise MoveError(state.stopped_by, state.text)
-                elif taken:
+                elif restarted:
+                    raise MoveError("restarted", "the mover was restarted")
+                elif begun:
                     raise MoveError("replaced", "another move was asked for")
-            if not taken and now > answer and (state is None or state.stands):
-                raise NoAnswerError(f"the mover has not begun the move within {ANSWER_TIMEOUT:g} s")
-            if now > end:
+                elif state.stands and (unmentioned := unmentioned + 1) >= UNMENTIONED:
+                    raise NoAnswerError("the mover stands, and has not received the request")
+            elif self.node.count_publishers(self._states) == 0:
+                raise NoAnswerError("the mover has ended")
+            if time.monotonic() > end:
                 self.stop()
                 raise NoAnswerError(f"the tool has not arrived within {timeout:g} s, and was stopped")
 
@@ -341,4 +352,5 @@ class Machine(RosSession):
             int(v["refused_request"]),
             v["refusal"],
             v["ready"] == "true",
+            int(v["move"]),
         )

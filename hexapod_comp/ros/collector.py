@@ -33,7 +33,8 @@ from .messages import message_pose, nanoseconds_of, pose_message, pose_numbers, 
 
 MEDIAN_TO_SIGMA = 1.4826  # Standard deviation of a normal distribution over the median of its absolute values
 OF_A_MEDIAN = math.sqrt(math.pi / 2.0)  # Its standard deviation, times √n, over that of a reading
-ASKED_AGAIN = 2  # How often a refused move is: a busy computer's commands come late
+ASKED_AGAIN = 2  # How often a refused move is: a busy computer's commands come late, and nodes are restarted
+READY_WITHIN = 30.0  # A mover, or a compensator below it, that is restarted knows the machine again within this time, s
 LEAST_SAMPLES = 3  # of which a median is taken
 PATIENCE = 2.0  # Fewer than half of a stop's readings within this time, s, are a broken beam
 ANSWERED_WITHIN = 60.0  # A model is read within 30 s, or refused
@@ -124,14 +125,19 @@ class WatchedMachine(Machine):
     # ---- what collect asks ----
 
     def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
-        """Move as :meth:`.Machine.move` does; ask again for a move whose commands were refused, as late ones are."""
+        """Move as :meth:`.Machine.move` does; ask again for a move whose commands were refused, as late ones are, and
+        where mover or compensator was restarted on the way."""
         for _ in range(ASKED_AGAIN):
             try:
                 return super().move(pose, *arguments, **options)
             except MoveError as error:
-                if error.reason != "refusal":
+                if error.reason not in ("refusal", "restarted"):
                     raise
-            self._spin(1.0)
+                self._spin(1.0)
+                try:
+                    self.wait(lambda: self.last.ready, READY_WITHIN, "the mover")
+                except NoAnswerError:
+                    raise error from None
         return super().move(pose, *arguments, **options)
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
@@ -240,7 +246,9 @@ class AdaptedMachine(WatchedMachine):
                 return self._arrived
 
     def _wait_for_others(self) -> None:
-        self.node.get_logger().warning("another client moves the tool: waiting until it stands")
+        restarted = self._arrived is not None and self.last.moves < self._arrived.moves
+        what = "the mover was restarted" if restarted else "another client moves the tool"
+        self.node.get_logger().warning(f"{what}: waiting until it stands")
         while not self.last.stands:
             if not self._going_on():
                 raise MoveError("person", "stopped while another client moved the tool")

@@ -46,7 +46,7 @@ RESUMED = 5  # Number of new plans of a delayed move, from the last answered pos
 # Reasons that refuse all commands until an operator acts; other refusals may be due to a busy computer
 STANDING = ("following_error", "several_publishers", "unknown_publisher", "no_feedback", "tool_changed")
 ESTIMATE_WITHIN = 1.0  # An older estimate does not give the machine's pose, s
-STATE_PERIOD = 0.1  # Period of ~/state while the machine moves, s
+STATE_PERIOD, STANDING_PERIOD = 0.1, 1.0  # Periods of ~/state while the machine moves, and while it stands, s
 
 IDLE, PLANNING, MOVING, SETTLING, ARRIVED, STOPPED = "idle", "planning", "moving", "settling", "arrived", "stopped"
 UNDER_WAY = (PLANNING, MOVING, SETTLING)
@@ -293,9 +293,9 @@ class MoverNode(MachineNode):
     def _ask(self, message: Any, read: Any) -> None:
         """Plan a message's request, at once or when the present move has been braked; an invalid one changes
         nothing."""
-        if not self._active:
-            return
         try:
+            if not self._active:
+                raise CommandError("not_active", "the mover is not active: ros2 lifecycle set /mover activate")
             if self._geometry is None:
                 raise CommandError("not_ready", "the compensator has not yet published its machine on ~/files")
             request = read()
@@ -499,19 +499,17 @@ class MoverNode(MachineNode):
         level = ERROR if self._state == STOPPED and self._by not in ("person",) else OK
         name = f"{self.get_fully_qualified_name()[1:]}: move"
         self._states.publish(status_of(name, self.hardware_id, level, f"{self._state}: {self._text}", values))
-        self._state_due = time.monotonic() + STATE_PERIOD
+        self._state_due = time.monotonic() + (STATE_PERIOD if self._state == MOVING else STANDING_PERIOD)
 
     def update(self, now: float) -> None:
         self._worker.poll(now)
-        if self._ready() != self._ready_shown:
+        if self._ready() != self._ready_shown or now >= self._state_due:
             self._publish_state()
         if self._active:
             if self._unanswered and now - self._unanswered[0][1] > ANSWERED_WITHIN:
                 self._refused()
             if self._state == SETTLING:
                 self._settle(now)
-            if self._state == MOVING and now >= self._state_due:
-                self._publish_state()
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
         if self._geometry is None:

@@ -21,6 +21,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseStamped, Quaternion, Transform, Vector3
 from helpers import long_test
 from node_helpers import HOME, Bench, Rig, Voice, closed_form_lengths, model_file, near
+from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
@@ -229,6 +230,9 @@ def test_bad_requests_are_refused_and_the_present_move_goes_on(moved: Moved) -> 
     assert moved.ended() == "arrived"
     assert moved.value("request") == str(good)
     assert apart(message_pose(moved.sent[-1]), near(HOME, (0.0, 0.0, 0.03))) < 1e-12
+    moved.node.trigger_deactivate()
+    moved.ask("move_to", HOME)
+    assert "the mover is not active" in moved.value("refusal")
 
 
 def test_a_program_slows_down_where_a_strut_would_be_too_fast_and_is_never_ahead(moved: Moved) -> None:
@@ -314,6 +318,42 @@ def test_a_client_moves_a_machine_and_learns_how_it_ended(bench: Bench) -> None:
     assert ended[1].reason == "limit"
     told = np.array(bench.seen["strut_commands"][-1].position)
     assert np.abs(told - closed_form_lengths(near(HOME, (0.0, 0.0, 0.01)))).max() < 1e-9, "the model is ideal"
+
+
+@pytest.mark.parametrize(
+    ("states", "ends"),
+    [
+        ([None] * 100 + [{"state": "planning", "request": 7}, None, {"state": "arrived", "request": 7}], ""),
+        ([{"state": "moving"}] * 20 + [{"state": "planning", "request": 7}, {"state": "arrived", "request": 7}], ""),
+        ([{}] * 5, "the mover stands, and has not received the request"),
+        ([{"state": "moving", "request": 7}, {"moves": 0}], "restarted: the mover was restarted"),
+        ([{"state": "moving", "request": 7}, {"request": 8}], "replaced: another move was asked for"),
+        ([None, "ended"], "the mover has ended"),
+    ],
+)
+def test_the_movers_own_states_tell_what_has_become_of_a_request(states: list[Any], ends: str) -> None:
+    """Each is what one spin brings, None: nothing. On a starved computer the answer may come a hundred spins later."""
+    machine, left = object.__new__(Machine), iter(states)
+    machine.state = MoveState("idle", "", 1.0, 0.0, "", 0, 0, "", moves=3)
+    publishers = [1]
+
+    def spin(_: float) -> None:
+        change = next(left)
+        if change == "ended":
+            publishers[0] = 0
+        elif change is not None:
+            machine.state = replace(machine.last, **{"state": "arrived", "request": 6, **change})
+
+    clock = SimpleNamespace(now=lambda: Time(nanoseconds=7))
+    machine.node = SimpleNamespace(get_clock=lambda: clock, count_publishers=lambda _: publishers[0])  # type: ignore
+    machine._to, machine._states = SimpleNamespace(publish=lambda _: None), "/mover/state"  # type: ignore
+    machine.catch_up, machine.spin_once = lambda: None, spin  # type: ignore[method-assign]
+    if not ends:
+        assert machine.move(HOME).state == "arrived"
+        return
+    with pytest.raises((MoveError, NoAnswerError)) as caught:
+        machine.move(HOME)
+    assert str(caught.value) == ends
 
 
 # ---- a client in lock-step ----
@@ -432,7 +472,7 @@ def test_a_tracker_reads_in_its_own_frame(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize(
-    ("reasons", "ends"), [(["refusal"] * 2, ""), (["refusal"] * 3, "refusal"), (["limit"], "limit")]
+    ("reasons", "ends"), [(["refusal", "restarted"], ""), (["refusal"] * 3, "refusal"), (["limit"], "limit")]
 )
 def test_a_move_that_a_busy_computer_had_refused_is_asked_for_again(
     reasons: list[str], ends: str, monkeypatch: pytest.MonkeyPatch
@@ -446,6 +486,7 @@ def test_a_move_that_a_busy_computer_had_refused_is_asked_for_again(
 
     monkeypatch.setattr(Machine, "move", move)
     monkeypatch.setattr(WatchedMachine, "_spin", lambda *_: None)
+    monkeypatch.setattr(WatchedMachine, "wait", lambda *_: None)
     if not ends:
         assert machine.move(HOME) == "arrived"
         return
@@ -653,6 +694,7 @@ def test_a_stop_brakes_a_move_that_was_asked_for_again(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(Machine, "move", move)
     monkeypatch.setattr(WatchedMachine, "_spin", lambda *_: None)
+    monkeypatch.setattr(WatchedMachine, "wait", lambda *_: None)
     machine._going_on, machine._stop = lambda: False, SimpleNamespace(call_async=stops.append)
     with pytest.raises(MoveError, match="person"):
         machine.move(HOME)
