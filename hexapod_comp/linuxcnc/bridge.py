@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
 from functools import partial
 from typing import Any
@@ -59,12 +59,12 @@ FLAGS = ("compensating", "heartbeat", "stopped")
 COUNTERS = ("updates", "rejected", "resets")
 
 PINS = (
-    *pins("in", "float", *AXES, *FEEDBACK),
-    *pins("in", "bit", *SWITCHES),
-    *pins("out", "float", *CORRECTIONS, "age", "largest"),
-    *pins("out", "bit", *FLAGS),
-    *pins("out", "s32", "status"),
-    *pins("out", "u32", *COUNTERS),
+    pins("in", "float", *AXES, *FEEDBACK)
+    | pins("in", "bit", *SWITCHES)
+    | pins("out", "float", *CORRECTIONS, "age", "largest")
+    | pins("out", "bit", *FLAGS)
+    | pins("out", "s32", "status")
+    | pins("out", "u32", *COUNTERS)
 )
 
 TOPICS = """
@@ -104,37 +104,33 @@ class GuardStatus(IntEnum):
 class CorrectionGuard:
     """Six corrections that follow what a compensator asks for, within a limit and along a ramp."""
 
-    def __init__(self, limit: float, ramp_rate: float, timeout: float, on_loss: str = "zero") -> None:
-        self.follow(limit, ramp_rate, timeout, on_loss)
+    def __init__(self, rules: Mapping[str, Any]) -> None:
+        self._rules = rules  # the node's parameters limit, ramp_rate, timeout, on_loss; they may change
         self.output: list[float] = list(ZERO)  # the six corrections now, m; zero at first
         self.status = GuardStatus.OFF  # what they are doing
-        self.accepted = self.rejected = 0  # corrections taken, and those too large or not finite, which were not
+        self.accepted = 0  # number of corrections that were accepted
         self._newest: list[float] = list(ZERO)
         self._accepted_at = self._updated_at = -math.inf
-
-    def follow(self, limit: float, ramp_rate: float, timeout: float, on_loss: str) -> None:
-        """Go by other rules from now on, all positive; what has been accepted stays so."""
-        self._limit, self._ramp_rate, self._timeout = limit, ramp_rate, timeout
-        self._holds = on_loss == "hold"
 
     def age(self, now: float) -> float:
         return now - self._accepted_at
 
     def offer(self, correction: Sequence[float], now: float) -> None:
         """Make six corrections, m, the target of the output; a CommandError if one exceeds the limit, or is NaN."""
+        limit = self._rules["limit"]
         for number, value in enumerate(correction, start=1):
-            if not abs(value) <= self._limit:
-                self.rejected += 1
-                text = f"correction {value * 1e6:.3f} µm is larger than ±{self._limit * 1e6:g} µm"
+            if not abs(value) <= limit:
+                text = f"correction {value * 1e6:.3f} µm is larger than ±{limit * 1e6:g} µm"
                 raise CommandError("correction", f"strut {number}: {text}")
         self._newest, self._accepted_at = list(correction), now
         self.accepted += 1
 
     def update(self, now: float, enabled: bool) -> list[float]:
-        """Move the output on and return it."""
+        """Move the output towards its target, as far as the ramp allows since the last update, and return it."""
         # The first update moves nothing, nor does one after the clock went back.
         elapsed, self._updated_at = now - self._updated_at, now
-        reach = self._ramp_rate * (min(elapsed, LONGEST_STEP) if 0.0 < elapsed < math.inf else 0.0)
+        ramp_rate = self._rules["ramp_rate"]
+        reach = ramp_rate * (min(elapsed, LONGEST_STEP) if 0.0 < elapsed < math.inf else 0.0)
         target, arrived = self._aim(now, enabled)
         ways = [there - here for there, here in zip(target, self.output, strict=True)]
         longest = max(abs(way) for way in ways)
@@ -145,19 +141,21 @@ class CorrectionGuard:
         self.output = [here + share * way for here, way in zip(self.output, ways, strict=True)]
         if arrived is not GuardStatus.COMPENSATING:
             self.status = GuardStatus.RETURNING
-        elif self.status is not GuardStatus.COMPENSATING or left > self._ramp_rate * LONGEST_STEP:
+        elif self.status is not GuardStatus.COMPENSATING or left > ramp_rate * LONGEST_STEP:
             self.status = GuardStatus.RAMPING  # a target that moves on a little is still followed
         return self.output
 
     def _aim(self, now: float, enabled: bool) -> tuple[Sequence[float], GuardStatus]:
-        """Return where the output shall go, and what it does once it is there."""
+        """Return the output's target, and the status once it is reached."""
         if not enabled:
             return ZERO, GuardStatus.OFF
         if not self.accepted:
             return ZERO, GuardStatus.WAITING
-        if self.age(now) <= self._timeout:
+        if self.age(now) <= self._rules["timeout"]:
             return self._newest, GuardStatus.COMPENSATING
-        return (self.output, GuardStatus.HOLDING) if self._holds else (ZERO, GuardStatus.WAITING)
+        if self._rules["on_loss"] == "hold":
+            return self.output, GuardStatus.HOLDING
+        return ZERO, GuardStatus.WAITING
 
 
 TEXTS = {
@@ -225,7 +223,6 @@ class CompensatorReset:
         return True
 
 
-GUARDED = ("limit", "ramp_rate", "timeout", "on_loss")  # the guard's parameters
 NEVER = 1e9  # what the pin `age` shows before the first correction, s
 STANDING = 2e-3  # struts slower than this stand, m/s: no drive lags behind by more than some micrometres then
 
@@ -241,7 +238,7 @@ class LinuxcncBridgeNode(MachineNode):
     def __init__(self, hal: Any = None, **options: Any) -> None:
         super().__init__("linuxcnc_bridge", PARAMETERS, **options)
         self._metres = METRES[self._options["units"]]
-        self._guard = CorrectionGuard(*(self._options[name] for name in GUARDED))
+        self._guard = CorrectionGuard(self._options)
         # cycles of the loop; published commands and measured struts; corrections that arrived
         self._cycles, self._sent, self._states, self._received = Flow(), Flow(), Flow(), Flow()
         self._refusals, self._bad_pins = Refusals(), Refusals()  # corrections and pins that were not used
@@ -273,7 +270,6 @@ class LinuxcncBridgeNode(MachineNode):
     # ---- lifecycle ----
 
     def configure(self) -> None:
-        self.on_parameters(set())
         several = self._options["allow_several_publishers"]
         self._pose_out.header.frame_id = self._options["frame_id"]
         self._pose_pub = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS, self._options["timeout"])
@@ -284,9 +280,6 @@ class LinuxcncBridgeNode(MachineNode):
 
     def unconfigure(self) -> None:
         self._reset = None
-
-    def on_parameters(self, names: set[str]) -> None:
-        self._guard.follow(*(self._options[name] for name in GUARDED))
 
     def publish_last_status(self) -> None:
         """Ramp the corrections out if that is quick, and publish a last status."""

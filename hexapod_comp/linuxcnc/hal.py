@@ -17,9 +17,8 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -79,32 +78,22 @@ def _import(name: str) -> ModuleType:
         sys.path.remove(folder)
 
 
-@dataclass(frozen=True)
-class Pin:
-    name: str
-    kind: str
-    direction: str
-
-
-def pins(direction: str, kind: str, *names: str) -> tuple[Pin, ...]:
-    return tuple(Pin(name, kind, direction) for name in names)
+def pins(direction: str, kind: str, *names: str) -> dict[str, tuple[str, str]]:
+    """Return direction (in, out) and type (float, bit, s32, u32) of some pins, by name."""
+    return dict.fromkeys(names, (direction, kind))
 
 
 class HalComponent:
     """A userspace HAL component; its pins exist from the start, :meth:`ready` lets ``loadusr -W`` go on."""
 
-    def __init__(self, name: str, wanted: Iterable[Pin], hal: Any = None) -> None:
+    def __init__(self, name: str, wanted: Mapping[str, tuple[str, str]], hal: Any = None) -> None:
         hal = load_module() if hal is None else hal
-        self.name = name
-        self._error = hal.error
+        self._pins: dict[str, Any] = {}
         try:
             self._component = hal.component(name)
-            self._pins = {
-                pin.name: self._component.newpin(
-                    pin.name, getattr(hal, f"HAL_{pin.kind.upper()}"), getattr(hal, f"HAL_{pin.direction.upper()}")
-                )
-                for pin in wanted
-            }
+            for pin, words in wanted.items():
+                direction, kind = (getattr(hal, f"HAL_{word.upper()}") for word in words)
+                self._pins[pin] = self._component.newpin(pin, kind, direction)
         except (hal.error, ValueError, RuntimeError) as error:
             raise HalError(f"HAL refuses the component {name!r}: {error}") from error
 

@@ -39,63 +39,47 @@ TRUE = tuple(f"true-{axis}" for axis in AXES)
 ERRORS = ("error", "error-x", "error-y", "error-z")
 
 PINS = (
-    *pins("in", "float", *STRUTS, *AXES, "tool-offset"),
-    *pins("out", "float", *TRUE, *ERRORS),
-    *pins("out", "bit", "valid"),
+    pins("in", "float", *STRUTS, *AXES, "tool-offset")
+    | pins("out", "float", *TRUE, *ERRORS)
+    | pins("out", "bit", "valid")
 )
 
 LONGEST_SLEEP = 0.1  # s: how soon a signal ends the component
 
 
-class WatchedMachine:
-    """A simulated machine: strut commands in, tool pose out."""
-
-    def __init__(self, machine: RealMachine) -> None:
-        self.machine = machine
-        geometry = machine.geometry
-        self._motion = MotionState()
-        self._guess = geometry.home
-        self._base_in_work, self._platform_in_tool = geometry.work.inverse(), geometry.tool.inverse()
-
-    def observe(self, struts: np.ndarray, command: Pose, tool_length: float = 0.0) -> tuple[Pose, np.ndarray]:
-        """Return where the tool is, as LinuxCNC's axes would put it, and its tip's error."""
-        geometry, model, up = self.machine.geometry, self.machine.model, np.array([0.0, 0.0, tool_length])
-        commanded = Pose(command.position - up + command.rotation @ up, command.rotation)
-        wanted = geometry.work @ commanded @ self._platform_in_tool
-        # Directions of motion, which the truth's backlash and field depend on
-        point = wanted.position + wanted.rotation @ model.field.probe
-        thresholds = model.field.reversal_threshold, model.reversal_threshold
-        follow_nine(np.concatenate([point, struts]), *thresholds, self._motion.low, self._motion.sense)
-        platform, self._guess = self.machine.pose_for(struts, self._motion.sense, self._guess)
-        tool = self._base_in_work @ platform @ geometry.tool
-        true = Pose(tool.position - tool.rotation @ up + up, tool.rotation)
-        return true, true.position - command.position
-
-
 class MachineComponent:
-    """The HAL side: pins in, a :class:`WatchedMachine`, pins out."""
+    """A simulated machine as a HAL component: strut lengths and commanded axes in, the tool's pose and error out."""
 
     def __init__(self, machine: RealMachine, units: str = "mm", name: str = "hexapod_machine", hal: Any = None):
-        self._watched, self._metres = WatchedMachine(machine), METRES[units]
+        self._machine, self._metres = machine, METRES[units]
+        self._motion, self._guess = MotionState(), machine.geometry.home
         self.component = HalComponent(name, PINS, hal)
-        self._read_struts, self._read_axes = self.component.reader(*STRUTS), self.component.reader(*AXES)
-        self._read_tool = self.component.reader("tool-offset")
-        self._write_true, self._write_errors = self.component.writer(*TRUE), self.component.writer(*ERRORS)
-        self._write_valid = self.component.writer("valid")
+        self._read = self.component.reader(*STRUTS, "tool-offset", *AXES)
+        self._write, self._write_valid = self.component.writer(*TRUE, *ERRORS), self.component.writer("valid")
 
     def cycle(self) -> None:
         """Read pins, compute, write pins; lengths without a pose, as before homing, only clear ``valid``."""
-        axes = np.array(self._read_axes())
-        struts = np.array(self._read_struts()) * self._metres
-        command = Pose.from_quaternion(axes[:3] * self._metres, np.array(quaternion_from_axes(*axes[3:])))
+        read = np.array(self._read())
+        struts, up = read[:6] * self._metres, np.array([0.0, 0.0, read[6] * self._metres])
+        command = Pose.from_quaternion(read[7:10] * self._metres, np.array(quaternion_from_axes(*read[10:])))
+        geometry, field = self._machine.geometry, self._machine.model.field
+        commanded = Pose(command.position - up + command.rotation @ up, command.rotation)
+        wanted = geometry.work @ commanded @ geometry.tool.inverse()
+        # Directions of motion, which the truth's backlash and field depend on
+        point = np.concatenate([wanted.position + wanted.rotation @ field.probe, struts])
+        thresholds = field.reversal_threshold, self._machine.model.reversal_threshold
+        follow_nine(point, *thresholds, self._motion.low, self._motion.sense)
         try:
-            true, error = self._watched.observe(struts, command, self._read_tool()[0] * self._metres)
+            platform, self._guess = self._machine.pose_for(struts, self._motion.sense, self._guess)
         except KinematicsError:
             self._write_valid([False])
             return
-        degrees = Rotation.from_matrix(true.rotation).as_euler("xyz", degrees=True)
-        self._write_true([*(true.position / self._metres), *degrees])
-        self._write_errors([value / self._metres for value in (np.linalg.norm(error), *error)])
+        tool = geometry.work.inverse() @ platform @ geometry.tool
+        position = tool.position - tool.rotation @ up + up
+        error = position - command.position
+        lengths = np.concatenate([position, [np.linalg.norm(error)], error]) / self._metres
+        degrees = Rotation.from_matrix(tool.rotation).as_euler("xyz", degrees=True)
+        self._write([*lengths[:3], *degrees, *lengths[3:]])
         self._write_valid([True])
 
 

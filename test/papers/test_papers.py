@@ -118,19 +118,6 @@ def test_a_probability_is_the_share_of_machines_drawn():
     assert share == pytest.approx(chance, abs=3.0 * np.sqrt(chance * (1.0 - chance) / 400))
 
 
-def test_bounds_of_a_change_are_reached_in_the_corners_and_never_passed():
-    """Both joints moved 10 µm along every axis, outwards: by NumPy, without the package's kinematics."""
-    pose = table_poses()[4]
-    bounds = song_mou_king.change_bounds(PAPER, pose)
-    for strut in range(6):
-        start, end = PAPER.base_joints[strut], pose.position + pose.rotation @ PAPER.platform_joints[strut]
-        unit = (end - start) / np.linalg.norm(end - start)
-        start = start - 10 * MICRON * np.sign(unit)
-        end = end + pose.rotation @ (10 * MICRON * np.sign(pose.rotation.T @ unit))
-        ideal = np.linalg.norm(pose.position + pose.rotation @ PAPER.platform_joints[strut] - PAPER.base_joints[strut])
-        assert (np.linalg.norm(end - start) - ideal) * 1e6 + 10.0 == pytest.approx(bounds[strut], abs=1e-3)
-
-
 def test_the_rest_of_the_paper(run):
     assert set(song_mou_king.drawings(run).verdicts()) == {MET, SHOWN}
     assert set(song_mou_king.random_poses(run).verdicts()) == {MET}
