@@ -211,7 +211,8 @@ def _circles(before: dict[str, CircularTest], after: dict[str, CircularTest]) ->
 
 
 def left_out(fit: ModelFit) -> np.ndarray:
-    """Return each reading less what the model, fitted without that reading's line or pose, predicts, (N,), m or rad."""
+    """Return each reading minus the prediction of a model fitted without that reading's line or pose, (N,), m or
+    rad."""
     m, solution = fit.measurements, fit.solution
     cell = Cells.of(m).of_reading
     weights = solution.weights / m.stated**2

@@ -81,7 +81,8 @@ def widened(fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS) -> Fitte
 
 
 def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Change]:
-    """Return the possible changes of a machine, in a space that has all blocks; those of its fit, `modelled`, age."""
+    """Return the possible changes of a machine, in a space that has all blocks; the blocks of its fit, `modelled`, may
+    age."""
     geometry, unit = space.geometry, np.eye(space.size)
     start, count = space.blocks[0].part.start, int(space.platform_groups.max()) + 1
     base = start + np.arange(18).reshape(6, 3)
@@ -142,7 +143,7 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
 
     The stretch of struts under a weight is a smooth function of the pose; over the measured box, level and tilted, the
     most probable parameters with that effect represent it. Where no stiffness is stated, all struts have an assumed
-    one, and masses are so many kg at that.
+    one, and masses are those for this stiffness.
     """
     stations = [box_stations(space, tilt) for tilt in (0.0, TILT)]
     if stations[0] is None or stations[1] is None:
@@ -180,7 +181,7 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
 
 
 def heavier(space: ParameterSpace, change: np.ndarray) -> ParameterSpace:
-    """Return the same parameters of a machine that carries more, by a change of :func:`payload_changes`, (1 or 3,)."""
+    """Return the parameters of the same machine with a payload changed as in :func:`payload_changes`, (1 or 3,)."""
     load, aside = stated_load(space.settings), np.append(change[1:], np.zeros(3 - len(change)))
     mass = max(load.mass + change[0], LEAST_MASS)
     moment = load.mass * load.centre + space.level.T @ (across(space, load).T @ aside)
@@ -273,7 +274,7 @@ class CheckReadings:
         )
 
     def changed_by(self, values: np.ndarray) -> CheckReadings:
-        """Return the same with values changed, (N,), of channels whose directions do not depend on what they read."""
+        """Return these readings with other values, (N,), of channels whose directions do not depend on the values."""
         return replace(self, residuals=self.residuals + self.seen @ (self.weights @ values))
 
     def covariance(self, of_parameters: np.ndarray) -> np.ndarray:
@@ -311,7 +312,8 @@ class CheckReadings:
     ) -> np.ndarray:
         """Return an effect that is exact at the most probable change: Broyden's update of its slope.
 
-        Signs of forces give the likelihood steps and several maxima: Nelder and Mead's search, from the best of some.
+        The signs of forces give the likelihood steps and several maxima, so Nelder and Mead's search starts from the
+        best of several changes.
         """
         inverse, most = np.linalg.inv(covariance), float(change.scales.max())
 
@@ -388,7 +390,7 @@ class Evidence:
         return self._of_whitened(readings @ self._whitening.T)
 
     def log_evidence(self, readings: np.ndarray) -> float:
-        """Return the log evidence that the machine has changed or not, as likely beforehand, over that of no change."""
+        """Return the log evidence of a machine that may have changed, with even prior odds, over that of no change."""
         return float(
             np.logaddexp.reduce([0.0, *np.concatenate(self.log_weights(readings[None]), axis=1)[0]])
         ) - math.log(2.0)

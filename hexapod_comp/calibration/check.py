@@ -57,7 +57,7 @@ class Candidate:
 
     @property
     def family(self) -> str:
-        """Its kind, of FAMILIES."""
+        """The change's kind, one of FAMILIES."""
         return self.change.family
 
     @property
@@ -202,10 +202,10 @@ def _beyond_loads(model: MachineModel, fitted: FittedParameters, readings: Measu
 def _misread(
     check: CheckReadings, fitted: FittedParameters, evidence: Evidence, model: MachineModel, m: MeasurementSet
 ) -> list[str]:
-    """Return by name the mistakes without which the readings are probably those of an unchanged machine.
+    """Return the names of mistakes after whose correction the readings are probably those of an unchanged machine.
 
-    By the Bayes factor of each over the readings as they are, of a machine that has changed or not; the best, and those
-    that nothing tells from it, as :func:`.mixups.mixups` names them.
+    Each is judged by its Bayes factor over the uncorrected readings of a machine that may have changed. The best is
+    returned with those that the readings do not distinguish from it, as in :func:`.mixups.mixups`.
     """
     as_read = check.log_density(fitted.covariance) + evidence.log_evidence(check.residuals)
     most = check.log_density(fitted.covariance, np.zeros(len(check.residuals))) - as_read

@@ -84,7 +84,7 @@ def refuse_unreachable(geometry: HexapodGeometry, pose: Pose) -> None:
 def hold(
     geometry: HexapodGeometry, model: MachineModel, pose: Pose, part: np.ndarray
 ) -> tuple[MachineModel, HeldDatum]:
-    """Return a model that holds a part of the tool's error at a pose, in a model file's digits, and that part.
+    """Return a model in which a part of the tool's error at a pose is zero, rounded as in a model file, and that part.
 
     A pose that a limit of the machine forbids is refused.
     """

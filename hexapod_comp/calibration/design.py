@@ -66,7 +66,7 @@ def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) 
 
 
 def information_of_fit(fitted: FittedParameters, readings: MeasurementSet) -> tuple[np.ndarray, Cells]:
-    """Return the same by the parameters x of a fit, at what it has found."""
+    """Return :func:`information` by the parameters x of a fit, at its solution."""
     rows, cells = information(fitted.space, readings, fitted.x)
     return fitted.space.unwhitened(rows), cells
 
@@ -81,7 +81,7 @@ class Criterion(Protocol):
         """Return the improvement by each allowed candidate."""
 
     def add(self, n: int) -> None:
-        """Take a candidate."""
+        """Add a candidate to those chosen."""
 
 
 C = TypeVar("C", bound=Criterion)
@@ -111,7 +111,7 @@ class Greedy(Generic[C]):
         return self.spent + self.costs + [0.0 if name in up else self.putting_up.get(name, 0.0) for name in self.needs]
 
     def extend(self, budget: float, enough: Callable[[], bool] = lambda: False, most: int = 400) -> None:
-        """Choose candidates until the goal is met, none gains or is affordable, or `most` have been chosen."""
+        """Choose candidates until the goal is met, no affordable one has a gain, or `most` have been chosen."""
         most += len(self.picks)
         while len(self.picks) < most and not enough():
             totals = self.totals()
@@ -164,7 +164,7 @@ class ErrorLeft:
         return gains
 
     def add(self, n: int) -> None:
-        """Add a candidate's readings, also once more."""
+        """Add a candidate's readings; it may be added repeatedly."""
         part = self.parts[n]
         known, shown = self.known[part].copy(), self.shown[part].copy()
         gain = np.linalg.solve(self._variance(part), known @ self.rows.T).T
@@ -312,7 +312,7 @@ class Proposal:
 
     @property
     def readings(self) -> int:
-        """How many there are."""
+        """Number of readings."""
         return sum(run.count(self.campaign.cycles) for run in self.campaign.runs)
 
     @property
@@ -520,12 +520,12 @@ class Detectability:
         return np.array(tries) - self.now
 
     def add(self, n: int) -> None:
-        """Read a candidate."""
+        """Add a candidate's readings."""
         self.taken = np.concatenate([self.taken, self.of_candidate[n]])
         self.now = self._value(self.taken)
 
     def _value(self, chosen: np.ndarray) -> float:
-        """Return the log odds with some of all contrasts."""
+        """Return the log odds with a subset of the contrasts."""
         single = self.single[chosen][:, self.read[chosen].any(axis=0)]
         effects = [(change, effect[chosen]) for change, effect in self.effects]
         effects += wrong_readings(single, [""] * single.shape[1])

@@ -38,9 +38,9 @@ CHUNK, THREADED = 512, 500  # cells of a processor's cache; rows from which on t
 
 
 def at_once(work: Callable[[Given], Result], items: Iterable[Given], rows: int) -> list[Result]:
-    """Return the results of independent work with matrices of this number of rows together.
+    """Return the results of independent work with matrices of this number of rows, done in parallel if these are many.
 
-    NumPy uses as many threads as there are processors; few rows are done sooner than a thread is started.
+    NumPy uses as many threads as there are processors; work on few rows ends before a thread would have started.
     """
     if rows < THREADED:
         return list(map(work, items))
@@ -291,7 +291,8 @@ def _noise(
 def _tolerances(space: ParameterSpace | Components, posterior: Posterior, z: np.ndarray) -> np.ndarray:
     """Return new tolerances: MacKay's fixed point, squared parameters over how many are determined.
 
-    The first guess counts as a tenth of a parameter, which keeps an empty block from collapsing; a stated one stays.
+    The first guess counts as a tenth of a parameter, which keeps an empty block from collapsing; a stated tolerance is
+    not estimated.
     """
     result, start = posterior.tolerances.copy(), space.start_tolerances()
     for n, part in enumerate(space.parts):

@@ -354,8 +354,8 @@ def _solve(
 
 
 def _carried_over(start: Start, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return parameters, tolerances and noise of a start in another space; missing ones are zero, and the first
-    guess."""
+    """Return parameters, tolerances and noise of a start in another space; missing parameters are zero, missing
+    tolerances the first guess."""
     old, given, sizes, noise = start
     x, tolerances = np.zeros(space.size), space.start_tolerances()
     for n, block in enumerate(space.blocks):
@@ -374,7 +374,7 @@ def _averaged(
 ) -> LeftOut:
     """Return the probability that a block was left out although present, and the tool's error with all blocks.
 
-    By the blocks' Bayes factors, with even prior odds; at the same answer.
+    It is computed from the blocks' Bayes factors with even prior odds, at the same solution.
     """
     present = 1.0 - float(np.prod([expit(-d.evidence) for d in decisions if not d.kept]))
     if present < NEGLIGIBLE:

@@ -42,7 +42,7 @@ class ScrewLead:
 
     @property
     def used(self) -> float | None:
-        """The period to be fitted, m: the given one; else the one shown, or the round number near it."""
+        """The period to be fitted, m: the given one, else the detected one, or the round number near that."""
         if self.given is not None or self.shown is None:
             return self.given
         within = AGREES * self.error
@@ -228,7 +228,7 @@ class _Rest:
 def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return amplitudes (2, harmonics, 6) shrunk by the share of noise, harmonic by harmonic (James & Stein).
 
-    An absent harmonic turns fastest: its noise would count as information about the frequency.
+    The noise of an absent harmonic would count as information about the frequency, most of all that of the highest.
     """
     result, numbers = amplitudes.copy(), np.arange(amplitudes.size).reshape(amplitudes.shape)
     for n in range(amplitudes.shape[1]):

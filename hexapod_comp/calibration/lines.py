@@ -1,10 +1,10 @@
 """Scheme ``lines``, Mou & King's: a polynomial along each measured grid line, separate for forward and backward.
 
-A laser's zero relative to the next line's is not known, nor the slope of a straightness beam. So displacement along a
-line and rotations are set to zero, in the mean of both directions, where the line passes home's coordinate along it
-(backlash stays, half in each direction), and the least-squares line of a straightness is subtracted. The position and
-bending of the planes through home (1-D data), or the squareness of the axes and the twists of the planes (5-D data)
-remain in the machine.
+A laser's zero relative to the next line's is not known, nor the slope of a straightness beam. So the mean of both
+directions of a displacement along a line, and of rotations, is set to zero at home's coordinate along the line; each
+direction keeps half of the backlash. From a straightness its least-squares line is subtracted. The position and bending
+of the planes through home (1-D data), or the squareness of the axes and the twists of the planes (5-D data) remain in
+the machine.
 
 The three families of a field add up, but all cross in the grid's nodes and see the same errors there. So each component
 belongs first to one family (a displacement to the lines along it; a rotation to the first of x, y, z that reads it as
@@ -233,7 +233,7 @@ def _command_note(measurements: MeasurementSet, stations: np.ndarray) -> list[st
 
 
 def _distinct(values: np.ndarray) -> np.ndarray:
-    """Return distinct values, sorted; equal ones are the same place."""
+    """Return the sorted values, of those closer than :data:`LEAST_TRAVEL` only the first."""
     ordered = np.unique(values)
     return ordered[np.append(True, np.diff(ordered) > LEAST_TRAVEL)]
 

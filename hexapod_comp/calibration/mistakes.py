@@ -1,7 +1,7 @@
-"""Mistakes in how readings are taken: what may have been mixed up, and what readings are if it was.
+"""Mistakes in taking readings: what may have been mixed up, and the readings with that corrected.
 
-One table: a row is a mistake's name and the readings without it. Signs, units and labels of channels change readings
-alone; other frames and orders of angles change the poses at which they were taken.
+They are one table, each row a mistake's name and the readings with this mistake corrected. Signs, units and labels of
+channels change readings alone; other frames and orders of angles change the poses at which they were taken.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def family_of_run(measurements: MeasurementSet) -> np.ndarray:
 
 
 def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
-    """Yield what leaves the machine where it stood: signs, units and channels exchanged."""
+    """Yield the mistakes that leave the poses as they are: signs, units and channels exchanged."""
     for name, members in _parts(m):
         yield Mistake(f"{name}: sign reversed", partial(sign_reversed, m, members))
     for name, kinds, factor in _in_other_units(m):
@@ -77,7 +77,7 @@ def mistakes_of_check(m: MeasurementSet, model: MachineModel) -> Iterator[Mistak
 
 
 def mistakes_of_place(m: MeasurementSet) -> Iterator[Mistake]:
-    """Yield where else the machine may have stood: frames exchanged, mirrored and turned, other orders of angles."""
+    """Yield the mistakes that change the poses: frames exchanged, mirrored and turned, other orders of angles."""
     for a, b in combinations(range(3), 2):
         order = np.eye(3)
         order[[a, b]] = order[[b, a]]
@@ -101,7 +101,7 @@ def sign_reversed(m: MeasurementSet, members: np.ndarray) -> MeasurementSet:
 
 
 def has_nominal_commands(m: MeasurementSet) -> bool:
-    """Return whether the struts' lengths are those of the nominal machine at the poses: nobody measured them."""
+    """Return whether the struts' lengths equal those of the nominal machine at the poses: then nobody measured them."""
     return np.allclose(m.stations.commands, _nominal(m), rtol=0.0, atol=1e-9)
 
 

@@ -2,14 +2,14 @@
 
 Each mistake of the table in :mod:`.mistakes` is weighed against the model as fitted by one likelihood ratio, the ratio
 of the marginal likelihoods (evidence) of the same readings under the same blocks of parameters, and is named where that
-exceeds one prior odds. Blocks that the fit needs to describe readings that were mixed up cost evidence, which the right
-way to take them does not have to pay.
+exceeds one prior odds. To describe readings that were mixed up a fit needs blocks that cost evidence; to describe the
+corrected ones it does not.
 
-The linear problem is that of the nominal machine. Of each block only those principal components of its parameters stay
-of which the readings as they are tell more than the prior: the prior of a block is isotropic, so any orthonormal basis
-of it has the same prior. Signs and units change the values alone, and labels a few rows of the design matrix, so
-nothing is linearised anew where the machine stood where the file says. All sets of reversed groups of cells (a channel
-of a run) are quadratic forms of one Gram matrix; coordinate descent finds the most probable set of reversed runs.
+The linear problem is that of the nominal machine. Of each block only the principal components stay that the uncorrected
+readings determine better than the prior does: the prior of a block is isotropic, so any orthonormal basis of it has the
+same prior. Signs and units change the values alone, and labels a few rows of the design matrix, so the problem is
+linearised anew only for mistakes that change the poses. All sets of reversed groups of cells (a channel of a run) are
+quadratic forms of one Gram matrix; coordinate descent finds the most probable set of reversed runs.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Alternative:
 
 
 class Mode(NamedTuple):
-    """What all readings, or all parts of the machine, may have in common, by a mistake rather than by chance."""
+    """A change that all readings, or all parts of the machine, share: more probably by a mistake than by chance."""
 
     name: str
     causes: str  # what it looks like, and what to do
@@ -92,7 +92,7 @@ class Mode(NamedTuple):
 def mixups(
     everything: Estimation, blocks: Collection[str], progress: Callable[[str], object] = lambda text: None
 ) -> list[str]:
-    """Return by name how the readings must have been taken; the best and those that nothing tells from it; or none.
+    """Return the names of the most probable mix-up and of those that the readings do not distinguish from it; or none.
 
     `everything` are the readings against all parameters that may be used, `blocks` those that the fit uses beside the
     structure.
@@ -235,8 +235,8 @@ class _Fitted:
         """Return an alternative from its linear problem, in which the mistake is corrected; the density of scaled
         values is scaled too (Jacobian).
 
-        From the first guess on, as the fit itself: noise that a mistake has blown up can hold its own ground. `early`:
-        after few rounds, and against the readings as they are after as few.
+        It starts from the first guess, as the fit does: from noise that a mistake has inflated it might not find back.
+        `early`: after few rounds, and against the readings as they are after as few.
         """
         as_read, rounds = (self.early, FEW_ROUNDS) if early else (self.posterior, ROUNDS)
         tried = solve(components, problem, components.first, ALIKE, rounds)
@@ -246,7 +246,7 @@ class _Fitted:
         return Alternative(mistake.name, gain, better)
 
     def mistakes(self) -> list[Alternative]:
-        """Return the mistakes of the table, and of runs as they come out, that are most probable."""
+        """Return the most probable mistakes of the table, and of single runs."""
         tried = self._elsewhere()
         for mistake, problem in self._undone([*mistakes(self.estimation.measurements), *self._runs_reversed()]):
             gain = self._weighed(mistake, problem, self.components, early=True).gain
@@ -255,9 +255,9 @@ class _Fitted:
         return [self._weighed(mistake, problem, components) for _, mistake, problem, components in best]
 
     def _elsewhere(self) -> list[tuple[float, Mistake, LinearProblem, Components]]:
-        """Return where else the machine may have stood: as some runs tell, whose gain grows with the readings.
+        """Return the mistakes that change the poses, tried on some runs first, as the gain grows with the readings.
 
-        At first by a machine and its screws alone: a field that hides a wrong place is of no use in the right one.
+        The first trial fits joints and screws alone: a field that hides a wrong pose is of no use at the right one.
         """
         m, found = self.estimation.measurements, []
         alone = replace(self.space.settings, blocks=tuple(b for b in self.space.settings.blocks if b in EXPECTED))
@@ -281,9 +281,9 @@ class _Fitted:
         """Return what is more probably a mistake that all readings share than a machine whose parts err alike.
 
         The amplitude a of a mode d has the prior N(0, σ²): σ is usual for a right machine, or `mistaken` times that.
-        With K the readings' covariance without it, h = dᵀK⁻¹t and I = dᵀK⁻¹d, it changes their log evidence by
-        ½h²σ²/(1 + σ²I) − ½log(1 + σ²I). Parts that shift alike blow their block's tolerance up, which hides the mode:
-        tolerances and noise are estimated anew under either prior.
+        With K the readings' covariance without it, h = dᵀK⁻¹t and I = dᵀK⁻¹d, it changes their log evidence by ½h²σ²/(1
+        + σ²I) − ½log(1 + σ²I). Parts that shift alike inflate their block's tolerance, which hides the mode: tolerances
+        and noise are estimated anew under either prior.
         """
         found = []
         modes = list(common_modes(self.estimation, self.space))
@@ -335,8 +335,8 @@ class _Fitted:
         """Return readings whose direction of motion is probably mislabelled, each by its own likelihood ratio.
 
         A strut's backlash moves a reading by Δ or, taken the other way, by −Δ. Readings that the other way explains
-        better are relabelled and the model is fitted again, for wrong labels have hidden a part of the backlash. Which
-        they are is one choice of 2ⁿ.
+        better are relabelled and the model is fitted again, for wrong labels have hidden a part of the backlash. The
+        relabelled set is one of 2ⁿ.
         """
         m = self.estimation.measurements
         if self.space.block("backlash") is None or not (m.direction != UNKNOWN).any():
@@ -440,7 +440,7 @@ class _Fitted:
 
 
 def _elsewhere_fitted(m: MeasurementSet | None, settings: FitSettings, bases: dict[str, np.ndarray]) -> _Fitted | None:
-    """Return the model of readings with stations of their own; None where no machine can have taken them."""
+    """Return the model fitted to readings at other poses; None where no machine can have been there."""
     if m is None:
         return None
     try:

@@ -361,8 +361,8 @@ def expected_error(
 ) -> ToolError | None:
     """Return the tool error that drawn machines of a covariance leave, by the :func:`box_errors` of the fitted one.
 
-    The error before is that of the fitted machine, or of machines of a `prior` covariance. The part `beyond` all
-    parameters widens the interval upwards.
+    The error before is that of the fitted machine, or of machines of a `prior` covariance. Errors that no parameter
+    describes, `beyond`, raise the interval's upper end.
     """
     if errors is None:
         return None

@@ -1,8 +1,8 @@
 """The file of a posterior, beside the model file, which holds its hash, so that no model is used with another's
 figures.
 
-It holds all results of a fit: parameters, covariance, tolerances and noise, and their meaning. New
-readings can be added to it without the old ones.
+It holds all results of a fit: parameters, covariance, tolerances and noise, and their meaning. So a model is renewed by
+new readings without the files of the old ones.
 """
 
 from __future__ import annotations

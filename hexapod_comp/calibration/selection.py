@@ -36,7 +36,7 @@ def select(
 ) -> tuple[list[Decision], Posterior, Posterior]:
     """Return a decision for each block but the structure; the posterior with all blocks in, and with those kept.
 
-    What is stated with its error is known to be there.
+    A block whose size is stated is always kept.
     """
     everything = fit = solve(space, problem, space.start_tolerances(), noise, ROUNDS)
     silent = everything.used[everything.determined < SILENT]

@@ -128,9 +128,10 @@ class _Course:
         self.parts = self._directions.T @ self._means
 
     def _process(self, times: np.ndarray) -> np.ndarray:
-        """Return the process' covariance between times and the bins, for a rate of variance 1 per persistence.
+        """Return the prior covariance of the course between some times and the bins, for a rate of variance 1.
 
-        Of ∫r(u)du from the first bin on, with the rate's covariance e^−|u−v|: 2·min(s, t) + e^−s + e^−t − 1 − e^−|s−t|.
+        The course is ∫r(u)du from the first bin on; with times in units of the rate's persistence the rate's covariance
+        is e^−|u−v|, and the course's 2·min(s, t) + e^−s + e^−t − 1 − e^−|s−t|.
         """
         t, s = ((part - self._at[0]) / ASSUMED.rate_persistence for part in (times[:, None], self._at))
         t, early = np.maximum(t, 0.0), np.minimum(t, 0.0)  # before the first bin's middle the rate is constant

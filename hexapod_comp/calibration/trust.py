@@ -400,7 +400,7 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
 
 
 def _repeated(r: Residuals, kind: int) -> tuple[float, float]:
-    """Return the variance of readings about their cell's mean, in the stated noise's, and its degrees of freedom."""
+    """Return the variance of readings about their cell's mean, over the stated one, and its degrees of freedom."""
     m, solution, cell = r.estimation.measurements, r.solution, r.estimation.cells.of_reading
     members = np.flatnonzero(m.kind == kind)
     cell, weights = cell[members], solution.weights[members]

@@ -1,7 +1,7 @@
 """Options: each declared once, with its reader, and rules for their combination.
 
-A verb's options stand in :data:`.verbs.VERBS`. From the table are made the parser, its help, the shell's completions,
-the lists of files read and written, and every message about options that exclude each other. Imports nothing slow.
+A verb's options stand in :data:`.verbs.VERBS`. Parser, help, the shell's completions, the lists of files read and
+written, and every message about options that exclude each other come from that table. Imports nothing slow.
 """
 
 from __future__ import annotations

@@ -252,7 +252,7 @@ class Compensator:
 
     @property
     def temperatures(self) -> Temperatures:
-        """Readings in use, and the deficits of late parts' lags."""
+        """Readings in use, and by how much late parts lag behind them."""
         view = self._state.view
         values = {name: float(view["temperatures"][n]) for n, name in enumerate(MEASURED_PARTS) if name in self._sensed}
         if HUMIDITY in self._sensed:
@@ -294,7 +294,7 @@ class Compensator:
         Numbers that are not given stay unchanged. Until all numbers of the table are known it is ignored; numbers that
         it does not need are stored for a model that is set later. Errors as for :meth:`set_model`; a ModelError where a
         number is not finite, or so far outside the table that it must be in another unit; an OutsideTableError where it
-        is outside a table that refuses this. In all cases the old numbers stay.
+        is outside a table that refuses this. After an error the previous numbers remain in use.
         """
         outside = self.outside | read_numbers(numbers)
         if outside != self.outside:
@@ -311,7 +311,7 @@ class Compensator:
 
         A ModelError: it belongs to another machine. A LimitError, KinematicsError or OutsideFieldError: what it would
         correct at the last command, before the first one at home, breaks a limit: the ramp would drag the struts there
-        and be refused on its way. In all cases the old model stays.
+        and be refused on its way. After an error the old model remains in use.
         """
         model.outside.validate(self.outside)
         self._take_model(model, self.outside, np.zeros(DRIFT_STATES))
@@ -398,10 +398,9 @@ class Compensator:
     def reset(self, measured: np.ndarray | None = None) -> None:
         """Forget the last command and all directions of motion.
 
-        The last correction is kept, since the struts still stand there: the next command starts from it and ramps.
-        Where the struts are `measured`, six, m, and the next command's nominal lengths lie within the allowed
-        correction of that, it starts from there and ramps: the struts do not step. Elsewhere it may be at most one
-        allowed step away.
+        The last correction is kept, since the struts still stand there: the next command starts from it and ramps. With
+        `measured` lengths, six, m, the next command starts from these and ramps if its nominal lengths differ from them
+        by no more than the allowed correction; otherwise it may be at most one allowed step away.
         """
         if measured is None:
             lib.hc_reset(self._at, ffi.NULL)
@@ -525,8 +524,8 @@ class Compensator:
     def correct(self, tool_pose: Pose, time: float = math.nan) -> Correction:
         """Compensate one commanded tool pose, ``pose_tool_in_work``, and return the full record.
 
-        It was made at `time`, s, for ramps and speeds, as in :meth:`step`; without it neither counts. A LimitError,
-        KinematicsError or OutsideFieldError: the command is refused and nothing has changed.
+        `time`, s, is that of the command, for ramps and speeds as in :meth:`step`; without it neither is applied. A
+        LimitError, KinematicsError or OutsideFieldError: the command is refused and nothing has changed.
         """
         made = self._time
         made.made, made.received = time, math.nan
@@ -565,7 +564,7 @@ class Compensator:
 
     @property
     def outside_load(self) -> str:
-        """In what payload or gravity are outside those of the model's measurement; empty if they are not."""
+        """How payload or gravity differ from those at which the model was measured, as text; empty if they do not."""
         gravity = self.loading.gravity or tuple(self.model.load.gravity.tolist())
         return beyond_loads(self.model.origin.loads, self.geometry.payload, gravity)
 

@@ -108,10 +108,10 @@ class Excess(NamedTuple):
 
 
 class RateLimit:
-    """Limits the rate of values from the last accepted ones, plus a step `at_once`.
+    """Limits how fast values move away from the last accepted ones; a step `at_once` is allowed in addition.
 
-    With `bunched`, s, a sequence may be no faster either, plus `at_once` and the motion of a bunch delayed by that
-    time: a leaky bucket. Before the first values all pass.
+    With `bunched`, s, a whole sequence is limited too (a leaky bucket): it may be ahead by `at_once` and by the motion
+    of that time, since delayed messages arrive together. Before the first values all pass.
     """
 
     def __init__(self, at_once: float, rate: float, bunched: float = math.inf) -> None:
@@ -335,8 +335,8 @@ class StampGate(Guard):
 class OneSender(Guard):
     """Only one node may publish on a topic of commands or of readings; missing messages are detected.
 
-    The graph gives the publishers' names, but keeps a killed node for its own lease (20 s by default, set by its
-    Sequence numbers distinguish ghosts: every publisher counts its messages from 1, and only living ones send. A second
+    The graph gives the publishers' names, but keeps a killed node until its lease ends (20 s by default). Sequence
+    numbers distinguish such ghosts: every publisher counts its messages from 1, and only living ones send. A second
     node of this node's `own` name on a topic that it publishes is not detected here: it may be this one's killed
     predecessor; a subscriber detects it.
 

@@ -80,7 +80,7 @@ class Struct:
         return _rebuilt, (self.name, self.view.tobytes())
 
     def keep(self, other: Struct) -> None:
-        """Hold what C has made this struct point to, in place of what was held: as long as this lives, so does that."""
+        """Keep the memory alive to which C has pointed this struct, in place of the memory kept before."""
         self._kept[:] = [other]
 
     def copy_from(self, other: Struct) -> None:

@@ -161,7 +161,7 @@ def _near_home(geometry: HexapodGeometry, random: np.random.Generator) -> Pose:
 
 
 class Recorder:
-    """Runs a Python compensator and writes down what it was given and what it said."""
+    """Runs a Python compensator and records its inputs and answers."""
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel) -> None:
         self.compensator = Compensator(geometry, model, DEFAULT_RAMP_RATE)
@@ -174,7 +174,7 @@ class Recorder:
             self.record("c", (*pose.position, *pose.quaternion()))
 
     def record(self, kind: str, values: tuple[float, ...]) -> None:
-        """Do one thing, and write it down."""
+        """Do one step, and record it."""
         compensator, status = self.compensator, 0
         self.time += PERIOD
         expected = np.zeros(6)

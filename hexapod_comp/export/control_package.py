@@ -63,7 +63,7 @@ def filled(template: str, values: dict[str, str]) -> str:
 
 
 def _values(geometry: HexapodGeometry, model: MachineModel, rate: int, joint_names: Sequence[str]) -> dict[str, str]:
-    """Return what stands for each name in a template."""
+    """Return the value of each name in a template."""
     chained = [f"{CHAINED}/{name}" for name in joint_names]
     plain = {"MACHINE": geometry.name, "MODEL": model.name}
     return {

@@ -111,7 +111,7 @@ class Genhexkins:
 
 
 def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
-    """Put a machine into LinuxCNC's terms."""
+    """Describe a machine in LinuxCNC's terms."""
     refuse_unknown(machine.model, "genhexkins", without="load.")
     geometry, structure = machine.geometry, machine.structure
     lead = float(geometry.screw_lead[0])

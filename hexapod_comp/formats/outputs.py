@@ -43,7 +43,7 @@ def protected(read: Mapping[str, Any], written: Mapping[str, Any], folders: Mapp
 
 
 def _refuse_unwritable(files: Mapping[str, str]) -> None:
-    """Raise where no file of a name can be, or where two options have the same name; a pipe or a device may be both."""
+    """Raise where a file cannot be written, or is named by two options; these may share a pipe or a device."""
     taken: dict[str, str] = {}
     for name, path in files.items():
         if os.path.isdir(path):
@@ -67,7 +67,7 @@ def refuse_replacing_input(path: str | Path) -> None:
 
 @contextmanager
 def new_file(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
-    """Give a stream for a file that a reader, or a crash, sees complete or not at all; UTF-8 for text.
+    """Give a stream that writes a file completely or not at all, also when the process crashes; text is UTF-8.
 
     It replaces an existing file, with that one's mode and, if this user may give files away, its owner.
     Pipes, devices and other special files are written directly.

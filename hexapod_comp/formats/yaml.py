@@ -102,7 +102,7 @@ def yaml_content(text: str, name: str | Path, most_nodes: int = MAX_NODES) -> An
 
 
 def _reject_aliases_and_tags(text: str, most_nodes: int) -> None:
-    """Raise on anything by which a short file stands for something else, before objects are made from it."""
+    """Raise on aliases and tags, by which a short file could expand or make objects, before anything is made of it."""
     # Nested references (`*name`) can stand for more values than memory holds, and so can short lists; nesting overflows
     # the parser's stack and ends the process, a tag (`!!float`) makes the loader read a value as another type.
     depth = nodes = 0

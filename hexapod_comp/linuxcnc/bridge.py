@@ -178,7 +178,7 @@ COMPLAINT_COUNTS_FOR = 1.2
 
 
 class CompensatorReset:
-    """Calls ``compensator/reset`` when it helps."""
+    """Calls ``compensator/reset`` when the compensator reports an error and answers no command."""
 
     # Only a compensator that complains is asked: requests to one that is stopped get lost, and DDS then keeps back
     # those that follow for seconds.

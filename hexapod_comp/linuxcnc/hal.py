@@ -31,7 +31,7 @@ COUNTS = 2**32  # a u32 pin goes on from zero after this many
 
 
 class HalError(HexapodError):
-    """LinuxCNC's HAL is not there, or does not take what is asked of it."""
+    """LinuxCNC's HAL is not installed, or refuses a request."""
 
     reason = "hal"
 
@@ -186,7 +186,7 @@ def remove(number: int) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Free what a dead process has left under a name; the entry of the executable ``hal_sweep``."""
+    """Remove the HAL component that a dead process has left under a name; the entry of the executable ``hal_sweep``."""
     parser = argparse.ArgumentParser(prog="hal_sweep", description="Free the HAL component of a dead process.")
     parser.add_argument("name", help="of the component, e.g. hexapod_comp")
     name = parser.parse_args(argv).name

@@ -4,8 +4,8 @@ A HAL component without ROS, for people who watch a simulation with halscope, ha
 drives' strut lengths, runs them forwards through a hidden truth, and compares with LinuxCNC's commanded axes.
 Load it from a HAL file with ``loadusr -Wn hexapod_machine linuxcnc_machine --truth mine.yaml``.
 
-A moving tool trails its command by what motion's interpolator and the drives take, 3 ms in the shipped configuration:
-15 µm at 5 mm/s. That is in the error, too, until the tool rests.
+A moving tool lags its command by the delay of motion's interpolator and of the drives, 3 ms in the shipped
+configuration: 15 µm at 5 mm/s. The error includes this until the tool rests.
 
 LinuxCNC's frames (genhexkins): with no tool length, XYZ and R = Rz(C)·Ry(B)·Rx(A) are the pose of the geometry
 file's tool frame in its work frame. A tool length T puts the tip T further along the tool's −z and moves the

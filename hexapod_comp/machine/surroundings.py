@@ -39,7 +39,7 @@ class Surroundings:
         return Surroundings(warmth, unknown, unknown, np.tile(NO_LOAD, (count, 1)))
 
     def numbers(self) -> np.ndarray:
-        """Return all of them but the times as the bits of a row a place: NaN is equal to NaN."""
+        """Return all fields but the times, one row per place, as bits, by which NaN equals NaN."""
         rows = np.column_stack([value for name, value in vars(self).items() if name != "times"])
         return np.ascontiguousarray(rows, dtype=float).view(np.int64)
 

@@ -59,7 +59,7 @@ AT_ONCE = LateGrowth()  # Every part has a thermometer of its own and follows it
 
 @dataclass
 class Lag:
-    """How far a thermometer's late followers are behind it."""
+    """By how much the parts that follow a thermometer late lag behind it."""
 
     began: float  # Time of the first reading and of the newest one, s
     newest: float  # Time of the first reading and of the newest one, s
@@ -74,14 +74,14 @@ class Lag:
 
 
 def followed(behind: float, change: float, ages: float) -> float:
-    """Return how far a first-order lag is behind after its input has run by `change` in `ages` time constants."""
+    """Return by how much a first-order lag trails an input that has ramped by `change` within `ages` time constants."""
     gone = -math.expm1(-ages)
     kept = gone / ages if ages > 0.0 else 1.0
     return behind * (1.0 - gone) - change * kept
 
 
 def late(times: np.ndarray, values: np.ndarray, time_constants: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return how far lags are behind at each reading of some thermometers, K."""
+    """Return by how much first-order lags trail some thermometers at each of their readings, K."""
     constants, order = np.asarray(time_constants, dtype=float), np.argsort(times, kind="stable")
     changes, elapsed = np.diff(values[order], axis=0), np.diff(times[order])
     ages = elapsed[:, None] / constants
@@ -192,7 +192,7 @@ class Temperatures:
             self.lags[name] = Lag(time, time, [0.0] * len(time_constants))
 
     def unknown_for(self, late_growth: LateGrowth, time: float) -> float:
-        """Return for how long, s, late parts are still not known at a `time`, s: the readings began too short ago.
+        """Return for how long, s, late parts are still not known at a `time`, s, because readings began too recently.
 
         A first reading finds them at rest. What it did not know is forgotten after three time constants.
         """

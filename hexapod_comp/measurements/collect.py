@@ -204,7 +204,7 @@ class _Collecting:
     # ---- runs and stops ----
 
     def run(self, stops: Sequence[int]) -> None:
-        """Visit what is not found yet of a run's stops; anew where the zero of its readings is lost on the way."""
+        """Visit the stops of a run that have no reading yet; begin anew where the zero of its readings is lost."""
         if self._all_found(stops):
             self.resumed += len(stops)
             return
@@ -246,7 +246,7 @@ class _Collecting:
         return pose if self._listed[n].centre is None else Pose(self._plan.centre[n], np.eye(3))
 
     def _pass_over(self, stops: Sequence[int], own: Collection[str], counting: bool) -> str:
-        """Visit a run's stops that are not found yet; return by what the zero was lost, empty: it was not."""
+        """Visit a run's stops that are not found yet; return the reason if the zero was lost, else an empty text."""
         zeros: dict[str, float] = {}
         checked = not own or tuple(own) in self._nudged
         ways = {channel: WayCheck(channel, checked) for channel in own}
@@ -299,7 +299,7 @@ class _Collecting:
         return True
 
     def _observe(self) -> Observation | None:
-        """Return what is seen, asking again where it is nothing."""
+        """Return the instrument's reading; ask again where it reads nothing."""
         return next((o for o in (self._machine.observe() for _ in range(self._attempts)) if o is not None), None)
 
     def _check_channels(self, visit: Visit, own: Collection[str]) -> bool:
@@ -330,7 +330,8 @@ class _Collecting:
     def _take_channels(
         self, visit: Visit, seen: Observation, ways: Mapping[str, WayCheck], zeros: dict[str, float]
     ) -> str:
-        """Add what an instrument read itself; return what no machine errs by, empty: all of it may be so."""
+        """Add what an instrument read itself; return the jump that no machine makes, as text, empty if there is
+        none."""
         added, jumped = {}, ""
         for n in visit.readings:
             reading = self._listed[n]
@@ -387,7 +388,7 @@ class _Collecting:
         return self._reading(reading, value, float(np.sqrt(along**2 @ seen.uncertainty**2)), seen)
 
     def _reading(self, reading: Reading, value: float, deviation: float, seen: Observation) -> Reading:
-        """Return a campaign's reading with its value and what was felt then."""
+        """Return a campaign's reading with its value, and the temperatures and load at that time."""
         payload = self._geometry.payload
         load = (payload.mass, *payload.centre) if payload.mass else NO_LOAD[:4]
         return reading._replace(

@@ -362,7 +362,8 @@ def _longest(vector: np.ndarray) -> float:
 
 
 def _senses(angles: np.ndarray, cycles: np.ndarray) -> np.ndarray:
-    """Return in which sense each of some angles in a row was come to, (N,); a cycle's first, a pause: as the next."""
+    """Return the sense in which each of consecutive angles was reached, (N,); the first of a cycle or after a pause: as
+    the next."""
     steps = np.angle(np.exp(1j * np.diff(angles, prepend=angles[0])))
     steps[np.diff(cycles, prepend=cycles[0]) != 0] = 0.0
     senses = np.where(np.abs(steps) < ALONG, 0, np.sign(steps)).astype(int)

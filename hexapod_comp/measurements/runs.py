@@ -59,7 +59,7 @@ def impossible(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) ->
 
 
 def meant(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) -> list[str]:
-    """Return by name how poses may have been meant so that none is :func:`impossible`: "with x and z exchanged"."""
+    """Return in words how poses may have been meant so that none is :func:`impossible`: "with x and z exchanged"."""
     if len(commands) < ENOUGH:
         return []
     others = _others(geometry, poses)

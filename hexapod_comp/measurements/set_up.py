@@ -1,6 +1,7 @@
 """Is the instrument set up right? First readings are compared with the commands, before hours are spent on more.
 
-No machine errs by what is allowed here: a reading beyond it is another unit, sign, channel, frame or target.
+The tolerances are larger than any machine's error: a reading outside them has another unit, sign, channel, frame or
+target.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def _unit(scale: float, units: Mapping[float, str], tolerance: float) -> str:
 
 
 class PoseCheck:
-    """Holds measured poses against the commanded ones, in the base or in a frame that is estimated from both."""
+    """Compares measured poses with the commanded ones, in the base or in a frame that is estimated from both."""
 
     def __init__(self, size: float, frame: str = KNOWN, with_attitude: bool = True) -> None:
         if frame not in FRAMES:
@@ -65,7 +66,7 @@ class PoseCheck:
         self._meant, self._seen = list[Pose](), list[Pose]()
 
     def frame(self) -> Pose | None:
-        """Return the instrument's frame in the base as far as it shows; None: these stations do not show it."""
+        """Return the instrument's frame in the base as far as the stations determine it; None if they do not."""
         if not self.free or not self._meant:
             return None if self.free else Pose.identity()
         meant, seen = (np.concatenate([self._points(pose) for pose in poses]) for poses in (self._meant, self._seen))
@@ -77,8 +78,8 @@ class PoseCheck:
         return pose.position[None] + (self._size * pose.rotation.T if self._with_attitude else 0.0)
 
     def plausible(self, meant: Pose, seen: Pose) -> bool:
-        """Add a stop's poses, commanded in the base and as measured, and return whether a machine may err so; a
-        SetUpError as soon as the ways between the stops tell why it cannot."""
+        """Add a stop's poses, commanded in the base and as measured, and return whether a machine can have such errors;
+        a SetUpError as soon as the ways between the stops show why not."""
         self._meant.append(meant)
         self._seen.append(seen)
         if self._with_attitude and not self.free:
@@ -197,9 +198,9 @@ def check_nudges(
 
 
 class WayCheck:
-    """Holds one channel's readings, from stop to stop of a run, against the way that was commanded.
+    """Compares how one channel's readings change from stop to stop of a run with the commanded way.
 
-    The way is that along the line, or of lengths the distance from the centre. What is read of it is the median over
+    The way is along the line, or for lengths the distance from the centre. The measured share of it is the median over
     pairs of stops that are far enough apart.
     """
 
@@ -210,7 +211,7 @@ class WayCheck:
     def jump(self, way: float, read: float) -> float:
         """Add a stop, m or rad, and return by how much more its error changed than any machine's does, else 0.
 
-        A SetUpError where what was read until here tells another mistake.
+        A SetUpError where the readings so far show another mistake.
         """
         self._ways.append(way)
         self._read.append(read)

@@ -85,7 +85,8 @@ class Range(NamedTuple):
         return np.array([known[cells[index]] for _, cells in table.rows])
 
     def read(self, table: Table, name: str) -> np.ndarray:
-        """Return the same of an optional column with its unit in its name; NaN where it is missing."""
+        """Return the numbers in SI, (rows,), of an optional column whose name ends in its unit; NaN where there is
+        none."""
         column = table.column(name, self.dimension)
         return np.full(len(table.rows), np.nan) if column is None else self.of(table, *column)
 
@@ -514,7 +515,7 @@ def _moved(number: Decimal, digits: int) -> str:
 
 
 def _commanded(channel: str, point: np.ndarray, centre: np.ndarray) -> float:
-    """Return what a file's value has on top of the error, m: a coordinate, a distance, or nothing."""
+    """Return the commanded part of a file's value, m: a coordinate, a distance, or zero; the rest is the error."""
     kind, _, axis = channel.partition("_")
     if kind == "position":
         return float(point[AXES.index(axis)])

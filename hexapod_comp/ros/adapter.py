@@ -1,4 +1,4 @@
-"""The adapter node: a machine that calibrates itself when it is asked to, and checks its model every so often.
+"""The adapter node: a machine that calibrates itself on request, and checks its model periodically.
 
 It runs ``hexapod_comp adapt`` as a process beside it, which has the machine moved and measured and computes for
 minutes; the node only starts and stops it and publishes, on ``~/state``, what its journal says. Run it with

@@ -141,7 +141,7 @@ class WatchedMachine(Machine):
         return super().move(pose, *arguments, **options)
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
-        """Tell who sets instruments up where a run is, and wait for whoever confirms it."""
+        """Publish the run's place for whoever sets the instrument up, and wait for the confirmation."""
         self._own = () if not self._readings else tuple(
             channel for channel in run.channels if channel.partition("_")[0] not in ABSOLUTE_KINDS
         )  # fmt: skip
@@ -198,7 +198,7 @@ class WatchedMachine(Machine):
         )
 
     def _enough(self, count: int) -> bool:
-        """Return whether everything that this run needs has been read so often."""
+        """Return whether each channel that this run needs has the required number of readings."""
         return (not self._wants_pose or len(self._poses) >= count) and (not self._own or len(self._read) >= count)
 
 
@@ -265,7 +265,8 @@ class AdaptedMachine(WatchedMachine):
             self.move(pose, *arguments, **options)
 
     def reload(self, path: Path) -> None:
-        """Have the compensator run a model file, by its ramp; where it refuses, the old model and its name stay."""
+        """Have the compensator load a model file, which ramps in; if it refuses, the old model stays, and so does the
+        parameter."""
         (before,) = self._parameters("model_file")
         for client in (self._reload_model, self._set):
             self.wait(client.service_is_ready, 10.0, "the services of the compensator")

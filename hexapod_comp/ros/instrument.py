@@ -96,7 +96,7 @@ class InstrumentNode(MachineNode):
         self.every(1.0 / options["rate"], self._publish)
 
     def on_parameters(self, names: set[str]) -> None:
-        """Err by what has been set while the node runs; a beam breaks where it is asked for anew."""
+        """Apply errors that are set while the node runs; the beam breaks whenever ``fault_break`` is set."""
         if self.configured:
             self._instrument.flaws = self._flaws()
             if "fault_break" in names:

@@ -1,4 +1,4 @@
-"""Check readings: where they are taken, and whether a model keeps on them what its fit has promised."""
+"""Check readings: their places, and whether a model's error there is no larger than its fit has predicted."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ DISPLACEMENTS = ("linear", "straightness", "position")
 def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, seed: int, name: str) -> CampaignRun:
     """Return check readings of a box: the tool's pose at random places, each reached from the one before.
 
-    So every strut is read in both directions of its motion, on ways that no campaign has along its lines. On its way to
-    a place each strut goes further than its backlash after it has turned back: else it is in neither direction there.
+    So every strut is read in both directions of its motion, on ways off a campaign's lines. Before each place every
+    strut moves further than its backlash without reversing; otherwise it would have no direction of motion there.
     """
     rng, places = np.random.default_rng([seed, 30]), list[np.ndarray]()
     while len(places) < PLACES:
@@ -58,7 +58,7 @@ def check_campaign(
 
 @dataclass(frozen=True)
 class Judgement:
-    """What held-out readings say of a promise."""
+    """The verdict of readings that were not used in a fit on the error that it has predicted."""
 
     promised: float  # upper end of the tool error that was promised, RMS of the displacement, m
     found: float  # the same as the readings have it, their noise taken off, m; 0 where noise explains them
@@ -66,16 +66,16 @@ class Judgement:
 
     @property
     def kept(self) -> bool:
-        """Whether the readings bear the promise out."""
+        """Whether the readings confirm the promise."""
         return self.excess <= 1.0
 
 
 def judge_promise(fitted: FittedParameters, readings: MeasurementSet, promised: float) -> Judgement:
-    """Return whether readings that a fit has not seen err by no more than it has promised, m, beside its model.
+    """Return whether readings not used in a fit deviate from its model by no more than its promised error, m.
 
-    What a promise does not include is free: where the machine stands as a whole, the zero of a displacement read along
-    a line, the slope of a straightness. What is left after these has variance promised²/3 + noise² where the promise is
-    just kept: its sum has a χ² distribution.
+    What a promise does not include is left free: where the machine stands as a whole, the zero of a displacement read
+    along a line, the slope of a straightness. What is left after these has variance promised²/3 + noise² where the
+    promise is just kept: its sum has a χ² distribution.
     """
     chosen, directions, left, noise = _differences(fitted, readings, DISPLACEMENTS)
     absolute, along, squares, freedom, expected = _of_kind(chosen, "position"), chosen.along(), 0.0, 0, 0.0
@@ -100,7 +100,7 @@ def judge_promise(fitted: FittedParameters, readings: MeasurementSet, promised: 
 
 @dataclass(frozen=True)
 class Whole:
-    """Where base, workpiece and instrument stand to each other, by check readings."""
+    """The place of base, workpiece and instrument relative to each other, by check readings."""
 
     motion: np.ndarray  # (6,): of everything beside the model, m; turns by how far they move the farthest corner
     error: float  # standard error of each, m
@@ -112,7 +112,7 @@ class Whole:
 
 
 def stands(fitted: FittedParameters, readings: MeasurementSet) -> Whole | None:
-    """Return where everything stands as a whole, which no model of the machine contains; None: no position was read."""
+    """Return the shift and turn of everything, which no model of the machine contains; None if no position was read."""
     chosen, directions, left, noise = _differences(fitted, readings, ("position",))
     if not len(left):
         return None

@@ -4,7 +4,7 @@ The loop is a state machine whose memory is the journal: :meth:`State.after` fol
 :func:`next_step` says what is to be done in it, and each step ends with an event. A process that was killed goes on
 with the step that has no event yet; readings that it had collected are in their file.
 
-A model is adopted only when check readings that its fit has not seen bear it out. A check that contradicts a model
+A model is adopted only when check readings that were not used in its fit confirm it. A check that contradicts a model
 counts when a second one, read anew, repeats it.
 """
 
@@ -72,7 +72,7 @@ PLAN, COLLECT, FIT, CHECK, GIVE_UP, ADOPT, RELOAD, GUARD, REPAIR, END = (
 
 @dataclass(frozen=True)
 class Task:
-    """What is asked of the loop."""
+    """What the loop has to do."""
 
     box: np.ndarray  # (2, 3): where the tool works, m in the work frame
     level: np.ndarray  # (3, 3): the tool's attitude there, in the work frame
@@ -198,7 +198,7 @@ class Outcome(NamedTuple):
 
     @property
     def good(self) -> bool:
-        """Whether there is a model that its checks bear out."""
+        """Whether there is a model that its checks confirm."""
         return self.state in ("in use", "proposed")
 
 
@@ -284,7 +284,7 @@ class Adaptation:
         return self._run(0)
 
     def guard(self, checks: int | None) -> Outcome:
-        """Check the model in use so often, None: until it is stopped, and repair it; the first time at once."""
+        """Check the model in use this number of times (None: until stopped), the first time at once, and repair it."""
         state = self.state
         if not state.in_use and not state.candidate:
             raise CommandError("not_calibrated", f"{self._folder} has no model in use: calibrate first")
@@ -361,7 +361,7 @@ class Adaptation:
             )
 
     def _name(self, what: str, suffix: str) -> tuple[int, str]:
-        """Return number and name of the next file: the same ones after a restart, so that it is gone on with."""
+        """Return number and name of the next file: the same after a restart, so that the file is continued."""
         number = self.state.number + 1
         return number, f"{number:03d}_{what}{suffix}"
 
@@ -370,7 +370,7 @@ class Adaptation:
             raise Stopped(where)
 
     def _say_or_stop(self, text: str) -> None:
-        """Tell what a long calculation does, and end it when that is asked for: its step is done again."""
+        """Report the progress of a long calculation, and end it on request; its step is then repeated later."""
         self._say(text)
         if not self._going_on():
             raise Ended(f"stopped in a calculation ({text})")
@@ -500,7 +500,7 @@ class Adaptation:
         )
 
     def _moved(self, model: str, whole: Whole | None) -> float:
-        """Return by how much everything stands elsewhere as a whole than at the first check of a model, m."""
+        """Return by how much everything has moved as a whole since the first check of a model, m."""
         checks = (e for e in self.events if e["event"] == "checked" and e["model"] == model and e.get("stands_m"))
         first = next(checks, None)
         if whole is None or first is None:
@@ -590,7 +590,7 @@ class Adaptation:
         self._note("repaired", number=number, model=name, of=state.in_use, text=text, chi_square=update.chi_square)
 
     def _beyond_repair(self, text: str, reason: str) -> None:
-        """Calibrate anew where the loop may reload what comes of it; else propose the campaign and end."""
+        """Calibrate anew if the loop may reload the new model; otherwise propose the campaign and end."""
         number, name = self._name("proposed_campaign", ".yaml")
         if self._reload is None and self._task.goal is not None:
             plan = self._proposal(PLANNED_SHARE)
@@ -610,7 +610,7 @@ class Adaptation:
 
 
 def moved_text(check: Event) -> str:
-    """Return what a check says of base, workpiece and instrument, after its other results; empty: nothing."""
+    """Return what a check shows about base, workpiece and instrument, after its other results, as text or empty."""
     if not check.get("moved_m") or not check["good"]:  # a changed strut moves everything too
         return ""
     size = f"{check['moved_m'] * 1e6:.1f} µm"

@@ -1,4 +1,5 @@
-"""Shells of the workspace as RViz or Foxglove markers, on a latched topic: who comes late sees them too."""
+"""Shells of the workspace as RViz or Foxglove markers, on a latched topic, so that late subscribers receive them
+too."""
 
 from __future__ import annotations
 

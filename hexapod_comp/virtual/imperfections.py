@@ -117,7 +117,7 @@ def draw_model(geometry: HexapodGeometry, bounds: ImperfectionBounds, seed: int,
 
 
 def _waves_of(geometry: HexapodGeometry) -> tuple[float, float]:
-    """Return the shortest and the longest wave of a length map on a machine, m."""
+    """Return the shortest and the longest wavelength of a length map on a machine, m."""
     stroke = float(np.ptp(geometry.limits.stroke))
     shortest, longest = (max(share * stroke, least) for share, least in zip(WAVES_OF_STROKE, LEAST_WAVES, strict=True))
     return shortest, longest

@@ -45,10 +45,10 @@ def measure(
 ) -> MeasurementSet:
     """Return the readings of a template that instruments would give on the real machine.
 
-    value = w · (e + where the machine happened to stop) − the same at the run's first reading of that channel
-    + slope of the straightness beam × way along the line + noise of the instrument. Positions and attitudes are
-    absolute: nothing is subtracted; nor from lengths whose zero is known. Lengths are distances, from centres whose
-    body stands beside its place in the file. Each reading states its instrument's noise as its uncertainty, at least
+    value = w · (e + where the machine happened to stop) − the same at the run's first reading of that channel + slope
+    of the straightness beam × way along the line + noise of the instrument. Positions and attitudes are absolute:
+    nothing is subtracted; nor from lengths whose zero is known. Lengths are distances from centres whose body is
+    displaced from its place in the file. Each reading states its instrument's noise as its uncertainty, at least
     :data:`~hexapod_comp.measurements.readings.LEAST_NOISE`; an instrument without noise states nothing.
     """
     errors = station_errors(template, truth, advance)[template.station]
@@ -129,7 +129,7 @@ def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.
 
 
 def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
-    """Return the value at each reading's instrument's zero, the first reading, shape (N,)."""
+    """Return each reading's zero, the value of its instrument's first reading, shape (N,)."""
     _, first, group = np.unique(_groups(template), return_index=True, return_inverse=True)
     absolute = np.isin(np.array(KINDS)[template.kind], ABSOLUTE_KINDS)
     absolute |= np.array([run.known_zero for run in template.runs])[template.run]
@@ -176,7 +176,7 @@ class LiveFlaws:
 class LiveInstrument:
     """An instrument that reads the pose of a moving tool, with the signs and zeros of :func:`measure`.
 
-    A laser and a ball bar are set up for each run and count from where they are then; a tracker stands at a place.
+    A laser and a ball bar are set up for each run and read relative to that place; a tracker stays at its place.
     """
 
     def __init__(

@@ -1,7 +1,8 @@
 """The virtual machine: six stepper-driven struts with hidden errors and faults, their encoders, and a tracker.
 
-Its drives turn commands into motor positions and nut plays; :class:`hexapod_comp.machine.model.RealMachine`, the hidden
-truth, computes the platform's true pose from those. A command c is processed in this order:
+Its drives turn commands into the positions of motors and of nuts within their backlash;
+:class:`hexapod_comp.machine.model.RealMachine`, the hidden truth, computes the platform's true pose from those. A
+command c is processed in this order:
 
 1. A position loop moves the reference x towards c. Its speed is wanted(c − x), its acceleration
    (wanted − ẋ)·4/lag, both limited. Within the limits this is x″ + 4/lag·x′ + 4/lag²·x = 4/lag²·c: two equal

@@ -95,22 +95,23 @@ class VirtualMachine:
         return Observation(seen, np.repeat(sigma, 3) / np.sqrt(SAMPLES), struts, temperatures, float(self.stops))
 
     def reload(self, model: MachineModel) -> None:
-        """Have the compensation run another model, its ramp over: that takes more commands than a move has here."""
+        """Switch the compensation to another model without its ramp, which would take more commands than a move has
+        here."""
         self._core = Compensator(self._in_base, model)
 
     def knock(self, strut: int, distance: float) -> None:
-        """Make a strut longer for good, m, behind the compensation's back."""
+        """Lengthen a strut permanently, m, unknown to the compensation."""
         offset = self.truth.struts.offset.copy()
         offset[strut] += distance
         self.become(replace(self.truth, struts=replace(self.truth.struts, offset=offset)))
 
     def become(self, truth: MachineModel) -> None:
-        """Have other errors from now on, standing where it stands."""
+        """Give the machine other errors from now on; its struts do not move."""
         parameters = DriveParameters(initial_lengths=self._drive.commands)
         self.truth = truth
         self._drive = StrutDrive(RealMachine(self._in_base, truth, self._drive.machine.temperatures), parameters)
 
     def error(self, pose: Pose) -> np.ndarray:
-        """Return what the tool does beside a commanded pose in work, m, along the axes of base."""
+        """Return the tool's deviation from a commanded pose in work, m, along the axes of base."""
         self.move(pose)
         return np.asarray(self._drive.true_tool_pose().position - (self.geometry.work @ pose).position)

@@ -132,7 +132,8 @@ def _tilt_text(tilts: np.ndarray) -> str:
 
 
 def named_frames(geometry: HexapodGeometry) -> dict[str, tuple[str, Pose]]:
-    """Return platform and tool at home, all tools and work frames, by name: the frame each is given in, its pose."""
+    """Return of platform and tool at home, of all tools and work frames, by name, the frame of the pose and the
+    pose."""
     return {
         "platform, at home": ("base", geometry.home),
         **{name: ("platform", pose) for name, pose in geometry.tools.items()},

@@ -25,7 +25,7 @@ class Backlash(StrutBlock):
         return -0.5 * linkage.stations.sense[:, 3:, None]
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Negative backlash, which noise can produce, counts as none: the fit has refused larger values."""
+        """Negative backlash, which noise can produce, is written as zero: the fit has refused larger values."""
         draft.struts["backlash"] = np.maximum(x, 0.0)
 
 
@@ -36,7 +36,8 @@ class BacklashMap(LengthMap):
 
     @classmethod
     def of(cls, facts: Facts) -> BacklashMap:
-        """Every screw may wear; a natural spline through some of a map's knots is one through all."""
+        """Every screw may wear. The spline through every second knot is written exactly at all knots of the length
+        map."""
         knots = map_knots(*facts.region.commands)
         block = cls(knots[np.linspace(0, len(knots) - 1, max(2, (len(knots) - 1) // 2 + 1)).round().astype(int)])
         block.model_knots = knots
@@ -49,7 +50,7 @@ class BacklashMap(LengthMap):
         return -0.5 * linkage.stations.sense[:, 3:, None] * self.weights(linkage.stations.commands)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """It stands at the length map's knots."""
+        """Written at the length map's knots."""
         if x.any():
             draft.struts |= {
                 "map_knots": self.model_knots,

@@ -94,7 +94,7 @@ class Linkage:
         return np.einsum("mij,mi->mj", self._inverse, wrenches)
 
     def errors(self, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> Errors:
-        """Return errors of stations `at` along directions (n, 6) with some components only."""
+        """Return errors of stations `at` along directions (n, 6), of which only the given components are not zero."""
         return Errors(at, directions, components, np.einsum("nc,ncs->ns", directions, self.per_length[at]))
 
 
@@ -128,7 +128,8 @@ class Block(ABC):
         """Write its parameters into a model."""
 
     def moving(self, components: np.ndarray) -> np.ndarray:
-        """Return the parameters, ascending, that move an error with some of the six components only."""
+        """Return the indices, ascending, of the parameters that change an error of which only these components are not
+        zero."""
         return np.arange(len(self.labels))
 
 

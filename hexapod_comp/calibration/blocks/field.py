@@ -46,7 +46,7 @@ class SmoothField:
         return self._products(points, self.powers)
 
     def reversal_basis(self, points: np.ndarray) -> np.ndarray:
-        """Return the same for the terms that depend on the direction."""
+        """Return :meth:`basis` for the terms that depend on the direction of motion."""
         return self._products(points, self.reversal_powers)
 
     def _products(self, points: np.ndarray, powers: np.ndarray) -> np.ndarray:
@@ -145,7 +145,7 @@ class _Field(Block):
         return columns
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Into its components."""
+        """Written into its three components."""
         draft.field[self.first : self.first + 3] = x.reshape(3, -1)
 
 
@@ -193,7 +193,7 @@ class FieldReversal(Block):
         return columns
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """By axis of motion and component."""
+        """Written by axis of motion and component."""
         draft.reversal[:] = x.reshape(draft.reversal.shape)
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def per_growth(linkage: Linkage) -> np.ndarray:
-    """Return the lengthening of each strut by the relative growth of struts 1-6, base and platform, (M, 6, 8), m."""
+    """Return the lengthening of each strut per relative growth of struts 1-6, base and platform, (M, 6, 8), m."""
     along = [np.einsum("mik,mik->mi", linkage.directions, joints) for joints in (linkage.base_joints, -linkage.arms)]
     struts = np.eye(6) * linkage.lengths[:, None]
     return np.concatenate([struts, np.stack(along, axis=2)], axis=2)
@@ -33,8 +33,7 @@ def growth_columns(linkage: Linkage) -> np.ndarray:
 
 
 def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return the sources of growth, (M, 8, 1 + K), K: the parts' thermometers above 20 °C, and the deficits of the
-    lags."""
+    """Return the sources of growth, (M, 8, 1 + K), K: thermometers above 20 °C, and how far late parts lag."""
     sensors = LateGrowth(thermometer=settings.thermometer)
     read = stations.temperatures[:, [sensors.sensor_of(part) for part in range(len(PARTS))]]
     above = (read - REFERENCE_TEMPERATURE)[..., None]
@@ -63,7 +62,7 @@ def as_warmed(settings: FitSettings, stations: Stations) -> tuple[str, set[str]]
 
 
 class Expansion(Block):
-    """Growth of each part by its thermometer, 1/K, beyond the stated; struts of one material grow alike."""
+    """Growth of each part by its thermometer, 1/K, beyond the stated expansion; struts of one material grow alike."""
 
     name, unit, tolerance = "expansion", "1/K", 10e-6
 
@@ -74,7 +73,7 @@ class Expansion(Block):
 
     @classmethod
     def of(cls, facts: Facts) -> Expansion | None:
-        """Whether temperatures changed, as the settings' blocks report."""
+        """Every machine may have it; whether temperatures changed enough is decided before, in the settings' blocks."""
         return cls(facts.settings)
 
     def causes(self, stations: Stations) -> np.ndarray:
@@ -113,16 +112,16 @@ class Late(Expansion):
         return cls(facts.settings) if facts.settings.time_constants else None
 
     def causes(self, stations: Stations) -> np.ndarray:
-        """Deficits of the lags."""
+        """By how much the late parts lag behind their thermometers, K."""
         return growth_causes(self._settings, stations, self._constants)[..., 1:]
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """One column a time constant."""
+        """Written as one column per time constant."""
         draft.late = x.reshape(len(PARTS), -1)
 
 
 class Moisture(StrutBlock):
-    """Growth of all struts, of one material, by relative humidity, m/m from dry to damp, beyond the stated."""
+    """Growth of all struts, of one material, m/m from dry to damp air, beyond the stated swelling."""
 
     name, unit, tolerance = "moisture", "1", 1e-4
 

@@ -47,6 +47,6 @@ class LengthMap(StrutBlock):
         return self.weights(linkage.stations.commands)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Its knots are the model's."""
+        """Written at its knots, which become the model's."""
         if x.any():
             draft.struts |= {"map_knots": self.knots, "map_values": x.reshape(6, -1)}

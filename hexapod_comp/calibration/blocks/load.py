@@ -1,4 +1,5 @@
-"""What struts give under load, beyond what is stated: compliance, lost motion by force, friction of their bearings."""
+"""How far struts yield under load, beyond the stated values: compliance, lost motion by force, friction of their
+bearings."""
 
 from __future__ import annotations
 
@@ -65,7 +66,7 @@ def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) ->
 
 
 def bearing_forces(linkage: Linkage) -> np.ndarray:
-    """Return the forces on the platform of bearings that resist with 1 N m, by each strut's, (M, 6, 3), N."""
+    """Return the force of each strut's bearings on the platform when they resist with 1 N m, (M, 6, 3), N."""
     u, motion, axes = linkage.directions, linkage.stations.sense[:, None, :3], linkage.geometry.base_axes
     slow = SLIDING * np.maximum(np.linalg.norm(motion, axis=2), 1.0)
     if axes is not None:  # two bearings of a cardan joint turn
@@ -90,7 +91,7 @@ def by_friction(linkage: Linkage) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def tensions(linkage: Linkage) -> np.ndarray:
-    """Return what the struts pull with under weight and friction at a linkage's stations, (M, 6), N."""
+    """Return the struts' tensions under weight and friction at a linkage's stations, (M, 6), N."""
     load = linkage.load
     mass, moment, gravity = weights(load, linkage.geometry, linkage.stations)
     torque = np.cross(np.einsum("mij,mj->mi", linkage.rotations, moment), gravity)
@@ -106,9 +107,9 @@ def taken_up(linkage: Linkage) -> np.ndarray:
 def unsettled_lengths(linkage: Linkage) -> np.ndarray:
     """Return the standard deviation of the struts' lengths where the take-up exceeds their tension, (M, 6), m.
 
-    A clearance goes to one of its ends, to which depends on a force that is known to no better than the take-up; the
-    line between the ends, by which the model lengthens the strut, is the mean of both, weighted by their probabilities.
-    A strut whose own clearance hardly shows has the usual one of the six.
+    A clearance rests at one of its ends. Which one depends on a force that is not known better than the take-up, so the
+    model lengthens the strut by the mean of both, weighted by their probabilities. A strut whose own clearance hardly
+    shows has the usual one of the six.
     """
     usual = np.maximum(linkage.load.lost_motion, rms(linkage.load.lost_motion))
     deviation: np.ndarray = 0.5 * usual * np.sqrt(1.0 - taken_up(linkage) ** 2)
@@ -116,7 +117,7 @@ def unsettled_lengths(linkage: Linkage) -> np.ndarray:
 
 
 def as_loaded(settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> set[str]:
-    """Return the blocks of load that stations cannot show: with forces of one sign, struts look longer.
+    """Return the blocks of load that stations cannot determine: under forces of one sign a strut only looks longer.
 
     Forces are those of the nominal machine.
     """
@@ -147,7 +148,7 @@ class LoadBlock(Block):
 
     @classmethod
     def of(cls, facts: Facts) -> LoadBlock | None:
-        """If a stiffness is stated; the settings' blocks report whether readings show it."""
+        """Only if a stiffness is stated; whether readings determine it is decided before, in the settings' blocks."""
         return cls(facts) if stated_load(facts.settings).stiffness.all() else None
 
     @abstractmethod
@@ -160,7 +161,7 @@ class LoadBlock(Block):
         return lambda errors: np.einsum("ns,nsp->np", errors.gains, factors[errors.at])
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """It adds to what is stated; a small negative one is noise, and stays."""
+        """Added to the stated value; a small negative one is noise, and is kept."""
         draft.load[self.term] = x
 
 
@@ -183,14 +184,14 @@ class Compliance(LoadBlock):
 class LostMotion(LoadBlock):
     """By how much a strut is longer when it is pulled than when it is pushed, c: δl = c/2 · the sign of its tension.
 
-    In proportion where that is nearly none.
+    Near zero tension it is in proportion to the tension.
     """
 
     name, unit, tolerance, term = "lost motion", "m", 3e-6, "lost_motion"
 
     @classmethod
     def of(cls, facts: Facts) -> LoadBlock | None:
-        """Where it is stated what the struts carry, be they rigid."""
+        """For a machine whose load is stated, also with rigid struts."""
         return cls(facts) if facts.settings.load else None
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
