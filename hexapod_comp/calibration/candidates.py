@@ -113,7 +113,8 @@ def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
 
 
 def _longest(within: np.ndarray) -> tuple[int, int]:
-    """Return first and last index of the longest stretch; one less at an end that a limit cuts."""
+    """Return first and last index of the longest stretch within the limits, without the last point where a limit ends
+    it."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], within, [False]]).astype(int)))
     if not len(edges):
         return 0, -1

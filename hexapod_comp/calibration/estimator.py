@@ -476,8 +476,8 @@ class Estimation:
     def unknowns(
         self, directions: np.ndarray, errors: np.ndarray, values: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, list[Nuisance]]:
-        """Return the predicted values of cells with errors (C, 6), and the unknowns; renews `directions` that
-        change."""
+        """Return the predicted values of cells with errors (C, 6), and the unknowns; updates `directions` that depend
+        on them."""
         expected = np.einsum("ci,ci->c", directions, errors)
         unknowns = self._zeros.unknowns(scale)
         unknowns += [of_square(n, scale[n], self.cells.lever[n], self.cells.group[n]) for n in self._squares]

@@ -130,7 +130,8 @@ def _parts(m: MeasurementSet) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _in_other_units(m: MeasurementSet) -> Iterator[tuple[str, np.ndarray, float]]:
-    """Yield name, kinds and factor of each kind in each other unit, those of lines together, and all."""
+    """Yield, for each other unit, its name, kinds of reading and their factors: one kind, those of lines together, or
+    all."""
     present = np.unique(m.kind)
     angular = np.array([KINDS[k] in ANGULAR_KINDS for k in present])
     for which, meant, kinds in (("length", "µm", present[~angular]), ("angle", "µrad", present[angular])):
@@ -198,7 +199,7 @@ def _turned_runs(m: MeasurementSet, turn: np.ndarray) -> tuple[Run, ...]:
 
 
 def _sent(m: MeasurementSet, positions: np.ndarray, rotations: np.ndarray, turn: np.ndarray) -> MeasurementSet:
-    """Return a set with other poses and directions turned alike; lengths of struts that were measured stay."""
+    """Return a set with other poses, and directions turned in the same way; measured strut lengths are kept."""
     moving = Passes(m.geometry, positions, rotations, m.stations.sense[:, :3] @ turn.T)
     commands = moving.nominal_commands() if has_nominal_commands(m) else m.stations.commands
     stations = replace(m.stations, positions=positions, rotations=rotations, commands=commands, sense=moving.senses())

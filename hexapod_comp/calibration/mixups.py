@@ -73,7 +73,8 @@ class Alternative:
     text: str = ""  # what to print in place of both
 
     def words(self) -> str:
-        """Return what is reported of it; the same residuals by a machine with smaller errors are more probable too."""
+        """Return the report's words for it; it is also more probable where a machine with smaller errors has the same
+        residuals."""
         fits = f"{self.better:.3g} times better" if self.better > 1.005 else "as well, by smaller errors of the machine"
         return self.text or f"{self.name} fits {fits}"
 
@@ -145,7 +146,7 @@ class _Fitted:
 
     @cached_property
     def early(self) -> Posterior:
-        """The same after few rounds."""
+        """The same after few rounds of the estimation of tolerances and noise."""
         return solve(self.components, self.problem, self.components.first, ALIKE, FEW_ROUNDS)
 
     @cached_property
@@ -202,7 +203,7 @@ class _Fitted:
         return directions, target, unknowns
 
     def _undone(self, wrong: Sequence[Mistake]) -> Iterator[tuple[Mistake, LinearProblem]]:
-        """Yield mistakes with the problem of the corrected readings, the machine at its place in the file, if any.
+        """Yield the mistakes that leave the poses as they are, each with the linear problem of the corrected readings.
 
         Where only values differ, all targets are cleared of the instruments' unknowns at once; of other channels, only
         their rows are new.

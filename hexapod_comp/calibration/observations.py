@@ -286,7 +286,7 @@ class Cells:
         return Zeros(zeros, along), lengths
 
     def squares(self) -> list[np.ndarray]:
-        """Return the cells that turn with each square about each axis: all of their groups."""
+        """Return, for each square and axis, all cells whose values change when the square turns about that axis."""
         numbers = np.unique(self.square[self.square >= 0])
         return [np.flatnonzero(np.isin(self.group, self.group[self.square == n])) for n in numbers]
 

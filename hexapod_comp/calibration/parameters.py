@@ -319,7 +319,7 @@ class ParameterSpace:
         )
 
     def _load(self, draft: Draft) -> Load:
-        """Return the load block as stated, with terms that differ from it by a draft's."""
+        """Return the stated load block plus the terms of a draft."""
         stated, beyond = stated_load(self.settings), dict(draft.load)
         known = {name: getattr(stated, name) + beyond.get(name, 0.0) for name in ("lost_motion", "friction")}
         if "compliance" in beyond:

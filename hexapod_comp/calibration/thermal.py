@@ -97,7 +97,7 @@ def with_courses(measurements: MeasurementSet) -> MeasurementSet:
 def _stairs(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
     """Return the length of a sensor's bins, s, and the least variance of their noise by rounding.
 
-    Values that are all multiples of a step are rounded to it; a stair is the mean time of reading per step.
+    Values that are all multiples of a step are rounded to it; the length of a stair is the mean time between two steps.
     """
     pauses = np.diff(times)
     shortest = max(BIN, float(pauses.sum()) / MOST_BINS)

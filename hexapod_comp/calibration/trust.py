@@ -345,9 +345,9 @@ def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
     Repeats show the pure error; the rest beyond the stated noise is lack of fit (Draper & Smith 1998): an error of the
     machine, such as lost motion by friction, also where it differs between directions.
 
-    A field that is rougher than its terms shows that first where it is large compared with the readings' noise, usually
-    in its rotations; the same lack is assumed for displacements, in proportion to their fitted sizes, unless it would
-    have shown there as well.
+    A field that is rougher than its terms is seen first in the kind of reading in which it is large compared with the
+    noise, usually in rotations. The same lack is then assumed for displacements, in proportion to the fitted sizes of
+    both, unless it would have been seen there as well.
     """
     kinds = np.unique(r.estimation.cells.kind)
     found = []
@@ -426,8 +426,8 @@ def _likeness(r: Residuals, there: np.ndarray, back: np.ndarray) -> tuple[float,
     """Return the error variance common to both directions, over that of the noise, and its share that a fit leaves.
 
     Fitting makes the noise of a pair anticorrelated, by the contribution of both to the parameters and to the run's
-    unknowns; and it absorbs the same share of their common error. Residuals are cut at 2 σ, for an instrument that
-    slips puts many readings off; (P(|x| < 2))² of the covariance of normal ones is left.
+    unknowns; and it absorbs the same share of their common error. Residuals are cut off at 2 σ, since an instrument
+    that slips falsifies many readings; of the covariance of normal residuals (P(|x| < 2))² remains.
     """
     # Means of repeated readings are off by more than their noise if each place has its own error.
     size = 2.0 * max(1.0, MEDIAN_TO_SIGMA * float(np.median(np.abs(r.residual[there]))))

@@ -70,7 +70,7 @@ class LimitSummary:
 
     def add(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
         """Keep the worst of these margins and values, (n, 2, k), of n poses that belong to the rows `owner`, ascending,
-        and of the previous ones; of equals the nominal stage."""
+        and of the previous ones; of equal ones that of the nominal stage."""
         margin = np.where(np.isnan(margin), -np.inf, margin)
         starts = np.flatnonzero(np.diff(owner, prepend=-1))
         rows, of_pose = owner[starts], margin.min(axis=2)

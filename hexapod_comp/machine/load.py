@@ -52,7 +52,7 @@ NOTHING = Payload()
 
 
 def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Sequence[float]) -> str:
-    """Return in what a load is outside those of a model's measurement; empty if it is not, or not known.
+    """Return how a load differs from those of a model's measurement, as text; empty if it does not, or none is known.
 
     The model also holds between measured directions of gravity: half of their largest gap is allowed.
     """
@@ -179,7 +179,7 @@ class Load:
 
     @property
     def bends(self) -> bool:
-        """Whether any strut's length depends on its force, which friction alone does not make it do."""
+        """Whether any strut's length depends on its force; friction alone does not cause that."""
         return bool(self.stiffness.any() or self.lost_motion.any())
 
     def numbers(self) -> tuple[float, ...]:

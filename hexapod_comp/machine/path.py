@@ -4,11 +4,11 @@ A leg is a straight line of one point of the tool, its tip or another pivot, and
 from 0 to 1 is the share of both. The struts' lengths and three derivatives by s are closed forms. Speed and
 acceleration without jerk are time-optimal path parameterisation by reachability (Pham & Pham 2018): on a grid of s a
 backward pass finds the largest ṡ² from which the end can still be reached, and a forward pass uses the largest
-acceleration. A moving average over a time w then turns a change of acceleration by A into a jerk of A/w. A search finds
-the share of the limits of speed and acceleration for the optimum before it is averaged (a short move has no time to
-reach them) that gives the shortest motion; for one strut this is the optimal profile of seven phases. Any remaining
-excess over a limit is removed by running the whole motion more slowly, so that no limit is ever exceeded, whatever the
-search found.
+acceleration. A moving average over a time w then turns a change of acceleration by A into a jerk of A/w. Averaging
+lengthens the motion, so the optimum before it uses only a share of the limits of speed and acceleration (a short move
+has no time to reach them). A search finds the share that gives the shortest motion; for one strut this is the optimal
+profile of seven phases. Any remaining excess over a limit is removed by running the whole motion more slowly, so that
+no limit is ever exceeded, whatever the search found.
 """
 
 from __future__ import annotations

@@ -194,7 +194,8 @@ class Temperatures:
     def unknown_for(self, late_growth: LateGrowth, time: float) -> float:
         """Return for how long, s, late parts are still not known at a `time`, s, because readings began too recently.
 
-        A first reading finds them at rest. What it did not know is forgotten after three time constants.
+        At the first reading they are assumed at rest; the error of this assumption has decayed after three time
+        constants.
         """
         begun = [lag.began for name, lag in self.lags.items() if late_growth.thermometer in ("", name)]
         if not begun or not late_growth.time_constants:

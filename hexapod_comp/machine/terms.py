@@ -23,7 +23,7 @@ SHOWN = {
 
 @dataclass(frozen=True)
 class Row:
-    """The file's and the documentation's side of one term."""
+    """One term as it appears in files and in the documentation."""
 
     place: str  # section of the file, such as struts.wave
     key: str  # there, without its unit; empty: the field's name

@@ -42,7 +42,7 @@ class ToolErrors:
     def aligned(self) -> ToolErrors:
         """Return the same with the datum aligned: minus the turn and shift that best explain the displacements.
 
-        Rotations lose their mean.
+        The mean rotation is subtracted.
         """
         actual = self.points + self.displacement
         motion = best_motion(actual, self.points)

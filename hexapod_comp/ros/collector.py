@@ -125,8 +125,8 @@ class WatchedMachine(Machine):
     # ---- what collect asks ----
 
     def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
-        """Move as :meth:`.Machine.move` does; ask again for a move whose commands were refused, as late ones are, and
-        where mover or compensator was restarted on the way."""
+        """Move as :meth:`.Machine.move` does; repeat a move whose commands were refused for their delay, and where
+        mover or compensator was restarted on the way."""
         for _ in range(ASKED_AGAIN):
             try:
                 return super().move(pose, *arguments, **options)

@@ -368,8 +368,8 @@ class Outputs:
             self._estimates.publish(self._estimate_out.made(pose, stamp))
 
     def nominal(self, stamp: int, mean: Callable[[], np.ndarray]) -> None:
-        """Publish the struts for a controller of nominal lengths; it starts from there and holds that: for struts at
-        rest it is their average."""
+        """Publish nominal lengths of the measured struts, from which a controller starts and which it holds: the
+        average for struts at rest."""
         if self._nominal is not None:
             out, fastest = self._nominal_out, self._compensator.geometry.limits.speed
             lengths = np.ascontiguousarray(nominal_lengths(self._compensator, mean()))

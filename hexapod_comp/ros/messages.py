@@ -70,7 +70,7 @@ def stamp_of(nanoseconds: int) -> Time:
 
 
 def period(since: int, until: int) -> float:
-    """Return the time between two stamps, ns, for the speed of a strut, s; 0: it has none.
+    """Return the time between two stamps, ns, by which a strut's speed is computed, s; 0 if there is none.
 
     It depends on the stamps alone, so that a recorded run answers the same when it is replayed.
     """

@@ -328,7 +328,8 @@ class MoverNode(MachineNode):
     # ---- planning ----
 
     def _plan(self, anew: bool = False) -> None:
-        """Have the pending request planned, from the machine's present pose; anew: one that has begun already."""
+        """Have the pending request planned, from the machine's present pose; `anew`: also one that has begun
+        already."""
         request, self._pending = self._pending, None
         if request is None or self._geometry is None:
             return

@@ -38,7 +38,7 @@ def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, see
 
 
 def _since_turning(geometry: HexapodGeometry, start: np.ndarray, end: np.ndarray, level: np.ndarray) -> float:
-    """Return the least change of a strut's length on a straight way since it has turned back, m."""
+    """Return the least distance that a strut has moved on a straight way since its last reversal, m."""
     way = np.linspace(start, end, SAMPLES)
     lengths = strut_lengths_batch(
         Structure.of(geometry), *geometry.platform_poses(way, np.tile(level, (SAMPLES, 1, 1))), threads=1
@@ -130,7 +130,7 @@ def _of_kind(readings: MeasurementSet, *kinds: str) -> np.ndarray:
 def _differences(
     fitted: FittedParameters, readings: MeasurementSet, kinds: tuple[str, ...]
 ) -> tuple[MeasurementSet, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the readings of some kinds, their directions, and by how much they differ from the fit, beside noise."""
+    """Return the readings of some kinds, their directions, their differences from the fit, and their noise."""
     chosen = readings.select(_of_kind(readings, *kinds))
     errors, directions = predict(fitted.space, fitted.x, chosen.stations).errors[chosen.station], chosen.directions()
     return (
@@ -142,6 +142,6 @@ def _differences(
 
 
 def _rigid(space: ParameterSpace, readings: MeasurementSet, directions: np.ndarray) -> np.ndarray:
-    """Return what a shift, m, and a turn about the box's centre, rad, do to each of some readings, (n, 6)."""
+    """Return the derivatives of some readings by a shift, m, and a turn about the box's centre, rad, (n, 6)."""
     arms = readings.points()[readings.station] - space.places(space.work_box.mean(axis=0))
     return np.concatenate([directions[:, :3], np.cross(arms, directions[:, :3])], axis=1)

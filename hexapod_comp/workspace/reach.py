@@ -401,7 +401,7 @@ def _fits(examiner: Examiner, rotation: np.ndarray, box: np.ndarray) -> bool:
 
 
 def _cause(examiner: Examiner, rotation: np.ndarray, box: np.ndarray) -> str:
-    """Return what most of the points of a box that are not within break, with the struts concerned."""
+    """Return the limit that most of a box's points outside the reach break, with the struts concerned."""
     findings, struts = examiner.findings(_points(box), rotation[None])
     out = findings[findings != Status.OK]
     code = int(np.bincount(out).argmax())
