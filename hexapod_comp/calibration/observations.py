@@ -125,8 +125,9 @@ class Lengths:
     ) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
         """Return the information in these lengths, once their body is at its most probable place.
 
-        A residual of the lengths larger than their noise counts as noise: far from the answer a circle's centre would
-        otherwise leave its plane, where it hardly matters, to explain the machine's errors.
+        Where the residual of the lengths is larger than their noise, it is used as the noise. Otherwise, far from the
+        solution, a circle's centre would be moved out of its plane, where it hardly changes the lengths, to explain the
+        machine's errors.
         """
         known = 0 if self.known_zero else 1
         zero = Nuisance(self.members, (scale / np.linalg.norm(scale))[:, None][:, :known], np.ones(known))

@@ -2,8 +2,8 @@
 
 The machine is whatever can be sent to a pose and watched there by an instrument: one that reads poses of the tool, a
 tracker or motion capture, or one that reads single channels, a laser on a line or a ball bar. What they read is written
-as the campaign's channels, so that ``fit`` takes the file. A run that was interrupted goes on after the stations that
-its file has; one whose unknown zero was lost with that begins anew. First readings are compared with the commands:
+as the campaign's channels, so that ``fit`` takes the file. An interrupted run continues after the stations that its
+file has, or begins anew if the interruption has lost its unknown zero. First readings are compared with the commands:
 :mod:`.set_up` reports a mistake then, not when everything has been measured.
 """
 

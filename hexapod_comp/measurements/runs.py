@@ -280,7 +280,8 @@ def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray,
 def _collect_stations(
     geometry: HexapodGeometry, readings: Sequence[tuple[Reading, int, Run]], poses: Poses
 ) -> tuple[Stations, np.ndarray]:
-    """Return the distinct stations and each reading's index among them; readings with the numbers of their poses."""
+    """Return the distinct stations and each reading's index among them, from readings and the numbers of their
+    poses."""
     known: dict[tuple, int] = {}
     rows: list[tuple] = []
     known_by: list[int | None] = []  # the station from which the machine came, where that is known

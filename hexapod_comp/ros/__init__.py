@@ -54,7 +54,7 @@ def _handle_stop_signals(handler: Callable[[int, FrameType | None], object]) -> 
 def open_streams() -> None:
     """Open those of stdin, stdout and stderr that were closed when the process began: rclpy's executor needs a stderr.
 
-    Otherwise the next file or socket would get its number, and the output of libraries.
+    Otherwise the next file or socket would get the number of a closed one, and with it the output of libraries.
     """
     for number in (0, 1, 2):
         try:
