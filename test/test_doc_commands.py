@@ -18,7 +18,7 @@ import sys
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 import yaml
@@ -63,18 +63,14 @@ def blocks(page: Path) -> Iterator[tuple[int, str]]:
             yield line, re.sub(rf"^{block[1]}", "", block[3], flags=re.MULTILINE)
 
 
-OURS = {"hexapod_comp", "ros2", "make", "python", *NODES}
-
-
-def commands() -> list[Command]:
-    """Return the commands of all blocks that begin with one, in sessions those after ``$``; comments are cut."""
-    found = []
+def commands() -> Iterator[Command]:
+    """Yield the commands of all blocks that begin with one, in sessions those after ``$``; comments are cut."""
     for page in PAGES:
         for line, text in blocks(page):
             joined = re.sub(r"\\\n *", " ", text)  # its lines count as one
             session = joined.startswith("$ ")
             first = joined.removeprefix("$ ").lstrip("#").split()
-            if not session and not (first and first[0] in OURS | OTHERS) and "\nros2 " not in joined:
+            if not session and not (first and first[0] in CHECKS.keys() | OTHERS) and "\nros2 " not in joined:
                 continue
             for number, row in enumerate(joined.splitlines()):
                 if (session and not row.startswith("$ ")) or not row.strip() or row.startswith("#"):
@@ -85,33 +81,18 @@ def commands() -> list[Command]:
                     while words and "=" in words[0]:
                         words = words[1:]
                     if words:
-                        found.append(Command(f"{page.relative_to(ROOT)}:{line + number}", words))
-    return found
+                        yield Command(f"{page.relative_to(ROOT)}:{line + number}", words)
 
 
-COMMANDS = commands()
+def check_verb(words: list[str]) -> None:
+    """Our verbs and options are those of the parser."""
+    if words[1:] != ["--version"]:  # which leaves
+        make_parser().parse_args(words[1:])
 
 
-def test_all_programs_are_known() -> None:
-    assert not [c for c in COMMANDS if c.words[0] not in OURS | OTHERS]
-
-
-def of(*program: str) -> Any:
-    """Return the commands of a program, as parameters of a test."""
-    rows = [c for c in COMMANDS if c.words[: len(program)] == list(program)]
-    assert rows
-    return pytest.mark.parametrize("command", rows, ids=lambda c: f"{c.place} {' '.join(c.words)[:60]}")
-
-
-@of("hexapod_comp")
-def test_our_verbs_and_options_are_there(command: Command) -> None:
-    if command.words[1:] != ["--version"]:  # which leaves
-        make_parser().parse_args(command.words[1:])
-
-
-@of("python", "-m")
-def test_benchmarks_are_there(command: Command) -> None:
-    module, *options = command.words[2:]
+def check_benchmark(words: list[str]) -> None:
+    """``python -m MODULE``: the module is there, and somewhere in its files each option."""
+    module, *options = words[2:]
     source = importlib.util.find_spec(module)
     assert source is not None
     assert source.origin is not None
@@ -120,84 +101,89 @@ def test_benchmarks_are_there(command: Command) -> None:
     assert all(f'"{word}"' in text for word in options if word.startswith("--")), options
 
 
-@of("make")
-def test_targets_are_in_the_makefile(command: Command) -> None:
-    target, *variables = command.words[1:]
+def check_make(words: list[str]) -> None:
+    """Targets and variables stand in the Makefile."""
     text = (ROOT / "Makefile").read_text(encoding="utf-8")
-    assert re.search(rf"^{re.escape(target)}:", text, re.MULTILINE)
-    assert all(re.search(rf"\b{word.partition('=')[0]}\b", text) for word in variables)
-
-
-@of("ros2")
-def test_what_is_asked_of_ros_exists(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    kind, verb, *words = command.words[1:]
-    if kind == "launch":
-        check_launch(monkeypatch, words)
-    elif kind not in ("lifecycle", "security", "pkg"):  # which have nothing of ours but a node's name
-        check: Callable[..., None] = globals()[f"check_{kind}"]
-        check(verb, words)
-
-
-def check_launch(monkeypatch: pytest.MonkeyPatch, words: list[str]) -> None:
-    assert words.pop(0) == "machine.launch.py"
-    assert {word.partition(":=")[0] for word in words} <= set(LaunchFile(monkeypatch).defaults)
-
-
-def check_run(package: str, words: list[str]) -> None:
-    if package == "hexapod_comp":
-        check_node(words)
-
-
-@pytest.mark.parametrize("command", [c for c in COMMANDS if c.words[0] in NODES], ids=lambda c: c.place)
-def test_nodes_are_started_with_parameters_that_they_have(command: Command) -> None:
-    check_node(command.words)
+    assert re.search(rf"^{re.escape(words[1])}:", text, re.MULTILINE)
+    assert all(re.search(rf"\b{word.partition('=')[0]}\b", text) for word in words[2:])
 
 
 def check_node(words: list[str]) -> None:
+    """A node has the parameters, with these values, and the topics that are renamed."""
     node = NODES[words[0]]
     table = {parameter.name: parameter for parameter in node.PARAMETERS}
-    topics = topics_of(words[0])
     for option, word in pairwise(words):
         if option == "-p":
             name, _, value = word.partition(":=")
             table[name].checked(yaml.safe_load(value))
         elif option == "-r":
-            assert f"/{word.partition(':=')[0]}" in topics, word
+            assert f"/{word.partition(':=')[0]}" in topics_of(words[0]), word
 
 
-def topics_of(name: str) -> dict[str, str]:
-    """Return topics and services of a node with their types' names, from its help."""
-    found = {}
+def topics_of(name: str) -> set[str]:
+    """Return topics and services of a node from its help."""
+    found = set()
     for line in NODES[name].TOPICS.splitlines():
-        names, _, kind = re.sub(r"^(in|out|ask)?\s+", "", line).partition("  ")
-        for topic in names.split(", "):
-            found["/" + topic.strip().replace("~", name).lstrip("/")] = kind.strip()
+        names = re.sub(r"^(in|out|ask)?\s+", "", line).partition("  ")[0]
+        found |= {"/" + topic.strip().replace("~", name).lstrip("/") for topic in names.split(", ")}
     return found
 
 
-def check_topic(verb: str, words: list[str]) -> None:
-    topic = next(word for word in words if word.startswith("/"))
-    known = {name for node in NODES for name in topics_of(node)}
-    assert topic in known | set(OURS_ELSEWHERE)
-    assert verb in ("echo", "hz", "delay", "pub")
+def check_ros(words: list[str]) -> None:
+    """What ROS's tools are asked for is ours, or has nothing of ours but a node's name (lifecycle, security, pkg)."""
+    kind, verb, *rest = words[1:]
+    if kind == "launch":
+        with pytest.MonkeyPatch.context() as patch:
+            known = set(LaunchFile(patch).defaults)
+        assert verb == "hexapod_comp"
+        assert rest.pop(0) == "machine.launch.py"
+        assert {word.partition(":=")[0] for word in rest} <= known
+    elif kind == "run" and verb == "hexapod_comp":
+        check_node(rest)
+    elif kind == "topic":
+        topic = next(word for word in rest if word.startswith("/"))
+        assert verb in ("echo", "hz", "delay", "pub")
+        assert topic in set(OURS_ELSEWHERE).union(*map(topics_of, NODES))
+    elif kind == "service":
+        node, service = rest[0].strip("/").split("/")
+        assert verb == "call"
+        assert re.search(rf"~/{service}\b", NODES[node].TOPICS), rest[0]
+        assert rest[1].rpartition("/")[2] in NODES[node].TOPICS
+    elif kind == "param":
+        table = {parameter.name: parameter for parameter in NODES[rest[0].strip("/")].PARAMETERS}
+        if verb == "set":
+            table[rest[1]].checked(yaml.safe_load(rest[2]))
+            assert table[rest[1]].taken in (Taken.ALWAYS, Taken.RELOAD)
+        elif verb == "describe":
+            assert rest[1] in table
+    else:
+        assert kind in ("lifecycle", "security", "pkg", "run")
 
 
-def check_service(verb: str, words: list[str]) -> None:
-    name, kind = words[:2]
-    assert verb == "call"
-    node, service = name.strip("/").split("/")
-    listed = NODES[node].TOPICS
-    assert re.search(rf"~/{service}\b", listed), name
-    assert kind.rpartition("/")[2] in listed
+CHECKS: dict[str, Callable[[list[str]], None]] = {
+    "hexapod_comp": check_verb,
+    "python": check_benchmark,
+    "make": check_make,
+    "ros2": check_ros,
+    **dict.fromkeys(NODES, check_node),
+}
+COMMANDS = list(commands())
 
 
-def check_param(verb: str, words: list[str]) -> None:
-    table = {parameter.name: parameter for parameter in NODES[words[0].strip("/")].PARAMETERS}
-    if verb == "set":
-        table[words[1]].checked(yaml.safe_load(words[2]))
-        assert table[words[1]].taken in (Taken.ALWAYS, Taken.RELOAD)
-    elif verb == "describe":
-        assert words[1] in table
+def test_all_programs_are_known() -> None:
+    assert {c.words[0] for c in COMMANDS} - OTHERS == CHECKS.keys() - {
+        "instrument",
+        "adapter",
+        "mover",
+        "linuxcnc_bridge",
+    }
+
+
+@pytest.mark.parametrize(
+    "command", [c for c in COMMANDS if c.words[0] in CHECKS], ids=lambda c: f"{c.place} {' '.join(c.words)[:60]}"
+)
+def test_what_a_command_names_is_there(command: Command) -> None:
+    CHECKS[command.words[0]](command.words)
 
 
 # ---- sessions ----
