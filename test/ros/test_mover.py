@@ -6,6 +6,7 @@ makes of the errors that the drive hides; for a client in lock-step a stand-in t
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,6 +27,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
+from hexapod_comp.cli.app import make_parser
 from hexapod_comp.errors import CommandError, NoAnswerError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import strut_lengths
@@ -701,28 +703,48 @@ def test_a_stop_brakes_a_move_that_was_asked_for_again(monkeypatch: pytest.Monke
     assert len(stops) == 2
 
 
-def test_the_node_starts_reports_and_stops_a_calibration(bench: Bench, tmp_path: Path) -> None:
-    """No machine is there: the process waits for one. The journal is the test's."""
-    node = bench.add(AdapterNode, True, {"folder": str(tmp_path)})
-    assert bench.call(Trigger, "adapter/stop").message == "nothing was running"
+@pytest.fixture
+def adapter(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], AdapterNode]:
+    """Give a node whose process is a shell script: Python's imports would wait for a processor at its low priority."""
+
+    def make(script: str) -> AdapterNode:
+        program = tmp_path / "python"
+        program.write_text(f"#!/bin/sh\n{script}\n", encoding="utf-8")
+        program.chmod(0o755)
+        monkeypatch.setattr(sys, "executable", str(program))
+        return rig.add(AdapterNode, True, {"folder": str(tmp_path)})
+
+    return make
+
+
+def test_the_node_starts_reports_and_stops_a_calibration(
+    rig: Rig, adapter: Callable[[str], AdapterNode], tmp_path: Path
+) -> None:
+    """The journal is the test's."""
+    node = adapter("exec sleep 100")
+    assert rig.call(Trigger, "adapter/stop").message == "nothing was running"
     (tmp_path / "journal.jsonl").write_text('{"event": "stopped"}\n', encoding="utf-8")
-    assert bench.call(Trigger, "adapter/calibrate").success
-    refused = bench.call(Trigger, "adapter/verify")
+    assert rig.call(Trigger, "adapter/calibrate").success
+    process = node._process
+    assert make_parser().parse_args(process.args[3:]).verb == "adapt"
+    refused = rig.call(Trigger, "adapter/verify")
     assert (refused.success, refused.message) == (False, "calibrating already: ~/stop ends it")
     node._check_state()  # reads the journal
     assert (node._step, node._text) == ("", "starting"), "the step of the run before is none of this one"
     journal = '{"event": "begun", "machine": "paper", "goal_m": 3e-06}\n{"event": "pla'
     (tmp_path / "journal.jsonl").write_text(journal, encoding="utf-8")
-    bench.until(lambda: node._step == "begun", "the step")
-    assert bench.call(Trigger, "adapter/stop").message == "the machine brakes"
-    bench.until(lambda: node._state == "stopped", "its end", timeout=60.0)
-    assert bench.call(Trigger, "adapter/stop").message == "nothing was running"
+    rig.until(lambda: node._step == "begun", "the step")
+    assert rig.call(Trigger, "adapter/stop").message == "the machine brakes"
+    process.wait()
+    rig.until(lambda: node._state == "stopped", "its end")
+    assert rig.call(Trigger, "adapter/stop").message == "nothing was running"
 
 
-def test_a_process_that_ends_without_a_result_is_reported(bench: Bench, tmp_path: Path) -> None:
-    node = bench.add(AdapterNode, True, {"folder": str(tmp_path), "geometry_file": "not_there.yaml"})
-    assert bench.call(Trigger, "adapter/verify").success
-    bench.until(lambda: node._state == "failed", "its end", timeout=60.0)
+def test_a_process_that_ends_without_a_result_is_reported(rig: Rig, adapter: Callable[[str], AdapterNode]) -> None:
+    node = adapter("exit 2")
+    assert rig.call(Trigger, "adapter/verify").success
+    node._process.wait()
+    rig.until(lambda: node._state == "failed", "its end")
     assert node._text.startswith("the process ended with 2")
     assert node._next == "", "it would fail again"
     node._state, node._step, node._reason = "verifying", "interrupted", "refusal: several_publishers: /mover, /other"
