@@ -504,7 +504,12 @@ def test_corrections_ramp_in_and_out_in_proportion():
     loop = Loop()
     shares = np.arange(1, 101) / 100.0
     np.testing.assert_allclose(loop.run(100), np.outer(shares, TARGET), rtol=1e-9, atol=SLACK)
-    assert loop.guard.status is GuardStatus.COMPENSATING
+    for share, status in ((1.05, GuardStatus.COMPENSATING), (1.5, GuardStatus.RAMPING)):  # one that moves on by 5 µm
+        loop.target = [share * value for value in TARGET]
+        loop.run(1)
+        assert loop.guard.status is status
+    loop.target = TARGET
+    loop.run(4)
     loop.enabled = False
     np.testing.assert_allclose(loop.run(99), np.outer(shares[98::-1], TARGET), rtol=1e-9, atol=SLACK)
     assert loop.guard.status is GuardStatus.RETURNING
