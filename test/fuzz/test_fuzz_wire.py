@@ -34,7 +34,7 @@ from hexapod_comp.ros.messages import pose_message
 MESSAGES = max(1000, NIGHTLY)
 HUGE = 10_000_000  # Byte; one message in a hundred
 
-# What the messages may add to the node's memory, MB: six copies of the longest message, which middleware, rclpy and node
+# What the messages may add to the memory, MB: six copies of the longest message, which middleware, rclpy and node
 # hold (55 in 200,000 messages), and some more. Some ten such messages arrive: a node that kept them would add 100.
 GROWTH = 75
 
