@@ -16,8 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from hexapod_comp.machine.field import CROSS_AXES, GridField
 from hexapod_comp.machine.geometry import HexapodGeometry, Limits, load_geometry
+from hexapod_comp.machine.load import Load
 from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.machine.temperatures import LateGrowth
 from hexapod_comp.pose import Pose
 
 PAPER_FILE = Path(__file__).resolve().parents[1] / "config" / "paper.yaml"
@@ -105,4 +107,19 @@ def random_model(rng: np.random.Generator, machine: str) -> MachineModel:
         field=random_field(rng, probe=[0.03, -0.02, -0.12]),
         base_expansion=11e-6,
         platform_expansion=23e-6,
+    )
+
+
+def whole_model(rng: np.random.Generator, machine: str) -> MachineModel:
+    """Return a random model with the blocks as well of which few machines need one: all that the C core knows."""
+    load = Load(
+        *(rng.uniform(5e6, 1e8, 6), rng.uniform(-1e-5, 1e-5, 6), 5.0, 12.5, rng.uniform(-0.1, 0.1, 3)),
+        *(np.array([0.0, 9.8, 0.1]), rng.uniform(0.0, 3.0, 6)),
+    )
+    return replace(
+        random_model(rng, machine),
+        base_axes_turn=rng.uniform(-1e-3, 1e-3, 3),
+        late_growth=LateGrowth((600.0, 7200.0), rng.uniform(-1e-5, 1e-5, (8, 2)), "base"),
+        load=load,
+        reversal_threshold=rng.uniform(0.0, 1e-5),
     )

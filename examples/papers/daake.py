@@ -92,7 +92,7 @@ def ranking(case: Study) -> Exhibit:
 
 def _order(rows: dict[str, RankingRow]) -> Statement:
     """Compare the printed order of the rows with the computed one."""
-    here = sorted(rows, key=lambda name: -rows[name].translation_max.value)
+    here = sorted(rows, key=lambda name: -rows[name].extremes[0].value)
     first = here[0] == next(iter(rows))
     return Statement(
         "order by largest translation",

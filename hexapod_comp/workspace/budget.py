@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,73 +46,47 @@ class SingleErrors:
             self.kind[chosen], self.part[chosen], self.struts[chosen], self.vector[chosen], self.kinds, labels
         )
 
-    def scaled(self, factors: np.ndarray) -> SingleErrors:
-        """Return the errors with each type's size multiplied by a factor, shape (kinds,)."""
-        vector = self.vector * np.asarray(factors)[self.kind][:, None]
-        return SingleErrors(self.kind, self.part, self.struts, vector, self.kinds, self.labels)
-
-
-Row = tuple[int, np.ndarray, tuple[float, ...], str]  # Part, struts (6,), vector and label of one single error
-
 
 @dataclass(frozen=True)
 class SourceType:
-    """A type of error that a budget may contain."""
+    """A type of error that a budget may contain: single errors of one size, one after the other along each axis."""
 
     name: str  # key in the budget file, without its unit
     dimension: str  # Kind of unit of its size
     title: str  # in reports
-    # From a size in SI and the struts that end in each platform joint, shape (joints, 6), to the single errors
-    make: Callable[[float, np.ndarray], Iterable[Row]]
+    part: int
+    axes: tuple[int, ...]  # of the vectors of :class:`SingleErrors`
+    factor: float = 1.0  # of a size, for what a single error is
 
+    def rows(self, size: float, joints: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray, str]]:
+        """Yield part, struts (6,), vector and label of each single error of a size.
 
-EACH = np.eye(6, dtype=bool)  # Every strut by itself
-
-
-def _lengths(coefficient: int, factor: float = 1.0) -> Callable[[float, np.ndarray], Iterable[Row]]:
-    """Return a maker of one length error per strut."""
-
-    def make(size: float, joints: np.ndarray) -> Iterable[Row]:
-        del joints
-        for number, struts in enumerate(EACH, start=1):
-            yield LENGTH, struts, tuple(factor * size * np.eye(3)[coefficient]), f"strut_{number}"
-
-    return make
-
-
-def _joints(part: int, axes: tuple[int, ...]) -> Callable[[float, np.ndarray], Iterable[Row]]:
-    """Return a maker of one displacement per joint and axis."""
-    body = "base" if part == BASE_JOINT else "platform"
-
-    def make(size: float, joints: np.ndarray) -> Iterable[Row]:
-        for struts in EACH if part == BASE_JOINT else joints:
+        `joints`, (joints, 6): which struts end in each platform joint.
+        """
+        for struts in {PLATFORM_JOINT: joints, TOOL: NO_STRUT}.get(self.part, EACH):
             numbers = "/".join(str(strut + 1) for strut in np.flatnonzero(struts))
-            for axis in axes:
-                yield part, struts, tuple(size * np.eye(3)[axis]), f"{body} joint {numbers} {AXES[axis]}"
+            where = ("strut_{}", "base joint {} ", "platform joint {} ", "tool ")[self.part].format(numbers)
+            for axis in self.axes:
+                vector = self.factor * size * np.eye(3)[axis]
+                yield self.part, struts, vector, where if self.part == LENGTH else where + AXES[axis]
 
-    return make
 
-
-def _tool(size: float, joints: np.ndarray) -> Iterable[Row]:
-    del joints
-    for axis in range(3):
-        yield TOOL, np.zeros(6, dtype=bool), tuple(size * np.eye(3)[axis]), f"tool {AXES[axis]}"
-
+EACH, NO_STRUT = np.eye(6, dtype=bool), np.zeros((1, 6), dtype=bool)
 
 # Types that a budget may have. Screw pitch as in v. Daake et al. is a bound of the length error; as a slope it grows
 # with the way from home. A strut is off by half its backlash. Thermal growth is relative: expansion times kelvins.
 SOURCE_TYPES = (
-    SourceType("strut_length", "length", "strut length", _lengths(0)),
-    SourceType("screw_pitch", "length", "screw pitch", _lengths(0)),
-    SourceType("screw_pitch_slope", "ratio", "screw pitch slope", _lengths(1)),
-    SourceType("quantisation", "length", "quantisation", _lengths(0)),
-    SourceType("base_joint_xy", "length", "base joint x/y", _joints(BASE_JOINT, (0, 1))),
-    SourceType("base_joint_z", "length", "base joint z", _joints(BASE_JOINT, (2,))),
-    SourceType("platform_joint_xy", "length", "platform joint x/y", _joints(PLATFORM_JOINT, (0, 1))),
-    SourceType("platform_joint_z", "length", "platform joint z", _joints(PLATFORM_JOINT, (2,))),
-    SourceType("backlash", "length", "backlash", _lengths(0, 0.5)),
-    SourceType("thermal_growth", "ratio", "thermal growth", _lengths(2)),
-    SourceType("tool_offset", "length", "tool offset", _tool),
+    SourceType("strut_length", "length", "strut length", LENGTH, (0,)),
+    SourceType("screw_pitch", "length", "screw pitch", LENGTH, (0,)),
+    SourceType("screw_pitch_slope", "ratio", "screw pitch slope", LENGTH, (1,)),
+    SourceType("quantisation", "length", "quantisation", LENGTH, (0,)),
+    SourceType("base_joint_xy", "length", "base joint x/y", BASE_JOINT, (0, 1)),
+    SourceType("base_joint_z", "length", "base joint z", BASE_JOINT, (2,)),
+    SourceType("platform_joint_xy", "length", "platform joint x/y", PLATFORM_JOINT, (0, 1)),
+    SourceType("platform_joint_z", "length", "platform joint z", PLATFORM_JOINT, (2,)),
+    SourceType("backlash", "length", "backlash", LENGTH, (0,), 0.5),
+    SourceType("thermal_growth", "ratio", "thermal growth", LENGTH, (2,)),
+    SourceType("tool_offset", "length", "tool offset", TOOL, (0, 1, 2)),
 )
 
 BY_NAME = {source.name: source for source in SOURCE_TYPES}
@@ -151,7 +125,7 @@ class Budget:
         rows = [
             (number, *row)
             for number, (name, size) in enumerate(self.sizes.items())
-            for row in BY_NAME[name].make(size, joints)
+            for row in BY_NAME[name].rows(size, joints)
         ]
         kind, part, struts, vector, labels = zip(*rows, strict=True)
         titles = tuple(BY_NAME[name].title for name in self.sizes)

@@ -32,9 +32,8 @@ class Extremes:
 
     errors: SingleErrors  # The E errors of K types
     values: np.ndarray  # (K, 4): m, m, rad, rad; NaN for a type without any certified effect
-    at_pose: np.ndarray  # (K, 4): number of the pose; −1 for none
-    at_error: np.ndarray  # (K, 4): which single error
-    positions: np.ndarray  # (K, 4, 3): that pose, ``pose_platform_in_base``, m
+    at_error: np.ndarray  # (K, 4): which single error; −1 for none
+    positions: np.ndarray  # (K, 4, 3): the pose where it happens, ``pose_platform_in_base``, m
     rotations: np.ndarray  # (K, 4, 3, 3)
     failed: np.ndarray  # (K,): number of effects without a certified solution, which are left out
     poses: int  # Number of poses
@@ -76,7 +75,6 @@ def extremes(
     positions: np.ndarray,
     rotations: np.ndarray,
     method: str = EXACT,
-    first: int = 0,
     threads: int | None = None,
 ) -> Extremes:
     """Return the largest and smallest effects of each error type over some poses (v. Daake et al., Table 1)."""
@@ -86,17 +84,17 @@ def extremes(
     def run(rows: slice) -> None:
         poses = positions[rows], rotations[rows]
         vectors = _vectors(geometry, errors, *poses, method)
-        parts[rows.start] = _extremes(errors, vectors, *poses, first + rows.start)
+        parts[rows.start] = _extremes(errors, vectors, *poses)
 
     over_chunks(run, len(positions), threads, BLOCK)
     if not parts:
         nowhere = np.full((1, 3), np.nan), np.full((1, 3, 3), np.nan)
-        return replace(_extremes(errors, (), *nowhere, first), poses=0)
+        return replace(_extremes(errors, (), *nowhere), poses=0)
     return merged(parts[start] for start in sorted(parts))
 
 
 def _extremes(
-    errors: SingleErrors, vectors: Iterable[np.ndarray], positions: np.ndarray, rotations: np.ndarray, first: int
+    errors: SingleErrors, vectors: Iterable[np.ndarray], positions: np.ndarray, rotations: np.ndarray
 ) -> Extremes:
     """Return the extremes of a few poses; of equal effects the first pose's first error."""
     best, at = np.full((len(errors), 4), -np.inf), np.zeros((len(errors), 4), int)
@@ -118,7 +116,6 @@ def _extremes(
     return Extremes(
         errors=errors,
         values=np.where(found, best[error, columns] * _SIGNS, nan),
-        at_pose=np.where(found, pose + first, -1),
         at_error=error,
         positions=np.where(found[..., None], positions[pose], nan),
         rotations=np.where(found[..., None, None], rotations[pose], nan),
@@ -139,7 +136,6 @@ def merged(parts: Iterable[Extremes]) -> Extremes:
         result = replace(
             a,
             values=np.where(take_b, b.values, a.values),
-            at_pose=np.where(take_b, b.at_pose, a.at_pose),
             at_error=np.where(take_b, b.at_error, a.at_error),
             positions=np.where(take_b[..., None], b.positions, a.positions),
             rotations=np.where(take_b[..., None, None], b.rotations, a.rotations),

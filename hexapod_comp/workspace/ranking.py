@@ -32,7 +32,6 @@ class Extreme:
     error: str  # which single error
     position: np.ndarray  # (3,): ``pose_tool_in_work`` where it happens: m; α, β, γ, rad
     angles: np.ndarray  # (3,)
-    pose: int  # that pose's number
 
 
 @dataclass(frozen=True)
@@ -40,15 +39,13 @@ class RankingRow:
     """One error type, or several that share a row."""
 
     title: str
-    translation_max: Extreme  # largest and smallest displacement of the tool, m
-    translation_min: Extreme
-    rotation_max: Extreme  # largest and smallest of its rotation, the largest about three axes, rad
-    rotation_min: Extreme
+    # In the order of :data:`FIGURES`: displacement of the tool, m, and its rotation, the largest about three axes, rad
+    extremes: tuple[Extreme, ...]
     failed: int  # number of effects without a certified solution
 
     def figures(self) -> np.ndarray:
         """Return the four values, m, m, rad, rad."""
-        return np.array([getattr(self, name).value for name in FIGURES])
+        return np.array([extreme.value for extreme in self.extremes])
 
 
 def ranked(extremes: Extremes, geometry: HexapodGeometry) -> list[RankingRow]:
@@ -62,9 +59,9 @@ def ranked(extremes: Extremes, geometry: HexapodGeometry) -> list[RankingRow]:
             rest = [k for k in rest if k not in kinds]
     rows = []
     for title, kinds in groups + [(titles[k], [k]) for k in rest]:
-        a, b, c, d = (_extreme(extremes, geometry, title, kinds, column) for column in range(4))
-        rows.append(RankingRow(title, a, b, c, d, int(extremes.failed[kinds].sum())))
-    return sorted(rows, key=lambda row: -row.translation_max.value)
+        four = tuple(_extreme(extremes, geometry, title, kinds, column) for column in range(4))
+        rows.append(RankingRow(title, four, int(extremes.failed[kinds].sum())))
+    return sorted(rows, key=lambda row: -row.extremes[0].value)
 
 
 def _extreme(extremes: Extremes, geometry: HexapodGeometry, title: str, kinds: list[int], column: int) -> Extreme:
@@ -80,8 +77,7 @@ def _extreme(extremes: Extremes, geometry: HexapodGeometry, title: str, kinds: l
     tip = extremes.positions[kind, column] + rotation @ geometry.tool.position
     position = geometry.work.rotation.T @ (tip - geometry.work.position)
     angles = angles_from_rotation(geometry.work.rotation.T @ rotation @ geometry.tool.rotation)
-    pose = int(extremes.at_pose[kind, column])
-    return Extreme(float(extremes.values[kind, column]), label, position, angles, pose)
+    return Extreme(float(extremes.values[kind, column]), label, position, angles)
 
 
 def ranking_text(rows: Sequence[RankingRow]) -> str:
@@ -90,8 +86,7 @@ def ranking_text(rows: Sequence[RankingRow]) -> str:
     lines = [[row.title, *(number(value, 2) for value in row.figures() * FACTORS)] for row in rows]
     parts, places = [aligned(head, lines)], []
     for row in rows:
-        for name in FIGURES:
-            extreme = getattr(row, name)
+        for name, extreme in zip(FIGURES, row.extremes, strict=True):
             place, tilt = 1e3 * extreme.position, np.rad2deg(extreme.angles)
             cells = (", ".join(number(float(v), 1) for v in values) for values in (place, tilt))
             places.append([row.title, name.replace("_", " "), extreme.error, *cells])
@@ -105,8 +100,7 @@ def ranking_rows(rows: Sequence[RankingRow]) -> list[dict[str, Any]]:
     records = []
     for rank, row in enumerate(rows, start=1):
         record: dict[str, Any] = {"rank": rank, "error_type": row.title, "frame": "work"}
-        for name, factor in zip(FIGURES, FACTORS, strict=True):
-            extreme = getattr(row, name)
+        for name, factor, extreme in zip(FIGURES, FACTORS, row.extremes, strict=True):
             record[f"{name}_{'um' if name.startswith('translation') else 'mdeg'}"] = extreme.value * factor
             record[f"{name}_error"] = extreme.error
             for axis, value in zip("xyz", extreme.position, strict=True):

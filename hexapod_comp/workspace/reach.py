@@ -60,19 +60,17 @@ class Examiner:
         over_chunks(run, len(positions), threads)
         return findings, struts
 
-    def boundary(
-        self, inside: np.ndarray, outside: np.ndarray, rotation: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Bisect between M points within the limits and M beyond; return boundary, finding and struts there."""
+    def boundary(self, inside: np.ndarray, outside: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Bisect between M points within the limits and M beyond; return the boundary, and the finding there."""
         inside, outside, rotations = inside.copy(), outside.copy(), rotation[None]
-        findings, struts = self.findings(outside, rotations)
+        findings, _ = self.findings(outside, rotations)
         for _ in range(HALVINGS):
             middle = 0.5 * (inside + outside)
-            at_middle, who = self.findings(middle, rotations)
+            at_middle, _ = self.findings(middle, rotations)
             beyond = at_middle != Status.OK
             inside[~beyond], outside[beyond] = middle[~beyond], middle[beyond]
-            findings[beyond], struts[beyond] = at_middle[beyond], who[beyond]
-        return inside, findings, struts
+            findings[beyond] = at_middle[beyond]
+        return inside, findings
 
 
 @dataclass(frozen=True)
@@ -81,7 +79,6 @@ class Boundary:
 
     positions: np.ndarray  # (M, 3): last point within the limits, m in the work frame
     findings: np.ndarray  # (M,): limit there, index into :data:`FINDINGS`
-    struts: np.ndarray  # (M, 2): struts concerned, 0…5 or −1
     axis: np.ndarray  # (M,): axis of the line, 0…2
     outward: np.ndarray  # (M,): +1 where the line leaves the reach in the sense of its axis, −1 where it enters
 
@@ -152,15 +149,6 @@ class Reach:
     def shares(self) -> dict[str, float]:
         """Return the share of each limit in the boundary, by name, largest first."""
         return _shares(self.boundary.findings)
-
-    def regions(self) -> dict[str, dict[str, float]]:
-        """Return the shares of each region of the boundary: top, bottom, and six sectors of its side."""
-        away = self.boundary.positions - self.centre
-        steep = np.abs(away[:, 2]) > np.hypot(away[:, 0], away[:, 1])
-        sector = np.floor(np.rad2deg(np.arctan2(away[:, 1], away[:, 0])) % 360.0 / 60.0).astype(int) % 6
-        masks = {"top": steep & (away[:, 2] > 0.0), "bottom": steep & (away[:, 2] <= 0.0)}
-        masks.update({f"side {60 * k}…{60 * k + 60}°": ~steep & (sector == k) for k in range(6)})
-        return {name: _shares(self.boundary.findings[mask]) for name, mask in masks.items() if mask.any()}
 
 
 def home_orientation(geometry: HexapodGeometry) -> np.ndarray:

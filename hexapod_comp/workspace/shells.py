@@ -35,7 +35,7 @@ class Quantity:
 
 TRANSLATION = Quantity("translation of the tool", "µm", 1e6)
 ROTATION = Quantity("rotation of the tool, largest of three", "m°", 1e3 * 180.0 / np.pi)
-# Points along a ray at which gaps are looked for: one smaller than a hundredth of the reach can stay unseen
+# Points along a ray at which its first exit is looked for: a gap smaller than a hundredth of the reach can stay unseen
 SAMPLES = 96
 
 
@@ -48,14 +48,6 @@ class Shell:
     centre: np.ndarray  # (3,): where the rays start, m in the work frame
     points: np.ndarray  # (H, A, 3): tool tip on the boundary, m in the work frame
     findings: np.ndarray  # (H, A): what limits there, index into :data:`~hexapod_comp.workspace.reach.FINDINGS`
-    struts: np.ndarray  # (H, A, 2): struts concerned, 0…5 or −1
-    folded: np.ndarray  # (H, A): the ray enters the reach again beyond a gap: there is more than the mesh shows
-    coverage: float  # Volume inside the mesh over the volume of the reach
-
-    @property
-    def volume(self) -> float:
-        """Volume inside the mesh, m³."""
-        return mesh_volume(self.points)
 
     def scaled(self, fraction: float) -> np.ndarray:
         """Return the mesh shrunk towards the centre, shape (H, A, 3), m in the work frame."""
@@ -68,25 +60,9 @@ class Shell:
 
 def shell(reach: Reach, rings: int, sectors: int) -> Shell:
     """Find the boundary of a reach along rays from its centre."""
-    ends, findings, struts, folded = _cast(reach, reach.centre, _directions(reach, rings, sectors))
+    ends, findings = _cast(reach, reach.centre, _directions(reach, rings, sectors))
     points = _closed(ends.reshape(rings, -1, 3))
-    return Shell(
-        reach.geometry,
-        reach.rotation,
-        reach.centre,
-        points,
-        findings.reshape(rings, -1),
-        struts.reshape(rings, -1, 2),
-        folded.reshape(rings, -1),
-        mesh_volume(points) / reach.volume,
-    )
-
-
-def mesh_volume(points: np.ndarray) -> float:
-    """Return the volume inside a closed mesh of rings from bottom to top, (H, A, 3) m, in m³."""
-    p = points - points.reshape(-1, 3).mean(axis=0)
-    a, b, c, d = p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]
-    return float((np.cross(a, b) * c + np.cross(a, c) * d).sum() / 6.0)
+    return Shell(reach.geometry, reach.rotation, reach.centre, points, findings.reshape(rings, -1))
 
 
 def _directions(reach: Reach, rings: int, sectors: int) -> np.ndarray:
@@ -99,10 +75,8 @@ def _directions(reach: Reach, rings: int, sectors: int) -> np.ndarray:
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def _cast(
-    reach: Reach, origin: np.ndarray, directions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Follow rays from a point within reach to where they first leave it."""
+def _cast(reach: Reach, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Follow rays from a point within reach to where they first leave it; return where, and what limits there."""
     examiner = Examiner(reach.geometry)
     corners = np.array([[axis[0], axis[-1]] for axis in reach.axes])
     farthest = np.linalg.norm(np.abs(corners - origin[:, None]).max(axis=1))  # all of the grid, hence of the reach
@@ -113,9 +87,7 @@ def _cast(
     within[:, 0] = True
     exits = within.argmin(axis=1)
     ray = np.arange(len(directions))
-    ends, findings, struts = examiner.boundary(samples[ray, exits - 1], samples[ray, exits], reach.rotation)
-    folded = (np.arange(SAMPLES) > exits[:, None]) & within
-    return ends, findings, struts, folded.any(axis=1)
+    return examiner.boundary(samples[ray, exits - 1], samples[ray, exits], reach.rotation)
 
 
 def _closed(points: np.ndarray) -> np.ndarray:

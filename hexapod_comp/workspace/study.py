@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from itertools import starmap
 from multiprocessing import get_context
 from typing import Any
 
@@ -149,25 +150,15 @@ def mesh_effects(study: Study, body: Shell) -> tuple[np.ndarray, np.ndarray]:
 
 WAIT = 10  # For a cluster to answer, s
 PART = 65_536  # Poses per part: some seconds of work, and a few megabytes to send
+Part = tuple[Any, ...]  # Arguments of :func:`look_at`
 
 
-@dataclass(frozen=True)
-class Part:
-    """Poses of one orientation that one job computes."""
-
-    geometry: HexapodGeometry  # The machine
-    errors: SingleErrors  # The errors
-    points: np.ndarray  # (N, 3): tool tips in the work frame, m
-    rotation: np.ndarray  # (3, 3): orientation of the tool in the work frame
-    method: str  # As for :func:`~hexapod_comp.workspace.effects.extremes`
-    first: int  # Number of the first pose
-    threads: int | None  # Threads to use
-
-
-def look_at(part: Part) -> Extremes:
-    """Return the extremes over a part; the function that workers run."""
-    poses = poses_at(part.geometry, part.points, part.rotation)
-    return extremes(part.geometry, part.errors, *poses, part.method, part.first, part.threads)
+def look_at(
+    geometry: HexapodGeometry, errors: SingleErrors, points: np.ndarray, rotation: np.ndarray, method: str,
+    threads: int | None,
+) -> Extremes:  # fmt: skip
+    """Return the extremes over a part, tool tips (N, 3), m, of one orientation; the function that workers run."""
+    return extremes(geometry, errors, *poses_at(geometry, points, rotation), method, threads)
 
 
 def survey(
@@ -184,7 +175,7 @@ def survey(
     if scheduler is not None:
         found: Iterable[Extremes] = _on_cluster(parts, scheduler)
     else:
-        found = map(look_at, parts) if alone else _in_processes(parts, workers)
+        found = starmap(look_at, parts) if alone else _in_processes(parts, workers)
 
     def counted() -> Iterator[Extremes]:
         for part in found:
@@ -195,20 +186,17 @@ def survey(
 
 
 def _parts(reaches: Iterable[Reach], errors: SingleErrors, method: str, threads: int | None) -> Iterator[Part]:
-    first = 0
     for one in reaches:
         points = one.points()
         for start in range(0, len(points), PART):
-            chosen = points[start : start + PART]
-            yield Part(one.geometry, errors, chosen, one.rotation, method, first, threads)
-            first += len(chosen)
+            yield one.geometry, errors, points[start : start + PART], one.rotation, method, threads
 
 
 def _in_processes(parts: Iterable[Part], workers: int) -> Iterator[Extremes]:
     """Yield the parts' extremes in order, from local processes; an interruption ends these."""
     pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
     try:
-        yield from pool.map(look_at, parts)
+        yield from pool.map(look_at, *zip(*parts, strict=True))
     except BrokenProcessPool as error:
         raise HexapodError("a worker process died (out of memory?); take fewer --workers") from error
     finally:
@@ -232,7 +220,7 @@ def _on_cluster(parts: Iterable[Part], scheduler: str) -> Iterator[Extremes]:
             client.wait_for_workers(1, timeout=WAIT)
         except (TimeoutError, asyncio.TimeoutError) as error:
             raise HexapodError(f"the Dask scheduler at {scheduler!r} has no workers") from error
-        for future in client.map(look_at, list(parts), pure=False):
+        for future in client.map(look_at, *zip(*parts, strict=True), pure=False):
             yield future.result()
 
 
@@ -314,10 +302,7 @@ def as_json(study: Study) -> dict[str, Any]:
         "budget_si": study.budget.sizes,
         "poses": study.extremes.poses,
         "ranking": ranking_rows(study.rows),
-        "reach": [
-            {"volume_m3": item.volume, "box_m": item.box, "limits": item.shares(), "regions": item.regions()}
-            for item in study.reaches
-        ],
+        "reach": [{"volume_m3": item.volume, "box_m": item.box, "limits": item.shares()} for item in study.reaches],
         "combined_m_rad": {
             "worst_case": study.worst_case,
             "percentiles": dict(zip(drawn.percentiles, drawn.values, strict=True)),

@@ -148,30 +148,6 @@ def test_the_target_itself_between_100000_pairs_in_the_box() -> None:
     assert answers >= 99_900
 
 
-def test_batch_of_anything_holds_or_is_nan() -> None:
-    """20,000 sets of lengths from reachable to absurd; every row without an outcome OK is NaN throughout."""
-    rng = np.random.default_rng(20)
-    for machine in MACHINES:
-        structure = Structure.of(machine)
-        home = strut_lengths(structure, machine.home)
-        spread = 10.0 ** rng.uniform(-4.0, 1.0, (20_000, 1))
-        found = solve_poses(structure, home + spread * rng.normal(size=(20_000, 6)), machine.home, threads=1)
-        assert 0 < found.ok.sum() < len(found.ok)
-        assert np.isnan(found.positions[~found.ok]).all()
-        assert (found.conditions[found.ok] <= machine.limits.condition).all()
-        for n in np.flatnonzero(found.ok)[::200]:
-            pose = Pose(found.positions[n], found.rotations[n])
-            _, lengths = jacobian_by_numpy(structure, pose)
-            judge(machine, structure, lengths, pose)
-
-
-def test_a_window_follows_with_play():
-    """As a nut in its thread: 2 wide, pushed up to 5, the way back shows after 2."""
-    low, sense = batch.follow(2.0, np.array([0.0, 5.0, 3.5, 3.0, 2.5, 5.5]))
-    assert low.tolist() == [-1.0, 3.0, 3.0, 3.0, 2.5, 3.5]
-    assert sense.tolist() == [0.0, 1.0, 1.0, 1.0, -1.0, 1.0]
-
-
 WRONG = {"shape": lambda a: a[:-1], "type": lambda a: a.astype(np.float32), "layout": lambda a: np.asfortranarray(a)}
 
 

@@ -12,15 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import distances, long_test
-from hypothesis import given
+from helpers import distances
 from replay_helpers import CONFIG
-from strategies import fixed, paper_geometry, random_model, random_pose, seeds, skewed_geometry
+from strategies import paper_geometry, random_model, random_pose, skewed_geometry, whole_model
 
 from hexapod_comp.cli import main
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.core import Status, Struct, ffi, lib
-from hexapod_comp.export.c_code import CORE, model_header, write_c
+from hexapod_comp.export.c_code import CORE, write_c
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import strut_lengths
 from hexapod_comp.machine.load import Load, Loading
@@ -34,21 +33,18 @@ MATHEMATICS = ["sqrt", "floor", "fmin", "fmax", "rint", "fmod", "frexp", "ldexp"
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no gcc here")
 
-MACHINES = [
-    ("paper", "paper_machine"),
-    pytest.param("paper", "paper_lines_model", marks=long_test),
-    pytest.param("positioning_unit", "ideal", marks=long_test),
-]
-
 
 def compiled(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([str(COMPILER), *STRICT, *arguments, "-lm"], cwd=folder, capture_output=True, text=True)
 
 
-@pytest.mark.parametrize(("machine", "model"), MACHINES)
-def test_self_test_agrees_to_the_last_digit_and_stays_inside(tmp_path, capsys, machine, model):
+@pytest.mark.parametrize("whole", [False, True], ids=["paper", "with every block"])
+def test_self_test_agrees_to_the_last_digit_and_stays_inside(tmp_path: Path, whole: bool) -> None:
     """As a user makes it; gcc's address and undefined-behaviour sanitizers end the program at the first fault."""
-    assert main(["export", "--machine", machine, "--model", model, "--c", str(tmp_path)]) == 0
+    if whole:
+        write_c(tmp_path, skewed_geometry(0.005), whole_model(np.random.default_rng(1), "skewed"), ("", ""))
+    else:
+        assert main(["export", "--machine", "paper", "--model", "paper_machine", "--c", str(tmp_path)]) == 0
     sanitizers = "-fsanitize=address,undefined", "-fno-sanitize-recover=all"
     made = compiled(tmp_path, *sanitizers, "hexapod_comp.c", "hexapod_selftest.c", "-o", "selftest")
     assert made.returncode == 0, made.stderr
@@ -124,41 +120,6 @@ def test_nominal_lengths_give_what_their_pose_gives():
         np.testing.assert_allclose(list(answer.command), by_pose.command, rtol=0.0, atol=1e-12)
     far = by_pose.nominal * [1, 1, 1, 1, 1, 3]
     assert lib.hc_command_lengths(state.at, far.tolist(), now[0], answer) == Status.UNREACHABLE
-
-
-@fixed
-@given(seeds)
-def test_the_header_is_what_python_fills(seed):
-    """Drawn machines and models: compiled constants and those in memory are the same numbers.
-
-    The header's own text is read here, member by member, by a reader that knows nothing of how it is written.
-    """
-    rng = np.random.default_rng(seed)
-    geometry = skewed_geometry(0.005) if rng.random() < 0.5 else paper_geometry()
-    model = random_model(rng, geometry.name)
-    text = model_header(geometry, model, ("", ""))
-    told = {name: numbers_in(text, name) for name in ("base", "platform", "tool_inverse", "limits", "struts", "late")}
-    view = core_model(geometry, model).view
-    for name, numbers in told.items():
-        np.testing.assert_array_equal(numbers, np.array(flat(view[name].tolist())), err_msg=name)
-    for name, array in (("map_pieces", model.struts.spline_coefficients()), ("field_lines_1", model.field.lines[1])):
-        block = text.partition(f"hexapod_{name}[")[2].partition("};")[0].partition("{")[2]
-        assert sorted(numbers_of(block)) == sorted(array.ravel().tolist() or [0.0])
-
-
-def numbers_of(text: str) -> list[float]:
-    return [float(word) for word in re.findall(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.])", text)]
-
-
-def numbers_in(text: str, name: str) -> np.ndarray:
-    """Return the numbers of a member of the model, down to the next member's name at its depth."""
-    return np.array(numbers_of(re.split(rf"\n    \.{name} = ", text)[1].partition("\n    .")[0]))
-
-
-def flat(value: object) -> list[float]:
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    return [x for part in value for x in flat(part)] if isinstance(value, (list, tuple)) else [float(value)]
 
 
 TYPES = {"float": "double", "bit": "int", "s32": "int", "u32": "unsigned"}

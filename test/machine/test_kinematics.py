@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,7 +29,7 @@ from hexapod_comp.core import Status, batch
 from hexapod_comp.errors import KinematicsError, NotFiniteError, OtherAssemblyModeError, SingularError
 from hexapod_comp.machine import kinematics
 from hexapod_comp.machine.assembly import assembly_modes, mode_objections, working_mode
-from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.kinematics import (
     Structure,
     condition_number,
@@ -152,7 +151,7 @@ def test_condition_number_and_sign_against_linear_algebra(machine: HexapodGeomet
 
 
 @machines
-@pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 203])
+@pytest.mark.parametrize("count", [0, 1, 8, 203])
 def test_batch_equals_single_bit_for_bit(machine: HexapodGeometry, count: int) -> None:
     """Whatever lane a pose falls into, and on whatever branch; some rows fail on purpose."""
     structure = Structure.of(machine)
@@ -176,9 +175,9 @@ def test_batch_equals_single_bit_for_bit(machine: HexapodGeometry, count: int) -
             assert np.isnan(batch.rotations[n]).all()
 
 
-@pytest.mark.parametrize("alone", [-1.0, 0.0, np.inf])
-@pytest.mark.parametrize("threads", [None, 1, 3])
-@pytest.mark.parametrize("count", [0, 1, 255, 256, 257, 5000])
+@pytest.mark.parametrize("alone", [-1.0, np.inf])
+@pytest.mark.parametrize("threads", [None, 3])
+@pytest.mark.parametrize("count", [0, 257, 5000])
 def test_every_row_is_in_one_slice(
     monkeypatch: pytest.MonkeyPatch, count: int, threads: int | None, alone: float
 ) -> None:
@@ -261,41 +260,24 @@ def test_failure_leaves_the_guess_untouched(outcome: int, spoil) -> None:
     np.testing.assert_array_equal(rotation, before[1])
 
 
-CLOSED = 5e-13  # m; the closure at which the core's Newton ends
+# --- assembly modes ----------------------------------------------------------------------------------------
 
+CLOSED = 5e-13  # m; the closure at which the core's Newton ends
 # m and rad; a pose of condition number up to 1e4 comes back to 1e4 roundings of the lengths, with margin
 REGULAR = 1e-10
 
 
-@pytest.fixture(scope="module")
-def geometry() -> HexapodGeometry:
-    return load_geometry(Path(__file__).parents[2] / "config" / "paper.yaml")
-
-
-@pytest.fixture(scope="module")
-def structure(geometry) -> Structure:
-    return Structure.of(geometry)
-
-
-def numbers(pose: Pose) -> np.ndarray:
-    return np.concatenate([pose.position, pose.rotation.ravel()])
-
-
 def miss(pose: Pose, modes: list[Pose]) -> float:
     """Distance of the nearest mode, largest of its differences in m and in rotation matrix elements."""
-    return min((float(np.abs(numbers(pose) - numbers(mode)).max()) for mode in modes), default=np.inf)
-
-
-def pose_mm_deg(position_mm, angles_deg) -> Pose:
-    return Pose.from_angles(1e-3 * np.array(position_mm, float), np.deg2rad(angles_deg))
-
-
-def workspace_poses(geometry: HexapodGeometry, count: int, seed: int) -> list[Pose]:
-    rng = np.random.default_rng(seed)
-    return [
-        Pose.from_angles(geometry.home.position + rng.uniform(-0.05, 0.05, 3), np.deg2rad(rng.uniform(-30.0, 30.0, 3)))
-        for _ in range(count)
+    apart = [
+        max(np.abs(pose.position - mode.position).max(), np.abs(pose.rotation - mode.rotation).max()) for mode in modes
     ]
+    return float(min(apart, default=np.inf))
+
+
+def high(tilt_deg: list[float]) -> Pose:
+    """Return the pose 400 mm over the middle of the base, at the paper's angles."""
+    return Pose.from_angles([0.0, 0.0, 0.4], np.deg2rad(tilt_deg))
 
 
 def random_machine(seed: int, planar: bool, deviation: float) -> tuple[Structure, np.ndarray]:
@@ -314,9 +296,8 @@ def multi_start(structure: Structure, lengths: np.ndarray, seed: int, count: int
     positions = np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 3)) * lengths.max()
     rotations = Rotation.random(count, random_state=seed).as_matrix()
     outcomes, iterations = np.empty(count, np.intc), np.empty(count, np.intc)
-    joints = structure.base_joints, structure.platform_joints
     state = (np.tile(lengths, (count, 1)), positions, rotations, 0.2, 0.0, np.inf)
-    batch.solve_poses(*joints, *state, outcomes, iterations, np.empty(count))
+    batch.solve_poses(*structure.joints, *state, outcomes, iterations, np.empty(count))
     found: list[Pose] = []
     rows = np.hstack([positions, rotations.reshape(-1, 9)])[outcomes == Status.OK]
     while len(rows):
@@ -326,8 +307,8 @@ def multi_start(structure: Structure, lengths: np.ndarray, seed: int, count: int
 
 
 @pytest.mark.parametrize(("planar", "deviation"), [(True, 0.0), (False, 0.0), (False, 1e-4)])
-@pytest.mark.parametrize("seed", range(5))
-def test_modes_are_those_a_multi_start_finds(seed, planar, deviation):
+@pytest.mark.parametrize("seed", range(3))
+def test_modes_are_those_a_multi_start_finds(seed: int, planar: bool, deviation: float) -> None:
     """Of joints in pairs, and of joints that are a tenth of a millimetre apart."""
     structure, lengths = random_machine(seed, planar, deviation)
     modes, truth = assembly_modes(structure, lengths), multi_start(structure, lengths, seed)
@@ -337,83 +318,51 @@ def test_modes_are_those_a_multi_start_finds(seed, planar, deviation):
         np.testing.assert_allclose(distances(structure, mode), lengths, rtol=0, atol=CLOSED)
 
 
-def modes_and_the_picked(geometry, structure, pose):
-    """Return the modes at a pose's lengths: they close, the pose is one of them, and the one that is picked."""
-    lengths = distances(structure, pose)
-    modes = assembly_modes(structure, lengths)
-    assert miss(pose, modes) < REGULAR
-    assert miss(pose, [working_mode(geometry, structure, lengths)]) < REGULAR
-    for mode in modes:
-        np.testing.assert_allclose(distances(structure, mode), lengths, rtol=0, atol=CLOSED)
-    return modes
+@pytest.mark.parametrize("split", [0.0, 0.03], ids=["6-3", "6-6"])
+@pytest.mark.parametrize("deviation", [0.0, 5e-4])
+def test_every_workspace_pose_is_found_and_picked(split: float, deviation: float) -> None:
+    """Truth: the pose that made the lengths."""
+    rng, platform = np.random.default_rng(3), IDEAL.platform_joints.copy()
+    platform[::2, 0] += split
+    real = replace(IDEAL, platform_joints=platform).moved(*rng.uniform(-deviation, deviation, (2, 6, 3)))
+    for pose in map(Pose, *poses_about(HOME, 10, seed=4)):
+        lengths = distances(real, pose)
+        assert miss(pose, assembly_modes(real, lengths)) < REGULAR
+        assert miss(pose, [working_mode(PAPER, real, lengths)]) < REGULAR
 
 
-@pytest.mark.parametrize("deviation", [0.0, 1e-5, 5e-4])
-def test_every_workspace_pose_is_found_and_picked(geometry, structure, deviation):
-    rng = np.random.default_rng(3)
-    for pose in workspace_poses(geometry, 20, seed=4):
-        real = structure.moved(*rng.uniform(-deviation, deviation, (2, 6, 3)))
-        modes_and_the_picked(geometry, real, pose)
-
-
-def test_sixteen_modes_are_the_most_of_a_6_3_machine(structure):
-    """The paper's machine reaches them half a turn from home."""
-    pose = pose_mm_deg([0, 0, 400], [0, 0, 180])
-    modes = assembly_modes(structure, distances(structure, pose))
-    assert len(modes) == 16
-    assert miss(pose, modes) < REGULAR
-
-
-def test_lengths_out_of_reach_have_no_mode(structure):
-    # The platform flat in the base plane, centred, is where equal struts are shortest.
-    assert assembly_modes(structure, distances(structure, Pose.identity()) * (1.0 - 1e-3)) == []
-
-
-def test_other_machines_are_sought_from_all_around(geometry, structure):
-    """Truth: the pose that made the lengths, distances, and a multi-start of the tests' own."""
-    split = structure.platform_joints.copy()
-    split[::2, 0] += 0.03
-    general = replace(structure, platform_joints=split)
-    for number, pose in enumerate(workspace_poses(geometry, 10, seed=6)):
-        modes = modes_and_the_picked(geometry, general, pose)
-        if number < 2:
-            truth = multi_start(general, distances(general, pose), number)
-            assert len(modes) == len(truth)
-            assert max(miss(other, modes) for other in truth) < 1e-8
-
-
-def test_refused(structure):
+def test_what_has_no_mode() -> None:
+    """Lengths out of reach: flat in the base plane, centred, equal struts are shortest. What is no length. A rod."""
+    assert assembly_modes(IDEAL, distances(IDEAL, Pose.identity()) * (1.0 - 1e-3)) == []
     rod = np.zeros((6, 3))
     rod[:, 0] = [-0.5, -0.3, -0.1, 0.1, 0.3, 0.5]  # everything can turn about it
-    swinging = replace(structure, base_joints=rod)
+    swinging = replace(IDEAL, base_joints=rod)
     for machine, lengths, error, words in (
-        (structure, [0.45] * 3 + [np.nan] + [0.45] * 2, NotFiniteError, "strut_4"),
-        (structure, [0.45] * 3 + [-0.4] + [0.45] * 2, NotFiniteError, "strut_4"),
-        (swinging, distances(swinging, pose_mm_deg([20, 30, 400], [5, 10, 15])), SingularError, "struts locked"),
+        (IDEAL, [0.45] * 3 + [np.nan] + [0.45] * 2, NotFiniteError, "strut_4"),
+        (IDEAL, [0.45] * 3 + [-0.4] + [0.45] * 2, NotFiniteError, "strut_4"),
+        (swinging, distances(swinging, high([5, 10, 15])), SingularError, "struts locked"),
     ):
         with pytest.raises(error, match=words):
             assembly_modes(machine, np.array(lengths))
 
 
-def test_no_mode_within_the_limits(geometry, structure):
-    # Two degrees from Fichter's singular pose the condition number is 17, above the machine's limit of 10.
-    lengths = distances(structure, pose_mm_deg([0, 0, 400], [0, 0, 88]))
-    count = len(assembly_modes(structure, lengths))
+def test_no_mode_within_the_limits() -> None:
+    """Two degrees from Fichter's singular pose the condition number is 17, above the machine's limit of 10."""
+    lengths = distances(IDEAL, high([0, 0, 88]))
+    count = len(assembly_modes(IDEAL, lengths))
     expected = f"none of the {count} poses.*condition number 16.7"
     with pytest.raises(OtherAssemblyModeError, match=expected) as caught:
-        working_mode(geometry, structure, lengths)
+        working_mode(PAPER, IDEAL, lengths)
     assert caught.value.value == count
-    assert mode_objections(geometry, structure, geometry.home) == []
-    below = Pose(geometry.home.position * [1, 1, -1], np.eye(3))
-    found = " ".join(mode_objections(geometry, structure, below))
+    assert mode_objections(PAPER, IDEAL, HOME) == []
+    below = Pose(HOME.position * [1, 1, -1], np.eye(3))
+    found = " ".join(mode_objections(PAPER, IDEAL, below))
     assert all(words in found for words in ("other sign", "other side", "base joint"))
 
 
-def test_two_candidates_as_near_are_refused(geometry, structure):
-    # Tilted by 80° about its axis of symmetry the paper's machine has two more modes, mirror images of each
-    # other and so equally near to home; with the cones open nothing tells them apart.
-    limits = replace(geometry.limits, base_cone=np.full(6, np.pi), platform_cone=np.full(6, np.pi))
-    open_cones = replace(geometry, limits=limits)
-    lengths = distances(structure, pose_mm_deg([0, 0, 400], [0, 80, 0]))
+def test_two_candidates_as_near_are_refused() -> None:
+    """Tilted by 80° about its axis of symmetry the paper's machine has two more modes, mirror images of each other and
+    so equally near to home; with the cones open nothing tells them apart."""
+    limits = replace(PAPER.limits, base_cone=np.full(6, np.pi), platform_cone=np.full(6, np.pi))
     with pytest.raises(OtherAssemblyModeError, match="about as near"):
-        working_mode(open_cones, structure, lengths)
+        working_mode(replace(PAPER, limits=limits), IDEAL, distances(IDEAL, high([0, 80, 0])))

@@ -39,7 +39,6 @@ from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
 from hexapod_comp.machine.load import STANDARD_GRAVITY, Load, Loading, Payload
 from hexapod_comp.machine.model import MachineModel, ModelOrigin, MotionState, RealMachine
-from hexapod_comp.machine.model_file import load_model, model_text, parse_model, save_model
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.surroundings import NO_LOAD, Surroundings
 from hexapod_comp.machine.temperatures import PARTS, Lag, LateGrowth, Temperatures, late
@@ -47,7 +46,7 @@ from hexapod_comp.machine.trial import drive
 from hexapod_comp.pose import Pose
 
 WARM = {"strut_1": 24.0, "strut_4": 18.5, "base": 21.0, "platform": 27.0}
-GEOMETRIES = {"paper": paper_geometry(), "skewed": skewed_geometry(), "with lead": skewed_geometry(lead=0.01)}
+GEOMETRIES = {"paper": paper_geometry(), "skewed": skewed_geometry()}
 
 
 def assert_same_pose(found, truth, position=1e-13, angle=1e-12):
@@ -69,27 +68,6 @@ def moving(machine, pose):
 
 
 # Forwards and backwards.
-
-
-@pytest.mark.parametrize("name", GEOMETRIES)
-@pytest.mark.parametrize("temperatures", [{}, WARM], ids=["20 °C", "warm"])
-def test_forwards_undoes_backwards(name, temperatures):
-    """Truth: closure, over 20 random models with every block on and tilted poses within ±50 mm and 15°."""
-    geometry = GEOMETRIES[name]
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        model = random_model(rng, geometry.name)
-        machine = RealMachine(geometry, model, Temperatures(temperatures))
-        target = random_pose(rng, geometry.home)
-        motion = moving(machine, target)
-        commands, model_pose, _ = machine.commands_for(target, motion)
-        assert motion.sense.all()
-        actual, again = machine.pose_for(commands, motion.sense, geometry.home)
-        assert_same_pose(actual, target)
-        assert_same_pose(again, model_pose)
-        # The model is no small matter: uncompensated, the same pose is missed by 10 µm at the least.
-        missed = nominal_error(machine, target, motion.sense)
-        assert np.linalg.norm(missed.position - target.position) > 1e-5
 
 
 @fixed
@@ -129,20 +107,6 @@ def test_a_deviation_is_a_moved_joint(body):
         nominal = distances(geometry, pose)
         np.testing.assert_allclose(commands, distances(real, pose), atol=2e-16)
         np.testing.assert_array_equal(np.abs(commands - nominal) > 1e-9, np.arange(6) == 2)
-
-
-def test_backlash_follows_each_struts_own_direction():
-    """Truth: half the play is added going out and taken off coming back; none before anything has moved."""
-    geometry, play = GEOMETRIES["paper"], 40e-6
-    machine = RealMachine(geometry, MachineModel("paper", struts=StrutErrors(backlash=np.full(6, play))))
-    motion = MotionState()
-    home = geometry.home
-    nominal = distances(geometry, home)
-    np.testing.assert_allclose(machine.commands_for(home, motion)[0], nominal, atol=2e-16)
-    up = shifted(home, 0.0, 0.0, 1e-3)
-    lengths_up = distances(geometry, up)
-    np.testing.assert_allclose(machine.commands_for(up, motion)[0], lengths_up + play / 2, atol=2e-16)
-    np.testing.assert_allclose(machine.commands_for(home, motion)[0], nominal - play / 2, atol=2e-16)
 
 
 def test_a_field_too_steep_to_undo_is_refused():
@@ -336,26 +300,6 @@ def test_stations_driven_together_go_where_each_goes_alone():
         drive(machines, (positions, rotations), senses, commands, lambda n: f"row {n}")
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("thermometer: base", "thermometer: spindle", ["thermometer", "spindle", "strut_1"]),
-        ("time_constants_s: [600.0, 7200.0]", "time_constants_s: [7200.0, 600.0]", ["time_constants", "increasing"]),
-        ("time_constants_s: [600.0, 7200.0]", "time_constants_s: [0.6, 7200.0]", ["time_constants", "10…1e"]),
-        ("time_constants_s: [600.0, 7200.0]", "time_constants_s: [1, 2, 3]", ["late_struts"]),
-        ("late_base_ppm_per_K: [12.0, 13.0]", "late_base_ppm_per_K: [12.0, 1300000]", ["thermal.late", "unit"]),
-    ],
-)
-def test_a_file_in_doubt_is_refused(tmp_path: Path, old: str, new: str, words: list[str]):
-    path = tmp_path / "warm.yaml"
-    save_model(warming_model(), path)
-    assert old in path.read_text()
-    path.write_text(path.read_text().replace(old, new))
-    with pytest.raises(InputFileError) as refused:
-        load_model(path, paper())
-    assert all(word in str(refused.value) for word in words)
-
-
 def test_a_restart_does_not_know_what_was_before_and_says_for_how_long():
     """Three time constants of the slowest, 7200 s, from the first reading of the thermometer that counts."""
     late_growth, temperatures = warming_model().late_growth, Temperatures()
@@ -463,8 +407,11 @@ def test_a_hanging_machine_is_commanded_shorter() -> None:
 
 @fixed
 @given(seeds)
-def test_forwards_undoes_backwards_under_any_load(seed: int) -> None:
-    """Closure within 1e-13 m and 1e-12 rad, with all other blocks and terms of load, any gravity and a wrench."""
+def test_forwards_undoes_backwards(seed: int) -> None:
+    """Closure within 1e-13 m and 1e-12 rad: all blocks and terms, uneven temperatures, any gravity and a wrench.
+
+    The model is no small matter: uncompensated, the same pose is missed by 10 µm at the least.
+    """
     rng = np.random.default_rng(seed)
     geometry = skewed_geometry(lead=0.01 * float(rng.integers(2)))
     geometry = replace(geometry, payloads={"tool": Payload(rng.uniform(0.0, 20.0), tuple(rng.uniform(-0.1, 0.1, 3)))})
@@ -474,13 +421,16 @@ def test_forwards_undoes_backwards_under_any_load(seed: int) -> None:
     )  # fmt: skip
     down = rng.normal(size=3)
     loading = Loading.of(G * down / np.linalg.norm(down), rng.uniform(-100.0, 100.0, 6))
-    machine = RealMachine(geometry, replace(random_model(rng, "skewed"), load=load), loading=loading)
-    target, motion = random_pose(rng, geometry.home), MotionState()
-    machine.commands_for(Pose(target.position + 1e-3, target.rotation), motion)
+    machine = RealMachine(geometry, replace(random_model(rng, "skewed"), load=load), Temperatures(WARM), loading)
+    target = random_pose(rng, geometry.home)
+    motion = moving(machine, target)
     commands, model_pose, _ = machine.commands_for(target, motion)
+    assert motion.sense.all()
     actual, again = machine.pose_for(commands, motion.sense, geometry.home)
     assert_same_pose(actual, target)
     assert_same_pose(again, model_pose)
+    missed = nominal_error(machine, target, motion.sense)
+    assert np.linalg.norm(missed.position - target.position) > 1e-5
 
 
 def test_a_tool_weighs_like_a_wrench_in_its_centre() -> None:
@@ -546,22 +496,6 @@ def loaded_commands(geometry: HexapodGeometry, model: MachineModel, loading: Loa
 
 
 # ---- files ----
-
-
-def test_the_model_file_has_the_block() -> None:
-    """Written and read again it is the same; engineers write N/µm, µm, kg and mm."""
-    load = Load(
-        SOFT, np.full(6, 3e-6), 5.0, 12.5, np.array([0.01, 0.0, 0.02]), np.array([0.0, G, 0.0]), np.arange(1.0, 7.0)
-    )
-    text = model_text(MachineModel("paper", load=load, origin=ModelOrigin("2026-11-24")))
-    assert "stiffness_N_per_um: 20.0\n" in text
-    assert "mass_kg: 12.5\n" in text
-    assert "friction_N_m: [1.0, 2.0, " in text
-    assert "gravity_m_s2: [" in text
-    again = parse_model(text, "paper").load
-    for name in ("stiffness", "lost_motion", "take_up", "mass", "centre", "gravity", "friction"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(load, name))
-    assert "load" not in model_text(MachineModel("paper", origin=ModelOrigin("2026-11-24")))
 
 
 def test_a_load_that_no_machine_has_is_refused() -> None:

@@ -18,19 +18,15 @@ from foreign_machines import machine_names, machines
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.errors import HexapodError, ModelError
-from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import solve_pose, strut_lengths
 from hexapod_comp.machine.load import Load, Payload
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.robot_description import foot_frames
-from hexapod_comp.measurements.campaign import load_campaign, template
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
-from hexapod_comp.virtual.instruments import measure
 from hexapod_comp.virtual.machine import DriveParameters, StrutDrive
-from hexapod_comp.virtual.named import imagine
 from hexapod_comp.virtual.physics import PhysicalMachine, Physics, find_mujoco
 
 SPINDLE = Payload(10.0, (0.02, -0.03, 0.08))
@@ -231,17 +227,6 @@ def test_a_drive_moves_it_and_it_oscillates():
     assert max(heights) > rests.position[2] + 1e-5
     assert off(drive.true_pose(), rests)[0] < 2e-8
     assert drive.time == pytest.approx(0.8)
-
-
-def test_readings_of_a_rigid_plant_are_those_of_the_machine():
-    geometry = load_geometry("paper")
-    campaign = replace(load_campaign(config_file("campaign_1d.yaml", "campaign")), cell=0.1, step=0.05)
-    planned, real = template(campaign, geometry), RealMachine(geometry, imagine(geometry, 3))
-    readings = measure(planned, campaign, real, 1).value
-    rigid = measure(planned, campaign, PhysicalMachine(real, Physics(1e13)), 1).value
-    np.testing.assert_allclose(rigid, readings, rtol=0.0, atol=1e-10)
-    soft = measure(planned, campaign, PhysicalMachine(real, Physics(payload=SPINDLE)), 1).value
-    assert 1e-7 < np.abs(soft - readings).max() < 1e-4
 
 
 @pytest.mark.parametrize(

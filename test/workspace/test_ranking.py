@@ -13,12 +13,9 @@ import pytest
 from helpers import poses_about
 from scipy import stats
 
-from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
-from hexapod_comp.calibration.sensitivity import Prediction, derivatives
 from hexapod_comp.errors import CalibrationError, InputFileError, ModelError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.machine.load import Load
 from hexapod_comp.pose import Pose
 from hexapod_comp.workspace.budget import (
     Budget,
@@ -84,16 +81,16 @@ def test_screw_pitch_comes_first_as_in_the_paper():
     assert rows[0].title == "screw pitch"
     records = json.loads(json.dumps(ranking_rows(rows)))
     assert [record["rank"] for record in records] == [1, 2, 3, 4]
-    assert records[0]["translation_max_um"] == pytest.approx(rows[0].translation_max.value * 1e6)
+    assert records[0]["translation_max_um"] == pytest.approx(rows[0].extremes[0].value * 1e6)
     assert all(words in ranking_text(rows) for words in ("screw pitch", "strut_", "transl. max µm", "rot. max m°"))
-    assert rows[0].translation_max.value > 1.9 * rows[1].translation_max.value
+    assert rows[0].extremes[0].value > 1.9 * rows[1].extremes[0].value
     assert {row.title for row in rows} == {
         "screw pitch",
         "quantisation",
         "base-/platform joint (x/y)",
         "base-/platform joint (z)",
     }
-    largest = [row.translation_max.value for row in rows]
+    largest = [row.extremes[0].value for row in rows]
     assert largest == sorted(largest, reverse=True)
     for row in rows:
         # the paper's order of magnitude: its machine's geometry is not printed
@@ -107,18 +104,15 @@ def test_screw_pitch_comes_first_as_in_the_paper():
 
 
 def test_rows_name_the_error_and_the_tools_pose():
+    """The error alone, at the pose where the tool is said to be, has the effect that the row has."""
     geometry = tooled()
     found = over(geometry, PAPER_SIZES, count=50)
-    positions, rotations = poses_about(geometry.home, 50, seed=1, reach=0.02, tilt_deg=3.0)
     row = next(row for row in ranked(found, geometry) if row.title == "screw pitch")
-    extreme, labels = row.translation_max, found.errors.labels
-    tool = geometry.work.inverse() @ Pose(positions[extreme.pose], rotations[extreme.pose]) @ geometry.tool
-    np.testing.assert_allclose(extreme.position, tool.position, atol=1e-15)
-    np.testing.assert_allclose(extreme.angles, tool.angles(), atol=1e-12)
-    alone = found.errors.select(np.array([label == extreme.error for label in labels]))
-    at = positions[extreme.pose][None], rotations[extreme.pose][None]
-    again = effect_vectors(geometry, alone, *at)[0, 0, :3]
-    assert np.linalg.norm(again) == pytest.approx(extreme.value, rel=1e-12)
+    extreme = row.extremes[0]
+    at = geometry.platform_pose(Pose.from_angles(extreme.position, extreme.angles))
+    alone = found.errors.select(np.array([label == extreme.error for label in found.errors.labels]))
+    again = effect_vectors(geometry, alone, at.position[None], at.rotation[None])[0, 0, :3]
+    assert np.linalg.norm(again) == pytest.approx(extreme.value, rel=1e-9)
 
 
 def test_joined_rows_hold_the_larger_and_the_smaller_of_their_types():
@@ -210,30 +204,16 @@ def test_nothing_is_left_for_a_source_when_the_others_are_too_much():
         allocate(errors, vectors[:0], 1e-5)
 
 
-def covariance_vectors(rows, covariance):
-    """Return what parameters known to a covariance do to the tool: independent effects of one sigma each."""
-    return np.swapaxes(rows @ covariance_factor(covariance), 1, 2)
-
-
 # --- after compensation ------------------------------------------------------------------------------------
 
 
-def test_calibrations_derivatives_are_effects_of_single_errors():
-    # A base joint known to 10 µm in every coordinate is a budget of 10 µm: two codes for the same first order.
-    probe = np.array([0.02, -0.03, -0.06])
-    geometry = replace(small.paper(), tool=Pose(probe, np.eye(3)))
-    positions, rotations = poses_about(geometry.home, 4, seed=6, reach=0.04, tilt_deg=8.0)
-    poses = [Pose(p, r) for p, r in zip(positions, rotations, strict=True)]
-    readings = small.scattered(small.paper(), poses, None, probe)
-    space = ParameterSpace(readings, FitSettings(lead=small.LEAD, field_degree=2))
-    base, platform = (np.tile(each, (len(poses), 1, 1)) for each in (geometry.base_joints, geometry.platform_joints))
-    nominal = Prediction(np.zeros((len(poses), 6)), positions, rotations, base, platform, Load(), geometry)
-    rows = derivatives(space, nominal, readings.stations)[:, :, space.block("structure").part][:, :, :18]
-    found = root_sum_of_squares(covariance_vectors(rows, 10e-6**2 * np.eye(18)))
-    budget = Budget(geometry.name, {"base_joint_xy": 10e-6, "base_joint_z": 10e-6})
-    errors = budget.single_errors(geometry)
-    expected = root_sum_of_squares(effect_vectors(geometry, errors, positions, rotations, LINEAR))
-    np.testing.assert_allclose(found, expected, rtol=1e-10)
+def test_independent_errors_add_up_by_their_squares():
+    """Displacements in space, 5² + 12² = 13² of two errors across each other; of rotations the largest axis counts."""
+    vectors = np.array([[[3.0, 4.0, 0.0, 0.3, 0.0, 0.1], [0.0, 0.0, 12.0, 0.4, 0.2, 0.0]]])
+    np.testing.assert_allclose(root_sum_of_squares(vectors), [[13.0, 0.5]], rtol=1e-15)
+    covariance = np.array([[4.0, 2.0e6], [2.0e6, 9.0e12]])  # of parameters in units that are far apart
+    factor = covariance_factor(covariance)
+    np.testing.assert_allclose(factor @ factor.T, covariance, rtol=1e-12)
 
 
 def test_a_matrix_that_is_no_covariance_is_refused():
