@@ -8,8 +8,9 @@ MJCF closes the loops by constraints.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from xml.sax.saxutils import escape
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -22,15 +23,17 @@ from .kinematics import strut_lengths
 PLATFORM_JOINTS = ("platform_x", "platform_y", "platform_z", "platform_beta", "platform_alpha", "platform_gamma")
 X, Y, Z = "1.0 0.0 0.0", "0.0 1.0 0.0", "0.0 0.0 1.0"
 STRUT_RADIUS, JOINT_RADIUS, PLATE = 0.01, 0.018, 0.01  # Drawn sizes, m: struts, joints, and the platform's thickness
-# Parameters of ros2_control's JointStateTopicSystem: the last one makes it send commands near the readings too. It
-# exits at a reading with velocities, which ours have, unless each joint has a state for them
-TOPICS = """
-      <plugin>joint_state_topic_hardware_interface/JointStateTopicSystem</plugin>
-      <param name="joint_commands_topic">strut_setpoints</param>
-      <param name="joint_states_topic">nominal_strut_states</param>
-      <param name="trigger_joint_command_threshold">-1</param>"""
-MOCK = """
-      <plugin>mock_components/GenericSystem</plugin>"""
+# ros2_control's hardware and its parameters; the last one makes it send commands near the readings too. It exits at a
+# reading with velocities, which ours have, unless each joint has a state for them
+TOPICS = (
+    "joint_state_topic_hardware_interface/JointStateTopicSystem",
+    {
+        "joint_commands_topic": "strut_setpoints",
+        "joint_states_topic": "nominal_strut_states",
+        "trigger_joint_command_threshold": "-1",
+    },
+)
+MOCK: tuple[str, dict[str, str]] = ("mock_components/GenericSystem", {})
 # Density of the drawn bodies, kg/m³, in MJCF; a machine file has no masses. A platform of 0.35 m weighs 7 kg
 STEEL = 7850.0
 # Armature of a strut's slide, kg, 1.3e-4 kg m² turning on a screw of 5 mm lead; and of a hinge at its foot, kg m².
@@ -42,7 +45,7 @@ STIFFNESS, DAMPING = 1e8, 2.8e5
 # Without a limit of force, a `ctrl` that was not set, 0, would throw the platform
 FASTEST = 1.0
 # MuJoCo's step, s; struts' ends are tied as stiffly as that allows (two steps): gravity separates them by 0.1 µm
-TIMESTEP, TIED = 1e-3, 'solref="0.002 1" solimp="0.9999 0.9999 0.001"'
+TIMESTEP, TIED = 1e-3, {"solref": "0.002 1", "solimp": "0.9999 0.9999 0.001"}
 LOOSE = 1e3  # Limit of effort and speed of joints without motor; readers of URDF require one
 
 
@@ -66,63 +69,62 @@ def urdf(
     geometry: HexapodGeometry,
     joint_names: Sequence[str] = STRUT_NAMES,
     ros2_control: bool = True,
-    hardware: str = TOPICS,
+    hardware: tuple[str, dict[str, str]] = TOPICS,
 ) -> str:
     """Return the machine as URDF: links ``base``, ``work``, ``platform``, ``tool``, the struts', the named frames'.
 
     ros2_control's block moves the struts through topics, or simulates drives at home with the hardware :data:`MOCK`.
     """
+    robot = ET.Element("robot", name=geometry.name)
     span, half = float(np.abs(geometry.home.position).max() + geometry.limits.stroke.max()), 0.5 * np.pi
-    parts = [_link("base", map(_ball, geometry.base_joints))]
+    _draw_joints(_add(robot, "link", name="base"), geometry.base_joints)
     for name, pose in geometry.work_frames.items():
         if name != BASE:
-            parts += [_joint(f"{name}_mount", "fixed", ("base", name), pose), _link(name)]
+            _fix(robot, "base", name, pose)
     parent = "base"
     for name, axis, limit in zip(PLATFORM_JOINTS, (X, Y, Z, Y, X, Z), [span] * 3 + [np.pi] * 3, strict=True):
         child = "platform" if name == PLATFORM_JOINTS[-1] else f"{name}_link"
         kind = "prismatic" if limit == span else "revolute"
-        parts.append(_joint(name, kind, (parent, child), axis=axis, limits=(-limit, limit)))
-        parts += [_link(child)] * (child != "platform")
-        parent = child
+        _move(_join(robot, name, kind, parent, child), axis, (-limit, limit))
+        parent, link = child, _add(robot, "link", name=child)
     middle, radius = _plate(geometry)
-    parts.append(_link("platform", [_cylinder(radius, PLATE, middle), *map(_ball, geometry.platform_joints)]))
+    _draw(link, middle, "cylinder", radius=radius, length=PLATE)
+    _draw_joints(link, geometry.platform_joints)
     for name, pose in geometry.tools.items():
-        parts += [_joint(f"{name}_mount", "fixed", ("platform", name), pose), _link(name)]
+        _fix(robot, "platform", name, pose)
     feet = map(Pose, geometry.base_joints, foot_frames(geometry))
     for name, foot, (short, long) in zip(joint_names, feet, geometry.limits.stroke, strict=True):
         hinge, body, rod = f"{name}_hinge", f"{name}_body", f"{name}_rod"
-        parts += [_joint(f"{name}_foot_1", "revolute", ("base", hinge), foot, Y, (-half, half)), _link(hinge)]
-        parts.append(_joint(f"{name}_foot_2", "revolute", (hinge, body), axis=X, limits=(-half, half)))
-        parts.append(_link(body, [_cylinder(1.5 * STRUT_RADIUS, 0.5 * short, [0.0, 0.0, 0.25 * short])]))
-        parts.append(_joint(name, "prismatic", (body, rod), axis=Z, limits=(short, long), speed=geometry.limits.speed))
-        parts.append(_link(rod, [_cylinder(STRUT_RADIUS, 0.6 * short, [0.0, 0.0, -0.3 * short])]))
+        _move(_join(robot, f"{name}_foot_1", "revolute", "base", hinge, foot), Y, (-half, half))
+        _add(robot, "link", name=hinge)
+        _move(_join(robot, f"{name}_foot_2", "revolute", hinge, body), X, (-half, half))
+        link = _add(robot, "link", name=body)
+        _draw(link, [0.0, 0.0, 0.25 * short], "cylinder", radius=1.5 * STRUT_RADIUS, length=0.5 * short)
+        _move(_join(robot, name, "prismatic", body, rod), Z, (short, long), geometry.limits.speed)
+        link = _add(robot, "link", name=rod)
+        _draw(link, [0.0, 0.0, -0.3 * short], "cylinder", radius=STRUT_RADIUS, length=0.6 * short)
     if ros2_control:
-        parts.append(_control(geometry, joint_names, hardware))
-    body = "".join(parts)
-    return f'{HEAD}<robot name="{_text(geometry.name)}">{body}\n</robot>\n'
+        _add_control(robot, geometry, joint_names, *hardware)
+    return _text(robot)
 
 
-def _control(geometry: HexapodGeometry, joint_names: Sequence[str], hardware: str) -> str:
-    """Return ros2_control's block: commands and states of the struts."""
-    joints = ""
+def _add_control(
+    robot: ET.Element, geometry: HexapodGeometry, joint_names: Sequence[str], plugin: str, parameters: dict[str, str]
+) -> None:
+    """Add ros2_control's block: commands and states of the struts."""
+    control = _add(robot, "ros2_control", name=geometry.name, type="system")
+    hardware = _add(control, "hardware")
+    _add(hardware, "plugin").text = plugin
+    for name, value in parameters.items():
+        _add(hardware, "param", name=name).text = value
     for name, length in zip(joint_names, strut_lengths(geometry, geometry.home), strict=True):
-        states = """
-      <state_interface name="position" />
-      <state_interface name="velocity" />"""
-        if hardware == MOCK:
-            states = f"""
-      <state_interface name="position">
-        <param name="initial_value">{_number(length)}</param>
-      </state_interface>"""
-        joints += f"""
-    <joint name="{_text(name)}">
-      <command_interface name="position" />{states}
-    </joint>"""
-    return f"""
-  <ros2_control name="{_text(geometry.name)}" type="system">
-    <hardware>{hardware}
-    </hardware>{joints}
-  </ros2_control>"""
+        joint = _add(control, "joint", name=name)
+        _add(joint, "command_interface", name="position")
+        position = _add(joint, "state_interface", name="position")
+        if plugin == MOCK[0]:
+            _add(position, "param", name="initial_value").text = _numbers(length)
+        else:
+            _add(joint, "state_interface", name="velocity")
 
 
 def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) -> str:
@@ -134,67 +136,46 @@ def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
     """
     home, (middle, radius) = geometry.home, _plate(geometry)
     lengths, push = strut_lengths(geometry, home), DAMPING * min(geometry.limits.speed, FASTEST)
-    sites = "".join(
-        f"""
-      <site name="platform_joint_{n}" pos="{_numbers(joint)}" />"""
-        for n, joint in enumerate(geometry.platform_joints, 1)
-    )
-    for name, pose in geometry.tools.items():
-        sites += f"""
-      <site name="{name}" {_place(pose.position, pose.rotation)} />"""
-    struts = ties = drives = ""
-    force = _numbers([-push, push])
-    feet, at_rest = foot_frames(geometry), joint_positions(geometry, home)
-    bent = [at_rest[f"{name}_foot_2"] for name in STRUT_NAMES]
-    rows = zip(joint_names, lengths, geometry.limits.stroke, geometry.base_joints, feet, bent, strict=True)
-    for n, (given, length, stroke, joint, foot, angle) in enumerate(rows, 1):
-        name, short, reach = _text(given), stroke[0], _numbers(stroke)
-        # MuJoCo adds a joint's position to the place of its body: `ref` makes it the length, or the angle
-        c, s = np.cos(angle), np.sin(angle)
-        struts += f"""
-    <body name="{name}_body" {_place(joint, foot @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]))}>
-      <joint name="{name}_foot_1" axis="{_numbers([0.0, c, -s])}" armature="{HINGE_INERTIA}" />
-      <joint name="{name}_foot_2" axis="1 0 0" ref="{_number(angle)}" armature="{HINGE_INERTIA}" />
-      <geom type="cylinder" size="{STRUT_RADIUS * 1.5}" fromto="0 0 0 0 0 {_number(0.5 * short)}" />
-      <site name="base_joint_{n}" />
-      <body name="{name}_rod" {_place([0.0, 0.0, length], np.eye(3))}>
-        <joint name="{name}" type="slide" axis="0 0 1" ref="{_number(length)}" range="{reach}" \
-armature="{SCREW_INERTIA}" damping="{DAMPING}" />
-        <geom type="cylinder" size="{STRUT_RADIUS}" fromto="0 0 {_number(-0.6 * short)} 0 0 0" />
-        <site name="strut_end_{n}" />
-      </body>
-    </body>"""
-        ties += f"""
-    <connect name="{name}_end" site1="strut_end_{n}" site2="platform_joint_{n}" />"""
-        drives += f"""
-    <position name="{name}" joint="{name}" kp="{STIFFNESS}" ctrlrange="{reach}" forcerange="{force}" />"""
-    at_home = f"{_numbers(home.position)} {_quaternion(home.rotation)}"
-    at_home += "".join(f" 0.0 {_number(angle)} {_number(length)}" for angle, length in zip(bent, lengths, strict=True))
+    root = ET.Element("mujoco", model=geometry.name)
+    _add(root, "compiler", angle="radian", autolimits="true")
     # Damping is integrated implicitly: explicit steps would have to be shorter than a light body's settling time.
+    _add(root, "option", integrator="implicitfast", timestep=TIMESTEP)
+    default = _add(root, "default")
     # Struts begin and end inside each other's joints and the plate: nothing collides
-    return f"""\
-{HEAD}<mujoco model="{_text(geometry.name)}">
-  <compiler angle="radian" autolimits="true" />
-  <option integrator="implicitfast" timestep="{TIMESTEP}" />
-  <default>
-    <geom density="{STEEL}" contype="0" conaffinity="0" />
-    <equality {TIED} />
-  </default>
-  <worldbody>
-    <body name="platform" {_place(home.position, home.rotation)}>
-      <freejoint name="platform" />
-      <geom type="cylinder" size="{_numbers([radius, 0.5 * PLATE])}" pos="{_numbers(middle)}" />{sites}
-    </body>{struts}
-  </worldbody>
-  <equality>{ties}
-  </equality>
-  <actuator>{drives}
-  </actuator>
-  <keyframe>
-    <key name="home" qpos="{at_home}" ctrl="{_numbers(lengths)}" />
-  </keyframe>
-</mujoco>
-"""
+    _add(default, "geom", density=STEEL, contype="0", conaffinity="0")
+    _add(default, "equality", **TIED)
+    world, ties, drives = _add(root, "worldbody"), _add(root, "equality"), _add(root, "actuator")
+    platform = _add(world, "body", name="platform", **_place(home.position, home.rotation))
+    _add(platform, "freejoint", name="platform")
+    _add(platform, "geom", type="cylinder", size=[radius, 0.5 * PLATE], pos=middle)
+    for n, joint in enumerate(geometry.platform_joints, 1):
+        _add(platform, "site", name=f"platform_joint_{n}", pos=joint)
+    for name, pose in geometry.tools.items():
+        _add(platform, "site", name=name, **_place(pose.position, pose.rotation))
+    at_rest = joint_positions(geometry, home)
+    bent = [at_rest[f"{name}_foot_2"] for name in STRUT_NAMES]
+    feet = map(Pose, geometry.base_joints, foot_frames(geometry))
+    rows = zip(joint_names, lengths, geometry.limits.stroke, feet, bent, strict=True)
+    for n, (name, length, reach, foot, angle) in enumerate(rows, 1):
+        # MuJoCo adds a joint's position to the place of its body: `ref` makes it the length, or the angle
+        c, s, short = np.cos(angle), np.sin(angle), reach[0]
+        turned = foot.rotation @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+        body = _add(world, "body", name=f"{name}_body", **_place(foot.position, turned))
+        _add(body, "joint", name=f"{name}_foot_1", axis=[0.0, c, -s], armature=HINGE_INERTIA)
+        _add(body, "joint", name=f"{name}_foot_2", axis="1 0 0", ref=angle, armature=HINGE_INERTIA)
+        _add(body, "geom", type="cylinder", size=STRUT_RADIUS * 1.5, fromto=f"0 0 0 0 0 {_numbers(0.5 * short)}")
+        _add(body, "site", name=f"base_joint_{n}")
+        rod = _add(body, "body", name=f"{name}_rod", **_place([0.0, 0.0, length], np.eye(3)))
+        _add(rod, "joint", name=name, type="slide", axis="0 0 1", ref=length, range=reach, armature=SCREW_INERTIA,
+             damping=DAMPING)  # fmt: skip
+        _add(rod, "geom", type="cylinder", size=STRUT_RADIUS, fromto=f"0 0 {_numbers(-0.6 * short)} 0 0 0")
+        _add(rod, "site", name=f"strut_end_{n}")
+        _add(ties, "connect", name=f"{name}_end", site1=f"strut_end_{n}", site2=f"platform_joint_{n}")
+        _add(drives, "position", name=name, joint=name, kp=STIFFNESS, ctrlrange=reach, forcerange=[-push, push])
+    struts = np.stack([np.zeros(6), bent, lengths], axis=1).ravel()
+    place = [*home.position, *_quaternion(home.rotation), *struts]
+    _add(_add(root, "keyframe"), "key", name="home", qpos=place, ctrl=lengths)
+    return _text(root)
 
 
 def foot_frames(geometry: HexapodGeometry) -> np.ndarray:
@@ -218,52 +199,51 @@ def foot_frames(geometry: HexapodGeometry) -> np.ndarray:
 HEAD = "<?xml version='1.0' encoding='utf-8'?>\n"
 
 
-def _ball(middle: np.ndarray) -> str:
-    return _visual(f'sphere radius="{JOINT_RADIUS}"', middle)
+def _text(root: ET.Element) -> str:
+    ET.indent(root)
+    return f"{HEAD}{ET.tostring(root, encoding='unicode')}\n"
 
 
-def _cylinder(radius: float, length: float, middle: Sequence[float] | np.ndarray) -> str:
-    return _visual(f'cylinder radius="{_number(radius)}" length="{_number(length)}"', middle)
+def _add(parent: ET.Element, tag: str, **attributes: Any) -> ET.Element:
+    """Add an element; its attributes are texts, or numbers."""
+    texts = {name: value if isinstance(value, str) else _numbers(value) for name, value in attributes.items()}
+    return ET.SubElement(parent, tag, texts)
 
 
-def _visual(shape: str, middle: Sequence[float] | np.ndarray) -> str:
-    return f"""
-    <visual>
-      <origin xyz="{_numbers(middle)}" />
-      <geometry>
-        <{shape} />
-      </geometry>
-    </visual>"""
+def _numbers(values: Any) -> str:
+    return " ".join(repr(float(value)) for value in np.ravel(values))
 
 
-def _link(name: str, visuals: Iterable[str] = ()) -> str:
-    drawn = "".join(visuals)
-    return f'\n  <link name="{_text(name)}"' + (f">{drawn}\n  </link>" if drawn else " />")
+def _draw_joints(link: ET.Element, joints: np.ndarray) -> None:
+    for joint in joints:
+        _draw(link, joint, "sphere", radius=JOINT_RADIUS)
 
 
-def _joint(
-    name: str,
-    kind: str,
-    links: tuple[str, str],
-    at: Pose | None = None,
-    axis: str = "",
-    limits: tuple[float, float] = (0.0, 0.0),
-    speed: float = LOOSE,
-) -> str:
-    origin = limit = ""
+def _draw(link: ET.Element, middle: Any, shape: str, **size: float) -> None:
+    visual = _add(link, "visual")
+    _add(visual, "origin", xyz=middle)
+    _add(_add(visual, "geometry"), shape, **size)
+
+
+def _join(robot: ET.Element, name: str, kind: str, parent: str, child: str, at: Pose | None = None) -> ET.Element:
+    joint = _add(robot, "joint", name=name, type=kind)
     if at is not None:
-        origin = f"""
-    <origin xyz="{_numbers(at.position)}" rpy="{_numbers(roll_pitch_yaw(at.rotation))}" />"""
-    if axis:
-        low, high = map(_number, limits)
-        limit = f"""
-    <axis xyz="{axis}" />
-    <limit lower="{low}" upper="{high}" effort="{LOOSE}" velocity="{_number(min(speed, LOOSE))}" />"""
-    return f"""
-  <joint name="{_text(name)}" type="{kind}">{origin}
-    <parent link="{_text(links[0])}" />
-    <child link="{_text(links[1])}" />{limit}
-  </joint>"""
+        _add(joint, "origin", xyz=at.position, rpy=roll_pitch_yaw(at.rotation))
+    _add(joint, "parent", link=parent)
+    _add(joint, "child", link=child)
+    return joint
+
+
+def _fix(robot: ET.Element, parent: str, name: str, at: Pose) -> None:
+    """Add a frame that is fixed to a link."""
+    _join(robot, f"{name}_mount", "fixed", parent, name, at)
+    _add(robot, "link", name=name)
+
+
+def _move(joint: ET.Element, axis: str, limits: tuple[float, float], speed: float = LOOSE) -> None:
+    """Let a joint move along or about an axis."""
+    _add(joint, "axis", xyz=axis)
+    _add(joint, "limit", lower=limits[0], upper=limits[1], effort=LOOSE, velocity=min(speed, LOOSE))
 
 
 def _plate(geometry: HexapodGeometry) -> tuple[np.ndarray, float]:
@@ -273,22 +253,10 @@ def _plate(geometry: HexapodGeometry) -> tuple[np.ndarray, float]:
     return middle, float(np.linalg.norm((joints - middle)[:, :2], axis=1).mean())
 
 
-def _place(position: Sequence[float] | np.ndarray, rotation: np.ndarray) -> str:
-    return f'pos="{_numbers(position)}" quat="{_quaternion(rotation)}"'
+def _place(position: Any, rotation: np.ndarray) -> dict[str, Any]:
+    return {"pos": position, "quat": _quaternion(rotation)}
 
 
-def _quaternion(rotation: np.ndarray) -> str:
+def _quaternion(rotation: np.ndarray) -> list[float]:
     x, y, z, w = quaternion_of(rotation)
-    return _numbers([w, x, y, z])
-
-
-def _text(name: str) -> str:
-    return escape(name, {'"': "&quot;"})
-
-
-def _number(value: float) -> str:
-    return repr(float(value))
-
-
-def _numbers(values: Sequence[float] | np.ndarray) -> str:
-    return " ".join(map(_number, values))
+    return [w, x, y, z]
