@@ -20,7 +20,7 @@ from strategies import fixed, paper_geometry
 
 from benchmarks.c_core import SANITIZED, STRICT, Build, builds, missing, printed
 from hexapod_comp import core
-from hexapod_comp.core import Status, batch, ffi
+from hexapod_comp.core import Status, batch
 from hexapod_comp.core.build import FLAGS, sources_hash
 from hexapod_comp.errors import KinematicsError, NotFiniteError
 from hexapod_comp.export.c_code import write_c
@@ -162,12 +162,6 @@ def test_what_does_not_fit_is_refused_where_it_crosses(place, wrong):
     blamed = "rotations" if (names[place], wrong) == ("positions", "shape") else names[place]
     with pytest.raises(ValueError, match=f"^{blamed}: must be"):
         batch.strut_lengths(*arrays)
-
-
-def test_quantities_lie_as_in_the_header():
-    assert ffi.sizeof("hc_quantities") == batch.QUANTITIES.itemsize
-    for name in batch.QUANTITIES.names:
-        assert ffi.offsetof("hc_quantities", name) == batch.QUANTITIES.fields[name][1]
 
 
 SOURCE = Path(core.__file__).parent / "hexapod_batch.c"

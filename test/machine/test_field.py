@@ -19,7 +19,6 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 from strategies import UNEVEN_GRID, fixed, paper_geometry, random_field, seeds
 
-from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.errors import InputFileError, LimitError, ModelError, OutsideTableError
 from hexapod_comp.machine.field import CROSS_AXES, GridField, no_field
@@ -308,31 +307,6 @@ def test_a_csv_that_is_no_table_is_refused(text: str, problem: str, tmp_path: Pa
 
 
 SIDES = np.array([[-0.1, -0.05, 0.3], [0.1, 0.05, 0.5]])
-
-
-def space_of(poses: list[Pose]) -> ParameterSpace:
-    return ParameterSpace(small.scattered(small.paper(), poses), FitSettings(blocks=()))
-
-
-def drawn(rng: np.random.Generator, count: int, half: float, tilt_deg: float) -> list[Pose]:
-    middle = np.array([0.0, 0.0, 0.45])
-    turns = Rotation.from_rotvec(np.radians(tilt_deg) * rng.uniform(-1.0, 1.0, (count, 3))).as_matrix()
-    return [Pose(middle + rng.uniform(-half, half, 3), turn) for turn in turns]
-
-
-@fixed
-@given(seeds)
-def test_readings_that_are_added_never_make_it_smaller(seed: int) -> None:
-    """Some poses tilted, some level, some all tilted one way: in any order."""
-    rng = np.random.default_rng(seed)
-    poses = drawn(rng, 4, 0.1, 8.0) + drawn(rng, 4, 0.03, 0.0) + drawn(rng, 3, 0.1, 0.0)
-    poses = [poses[n] for n in rng.permutation(len(poses))]
-    few, more = (space_of(part).measured for part in (poses[: rng.integers(3, 11)], poses))
-    assert few is not None
-    assert more is not None
-    assert (more.box[0] <= few.box[0]).all()
-    assert (more.box[1] >= few.box[1]).all()
-    np.testing.assert_array_equal(more.point, few.point)
 
 
 def test_a_tilted_tool_is_inside_where_its_point_is() -> None:

@@ -73,45 +73,23 @@ def test_each_term_by_its_closed_form(struts, truth):
         assert length(struts, command, strut=0) == command
 
 
-def test_backlash_lags_behind_the_motion():
-    """Truth: a nut with 40 µm of play stands half of it behind: shorter going out, longer coming back."""
-    struts = StrutErrors(backlash=np.full(6, 40e-6))
-    assert length(struts, 0.5, +1.0) == pytest.approx(0.5 - 20e-6, abs=2e-16)
-    assert length(struts, 0.5, -1.0) == pytest.approx(0.5 + 20e-6, abs=2e-16)
-    assert length(struts, 0.5, 0.0) == 0.5
-
-
-def test_length_map_is_the_natural_spline():
-    """Truth: SciPy's B-spline interpolation, another algorithm than the piecewise one under test.
+def test_maps_are_natural_splines_and_lost_motion_lags_behind():
+    """Truth: SciPy's B-splines, another algorithm; a nut with play b(c) stands half of it behind, −s·b(c)/2.
 
     Tolerance: 1e-12 of 50 µm; outside the knots the end values hold.
     """
-    struts = random_struts(np.random.default_rng(11))
-    knots, values = struts.map_knots, struts.map_values
-    only_map = StrutErrors(map_knots=knots, map_values=values)
-    for strut in range(6):
-        natural = ([(2, 0.0)], [(2, 0.0)])
-        spline = make_interp_spline(knots, values[strut], k=3, bc_type=natural)
-        for command in np.linspace(0.25, 0.75, 101):
-            truth = spline(np.clip(command, knots[0], knots[-1]))
-            assert length(only_map, command, strut=strut) - command == pytest.approx(truth, abs=2e-16)
-        for knot, value in zip(knots, values[strut], strict=True):
-            assert length(only_map, knot, strut=strut) - knot == pytest.approx(value, abs=2e-16)
-
-
-def test_lost_motion_changes_along_a_worn_screw():
-    """Truth: the definition, −s·b(c)/2, with SciPy's B-spline through the changes of b; tolerance as above."""
-    knots, change = np.array([0.3, 0.4, 0.55, 0.7]), 1e-6 * np.array([[0.0, 6.0, 2.0, 1.0]])
-    struts = StrutErrors(
-        backlash=np.full(6, 4e-6), map_knots=knots, map_values=np.zeros((6, 4)), map_backlash=change * np.ones((6, 1))
-    )
-    spline = make_interp_spline(knots, change[0], k=3, bc_type=([(2, 0.0)], [(2, 0.0)]))
-    for sense in (-1.0, 0.0, 0.5, 1.0):
-        for command in np.linspace(0.25, 0.75, 21):
-            lost = 4e-6 + spline(np.clip(command, knots[0], knots[-1]))
-            assert length(struts, command, sense) - command == pytest.approx(-0.5 * sense * lost, abs=2e-16)
-    assert struts.largest_backlash == pytest.approx([10e-6] * 6, rel=1e-12)
-    assert StrutErrors(map_knots=knots, map_values=np.zeros((6, 4))).map_backlash.shape == (6, 4)
+    drawn = random_struts(np.random.default_rng(11))
+    knots, maps = drawn.map_knots, np.stack([drawn.map_values, drawn.map_backlash])
+    struts = StrutErrors(backlash=drawn.backlash, map_knots=knots, map_values=maps[0], map_backlash=maps[1])
+    splines = make_interp_spline(knots, maps, k=3, axis=2, bc_type=([(2, np.zeros((2, 6)))], [(2, np.zeros((2, 6)))]))
+    for command in (*np.linspace(0.25, 0.75, 41), *knots):
+        values, change = splines(np.clip(command, knots[0], knots[-1]))
+        for sense in (-1.0, 0.0, 0.5, 1.0):
+            truth = command + values - 0.5 * sense * (drawn.backlash + change)
+            found = [length(struts, command, sense, strut) for strut in range(6)]
+            np.testing.assert_allclose(found, truth, rtol=0.0, atol=3e-16)
+    np.testing.assert_allclose(struts.largest_backlash, drawn.backlash + maps[1].max(axis=1), rtol=1e-12)
+    assert StrutErrors(map_knots=knots, map_values=maps[0]).map_backlash.shape == (6, 5)
 
 
 # There and back.

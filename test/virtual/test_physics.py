@@ -169,19 +169,6 @@ def test_mujoco_s_steps_end_where_the_forces_balance(given: dict[str, Any], allo
         assert turn < 5.0 * allowed
 
 
-def test_friction_leaves_the_tool_behind_on_both_sides():
-    """Approached from either side the tool stops short of where it stops without friction, by M/(L·k) of each strut."""
-    geometry = load_geometry("paper")
-    real, home = RealMachine(geometry, MachineModel("paper")), geometry.home
-    commands, places = strut_lengths(geometry, home), []
-    for friction, way in ((2.0, 1.0), (2.0, -1.0), (0.0, 1.0)):
-        machine = PhysicalMachine(real, Physics(friction=friction))
-        places.append(machine.pose_for(commands, np.array([way, *np.zeros(8)]))[0].position)
-    forth, back, free = places
-    np.testing.assert_allclose(forth + back, 2.0 * free, rtol=0.0, atol=1e-11)
-    assert -2e-6 < forth[0] - free[0] < -2e-7
-
-
 @pytest.mark.parametrize("name", MACHINES)
 def test_the_model_s_friction_is_that_of_cardan_joints(name: str, tmp_path: Path):
     """MuJoCo's bearings about the axes that the geometry states, against the core; both with clearance and weight.

@@ -30,7 +30,7 @@ from hexapod_comp.workspace.combined import (
     worst_case,
 )
 from hexapod_comp.workspace.effects import LINEAR, Extremes, effect_vectors, extremes
-from hexapod_comp.workspace.ranking import ranked, ranking_rows, ranking_text
+from hexapod_comp.workspace.ranking import JOINED, ranked, ranking_rows, ranking_text
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 
@@ -41,13 +41,6 @@ PAPER_SIZES = {
     "base_joint_z": 10e-6,
     "platform_joint_xy": 10e-6,
     "platform_joint_z": 10e-6,
-}
-# V. Daake et al., Table 1: largest translation, m, and rotation, rad
-PRINTED = {
-    "screw pitch": np.array([34.4e-6, np.radians(15.41e-3)]),
-    "base-/platform joint (x/y)": np.array([13.68e-6, np.radians(6.16e-3)]),
-    "base-/platform joint (z)": np.array([11.2e-6, np.radians(5.36e-3)]),
-    "quantisation": np.array([10.85e-6, np.radians(4.39e-3)]),
 }
 MIXED = {"strut_length": 8e-6, "base_joint_xy": 10e-6, "platform_joint_z": 12e-6, "tool_offset": 5e-6}
 
@@ -76,43 +69,22 @@ def linear(sizes: dict[str, float], count: int = 3) -> tuple[SingleErrors, np.nd
 
 
 def test_screw_pitch_comes_first_as_in_the_paper():
+    """Whose machine's geometry is not printed; effects scale with the input error, but for 20 µm / 250 mm."""
     geometry = unit()
     rows = ranked(over(geometry, PAPER_SIZES), geometry)
     assert rows[0].title == "screw pitch"
+    largest = [row.figures()[0] for row in rows]
+    assert largest == sorted(largest, reverse=True)
+    assert largest[0] > 1.9 * largest[1]
+    by_title = {row.title: row.figures() for row in rows}
+    pitch, step, joints, _ = (by_title.pop(title) for title in ("screw pitch", "quantisation", *JOINED))
+    assert not by_title
+    np.testing.assert_allclose(step / pitch, 7.0 / 20.0, rtol=1e-3)
+    assert joints[1] < 0.05e-6  # a joint can be off across its strut, which moves nothing: "≈ 0" in the paper
     records = json.loads(json.dumps(ranking_rows(rows)))
     assert [record["rank"] for record in records] == [1, 2, 3, 4]
-    assert records[0]["translation_max_um"] == pytest.approx(rows[0].extremes[0].value * 1e6)
+    assert records[0]["translation_max_um"] == pytest.approx(largest[0] * 1e6)
     assert all(words in ranking_text(rows) for words in ("screw pitch", "strut_", "transl. max µm", "rot. max m°"))
-    assert rows[0].extremes[0].value > 1.9 * rows[1].extremes[0].value
-    assert {row.title for row in rows} == {
-        "screw pitch",
-        "quantisation",
-        "base-/platform joint (x/y)",
-        "base-/platform joint (z)",
-    }
-    largest = [row.extremes[0].value for row in rows]
-    assert largest == sorted(largest, reverse=True)
-    for row in rows:
-        # the paper's order of magnitude: its machine's geometry is not printed
-        largest = PRINTED[row.title]
-        assert ((row.figures()[::2] > 0.1 * largest) & (row.figures()[::2] < 10.0 * largest)).all()
-    by_title = {row.title: row.figures() for row in rows}
-    # effects scale with the input error, but for curvature of 20 µm / 250 mm
-    np.testing.assert_allclose(by_title["quantisation"] / by_title["screw pitch"], 7.0 / 20.0, rtol=1e-3)
-    # a joint can be off across its strut, which moves nothing: "≈ 0" in the paper
-    assert by_title["base-/platform joint (x/y)"][1] < 0.05e-6
-
-
-def test_rows_name_the_error_and_the_tools_pose():
-    """The error alone, at the pose where the tool is said to be, has the effect that the row has."""
-    geometry = tooled()
-    found = over(geometry, PAPER_SIZES, count=50)
-    row = next(row for row in ranked(found, geometry) if row.title == "screw pitch")
-    extreme = row.extremes[0]
-    at = geometry.platform_pose(Pose.from_angles(extreme.position, extreme.angles))
-    alone = found.errors.select(np.array([label == extreme.error for label in found.errors.labels]))
-    again = effect_vectors(geometry, alone, at.position[None], at.rotation[None])[0, 0, :3]
-    assert np.linalg.norm(again) == pytest.approx(extreme.value, rel=1e-9)
 
 
 def test_joined_rows_hold_the_larger_and_the_smaller_of_their_types():
