@@ -25,7 +25,7 @@ from ..measurements.campaign import (
 )
 from ..measurements.readings import AXES, CHANNELS, MeasurementSet
 from ..pose import rotation_from_angles
-from ..workspace.reach import Examiner
+from ..workspace.reach import first_limits
 from .parameters import ParameterSpace
 
 TILTS = (10.0, 5.0, 2.0)  # of scattered poses, °: the first within reach
@@ -60,7 +60,7 @@ class MeasuringBox:
 
     def reaches(self, positions: np.ndarray, rotations: np.ndarray, threads: int | None = 1) -> np.ndarray:
         """Return which poses of the tool the nominal machine's limits allow, shape (n,)."""
-        return Examiner(self.geometry).findings(positions, rotations, threads=threads)[0] == Status.OK
+        return first_limits(self.geometry, positions, rotations, threads=threads)[0] == Status.OK
 
 
 def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[CampaignRun]:

@@ -15,9 +15,9 @@ from ..machine.kinematics import condition_number, strut_lengths
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
 from .reach import (
     BOX_CELLS,
-    Examiner,
     Reach,
     ReachedBox,
+    first_limits,
     home_orientation,
     largest_box,
     machine_box,
@@ -65,14 +65,14 @@ def overview(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> Overview:
 
 def _tilts(geometry: HexapodGeometry) -> np.ndarray:
     """Return how far the tool tilts at home about each axis alone, shape (3, 2), rad."""
-    tip, examiner = geometry.tool_pose(geometry.home).position, Examiner(geometry)
+    tip = geometry.tool_pose(geometry.home).position
     angles = np.linspace(0.0, MOST_TILT, TILT_STEPS)
     tilts = np.zeros((3, 2))
     for axis in range(3):
         for side, way in enumerate((-1.0, 1.0)):
             sets = [way * angles if a == axis else np.zeros(1) for a in range(3)]
             turned = orientations(geometry, [values.tolist() for values in sets])
-            findings, _ = examiner.findings(np.tile(tip, (len(turned), 1)), turned)
+            findings, _ = first_limits(geometry, np.tile(tip, (len(turned), 1)), turned)
             out = np.flatnonzero(findings != Status.OK)
             tilts[axis, side] = way * angles[out[0] - 1 if len(out) else -1]
     return tilts

@@ -38,39 +38,36 @@ CELLS = (4, 200)
 HALVINGS = 24  # Of a grid cell: a boundary is found to a fraction of a nanometre
 
 
-class Examiner:
-    """Determines the limits that poses of a machine break."""
+def first_limits(
+    geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, threads: int | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what limits each of N poses, the first of :data:`FINDINGS` that applies, and the struts concerned."""
+    findings, struts = np.empty(len(positions), np.int8), np.empty((len(positions), 2), np.int8)
 
-    def __init__(self, geometry: HexapodGeometry) -> None:
-        self.geometry = geometry
+    def run(rows: slice) -> None:
+        turned = rotations if len(rotations) == 1 else rotations[rows]
+        platform = geometry.platform_poses(positions[rows], turned)
+        places, turns = (np.ascontiguousarray(part) for part in platform)
+        given = *geometry.kernel_joints, geometry.limit_numbers.at, places, turns
+        check_poses(*given, findings[rows], struts[rows])
 
-    def findings(
-        self, positions: np.ndarray, rotations: np.ndarray, threads: int | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return what limits each of N poses, the first of :data:`FINDINGS` that applies."""
-        findings, struts = np.empty(len(positions), np.int8), np.empty((len(positions), 2), np.int8)
+    over_chunks(run, len(positions), threads)
+    return findings, struts
 
-        def run(rows: slice) -> None:
-            turned = rotations if len(rotations) == 1 else rotations[rows]
-            platform = self.geometry.platform_poses(positions[rows], turned)
-            places, turns = (np.ascontiguousarray(part) for part in platform)
-            given = *self.geometry.kernel_joints, self.geometry.limit_numbers.at, places, turns
-            check_poses(*given, findings[rows], struts[rows])
 
-        over_chunks(run, len(positions), threads)
-        return findings, struts
-
-    def boundary(self, inside: np.ndarray, outside: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Bisect between M points within the limits and M beyond; return the boundary, and the finding there."""
-        inside, outside, rotations = inside.copy(), outside.copy(), rotation[None]
-        findings, _ = self.findings(outside, rotations)
-        for _ in range(HALVINGS):
-            middle = 0.5 * (inside + outside)
-            at_middle, _ = self.findings(middle, rotations)
-            beyond = at_middle != Status.OK
-            inside[~beyond], outside[beyond] = middle[~beyond], middle[beyond]
-            findings[beyond] = at_middle[beyond]
-        return inside, findings
+def bisected(
+    geometry: HexapodGeometry, inside: np.ndarray, outside: np.ndarray, rotation: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bisect between M points within the limits and M beyond; return the boundary, and the finding there."""
+    inside, outside, rotations = inside.copy(), outside.copy(), rotation[None]
+    findings, _ = first_limits(geometry, outside, rotations)
+    for _ in range(HALVINGS):
+        middle = 0.5 * (inside + outside)
+        at_middle, _ = first_limits(geometry, middle, rotations)
+        beyond = at_middle != Status.OK
+        inside[~beyond], outside[beyond] = middle[~beyond], middle[beyond]
+        findings[beyond] = at_middle[beyond]
+    return inside, findings
 
 
 @dataclass(frozen=True)
@@ -131,7 +128,7 @@ class Reach:
         """A point well inside, m, shape (3,): the centroid, or the deepest grid point if that lies outside."""
         points = self.points()
         centroid = points.mean(axis=0)
-        finding, _ = Examiner(self.geometry).findings(centroid[None], self.rotation[None])
+        finding, _ = first_limits(self.geometry, centroid[None], self.rotation[None])
         if finding[0] == Status.OK:
             return centroid
         depth = ndimage.distance_transform_edt(self.within)
@@ -141,10 +138,6 @@ class Reach:
     def points(self) -> np.ndarray:
         """Return the grid points within reach, m in the work frame, shape (N, 3)."""
         return _grid_points(self.axes)[self.within.ravel()]
-
-    def platform_poses(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return ``pose_platform_in_base`` of the grid points within reach, shape (N, 3) m and (N, 3, 3)."""
-        return poses_at(self.geometry, self.points(), self.rotation)
 
     def shares(self) -> dict[str, float]:
         """Return the share of each limit in the boundary, by name, largest first."""
@@ -167,23 +160,17 @@ def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: 
     if not CELLS[0] <= cells <= CELLS[1]:
         raise GeometryError("cells", f"must lie in {CELLS[0]}…{CELLS[1]}", cells)
     rotation = home_orientation(geometry) if rotation is None else Pose(np.zeros(3), rotation).rotation
-    examiner = Examiner(geometry)
-    box = _search(examiner, rotation)
+    box = _search(geometry, rotation)
     outermost = possible_box(geometry, rotation)
     while True:
-        axes, findings = _grid(examiner, rotation, box, cells)
+        axes, findings = _grid(geometry, rotation, box, cells)
         grown = _grown(box, findings == Status.OK, outermost)
         if np.array_equal(grown, box):
             if not (findings == Status.OK).any():
                 raise GeometryError("cells", "are too coarse: the grid misses the small workspace; take more", cells)
-            boundary = _crossings(examiner, rotation, axes, findings)
+            boundary = _crossings(geometry, rotation, axes, findings)
             return Reach(geometry, rotation, axes, findings, boundary)
         box = grown
-
-
-def reaches(geometry: HexapodGeometry, rotations: np.ndarray, cells: int = 40) -> tuple[Reach, ...]:
-    """Compute the reach of a machine at each of some orientations, shape (M, 3, 3); see :func:`reach`."""
-    return tuple(reach(geometry, rotation, cells) for rotation in rotations)
 
 
 def possible_box(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
@@ -197,11 +184,11 @@ def possible_box(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
     return box
 
 
-def _search(examiner: Examiner, rotation: np.ndarray) -> np.ndarray:
+def _search(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
     """Return a box that contains the reach as found by a coarse grid, enlarged by one coarse cell."""
-    possible = possible_box(examiner.geometry, rotation)
+    possible = possible_box(geometry, rotation)
     for cells in SEARCH_CELLS:
-        axes, findings = _grid(examiner, rotation, possible, cells)
+        axes, findings = _grid(geometry, rotation, possible, cells)
         where = np.argwhere(findings == Status.OK)
         if len(where):
             step = axes[0][1] - axes[0][0]
@@ -214,7 +201,7 @@ def _search(examiner: Examiner, rotation: np.ndarray) -> np.ndarray:
 
 
 def _grid(
-    examiner: Examiner, rotation: np.ndarray, box: np.ndarray, cells: int
+    geometry: HexapodGeometry, rotation: np.ndarray, box: np.ndarray, cells: int
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
     """Return axes and findings of a grid with equal steps whose outermost points lie on a box or beyond."""
     size = box[1] - box[0]
@@ -222,7 +209,7 @@ def _grid(
     middle = box.mean(axis=0)
     counts = [math.ceil(edge / step - 1e-9) for edge in size]
     x, y, z = (m + step * (np.arange(n + 1) - n / 2) for m, n in zip(middle, counts, strict=True))
-    findings, _ = examiner.findings(_grid_points((x, y, z)), rotation[None])
+    findings, _ = first_limits(geometry, _grid_points((x, y, z)), rotation[None])
     return (x, y, z), findings.reshape(len(x), len(y), len(z))
 
 
@@ -239,7 +226,7 @@ def _grown(box: np.ndarray, within: np.ndarray, outermost: np.ndarray) -> np.nda
 
 
 def _crossings(
-    examiner: Examiner, rotation: np.ndarray, axes: tuple[np.ndarray, ...], findings: np.ndarray
+    geometry: HexapodGeometry, rotation: np.ndarray, axes: tuple[np.ndarray, ...], findings: np.ndarray
 ) -> Boundary:
     """Bisect every edge of the grid that has one end within reach."""
     within = findings == Status.OK
@@ -255,7 +242,7 @@ def _crossings(
             outside.append(second if way > 0 else first)
             axis.append(np.full(len(start), k))
             outward.append(np.full(len(start), way))
-    boundary = examiner.boundary(np.concatenate(inside), np.concatenate(outside), rotation)
+    boundary = bisected(geometry, np.concatenate(inside), np.concatenate(outside), rotation)
     return Boundary(*boundary, np.concatenate(axis), np.concatenate(outward))
 
 
@@ -303,11 +290,11 @@ def largest_box(reached: Reach) -> ReachedBox:
         raise GeometryError("limits", "leave no room for a box; the workspace is smaller than a cell of its grid")
     axes = reached.axes
     box = np.array([[axis[index] for axis, index in zip(axes, corner, strict=True)] for corner in corners])
-    examiner = Examiner(reached.geometry)
-    while not _fits(examiner, reached.rotation, box):  # a dent between grid points
+    geometry = reached.geometry
+    while not _fits(geometry, reached.rotation, box):  # a dent between grid points
         middle = box.mean(axis=0)
         box = middle + 0.97 * (box - middle)
-    box, causes = _faces_moved_out(examiner, reached, box)
+    box, causes = _faces_moved_out(geometry, reached, box)
     room = ROOM * np.ptp(box, axis=0)
     digit = 10.0 ** (np.floor(np.log10(np.ptp(box, axis=0).min())) - 2.0)  # of the shortest edge, the third
     inside = np.array([np.ceil((box[0] + room) / digit), np.floor((box[1] - room) / digit)]) * digit
@@ -318,7 +305,7 @@ def machine_box(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> ReachedBox
     """Return the largest box in which a machine can be measured: with the tool parallel to the work frame."""
     level, home = np.eye(3), home_orientation(geometry)
     tip = geometry.tool_pose(geometry.home).position
-    finding, _ = Examiner(geometry).findings(tip[None], level[None])
+    finding, _ = first_limits(geometry, tip[None], level[None])
     return largest_box(reach(geometry, level if finding[0] == Status.OK else home, cells))
 
 
@@ -359,20 +346,20 @@ def _largest_cells(within: np.ndarray) -> tuple[tuple[int, int, int], tuple[int,
     return corners
 
 
-def _faces_moved_out(examiner: Examiner, reached: Reach, box: np.ndarray) -> tuple[np.ndarray, dict[str, str]]:
+def _faces_moved_out(geometry: HexapodGeometry, reached: Reach, box: np.ndarray) -> tuple[np.ndarray, dict[str, str]]:
     """Move each face out until a limit stops it, at most by a cell at a time; return the box and what stops each."""
     causes = {}
     step = reached.spacing * 0.5**FACE_HALVINGS
     for name, (axis, side) in zip(FACES, ((axis, side) for axis in range(3) for side in (0, 1)), strict=True):
         way = 2.0 * side - 1.0
         inside, beyond = 0.0, reached.spacing
-        while _fits(examiner, reached.rotation, _moved(box, axis, side, way * beyond)):
+        while _fits(geometry, reached.rotation, _moved(box, axis, side, way * beyond)):
             inside, beyond = beyond, beyond + reached.spacing
         while beyond - inside > step:
             middle = 0.5 * (inside + beyond)
-            fits = _fits(examiner, reached.rotation, _moved(box, axis, side, way * middle))
+            fits = _fits(geometry, reached.rotation, _moved(box, axis, side, way * middle))
             inside, beyond = (middle, beyond) if fits else (inside, middle)
-        causes[name] = _cause(examiner, reached.rotation, _moved(box, axis, side, way * beyond))
+        causes[name] = _cause(geometry, reached.rotation, _moved(box, axis, side, way * beyond))
         box = _moved(box, axis, side, way * inside)
     return box, causes
 
@@ -383,14 +370,14 @@ def _moved(box: np.ndarray, axis: int, side: int, way: float) -> np.ndarray:
     return moved
 
 
-def _fits(examiner: Examiner, rotation: np.ndarray, box: np.ndarray) -> bool:
-    findings, _ = examiner.findings(_points(box), rotation[None])
+def _fits(geometry: HexapodGeometry, rotation: np.ndarray, box: np.ndarray) -> bool:
+    findings, _ = first_limits(geometry, _points(box), rotation[None])
     return bool((findings == Status.OK).all())
 
 
-def _cause(examiner: Examiner, rotation: np.ndarray, box: np.ndarray) -> str:
+def _cause(geometry: HexapodGeometry, rotation: np.ndarray, box: np.ndarray) -> str:
     """Return the limit that most of a box's points outside the reach break, with the struts concerned."""
-    findings, struts = examiner.findings(_points(box), rotation[None])
+    findings, struts = first_limits(geometry, _points(box), rotation[None])
     out = findings[findings != Status.OK]
     code = int(np.bincount(out).argmax())
     concerned = np.unique(struts[findings == code])

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core import Status
 from ..machine.geometry import HexapodGeometry
-from .reach import Examiner, Reach, poses_at
+from .reach import Reach, bisected, first_limits, poses_at
 
 
 @dataclass(frozen=True)
@@ -77,17 +77,16 @@ def _directions(reach: Reach, rings: int, sectors: int) -> np.ndarray:
 
 def _cast(reach: Reach, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Follow rays from a point within reach to where they first leave it; return where, and what limits there."""
-    examiner = Examiner(reach.geometry)
     corners = np.array([[axis[0], axis[-1]] for axis in reach.axes])
     farthest = np.linalg.norm(np.abs(corners - origin[:, None]).max(axis=1))  # all of the grid, hence of the reach
     shares = np.linspace(0.0, farthest, SAMPLES)
     samples = origin + shares[:, None] * directions[:, None]
-    at_samples, _ = examiner.findings(samples.reshape(-1, 3), reach.rotation[None])
+    at_samples, _ = first_limits(reach.geometry, samples.reshape(-1, 3), reach.rotation[None])
     within = (at_samples == Status.OK).reshape(len(directions), SAMPLES)
     within[:, 0] = True
     exits = within.argmin(axis=1)
     ray = np.arange(len(directions))
-    return examiner.boundary(samples[ray, exits - 1], samples[ray, exits], reach.rotation)
+    return bisected(reach.geometry, samples[ray, exits - 1], samples[ray, exits], reach.rotation)
 
 
 def _closed(points: np.ndarray) -> np.ndarray:

@@ -86,7 +86,7 @@ def classify(
     geometry, budget : HexapodGeometry, Budget
         The machine and the sizes of its errors.
     reaches : tuple of Reach, optional
-        From :func:`~hexapod_comp.workspace.reach.reaches`; by default what is reached with the tool as at home.
+        By default what is reached with the tool as at home.
     method, allowed : str, float, optional
         ``exact`` or ``linear``, for the ranking; displacement of the tool to allocate tolerances for, m.
     seed : int

@@ -27,7 +27,7 @@ from hexapod_comp.machine.limits import REASONS, Limits
 from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.pose import Pose
-from hexapod_comp.workspace.reach import Examiner
+from hexapod_comp.workspace.reach import first_limits
 
 PAPER = paper_geometry()
 HOME = PAPER.home
@@ -210,7 +210,7 @@ def test_check_reach_cold_start_and_compensator_agree(name: str, seed: int) -> N
     told = [machine.tool_pose(pose) for pose in poses]
     positions, rotations = np.array([p.position for p in told]), np.array([p.rotation for p in told])
     result = check(machine, model, (positions, rotations), "poses")
-    reach, _ = Examiner(machine).findings(positions, rotations)
+    reach, _ = first_limits(machine, positions, rotations)
     for row, (pose, tool) in enumerate(zip(poses, told, strict=True)):
         breaches = {(b.limit, getattr(b.error, "strut", None)) for b in result.breaches if b.row == row}
         assert compensators_refusal(machine, model, tool) in (breaches or {None})

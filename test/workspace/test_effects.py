@@ -34,7 +34,7 @@ from hexapod_comp.workspace.effects import (
     extremes,
     merged,
 )
-from hexapod_comp.workspace.reach import Reach, orientations, reach
+from hexapod_comp.workspace.reach import Reach, orientations, poses_at, reach
 from hexapod_comp.workspace.study import survey
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
@@ -190,7 +190,7 @@ def parted(monkeypatch: pytest.MonkeyPatch, small: list[Reach]) -> None:
 
 def at_once(small: list[Reach], errors: SingleErrors, method: str = EXACT) -> Extremes:
     """Return the extremes over all poses at once, without the runner."""
-    poses = [found.platform_poses() for found in small]
+    poses = [poses_at(found.geometry, found.points(), found.rotation) for found in small]
     positions, rotations = (np.concatenate([pose[k] for pose in poses]) for k in range(2))
     return extremes(small[0].geometry, errors, positions, rotations, method)
 

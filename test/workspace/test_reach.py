@@ -27,15 +27,14 @@ from hexapod_comp.workspace.reach import (
     FINDINGS,
     ROOM,
     Boundary,
-    Examiner,
     Reach,
     _largest_cells,
+    first_limits,
     largest_box,
     machine_box,
     orientations,
     possible_box,
     reach,
-    reaches,
 )
 from hexapod_comp.workspace.shells import Shell, shell
 
@@ -77,13 +76,12 @@ def test_poses_of_their_own_orientation(monkeypatch):
     geometry, rng = unit(), np.random.default_rng(2)
     rotations = turned_by(geometry, [-8, 0, 8], [-8, 0, 8], [-10, 0, 10])[rng.integers(0, 27, 5000)]
     tips = rng.uniform([-0.09, -0.09, 0.14], [0.09, 0.09, 0.23], (5000, 3))
-    examiner = Examiner(geometry)
-    found, struts = examiner.findings(tips, rotations, threads=3)
+    found, struts = first_limits(geometry, tips, rotations, threads=3)
     assert len(np.unique(found)) >= 4
     for n in range(0, 5000, 97):
-        alone = examiner.findings(tips[n : n + 1], rotations[n : n + 1])
+        alone = first_limits(geometry, tips[n : n + 1], rotations[n : n + 1])
         assert (alone[0][0], *alone[1][0]) == (found[n], *struts[n])
-    again = examiner.findings(tips, rotations, threads=1)
+    again = first_limits(geometry, tips, rotations, threads=1)
     assert np.array_equal(again[0], found)
     assert np.array_equal(again[1], struts)
 
@@ -156,7 +154,7 @@ def test_an_empty_workspace_says_where_and_why():
     with pytest.raises(GeometryError, match=r"empty at the orientation \(0, 0, 80\)°.*none is within.*stroke"):
         reach(unit(), tilted(unit(), gamma=80.0))
     with pytest.raises(GeometryError, match=r"empty at the orientation \(70, 0, 0\)°"):
-        reaches(unit(), turned_by(unit(), [0, 70], [0], [0]), cells=8)
+        reach(unit(), tilted(unit(), alpha=70.0), cells=8)
     # Turned by 180° about z each strut's ball is about a point 260 mm from the axis; 250 mm do not reach across
     short = limited(unit(), stroke=np.tile([0.187, 0.19], (6, 1)))
     with pytest.raises(GeometryError, match="no point is near enough"):
@@ -164,7 +162,7 @@ def test_an_empty_workspace_says_where_and_why():
 
 
 def within(found: Shell, points: np.ndarray) -> np.ndarray:
-    return Examiner(found.geometry).findings(points.reshape(-1, 3), found.rotation[None])[0] == Status.OK
+    return first_limits(found.geometry, points.reshape(-1, 3), found.rotation[None])[0] == Status.OK
 
 
 def test_a_shell_is_the_boundary_and_closed():
@@ -175,7 +173,7 @@ def test_a_shell_is_the_boundary_and_closed():
         step = 1e-6 * away / np.linalg.norm(away, axis=-1, keepdims=True)
         assert within(found, found.points - step).all()
         assert not within(found, found.points + step).any()
-        beyond, _ = Examiner(unit()).findings((found.points + step).reshape(-1, 3), rotation[None])
+        beyond, _ = first_limits(unit(), (found.points + step).reshape(-1, 3), rotation[None])
         assert (beyond == found.findings.ravel()).mean() > 0.99  # at an edge of two limits either may come first
         assert np.array_equal(found.points[:, 0], found.points[:, -1])  # the last azimuth is the first
         for pole in (found.points[0], found.points[-1]):
