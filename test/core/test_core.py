@@ -148,6 +148,13 @@ def test_the_target_itself_between_100000_pairs_in_the_box() -> None:
     assert answers >= 99_900
 
 
+def test_a_window_follows_with_play():
+    """As a nut in its thread: 2 wide, pushed up to 5, the way back shows after 2."""
+    low, sense = batch.follow(2.0, np.array([0.0, 5.0, 3.5, 3.0, 2.5, 5.5]))
+    assert low.tolist() == [-1.0, 3.0, 3.0, 3.0, 2.5, 3.5]
+    assert sense.tolist() == [0.0, 1.0, 1.0, 1.0, -1.0, 1.0]
+
+
 WRONG = {"shape": lambda a: a[:-1], "type": lambda a: a.astype(np.float32), "layout": lambda a: np.asfortranarray(a)}
 
 
