@@ -228,7 +228,10 @@ class HexapodGeometry:
         cone_axes, joints = np.array([self.base_cone_axes, self.platform_cone_axes]), self.platform_joints
         # The distance of struts that share a joint cannot be limited.
         apart = (~coincident(joints)).astype(float)
-        put("limit_numbers", self.limits.numbers(cone_axes, apart, self.characteristic_length, self.home_sign))
+        given = ("stroke", "cone_cosines", "condition", "correction", "step", "clearance", "speed", "acceleration")
+        values = {name: getattr(self.limits, name) for name in given}
+        values |= {name: getattr(self, name) for name in ("characteristic_length", "home_sign")}
+        put("limit_numbers", Struct("hc_limits", values | {"cone_axes": cone_axes, "apart": apart}))
         refusal = self.refusal(*pose, lengths[0])
         if refusal is not None:
             from .doubts import joint_doubts

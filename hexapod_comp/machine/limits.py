@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ..core import Status, Struct, ffi, lib
+from ..core import Status, ffi, lib
 from ..errors import GeometryError, KinematicsError, LimitError, NotFiniteError, TooEarlyError
 from ..formats.schema import PAIRS_PER_STRUT, PER_STRUT, Numbers
 
@@ -79,15 +79,6 @@ class Limits:
             if not 0.0 <= getattr(self, name) < np.inf:
                 raise GeometryError(f"limits.{name}", f"must be finite and not negative, {unit}", getattr(self, name))
         object.__setattr__(self, "cone_cosines", np.cos(np.array([self.base_cone, self.platform_cone])))
-
-    def numbers(
-        self, cone_axes: np.ndarray, apart: np.ndarray, characteristic_length: float, home_sign: float
-    ) -> Struct:
-        """Return the limits for the core, hc_limits; the arguments are the machine's."""
-        given = ("stroke", "cone_cosines", "condition", "correction", "step", "clearance", "speed", "acceleration")
-        values = {name: getattr(self, name) for name in given}
-        machine = {"cone_axes": cone_axes, "apart": apart, "home_sign": home_sign}
-        return Struct("hc_limits", values | machine | {"characteristic_length": characteristic_length})
 
     def margins(self, quantities: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Return the margin of each limit of single poses, and the values, by the limit's name."""
