@@ -15,7 +15,7 @@ import numpy as np
 
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel, RealMachine
-from ..machine.passes import Passes, Poses
+from ..machine.passes import Passes
 from ..machine.trial import drive, model_commands
 from ..pose import Pose, attitude_error
 from .imperfections import ImperfectionBounds, draw_model
@@ -67,42 +67,20 @@ def assess(
     names = names or [f"pose {n + 1}" for n in range(len(poses))]
     tool = np.array([pose.position for pose in poses]), np.array([pose.rotation for pose in poses])
     passes = Passes.of_tool(geometry, *tool, np.zeros_like(tool[0]))
-    ideal = _ideal_commands(geometry, passes, names)
-    seeds = tuple(range(seed, seed + machines))
-    runs = []
+    ideal, unknown = passes.nominal_commands(), passes.senses()
+    if geometry.screw_lead.any():
+        turning = [RealMachine(geometry, MachineModel(geometry.name))] * len(passes)
+        ideal, _ = model_commands(turning, passes.poses, unknown, names.__getitem__)
+    seeds, runs = tuple(range(seed, seed + machines)), []
     for one in seeds:
-        real = RealMachine(geometry, draw_model(geometry, bounds, one))
-        runs.append(_run_machine(real, ideal, passes, tool, names))
+        model = draw_model(geometry, bounds, one)
+        alike, named = [RealMachine(geometry, model)] * len(passes), [f"{name}, {model.name}" for name in names]
+        real, modelled = model_commands(alike, passes.poses, unknown, named.__getitem__)
+        taken = geometry.tool_poses(*drive(alike, passes.poses, unknown, ideal, named.__getitem__).actual)
+        # The start is 1 mm off: the solution itself would be no test.
+        back = drive(alike, (modelled[0] + 1e-3, modelled[1]), unknown, real, named.__getitem__)
+        trip = back.errors(passes.poses, np.zeros(3)).as_array().reshape(-1, 2, 3)
+        errors = np.hstack([taken[0] - tool[0], attitude_error(taken[1], tool[1])])
+        runs.append((real, *taken, errors, np.linalg.norm(trip, axis=2)))
         progress(1)
-    parts = (np.array(part) for part in zip(*runs, strict=True))
-    return Assessment(seeds, ideal, *parts)
-
-
-def _ideal_commands(geometry: HexapodGeometry, passes: Passes, names: Sequence[str]) -> np.ndarray:
-    """Return the strut commands of the nominal machine, shape (P, 6), m."""
-    if not geometry.screw_lead.any():
-        return passes.nominal_commands()
-    ideal = RealMachine(geometry, MachineModel(geometry.name))
-    return model_commands([ideal] * len(passes), passes.poses, passes.senses(), lambda n: names[n])[0]
-
-
-def _run_machine(
-    machine: RealMachine, ideal: np.ndarray, passes: Passes, tool: Poses, names: Sequence[str]
-) -> tuple[np.ndarray, ...]:
-    """Return real lengths, actual tool poses, their errors and round trips of one machine.
-
-    `ideal` are the commands of the nominal machine for the poses, `tool` the tool poses commanded.
-    """
-
-    def name_of(n: int) -> str:
-        return f"{names[n]}, {machine.model.name}"
-
-    machines, unknown = [machine] * len(passes), passes.senses()
-    real, modelled = model_commands(machines, passes.poses, unknown, name_of)
-    driven = drive(machines, passes.poses, unknown, ideal, name_of)
-    taken = machine.geometry.tool_poses(*driven.actual)
-    # The start is 1 mm off: the solution itself would be no test.
-    back = drive(machines, (modelled[0] + 1e-3, modelled[1]), unknown, real, name_of)
-    trip = back.errors(passes.poses, np.zeros(3)).as_array().reshape(-1, 2, 3)
-    errors = np.hstack([taken[0] - tool[0], attitude_error(taken[1], tool[1])])
-    return real, *taken, errors, np.linalg.norm(trip, axis=2)
+    return Assessment(seeds, ideal, *map(np.array, zip(*runs, strict=True)))
