@@ -80,13 +80,10 @@ class ImperfectionBounds:
         if self.field_reversal > 1.0:
             raise ModelError("bounds.field_reversal", "must be at most 1", self.field_reversal)
         if self.field_displacement or self.field_rotation:
-            self._check_box()
-
-    def _check_box(self) -> None:
-        box = np.array(self.field_box if self.field_box is not None else np.nan, dtype=float)
-        if box.shape != (2, 3) or not np.isfinite(box).all() or (box[1] <= box[0]).any():
-            problem = "must be two finite corners, the lower first, m, when there is a field"
-            raise ModelError("bounds.field_box", problem, self.field_box)
+            box = np.array(self.field_box if self.field_box is not None else np.nan, dtype=float)
+            if box.shape != (2, 3) or not np.isfinite(box).all() or (box[1] <= box[0]).any():
+                problem = "must be two finite corners, the lower first, m, when there is a field"
+                raise ModelError("bounds.field_box", problem, self.field_box)
 
 
 def draw_model(geometry: HexapodGeometry, bounds: ImperfectionBounds, seed: int, name: str = "") -> MachineModel:
@@ -112,15 +109,10 @@ def draw_model(geometry: HexapodGeometry, bounds: ImperfectionBounds, seed: int,
         origin=ModelOrigin(note=f"virtual machine drawn with seed {seed}"),
     )
     if bounds.length_map:
-        model = with_length_map(model, geometry, seed, bounds.length_map, _waves_of(geometry))
+        stroke = float(np.ptp(geometry.limits.stroke))
+        shortest, longest = np.maximum(np.multiply(WAVES_OF_STROKE, stroke), LEAST_WAVES).tolist()
+        model = with_length_map(model, geometry, seed, bounds.length_map, (shortest, longest))
     return with_wear(model, geometry, seed, bounds.wear) if bounds.wear else model
-
-
-def _waves_of(geometry: HexapodGeometry) -> tuple[float, float]:
-    """Return the shortest and the longest wavelength of a length map on a machine, m."""
-    stroke = float(np.ptp(geometry.limits.stroke))
-    shortest, longest = (max(share * stroke, least) for share, least in zip(WAVES_OF_STROKE, LEAST_WAVES, strict=True))
-    return shortest, longest
 
 
 def with_length_map(

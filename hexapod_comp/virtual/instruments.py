@@ -105,11 +105,6 @@ def _stopping(template: MeasurementSet, repeatability: float, rng: np.random.Gen
     return repeatability * rng.standard_normal((visit.max() + 1, 3))[visit]
 
 
-def _groups(template: MeasurementSet) -> np.ndarray:
-    """Return a number for each run and channel, shape (N,)."""
-    return template.run * len(CHANNELS) + template.channel
-
-
 def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.random.Generator) -> np.ndarray:
     """Return the true places of the centres of some readings, shape (n, 3), m in ``base``: one draw per run.
 
@@ -130,7 +125,8 @@ def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.
 
 def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
     """Return each reading's zero, the value of its instrument's first reading, shape (N,)."""
-    _, first, group = np.unique(_groups(template), return_index=True, return_inverse=True)
+    groups = template.run * len(CHANNELS) + template.channel
+    _, first, group = np.unique(groups, return_index=True, return_inverse=True)
     absolute = np.isin(np.array(KINDS)[template.kind], ABSOLUTE_KINDS)
     absolute |= np.array([run.known_zero for run in template.runs])[template.run]
     return np.where(absolute, 0.0, value[first][group.ravel()])

@@ -41,8 +41,6 @@ class Overview:
     campaign: ReachedBox
     # (3, 2): how far the tool tilts at home about x, y and z of the work frame, each alone, backward and forward, rad
     tilts: np.ndarray
-    lengths: np.ndarray  # (6,): strut lengths at home, m
-    condition: float  # Condition number at home
     doubts: tuple[str, ...]  # What looks wrong
 
 
@@ -57,8 +55,6 @@ def overview(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> Overview:
         box=box,
         campaign=box if level else machine_box(geometry, cells),
         tilts=_tilts(geometry),
-        lengths=strut_lengths(geometry, geometry.home),
-        condition=condition_number(geometry, geometry.home)[0],
         doubts=(*doubts(geometry), *_screws(geometry)),
     )
 
@@ -96,8 +92,9 @@ def report(overview: Overview) -> str:
     geometry, machine = overview.geometry, overview.reach
     size = " × ".join(f"{edge * 1e3:.1f}" for edge in np.ptp(overview.box.box, axis=0))
     lines = [f"machine {geometry.name}", "", "frames, position mm and α, β, γ °:", _frames(geometry)]
-    lines += ["", "joints, mm; strut at home, mm, and its limits:", _joints(overview)]
-    lines += ["", f"condition number at home {overview.condition:.3f}, allowed {geometry.limits.condition:g}"]
+    lines += ["", "joints, mm; strut at home, mm, and its limits:", _joints(geometry)]
+    condition, _ = condition_number(geometry, geometry.home)
+    lines += ["", f"condition number at home {condition:.3f}, allowed {geometry.limits.condition:g}"]
     lines += ["tool tilts at home, each axis of the work frame alone: " + _tilt_text(overview.tilts)]
     shares = ", ".join(f"{cause} {100.0 * share:.0f} %" for cause, share in machine.shares().items())
     lines += ["", f"reach with the tool as at home: {machine.volume * 1e3:.4g} litres, {corners(machine.box)}"]
@@ -150,11 +147,10 @@ def _frames(geometry: HexapodGeometry) -> str:
     return aligned(["frame", "in", "x", "y", "z", "α", "β", "γ"], rows)
 
 
-def _joints(overview: Overview) -> str:
-    geometry, limits = overview.geometry, overview.geometry.limits
-    rows = []
+def _joints(geometry: HexapodGeometry) -> str:
+    lengths, limits, rows = strut_lengths(geometry, geometry.home), geometry.limits, []
     for n in range(6):
-        places = [*geometry.base_joints[n], *geometry.platform_joints[n], overview.lengths[n], *limits.stroke[n]]
+        places = [*geometry.base_joints[n], *geometry.platform_joints[n], lengths[n], *limits.stroke[n]]
         cones = np.degrees([limits.base_cone[n], limits.platform_cone[n]])
         rows.append([str(n + 1), *(number(value * 1e3, 3) for value in places), *(f"{cone:g}" for cone in cones)])
     head = ["strut", "base x", "y", "z", "platform x", "y", "z", "home", "shortest", "longest", "base °", "platform °"]
@@ -169,8 +165,8 @@ def as_json(overview: Overview) -> dict[str, Any]:
         "frames": {name: {"in": outer, "pose": pose} for name, (outer, pose) in named_frames(geometry).items()},
         "base_joints_m": geometry.base_joints,
         "platform_joints_m": geometry.platform_joints,
-        "home_lengths_m": overview.lengths,
-        "home_condition": overview.condition,
+        "home_lengths_m": strut_lengths(geometry, geometry.home),
+        "home_condition": condition_number(geometry, geometry.home)[0],
         "home_tilts_rad": overview.tilts,
         "reach": {"volume_m3": machine.volume, "box_m": machine.box, "frame": "work", "limits": machine.shares()},
         "largest_box": _box_json(overview.box),
