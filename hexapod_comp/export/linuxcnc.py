@@ -230,8 +230,11 @@ def write_genhexkins(
         raise InputFileError(folder, "", f"cannot be made: {error.strerror}") from error
     size = MACHINE_UNITS[unit]
     titles = [" ".join(title.split()) for title in titles]  # a line break would end the comment
-    bodies = {HAL_FILE: _hal_lines(genhexkins, size), INI_FILE: _ini_lines()}
-    bodies |= {name: _comp_lines(table, size) for name, table in zip(COMP_FILES, genhexkins.tables, strict=True)}
+    bodies: dict[str, list[str]] = {HAL_FILE: _hal_lines(genhexkins, size), INI_FILE: []}
+    for joint, (name, table) in enumerate(zip(COMP_FILES, genhexkins.tables, strict=True)):
+        bodies[INI_FILE] += [f"[JOINT_{joint}]", f"COMP_FILE = {name}", f"COMP_FILE_TYPE = {COMP_TYPE}"]
+        rows = zip(table.nominal / size, *(table.trims / size), strict=True)
+        bodies[name] = [f"{nominal:.9f} {up + 0.0:.12f} {down + 0.0:.12f}" for nominal, up, down in rows]
     titles = [*titles, f"machine unit: {unit}"]
     for name, body in bodies.items():
         about = {HAL_FILE: HAL_ABOUT, INI_FILE: INI_ABOUT}.get(name) or _comp_about(misfit[COMP_FILES.index(name)])
@@ -277,18 +280,6 @@ def _hal_lines(genhexkins: Genhexkins, size: float) -> list[str]:
         for joint, vector in enumerate(getattr(genhexkins, name)):
             values += [(f"{pin}.{joint}.{axis}", v / scale) for axis, v in zip("xyz", vector, strict=True)]
     return [f"setp genhexkins.{pin} {value + 0.0:.12f}" for pin, value in values]
-
-
-def _comp_lines(table: ScrewTable, size: float) -> list[str]:
-    rows = zip(table.nominal / size, *(table.trims / size), strict=True)
-    return [f"{nominal:.9f} {up + 0.0:.12f} {down + 0.0:.12f}" for nominal, up, down in rows]
-
-
-def _ini_lines() -> list[str]:
-    lines = []
-    for joint, name in enumerate(COMP_FILES):
-        lines += [f"[JOINT_{joint}]", f"COMP_FILE = {name}", f"COMP_FILE_TYPE = {COMP_TYPE}"]
-    return lines
 
 
 # Reading back

@@ -214,7 +214,12 @@ def read_table(path: str | Path) -> GridTable:
     rotations = table.numbers(table.required(ROTATION, "angle"))
     ((column, _),) = table.required(("direction",), None)
     table.refuse_unknown()
-    ways = [_direction(path, line, row[column].strip()) for line, row in table.rows]
+    given = [row[column].strip() for _, row in table.rows]
+    for (line, _), text in zip(table.rows, given, strict=True):
+        if text not in DIRECTIONS:
+            where = f"line {line}, column direction"
+            raise InputFileError(path, where, f"must be one of {', '.join(DIRECTIONS)}", text)
+    ways = [DIRECTIONS.index(text) for text in given]
     (directions, *places), order = grid_order(table, np.vstack([ways, positions.T]), "position and direction")
     for axis, coordinates in zip(("direction", *POSITION), (directions, *places), strict=True):
         if len(coordinates) < 2:
@@ -223,9 +228,3 @@ def read_table(path: str | Path) -> GridTable:
     shape = (2, len(x), len(y), len(z))
     grids = (struts, backlash, np.hstack([displacements, rotations]))
     return GridTable((x, y, z), *(values[order].reshape(*shape, 6) for values in grids))
-
-
-def _direction(path: str | Path, line: int, text: str) -> int:
-    if text not in DIRECTIONS:
-        raise InputFileError(path, f"line {line}, column direction", f"must be one of {', '.join(DIRECTIONS)}", text)
-    return DIRECTIONS.index(text)

@@ -103,14 +103,11 @@ def report(overview: Overview) -> str:
     lines += [f"largest box in it: {size} mm, {corners(overview.box.box)}"]
     lines += [f"  {face} stops at {cause}" for face, cause in overview.box.causes.items()]
     if overview.campaign is not overview.box:
-        lines += [f"box for campaigns, tool {_level_text(overview)}: {corners(overview.campaign.box)}"]
+        level = np.array_equal(overview.campaign.rotation.round(12), np.eye(3))
+        tool = "parallel to the work frame" if level else "as at home"
+        lines += [f"box for campaigns, tool {tool}: {corners(overview.campaign.box)}"]
     lines += ["", *(f"look again: {doubt}" for doubt in overview.doubts)] if overview.doubts else []
     return "\n".join(lines)
-
-
-def _level_text(overview: Overview) -> str:
-    level = np.array_equal(overview.campaign.rotation.round(12), np.eye(3))
-    return "parallel to the work frame" if level else "as at home"
 
 
 def corners(box: np.ndarray) -> str:

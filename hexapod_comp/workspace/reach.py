@@ -141,7 +141,8 @@ class Reach:
 
     def shares(self) -> dict[str, float]:
         """Return the share of each limit in the boundary, by name, largest first."""
-        return _shares(self.boundary.findings)
+        codes, counts = np.unique(self.boundary.findings, return_counts=True)
+        return {FINDINGS[codes[i]]: float(counts[i] / counts.sum()) for i in np.argsort(-counts, kind="stable")}
 
 
 def home_orientation(geometry: HexapodGeometry) -> np.ndarray:
@@ -254,11 +255,6 @@ def poses_at(geometry: HexapodGeometry, points: np.ndarray, rotation: np.ndarray
     """Return the platform poses in ``base`` of tool tips (N, 3), m in the work frame, at one orientation."""
     positions, rotations = geometry.platform_poses(points, rotation[None])
     return positions, np.repeat(rotations, len(points), axis=0)
-
-
-def _shares(findings: np.ndarray) -> dict[str, float]:
-    codes, counts = np.unique(findings, return_counts=True)
-    return {FINDINGS[codes[i]]: float(counts[i] / counts.sum()) for i in np.argsort(-counts, kind="stable")}
 
 
 def _empty(rotation: np.ndarray, problem: str) -> GeometryError:

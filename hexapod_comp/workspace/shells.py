@@ -59,38 +59,23 @@ class Shell:
 
 
 def shell(reach: Reach, rings: int, sectors: int) -> Shell:
-    """Find the boundary of a reach along rays from its centre."""
-    ends, findings = _cast(reach, reach.centre, _directions(reach, rings, sectors))
-    points = _closed(ends.reshape(rings, -1, 3))
-    return Shell(reach.geometry, reach.rotation, reach.centre, points, findings.reshape(rings, -1))
-
-
-def _directions(reach: Reach, rings: int, sectors: int) -> np.ndarray:
-    """Return unit vectors, (rings·(sectors + 1), 3), spread over a spheroid as flat as the reach."""
-    box = reach.box[1] - reach.box[0]
+    """Find the boundary of a reach along rays from its centre, spread over a spheroid as flat as the reach."""
+    geometry, origin, size = reach.geometry, reach.centre, np.ptp(reach.box, axis=0)
     elevation = np.linspace(-0.5 * np.pi, 0.5 * np.pi, rings)[:, None]
     azimuth = np.linspace(0.0, 2.0 * np.pi, sectors + 1)
-    across, up = box[:2].mean() * np.cos(elevation), box[2] * np.sin(elevation) + 0.0 * azimuth
+    across, up = size[:2].mean() * np.cos(elevation), size[2] * np.sin(elevation) + 0.0 * azimuth
     directions = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), up], axis=-1).reshape(-1, 3)
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
-
-
-def _cast(reach: Reach, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Follow rays from a point within reach to where they first leave it; return where, and what limits there."""
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     corners = np.array([[axis[0], axis[-1]] for axis in reach.axes])
     farthest = np.linalg.norm(np.abs(corners - origin[:, None]).max(axis=1))  # all of the grid, hence of the reach
-    shares = np.linspace(0.0, farthest, SAMPLES)
-    samples = origin + shares[:, None] * directions[:, None]
-    at_samples, _ = first_limits(reach.geometry, samples.reshape(-1, 3), reach.rotation[None])
+    samples = origin + np.linspace(0.0, farthest, SAMPLES)[:, None] * directions[:, None]
+    at_samples, _ = first_limits(geometry, samples.reshape(-1, 3), reach.rotation[None])
     within = (at_samples == Status.OK).reshape(len(directions), SAMPLES)
     within[:, 0] = True
-    exits = within.argmin(axis=1)
-    ray = np.arange(len(directions))
-    return bisected(reach.geometry, samples[ray, exits - 1], samples[ray, exits], reach.rotation)
-
-
-def _closed(points: np.ndarray) -> np.ndarray:
-    """Make poles and seam exactly one, where cosines of 90° and 360° left rounding."""
+    exits, ray = within.argmin(axis=1), np.arange(len(directions))
+    ends, findings = bisected(geometry, samples[ray, exits - 1], samples[ray, exits], reach.rotation)
+    points = ends.reshape(rings, -1, 3)
+    # Make poles and seam exactly one, where cosines of 90° and 360° left rounding.
     points[:, -1] = points[:, 0]
     points[0], points[-1] = points[0, 0], points[-1, 0]
-    return points
+    return Shell(geometry, reach.rotation, origin, points, findings.reshape(rings, -1))

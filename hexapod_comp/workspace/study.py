@@ -104,7 +104,8 @@ def classify(
     errors = budget.single_errors(geometry, shared_platform_joints)
     reaches = (reach(geometry),) if reaches is None else reaches
     extremes = survey(reaches, errors, method, workers, scheduler, progress)
-    vectors = _finite(effect_vectors(geometry, errors, *random_poses(reaches, COMBINED_POSES, seed), LINEAR))
+    vectors = effect_vectors(geometry, errors, *random_poses(reaches, COMBINED_POSES, seed), LINEAR)
+    vectors = vectors[np.isfinite(vectors).all(axis=(1, 2))]  # at the poses where all effects are known
     return Study(
         *(geometry, budget, errors, reaches, extremes),
         rows=tuple(ranked(extremes, geometry)),
@@ -112,11 +113,6 @@ def classify(
         monte_carlo=monte_carlo(vectors, DRAWS, seed=seed),
         allocation=None if allowed is None else allocate(errors, vectors, allowed),
     )
-
-
-def _finite(vectors: np.ndarray) -> np.ndarray:
-    """Return the effects at the poses where all are known."""
-    return vectors[np.isfinite(vectors).all(axis=(1, 2))]
 
 
 def random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
