@@ -38,6 +38,12 @@ class Comparison:
     before_rotation: Size  # Rotation error, rad
     after_rotation: Size
 
+    @staticmethod
+    def of(before: ToolErrors, after: ToolErrors) -> Comparison:
+        """Return the sizes of errors without and with an export."""
+        sizes = [Size.of(v) for v in (before.displacement, after.displacement, before.rotation, after.rotation)]
+        return Comparison(len(after.displacement), *sizes)
+
 
 @dataclass(frozen=True)
 class ExportCheck:
@@ -88,14 +94,9 @@ class ExportTrial:
         """Compare the tool error without and with an export."""
         commands = [commands_of(trial.passes) for trial in self._trials]
         after = [trial.errors(lengths) for trial, lengths in zip(self._trials, commands, strict=True)]
-        level, *tilted = (_comparison(*pair) for pair in zip(self._before, after, strict=True))
+        level, *tilted = (Comparison.of(*pair) for pair in zip(self._before, after, strict=True))
         grown = [_grown(self._trials[0], commands[0], after[0], readings) for readings in (WARMER, DAMPER)]
         return ExportCheck(level, tilted[0] if tilted else None, Size.of(after[0].field_share), *grown)
-
-
-def _comparison(before: ToolErrors, after: ToolErrors) -> Comparison:
-    sizes = [Size.of(v) for v in (before.displacement, after.displacement, before.rotation, after.rotation)]
-    return Comparison(len(after.displacement), *sizes)
 
 
 def _grown(trial: Trial, commands: np.ndarray, driven: ToolErrors, readings: dict[str, float]) -> Size | None:

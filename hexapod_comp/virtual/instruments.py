@@ -52,7 +52,9 @@ def measure(
     :data:`~hexapod_comp.measurements.readings.LEAST_NOISE`; an instrument without noise states nothing.
     """
     errors = station_errors(template, truth, advance)[template.station]
-    errors[:, :3] += _stopping(template, campaign.repeatability, np.random.default_rng([seed, VISITS]))
+    _, visit = different_rows(np.stack([template.station, template.cycle], axis=1))
+    stops = np.random.default_rng([seed, VISITS]).standard_normal((visit.max() + 1, 3))  # beside the usual place
+    errors[:, :3] += campaign.repeatability * stops[visit]
     value = (template.directions() * errors).sum(axis=1)
     lengths = np.flatnonzero(template.channel == LENGTH)
     centres = _centres(template, lengths, campaign.centre_off, np.random.default_rng([seed, CENTRES]))
@@ -96,13 +98,6 @@ def _station_name(measurements: MeasurementSet, station: int) -> str:
     position = (measurements.stations.positions[station] * 1e3).round(3).tolist()
     run = measurements.runs[measurements.run[reading]].name
     return f"run {run}, reading {reading + 1}, platform at {position} mm in base"
-
-
-def _stopping(template: MeasurementSet, repeatability: float, rng: np.random.Generator) -> np.ndarray:
-    """Return the deviation of the machine's stop from its usual place, shape (N, 3), m; one draw per visit."""
-    visits = np.stack([template.station, template.cycle], axis=1)
-    _, visit = different_rows(visits)
-    return repeatability * rng.standard_normal((visit.max() + 1, 3))[visit]
 
 
 def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.random.Generator) -> np.ndarray:

@@ -163,7 +163,8 @@ def _worst(groups: np.ndarray) -> np.ndarray:
     """Return the largest |Σ ± w| over all signs, (N, G, 6) → (N, 2)."""
     parts = [groups[start : start + CHUNK] for start in range(0, len(groups), CHUNK)]
     farthest = np.concatenate([_farthest(part[..., :3]) for part in parts])
-    return np.stack([farthest, _turns(groups)], axis=1)
+    turns = np.abs(groups[..., 3:]).sum(axis=1).max(axis=1)  # the signs are chosen for each axis
+    return np.stack([farthest, turns], axis=1)
 
 
 def _farthest(ways: np.ndarray) -> np.ndarray:
@@ -182,8 +183,3 @@ def _farthest(ways: np.ndarray) -> np.ndarray:
     corners = [rest + ways[:, one] + turn * ways[:, other] for turn in (1.0, -1.0)]
     corners += [rest - ways[:, one] + turn * ways[:, other] for turn in (1.0, -1.0)]
     return np.sqrt(np.max([(corner**2).sum(axis=2).max(axis=1) for corner in corners], axis=0))
-
-
-def _turns(vectors: np.ndarray) -> np.ndarray:
-    """Return the largest possible rotation about an axis, shape (N,): the signs are chosen for each axis."""
-    return np.abs(vectors[..., 3:]).sum(axis=1).max(axis=1)

@@ -55,7 +55,9 @@ def outline(geometry: HexapodGeometry) -> list[np.ndarray]:
 
 def shells_figure(geometry: HexapodGeometry, layers: Sequence[Layer], quantity: Quantity, title: str) -> Figure:
     """Show shells of the workspace coloured by an effect (v. Daake et al., Figure 2), with the machine at home."""
-    values = _finite_values(layers) * quantity.factor
+    values = np.concatenate([layer.values.ravel() for layer in layers]) * quantity.factor
+    if not np.isfinite(values).all():
+        raise GeometryError("values", "of a mesh must be finite", int((~np.isfinite(values)).sum()))
     norm = Normalize(values.min(), values.max())
     figure = Figure(figsize=(12.0, 6.0), layout="constrained")
     figure.suptitle(picture_text(title))
@@ -104,7 +106,9 @@ def overview_figure(overview: Overview) -> Figure:
     faces, corners = _faces(_in_base(geometry, body.points), 0.0)
     box = _in_base(geometry, _box_edges(overview.box.box))
     figure = Figure(figsize=(14.0, 8.0), layout=ConstrainedLayoutEngine(rect=(0.0, 0.08, 1.0, 0.92)))
-    figure.suptitle(_overview_title(overview))
+    sides = " × ".join(f"{edge * 1e3:.0f}" for edge in np.ptp(overview.box.box, axis=0))
+    reached = f"reach of the tool's tip {overview.reach.volume * 1e3:.3g} litres, largest box {sides} mm"
+    figure.suptitle(f"{picture_text(geometry.name)} at home; {reached}")
     places = figure.add_gridspec(2, 2, width_ratios=[3, 2])
     space: Any = figure.add_subplot(places[:, 0], projection="3d")
     draw_in_space(space, geometry)
@@ -131,12 +135,6 @@ def overview_figure(overview: Overview) -> Figure:
     lines = [Line2D([], [], color=BOX, label="largest box"), *cardan, shadow]
     figure.legend(handles=[*lines, *handles], loc="lower center", ncols=4)
     return figure
-
-
-def _overview_title(overview: Overview) -> str:
-    size = " × ".join(f"{edge * 1e3:.0f}" for edge in np.ptp(overview.box.box, axis=0))
-    name = picture_text(overview.geometry.name)
-    return f"{name} at home; reach of the tool's tip {overview.reach.volume * 1e3:.3g} litres, largest box {size} mm"
 
 
 def _in_base(geometry: HexapodGeometry, points: np.ndarray) -> np.ndarray:
@@ -176,13 +174,6 @@ def _bars(axes: Axes, low: np.ndarray, high: np.ndarray, quantity: Quantity, col
     axes.set_xlim(0.0, 1.28 * high.max())
     axes.set(title=quantity.name, xlabel=f"minimum – maximum over the workspace, {quantity.unit}")
     axes.grid(False, axis="y")
-
-
-def _finite_values(layers: Sequence[Layer]) -> np.ndarray:
-    values = np.concatenate([layer.values.ravel() for layer in layers])
-    if not np.isfinite(values).all():
-        raise GeometryError("values", "of a mesh must be finite", int((~np.isfinite(values)).sum()))
-    return values
 
 
 def _space(figure: Figure, place: SubplotSpec, title: str, elevation: float = VIEW_ELEVATION) -> Any:
