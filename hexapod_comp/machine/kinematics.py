@@ -212,13 +212,19 @@ def solve_poses(
     if lengths.ndim != 2 or lengths.shape[1] != 6:
         raise KinematicsError(f"lengths must have shape (N, 6), not {lengths.shape}", lengths.shape)
     count = len(lengths)
-    guesses = _guesses(guess, count)
+    if isinstance(guess, Pose):
+        starts = np.broadcast_to(guess.position, (count, 3)), np.broadcast_to(guess.rotation, (count, 3, 3))
+    else:
+        starts = np.asarray(guess[0], dtype=float), np.asarray(guess[1], dtype=float)
+    if starts[0].shape != (count, 3) or starts[1].shape != (count, 3, 3):
+        problem = f"guesses must have shapes ({count}, 3) and ({count}, 3, 3), as there are {count} sets of lengths"
+        raise KinematicsError(f"{problem}; not {starts[0].shape} and {starts[1].shape}", starts[0].shape)
     positions, rotations = np.empty((count, 3)), np.empty((count, 3, 3))
     outcomes, iterations = np.empty(count, np.intc), np.empty(count, np.intc)
     conditions = np.empty(count)
 
     def run(rows: slice) -> None:
-        positions[rows], rotations[rows] = guesses[0][rows], guesses[1][rows]
+        positions[rows], rotations[rows] = starts[0][rows], starts[1][rows]
         given = lengths[rows], positions[rows], rotations[rows]
         results = outcomes[rows], iterations[rows], conditions[rows]
         batch.solve_poses(*structure.joints, *given, *structure.solver, *results)
@@ -228,17 +234,6 @@ def solve_poses(
     positions[failed] = np.nan
     rotations[failed] = np.nan
     return ForwardBatch(positions, rotations, outcomes, iterations, conditions)
-
-
-def _guesses(guess: Pose | tuple[np.ndarray, np.ndarray], count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and rotations with a start for each row."""
-    if isinstance(guess, Pose):
-        return np.broadcast_to(guess.position, (count, 3)), np.broadcast_to(guess.rotation, (count, 3, 3))
-    positions, rotations = (np.asarray(rows, dtype=float) for rows in guess)
-    if positions.shape != (count, 3) or rotations.shape != (count, 3, 3):
-        problem = f"guesses must have shapes ({count}, 3) and ({count}, 3, 3), as there are {count} sets of lengths"
-        raise KinematicsError(f"{problem}; not {positions.shape} and {rotations.shape}", positions.shape)
-    return positions, rotations
 
 
 def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = None, first: int = FIRST_SLICE) -> None:

@@ -58,16 +58,14 @@ class Surroundings:
             lags = late(self.times, self.temperatures, constants)
         bits = np.hstack([around.numbers(), np.ascontiguousarray(lags.reshape(count, -1)).view(np.int64)])
         first, number = different_rows(bits)
-        different = [around._machine(machine, n, lags[n]) for n in first.tolist()]
+        different = []
+        for n in first.tolist():
+            readings = dict(zip(PARTS, around.temperatures[n].tolist(), strict=True))
+            if math.isfinite(around.humidity[n]):
+                readings[HUMIDITY] = float(around.humidity[n])
+            behind = {name: Lag(math.nan, math.nan, row) for name, row in zip(PARTS, lags[n].tolist(), strict=True)}
+            mass, x, y, z, *gravity = around.loads[n].tolist()
+            payload = None if math.isnan(mass) else Payload(mass, (x, y, z))
+            now = Temperatures(readings, behind if lags.size else {})
+            different.append(machine.at(now, payload, None if math.isnan(gravity[0]) else gravity))
         return [different[n] for n in number.tolist()]
-
-    def _machine(self, machine: RealMachine, n: int, lags: np.ndarray) -> RealMachine:
-        """Return the machine at a place; its parts lag behind their thermometers by `lags`, (8, time constants)."""
-        readings = dict(zip(PARTS, self.temperatures[n].tolist(), strict=True))
-        if math.isfinite(self.humidity[n]):
-            readings[HUMIDITY] = float(self.humidity[n])
-        late_parts = dict(zip(PARTS, lags.tolist(), strict=True)) if lags.size else {}
-        behind = {name: Lag(math.nan, math.nan, row) for name, row in late_parts.items()}
-        mass, x, y, z, *gravity = self.loads[n].tolist()
-        payload = None if math.isnan(mass) else Payload(mass, (x, y, z))
-        return machine.at(Temperatures(readings, behind), payload, None if math.isnan(gravity[0]) else gravity)
