@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,17 +30,6 @@ from .carried import refuse_unknown
 CORE, AROUND = Path(__file__).parents[1] / "core", Path(__file__).parent / "c"
 PERIOD = 0.004  # Between two commands of the self-test, s
 MODEL_FILE, VECTORS_FILE = "hexapod_model.h", "hexapod_vectors.h"
-
-
-@dataclass(frozen=True)
-class Vector:
-    """One line of the self-test: what the core is given, and what it must answer."""
-
-    kind: str  # command, pose estimate, temperature, gravity, enable, forget, reset to measured struts: c p t g e f r
-    values: tuple[float, ...]  # as the core's function takes them
-    time: float  # of a command, s
-    status: int  # hc_status
-    expected: tuple[float, ...]  # strut commands, m; of an estimate, position, m, and last row of the rotation matrix
 
 
 def write_c(folder: str | Path, geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str]) -> list[Path]:
@@ -113,8 +101,8 @@ def _numbers(value: Any) -> str:
     return str(value) if isinstance(value, int) else repr(value).replace("inf", "HUGE_VAL").replace("nan", "NAN")
 
 
-def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> list[Vector]:
-    """Return commands, refusals and estimates, answered by the Python compensator.
+def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> list[str]:
+    """Return commands, refusals and estimates, answered by the Python compensator, as rows of C.
 
     A stream of small moves around home, there and back; on the way temperatures and gravity change, compensation
     is switched, a command is too far, one is not finite, one has no unit quaternion, and it starts again from measured
@@ -143,7 +131,7 @@ def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> 
     recorder.commands(stream[::-1][: quarter + 1])
     recorder.record("f", ())
     recorder.commands(stream[:3])
-    return recorder.vectors
+    return recorder.rows
 
 
 def _near_home(geometry: HexapodGeometry, random: np.random.Generator) -> Pose:
@@ -161,11 +149,11 @@ def _near_home(geometry: HexapodGeometry, random: np.random.Generator) -> Pose:
 
 
 class Recorder:
-    """Runs a Python compensator and records its inputs and answers."""
+    """Runs a Python compensator and records its inputs and answers, as rows of C's ``hexapod_vector``."""
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel) -> None:
         self.compensator = Compensator(geometry, model, DEFAULT_RAMP_RATE)
-        self.vectors: list[Vector] = []
+        self.rows: list[str] = []
         self.time = 100.0
 
     def commands(self, poses: Iterable[Pose]) -> None:
@@ -174,7 +162,11 @@ class Recorder:
             self.record("c", (*pose.position, *pose.quaternion()))
 
     def record(self, kind: str, values: tuple[float, ...]) -> None:
-        """Do one step, and record it."""
+        """Do one step, and record it: its kind, the core's status, the time, s, what the core is given and answers.
+
+        Kinds: command, pose estimate, temperature, gravity, enable, forget, reset to measured struts: c p t g e f r.
+        The core answers strut commands, m; an estimate by a position, m, and the last row of its rotation matrix.
+        """
         compensator, status = self.compensator, 0
         self.time += PERIOD
         expected = np.zeros(6)
@@ -197,7 +189,9 @@ class Recorder:
             expected = np.full(6, np.nan) if kind == "p" else expected
         if kind == "c":
             expected = compensator.command
-        self.vectors.append(Vector(kind, tuple(map(float, values)), self.time, status, tuple(expected.tolist())))
+        given = [*map(float, values), *[0.0] * (7 - len(values))]
+        numbers = f"{self.time!r}, {_numbers(given)}, {_numbers(expected.tolist())}"
+        self.rows.append(f"    {{'{kind}', {status}, {numbers}}},\n")
 
 
 def status_of(error: HexapodError) -> int:
@@ -209,12 +203,8 @@ def status_of(error: HexapodError) -> int:
     return min(int(status) for status in Status if ffi.string(lib.hc_reason(status)).decode() == error.reason)
 
 
-def vectors_header(vectors: Sequence[Vector]) -> str:
+def vectors_header(rows: Sequence[str]) -> str:
     """Return ``hexapod_vectors.h``."""
-    rows = ""
-    for v in vectors:
-        numbers = f"{v.time!r}, {_numbers(v.values + (7 - len(v.values)) * (0.0,))}, {_numbers(v.expected)}"
-        rows += f"    {{'{v.kind}', {v.status}, {numbers}}},\n"
     return f"""\
 /* Written by hexapod_comp export --c: what the Python compensator answered, for hexapod_selftest.c. */
 #ifndef HEXAPOD_VECTORS_H
@@ -231,7 +221,7 @@ typedef struct {{
 static const double hexapod_ramp_rate = {DEFAULT_RAMP_RATE!r};
 
 static const hexapod_vector hexapod_vectors[] = {{
-{rows}}};
+{"".join(rows)}}};
 
 #endif
 """
