@@ -84,6 +84,7 @@ def test_screw_pitch_comes_first_as_in_the_paper():
     records = json.loads(json.dumps(ranking_rows(rows)))
     assert [record["rank"] for record in records] == [1, 2, 3, 4]
     assert records[0]["translation_max_um"] == pytest.approx(largest[0] * 1e6)
+    assert records[0]["rotation_min_mdeg"] == pytest.approx(np.degrees(rows[0].figures()[3]) * 1e3)
     assert all(words in ranking_text(rows) for words in ("screw pitch", "strut_", "transl. max µm", "rot. max m°"))
 
 
@@ -246,7 +247,11 @@ def test_units_are_read_from_the_keys(tmp_path: Path) -> None:
 
 
 def test_a_budget_that_is_none_is_refused(tmp_path: Path) -> None:
-    for text, complaint in ((HEAD, "errors: is missing"), (f"{HEAD}errors: {{screw_pitch_um: 20}}\nnote: x\n", "note")):
+    for text, complaint in (
+        (HEAD, "errors: is missing"),
+        (f"{HEAD}errors: {{screw_pitch_um: 20}}\nnote: x\n", "note"),
+        (f"{HEAD}errors: {{screw_pitch_um: 20, wobble_um: 1}}\n", "errors.wobble_um: is no error type with its unit"),
+    ):
         with pytest.raises(InputFileError, match=rf"budget\.yaml: .*{complaint}"):
             read(tmp_path, text)
     for sizes, key in (({}, "errors"), ({"wobble": 1e-6}, "errors.wobble"), ({"backlash": np.nan}, "errors.backlash")):
