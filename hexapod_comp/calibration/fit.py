@@ -197,7 +197,7 @@ def _drop_outlier_runs(
         of_cell = kept.run[Estimation(kept, begun.everything.space, alone=False).cells.first]
         worst = int(influence(of_cell, error.solution).argmax())
         names.append(kept.runs[worst].name)
-        progress(f"does not settle: without run {names[-1]}, which pulls most")
+        progress(f"does not settle: trying without run {names[-1]}, which has the largest influence")
         kept = kept.select(kept.run != worst)
         try:
             fit = _fit(kept, _begin(kept, begun.everything.space.settings, progress), progress, datum)

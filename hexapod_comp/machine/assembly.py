@@ -17,7 +17,7 @@ from .kinematics import Structure, six_lengths, solve_poses
 DISTINCT = 1e-6
 # A machine has at most forty modes (Raghavan 1993) unless it can move with all struts locked
 MOST_MODES = 40
-MOVES = "the machine moves with its struts locked at these lengths: its pose is open"
+MOVES = "the machine can move with its struts locked at these lengths: they do not determine its pose"
 ORIENTATIONS = 2000  # Attitudes from which modes are sought, two positions each
 AMBIGUITY = 1.2  # A cold start is refused when the second-nearest candidate is within this factor of the nearest
 

@@ -444,7 +444,9 @@ def measured_region(model: MachineModel) -> Region:
     """Return the region of a model's measurement."""
     region = model.measured
     if region is None:
-        raise ModelError("region", "the model tells of no box in which it was measured; give a box of tool positions")
+        raise ModelError(
+            "region", "the model does not state the box in which it was measured; give a box of tool positions"
+        )
     return region
 
 

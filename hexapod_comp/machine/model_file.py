@@ -196,7 +196,7 @@ def _refuse_cut_off(top: Section) -> None:
     for key in marks:
         value = top.require(key)
         if value is not True:
-            raise top.error(key, "must be true, or be left out together with its fellow", value)
+            raise top.error(key, "must be true; `closed` and `end` stand both or neither", value)
     if marks == ["closed"]:
         raise top.error("end", "is missing: the file is cut off, or still being written")
     if marks == ["end"]:

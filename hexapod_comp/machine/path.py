@@ -98,7 +98,7 @@ class Leg:
         self.start, self.end, self.pivot = start, end, pivot
         self.turn = attitude_error(end.rotation, start.rotation)  # In ``work``
         if np.linalg.norm(self.turn) > np.pi - HALF_TURN:
-            raise PoseError("a turn by 180° has two shortest ways: give a way point between", np.degrees(self.turn))
+            raise PoseError("a turn by 180° has two shortest ways: give a pose in between", np.degrees(self.turn))
         self.origin = start.position + start.rotation @ pivot
         self.travel = end.position + end.rotation @ pivot - self.origin
         # In ``work``: base joints, and platform joints seen from the pivot

@@ -382,7 +382,7 @@ class Campaign:
         if self.diagonals not in DIAGONALS:
             raise ModelError("diagonals", f"must be one of {DIAGONALS}", self.diagonals)
         if not (1 <= self.cycles <= MOST_READINGS and 0 <= self.poses <= MOST_READINGS):
-            problem = f"must be at least 1 and 0, and at most {MOST_READINGS}"
+            problem = f"must be 1 or more cycles and 0 or more poses, at most {MOST_READINGS} of each"
             raise ModelError("cycles, poses", problem, [self.cycles, self.poses])
         if not (self.instrument or self.diagonals or self.poses or self.runs):
             raise ModelError("instrument", "or diagonals, poses or runs: nothing is measured")

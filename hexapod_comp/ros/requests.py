@@ -175,7 +175,7 @@ class ToolChoice:
         for name in (parameter.value for parameter in parameters if parameter.name == "tool"):
             if name != self._compensator.geometry.tool_name:
                 self._compensator.set_tool(name)
-                self._node.note("tool", f"tool {name!r}: the next command must be where the struts are")
+                self._node.note("tool", f"tool {name!r}: the next command must be at the struts' present position")
                 self._publish()
 
     def _on_message(self, data: bytes, sample: Sample) -> None:

@@ -341,7 +341,7 @@ def test_verb_tells_when_an_export_makes_it_worse(tmp_path: Path, monkeypatch: p
     assert run_verb(*box) == 0
     with pytest.raises(InputFileError, match="cannot be made"):
         run_verb("--linuxcnc", "/nonexistent/folder/x", "--box=-9,-9,390,9,9,410")
-    with pytest.raises(HexapodError, match="tells of no box in which it was measured"):
+    with pytest.raises(HexapodError, match="does not state the box in which it was measured"):
         run_verb("--linuxcnc", str(tmp_path))
     read = read_genhexkins
 
