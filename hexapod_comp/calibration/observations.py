@@ -287,7 +287,8 @@ class Cells:
         return Zeros(zeros, along), lengths
 
     def squares(self) -> list[np.ndarray]:
-        """Return, for each square and axis, all cells whose values change when the square turns about that axis."""
+        """Return, for each square and axis, all cells of the groups whose slope is that of the square about the
+        axis."""
         numbers = np.unique(self.square[self.square >= 0])
         return [np.flatnonzero(np.isin(self.group, self.group[self.square == n])) for n in numbers]
 

@@ -374,7 +374,8 @@ def _lines(given: Sequence[Reading], points: np.ndarray) -> dict[str, _Line]:
 def _whole(
     file: str, given: Sequence[Reading], visits: Sequence[tuple], channels: Sequence[str], wrong: str
 ) -> Iterator[tuple[tuple, Reading, tuple[float, ...]]]:
-    """Yield the visits at which all channels of a group were read: the first reading, and all values."""
+    """Yield the visits at which channels were read that must all be read together: the first reading, and all
+    values."""
     by_visit: dict[tuple, dict[str, Reading]] = {}
     for r, visit in zip(given, visits, strict=True):
         if r.channel in channels:
