@@ -83,59 +83,37 @@ NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.
 UNIT = re.compile(r"_(?:mm_s|mm|um|m|in|deg|rad|urad|mrad|arcsec|ppm_per_K|ppm|percent|ms|s|degC)\b(?=\s*[:,\r\n])")
 
 
-def _number(text: str, place: int, span: int, token: str) -> str:
-    found = list(NUMBER.finditer(text))
-    return _replaced(text, found[place % len(found)].span(), token) if found else text
+# What may happen to a part of a file; numbers most often
+EDITS = ("number", "number", "number", "unit", "overwrite", "overwrite", "byte", "cut", "copy")
+EDITS += ("drop line", "repeat line", "swap lines")
 
 
-def _unit(text: str, place: int, span: int, token: str) -> str:
-    found = list(UNIT.finditer(text))
-    return _replaced(text, found[place % len(found)].span(), UNIT_NAMES[span % len(UNIT_NAMES)]) if found else text
-
-
-def _replaced(text: str, span: tuple[int, int], token: str) -> str:
-    return text[: span[0]] + token + text[span[1] :]
-
-
-def _overwrite(text: str, place: int, span: int, token: str) -> str:
-    start = place % (len(text) + 1)
-    return text[:start] + token + text[start + span % 9 :]
-
-
-def _byte(text: str, place: int, span: int, token: str) -> str:
-    start = place % (len(text) + 1)
-    return text[:start] + chr(span % 256) + text[start + 1 :]
-
-
-def _cut(text: str, place: int, span: int, token: str) -> str:
-    return text[: place % (len(text) + 1)]
-
-
-def _copy(text: str, place: int, span: int, token: str) -> str:
-    start, to = place % (len(text) + 1), span % (len(text) + 1)
-    return text[:to] + text[start : start + 60] + text[to:]
-
-
-def _lines(change: Callable[[list[str], int, int], None]) -> Callable[[str, int, int, str], str]:
-    def edit(text: str, place: int, span: int, token: str) -> str:
-        lines = text.splitlines(keepends=True)
-        if lines:
-            change(lines, place % len(lines), span % len(lines))
+def edited(text: str, edit: str, place: int, span: int, token: str) -> str:
+    """Return a text after one of :data:`EDITS`."""
+    if edit in ("number", "unit"):
+        found = list((NUMBER if edit == "number" else UNIT).finditer(text))
+        if not found:
+            return text
+        start, end = found[place % len(found)].span()
+        return text[:start] + (token if edit == "number" else UNIT_NAMES[span % len(UNIT_NAMES)]) + text[end:]
+    if edit.endswith(("line", "lines")):
+        lines = text.splitlines(keepends=True) or [""]
+        one, other = place % len(lines), span % len(lines)
+        if edit == "drop line":
+            del lines[one]
+        elif edit == "repeat line":
+            lines.insert(other, lines[one])
+        else:
+            lines[one], lines[other] = lines[other], lines[one]
         return "".join(lines)
-
-    return edit
-
-
-def _drop(lines: list[str], i: int, j: int) -> None:
-    del lines[i]
-
-
-def _repeat(lines: list[str], i: int, j: int) -> None:
-    lines.insert(j, lines[i])
-
-
-def _swap(lines: list[str], i: int, j: int) -> None:
-    lines[i], lines[j] = lines[j], lines[i]
+    start, to = place % (len(text) + 1), span % (len(text) + 1)
+    if edit == "cut":
+        return text[:start]
+    if edit == "copy":
+        return text[:to] + text[start : start + 60] + text[to:]
+    if edit == "byte":
+        return text[:start] + chr(span % 256) + text[start + 1 :]
+    return text[:start] + token + text[start + span % 9 :]
 
 
 # What whole files suffer on their way: encodings, line ends, spreadsheets
@@ -156,11 +134,6 @@ WHOLE: tuple[Callable[[bytes], bytes], ...] = (
     lambda data: data.upper(),
 )
 
-EDITS: tuple[Callable[[str, int, int, str], str], ...] = (
-    *(_number, _number, _number, _unit, _overwrite, _overwrite, _byte, _cut, _copy),
-    *(_lines(_drop), _lines(_repeat), _lines(_swap)),
-)
-
 places = st.integers(0, 1 << 14)
 # What is done to a file: (which edit, place, span, token) each; see :func:`mutated`
 edits = st.lists(st.tuples(st.integers(0, len(EDITS)), places, places, tokens), min_size=1, max_size=3)
@@ -173,7 +146,7 @@ def mutated(data: bytes, changes: list[tuple[int, int, int, str]]) -> bytes:
             data = WHOLE[place % len(WHOLE)](data)
         else:
             raw = token.encode("utf-8", "surrogatepass").decode("latin-1")
-            data = EDITS[kind](data.decode("latin-1"), place, span, raw).encode("latin-1")
+            data = edited(data.decode("latin-1"), EDITS[kind], place, span, raw).encode("latin-1")
     return data
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers import long_test
 
-from benchmarks import kinematics, rubin
+from benchmarks import rubin
 from benchmarks.genhexkins import Genhexkins, NotHere, emc_poses, si_poses
 from benchmarks.kinematics import make_poses
 from benchmarks.network import refusal, without_udp_checksum
@@ -125,15 +125,3 @@ def test_poses_are_linuxcncs(genhexkins):
     positions, rotations = si_poses(found)
     np.testing.assert_allclose(positions, poses.positions, rtol=0.0, atol=1e-11)
     np.testing.assert_allclose(rotations, poses.rotations, rtol=0.0, atol=1e-10)
-
-
-def test_ours_converges_at_yaws_where_theirs_cannot(genhexkins):
-    """From 60° on the step error of genhexkins is 2·sin(ψ/2) ≥ 1 times the last one."""
-    found = kinematics.convergence(np.array([0.0, 60.0, 70.0, 80.0]), 50)
-    assert found == [[1.0, 1.0], [1.0, 0.0], [1.0, 0.0], [1.0, 0.0]]
-
-
-def test_nothing_that_is_not_so_is_called_solved(genhexkins):
-    solved, *wrong = kinematics.honesty(2000)[:, 0]
-    assert solved > 500
-    assert wrong == [0, 0, 0]
