@@ -326,7 +326,8 @@ def whitened_precision(problem: LinearProblem, posterior: Posterior) -> np.ndarr
 
 
 def _whitened(noise: np.ndarray, information: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Return the same from the noise (kinds,) and the information (kinds, n, n) of each kind, and the spread (n,)."""
+    """Return :func:`whitened_precision` of the noise (kinds,) and the information (kinds, n, n) of each kind, and the
+    spread (n,)."""
     precision = np.tensordot(noise**-2, information, 1)
     precision *= spread[:, None] * spread
     precision[np.diag_indices_from(precision)] += 1.0

@@ -501,7 +501,7 @@ def _columns(pattern: str, names: Sequence[str], values: np.ndarray, digits: int
 
 
 def _rows(columns: Mapping[str, Sequence[str]], count: int) -> list[tuple[str, ...]]:
-    """Return the rows of columns of cells."""
+    """Return columns of cells as rows."""
     return list(zip(*columns.values(), strict=True)) if columns else [()] * count
 
 
