@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import io
 import json
 import threading
 from collections.abc import Iterator
@@ -36,6 +37,7 @@ from foreign_machines import (
 from helpers import hexapod, quick_pictures
 from scipy.spatial.transform import Rotation
 
+from hexapod_comp import cli
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import ErrorPredictor, FittedParameters
@@ -87,10 +89,11 @@ class Animal:
 
 
 def said(*words: object, code: int = 0) -> str:
-    """Run the command in this process, and return what it prints."""
-    found, out, err = hexapod(*words)
-    assert found == code, f"{words}: {found}\n{out}{err}"
-    return out
+    """Run the command in this process, and return what it prints; stderr stays, since ROS's log needs a real one."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        found = cli.main([str(word) for word in words])
+    assert found == code, f"{words}: {found}\n{out.getvalue()}"
+    return out.getvalue()
 
 
 @pytest.fixture(scope="module", params=machine_names())
