@@ -21,8 +21,8 @@ from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.sensitivity import predict
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
+from hexapod_comp.measurements.files import read_measurements
 from hexapod_comp.measurements.readings import AXES, CHANNELS, KINDS, MeasurementSet
-from hexapod_comp.measurements.wide_csv import read_wide
 
 from . import cannot_run
 from .drawn import each
@@ -37,7 +37,7 @@ POSES_BAR, GRID_BAR = 1.08e-3, 0.96  # m: what an independent fit of 48 paramete
 
 def read(folder: Path, name: str, columns: str) -> MeasurementSet:
     geometry = load_geometry(ROOT / "config" / "jugglebot.yaml")
-    return read_wide(folder / name, ROOT / "config" / columns, geometry)
+    return read_measurements(folder / name, geometry, ROOT / "config" / columns)
 
 
 def position_squares(measured: MeasurementSet, errors: np.ndarray) -> np.ndarray:

@@ -163,6 +163,58 @@ def roll_pitch_yaw(rotation: np.ndarray) -> np.ndarray:
     return np.array([roll, pitch, yaw])
 
 
+# SciPy's Rotation has all of these; loading it takes 27 MB, and a fifth of a second.
+
+
+def rotation_from_vector(vector: np.ndarray) -> np.ndarray:
+    """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3), rad (Rodrigues)."""
+    vector = np.asarray(vector, dtype=float)
+    angle = np.sqrt((vector * vector).sum(axis=-1))[..., None, None]
+    sine, cosine = np.sinc(angle / np.pi), 0.5 * np.sinc(0.5 * angle / np.pi) ** 2  # sin θ / θ and (1 − cos θ) / θ²
+    outer = vector[..., :, None] * vector[..., None, :]
+    return np.cos(angle) * np.eye(3) + sine * _cross_matrix(vector) + cosine * outer
+
+
+def rotation_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
+    """Return the rotation matrices (..., 3, 3) of quaternions (..., 4), x, y, z, w, of any norm above zero."""
+    quaternion = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    across = _cross_matrix(quaternion[..., :3])
+    return np.eye(3) + 2.0 * (quaternion[..., 3, None, None] * across + across @ across)
+
+
+def rotation_vector(rotation: np.ndarray) -> np.ndarray:
+    """Return the rotation vectors (..., 3), rad, no longer than π, of rotation matrices (..., 3, 3)."""
+    r = np.asarray(rotation, dtype=float)
+    # Four times the products of the quaternion's components: each row is the quaternion, times one of them
+    products = np.empty((*r.shape[:-2], 4, 4))
+    symmetric, difference = r + np.swapaxes(r, -1, -2), r - np.swapaxes(r, -1, -2)
+    trace = np.trace(r, axis1=-2, axis2=-1)[..., None]
+    products[..., :3, :3] = symmetric + (1.0 - trace[..., None]) * np.eye(3)
+    sines = np.stack([difference[..., 2, 1], difference[..., 0, 2], difference[..., 1, 0]], axis=-1)
+    products[..., :3, 3] = products[..., 3, :3] = sines
+    products[..., 3, 3] = 1.0 + trace[..., 0]
+    largest = np.diagonal(products, axis1=-2, axis2=-1).argmax(axis=-1)
+    quaternion = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
+    quaternion = np.where(quaternion[..., 3:] < 0.0, -quaternion, quaternion)
+    size = np.linalg.norm(quaternion[..., :3], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(size, quaternion[..., 3:])
+    return quaternion[..., :3] * (angle / np.where(size > 0.0, size, 1.0))
+
+
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """Return the rotations nearest to matrices (..., 3, 3): of a sum of rotations, their mean."""
+    left, _, right = np.linalg.svd(matrix)
+    left[..., 2] *= np.linalg.det(left @ right)[..., None]
+    return np.asarray(left @ right)
+
+
+def _cross_matrix(vector: np.ndarray) -> np.ndarray:
+    """Return the matrices (..., 3, 3) of the cross products with vectors (..., 3)."""
+    half = np.zeros((*vector.shape, 3))
+    half[..., 2, 1], half[..., 0, 2], half[..., 1, 0] = np.moveaxis(vector, -1, 0)
+    return half - half.swapaxes(-1, -2)
+
+
 def rotation_angle(rotation: np.ndarray) -> float:
     """Return the angle of a rotation matrix, radians in [0, π]."""
     *vector, scalar = quaternion_of(rotation)
@@ -171,19 +223,15 @@ def rotation_angle(rotation: np.ndarray) -> float:
 
 def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:
     """Return the rotation vector(s) that turn commanded into actual rotations, rad in their common frame."""
-    from scipy.spatial.transform import Rotation  # 27 MB with its dependencies, which a node avoids
-
-    return Rotation.from_matrix(actual @ np.swapaxes(commanded, -1, -2)).as_rotvec()
+    return rotation_vector(actual @ np.swapaxes(commanded, -1, -2))
 
 
 def middle_pose(poses: Sequence[Pose]) -> tuple[Pose, np.ndarray]:
     """Return the median of poses near each other, and how far each lies from it, (n, 6), m and rad, in their frame."""
-    from scipy.spatial.transform import Rotation  # As in attitude_error
-
     first = poses[0].rotation
     numbers = np.array([[*pose.position, *attitude_error(pose.rotation, first)] for pose in poses])
     middle = np.median(numbers, axis=0)
-    return Pose(middle[:3], Rotation.from_rotvec(middle[3:]).as_matrix() @ first), numbers - middle
+    return Pose(middle[:3], rotation_from_vector(middle[3:]) @ first), numbers - middle
 
 
 def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
@@ -191,13 +239,11 @@ def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
 
     None for fewer than three points or points in a line, which do not determine a turn.
     """
-    from scipy.spatial.transform import Rotation  # As in attitude_error
-
     centre, mean = onto.mean(axis=0), points.mean(axis=0)
     spread = np.linalg.svd(onto - centre, compute_uv=False)
     if len(points) < 3 or spread[1] <= IN_A_LINE * spread[0]:
         return None
-    turn = Rotation.align_vectors(onto - centre, points - mean)[0].as_matrix()
+    turn = nearest_rotation((onto - centre).T @ (points - mean))
     return Pose(centre - turn @ mean, turn)
 
 

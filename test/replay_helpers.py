@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from hexapod_comp.compensation.compensator import Compensator, pack_pose
 from hexapod_comp.compensation.journal import SNAPSHOT_PERIOD, Journal, Source, sources_text, time_of
 from hexapod_comp.errors import HexapodError
-from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.pose import Pose
 
 CONFIG = Path(__file__).resolve().parents[1] / "config"
@@ -30,9 +29,6 @@ KINDS = {
     "tool_pose_command": "geometry_msgs/msg/PoseStamped",
     "tool_pose_estimate": "geometry_msgs/msg/PoseStamped",
     "tool_pose_true": "geometry_msgs/msg/PoseStamped",
-    "strut_commands": "sensor_msgs/msg/JointState",
-    "strut_corrections": "sensor_msgs/msg/JointState",
-    "strut_states": "sensor_msgs/msg/JointState",
     "compensator/journal": "std_msgs/msg/String",
     "compensator/files": "std_msgs/msg/String",
 }
@@ -89,15 +85,7 @@ def serialized(kind: str, message: Any) -> bytes:
 
 
 class RecordedMachine:
-    """A compensator and its journal, all of whose messages are kept: what a recorder would have seen.
-
-    Parameters
-    ----------
-    namespace : str
-        ``/mill`` or nothing.
-    model, geometry : str or Path
-        Model file and geometry file.
-    """
+    """A compensator and its journal, with all messages that a replay reads or counts: what a recorder has seen."""
 
     def __init__(
         self,
@@ -130,12 +118,6 @@ class RecordedMachine:
         """Return a header."""
         time = TYPES["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9)
         return TYPES["std_msgs/msg/Header"](time, frame)
-
-    def keep_struts(self, topic: str, stamp: int, lengths: np.ndarray) -> None:
-        """Keep a message of six struts."""
-        numbers = np.array(lengths, dtype=float)
-        joint_state = TYPES["sensor_msgs/msg/JointState"]
-        self.keep(topic, joint_state(self.header(stamp), list(STRUT_NAMES), numbers, np.zeros(6), np.zeros(0)))
 
     def keep_pose(self, topic: str, stamp: int, pose: Pose, frame: str = "base") -> tuple[float, ...]:
         """Keep a message of a pose; return its seven numbers."""
@@ -172,8 +154,6 @@ class RecordedMachine:
         self.compensator.published(received + 2e-4)
         self.journal.answered(self.now, frame, numbers, (received, received + 2e-4), stamped)
         self.answers.append(np.array([self.compensator.command, self.compensator.correction]))
-        self.keep_struts("strut_commands", self.now, self.compensator.command)
-        self.keep_struts("strut_corrections", self.now, self.compensator.correction)
         return True
 
     def wave(self, count: int, start: int = 0) -> None:

@@ -14,9 +14,13 @@ from hexapod_comp.pose import (
     Pose,
     angles_from_rotation,
     best_motion,
+    nearest_rotation,
     roll_pitch_yaw,
     rotation_angle,
     rotation_from_angles,
+    rotation_from_quaternion,
+    rotation_from_vector,
+    rotation_vector,
 )
 
 EXACT = 4e-16  # A rotation matrix's elements are sums of two products of numbers up to 1
@@ -140,3 +144,25 @@ def test_the_best_motion_takes_points_back_to_where_they_came_from():
     for count in (2, 7):
         line = np.linspace(0.0, 1.0, count)[:, None] * [0.1, 0.2, -0.3] + [1.0, 2.0, 3.0]
         assert best_motion(line + 1e-4, line) is None
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-5, 0.5, 2.0, np.pi - 1e-9, np.pi])
+def test_rotation_vectors_are_those_of_scipy(angle: float) -> None:
+    """Truth: SciPy's Rotation, both ways and by quaternions. At π a vector's sign is free, its rotation not."""
+    axes = np.vstack([np.random.default_rng(4).normal(size=(50, 3)), np.eye(3), -np.eye(3)])
+    vectors = angle * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    truth = Rotation.from_rotvec(vectors)
+    np.testing.assert_allclose(rotation_from_vector(vectors), truth.as_matrix(), atol=2e-15)
+    np.testing.assert_allclose(rotation_from_quaternion(3.0 * truth.as_quat()), truth.as_matrix(), atol=2e-15)
+    found = rotation_vector(truth.as_matrix())
+    np.testing.assert_allclose(Rotation.from_rotvec(found).as_matrix(), truth.as_matrix(), atol=4e-15)
+    if angle < 3.1:
+        np.testing.assert_allclose(found, vectors, rtol=1e-14, atol=angle * 1e-15)
+    np.testing.assert_allclose(rotation_vector(truth.as_matrix()[0]), found[0], rtol=1e-15)
+
+
+def test_the_nearest_rotation_to_a_sum_is_the_mean() -> None:
+    """Truth: SciPy's mean; of a matrix with a negative determinant still a rotation."""
+    some = Rotation.from_rotvec(0.4 * np.random.default_rng(5).normal(size=(9, 3)))
+    np.testing.assert_allclose(nearest_rotation(some.as_matrix().sum(axis=0)), some.mean().as_matrix(), atol=1e-14)
+    assert np.linalg.det(nearest_rotation(np.diag([1.0, 1.0, -0.5]))) == pytest.approx(1.0)

@@ -13,13 +13,12 @@ from itertools import combinations, permutations, product
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import MachineModel
 from ..machine.passes import Passes
 from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_KINDS, MeasurementSet, Run
-from ..pose import angles_from_rotation
+from ..pose import angles_from_rotation, rotation_from_vector
 from ..virtual.instruments import compensated
 
 PARALLEL = 0.999  # cosine from which a line is parallel to an axis
@@ -87,7 +86,7 @@ def mistakes_of_place(m: MeasurementSet) -> Iterator[Mistake]:
         yield Mistake(f"{axis}: mirrored", partial(in_frame, m, mirror))
         yield Mistake(f"{axis}: mirrored, rotations as well", partial(in_frame, m, mirror, axial=True))
         for quarters, name in TURNS:
-            turn = Rotation.from_rotvec(0.5 * np.pi * quarters * np.eye(3)[a]).as_matrix().round()
+            turn = rotation_from_vector(0.5 * np.pi * quarters * np.eye(3)[a]).round()
             yield Mistake(f"the work frame: turned about {axis} {name}", partial(in_frame, m, turn))
     for axes in permutations(AXES):
         if axes != ("y", "x", "z"):  # R = Ry(β)·Rx(α)·Rz(γ)
@@ -189,8 +188,8 @@ def _in_order(m: MeasurementSet, order: str) -> MeasurementSet | None:
     angles = angles_from_rotation(tools)
     if (np.abs(angles) > 1e-6).sum(axis=1).max() < 2:
         return None
-    by_axis = angles[:, ["XYZ".index(axis) for axis in order]]
-    turned = Rotation.from_euler(order, by_axis).as_matrix()
+    about = [rotation_from_vector(angles[:, [a]] * np.eye(3)[a]) for a in ("XYZ".index(axis) for axis in order)]
+    turned = about[0] @ about[1] @ about[2]
     return _sent(m, *m.geometry.platform_poses(tips, turned), np.eye(3))
 
 

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..errors import CalibrationError
 from ..machine.arrays import different_rows, rms
 from ..measurements.readings import ABSOLUTE_KINDS, KINDS, LEAST_TRAVEL, LENGTH, MeasurementSet
+from ..pose import rotation_from_vector, rotation_vector
 from .assumptions import ASSUMED
 
 FAR = 5.0  # a centre further off its stated place is refused, σ of its prior
@@ -135,9 +135,9 @@ class Lengths:
         size = float(np.linalg.norm(arms, axis=1).max()) or 1.0  # m; turns are counted by how far they move a centre
         nominal = np.linalg.norm(self.points - self.centres, axis=1)
         root = self._prior(arms / size)
-        body, turn = np.zeros(6), Rotation.identity()
+        body, turn = np.zeros(6), np.eye(3)
         for _ in range(ROUNDS):
-            turned = turn.apply(arms)
+            turned = arms @ turn.T
             away = self.points + displacement - self.centres + arms - turned - body[:3]
             distance = np.linalg.norm(away, axis=1)
             n = away / distance[:, None]
@@ -150,8 +150,8 @@ class Lengths:
             step = root @ np.linalg.solve(weighted @ columns + np.eye(6), weighted @ left - off)
             if np.abs(step).max() < SETTLED:
                 break
-            turn = Rotation.from_rotvec(step[3:] / size) * turn
-            body = np.concatenate([body[:3] + step[:3], size * turn.as_rotvec()])
+            turn = rotation_from_vector(step[3:] / size) @ turn
+            body = np.concatenate([body[:3] + step[:3], size * rotation_vector(turn)])
         self._refuse_far(body[:3])
         u, s, _ = np.linalg.svd(columns / noise, full_matrices=False)
         # Relative to the file's place, the prior's mean: otherwise an offset from it would cost nothing.
@@ -201,20 +201,20 @@ class Frame:
         """
         centre = self.points.mean(axis=0)
         size = float(np.linalg.norm(self.points - centre, axis=1).max()) or 1.0  # m; turns are counted by it
-        shift, turn, attitude = np.zeros(3), Rotation.identity(), Rotation.from_rotvec(errors[:, 3:])
+        shift, turn, attitude = np.zeros(3), np.eye(3), rotation_from_vector(errors[:, 3:])
         for _ in range(ROUNDS):
             away = self.points + errors[:, :3] - centre - shift
-            shown = centre + turn.inv().apply(away) - self.points
-            turned = (turn.inv() * attitude).as_rotvec()
+            shown = centre + away @ turn - self.points
+            turned = rotation_vector(turn.T @ attitude)
             expected = (directions[:, :3] * shown).sum(axis=1) + (directions[:, 3:] * turned).sum(axis=1)
             moving = directions[:, 3:] + 0.5 * np.cross(turned, directions[:, 3:])  # of a rotation vector, by a turn
-            along = np.hstack([turn.apply(directions[:, :3]), turn.apply(moving)])
+            along = np.hstack([directions[:, :3] @ turn.T, moving @ turn.T])
             turning = np.cross(away, along[:, :3]) + along[:, 3:]
             u, s, v = np.linalg.svd(-scale[:, None] * np.hstack([along[:, :3], turning / size]), full_matrices=False)
             rank = int((s > FRAME_RANK * s[0]).sum())
             step = v[:rank].T @ (u[:, :rank].T @ (scale * (value - expected)) / s[:rank])
             shift = shift + step[:3]
-            turn = Rotation.from_rotvec(step[3:] / size) * turn
+            turn = rotation_from_vector(step[3:] / size) @ turn
             if np.abs(step).max() < SETTLED:
                 break
         return expected, along, Nuisance(self.members, u[:, :rank], np.ones(rank))

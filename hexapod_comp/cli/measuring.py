@@ -14,10 +14,10 @@ import numpy as np
 
 from ..errors import CalibrationError, CommandError, GeometryError
 from ..formats.schema import in_unit
-from ..formats.texts import aligned, number
+from ..formats.texts import number
 from ..machine.arrays import rms
 from ..machine.geometry import load_geometry
-from ..machine.model import MachineModel, RealMachine
+from ..machine.model import RealMachine
 from ..machine.model_file import save_model
 from ..machine.outside import load_outside
 from ..machine.temperatures import PARTS
@@ -25,11 +25,10 @@ from ..measurements.campaign import template
 from ..measurements.collect import RunSetUp
 from ..measurements.readings import ANGULAR_KINDS, KINDS
 from ..virtual import named
-from ..virtual.imperfections import ImperfectionBounds, largest_errors
+from ..virtual.imperfections import ImperfectionBounds
 from . import results
 from .results import Result, Table
 
-UNITS = {"um": "µm", "urad": "µrad", "ppm_per_k": "ppm/K"}  # as people read them
 RESOLUTION = 10  # digits after the point of the instruments, m and rad: a tenth of a nanometre
 
 
@@ -51,9 +50,6 @@ def imagine(args: argparse.Namespace) -> Result:
     model = named.imagine(geometry, args.seed, named.usual_bounds(geometry, **bounds), args.name or "")
     save_model(model, args.out)
     lines = [f"machine {model.machine}, seed {args.seed}: model {model.name}"]
-    drawn = _drawn(model)
-    rows = [[name, number(value, 3), UNITS.get(unit, unit)] for name, value, unit in drawn]
-    lines.append(aligned(["error", "largest", ""], rows) if rows else "no errors")
     tool: dict[str, Any] | None = None
     try:
         box, attitude, _ = machine_box(geometry)
@@ -70,7 +66,6 @@ def imagine(args: argparse.Namespace) -> Result:
         "machine": model.machine,
         "name": model.name,
         "seed": args.seed,
-        "largest": {f"{name.replace(', ', ' ').replace(' ', '_')}_{unit}": value for name, value, unit in drawn},
         "tool_error": tool,
         "written": args.out,
     }
@@ -112,29 +107,6 @@ def outside(args: argparse.Namespace) -> Result:
         "written": args.out,
     }
     return Result(lambda: "\n".join([*lines, f"written: {args.out}"]), lambda: content, notes=notes)
-
-
-def _drawn(model: MachineModel) -> list[tuple[str, float, str]]:
-    """Return name, largest value and unit of each of the machine's errors."""
-    struts, size = model.struts, np.abs
-    bodies = np.array([model.base_expansion, model.platform_expansion])
-    of_field = largest_errors(model.field) if any(family.size for family in model.field.lines) else np.zeros(6)
-    sizes = (
-        ("base joints", size(model.base_deviation).max(), "um"),
-        ("platform joints", size(model.platform_deviation).max(), "um"),
-        ("strut lengths", size(struts.offset).max(), "um"),
-        ("pitch", size(struts.pitch).max(), "ppm"),
-        ("wave", np.hypot(struts.cosine, struts.sine)[:, 0].max(), "um"),
-        ("its harmonics", np.hypot(struts.cosine, struts.sine)[:, 1:].max(initial=0.0), "um"),
-        ("smooth length error", size(struts.map_values).max(initial=0.0), "um"),
-        ("backlash", struts.backlash.max(), "um"),
-        ("wear", struts.map_backlash.max(initial=0.0), "um"),
-        ("expansion of struts", size(struts.expansion).max(), "ppm_per_k"),
-        ("expansion of bodies", size(bodies).max(), "ppm_per_k"),
-        ("field, displacement", of_field[:3].max(), "um"),
-        ("field, rotation", of_field[3:].max(), "urad"),
-    )
-    return [(name, float(value) * 1e6, unit) for name, value, unit in sizes if value > 0.0]
 
 
 def simulate(args: argparse.Namespace) -> Result:

@@ -335,6 +335,8 @@ class LimitFormat(NamedTuple):
 
 
 STAGES = ("nominal", "compensated")
+# Columns of the table of smallest margins; JSON has the row's number too
+SMALLEST = ("limit", "margin", "value", "allowed", "unit", "strut", "stage", "label", "line", "share_of_move")
 LIMITS_SHOWN = {
     "stroke": LimitFormat("stroke_margin", "mm", 1e3, 3, margin=True),
     "base_cone": LimitFormat("base_cone_margin", "deg", 180.0 / math.pi, 3, margin=True),
@@ -374,7 +376,7 @@ def check(args: argparse.Namespace) -> Result:
                 lines.append(f"{results.where(rows[breach.row])}{way}: {breach.error}")
             if len(result.breaches) > MOST_BREACHES:
                 lines.append(f"… and {len(result.breaches) - MOST_BREACHES} more; --json prints all")
-        lines += ["", "smallest margin per limit:", _smallest_table(smallest), ""]
+        lines += ["", "smallest margin per limit:", Table(smallest).text(SMALLEST), ""]
         if skipped := int(result.unchecked_moves.sum()):
             first = results.where(rows[int(result.unchecked_moves.argmax())])
             lines.append(f"not checked: {skipped} moves with an end that breaks a limit itself, the first to {first}")
@@ -473,17 +475,6 @@ def _smallest(limits: Limits, rows: list[Row], result: CheckResult) -> list[dict
             }
         )
     return listed
-
-
-def _smallest_table(smallest: list[dict[str, Any]]) -> str:
-    header = ["limit", "margin", "value", "allowed", "unit", "strut", "stage", "row", "line", "of the move"]
-    body = []
-    for entry in smallest:
-        numbers = [f"{entry[key]:.{LIMITS_SHOWN[entry['limit']].digits}f}" for key in ("margin", "value", "allowed")]
-        way = "at the pose" if entry["share_of_move"] == 1.0 else f"{entry['share_of_move'] * 100:.1f} %"
-        place = [str(entry["strut"] or "–"), entry["stage"], entry["label"], str(entry["line"]), way]
-        body.append([entry["limit"], *numbers, entry["unit"].replace("_", "/") or "–", *place])
-    return texts.aligned(header, body)
 
 
 # ---- assess ----

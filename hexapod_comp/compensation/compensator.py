@@ -34,7 +34,7 @@ from ..machine.model import MachineModel, MotionState, RealMachine, core_model, 
 from ..machine.outside import read_numbers
 from ..machine.temperatures import HUMIDITY, Lag, Temperatures, check_part
 from ..machine.temperatures import PARTS as MEASURED_PARTS
-from ..pose import Pose
+from ..pose import Pose, rotation_from_vector
 
 DEFAULT_RAMP_RATE = 1e-3  # Speed at which a change of model, temperature or enabling moves a strut, m/s
 
@@ -147,9 +147,7 @@ def drifted(geometry: HexapodGeometry, model: MachineModel, drift: np.ndarray) -
         return model
     centre, turn = geometry.home.position, drift[3:6] / geometry.characteristic_length
     joints = geometry.base_joints + model.base_deviation
-    from scipy.spatial.transform import Rotation  # only a drift needs SciPy
-
-    moved = centre + drift[:3] + (joints - centre) @ Rotation.from_rotvec(turn).as_matrix().T
+    moved = centre + drift[:3] + (joints - centre) @ rotation_from_vector(turn).T
     return replace(
         model,
         base_deviation=model.base_deviation + (moved - joints),

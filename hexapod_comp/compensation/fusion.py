@@ -19,7 +19,7 @@ import numpy as np
 from ..errors import CommandError, HexapodError
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import jacobian
-from ..pose import Pose
+from ..pose import Pose, attitude_error, rotation_from_vector
 from .compensator import DRIFT_STATES, Compensator
 
 KEPT = 1024  # Number of stored struts: a second at 1 kHz
@@ -171,9 +171,7 @@ class Fusion:
             return tool
         pose = Pose(tool[:3], tool[3:].reshape((3, 3)))
         moved = self._observation(pose) @ left
-        from scipy.spatial.transform import Rotation
-
-        turned = Rotation.from_rotvec(moved[3:]).as_matrix() @ pose.rotation
+        turned = rotation_from_vector(moved[3:]) @ pose.rotation
         return np.concatenate([pose.position + moved[:3], turned.ravel()])
 
     def feed(self, compensate: bool) -> None:
@@ -205,15 +203,13 @@ class Fusion:
         return rejected
 
     def _take(self, reading: PoseReading) -> None:
-        from scipy.spatial.transform import Rotation
-
         struts, speed = self._struts_at(reading.made)
         estimated = self._compensator.estimate(struts)
         tool = Pose(estimated[:3].copy(), estimated[3:].reshape((3, 3)).copy())
         rules, matrix = self.rules, self._observation(tool)
         seen = np.concatenate([
             reading.pose.position - tool.position,
-            Rotation.from_matrix(reading.pose.rotation @ tool.rotation.T).as_rotvec(),
+            attitude_error(reading.pose.rotation, tool.rotation),
         ])  # fmt: skip
         effect, moving = matrix[:, 6:], matrix[:, 6:] @ speed * rules.time_deviation
         noise = reading.covariance + rules.strut_deviation**2 * effect @ effect.T + np.outer(moving, moving)

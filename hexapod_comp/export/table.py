@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
-from scipy.spatial.transform import Rotation
 
 from ..errors import InputFileError, ModelError, OutsideFieldError
 from ..formats.csv import Table, csv_text, grid_order
@@ -27,7 +26,7 @@ from ..machine.model import MachineModel, RealMachine
 from ..machine.model_file import DIRECTIONS
 from ..machine.passes import Passes, at
 from ..machine.trial import model_commands
-from ..pose import Pose, attitude_error
+from ..pose import Pose, attitude_error, rotation_from_vector
 from .carried import refuse_unknown
 from .trial import DIAGONAL
 
@@ -184,7 +183,7 @@ def commands_by_poses(table: GridTable, passes: Passes) -> np.ndarray:
     """Return strut commands, shape (N, 6), m: nominal lengths of the corrected tool poses."""
     positions, rotations, directions = passes.of_the_tool()
     changes = table.pose_corrections(positions, directions[:, 0] < 0.0)
-    turned = Rotation.from_rotvec(changes[:, 3:]).as_matrix() @ rotations
+    turned = rotation_from_vector(changes[:, 3:]) @ rotations
     return Passes.of_tool(passes.geometry, positions + changes[:, :3], turned, directions).nominal_commands()
 
 

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..machine.arrays import Size
 from ..machine.geometry import HexapodGeometry
@@ -19,6 +18,7 @@ from ..machine.model import MachineModel, RealMachine
 from ..machine.passes import Passes
 from ..machine.temperatures import HUMIDITY, PARTS, REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE, Temperatures
 from ..machine.trial import ToolErrors, Trial
+from ..pose import rotation_from_vector
 
 # Readings of a machine that is 1 K warmer, and of one in damper air
 WARMER, DAMPER = dict.fromkeys(PARTS, REFERENCE_TEMPERATURE + 1.0), {HUMIDITY: REFERENCE_HUMIDITY + 0.1}
@@ -65,7 +65,7 @@ def diagonal_passes(geometry: HexapodGeometry, box: np.ndarray, count: int, seed
     positions = rng.uniform(box[0], box[1], (count, 3))
     azimuth = rng.uniform(0.0, 2.0 * np.pi, count)
     axes = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(count)], axis=1)
-    rotations = Rotation.from_rotvec(tilt * axes).as_matrix()
+    rotations = rotation_from_vector(tilt * axes)
     return Passes.of_tool(geometry, positions, rotations, np.tile(DIAGONAL, (count, 1))).both_ways()
 
 

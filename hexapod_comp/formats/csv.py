@@ -18,13 +18,13 @@ from dataclasses import dataclass
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from ..errors import InputFileError
 from .files import MAX_CSV_BYTES, open_input, too_large
-from .schema import LARGEST, UNITS, spellings
+from .schema import LARGEST, UNITS, Choice, Integer, spellings
 from .texts import DECIMAL_COMMA, MICRO_ERRORS, THOUSANDS, number_hint, plain_number
 
 LABEL_COLUMNS = ("sequence", "name")
@@ -78,9 +78,10 @@ class Row:
 class Layout:
     """Format of a CSV file, where its header does not show it."""
 
-    encoding: str = ""  # one of :data:`ENCODINGS`; empty: detected
-    above: int = 0  # rows to skip above the header, empty ones and comments too, and below it: titles, a row of units
-    below: int = 0
+    encoding: Annotated[str, Choice(*ENCODINGS)] = ""  # empty: detected
+    # Rows to skip above the header, empty ones and comments too, and below it: titles, a row of units
+    rows_above_header: Annotated[int, Integer(0, MOST_SKIPPED)] = 0
+    rows_below_header: Annotated[int, Integer(0, MOST_SKIPPED)] = 0
 
 
 AS_USUAL = Layout()
@@ -129,7 +130,7 @@ class Table:
         codec, errors = options.get(encoding, (encoding, "strict"))
         stream = io.TextIOWrapper(io.BufferedReader(source), newline="", encoding=codec, errors=errors)
         text, lines = self._bounded_lines(stream), None
-        before = sum(1 for _ in itertools.islice(text, layout.above))
+        before = sum(1 for _ in itertools.islice(text, layout.rows_above_header))
         try:
             header = ""  # the first line, below the skipped ones, that is neither empty nor a comment
             for line in text:
@@ -140,7 +141,7 @@ class Table:
             self._separator = next((mark for mark in SEPARATORS if mark in QUOTED.sub("", header)), ",")
             lines = csv.reader(itertools.chain([header], text), delimiter=self._separator, skipinitialspace=True)
             self._parse_header(next(lines, []))
-            for _ in itertools.islice(lines, layout.below):
+            for _ in itertools.islice(lines, layout.rows_below_header):
                 pass
             for row in lines:
                 if row and not row[0].startswith("#"):
@@ -250,6 +251,11 @@ class Table:
         problem += f"; columns are separated by {', '.join(SEPARATORS.values())}, and this is one column"
         return InputFileError(self.path, "header", problem, self.header[0])
 
+    @property
+    def unknown(self) -> list[str]:
+        """Names of the columns for which nobody has asked."""
+        return [name for name in self.header if name and name not in self._known]
+
     def refuse_unknown(self) -> None:
         for name in self.header:
             if name not in self._known:
@@ -257,15 +263,17 @@ class Table:
 
     def numbers(self, columns: list[tuple[int, float]]) -> np.ndarray:
         """Return the finite numbers of some columns in SI, shape (rows, columns)."""
-        values = np.empty((len(self.rows), len(columns)))
-        for k, (index, unit) in enumerate(columns):
-            known: dict[str, float] = {}  # places repeat
-            for line, row in self.rows:
-                text = row[index]
-                if text not in known:
-                    known[text] = si_from_text(text, self.number(line, index, text), unit)
-            values[:, k] = [known[row[index]] for _, row in self.rows]
-        return values
+        return np.stack([self.values(index, unit) for index, unit in columns], axis=1)
+
+    def values(self, index: int, unit: float, blank: bool = False) -> np.ndarray:
+        """Return the finite numbers of a column in SI, shape (rows,); NaN for blank cells where there may be some."""
+        known: dict[str, float] = {}  # numbers repeat
+        for line, row in self.rows:
+            text = row[index]
+            if text not in known:
+                empty = blank and not text.strip()
+                known[text] = math.nan if empty else si_from_text(text, self.number(line, index, text), unit)
+        return np.array([known[row[index]] for _, row in self.rows])
 
     def texts(self, name: str) -> list[str]:
         """Return the cells of a required column, without spaces around them."""

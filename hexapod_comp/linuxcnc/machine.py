@@ -21,14 +21,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..core.batch import follow_nine
 from ..errors import HexapodError, KinematicsError
 from ..formats.texts import plain_number
 from ..machine.geometry import load_geometry
 from ..machine.model import MotionState, RealMachine
-from ..pose import Pose
+from ..pose import Pose, roll_pitch_yaw
 from ..ros import received_signals
 from ..virtual.named import find_model
 from .hal import METRES, HalComponent, pins, quaternion_from_axes
@@ -78,7 +77,7 @@ class MachineComponent:
         position = tool.position - tool.rotation @ up + up
         error = position - command.position
         lengths = np.concatenate([position, [np.linalg.norm(error)], error]) / self._metres
-        degrees = Rotation.from_matrix(tool.rotation).as_euler("xyz", degrees=True)
+        degrees = np.degrees(roll_pitch_yaw(tool.rotation))
         self._write([*lengths[:3], *degrees, *lengths[3:]])
         self._write_valid([True])
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..core import Status, batch
 from ..errors import OtherAssemblyModeError, SingularError, UnreachableError
-from ..pose import Pose, rotation_angle
+from ..pose import Pose, nearest_rotation, rotation_angle
 from .geometry import HexapodGeometry
 from .kinematics import Structure, six_lengths, solve_poses
 
@@ -46,9 +46,7 @@ def assembly_modes(structure: Structure, lengths: np.ndarray) -> list[Pose]:
 
 def _starts_around(structure: Structure, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return positions (N, 3), m, and rotations (N, 3, 3) with approximately the struts' lengths."""
-    from scipy.spatial.transform import Rotation  # half of the time in which ik starts, and it needs none
-
-    rotations = Rotation.random(ORIENTATIONS, random_state=0).as_matrix()
+    rotations = nearest_rotation(np.random.default_rng(0).standard_normal((ORIENTATIONS, 3, 3)))
     centres = structure.base_joints - structure.platform_joints @ np.swapaxes(rotations, 1, 2)
     middle = centres.mean(axis=1)
     around, squares = centres - middle[:, None], lengths**2

@@ -22,7 +22,7 @@ from ..errors import (
     SingularError,
     UnreachableError,
 )
-from ..pose import Pose
+from ..pose import Pose, rotation_from_vector
 from .geometry import STRUT_NAMES, HexapodGeometry
 
 # Work of the calling thread, s, before others join: they take 0.1 ms to start, and some ms to end on busy cores
@@ -297,11 +297,10 @@ def solve_one(
 def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tuple[np.ndarray, np.ndarray]:
     """Return the pose near `guess` whose lengths are closest to the given ones."""
 
-    from scipy.optimize import least_squares  # 39 MB with the next one that a running node does not need
-    from scipy.spatial.transform import Rotation
+    from scipy.optimize import least_squares  # 39 MB that a running node does not need
 
     def pose_at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        rotation = Rotation.from_rotvec(x[3:] / structure.characteristic_length).as_matrix() @ guess.rotation
+        rotation = rotation_from_vector(x[3:] / structure.characteristic_length) @ guess.rotation
         return guess.position + x[:3], rotation
 
     def misfit(x: np.ndarray) -> np.ndarray:

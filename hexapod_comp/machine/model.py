@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from ..core import Status, Struct, batch, lib
 from ..core.batch import backwards, rotate
 from ..errors import ModelError, NotConvergedError
-from ..pose import Pose, attitude_error
+from ..pose import Pose, attitude_error, rotation_from_vector, rotation_vector
 from .field import GridField, no_field
 from .geometry import HexapodGeometry
 from .kinematics import Structure, forward_error, over_chunks, strut_lengths
@@ -466,8 +466,6 @@ def with_datum_held(
     geometry: HexapodGeometry, model: MachineModel, pose: Pose, part: np.ndarray | None = None
 ) -> MachineModel:
     """Return a model whose whole machine is shifted and turned so that it does not move the tool at a pose."""
-    from scipy.spatial.transform import Rotation  # 14 MB that a running node does not need
-
     part = np.eye(6) if part is None else part
     tip = (pose @ geometry.tool).position
     for _ in range(ROUNDS):
@@ -475,10 +473,10 @@ def with_datum_held(
         taken = part @ move
         if np.abs(taken).max() <= SETTLED:
             return model
-        about, back = tip + move[:3], Rotation.from_rotvec(-taken[3:])
-        joints = about - taken[:3] + back.apply(geometry.base_joints + model.base_deviation - about)
+        about, back = tip + move[:3], rotation_from_vector(-taken[3:])
+        joints = about - taken[:3] + (geometry.base_joints + model.base_deviation - about) @ back.T
         model = replace(model, base_deviation=joints - geometry.base_joints)
         if geometry.screw_lead.any():
-            axes = back * Rotation.from_rotvec(model.base_axes_turn.copy())
-            model = replace(model, base_axes_turn=axes.as_rotvec())
+            axes = back @ rotation_from_vector(model.base_axes_turn)
+            model = replace(model, base_axes_turn=rotation_vector(axes))
     raise NotConvergedError("the whole machine cannot be moved so that the tool stays at the datum", limit=ROUNDS)

@@ -18,11 +18,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.interpolate import CubicSpline, make_interp_spline
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from ..errors import GeometryError, PoseError
-from ..pose import Pose, attitude_error
+from ..pose import Pose, attitude_error, rotation_from_vector
 from .geometry import HexapodGeometry
 from .trajectory import SHARE_OF_LIMIT, Path
 
@@ -108,7 +106,7 @@ class Leg:
 
     def poses(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the tool's positions, (n, 3), and rotations, (n, 3, 3), at shares s; at 0 and 1 as given."""
-        rotations = Rotation.from_rotvec(s[:, None] * self.turn).as_matrix() @ self.start.rotation
+        rotations = rotation_from_vector(s[:, None] * self.turn) @ self.start.rotation
         positions = self.origin + s[:, None] * self.travel - rotations @ self.pivot
         for at, pose in ((0.0, self.start), (1.0, self.end)):
             positions[s == at], rotations[s == at] = pose.position, pose.rotation
@@ -116,7 +114,7 @@ class Leg:
 
     def struts(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the struts' nominal lengths and their first three derivatives by s, each (n, 6)."""
-        arms = np.einsum("nij,kj->nki", Rotation.from_rotvec(s[:, None] * self.turn).as_matrix(), self.arms)
+        arms = np.einsum("nij,kj->nki", rotation_from_vector(s[:, None] * self.turn), self.arms)
         d = self.origin + s[:, None, None] * self.travel + arms - self.base
         swing = np.cross(self.turn, arms)
         d1, d2, d3 = self.travel + swing, np.cross(self.turn, swing), -(self.turn @ self.turn) * swing
@@ -136,6 +134,9 @@ class Course:
     """The path of a program: a smooth curve through tool poses, with s the share of the program's own time."""
 
     def __init__(self, geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequence[float]) -> None:
+        from scipy.interpolate import CubicSpline, make_interp_spline  # half a second that moves alone need not load
+        from scipy.spatial.transform import Rotation, RotationSpline
+
         shares = (np.asarray(times, dtype=float) - times[0]) / (times[-1] - times[0])
         self._ends = poses[0], poses[-1]
         self._line = CubicSpline(shares, [pose.position for pose in poses], bc_type="clamped")

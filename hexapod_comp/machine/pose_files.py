@@ -10,7 +10,7 @@ from ..core import QUATERNION_NORM_TOLERANCE
 from ..errors import InputFileError, PoseError
 from ..formats.csv import Row, Table
 from ..formats.paths import input_file
-from ..pose import Pose, rotation_from_angles
+from ..pose import Pose, rotation_from_angles, rotation_from_quaternion
 
 POSITION_COLUMNS = ("x", "y", "z")
 ANGLE_COLUMNS = ("alpha", "beta", "gamma")
@@ -69,29 +69,25 @@ def poses_of(table: Table) -> tuple[np.ndarray, np.ndarray]:
     if angle_columns and quaternion_columns:
         raise InputFileError(table.path, "header", "give either angles or a quaternion, not both")
     positions = table.numbers(columns)
-    if not quaternion_columns:
-        angles = table.numbers(angle_columns) if angle_columns else np.zeros((len(table.rows), 3))
-        return positions, rotations_of(table, angles)
-    quaternions = table.numbers(quaternion_columns)
-    wrong = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > QUATERNION_NORM_TOLERANCE
-    if wrong.any():
-        row = int(wrong.argmax())
-        try:
-            Pose.from_quaternion(np.zeros(3), quaternions[row])
-        except PoseError as error:
-            raise InputFileError(table.path, f"line {table.rows[row][0]}, columns qx…qw", str(error)) from error
-    from scipy.spatial.transform import Rotation  # 27 MB that a node, which reads other tables, does not need
-
-    return positions, Rotation.from_quat(quaternions).as_matrix()
+    if quaternion_columns:
+        return positions, rotations_of(table, table.numbers(quaternion_columns), "qx…qw")
+    angles = table.numbers(angle_columns) if angle_columns else np.zeros((len(table.rows), 3))
+    return positions, rotations_of(table, angles, "alpha…gamma")
 
 
-def rotations_of(table: Table, angles: np.ndarray) -> np.ndarray:
-    """Return the rotation matrices (N, 3, 3) of the rows' angles (N, 3), rad."""
+def rotations_of(table: Table, turns: np.ndarray, columns: str) -> np.ndarray:
+    """Return the rotation matrices (N, 3, 3) of the rows' angles (N, 3), rad, or quaternions (N, 4)."""
+    row = int(np.abs(turns).max(axis=1).argmax())
     try:
-        return rotation_from_angles(angles)
+        if turns.shape[1] == 3:
+            return rotation_from_angles(turns)
+        wrong = np.abs(np.linalg.norm(turns, axis=1) - 1.0) > QUATERNION_NORM_TOLERANCE
+        if wrong.any():
+            row = int(wrong.argmax())
+            Pose.from_quaternion(np.zeros(3), turns[row])
+        return rotation_from_quaternion(turns)
     except PoseError as error:
-        row = int(np.abs(angles).max(axis=1).argmax())
-        raise InputFileError(table.path, f"line {table.rows[row][0]}", str(error)) from error
+        raise InputFileError(table.path, f"line {table.rows[row][0]}, columns {columns}", str(error)) from error
 
 
 def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,6 @@ from ..errors import ModelError
 from .geometry import HexapodGeometry
 from .temperatures import EXPANSION
 from .terms import settle, term
-
-if TYPE_CHECKING:
-    from scipy.interpolate import CubicSpline
 
 # Largest slope of the strut error against the command: below it, undoing the error is a contraction
 STEEPEST_ERROR = 0.2
@@ -100,9 +97,10 @@ class StrutErrors:
         waves = 2.0 * np.pi / self.period * (np.hypot(self.cosine, self.sine) @ self.harmonics)
         steep = np.abs(self.pitch) + waves
         if len(self.map_knots):
-            spline = self._spline().derivative()
-            dense = np.linspace(self.map_knots[0], self.map_knots[-1], 20 * len(self.map_knots))
-            lengths, backlash = np.abs(spline(dense)).reshape(2, 6, -1).max(axis=2)
+            cubic, square, linear, _ = np.moveaxis(self.spline_coefficients().reshape(6, -1, 2, 4), 3, 0)
+            along = np.linspace(0.0, 1.0, 20)[:, None, None, None] * np.diff(self.map_knots)[:, None]
+            slopes = (3.0 * cubic * along + 2.0 * square) * along + linear
+            lengths, backlash = np.abs(slopes).max(axis=(0, 2)).T
             steep = steep + lengths + 0.5 * backlash
         return steep
 
@@ -111,17 +109,12 @@ class StrutErrors:
         """Lost motion where it is largest, m, shape (6,)."""
         return self.backlash + self.map_backlash.max(axis=1, initial=0.0)
 
-    def _spline(self) -> CubicSpline:
-        """Return the length errors of struts 1–6, and then the changes of their backlash."""
-        from scipy.interpolate import CubicSpline  # 14 MB with all that it needs, which a node without a map does not
-
-        return CubicSpline(self.map_knots, np.vstack([self.map_values, self.map_backlash]), axis=1, bc_type="natural")
-
     def spline_coefficients(self) -> np.ndarray:
         """Return the cubic pieces of the map and of the backlash's change, shape (6, n − 1, 8)."""
         if not len(self.map_knots):
             return np.zeros((6, 0, 8))
-        lengths, backlash = np.split(np.transpose(self._spline().c, (2, 1, 0)), 2)
+        pieces = natural_spline(self.map_knots, np.vstack([self.map_values, self.map_backlash]).T)
+        lengths, backlash = np.split(np.transpose(pieces, (2, 1, 0)), 2)
         return np.ascontiguousarray(np.concatenate([lengths, backlash], axis=2))
 
     def members(self, geometry: HexapodGeometry) -> list[dict[str, Any]]:
@@ -143,6 +136,26 @@ class StrutErrors:
             "wave": wave,
         }
         return [{name: column[i] for name, column in columns.items()} for i in range(6)]
+
+
+def natural_spline(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the pieces of natural cubic splines through values (n, k) at knots (n,), shape (4, n − 1, k).
+
+    Coefficients of (x − the piece's first knot), the highest power first. SciPy's CubicSpline takes 14 MB to load.
+    """
+    width, slope = np.diff(knots)[:, None], np.diff(values, axis=0) / np.diff(knots)[:, None]
+    bends = np.zeros(values.shape)  # second derivatives at the knots: a tridiagonal system, solved by elimination
+    diagonal, right = 2.0 * (width[1:] + width[:-1]), 6.0 * np.diff(slope, axis=0)
+    for i in range(1, len(right)):
+        share = width[i] / diagonal[i - 1]
+        diagonal[i] -= share * width[i]
+        right[i] -= share * right[i - 1]
+    for i in reversed(range(len(right))):
+        bends[i + 1] = (right[i] - width[i + 1] * bends[i + 2]) / diagonal[i]
+    first, last = bends[:-1], bends[1:]
+    return np.stack(
+        [(last - first) / (6.0 * width), 0.5 * first, slope - width * (2.0 * first + last) / 6.0, values[:-1]]
+    )
 
 
 def home_twists(geometry: HexapodGeometry) -> np.ndarray:

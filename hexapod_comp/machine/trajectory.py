@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..pose import Pose, attitude_error, best_motion, rotation_angle
+from ..pose import Pose, attitude_error, best_motion, rotation_angle, rotation_from_vector
 from .geometry import HexapodGeometry
 from .kinematics import Structure, strut_lengths_batch
 
@@ -129,9 +129,7 @@ def _interpolate(
     positions: np.ndarray, rotations: np.ndarray, leg: np.ndarray, share: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the poses at the given shares, (K,), of the given legs, (K,): straight, shortest arc."""
-    from scipy.spatial.transform import Rotation  # as in attitude_error
-
     travel = np.diff(positions, axis=0)
     turn = attitude_error(rotations[1:], rotations[:-1])
-    turned = Rotation.from_rotvec(share[:, None] * turn[leg]).as_matrix() @ rotations[leg]
+    turned = rotation_from_vector(share[:, None] * turn[leg]) @ rotations[leg]
     return positions[leg] + share[:, None] * travel[leg], turned

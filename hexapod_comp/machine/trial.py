@@ -10,12 +10,11 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..core import Status
 from ..core.batch import backwards
 from ..errors import ModelError, NotConvergedError
-from ..pose import attitude_error, best_motion
+from ..pose import attitude_error, best_motion, nearest_rotation, rotation_from_vector, rotation_vector
 from .kinematics import forward_error
 from .load import FREE, Loading
 from .model import MachineModel, RealMachine
@@ -48,9 +47,11 @@ class ToolErrors:
         motion = best_motion(actual, self.points)
         if motion is None:
             raise ModelError("points", "must be three or more, not in a line, for a datum", len(actual))
-        turned = Rotation.from_rotvec(self.rotation)
+        turned = rotation_from_vector(self.rotation)
         displacement = motion.position + actual @ motion.rotation.T - self.points
-        return replace(self, displacement=displacement, rotation=(turned.mean().inv() * turned).as_rotvec())
+        return replace(
+            self, displacement=displacement, rotation=rotation_vector(nearest_rotation(turned.sum(axis=0)).T @ turned)
+        )
 
 
 @dataclass(frozen=True)

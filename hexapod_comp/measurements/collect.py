@@ -51,7 +51,7 @@ from .set_up import (
     nudge,
     nudge_tolerance,
 )
-from .tidy import tidy_readings, write_measurements
+from .tidy import read_tidy, write_measurements
 
 __all__ = ["Collected", "InstrumentMachine", "MeasuredMachine", "Observation", "RunSetUp", "SetUpError", "collect"]
 
@@ -472,7 +472,7 @@ def _resumed(path: str | Path, geometry: HexapodGeometry, listed: Sequence[Readi
 
     number = {key(r.run, r.cycle, r.direction, r.pose, r.channel): n for n, r in enumerate(listed)}
     found: dict[int, Reading] = {}
-    for reading in tidy_readings(path, geometry):
+    for reading in read_tidy(path, geometry).readings:
         n = number.get(key(reading.run, reading.cycle, reading.direction, reading.pose, reading.channel))
         if n is None:
             problem = f"run {reading.run}, {reading.channel} is no reading of this campaign; give another file"

@@ -13,7 +13,7 @@ from ..errors import InputFileError
 from ..formats.paths import config_file, input_file
 from ..machine.geometry import HexapodGeometry
 from .readings import MeasurementSet
-from .runs import joined
+from .runs import assembled
 from .tidy import read_tidy
 from .wide_csv import read_wide
 
@@ -51,12 +51,14 @@ def read_measurements(
         raise InputFileError("measurements", "", "no file is given")
     files = [input_file(path, "readings") for path in paths]
     columns = None if columns is None else config_file(columns, "columns", beside=True)
+    if columns is not None and probe is not None:
+        raise InputFileError(files[0], "", "a wide file is of the tool's tip; leave the probe out")
     with _kept_in_memory():
         if columns is None:
-            return read_tidy(files, geometry, probe, in_reach)
-        if probe is not None:
-            raise InputFileError(files[0], "", "a wide file is of the tool's tip; leave the probe out")
-        return joined([read_wide(path, columns, geometry, in_reach) for path in files])
+            read = [read_tidy(path, geometry, probe) for path in files]
+        else:
+            read = [read_wide(path, columns, geometry) for path in files]
+        return assembled(geometry, read, probe, in_reach)
 
 
 @contextmanager

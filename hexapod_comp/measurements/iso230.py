@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from scipy.optimize import linprog
 
 from ..formats.texts import aligned, number
 from .readings import BACKWARD, CHANNELS, FORWARD, LEAST_TRAVEL, LENGTH, MeasurementSet
@@ -48,13 +47,14 @@ def evaluate(positions: np.ndarray, readings: np.ndarray) -> PositioningTest:
         figures[f"E_{name}"] = np.ptp(mean[d])
         figures[f"R_{name}"] = repeatability[d].max()
     figures |= {"M": np.ptp(mean.mean(axis=0)), "B": np.abs(reversal).max(), "B_mean": reversal.mean()}
-    notes = _design_notes(positions, readings.shape[1]) + _swap_notes(reversal, s, readings.shape[1])
+    notes = _positioning_notes(positions, readings.shape[1], reversal, s)
     figures = {name: float(value) for name, value in figures.items()}
     return PositioningTest(positions, readings.shape[1], mean, s, reversal, repeatability, figures, tuple(notes))
 
 
-def _design_notes(targets: np.ndarray, cycles: int) -> list[str]:
-    """Return where the test's plan departs from the standard's."""
+def _positioning_notes(targets: np.ndarray, cycles: int, reversal: np.ndarray, deviation: np.ndarray) -> list[str]:
+    """Return where a plan departs from the standard's, and whether the motion leads instead of lagging, beyond
+    chance."""
     notes = []
     travel = float(np.ptp(targets))
     needed = max(TARGETS_PER_METRE, math.ceil(TARGETS_PER_METRE * travel))
@@ -70,19 +70,13 @@ def _design_notes(targets: np.ndarray, cycles: int) -> list[str]:
             f"targets every {spacings[0] * 1e3:g} mm: an error of that period, or of a whole fraction of it, does"
             " not show; the standard shifts each target by a random share of the expected period"
         )
+    mean, standard_error = float(reversal.mean()), math.sqrt(float((deviation**2).sum()) / cycles) / len(reversal)
+    if reversal.min() > 0.0 and mean > SURE_REVERSAL * standard_error:
+        notes.append(
+            f"the reversal is positive at every target (mean {mean * 1e6:.3f} µm), where play makes it"
+            " negative: directions or sign swapped, or backlash compensated too much?"
+        )
     return notes
-
-
-def _swap_notes(reversal: np.ndarray, deviation: np.ndarray, cycles: int) -> list[str]:
-    """Return a note when the motion leads instead of lagging, at every target and beyond chance."""
-    standard_error = math.sqrt(float((deviation**2).sum()) / cycles) / len(reversal)
-    mean = float(reversal.mean())
-    if reversal.min() <= 0.0 or mean <= SURE_REVERSAL * standard_error:
-        return []
-    return [
-        f"the reversal is positive at every target (mean {mean * 1e6:.3f} µm), where play makes it"
-        " negative: directions or sign swapped, or backlash compensated too much?"
-    ]
 
 
 ROWS = {
@@ -177,6 +171,8 @@ def _seen_from(
 
 def _separation(radius: float, angles: np.ndarray, deviations: np.ndarray) -> float:
     """Return the least radial distance of two concentric circles with all readings between them, m."""
+    from scipy.optimize import linprog  # a quarter of a second that a fit of lines need not wait
+
     centre = np.zeros(2)
     for _ in range(ROUNDS):
         radial, away = _seen_from(centre, radius, angles, deviations)
@@ -239,16 +235,6 @@ CIRCLE_COLUMNS = {
 
 
 @dataclass(frozen=True)
-class LinearRun:
-    """A linear run that ISO 230-2 or 230-6 judges: every target from both sides, in every cycle."""
-
-    name: str  # of the run
-    axes: tuple[int, ...]  # along which axes of the work frame it travels: one, or more for a diagonal
-    targets: np.ndarray  # (m,): commanded coordinates along the line, rising, m
-    deviations: np.ndarray  # (2, cycles, m): readings, forward and backward, m
-
-
-@dataclass(frozen=True)
 class Judged:
     """Figures of all runs that a standard judges, by the runs' names."""
 
@@ -261,48 +247,32 @@ class Judged:
 
 
 def judge(measurements: MeasurementSet) -> Judged:
-    """Return the figures of the runs that a standard can judge: the others are left out."""
+    """Return the figures of the runs that a standard can judge; the others are left out.
+
+    Of linear runs these have two cycles or more, and every target read from both sides in each.
+    """
+    points = measurements.points()[measurements.station]
     axes: dict[str, PositioningTest] = {}
     diagonals: dict[str, dict[str, PositioningTest]] = {}
-    for run in linear_runs(measurements):
-        kind = None if len(run.axes) == 1 else BODY if len(run.axes) == 3 else FACE
-        group = axes if kind is None else diagonals.setdefault(kind, {})
-        group[run.name] = evaluate(run.targets, run.deviations)
-    return Judged(axes, diagonals, circular_tests(measurements))
-
-
-def linear_runs(measurements: MeasurementSet) -> list[LinearRun]:
-    """Return the linear runs that can be judged: two cycles or more, every target from both sides in each."""
-    points = measurements.points()[measurements.station]
-    runs = []
     for index, run in enumerate(measurements.runs):
-        chosen = np.flatnonzero((measurements.run == index) & (measurements.channel == LINEAR))
-        table: dict[tuple[int, int], dict[float, float]] = {}
-        for n in chosen:
-            pass_of = (int(measurements.direction[n]), int(measurements.cycle[n]))
+        passes: dict[tuple[int, int], dict[float, float]] = {}  # of each direction and cycle the readings by target
+        for n in np.flatnonzero((measurements.run == index) & (measurements.channel == LINEAR)):
             target = round(float(points[n] @ run.axis), 9) + 0.0
-            table.setdefault(pass_of, {})[target] = float(measurements.value[n])
+            pass_of = int(measurements.direction[n]), int(measurements.cycle[n])
+            passes.setdefault(pass_of, {})[target] = float(measurements.value[n])
+        cycles = sorted({cycle for _, cycle in passes})
+        wanted = [(direction, cycle) for direction in (FORWARD, BACKWARD) for cycle in cycles]
+        if len(cycles) < 2 or set(passes) != set(wanted):
+            continue
+        targets = sorted(passes[wanted[0]])
+        if any(sorted(readings) != targets for readings in passes.values()):
+            continue
+        deviations = np.array([[passes[one][target] for target in targets] for one in wanted])
+        test = evaluate(np.array(targets), deviations.reshape(2, len(cycles), len(targets)))
         in_work = measurements.geometry.work.rotation.T @ run.axis
-        axes = tuple(np.flatnonzero(np.abs(in_work) > ALONG).tolist())
-        complete = _complete_run(run.name, axes, table)
-        if complete is not None:
-            runs.append(complete)
-    return runs
-
-
-def _complete_run(
-    name: str, axes: tuple[int, ...], table: dict[tuple[int, int], dict[float, float]]
-) -> LinearRun | None:
-    """Return a run from {(direction, cycle): {target: reading}} if nothing is missing in it."""
-    cycles = sorted({cycle for _, cycle in table})
-    passes = {(direction, cycle) for direction in (FORWARD, BACKWARD) for cycle in cycles}
-    if len(cycles) < 2 or set(table) != passes:
-        return None
-    targets = sorted(table[FORWARD, cycles[0]])
-    if any(sorted(readings) != targets for readings in table.values()):
-        return None
-    deviations = [[[table[d, c][t] for t in targets] for c in cycles] for d in (FORWARD, BACKWARD)]
-    return LinearRun(name, axes, np.array(targets), np.array(deviations))
+        along = np.count_nonzero(np.abs(in_work) > ALONG)  # of how many axes it travels along
+        (axes if along == 1 else diagonals.setdefault(BODY if along == 3 else FACE, {}))[run.name] = test
+    return Judged(axes, diagonals, circular_tests(measurements))
 
 
 def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
@@ -315,34 +285,32 @@ def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
         if len(chosen) < 3 or np.ptp(centres, axis=0).max() > LEAST_TRAVEL:
             continue
         circle = _circle(points[chosen], measurements.geometry.work.rotation)
-        if circle is None or np.linalg.norm(circle.middle - centres[0]) > OFF_THE_MIDDLE:
+        if circle is None:
+            continue
+        middle, axis, radius, angles = circle
+        if np.linalg.norm(middle - centres[0]) > OFF_THE_MIDDLE:
             continue
         lengths = measurements.value[chosen] + np.linalg.norm(points[chosen] - centres, axis=1)
-        height = float(circle.axis @ (centres[0] - circle.middle))
-        given = lengths - np.hypot(circle.radius, height), _senses(circle.angles, measurements.cycle[chosen])
-        test = evaluate_circle(circle.radius, circle.angles, *given, length_known=run.known_zero)
+        height = float(axis @ (centres[0] - middle))
+        given = lengths - np.hypot(radius, height), _senses(angles, measurements.cycle[chosen])
+        test = evaluate_circle(radius, angles, *given, length_known=run.known_zero)
         if test is not None:
             tests[run.name] = test
     return tests
 
 
-class Circle(NamedTuple):
-    """A circle in ``base``: middle and axis, shape (3,), radius, m, and where its points are, (N,), rad."""
+def _circle(points: np.ndarray, work_axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray] | None:
+    """Return the circle on which points (N, 3) lie: middle, axis, radius, m, and the points' angles, (N,), rad.
 
-    middle: np.ndarray
-    axis: np.ndarray
-    radius: float
-    angles: np.ndarray
-
-
-def _circle(points: np.ndarray, work_axes: np.ndarray) -> Circle | None:
-    """Return the circle on which points (N, 3) lie; its axis points along an axis of the work frame, columns (3, 3)."""
+    Its axis points along an axis of the work frame, columns (3, 3). None where they lie on no circle.
+    """
     arms = points - points.mean(axis=0)
     _, sizes, ways = np.linalg.svd(arms, full_matrices=False)
     if sizes[1] < LEAST_TRAVEL:
         return None  # a line
-    axis = ways[2] * np.sign(_longest(work_axes.T @ ways[2]))
-    first = work_axes[:, int(np.abs(work_axes.T @ axis).argmax()) - 2]  # x of a circle about z, and so on
+    nearest = int(np.abs(work_axes.T @ ways[2]).argmax())
+    axis = ways[2] * np.sign(work_axes[:, nearest] @ ways[2])
+    first = work_axes[:, nearest - 2]  # x of a circle about z, and so on
     first = first - axis * (axis @ first)
     first /= np.linalg.norm(first)
     flat = arms @ np.stack([first, np.cross(axis, first)], axis=1)
@@ -353,12 +321,7 @@ def _circle(points: np.ndarray, work_axes: np.ndarray) -> Circle | None:
     if max(np.ptp(distances), np.abs(arms @ axis).max()) > LEAST_TRAVEL:
         return None
     place = points.mean(axis=0) + middle[0] * first + middle[1] * np.cross(axis, first)
-    return Circle(place, axis, float(distances.mean()), np.arctan2(around[:, 1], around[:, 0]))
-
-
-def _longest(vector: np.ndarray) -> float:
-    """Return the component that is largest in magnitude."""
-    return float(vector[np.abs(vector).argmax()])
+    return place, axis, float(distances.mean()), np.arctan2(around[:, 1], around[:, 0])
 
 
 def _senses(angles: np.ndarray, cycles: np.ndarray) -> np.ndarray:

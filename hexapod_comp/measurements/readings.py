@@ -7,14 +7,13 @@ from dataclasses import dataclass, field, fields, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..errors import CalibrationError
 from ..machine.arrays import rms
 from ..machine.geometry import HexapodGeometry
 from ..machine.surroundings import NO_LOAD, Surroundings
 from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
-from ..pose import Pose, attitude_error
+from ..pose import Pose, attitude_error, nearest_rotation
 
 AXES = ("x", "y", "z")
 # What a reading is of. ``linear`` is along the run's line, ``length`` from a centre; the others are along or about an
@@ -247,7 +246,7 @@ class MeasurementSet:
         """
         rotations = self.stations.rotations
         parallel = self.geometry.work.rotation @ self.geometry.tool.rotation.T
-        mean = Rotation.from_matrix(rotations).mean().as_matrix()
+        mean = nearest_rotation(rotations.sum(axis=0))
         away = np.linalg.norm(attitude_error(rotations, mean), axis=1)
         if np.linalg.norm(attitude_error(parallel, mean)) <= away.max() + SAME_ATTITUDE:
             return parallel

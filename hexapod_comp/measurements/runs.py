@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 import struct
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields, replace
 from itertools import chain, combinations
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..errors import InputFileError
 from ..formats.paths import config_file
 from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.passes import APPROACH, Passes, Poses, arrivals
-from ..pose import Pose, attitude_error, stacked
+from ..pose import Pose, attitude_error, rotation_from_vector, stacked
 from .readings import (
     ANGULAR_KINDS,
     AXES,
@@ -343,27 +344,44 @@ def _arrival(geometry: HexapodGeometry, here: Sequence[np.ndarray], there: Seque
     way, turn = there[0] - here[0], attitude_error(there[1], here[1])
     length = np.linalg.norm(np.concatenate([way, geometry.characteristic_length * turn], axis=1), axis=1)
     share = np.minimum(1.0, APPROACH / np.maximum(length, SAME))[:, None]
-    before = here[0] + share * way, Rotation.from_rotvec(share * turn).as_matrix() @ here[1]
+    before = here[0] + share * way, rotation_from_vector(share * turn) @ here[1]
     change = np.concatenate([np.zeros_like(way), here[2] - there[2]], axis=1)
     standing = np.sign(change) * (np.abs(change) > SAME)
     return np.where(length[:, None] > SAME, arrivals(geometry, (here[0], here[1]), before), standing)
 
 
-def refuse_twice(files: Sequence[tuple[str, str]]) -> None:
-    """Raise on a file, (name, SHA-256), given twice: its readings would count twice."""
-    seen: dict[str, str] = {}
-    for name, digest in files:
-        if digest in seen:
-            raise InputFileError(name, "", f"is the same file as {seen[digest]}: its readings would count twice")
-        seen[digest] = name
+class MeasuredFile(NamedTuple):
+    """What a file holds."""
+
+    path: str | Path
+    sha256: str
+    readings: list[Reading]
+    notes: list[str]
+
+
+def assembled(
+    geometry: HexapodGeometry, files: Sequence[MeasuredFile], probe: np.ndarray | None = None, in_reach: bool = True
+) -> MeasurementSet:
+    """Return the set of all files' readings; runs of equal names stay apart, with their files' names in theirs."""
+    seen: dict[str, MeasuredFile] = {}
+    for file in files:
+        if (same := seen.setdefault(file.sha256, file)) is not file:
+            raise InputFileError(file.path, "", f"is the same file as {same.path}: its readings would count twice")
+    short = [Path(file.path).name for file in files]
+    labels = short if len(set(short)) == len(short) else [str(file.path) for file in files]
+    count = Counter(name for file in files for name in {reading.run for reading in file.readings})
+    readings = [
+        reading._replace(run=f"{reading.run} [{label}]") if count[reading.run] > 1 else reading
+        for file, label in zip(files, labels, strict=True)
+        for reading in file.readings
+    ]
+    read = zip(short, (file.sha256 for file in files), strict=True)
+    return assemble(geometry, readings, probe, read, chain(*(file.notes for file in files)), in_reach)
 
 
 def joined(sets: Sequence[MeasurementSet]) -> MeasurementSet:
     """Return several sets of one machine as one; runs of equal names stay apart."""
     first = sets[0]
-    refuse_twice([file for s in sets for file in s.files])
-    if len(sets) == 1:
-        return first
     if any(np.abs(other.probe - first.probe).max() > SAME for other in sets[1:]):
         raise InputFileError("measurements", "", "files with different measured points cannot be fitted together")
     stations_before = np.cumsum([0, *(len(s.stations) for s in sets)])[:-1]

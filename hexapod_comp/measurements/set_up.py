@@ -10,10 +10,9 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..errors import HexapodError
-from ..pose import Pose, attitude_error, best_motion
+from ..pose import Pose, attitude_error, best_motion, rotation_from_vector
 from .readings import ANGULAR_KINDS
 
 FREE, KNOWN = FRAMES = ("free", "known")  # Where a tracker stands: anywhere; or its frame is the base
@@ -149,7 +148,7 @@ class PoseCheck:
 def nudge(pose: Pose, direction: np.ndarray, channel: str, sign: float) -> Pose:
     """Return a pose moved along, or turned about, the direction (6,) in which a channel reads, in the pose's frame."""
     size = sign * NUDGE[dimension(channel)]
-    turn = Rotation.from_rotvec(size * direction[3:]).as_matrix()
+    turn = rotation_from_vector(size * direction[3:])
     return Pose(pose.position + size * direction[:3], turn @ pose.rotation)
 
 

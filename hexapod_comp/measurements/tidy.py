@@ -38,7 +38,7 @@ from .readings import (
     MeasurementSet,
     Reading,
 )
-from .runs import assemble, refuse_twice
+from .runs import MeasuredFile
 
 # Words of the column ``direction``
 DIRECTIONS = {"forward": FORWARD, "backward": BACKWARD, "sequence": FROM_PREVIOUS, "": UNKNOWN}
@@ -70,19 +70,13 @@ class Range(NamedTuple):
 
     def of(self, table: Table, index: int, unit: float) -> np.ndarray:
         """Return a column's numbers in SI, (rows,); NaN where a cell is blank."""
-        known: dict[str, float] = {}
-        for line, cells in table.rows:
-            text = cells[index]
-            if text in known:
-                continue
-            if self.blank and not text.strip():
-                known[text] = math.nan
-                continue
-            known[text] = si_from_text(text, table.number(line, index, text), unit)
-            if not self.low <= known[text] <= self.high:
-                where = f"line {line}, column {table.header[index]}"
-                raise InputFileError(table.path, where, f"must be within {self.allowed}", text)
-        return np.array([known[cells[index]] for _, cells in table.rows])
+        values = table.values(index, unit, self.blank)
+        wrong = (values < self.low) | (values > self.high)
+        if wrong.any():
+            line, cells = table.rows[int(wrong.argmax())]
+            where = f"line {line}, column {table.header[index]}"
+            raise InputFileError(table.path, where, f"must be within {self.allowed}", cells[index])
+        return values
 
     def read(self, table: Table, name: str) -> np.ndarray:
         """Return the numbers in SI, (rows,), of an optional column whose name ends in its unit; NaN where there is
@@ -131,48 +125,6 @@ def _meanings(table: Table, name: str, texts: list[str], meanings: Mapping[str, 
     return [meanings[text] for text in texts]
 
 
-class _Rows(NamedTuple):
-    """The rows of a file as they stand there: channels and values are those of the file."""
-
-    readings: list[Reading]
-    texts: list[str]  # of the values
-    units: list[float]  # of the values, in SI
-    air: np.ndarray  # (rows, 4): instrument's index, temperature, pressure, humidity; NaN: not to be corrected
-
-
-def _read_rows(table: Table) -> _Rows:
-    """Return the rows of a file, every cell checked by itself."""
-    runs, channels, units, cycles = *map(table.texts, ("run", "channel", "unit")), _texts(table, "cycle", "1")
-    directions = table.texts("direction")
-    directions = _meanings(table, "direction", directions, DIRECTIONS, "forward, backward, sequence or empty")
-    numbers = {text: int(text) for text in set(cycles) if CYCLE.fullmatch(text)}
-    cycles = _meanings(table, "cycle", cycles, numbers, "a whole number from 1")
-    poses, temperatures, air = _poses(table), _temperatures(table), _air(table)
-    centres = [None if math.isnan(row[0]) else tuple(row) for row in _together(table, "centre", CENTRE).tolist()]
-    known = _meanings(table, "zero", _texts(table, "zero"), {"known": True, "": False}, "known or empty")
-    times, humidities = TIME.read(table, "time").tolist(), HUMIDITY.read(table, "humidity").tolist()
-    loads, slopes = _loads(table), _texts(table, "slope")
-    (value_column, _), uncertain = table.required(("value",), None)[0], table.column("uncertainty", None)
-    table.refuse_unknown()
-    sizes: dict[tuple[str, str], float] = {}
-    rows = _Rows([], [], [], air)
-    for n, (line, cells) in enumerate(table.rows):
-        if not runs[n]:
-            raise InputFileError(table.path, f"line {line}, column run", "must be a name")
-        unit, text = sizes.get((channels[n], units[n])), cells[value_column]
-        if unit is None:
-            unit = sizes[channels[n], units[n]] = _unit_size(table, line, channels[n], units[n])
-        value = si_from_text(text, table.number(line, value_column, text), unit)
-        uncertainty = math.nan if uncertain is None else _uncertainty(table, line, cells, uncertain[0], unit)
-        place = runs[n], cycles[n], directions[n], poses[n], channels[n]
-        around = times[n], centres[n], known[n], humidities[n], loads[n], slopes[n]
-        state = value, uncertainty, temperatures[n], None, FileLine(str(table.path), line)
-        rows.readings.append(Reading._make((*place, *state, *around)))
-        rows.texts.append(text)
-        rows.units.append(unit)
-    return rows
-
-
 def _uncertainty(table: Table, line: int, cells: Sequence[str], index: int, unit: float) -> float:
     """Return a standard deviation in SI, NaN where there is none."""
     text = cells[index]
@@ -207,7 +159,7 @@ def _temperatures(table: Table) -> list[tuple[float, ...]]:
 
 
 def _air(table: Table) -> np.ndarray:
-    """Return :attr:`_Rows.air`."""
+    """Return instrument's index, temperature, pressure, humidity of each row, (rows, 4); NaN: not to be corrected."""
     index, pressure = INDEX.read(table, "instrument_index"), PRESSURE.read(table, "pressure")
     wanted = np.isfinite(index)
     if not wanted.any():
@@ -246,200 +198,185 @@ def _unit_size(table: Table, line: int, channel: str, unit: str) -> float:
 PARALLEL = 1e-9  # largest cross component of a unit vector that still is parallel to an axis
 
 
-def read_tidy(
-    paths: str | Path | Sequence[str | Path],
-    geometry: HexapodGeometry,
-    probe: np.ndarray | None = None,
-    in_reach: bool = True,
-) -> MeasurementSet:
-    """Read tidy CSV files as one set; runs of the same name in two files are two."""
-    tables = [Table(path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
-    refuse_twice([(str(table.path), table.sha256) for table in tables])
-    of_files = [_read_rows(table) for table in tables]
-    names = [{reading.run for reading in rows.readings} for rows in of_files]
-    short = [Path(table.path).name for table in tables]
-    label = short if len(set(short)) == len(short) else [str(table.path) for table in tables]
-    readings: list[Reading] = []
-    notes: list[str] = []
-    for n, (table, rows) in enumerate(zip(tables, of_files, strict=True)):
-        twice = {run: f"{run} [{label[n]}]" for run in names[n] if sum(run in other for other in names) > 1}
-        own, corrected = _file_readings(str(table.path), rows, geometry, probe)
-        readings += [reading._replace(run=twice.get(reading.run, reading.run)) for reading in own] if twice else own
-        if corrected:
-            notes.append(f"{table.path}: {corrected} readings corrected to the air of their rows (Ciddor)")
-    files = [(name, table.sha256) for name, table in zip(short, tables, strict=True)]
-    return assemble(geometry, readings, probe, files, notes, in_reach)
+class _TidyFile:
+    """A file on its way to readings: first every cell by itself, then what its rows say together."""
+
+    def __init__(self, table: Table, geometry: HexapodGeometry, probe: np.ndarray | None) -> None:
+        self._table, self._file = table, str(table.path)
+        self._rows, self._exact = list[Reading](), list[tuple[str, float]]()  # values' texts, and their units in SI
+        self._air = _air(table)
+        self._read_rows()
+        self._visits = list(self._numbered_visits())
+        self._refuse_duplicates()
+        # The commanded place of the measured point in the work frame, (rows, 3), m
+        self._points = np.array([r.pose.position for r in self._rows])
+        if probe is not None:
+            offset = geometry.tool.rotation.T @ (np.asarray(probe, dtype=float) - geometry.tool.position)
+            self._points += np.array([r.pose.rotation @ offset for r in self._rows])
+        self._axes = dict(self._lines())
+
+    def _read_rows(self) -> None:
+        """Read the rows as they stand there: channels and values are those of the file."""
+        table = self._table
+        runs, channels, units, cycles = *map(table.texts, ("run", "channel", "unit")), _texts(table, "cycle", "1")
+        directions = table.texts("direction")
+        directions = _meanings(table, "direction", directions, DIRECTIONS, "forward, backward, sequence or empty")
+        numbers = {text: int(text) for text in set(cycles) if CYCLE.fullmatch(text)}
+        cycles = _meanings(table, "cycle", cycles, numbers, "a whole number from 1")
+        poses, temperatures = _poses(table), _temperatures(table)
+        centres = [None if math.isnan(row[0]) else tuple(row) for row in _together(table, "centre", CENTRE).tolist()]
+        known = _meanings(table, "zero", _texts(table, "zero"), {"known": True, "": False}, "known or empty")
+        times, humidities = TIME.read(table, "time").tolist(), HUMIDITY.read(table, "humidity").tolist()
+        loads, slopes = _loads(table), _texts(table, "slope")
+        (value_column, _), uncertain = table.required(("value",), None)[0], table.column("uncertainty", None)
+        table.refuse_unknown()
+        sizes: dict[tuple[str, str], float] = {}
+        for n, (line, cells) in enumerate(table.rows):
+            if not runs[n]:
+                raise InputFileError(table.path, f"line {line}, column run", "must be a name")
+            unit, text = sizes.get((channels[n], units[n])), cells[value_column]
+            if unit is None:
+                unit = sizes[channels[n], units[n]] = _unit_size(table, line, channels[n], units[n])
+            value = si_from_text(text, table.number(line, value_column, text), unit)
+            uncertainty = math.nan if uncertain is None else _uncertainty(table, line, cells, uncertain[0], unit)
+            place = runs[n], cycles[n], directions[n], poses[n], channels[n]
+            around = times[n], centres[n], known[n], humidities[n], loads[n], slopes[n]
+            state = value, uncertainty, temperatures[n], None, FileLine(self._file, line)
+            self._rows.append(Reading._make((*place, *state, *around)))
+            self._exact.append((text, unit))
+
+    def _numbered_visits(self) -> Iterator[tuple]:
+        """Yield for each row what readings taken together share; a sequence may come back to a place."""
+        count, before = 0, None
+        for r in self._rows:
+            place = (r.run, r.cycle, r.direction, id(r.pose))
+            count += r.direction == FROM_PREVIOUS and place != before
+            before = place
+            yield (*place, count if r.direction == FROM_PREVIOUS else 0)
+
+    def _refuse_duplicates(self) -> None:
+        """Raise on a channel read twice in one pass at one place."""
+        seen: dict[tuple, int] = {}
+        for r, visit in zip(self._rows, self._visits, strict=True):
+            first = seen.setdefault((visit, r.channel, r.centre), r.source.line)
+            if first != r.source.line:
+                problem = (
+                    f"reads {r.channel} again at the place of line {first}; number repeated passes in column cycle"
+                )
+                raise self._error(r, problem)
+
+    def _error(self, reading: Reading, problem: str, column: str = "") -> InputFileError:
+        return InputFileError(self._file, f"line {reading.source.line}{column}", problem)
+
+    def _lines(self) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray]]]:
+        """Yield the runs that have channels of lines: first point, and direction forward, zero where it does not
+        travel."""
+        members: dict[str, list[int]] = {}
+        for n, r in enumerate(self._rows):
+            if r.channel.partition("_")[0] in ALONG_LINES:
+                members.setdefault(r.run, []).append(n)
+        for run, indices in members.items():
+            origin = self._points[indices[0]]
+            spread = self._points[indices] - origin
+            far = spread[np.linalg.norm(spread, axis=1).argmax()]
+            moving = np.flatnonzero(np.abs(far) > LEAST_TRAVEL)
+            forward = far / np.linalg.norm(far) * np.sign(far[moving[0]]) if len(moving) else np.zeros(3)
+            yield run, (origin, forward)
+
+    def readings(self) -> tuple[list[Reading], int]:
+        """Return the readings by the channels of sets, and how many of them were corrected for the air."""
+        commands = {visit: values for visit, _, values in self._whole(STRUT_NAMES, "must be empty for a strut")}
+        attitudes, corrected = self._attitudes(), self._corrected()
+        readings: list[Reading] = []
+        for n, r in enumerate(self._rows):
+            channel, value = r.channel, corrected.get(n, r.value)
+            if channel in STRUT_NAMES:
+                continue
+            if commands:
+                r = r._replace(commands=commands.get(self._visits[n]))
+            if channel in QUATERNION_CHANNELS:  # the first of the four stands for all
+                errors = zip(AXES, attitudes.pop(self._visits[n], ()), strict=False)
+                readings += [r._replace(channel=f"attitude_{axis}", value=error) for axis, error in errors]
+                continue
+            if channel.startswith("position_"):
+                value = self._minus(n, float(self._points[n, AXES.index(channel[-1])]))
+            elif channel == CHANNELS[LENGTH] and r.centre is not None:
+                value = self._minus(n, math.dist(self._points[n], r.centre))
+            elif channel in TURNS:
+                channel = self._rotation(r)
+            readings.append(r._replace(channel=channel, value=value))
+        if not readings:
+            raise InputFileError(self._file, "", "holds strut readings only: nothing that was measured")
+        return readings, len(corrected)
+
+    def _whole(self, channels: Sequence[str], wrong: str) -> Iterator[tuple[tuple, Reading, tuple[float, ...]]]:
+        """Yield the visits at which channels were read that must all be read together: first reading, all values."""
+        by_visit: dict[tuple, dict[str, Reading]] = {}
+        for r, visit in zip(self._rows, self._visits, strict=True):
+            if r.channel in channels:
+                if not math.isnan(r.uncertainty):
+                    raise self._error(r, wrong, ", column uncertainty")
+                by_visit.setdefault(visit, {})[r.channel] = r
+        for visit, group in by_visit.items():
+            first = next(iter(group.values()))
+            for channel in channels:
+                if channel not in group:
+                    problem = f"{channels[0]} … {channels[-1]} belong together; {channel} is missing at this pose"
+                    raise self._error(first, problem)
+            yield visit, first, tuple(group[channel].value for channel in channels)
+
+    def _attitudes(self) -> dict[tuple, tuple[float, ...]]:
+        """Return attitude errors from measured quaternions, rad along the work frame's axes."""
+        errors = {}
+        wrong = "must be empty for a quaternion; give attitude_x, attitude_y, attitude_z instead"
+        for visit, first, values in self._whole(QUATERNION_CHANNELS, wrong):
+            try:
+                measured = Pose.from_quaternion(np.zeros(3), np.array(values))
+            except PoseError as problem:
+                raise self._error(first, str(problem), f", channels {QUATERNION_CHANNELS[0]} …") from problem
+            errors[visit] = tuple(attitude_error(measured.rotation, first.pose.rotation).tolist())
+        return errors
+
+    def _rotation(self, reading: Reading) -> str:
+        """Return the rotation of a set that is roll, pitch or yaw on a line."""
+        along = np.flatnonzero(np.abs(self._axes[reading.run][1]) > 1.0 - PARALLEL)
+        if not len(along):
+            problem = f"{reading.channel} is for lines parallel to an axis of the work frame; use rotation_x, _y or _z"
+            raise self._error(reading, problem, ", column channel")
+        return f"rotation_{AXES[TURN_AXES[along[0]][TURNS.index(reading.channel)]]}"
+
+    def _corrected(self) -> dict[int, float]:
+        """Return the values of the rows that are to be corrected for the air, by the rows' number."""
+        chosen = np.flatnonzero(np.isfinite(self._air[:, 0]))
+        commanded = np.zeros(len(chosen))
+        for k, n in enumerate(chosen):
+            r = self._rows[n]
+            if r.channel.partition("_")[0] not in ALONG_LINES:
+                problem = f"is for what a laser reads along a line; a {r.channel} must come corrected"
+                raise self._error(r, problem, ", column instrument_index")
+            if r.channel == "linear":
+                origin, forward = self._axes[r.run]
+                commanded[k] = forward @ (self._points[n] - origin)
+        index, *air = self._air[chosen].T
+        shown = np.array([self._rows[n].value for n in chosen]) + commanded
+        true = correct_displacement(shown, Air(*air), index) - commanded
+        return dict(zip(chosen.tolist(), true.tolist(), strict=True))
+
+    def _minus(self, n: int, commanded: float) -> float:
+        """Return a coordinate minus the commanded one, without losing the digits that both share."""
+        text, unit = self._exact[n]
+        power = round(math.log10(unit))
+        if 10.0**power != unit:
+            return self._rows[n].value - commanded
+        return float(exact(text, float(text)).scaleb(power) - Decimal(repr(commanded)))
 
 
-def tidy_readings(path: str | Path, geometry: HexapodGeometry) -> list[Reading]:
-    """Return the readings of one file as they stand in it."""
-    return _file_readings(str(path), _read_rows(Table(path)), geometry, None)[0]
-
-
-def _file_readings(
-    file: str, rows: _Rows, geometry: HexapodGeometry, probe: np.ndarray | None
-) -> tuple[list[Reading], int]:
-    """Return a file's readings by the channels of sets, and how many of them were corrected for the air."""
-    given, visits = rows.readings, _visits(rows.readings)
-    _refuse_duplicates(file, given, visits)
-    points = _points(given, geometry, probe)
-    lines, commands = _lines(given, points), dict[tuple, tuple[float, ...]]()
-    wrong = "must be empty for a strut"
-    for visit, _, values in _whole(file, given, visits, STRUT_NAMES, wrong):
-        commands[visit] = values
-    attitudes = _attitudes(file, given, visits)
-    corrected = _corrected(file, rows, lines, points)
-    readings = []
-    for n, reading in enumerate(given):
-        channel, value = reading.channel, corrected.get(n, reading.value)
-        if channel in STRUT_NAMES:
-            continue
-        if commands:
-            reading = reading._replace(commands=commands.get(visits[n]))
-        if channel in QUATERNION_CHANNELS:
-            errors = attitudes.pop(visits[n], ())
-            readings += [
-                reading._replace(channel=f"attitude_{axis}", value=error)
-                for axis, error in zip(AXES, errors, strict=bool(errors))
-            ]
-            continue
-        if channel.startswith("position_"):
-            value = _minus(rows, n, float(points[n, AXES.index(channel[-1])]))
-        elif channel == CHANNELS[LENGTH] and reading.centre is not None:
-            value = _minus(rows, n, math.dist(points[n], reading.centre))
-        elif channel in TURNS:
-            channel = _rotation(file, reading, lines[reading.run].axis)
-        readings.append(reading._replace(channel=channel, value=value))
-    if not readings:
-        raise InputFileError(file, "", "holds strut readings only: nothing that was measured")
-    return readings, len(corrected)
-
-
-def _visits(given: Sequence[Reading]) -> list[tuple]:
-    """Return for each row what readings taken together share; a sequence may come back to a place."""
-    visits: list[tuple] = []
-    count, before = 0, None
-    for r in given:
-        place = (r.run, r.cycle, r.direction, id(r.pose))
-        if r.direction == FROM_PREVIOUS and place != before:
-            count += 1
-        before = place
-        visits.append((*place, count if r.direction == FROM_PREVIOUS else 0))
-    return visits
-
-
-def _refuse_duplicates(file: str, given: Sequence[Reading], visits: Sequence[tuple]) -> None:
-    """Raise on a channel read twice in one pass at one place."""
-    seen: dict[tuple, int] = {}
-    for r, visit in zip(given, visits, strict=True):
-        first = seen.setdefault((visit, r.channel, r.centre), r.source.line)
-        if first != r.source.line:
-            problem = f"reads {r.channel} again at the place of line {first}; number repeated passes in column cycle"
-            raise InputFileError(file, f"line {r.source.line}", problem)
-
-
-def _points(given: Sequence[Reading], geometry: HexapodGeometry, probe: np.ndarray | None) -> np.ndarray:
-    """Return the commanded place of the measured point in the work frame, shape (N, 3), m."""
-    points = np.array([r.pose.position for r in given])
-    if probe is not None:
-        offset = geometry.tool.rotation.T @ (np.asarray(probe, dtype=float) - geometry.tool.position)
-        if offset.any():
-            points += np.array([r.pose.rotation @ offset for r in given])
-    return points
-
-
-class _Line(NamedTuple):
-    """A run's first point and its direction forward, in the work frame; no direction when it does not travel."""
-
-    origin: np.ndarray
-    axis: np.ndarray
-
-
-def _lines(given: Sequence[Reading], points: np.ndarray) -> dict[str, _Line]:
-    """Return the lines of the runs that have channels of lines."""
-    members: dict[str, list[int]] = {}
-    for n, r in enumerate(given):
-        if r.channel.partition("_")[0] in ALONG_LINES:
-            members.setdefault(r.run, []).append(n)
-    lines = {}
-    for run, indices in members.items():
-        spread = points[indices] - points[indices[0]]
-        far = spread[np.linalg.norm(spread, axis=1).argmax()]
-        moving = np.flatnonzero(np.abs(far) > LEAST_TRAVEL)
-        axis = far / np.linalg.norm(far) * np.sign(far[moving[0]]) if len(moving) else np.zeros(3)
-        lines[run] = _Line(points[indices[0]], axis)
-    return lines
-
-
-def _whole(
-    file: str, given: Sequence[Reading], visits: Sequence[tuple], channels: Sequence[str], wrong: str
-) -> Iterator[tuple[tuple, Reading, tuple[float, ...]]]:
-    """Yield the visits at which channels were read that must all be read together: the first reading, and all
-    values."""
-    by_visit: dict[tuple, dict[str, Reading]] = {}
-    for r, visit in zip(given, visits, strict=True):
-        if r.channel in channels:
-            if not math.isnan(r.uncertainty):
-                raise InputFileError(file, f"line {r.source.line}, column uncertainty", wrong)
-            by_visit.setdefault(visit, {})[r.channel] = r
-    for visit, group in by_visit.items():
-        first = next(iter(group.values()))
-        for channel in channels:
-            if channel not in group:
-                problem = f"{channels[0]} … {channels[-1]} belong together; {channel} is missing at this pose"
-                raise InputFileError(file, f"line {first.source.line}", problem)
-        yield visit, first, tuple(group[channel].value for channel in channels)
-
-
-def _attitudes(file: str, given: Sequence[Reading], visits: Sequence[tuple]) -> dict[tuple, tuple[float, ...]]:
-    """Return attitude errors from measured quaternions, rad along the work frame's axes."""
-    errors = {}
-    wrong = "must be empty for a quaternion; give attitude_x, attitude_y, attitude_z instead"
-    for visit, first, values in _whole(file, given, visits, QUATERNION_CHANNELS, wrong):
-        try:
-            measured = Pose.from_quaternion(np.zeros(3), np.array(values))
-        except PoseError as problem:
-            where = f"line {first.source.line}, channels {QUATERNION_CHANNELS[0]} …"
-            raise InputFileError(file, where, str(problem)) from problem
-        errors[visit] = tuple(attitude_error(measured.rotation, first.pose.rotation).tolist())
-    return errors
-
-
-def _rotation(file: str, reading: Reading, axis: np.ndarray) -> str:
-    """Return the rotation of a set that is roll, pitch or yaw on a line."""
-    along = np.flatnonzero(np.abs(axis) > 1.0 - PARALLEL)
-    if not len(along):
-        problem = f"{reading.channel} is for lines parallel to an axis of the work frame; use rotation_x, _y or _z"
-        raise InputFileError(file, f"line {reading.source.line}, column channel", problem)
-    return f"rotation_{AXES[TURN_AXES[along[0]][TURNS.index(reading.channel)]]}"
-
-
-def _corrected(file: str, rows: _Rows, lines: dict[str, _Line], points: np.ndarray) -> dict[int, float]:
-    """Return the values of the rows that are to be corrected for the air, by the rows' number."""
-    chosen = np.flatnonzero(np.isfinite(rows.air[:, 0]))
-    if not len(chosen):
-        return {}
-    commanded = np.zeros(len(chosen))
-    for k, n in enumerate(chosen):
-        r = rows.readings[n]
-        if r.channel.partition("_")[0] not in ALONG_LINES:
-            problem = f"is for what a laser reads along a line; a {r.channel} must come corrected"
-            raise InputFileError(file, f"line {r.source.line}, column instrument_index", problem)
-        if r.channel == "linear":
-            commanded[k] = lines[r.run].axis @ (points[n] - lines[r.run].origin)
-    index, *air = rows.air[chosen].T
-    shown = np.array([rows.readings[n].value for n in chosen]) + commanded
-    true = correct_displacement(shown, Air(*air), index) - commanded
-    return dict(zip(chosen.tolist(), true.tolist(), strict=True))
-
-
-def _minus(rows: _Rows, n: int, commanded: float) -> float:
-    """Return a coordinate minus the commanded one, without losing the digits that both share."""
-    text, unit = rows.texts[n], rows.units[n]
-    power = round(math.log10(unit))
-    if 10.0**power != unit:
-        return rows.readings[n].value - commanded
-    return float(exact(text, float(text)).scaleb(power) - Decimal(repr(commanded)))
+def read_tidy(path: str | Path, geometry: HexapodGeometry, probe: np.ndarray | None = None) -> MeasuredFile:
+    """Read a tidy CSV file; `probe` is the measured point in ``platform``, the tool's tip by default."""
+    table = Table(path)
+    readings, corrected = _TidyFile(table, geometry, probe).readings()
+    notes = [f"{path}: {corrected} readings corrected to the air of their rows (Ciddor)"] if corrected else []
+    return MeasuredFile(path, table.sha256, readings, notes)
 
 
 def write_measurements(measurements: MeasurementSet, path: str | Path, remark: str = "") -> None:

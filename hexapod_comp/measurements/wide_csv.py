@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import difflib
+import math
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 
-from ..errors import InputFileError, ModelError, PoseError
-from ..formats.csv import AS_USUAL, ENCODINGS, MOST_SKIPPED, Layout, Table
+from ..errors import InputFileError, ModelError
+from ..formats.csv import AS_USUAL, Layout, Table
 from ..formats.schema import (
     MOST_NEIGHBOURS,
     PER_STRUT,
     Choice,
-    Integer,
+    Kind,
     Names,
     Numbers,
     Section,
@@ -32,8 +34,8 @@ from ..machine.passes import Poses
 from ..machine.pose_files import read_pose_arrays, rotations_of
 from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
 from ..pose import Pose, attitude_error
-from .readings import AXES, FROM_PREVIOUS, UNKNOWN, FileLine, MeasurementSet, Reading
-from .runs import assemble
+from .readings import AXES, FROM_PREVIOUS, UNKNOWN, FileLine, Reading
+from .runs import MeasuredFile
 from .tidy import HUMIDITY, TIME, WARMTH, Range
 
 COLUMNS_FORMAT = "hexapod_comp/columns"
@@ -53,13 +55,19 @@ class UncertaintyColumns:
     columns: tuple[str, ...]  # one for all axes, or three
     unit: float  # size of their unit in SI, divided by the coverage factor: what makes standard deviations of them
 
-    @staticmethod
-    def read(section: Section, name: str, dimension: str) -> float | UncertaintyColumns:
-        """Read one standard deviation for all rows, or one per row from its columns; NaN without either."""
+
+class Deviation(Kind):
+    """One standard deviation for all rows, or one per row from its columns; NaN without either."""
+
+    def __init__(self, dimension: str) -> None:
+        self.dimension = dimension
+
+    def read(self, section: Section, name: str, default: Any) -> float | UncertaintyColumns:
+        """Return what a key holds."""
         if name not in section:
-            return float(section.quantity(name, dimension, default=np.nan))
+            return float(section.quantity(name, self.dimension, default=default))
         part, (low, high) = section.section(name), COVERAGE_FACTORS
-        columns, unit = Names(1, 3).take(part, "columns"), part.unit("unit", dimension)
+        columns, unit = Names(1, 3).take(part, "columns"), part.unit("unit", self.dimension)
         factor = float(part.array("coverage_factor"))
         if not low <= factor <= high:
             raise part.error("coverage_factor", f"must be {low:g}…{high:g}; 1 where the column is a deviation", factor)
@@ -73,8 +81,8 @@ class PoseColumns:
 
     position: Annotated[tuple[str, ...], Names(3)]
     unit: Annotated[float, Unit("length")]
-    # Standard deviations of position (m) and attitude (rad), NaN when not known; or where each row's stand.
-    uncertainty: tuple[float | UncertaintyColumns, float | UncertaintyColumns]
+    position_uncertainty: Annotated[float | UncertaintyColumns, Deviation("length")] = math.nan
+    attitude_uncertainty: Annotated[float | UncertaintyColumns, Deviation("angle")] = math.nan
     offset: Annotated[np.ndarray, Numbers("mm", (3,))] = field(default_factory=lambda: np.zeros(3))  # is added
     quaternion: Annotated[tuple[str, ...], Names(4)] = ()
     angles: Annotated[tuple[str, ...], Names(3)] = ()  # the paper's, where there is no quaternion
@@ -90,13 +98,6 @@ class PoseColumns:
     def turn(self) -> tuple[str, ...]:
         """Columns of the orientation, empty when there are none."""
         return self.quaternion or self.angles
-
-    @staticmethod
-    def read(section: Section) -> PoseColumns:
-        """Return what a section holds."""
-        kinds = (("position_uncertainty", "length"), ("attitude_uncertainty", "angle"))
-        position, attitude = (UncertaintyColumns.read(section, *kind) for kind in kinds)
-        return read_whole(PoseColumns, section, uncertainty=(position, attitude))
 
 
 @dataclass(frozen=True)
@@ -148,14 +149,30 @@ class StrutColumns:
             raise ModelError("struts.zero_length", "belongs to zero: given", self.zero)
 
 
+def _commanded(section: Section, name: str) -> PoseColumns | PoseFile:
+    part = section.section(name)
+    return read_whole(PoseFile, part) if "file" in part else read_whole(PoseColumns, part)
+
+
+def _temperature_columns(section: Section, name: str) -> dict[str, str]:
+    """Return the columns by part; ``everywhere`` for all parts that have none."""
+    part = section.section(name)
+    part.unit("unit", "temperature")
+    columns = {key: part.text(key) for key in (EVERYWHERE, *Temperatures.NAMES) if key in part}
+    part.finish()
+    if not columns:
+        raise part.error(EVERYWHERE, "is missing, and so is every part")
+    return columns
+
+
 @dataclass(frozen=True)
 class Columns:
     """What the columns of a wide file mean; the parts are as in the file, None where left out."""
 
-    layout: Layout
-    commanded: PoseColumns | PoseFile | None
     measured: PoseColumns
-    temperature: dict[str, str]  # columns by part; ``everywhere`` for all that have none
+    table: Layout = AS_USUAL
+    commanded: Annotated[PoseColumns | PoseFile | None, Kind(_commanded)] = None
+    temperature: Annotated[dict[str, str], Kind(_temperature_columns)] = field(default_factory=dict)
     run: Annotated[str, Text()] = ""
     order: Annotated[str, Choice(*ORDERS)] = "unknown"
     humidity: Humidity | None = None
@@ -171,78 +188,42 @@ class Columns:
 
 def load_columns(path: str | Path) -> Columns:
     """Read a columns file."""
-    top = read_yaml(path, COLUMNS_FORMAT, COLUMNS_VERSION)
-    layout, commanded, temperature = AS_USUAL, None, dict[str, str]()
-    if "table" in top:
-        section = top.section("table")
-        skipped = (Integer(0, MOST_SKIPPED).read(section, f"rows_{side}_header", 0) for side in ("above", "below"))
-        layout = Layout(Choice(*ENCODINGS).read(section, "encoding", ""), *skipped)
-        section.finish()
-    if "commanded" in top:
-        section = top.section("commanded")
-        commanded = read_whole(PoseFile, section) if "file" in section else PoseColumns.read(section)
-    if "temperature" in top:
-        section = top.section("temperature")
-        section.unit("unit", "temperature")
-        parts = (EVERYWHERE, *Temperatures.NAMES)
-        temperature = {part: section.text(part) for part in parts if part in section}
-        section.finish()
-        if not temperature:
-            raise section.error(EVERYWHERE, "is missing, and so is every part")
-    given = {"layout": layout, "commanded": commanded, "temperature": temperature}
-    return read_whole(Columns, top, **given, measured=PoseColumns.read(top.section("measured")))
+    return read_whole(Columns, read_yaml(path, COLUMNS_FORMAT, COLUMNS_VERSION))
 
 
-def read_wide(
-    path: str | Path, columns_path: str | Path, geometry: HexapodGeometry, in_reach: bool = True
-) -> MeasurementSet:
+def read_wide(path: str | Path, columns_path: str | Path, geometry: HexapodGeometry) -> MeasuredFile:
     """Read a wide CSV file as one run of absolute positions and, where there are any, attitudes."""
     columns = load_columns(columns_path)
-    table = Table(path, columns.layout)
-    used: set[str] = set()
-    measured = _read_poses(table, columns.measured, used)
-    notes: list[str] = []
-    commands = None if columns.struts is None else _lengths(table, columns.struts, measured, geometry, used, notes)
+    table, notes = Table(path, columns.table), list[str]()
+    measured = _read_poses(table, columns.measured)
+    commands = None if columns.struts is None else _lengths(table, columns.struts, measured, geometry, notes)
     if isinstance(columns.commanded, PoseFile):
-        commanded = _poses_of_file(table, columns.commanded, Path(columns_path), used)
+        commanded = _poses_of_file(table, columns.commanded, Path(columns_path))
     elif columns.commanded is not None:
-        commanded = _read_poses(table, columns.commanded, used)
+        commanded = _read_poses(table, columns.commanded)
     else:
         commanded = _nominal_poses(table, geometry, np.asarray(commands))
-    conditions = _conditions(table, columns, used)
-    deviations = [_deviations(table, given, used) for given in columns.measured.uncertainty]
-    unused = [name for name in table.header if name and name not in used]
+    readings = list(_readings(table, columns, commanded, measured, commands))
     notes += table.notes
-    notes += [f"{path}: columns not used: {', '.join(unused)}"] if unused else []
-    readings = _readings(table, columns, commanded, measured, commands, deviations, conditions)
-    return assemble(geometry, readings, None, [(Path(path).name, table.sha256)], notes, in_reach)
+    notes += [f"{path}: columns not used: {', '.join(table.unknown)}"] if table.unknown else []
+    return MeasuredFile(path, table.sha256, readings, notes)
 
 
-def _read_numbers(table: Table, names: tuple[str, ...], unit: float, used: set[str]) -> np.ndarray:
+def _read_numbers(table: Table, names: tuple[str, ...], unit: float) -> np.ndarray:
     """Return some columns in SI, shape (rows, columns)."""
-    used.update(names)
     return table.numbers([(index, unit) for index, _ in table.required(names, None)])
 
 
-def _read_poses(table: Table, columns: PoseColumns, used: set[str]) -> Poses:
+def _read_poses(table: Table, columns: PoseColumns) -> Poses:
     """Return the poses in some columns; level where the file has no orientation."""
-    positions = _read_numbers(table, columns.position, columns.unit, used) + columns.offset
+    positions = _read_numbers(table, columns.position, columns.unit) + columns.offset
     if not columns.turn:
         return positions, np.tile(np.eye(3), (len(positions), 1, 1))
-    turns = _read_numbers(table, columns.turn, columns.angle_unit or 1.0, used)
-    if len(columns.turn) == 3:
-        return positions, rotations_of(table, turns)
-    rotations = np.empty((len(turns), 3, 3))
-    for n, ((line, _), quaternion) in enumerate(zip(table.rows, turns, strict=True)):
-        try:
-            rotations[n] = Pose.from_quaternion(np.zeros(3), quaternion).rotation
-        except PoseError as error:
-            where = f"line {line}, columns {', '.join(columns.turn)}"
-            raise InputFileError(table.path, where, str(error)) from error
-    return positions, rotations
+    turns = _read_numbers(table, columns.turn, columns.angle_unit or 1.0)
+    return positions, rotations_of(table, turns, ", ".join(columns.turn))
 
 
-def _poses_of_file(table: Table, file: PoseFile, columns_path: Path, used: set[str]) -> Poses:
+def _poses_of_file(table: Table, file: PoseFile, columns_path: Path) -> Poses:
     """Return the commanded pose of each row from a file of poses."""
     path = columns_path.with_name(file.file)
     labels, positions, rotations = read_pose_arrays(path)
@@ -251,7 +232,6 @@ def _poses_of_file(table: Table, file: PoseFile, columns_path: Path, used: set[s
             problem = f"has {len(table.rows)} rows, and {path.name} {len(labels)} poses; without commanded.name"
             raise InputFileError(table.path, "", f"{problem} they go row by row")
         return positions, rotations
-    used.add(file.name)
     rows = {one.label: n for n, one in enumerate(labels)}
     if len(rows) != len(labels):
         raise InputFileError(path, "", "has a name twice; commanded.name finds poses by their names")
@@ -265,11 +245,11 @@ def _poses_of_file(table: Table, file: PoseFile, columns_path: Path, used: set[s
     return positions[numbers], rotations[numbers]
 
 
-def _deviations(table: Table, given: float | UncertaintyColumns, used: set[str]) -> np.ndarray:
+def _deviations(table: Table, given: float | UncertaintyColumns) -> np.ndarray:
     """Return a standard deviation for each row and axis, shape (rows, 3)."""
     if not isinstance(given, UncertaintyColumns):
         return np.full((len(table.rows), 3), given)
-    values = _read_numbers(table, given.columns, given.unit, used)
+    values = _read_numbers(table, given.columns, given.unit)
     if not (values > 0.0).all():
         row, column = np.argwhere(values <= 0.0)[0]
         where = f"line {table.rows[row][0]}, column {given.columns[column]}"
@@ -277,37 +257,27 @@ def _deviations(table: Table, given: float | UncertaintyColumns, used: set[str])
     return np.broadcast_to(values, (len(values), 3))
 
 
-class _Conditions(NamedTuple):
-    """Of each row: temperatures (rows, 8), °C; time, s, and relative humidity, NaN where not known."""
-
-    temperatures: np.ndarray
-    times: np.ndarray
-    humidities: np.ndarray
-
-
-def _conditions(table: Table, columns: Columns, used: set[str]) -> _Conditions:
-    unknown, named, damp = np.full(len(table.rows), np.nan), columns.temperature, columns.humidity
+def _conditions(table: Table, columns: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return each row's temperatures (rows, 8), °C; time, s, and relative humidity, NaN where not known."""
+    unknown, named, damp, time = np.full(len(table.rows), np.nan), columns.temperature, columns.humidity, columns.time
 
     def read(name: str | None, unit: float, within: Range, otherwise: np.ndarray) -> np.ndarray:
         if name is None:
             return otherwise
-        used.add(name)
         return within._replace(blank=False).of(table, table.required((name,), None)[0][0], unit)
 
     everywhere = read(named.get(EVERYWHERE), 1.0, WARMTH, np.full_like(unknown, REFERENCE_TEMPERATURE))
     parts = [read(named.get(part), 1.0, WARMTH, everywhere) for part in Temperatures.NAMES]
     humidities = unknown if damp is None else read(damp.column, damp.unit, HUMIDITY, unknown)
-    times = unknown
-    if columns.time is not None and columns.time.format:
-        times = _clock_times(table, columns.time, used)
-    elif columns.time is not None:
-        times = read(columns.time.columns[0], columns.time.unit or 1.0, TIME, unknown)
-    return _Conditions(np.stack(parts, axis=1), times, humidities)
+    if time is not None and time.format:
+        times = _clock_times(table, time)
+    else:
+        times = unknown if time is None else read(time.columns[0], time.unit or 1.0, TIME, unknown)
+    return np.stack(parts, axis=1), times, humidities
 
 
-def _clock_times(table: Table, time: Times, used: set[str]) -> np.ndarray:
+def _clock_times(table: Table, time: Times) -> np.ndarray:
     """Return times that are written as dates and clocks, s; without a zone they are taken for UTC."""
-    used.update(time.columns)
     texts = [" ".join(parts) for parts in zip(*(table.texts(name) for name in time.columns), strict=True)]
     names, times = ", ".join(time.columns), np.empty(len(texts))
     for n, ((line, _), text) in enumerate(zip(table.rows, texts, strict=True)):
@@ -324,10 +294,10 @@ def _clock_times(table: Table, time: Times, used: set[str]) -> np.ndarray:
 
 
 def _lengths(
-    table: Table, struts: StrutColumns, measured: Poses, geometry: HexapodGeometry, used: set[str], notes: list[str]
+    table: Table, struts: StrutColumns, measured: Poses, geometry: HexapodGeometry, notes: list[str]
 ) -> np.ndarray:
     """Return the strut lengths that the readings say, shape (rows, 6), m."""
-    travel = _read_numbers(table, struts.readings, 1.0, used) * struts.length_per_unit
+    travel = _read_numbers(table, struts.readings, 1.0) * struts.length_per_unit
     structure = Structure.of(geometry)
     home = strut_lengths_batch(structure, geometry.home.position[None], geometry.home.rotation[None])[0]
     zero = {"home": home, "given": struts.zero_length}.get(struts.zero)
@@ -355,27 +325,21 @@ def _nominal_poses(table: Table, geometry: HexapodGeometry, lengths: np.ndarray)
 
 
 def _readings(
-    table: Table,
-    columns: Columns,
-    commanded: Poses,
-    measured: Poses,
-    commands: np.ndarray | None,
-    deviations: list[np.ndarray],
-    conditions: _Conditions,
-) -> list[Reading]:
-    """Return position and attitude readings of every row."""
-    errors = [("position", measured[0] - commanded[0], deviations[0])]
-    if columns.measured.turn:
-        errors.append(("attitude", attitude_error(measured[1], commanded[1]), deviations[1]))
+    table: Table, columns: Columns, commanded: Poses, measured: Poses, commands: np.ndarray | None
+) -> Iterator[Reading]:
+    """Yield position and attitude readings of every row."""
+    temperatures, times, humidities = _conditions(table, columns)
+    found = columns.measured
+    errors = [("position", measured[0] - commanded[0], _deviations(table, found.position_uncertainty))]
+    if found.turn:
+        turned = attitude_error(measured[1], commanded[1])
+        errors.append(("attitude", turned, _deviations(table, found.attitude_uncertainty)))
     run = columns.run or Path(table.path).stem
-    readings = []
     for n, (line, _) in enumerate(table.rows):
         pose = Pose(commanded[0][n], commanded[1][n])
         lengths = None if commands is None else tuple(commands[n].tolist())
-        temperatures, source = tuple(conditions.temperatures[n].tolist()), FileLine(str(table.path), line)
-        state = temperatures, lengths, source, float(conditions.times[n])
+        state = tuple(temperatures[n].tolist()), lengths, FileLine(str(table.path), line), float(times[n])
         for kind, values, spreads in errors:
             for axis, value, spread in zip(AXES, values[n].tolist(), spreads[n].tolist(), strict=True):
                 place = (run, 1, ORDERS[columns.order], pose, f"{kind}_{axis}")
-                readings.append(Reading(*place, value, spread, *state, humidity=float(conditions.humidities[n])))
-    return readings
+                yield Reading(*place, value, spread, *state, humidity=float(humidities[n]))

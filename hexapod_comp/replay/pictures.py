@@ -27,8 +27,6 @@ def figures_of(report: Report, geometry: HexapodGeometry | None) -> dict[str, Fi
         figures["following_error"] = following_figure(report)
     if geometry is not None:
         figures["tool"] = tool_figure(report, geometry)
-    if report.refused:
-        figures["refused"] = refused_figure(report)
     if report.other is not None or not report.same:
         figures["difference"] = difference_figure(report)
     return {f"{name}.png": figure for name, figure in figures.items()}
@@ -137,19 +135,6 @@ def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
             panels[2].plot(*_broken(at[inside], off * 1e6), lw=0.8, label=f"{name} in base")
         panels[2].set(title="estimated − commanded, lag included", xlabel="time, s", ylabel="µm")
         panels[2].legend(fontsize=7)
-    return figure
-
-
-def refused_figure(report: Report) -> Figure:
-    figure = _figure(report, "Refused commands", 3.5)
-    axes = figure.subplots()
-    reasons = sorted({event.entry.values["reason"] for event in report.refused})
-    for height, reason in enumerate(reasons):
-        times = [report.since_first_page(e.time) for e in report.refused if e.entry.values["reason"] == reason]
-        axes.plot(times, np.full(len(times), height), "|", ms=14)
-    axes.set_yticks(range(len(reasons)), [picture_text(reason, 30) for reason in reasons])
-    axes.set(xlabel="time, s")
-    axes.margins(y=0.3)
     return figure
 
 

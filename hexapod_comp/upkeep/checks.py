@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ..calibration.assumptions import ASSUMED
 from ..calibration.parameters import ParameterSpace
@@ -93,7 +93,7 @@ def judge_promise(fitted: FittedParameters, readings: MeasurementSet, promised: 
         expected += free * float(np.mean(noise[members] ** 2))
         freedom += free
     allowed = (freedom * promised**2 / 3.0 + expected) / max(freedom, 1)
-    most = float(chi2.ppf(1.0 - BEYOND, max(freedom, 1))) * allowed
+    most = float(chdtri(max(freedom, 1), BEYOND)) * allowed
     found = np.sqrt(max(3.0 * (squares - expected) / max(freedom, 1), 0.0))
     return Judgement(promised, float(found), squares / most)
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..errors import CommandError
 from ..machine.arrays import different_rows
@@ -30,7 +29,7 @@ from ..measurements.readings import (
     MeasurementSet,
 )
 from ..measurements.runs import assemble
-from ..pose import Pose, attitude_error
+from ..pose import Pose, attitude_error, rotation_from_vector
 
 # Streams of random numbers, one per cause: changing one leaves the others' draws alone
 VISITS, SLOPES, NOISE, CENTRES = range(4)
@@ -113,7 +112,7 @@ def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.
         arms = centres[members] - mean
         shift, turn = drawn[run]
         size = np.linalg.norm(arms, axis=1).max()
-        turned = Rotation.from_rotvec(turn / size).apply(arms) if size > off else arms
+        turned = arms @ rotation_from_vector(turn / size).T if size > off else arms
         centres[members] = mean + shift + turned
     return centres
 
@@ -233,7 +232,7 @@ class LiveInstrument:
         position = self.flaws.scale * (own.position + away)
         if self.flaws.exchanged:
             position[[0, 1]] = position[[1, 0]]
-        return Pose(position, Rotation.from_rotvec(turn).as_matrix() @ own.rotation)
+        return Pose(position, rotation_from_vector(turn) @ own.rotation)
 
     def _noise(self, channel: str) -> float:
         """Return the error of one reading: noise and, at times, an outlier."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..compensation.compensator import Compensator
 from ..errors import LimitError
@@ -19,7 +18,7 @@ from ..machine.model import MachineModel, RealMachine
 from ..machine.temperatures import Temperatures
 from ..machine.trajectory import commanded_in_base
 from ..measurements.collect import Observation
-from ..pose import Pose, attitude_error
+from ..pose import Pose, attitude_error, rotation_from_vector
 from .machine import DriveParameters, StrutDrive
 
 PLACES = (0.5, 0.75, 0.875, 0.94, 0.97, 0.99, 1.0)  # of a move, as shares of it: struts turn back where they would
@@ -64,7 +63,7 @@ class VirtualMachine:
         turn = attitude_error(target.rotation, start.rotation)
         for share in PLACES:
             place = start.position + share * way
-            before = Pose(place, Rotation.from_rotvec(share * turn).as_matrix() @ start.rotation)
+            before = Pose(place, rotation_from_vector(share * turn) @ start.rotation)
             try:
                 self._send(target if share == 1.0 else before)
             except LimitError as error:
@@ -89,7 +88,7 @@ class VirtualMachine:
             return None
         true, sigma = self._drive.true_tool_pose(), np.array([instrument.position, instrument.rotation])
         off = noise * sigma[:, None] + (draws[1] < instrument.wild) * jump
-        seen = Pose(true.position + off[0], Rotation.from_rotvec(off[1]).as_matrix() @ true.rotation)
+        seen = Pose(true.position + off[0], rotation_from_vector(off[1]) @ true.rotation)
         temperatures = tuple(self._drive.machine.temperatures.at(name) for name in Temperatures.NAMES)
         struts = tuple(self._drive.motor_lengths().tolist())
         return Observation(seen, np.repeat(sigma, 3) / np.sqrt(SAMPLES), struts, temperatures, float(self.stops))

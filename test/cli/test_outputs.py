@@ -33,9 +33,7 @@ def test_every_option_that_names_a_file_is_declared_as_read_or_written():
 
 COMMANDS = [
     ("ik {in}/table1.csv --out {in}/table1.csv", "table1.csv"),
-    ("run {in}/table1.csv --pictures {in}/table1.csv", "table1.csv"),
     ("fit {in}/other.csv {in}/m.csv --out {in}/new --report {in}/m.csv", "m.csv"),
-    ("export --model {in}/paper_machine.yaml --table {in}/paper_machine.yaml", "paper_machine.yaml"),
     ("replay {in}/bag --out {in}/bag/metadata.yaml", "metadata.yaml"),
 ]
 
@@ -61,28 +59,22 @@ def test_output_that_is_an_input_is_refused_at_once(command: str, name: str, fol
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
-@pytest.mark.parametrize("way", ["link", "other spelling", "standard input"])
-def test_other_names_of_an_input_are_refused_too(way: str, folder: Path, capsys):
-    given, out = str(folder / "table1.csv"), folder / "out.csv"
-    if way == "link":
-        out.symlink_to(given)
-    elif way == "other spelling":
-        out = folder / "bag" / ".." / "table1.csv"
-    else:
-        out, given = Path(given), "-"
-        with open(out, encoding="utf-8") as stream:
-            own = os.dup(0)
-            os.dup2(stream.fileno(), 0)
-            try:
-                assert cli.main(["ik", "-", "--out", str(out)]) == 2
-            finally:
-                os.dup2(own, 0)
-                os.close(own)
-        assert "is read by this command, as -" in capsys.readouterr().err
-        return
-    assert cli.main(["ik", given, "--out", str(out)]) == 2
+def test_other_names_of_an_input_are_refused_too(folder: Path, capsys):
+    """A link, and standard input."""
+    given, out = folder / "table1.csv", folder / "out.csv"
+    out.symlink_to(given)
+    assert cli.main(["ik", str(given), "--out", str(out)]) == 2
     assert "is read by this command" in capsys.readouterr().err
-    assert Path(given).read_bytes() == (ROOT / "config" / "table1.csv").read_bytes()
+    with open(given, encoding="utf-8") as stream:
+        own = os.dup(0)
+        os.dup2(stream.fileno(), 0)
+        try:
+            assert cli.main(["ik", "-", "--out", str(given)]) == 2
+        finally:
+            os.dup2(own, 0)
+            os.close(own)
+    assert "is read by this command, as -" in capsys.readouterr().err
+    assert given.read_bytes() == (ROOT / "config" / "table1.csv").read_bytes()
 
 
 def test_a_file_in_an_output_folder_that_is_read_is_not_replaced(folder: Path):

@@ -166,12 +166,9 @@ def test_a_missing_key_among_very_many(tmp_path):
 @pytest.mark.parametrize(
     ("dimension", "unit", "number", "si"),
     [
-        ("length", "mm", 350, 0.35),
         ("length", "um", 12.3, 12.3e-6),
-        ("length", "in", 8, 0.2032),
         ("angle", "deg", 180, np.pi),
         ("ratio", "ppm", 7, 7e-6),
-        ("expansion", "ppm_per_K", 11.7, 11.7e-6),
         ("speed", "m_min", 15, 0.25),
     ],
 )

@@ -37,9 +37,8 @@ from hexapod_comp.machine.model_file import load_model, model_text
 from hexapod_comp.machine.pose_files import read_lengths, read_poses
 from hexapod_comp.machine.region import Region
 from hexapod_comp.measurements.campaign import load_campaign
+from hexapod_comp.measurements.files import read_measurements
 from hexapod_comp.measurements.readings import FileLine, MeasurementSet
-from hexapod_comp.measurements.tidy import read_tidy
-from hexapod_comp.measurements.wide_csv import read_wide
 from hexapod_comp.workspace.budget import load_budget
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
@@ -275,14 +274,14 @@ def unplaced(found: MeasurementSet) -> MeasurementSet:
 def wide_by(columns: str) -> Callable[[Path], MeasurementSet]:
     def read(path: Path) -> MeasurementSet:
         path.with_name("w.yaml").write_text(columns)
-        return unplaced(read_wide(path, path.with_name("w.yaml"), PAPER))
+        return unplaced(read_measurements(path, PAPER, path.with_name("w.yaml")))
 
     return read
 
 
 def wide_rows(path: Path) -> MeasurementSet:
     path.with_name("w.csv").write_bytes(WIDE_ROWS)
-    return unplaced(read_wide(path.with_name("w.csv"), path, PAPER))
+    return unplaced(read_measurements(path.with_name("w.csv"), PAPER, path))
 
 
 def grid_table() -> bytes:
@@ -301,7 +300,7 @@ KINDS = {
     "budget": Kind(load_budget, plain_yaml, ((CONFIG / "error_budget.yaml").read_bytes(),)),
     "poses": Kind(lambda path: labelled(read_poses(path)), plain_csv, POSES),
     "lengths": Kind(lambda path: labelled(read_lengths(path)), plain_csv, (LENGTHS,)),
-    "tidy": Kind(lambda path: unplaced(read_tidy(path, PAPER)), plain_csv, (TIDY,), sound),
+    "tidy": Kind(lambda path: unplaced(read_measurements(path, PAPER)), plain_csv, (TIDY,), sound),
     "wide": Kind(wide_by(WIDE_COLUMNS), plain_cells, (WIDE_ROWS,), sound),
     "columns": Kind(wide_rows, plain_yaml, (WIDE_COLUMNS.encode(), FROM_STRUTS.encode()), sound),
     "table": Kind(read_table, plain_csv, (grid_table(),)),

@@ -12,6 +12,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 from strategies import fixed, paper_geometry, random_pose, random_struts, seeds, skewed_geometry
 
+from hexapod_comp.calibration.blocks.length_map import LengthMap
 from hexapod_comp.core.batch import actual_length, screw_twists, strut_commands
 from hexapod_comp.errors import ModelError
 from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine
@@ -76,14 +77,16 @@ def test_each_term_by_its_closed_form(struts, truth):
 def test_maps_are_natural_splines_and_lost_motion_lags_behind():
     """Truth: SciPy's B-splines, another algorithm; a nut with play b(c) stands half of it behind, −s·b(c)/2.
 
-    Tolerance: 1e-12 of 50 µm; outside the knots the end values hold.
+    Tolerance: 1e-12 of 50 µm; outside the knots the end values hold. A fit weights the knots by the same spline.
     """
     drawn = random_struts(np.random.default_rng(11))
     knots, maps = drawn.map_knots, np.stack([drawn.map_values, drawn.map_backlash])
     struts = StrutErrors(backlash=drawn.backlash, map_knots=knots, map_values=maps[0], map_backlash=maps[1])
     splines = make_interp_spline(knots, maps, k=3, axis=2, bc_type=([(2, np.zeros((2, 6)))], [(2, np.zeros((2, 6)))]))
+    weights = LengthMap(knots).weights
     for command in (*np.linspace(0.25, 0.75, 41), *knots):
         values, change = splines(np.clip(command, knots[0], knots[-1]))
+        np.testing.assert_allclose(maps @ weights(np.array(command)), [values, change], rtol=0.0, atol=5e-17)
         for sense in (-1.0, 0.0, 0.5, 1.0):
             truth = command + values - 0.5 * sense * (drawn.backlash + change)
             found = [length(struts, command, sense, strut) for strut in range(6)]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from ...machine.geometry import STRUT_NAMES
+from ...machine.struts import natural_spline
 from ..assumptions import ASSUMED
 from .block import Draft, Facts, Linkage, StrutBlock
 
@@ -31,7 +31,7 @@ class LengthMap(StrutBlock):
         self.knots = knots
         labels = tuple(f"{s} {self.name} at {1e3 * k:.0f} mm" for s in STRUT_NAMES for k in knots)
         super().__init__(labels, map_root(knots))
-        self._cardinal = CubicSpline(knots, np.eye(len(knots)), bc_type="natural")
+        self._cardinal = natural_spline(knots, np.eye(len(knots)))
 
     @classmethod
     def of(cls, facts: Facts) -> LengthMap:
@@ -40,7 +40,13 @@ class LengthMap(StrutBlock):
 
     def weights(self, commands: np.ndarray) -> np.ndarray:
         """Return the contribution of each knot's value at some commands (…), shape (…, knots); held outside."""
-        return self._cardinal(np.clip(commands, *self.knots[[0, -1]]))
+        inside = np.clip(commands, *self.knots[[0, -1]])
+        piece = np.clip(np.searchsorted(self.knots, inside, side="right") - 1, 0, len(self.knots) - 2)
+        along = (inside - self.knots[piece])[..., None]
+        values = self._cardinal[0][piece]
+        for coefficients in self._cardinal[1:]:
+            values = values * along + coefficients[piece]
+        return values
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
         """The spline's weights."""
