@@ -130,7 +130,7 @@ def achieved(campaign: Campaign, plan: Proposal, settings: FitSettings, seed: in
         commands, _ = model_commands([believed] * count, poses, stations.sense)
         left = drive([truth] * count, poses, stations.sense, commands).errors(poses, space.probe).aligned()
         box = box_errors(fit.space, fit.solution.x, tilt)
-        promise = expected_error(box, covariance, beyond=fit.verdict.unexplained)
+        promise = expected_error(box, covariance, beyond=fit.unexplained)
         assert promise is not None
         errors.append((float(np.sqrt((left.displacement**2).sum(axis=1).mean())), (promise.low, promise.high)))
     return max(errors)

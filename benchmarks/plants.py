@@ -26,7 +26,6 @@ from hexapod_comp.calibration.design import propose_check
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings
-from hexapod_comp.calibration.posterior import FittedParameters
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.machine.arrays import rms
 from hexapod_comp.machine.load import STANDARD_GRAVITY, Load, Loading, Payload
@@ -175,7 +174,7 @@ class Bench:
 
     def said(self, fit: ModelFit) -> dict[str, str]:
         """Return what ``verify`` says of payloads that nobody told."""
-        known, answers = FittedParameters.of(fit), {}
+        known, answers = fit.parameters, {}
         for n, (name, payload) in enumerate(OTHERS.items()):
             read, found = list[MeasurementSet](), None
             # An undecided check is followed by another with twice as many readings, and all are judged together

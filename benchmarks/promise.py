@@ -4,8 +4,8 @@ Usage: python -m benchmarks.promise [--machines 12] [--first 100] [--workers 2] 
 bars: doc/benchmarks.md.
 
 With ``--ablate``: what the promise would be with the covariance believed more or less than ``jackknife_prior`` degrees
-of freedom, and with how much it is most likely believed. The tool's error over its expectation, squared, is Fisher's F
-with the freedom of the covariance and of that belief.
+of freedom, or a discrepancy counted by other margins than ``lack_margin``, and with how much the covariance is most
+likely believed. The tool's error over its expectation, squared, is Fisher's F with its freedom and that of the belief.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from scipy import stats
 
 from benchmarks import calibration, drawn
 from benchmarks.calibration import LEAD
+from hexapod_comp.calibration.assumptions import ASSUMED
 from hexapod_comp.calibration.blocks import WAVES
 from hexapod_comp.calibration.estimator import physical_covariance
 from hexapod_comp.calibration.fit import ModelFit, fit_model
@@ -41,8 +42,8 @@ PLANS = (("5-D", 4), ("5-D", 16), ("1-D", 16))  # Instrument on lines, and diago
 # Blocks that a fit may use: harmonics of the screws are withheld
 KNOWN = tuple(block for block in BLOCKS if block not in WAVES or WAVES[block] == 1)
 BAR, WIDTH_BAR = 0.95, 2.0
-# Degrees of freedom with which the covariance is believed, for ``--ablate``
-BELIEVED = (2.0, 3.0, 5.0, 8.0, 12.0, 24.0, 70.0, np.inf)
+# Degrees of freedom with which the covariance is believed, and margins of a discrepancy, for ``--ablate``
+BELIEVED, MARGINS = (2.0, 3.0, 5.0, 8.0, 12.0, 24.0, 70.0, np.inf), (1.0, 1.5, 2.0)
 HARMONICS = {2: (0.5e-6, 2e-6), 3: (0.3e-6, 1e-6)}  # Lowest and highest amplitude by waves per turn, m
 # Amplitude, m, and wave, in direction cosines, of the error of a joint with its angle
 JOINTS, JOINT_WAVE = 20e-6, 0.7
@@ -201,7 +202,7 @@ class Outcome:
     high: float
     refused: str
     freedom: float = np.nan  # of the tool's squared error by the covariance
-    others: tuple[float, ...] = ()  # upper ends for BELIEVED
+    others: tuple[float, ...] = ()  # upper ends for BELIEVED and MARGINS
 
     @property
     def kept(self) -> bool:
@@ -222,26 +223,28 @@ def one_machine(kind: str, seed: int) -> Outcome:
 
 
 def other_promises(fit: ModelFit) -> tuple[float, tuple[float, ...]]:
-    """Return the freedom of the tool's squared error by the covariance, and its upper ends for :data:`BELIEVED`."""
-    beyond, covariance = fit.verdict.unexplained, physical_covariance(fit.space, fit.solution.posterior)
-    errors, highs = box_errors(fit.space, fit.solution.x), []
+    """Return the freedom of the tool's squared error by the covariance, and its upper ends for the ablation."""
+    beyond, covariance = fit.unexplained, physical_covariance(fit.space, fit.solution.posterior)
+    errors, part = box_errors(fit.space, fit.solution.x), beyond.displacement
     if errors is None:
         return np.nan, ()
-    for believed in BELIEVED:
-        error = expected_error(errors, covariance, beyond=replace(beyond, believed=min(believed, 1e9)))
-        highs.append(np.nan if error is None else error.high)
+    tried = [replace(beyond, believed=min(believed, 1e9)) for believed in BELIEVED]
+    tried += [replace(beyond, displacement=part._replace(lack=part.lack * m / ASSUMED.lack_margin)) for m in MARGINS]
+    promises = [expected_error(errors, covariance, beyond=one) for one in tried]
     product = errors.mean_squares[0] @ covariance
-    return float(np.trace(product) ** 2 / np.vdot(product.T, product)), tuple(highs)
+    freedom = float(np.trace(product) ** 2 / np.vdot(product.T, product))
+    return freedom, tuple(np.nan if promise is None else promise.high for promise in promises)
 
 
 def show_ablation(outcomes: list[Outcome]) -> None:
-    """Print how many promises other beliefs keep, how wide they are, and which belief is the most likely."""
+    """Print how many promises other assumptions keep, how wide they are, and which belief is the most likely."""
     judged = [o for o in outcomes if o.others and not o.refused]
     low, left_over, expected, freedom = np.array([(o.low, o.left, o.expected, o.freedom) for o in judged]).T
-    found = drawn.Table(["covariance believed as", "kept or refused", "upper end / left"], texts=0)
-    for believed, high in zip(BELIEVED, np.transpose([o.others for o in judged]), strict=True):
+    found = drawn.Table(["assumption", "kept or refused", "upper end / left"], texts=0)
+    names = [f"believed {value:g}" for value in BELIEVED] + [f"margin {value:g}" for value in MARGINS]
+    for name, high in zip(names, np.transpose([o.others for o in judged]), strict=True):
         broken = int(((left_over < low) | (left_over > high)).sum())
-        found.row(f"{believed:g}", f"{1.0 - broken / len(outcomes):.1%}", f"{np.median(high / left_over):.2f}")
+        found.row(name, f"{1.0 - broken / len(outcomes):.1%}", f"{np.median(high / left_over):.2f}")
     beliefs = np.geomspace(1.0, 1000.0, 301)
     likely = np.argmax([stats.f.logpdf((left_over / expected) ** 2, freedom, belief).sum() for belief in beliefs])
     print(f"\nmost likely believed as {beliefs[likely]:.1f} degrees of freedom ({len(judged)} machines)")

@@ -240,12 +240,11 @@ def pulls_of(kind: str, thermometer: str, seed: int) -> list[Pull]:
     if thermometer:  # what a part grows by, in the end, for each kelvin of the one that is read
         expansion *= warm.rise[:-1] / warm.rise[PARTS.index(thermometer)]
     true = {name: float(expansion[members].mean()) for name, members in MEMBERS.items()}
-    pulls = [Pull(p.part, (p.expansion - true[p.part]) / p.deviation, p.determined > SEEN_SHARE) for p in seen.parts]
-    if (s := seen.swelling) is not None and np.isfinite(s.deviation):
-        off = s.moisture - float(model.struts.moisture[0])
-        pulls.append(Pull("moisture", off / s.deviation, s.determined > SEEN_SHARE))
-    if thermometer and len(seen.time_constants.values) == 1:
-        (value,), (deviation,) = seen.time_constants.values, seen.time_constants.deviations
+    true["moisture"] = float(model.struts.moisture[0])
+    named = [("moisture" if g.unit == "m/m" else g.part, g) for g in seen.growths if np.isfinite(g.deviation)]
+    pulls = [Pull(name, (g.found - true[name]) / g.deviation, g.determined > SEEN_SHARE) for name, g in named]
+    if thermometer and len(seen.time_constants) == 1:
+        value, deviation = seen.time_constants[0]
         pulls.append(Pull("time constant", (np.log(value) - np.log(TAU[0])) / deviation, deviation < 1.0))
     return pulls
 

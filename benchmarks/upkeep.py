@@ -36,7 +36,6 @@ from hexapod_comp.calibration.design import propose_check
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings
-from hexapod_comp.calibration.posterior import FittedParameters
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.measurements.campaign import Campaign, template
@@ -120,7 +119,7 @@ class Machine:
         self.in_base = np.array([laid_out.points().min(axis=0), laid_out.points().max(axis=0)])
         measured = measure(laid_out, self.campaign, RealMachine(self.geometry, self.truth), seed)
         fit = fit_model(measured, FitSettings(lead=LEAD, field_degree=3))
-        self.model, self.fitted = fit.model, FittedParameters.of(fit)
+        self.model, self.fitted = fit.model, fit.parameters
         grid = Campaign(self.box, side, side, "5-D", 4)
         self.checks = {CHOSEN: propose_check(self.fitted)}
         self.checks |= {count: self._check(template(grid, self.geometry), int(count)) for count in ("12", "24")}

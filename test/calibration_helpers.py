@@ -76,7 +76,7 @@ def fitted(poses: int = 0) -> Fitted:
     """Return a machine measured by 5-D lines, four diagonals and so many of a tracker's poses, and fitted."""
     truth = virtual_machine(5)
     fit = fit_model(measured(truth, campaign(poses=poses, tilt=np.radians(10.0)), 5), FEW)
-    return Fitted(truth.model, fit.model, FittedParameters.of(fit))
+    return Fitted(truth.model, fit.model, fit.parameters)
 
 
 def true_parameters(space: ParameterSpace, truth: MachineModel) -> np.ndarray:

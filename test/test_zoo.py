@@ -40,7 +40,7 @@ from scipy.spatial.transform import Rotation
 from hexapod_comp import cli
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
-from hexapod_comp.calibration.posterior import ErrorPredictor, FittedParameters
+from hexapod_comp.calibration.posterior import ErrorPredictor
 from hexapod_comp.calibration.posterior_file import load_posterior
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import RealMachine
@@ -236,12 +236,12 @@ def test_the_truth_lies_within_every_published_deviation(
         assert fitted is not None
     else:
         monkeypatch.setattr("hexapod_comp.calibration.fit.mixups", lambda *_: [])
-        monkeypatch.setattr("hexapod_comp.calibration.trust.expected_error", lambda *_, **__: None)
+        monkeypatch.setattr("hexapod_comp.calibration.fit.expected_error", lambda *_, **__: None)
         truth = RealMachine(geometry, load_model(animal.file("truth.yaml"), geometry))
         side = float(np.ptp(machine.box, axis=0).min())
         plan = Campaign(machine.box, side, side / 3.0, "1-D", 4, poses=30, tilt=np.radians(4.0))
         fit = fit_model(measure(template(plan, geometry), plan, truth, 7), FitSettings(blocks=("pitch",)))
-        model, fitted = fit.model, FittedParameters.of(fit)
+        model, fitted = fit.model, fit.parameters
     rng = np.random.default_rng(4)
     tips = np.vstack([machine.middle, somewhere(machine, 39)])
     tools = np.array([rotation(*angles) for angles in [(0.0, 0.0, 0.0), *rng.uniform(-2.0, 2.0, (39, 3))]])

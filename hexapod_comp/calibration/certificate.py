@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -30,7 +30,6 @@ from ..measurements.iso230 import (
     largest,
     notes_of,
 )
-from ..measurements.readings import ANGULAR_KINDS
 from ..workspace.overview import corners
 from .fit import ModelFit
 from .observations import Cells
@@ -65,35 +64,46 @@ def load_details(path: str | Path) -> Details:
     return read_whole(Details, read_yaml(input_file(path, "details"), FORMAT, VERSION))
 
 
-@dataclass(frozen=True)
-class Filed:
-    """Files written with the certificate."""
+def certificate_text(
+    fit: ModelFit, model: str, files: Sequence[Path], report: str, details: Details | None = None
+) -> str:
+    """Return the certificate of a fit of scheme ``joint``, as HTML.
 
-    model: str  # name of the model
-    files: tuple[Path, ...]  # the model's file, and those beside it
-    report: str  # the fit's report as printed; the certificate opens with the warnings before its first machine line
-
-
-def certificate_text(fit: ModelFit, filed: Filed, details: Details | None = None) -> str:
-    """Return the certificate of a fit of scheme ``joint``, as HTML; model file and report must have been written."""
-    m, details = fit.measurements, details or Details()
-    seen = fit.observability
+    `model` is its name, `files` are the model's file and those beside it, which must have been written; `report` is
+    the fit's as printed, whose warnings before its first machine line open the certificate.
+    """
+    m, details, seen = fit.measurements, details or Details(), fit.observability
     unseen = f"{seen.structure_rank} of {seen.structure_size} parameters of the structure are seen by these readings."
     if fit.unseen_errors:
         unseen += f" Errors that they do not show: {listed(fit.unseen_errors)}."
-    hashes = [hashlib.sha256(read_bytes(path, MAX_ARCHIVE_BYTES)).hexdigest() for path in filed.files]
-    beside = ["model", *("beside it" for _ in filed.files[1:])]
-    files = [(what, path.name, digest) for what, path, digest in zip(beside, filed.files, hashes, strict=True)]
+    hashes = [hashlib.sha256(read_bytes(path, MAX_ARCHIVE_BYTES)).hexdigest() for path in files]
+    beside = ["model", *("beside it" for _ in files[1:])]
+    named = [(what, path.name, digest) for what, path, digest in zip(beside, files, hashes, strict=True)]
     before, after = judge(m), judge(m.with_values(left_out(fit)))
     return render(
         "certificate.html",
         title=f"Calibration certificate: {m.geometry.name}",
-        warning=filed.report.partition(f"machine {m.geometry.name}: {len(m)} readings")[0].strip(),
-        identity=_identity(fit, filed, details),
+        warning=report.partition(f"machine {m.geometry.name}: {len(m)} readings")[0].strip(),
+        identity=[
+            ("certificate number", details.number),
+            ("customer", details.customer),
+            ("machine's maker, type and serial number", details.machine),
+            ("machine in these files", m.geometry.name),
+            ("model", model),
+            ("place", details.place),
+            ("measured on", details.measured_on),
+            ("measured by", details.operator),
+            ("environment", details.environment),
+            *(("remarks", text) for text in details.remarks),
+            ("evaluated with", f"hexapod_comp {version()}, scheme joint, {fit.model.origin.date}"),
+        ],
         box=corners(fit.space.work_box),
         result=_result(fit),
         notes=(*tilt_doubt(fit.tilted, seen), *fit.notes),
-        instruments=_instruments(fit),
+        instruments=[
+            (c.kind, c.readings, *(number(v * 1e6, 2) for v in (c.stated, COVERAGE * c.stated, c.found)), f"µ{c.unit}")
+            for c in fit.channels
+        ],
         named_instruments=[(n, text) for n, text in enumerate(details.instruments or ("",) * len(fit.channels), 1)],
         temperatures=_temperatures(fit),
         humidity=_humidity(fit),
@@ -102,30 +112,13 @@ def certificate_text(fit: ModelFit, filed: Filed, details: Details | None = None
         figures=_figures(fit),
         unseen=unseen,
         datum=fit.held.report(),
-        files=files + [("readings", name, digest) for name, digest in m.files],
-        report=filed.report,
+        files=named + [("readings", name, digest) for name, digest in m.files],
+        report=report,
         most_runs=MOST_RUNS,
     )
 
 
 Rows = list[tuple[object, ...]]
-
-
-def _identity(fit: ModelFit, filed: Filed, details: Details) -> Rows:
-    rows: Rows = [
-        ("certificate number", details.number),
-        ("customer", details.customer),
-        ("machine's maker, type and serial number", details.machine),
-        ("machine in these files", fit.measurements.geometry.name),
-        ("model", filed.model),
-        ("place", details.place),
-        ("measured on", details.measured_on),
-        ("measured by", details.operator),
-        ("environment", details.environment),
-        *(("remarks", text) for text in details.remarks),
-    ]
-    made = f"hexapod_comp {version()}, scheme joint, {fit.model.origin.date}"
-    return [*rows, ("evaluated with", made)]
 
 
 def _result(fit: ModelFit) -> Rows:
@@ -145,15 +138,6 @@ def _result(fit: ModelFit) -> Rows:
             between = f"{number(error.rotation_low * 1e6, 2)} … {number(error.rotation_high * 1e6, 2)}"
             expanded = number(COVERAGE * error.rotation_high * 1e6, 1)
         rows.append((f"{name}: rotation", *sizes, between, expanded, "µrad"))
-    return rows
-
-
-def _instruments(fit: ModelFit) -> Rows:
-    rows: Rows = []
-    for channel in fit.channels:
-        sizes = [number(v * 1e6, 2) for v in (channel.stated, COVERAGE * channel.stated, channel.estimated)]
-        unit = "µrad" if channel.kind in ANGULAR_KINDS else "µm"
-        rows.append((channel.kind, str(channel.readings), *sizes, unit))
     return rows
 
 

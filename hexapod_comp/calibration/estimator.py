@@ -213,6 +213,12 @@ class Posterior:
     spread: np.ndarray  # (n,): The prior's standard deviation of each y
     log_determinant: float  # Logarithm of the determinant of the precision of y over that
 
+    def every(self, size: int) -> np.ndarray:
+        """Return all parameters y, (size,): zero for those not in use."""
+        y = np.zeros(size)
+        y[self.used] = self.y
+        return y
+
 
 def solve(
     space: ParameterSpace | Components,

@@ -1,8 +1,13 @@
-"""Fit a machine model to measurements with scheme ``joint``, and judge the result."""
+"""Fit a machine model to measurements with scheme ``joint``, and judge the result.
+
+Readings → linear problem at the nominal machine (courses of temperatures, time constants, the screws' lead) → blocks
+with evidence → Gauss–Newton with these → drift, discrepancy and jackknife → predicted error, doubts and mix-ups → the
+model with its datum held. :class:`ModelFit` is all that is known then; reports, JSON, pictures and files show it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from typing import NamedTuple
@@ -16,7 +21,7 @@ from ..machine.load import Payload
 from ..machine.model import MachineModel, ModelOrigin
 from ..machine.surroundings import load_row
 from ..machine.temperatures import REFERENCE_TEMPERATURE
-from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementSet, refuse_unmoved
+from ..measurements.readings import ANGULAR_KINDS, CHANNELS, KINDS, MeasurementSet, refuse_unmoved
 from ..pose import Pose
 from .assumptions import ASSUMED
 from .blocks import WAVES
@@ -25,6 +30,7 @@ from .blocks.load import measured_loads, refuse_half_stated, stated_load
 from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
 from .estimator import (
     ROUNDS,
+    SETTLED,
     Estimation,
     LinearProblem,
     NotSettled,
@@ -39,6 +45,7 @@ from .lead import ScrewLead, detect_lead
 from .mixups import SWAPPED, mixups
 from .parameters import FitSettings, ParameterSpace
 from .posterior import (
+    FittedParameters,
     Observability,
     ToolError,
     UnseenError,
@@ -49,9 +56,10 @@ from .posterior import (
     observe,
     without_trace,
 )
+from .promise import Unexplained
 from .selection import Decision, select
-from .thermal import ThermalEvidence, TimeConstants, estimate_time_constants, with_courses
-from .trust import LeftOut, Residuals, Verdict, judge, with_drift
+from .thermal import ThermalEvidence, TimeConstant, estimate_time_constants, with_courses
+from .trust import FIELDS, TILT, ChiSquare, Residuals, chi_squares, held_by_priors, unexplained, unstated, with_drift
 
 # Readings further than this from the reference temperature, K, need an expansion: 1 µm on half a metre
 WARM = 0.2
@@ -60,27 +68,27 @@ MOST_STRUTS = 4  # struts with a negative backlash mean that the directions are 
 MOST_LEFT_OUT = 3  # runs left out of a fit that does not converge; more are a bad campaign
 
 
-@dataclass(frozen=True)
-class ChannelFit:
-    """Result for one kind of channel."""
+class ChannelFit(NamedTuple):
+    """Result for one kind of channel, in its unit."""
 
     kind: str  # of KINDS
     readings: int
     stated: float  # standard deviation of a reading, as the file or the default says (root mean square)
-    estimated: float  # the same as fitted
+    found: float  # the same as fitted
     chi_square: float  # squared residuals over the stated variance, per degree of freedom
-    held_out: float  # RMS error at readings whose line or pose was left out, their noise included, m or rad
+    held_out: float  # RMS error at readings whose line or pose was left out, their noise included
+    unit: str  # m or rad
 
 
-@dataclass(frozen=True)
-class Outlier:
+class Outlier(NamedTuple):
     """A reading that disagrees with all others."""
 
-    source: FileLine  # Where it stands
-    channel: int  # Index of its channel
-    residual: float  # m or rad
-    sigmas: float  # The same in standard deviations
-    run: str  # Its run
+    source: str  # where it stands
+    run: str
+    channel: str
+    residual: float
+    sigmas: float  # the same in standard deviations
+    unit: str  # m or rad
 
 
 @dataclass(frozen=True)
@@ -95,9 +103,15 @@ class ModelFit:
     channels: tuple[ChannelFit, ...]  # χ² and held-out error of each kind of channel
     observability: Observability  # what the data determine
     unseen_errors: tuple[UnseenError, ...]  # machine errors that the readings do not show (posterior.MACHINE_ERRORS)
-    verdict: Verdict  # predicted tool error, and doubts
-    outliers: tuple[Outlier, ...]  # largest first
+    level: ToolError | None  # expected tool error with this model, for a level tool; None: nothing can be predicted
+    tilted: ToolError | None  # the same for a tool tilted by :data:`~.trust.TILT`
+    unexplained: Unexplained  # errors shown by readings that no parameter describes
+    chi_squares: tuple[ChiSquare, ...]  # by kind of channel, of families of lines and of directions
+    chi_squares_of_runs: tuple[ChiSquare, ...]  # the worst first
+    refusals: tuple[str, ...]  # why the model must not be written without force
+    doubts: tuple[str, ...]  # what else is wrong
     notes: tuple[str, ...]  # for the reader
+    outliers: tuple[Outlier, ...]  # largest first
     held: HeldDatum  # where the tool is held: the model is the solution's machine, shifted and turned as a whole
     warming: ThermalEvidence  # evidence on heat
     lead: ScrewLead | None  # the screws' lead; None if it was not searched for
@@ -106,34 +120,29 @@ class ModelFit:
     @property
     def misfit(self) -> str:
         """Why the model is not to be trusted; empty if it is."""
-        return "; ".join(self.verdict.refusals)
-
-    @property
-    def level(self) -> ToolError | None:
-        """The expected tool error with this model, for a level tool."""
-        return self.verdict.level
-
-    @property
-    def tilted(self) -> ToolError | None:
-        """The same for a tool tilted by :data:`~.trust.TILT`; None if nothing can be predicted."""
-        return self.verdict.tilted
-
-    def under(self, payload: Payload, gravity: Sequence[float] | None = None) -> ToolError | None:
-        """Return the expected tool error with this model where it is told another load, for a level tool."""
-        load = load_row(payload) if gravity is None else load_row(payload, gravity)
-        covariance = physical_covariance(self.space, self.solution.posterior)
-        errors = box_errors(self.space, self.solution.x, load=load)
-        return expected_error(errors, covariance, beyond=self.verdict.unexplained)
+        return "; ".join(self.refusals)
 
     @property
     def covariance(self) -> np.ndarray:
         """Covariance of the parameters, shape (size, size), SI, widened by :attr:`Unexplained.factor`."""
-        return self.verdict.unexplained.factor**2 * physical_covariance(self.space, self.solution.posterior)
+        return self.unexplained.factor**2 * physical_covariance(self.space, self.solution.posterior)
 
     @property
     def standard_errors(self) -> np.ndarray:
         """Standard errors of the parameters, shape (size,), SI."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def parameters(self) -> FittedParameters:
+        """What the fit knows of its parameters: what stands in a file beside the model, and checks go by."""
+        p = self.solution.posterior
+        return FittedParameters(self.space, self.solution.x, self.covariance, p.tolerances, p.noise, self.held)
+
+    def under(self, payload: Payload, gravity: Sequence[float] | None = None) -> ToolError | None:
+        """Return the expected tool error with this model where it is told another load, for a level tool."""
+        load = load_row(payload) if gravity is None else load_row(payload, gravity)
+        covariance = physical_covariance(self.space, self.solution.posterior)
+        return expected_error(box_errors(self.space, self.solution.x, load=load), covariance, beyond=self.unexplained)
 
 
 def fit_model(
@@ -165,8 +174,7 @@ def fit_model(
     datum = measurements.geometry.home if datum is None else datum
     refuse_unreachable(measurements.geometry, datum)
     refuse_half_stated(measurements)
-    settings = settings or FitSettings()
-    begun = _begin(measurements, settings, progress)
+    begun = _begin(measurements, settings or FitSettings(), progress)
     try:
         try:
             return _fit(measurements, begun, progress, datum)
@@ -207,10 +215,10 @@ def _drop_outlier_runs(
         except HexapodError:
             break
         doubt = f"with run {', '.join(names)} the fit does not converge: left out, as it changes the parameters most"
-        return replace(fit, verdict=replace(fit.verdict, doubts=(doubt, *fit.verdict.doubts)))
-    problem = f"{unsettled.problem}; the runs that pull most: {', '.join(names)}"
+        return replace(fit, doubts=(doubt, *fit.doubts))
     fit = _fit(measurements, begun, progress, datum, settles=False)
-    return replace(fit, verdict=replace(fit.verdict, refusals=(problem, *fit.verdict.refusals)))
+    problem = f"{unsettled.problem}; the runs that pull most: {', '.join(names)}"
+    return replace(fit, refusals=(problem, *fit.refusals))
 
 
 def mixed_up(measurements: MeasurementSet, settings: FitSettings) -> list[str]:
@@ -226,67 +234,15 @@ class _Begun(NamedTuple):
     everything: Estimation
     problem: LinearProblem
     lead: ScrewLead | None
-    constants: TimeConstants
-
-
-def _fit(
-    measurements: MeasurementSet,
-    begun: _Begun,
-    progress: Callable[[str], object],
-    datum: Pose,
-    settles: bool = True,
-) -> ModelFit:
-    """Select blocks, fit them, and judge the result."""
-    everything, nominal, lead, constants = begun
-    settings = everything.space.settings
-    decisions, possible, estimation, solution = _choose(everything, nominal, progress, settles)
-    space = estimation.space
-    residuals = with_drift(estimation, solution)
-    solution = residuals.solution
-    channels = tuple(_channels(residuals))
-    notes = [
-        *_about_lead(lead),
-        *_ignored(measurements, space),
-        *_check_backlash(space, solution),
-    ]
-    notes += _check_noise(channels)
-    progress("judging the result")
-    noise = {KINDS.index(c.kind): c.estimated for c in channels}
-    mixed = mixups(everything, [d.block for d in decisions if d.kept], progress)
-    left_out = _averaged(space, solution, everything.space, possible, decisions)
-    verdict = judge(residuals, settings, noise, mixed, left_out)
-    no_trace = unseen_errors(measurements, settings)
-    if rolls := [error for error in no_trace if error.name.startswith("roll")]:
-        verdict = verdict.without_rotation(listed(rolls))
-    notes = [*_about_loads(measurements, space, solution, verdict), *notes]
-    as_solved = _named(space, solution, measurements, channels, len(decisions), verdict.level)
-    unseen = unseen_part(estimation, solution.posterior.tolerances[0], solution.posterior.noise, datum)
-    model, held = hold(measurements.geometry, as_solved, datum, unseen)
-    return ModelFit(
-        model=model,
-        measurements=measurements,
-        space=space,
-        solution=solution,
-        decisions=tuple(decisions),
-        channels=channels,
-        observability=observe(space, solution.problem, solution.posterior, measurements.tilt()),
-        unseen_errors=no_trace,
-        verdict=verdict,
-        outliers=tuple(_outliers(estimation, solution)),
-        notes=(*measurements.notes, *notes, *verdict.remarks),
-        held=held,
-        warming=ThermalEvidence.of(measurements, estimation, solution, constants, verdict.unexplained.factor),
-        lead=lead,
-        held_out=residuals.held_out,
-    )
+    constants: tuple[TimeConstant, ...]
 
 
 def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object]) -> _Begun:
     """Return the starting point of a fit; the lead is not searched for if no screw wave is fitted or screws differ."""
     measurements = with_courses(measurements)
     constants = estimate_time_constants(measurements, ParameterSpace(measurements, settings), progress)
-    if constants.values:
-        settings = replace(settings, time_constants=constants.values)
+    if constants:
+        settings = replace(settings, time_constants=tuple(constant.value for constant in constants))
     everything = Estimation(measurements, ParameterSpace(measurements, settings))
     nominal, trust = np.zeros(everything.space.size), np.ones(len(measurements))
     problem, residuals = everything.linearise(nominal, trust)
@@ -302,6 +258,97 @@ def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callab
     return _Begun(everything, problem, lead, constants)
 
 
+def _fit(
+    measurements: MeasurementSet,
+    begun: _Begun,
+    progress: Callable[[str], object],
+    datum: Pose,
+    settles: bool = True,
+) -> ModelFit:
+    """Select blocks, fit them, and judge the result."""
+    everything, nominal, lead, constants = begun
+    settings = everything.space.settings
+    decisions, possible, estimation, solution = _choose(everything, nominal, progress, settles)
+    residuals, space = with_drift(estimation, solution), estimation.space
+    solution, posterior = residuals.solution, residuals.solution.posterior
+    channels = tuple(_channels(residuals))
+    backlash = list(_check_backlash(space, solution))
+    progress("judging the result")
+    mixed = mixups(everything, [d.block for d in decisions if d.kept], progress)
+
+    beyond = unexplained(residuals, settings, _averaged(residuals, everything.space, possible, decisions))
+    covariance = physical_covariance(space, posterior)
+    # A field that was measured with a level tool has no information on a tilted one.
+    level_only = space.block(FIELDS[0]) is not None and measurements.tilt() < 0.5 * TILT
+    boxes = residuals.level, None if level_only else box_errors(space, solution.x, TILT)
+    level, tilted = (expected_error(errors, covariance, beyond=beyond) for errors in boxes)
+    unseen = unseen_errors(measurements, settings)
+    if rolls := [error for error in unseen if error.name.startswith("roll")]:
+        level, tilted = (
+            error and replace(error, rotation_low=None, rotation_high=None, rotation_unknown=listed(rolls))
+            for error in (level, tilted)
+        )
+
+    noise = {KINDS.index(c.kind): c.found for c in channels}
+    far_off, doubtful = (measurements.misfit(noise, n) for n in ASSUMED.misfit[:0:-1])
+    widening, widened = beyond.findings()
+    refusals, doubts = [far_off], ["" if far_off else doubtful, *widening]
+    if solution.change >= SETTLED:
+        moved = f"a parameter still moves by {solution.change:.2g} standard deviations"
+        doubts.append(f"the fit has not settled: after {solution.steps} steps {moved}")
+    if level is not None and level.after > level.before:
+        refusals.append("the model is not expected to help: the readings determine too little of this machine")
+    if held_by_priors(residuals):
+        many = f"{len(measurements)} readings do not determine the {space.size} parameters"
+        refusals.append(f"{many}: what they say of the tool comes from the priors")
+    notes = [*measurements.notes, *_about_inputs(measurements, space, lead, solution, beyond), *backlash]
+    noisy = [f"{c.kind} {c.found / c.stated:.1f} times" for c in channels if c.found > ASSUMED.misfit[0] * c.stated]
+    if noisy:
+        problem = (
+            "readings scatter more than stated: something of the machine, or of an instrument, is not in the model"
+        )
+        notes.append(f"{problem} ({', '.join(noisy)}); the expected tool error allows for it")
+    notes += [*widened, unstated(measurements)]
+    if level_only:
+        notes.append("a field was needed, and measured with a level tool alone: nothing is promised for a tilted one")
+
+    kept = ", ".join(block.name for block in space.blocks)
+    note = f"scheme joint, {len(measurements)} readings, blocks {kept} (of {len(decisions) + 1} tried)"
+    if level is not None:
+        note += f", expected tool error {level.after * 1e6:.3f} µm RMS, up to {level.high * 1e6:.3f} (95 %)"
+    lengths = [c.held_out for c in channels if c.kind not in ANGULAR_KINDS]
+    loads = measured_loads(stated_load(space.settings), space.geometry, measurements.stations)
+    left = rms(lengths) if lengths else None
+    origin = ModelOrigin(date.today().isoformat(), measurements.files, left, note, loads=loads)
+    as_solved = replace(space.model(solution.x.round(DIGITS)), origin=origin)
+    part = unseen_part(estimation, posterior.tolerances[0], posterior.noise, datum)
+    model, held = hold(measurements.geometry, as_solved, datum, part)
+    families, runs = chi_squares(residuals)
+    return ModelFit(
+        model=model,
+        measurements=measurements,
+        space=space,
+        solution=solution,
+        decisions=tuple(decisions),
+        channels=channels,
+        observability=observe(space, solution.problem, posterior, measurements.tilt()),
+        unseen_errors=unseen,
+        level=level,
+        tilted=tilted,
+        unexplained=beyond,
+        chi_squares=families,
+        chi_squares_of_runs=runs,
+        refusals=tuple(filter(None, [*refusals, *mixed])),
+        doubts=tuple(filter(None, doubts)),
+        notes=tuple(filter(None, notes)),
+        outliers=tuple(_outliers(estimation, solution)),
+        held=held,
+        warming=ThermalEvidence.of(measurements, estimation, solution, constants, beyond.factor),
+        lead=lead,
+        held_out=residuals.held_out,
+    )
+
+
 Start = tuple[ParameterSpace, np.ndarray, np.ndarray, np.ndarray]
 """An answer from which a fit with other blocks starts: its space, parameters, tolerances and noise."""
 
@@ -309,48 +356,38 @@ Start = tuple[ParameterSpace, np.ndarray, np.ndarray, np.ndarray]
 def _choose(
     everything: Estimation, problem: LinearProblem, progress: Callable[[str], object], settles: bool
 ) -> tuple[list[Decision], Posterior, Estimation, Solution]:
-    """Return the decisions on blocks, the posterior with all blocks, and the fit with those kept."""
+    """Return the decisions on blocks, the posterior with all blocks, and the fit with those kept; if none `settles`,
+    that of the last step."""
     space, trust = everything.space, np.ones(len(everything.measurements))
+
+    def fitted(start: Start) -> tuple[Estimation, Solution]:
+        settings = replace(space.settings, blocks=tuple(d.block for d in decisions if d.kept))
+        estimation = Estimation(everything.measurements, ParameterSpace(everything.measurements, settings))
+        try:
+            return estimation, iterate(estimation, *_carried_over(start, estimation.space), progress)
+        except NotSettled as error:
+            if settles:
+                raise
+            return estimation, error.solution
+
     if {"lost motion", "friction"} & {block.name for block in space.blocks}:  # what forces do depends on them
         for _ in range(2):
             first = solve(space, problem, space.start_tolerances(), np.ones(len(KINDS)), ROUNDS)
-            y = np.zeros(space.size)
-            y[first.used] = first.y
-            problem, _ = everything.linearise(space.physical(y), trust)
+            problem, _ = everything.linearise(space.physical(first.every(space.size)), trust)
     decisions, possible, kept = select(space, problem, np.ones(len(KINDS)), progress)
-    y = np.zeros(space.size)
-    y[kept.used] = kept.y
-    start = space, space.physical(y), kept.tolerances, kept.noise
+    start = space, space.physical(kept.every(space.size)), kept.tolerances, kept.noise
     if not any(d.kept for d in decisions):  # too few runs to leave one out, or none with information: from the start
-        start = space, 0.0 * y, space.start_tolerances(), np.ones(len(KINDS))
-    estimation, solution = _solve(everything, decisions, start, progress, settles)
+        start = space, np.zeros(space.size), space.start_tolerances(), np.ones(len(KINDS))
+    estimation, solution = fitted(start)
     if solution.weights.min() < ASSUMED.huber / ASSUMED.outlier:  # it was made with readings that are wrong
         start = estimation.space, solution.x, solution.posterior.tolerances, solution.posterior.noise
         x, _, noise = _carried_over(start, space)
         problem, _ = everything.linearise(x, solution.weights)
-        again, possible, _ = select(space, problem, noise, progress)
-        if [d.kept for d in again] != [d.kept for d in decisions]:
-            estimation, solution = _solve(everything, again, start, progress, settles)
-        decisions = again
+        before = [d.kept for d in decisions]
+        decisions, possible, _ = select(space, problem, noise, progress)
+        if [d.kept for d in decisions] != before:
+            estimation, solution = fitted(start)
     return decisions, possible, estimation, solution
-
-
-def _solve(
-    everything: Estimation,
-    decisions: list[Decision],
-    start: Start,
-    progress: Callable[[str], object],
-    settles: bool,
-) -> tuple[Estimation, Solution]:
-    """Return a converged fit with the selected blocks; if none `settles`, the result of the last step."""
-    settings = replace(everything.space.settings, blocks=tuple(d.block for d in decisions if d.kept))
-    estimation = Estimation(everything.measurements, ParameterSpace(everything.measurements, settings))
-    try:
-        return estimation, iterate(estimation, *_carried_over(start, estimation.space), progress)
-    except NotSettled as error:
-        if settles:
-            raise
-        return estimation, error.solution
 
 
 def _carried_over(start: Start, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -365,33 +402,28 @@ def _carried_over(start: Start, space: ParameterSpace) -> tuple[np.ndarray, np.n
     return x, tolerances, noise
 
 
-def _averaged(
-    space: ParameterSpace,
-    solution: Solution,
-    everything: ParameterSpace,
-    possible: Posterior,
-    decisions: Sequence[Decision],
-) -> LeftOut:
-    """Return the probability that a block was left out although present, and the tool's error with all blocks.
+def _averaged(r: Residuals, everything: ParameterSpace, possible: Posterior, decisions: Sequence[Decision]) -> float:
+    """Return the factor on the tool's error by Bayesian model averaging, 1 or more.
 
-    It is computed from the blocks' Bayes factors with even prior odds, at the same solution.
+    With the probability that one of the blocks left out is present, by their Bayes factors at even prior odds, the
+    tool's error is that with all blocks.
     """
     present = 1.0 - float(np.prod([expit(-d.evidence) for d in decisions if not d.kept]))
-    if present < NEGLIGIBLE:
-        return LeftOut()
-    x, _, _ = _carried_over((space, solution.x, solution.posterior.tolerances, solution.posterior.noise), everything)
-    errors, y = box_errors(everything, x), np.zeros(everything.size)
+    if present < NEGLIGIBLE or not r.expected > 0.0:
+        return 1.0
+    p = r.solution.posterior
+    x, _, _ = _carried_over((r.estimation.space, r.solution.x, p.tolerances, p.noise), everything)
+    errors = box_errors(everything, x)
     if errors is None:
-        return LeftOut()
-    y[possible.used] = possible.y
-    metric, shift = errors.mean_squares[0], everything.physical(y) - x
+        return 1.0
+    metric, shift = errors.mean_squares[0], everything.physical(possible.every(everything.size)) - x
     square = np.vdot(metric, physical_covariance(everything, possible)) + shift @ metric @ shift
-    return LeftOut(present, float(square))
+    return float(np.sqrt(max(1.0, 1.0 + present * (float(square) / r.expected - 1.0))))
 
 
 def unseen_errors(measurements: MeasurementSet, settings: FitSettings) -> tuple[UnseenError, ...]:
     """Return the machine errors that the readings do not show, for any allowed blocks."""
-    space = ParameterSpace(measurements, replace(settings, blocks=("field displacement", "field rotation")))
+    space = ParameterSpace(measurements, replace(settings, blocks=FIELDS))
     return without_trace(Estimation(measurements, space))
 
 
@@ -415,110 +447,62 @@ def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
     return [f"strut_{i + 1}: backlash of {values[i]} µm found, taken as none" for i in negative]
 
 
-def _about_lead(lead: ScrewLead | None) -> list[str]:
-    """Return notes on a lead that is not known, or differs from the given one."""
-    if lead is None:
-        return []
-    if not lead.agrees:
-        problem = f"the screws' errors repeat every {lead.shown * 1e3:.4g} mm by the readings"  # type: ignore[operator]
-        return [f"{problem}, not with the given lead of {lead.given * 1e3:.6g} mm: is it right?"]  # type: ignore[operator]
-    if lead.used is None:
+def _about_inputs(
+    measurements: MeasurementSet,
+    space: ParameterSpace,
+    lead: ScrewLead | None,
+    solution: Solution,
+    beyond: Unexplained,
+) -> Iterator[str]:
+    """Yield notes on loads, lead, temperatures and humidity, as stated or missing: what the fit made of them."""
+    loads = np.array(measured_loads(stated_load(space.settings), space.geometry, measurements.stations))
+    if len(loads):
+        low, high = loads[:, 0].min(), loads[:, 0].max()
+        masses = f"a tool of {low:g} kg" if low == high else f"tools of {low:g} to {high:g} kg"
+        directions = len(np.unique(loads[:, 4:], axis=0))
+        gravity = "one direction of gravity" if directions == 1 else f"{directions} directions of gravity"
+        covariance = physical_covariance(space, solution.posterior)
+        elsewhere = about_other_loads(space, solution.x, covariance, beyond)
+        elsewhere = f"; {elsewhere}" if elsewhere else ", for no struts' stiffness is stated (--load)"
+        yield f"read with {masses} and {gravity}: the promise holds for these{elsewhere}"
+    if lead is not None and lead.given is not None and lead.shown is not None and not lead.agrees:
+        problem = f"the screws' errors repeat every {lead.shown * 1e3:.4g} mm by the readings"
+        yield f"{problem}, not with the given lead of {lead.given * 1e3:.6g} mm: is it right?"
+    if lead is not None and lead.used is None:
         problem = "the screws' lead is not known, and the readings do not show it"
-        return [f"{problem}: a periodic error of the screws, if they have one, is not fitted"]
-    return []
-
-
-def _about_loads(
-    measurements: MeasurementSet, space: ParameterSpace, solution: Solution, verdict: Verdict
-) -> list[str]:
-    """Return the loads for which the predicted error holds, if any is stated, and what it is under others."""
-    load = stated_load(space.settings)
-    loads = np.array(measured_loads(load, space.geometry, measurements.stations))
-    if not len(loads):
-        return []
-    low, high = loads[:, 0].min(), loads[:, 0].max()
-    masses = f"a tool of {low:g} kg" if low == high else f"tools of {low:g} to {high:g} kg"
-    directions = len(np.unique(loads[:, 4:], axis=0))
-    gravity = "one direction of gravity" if directions == 1 else f"{directions} directions of gravity"
-    text = f"read with {masses} and {gravity}: the promise holds for these"
-    covariance = physical_covariance(space, solution.posterior)
-    elsewhere = about_other_loads(space, solution.x, covariance, verdict.unexplained)
-    return [f"{text}; {elsewhere}" if elsewhere else f"{text}, for no struts' stiffness is stated (--load)"]
-
-
-def _ignored(measurements: MeasurementSet, space: ParameterSpace) -> list[str]:
-    """Return notes on missing inputs, whose effects the fit attributes to other errors."""
-    notes = []
+        yield f"{problem}: a periodic error of the screws, if they have one, is not fitted"
     warmth = np.abs(measurements.stations.temperatures - REFERENCE_TEMPERATURE).max()
     if warmth > WARM and space.block("expansion") is None and not space.stated_expansion.any():
-        notes.append(f"read up to {warmth:.1f} K from 20 °C, but no expansion is given: growth is taken for an error")
+        yield f"read up to {warmth:.1f} K from 20 °C, but no expansion is given: growth is taken for an error"
     if space.swells and not np.isfinite(measurements.stations.humidity).all():
-        notes.append("the struts swell, but not every reading has its humidity (humidity_percent): 50 % is taken there")
-    return notes
+        yield "the struts swell, but not every reading has its humidity (humidity_percent): 50 % is taken there"
 
 
-def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:
-    """Return a note on readings that scatter more than stated."""
-    noisy = [
-        f"{c.kind} {c.estimated / c.stated:.1f} times" for c in channels if c.estimated > ASSUMED.misfit[0] * c.stated
-    ]
-    if not noisy:
-        return []
-    problem = "readings scatter more than stated: something of the machine, or of an instrument, is not in the model"
-    return [f"{problem} ({', '.join(noisy)}); the expected tool error allows for it"]
-
-
-def _channels(residuals: Residuals) -> list[ChannelFit]:
-    """Return the residuals of each kind of channel."""
-    estimation, problem, posterior = residuals.estimation, residuals.solution.problem, residuals.solution.posterior
-    kinds, errors = estimation.measurements.kind, residuals.held_out
-    readings_of_cell = np.bincount(estimation.cells.of_reading, minlength=len(problem.kind))
-    result = []
-    for k in np.unique(kinds):
-        members = problem.kind == k
-        stated = estimation.measurements.stated_of(k)
-        mean_square = float((errors[members] ** 2 / readings_of_cell[members]).mean())
-        factor = float(posterior.noise[k])
-        result.append(
-            ChannelFit(
-                kind=KINDS[k],
-                readings=int((kinds == k).sum()),
-                stated=stated,
-                estimated=factor * stated,
-                chi_square=factor**2,
-                held_out=stated * float(np.sqrt(mean_square)),
-            )
+def _channels(residuals: Residuals) -> Iterator[ChannelFit]:
+    """Yield the residuals of each kind of channel."""
+    m, cells = residuals.estimation.measurements, residuals.estimation.cells
+    readings_of_cell = np.bincount(cells.of_reading, minlength=len(cells.kind))
+    for k in np.unique(m.kind):
+        members, stated = cells.kind == k, m.stated_of(k)
+        mean_square = float((residuals.held_out[members] ** 2 / readings_of_cell[members]).mean())
+        factor = float(residuals.solution.posterior.noise[k])
+        yield ChannelFit(
+            kind=KINDS[k],
+            readings=int((m.kind == k).sum()),
+            stated=stated,
+            found=factor * stated,
+            chi_square=factor**2,
+            held_out=stated * float(np.sqrt(mean_square)),
+            unit="rad" if KINDS[k] in ANGULAR_KINDS else "m",
         )
-    return result
 
 
-def _outliers(estimation: Estimation, solution: Solution) -> list[Outlier]:
-    """Return the readings that are too far off to be noise, the worst first."""
+def _outliers(estimation: Estimation, solution: Solution) -> Iterator[Outlier]:
+    """Yield the readings that are too far off to be noise, the worst first."""
     m = estimation.measurements
     sigmas = solution.residuals / (estimation.uncertainty * solution.posterior.noise[m.kind])
     worst = np.argsort(-np.abs(sigmas))
-    far = worst[np.abs(sigmas[worst]) > ASSUMED.outlier]
-    return [
-        Outlier(m.sources[i], int(m.channel[i]), float(solution.residuals[i]), float(sigmas[i]), m.runs[m.run[i]].name)
-        for i in far
-    ]
-
-
-def _named(
-    space: ParameterSpace,
-    solution: Solution,
-    measurements: MeasurementSet,
-    channels: tuple[ChannelFit, ...],
-    tried: int,
-    level: ToolError | None,
-) -> MachineModel:
-    """Return the fitted model with its origin, and its predicted error."""
-    kept = ", ".join(block.name for block in space.blocks)
-    lengths = [c.held_out for c in channels if c.kind not in ANGULAR_KINDS]
-    note = f"scheme joint, {len(measurements)} readings, blocks {kept} (of {tried + 1} tried)"
-    if level is not None:
-        note += f", expected tool error {level.after * 1e6:.3f} µm RMS, up to {level.high * 1e6:.3f} (95 %)"
-    residual = rms(lengths) if lengths else None
-    loads = measured_loads(stated_load(space.settings), space.geometry, measurements.stations)
-    origin = ModelOrigin(date.today().isoformat(), measurements.files, residual, note, loads=loads)
-    return replace(space.model(solution.x.round(DIGITS)), origin=origin)
+    for i in worst[np.abs(sigmas[worst]) > ASSUMED.outlier]:
+        unit = "rad" if KINDS[m.kind[i]] in ANGULAR_KINDS else "m"
+        channel, residual = CHANNELS[m.channel[i]], float(solution.residuals[i])
+        yield Outlier(str(m.sources[i]), m.runs[m.run[i]].name, channel, residual, float(sigmas[i]), unit)

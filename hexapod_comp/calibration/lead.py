@@ -129,9 +129,7 @@ class _Rest:
     def __init__(self, estimation: Estimation, problem: LinearProblem, posterior: Posterior) -> None:
         over_noise = 1.0 / posterior.noise[problem.kind]
         self._problem, self._posterior, self._over_noise = problem, posterior, over_noise
-        y = np.zeros(problem.rows.shape[1])
-        y[posterior.used] = posterior.y
-        left = over_noise * (problem.target - problem.rows.times(y))
+        left = over_noise * (problem.target - problem.rows.times(posterior.every(problem.rows.shape[1])))
         cut = ASSUMED.huber * MEDIAN_TO_SIGMA * np.median(np.abs(left))
         self.left = np.clip(left, -cut, cut)
         self.gains = over_noise[:, None] * problem.per_length

@@ -14,7 +14,7 @@ family's coordinate. On twenty virtual machines the residual was 18.1 µm of 27.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import date as calendar
 from itertools import product
@@ -75,38 +75,39 @@ class LinesFit:
     """Result of scheme ``lines`` for a machine's readings."""
 
     model: MachineModel  # the field; the rest is nominal, except the base if holding the datum moves it
+    measurements: MeasurementSet
     lines: tuple[LineFit, ...]
     notes: tuple[str, ...]  # notes on odd, omitted or assumed inputs
     held: HeldDatum
     misfit: str = ""  # why the model is not to be trusted: repeats that scatter, or readings far off their polynomials
 
 
-def fit_lines(
-    measurements: MeasurementSet,
-    order: int | None = None,
-    date: str = "",
-    name: str = "",
-    datum: Pose | None = None,
-) -> LinesFit:
-    """Fit Mou & King's polynomials to a rectangular grid of lines; None: of the orders with the largest adjusted R²."""
+def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datum: Pose | None = None) -> LinesFit:
+    """Fit Mou & King's polynomials to a rectangular grid of lines: of the orders with the largest adjusted R²."""
     readings, notes = _grid_readings(measurements)
     grid = _grid_of(readings)
-    readings = readings._replace(node=_nearest_nodes(readings.point, grid))
+    nearest = [np.abs(readings.point[:, axis, None] - nodes).argmin(axis=1) for axis, nodes in enumerate(grid)]
+    readings = readings._replace(node=np.stack(nearest, axis=1))
     _check_complete(readings, grid)
-    zero, remark = _datum_of(measurements, grid)
-    notes += remark
-    field, fits = _fit_families(readings, GridField(grid, _no_lines(grid), probe=measurements.probe), order, zero)
-    notes += _fit_notes(fits, order)
+    home = measurements.geometry.home
+    point = home.position + home.rotation @ measurements.probe
+    zero = np.array([min(max(p, nodes[0]), nodes[-1]) for p, nodes in zip(point, grid, strict=True)])
+    if beyond := [AXES[a] for a in range(3) if abs(point[a] - zero[a]) > LEAST_TRAVEL]:
+        where = f"home lies outside the box along {', '.join(beyond)}"
+        notes.append(f"{where}: lines are zeroed at their end nearest to it")
+    field, fits = _fit_families(readings, grid, measurements.probe, zero)
+    if one_way := list(dict.fromkeys(fit.name for fit in fits if fit.direction == 0)):
+        what = "not read in both directions; what was read is used for both"
+        notes.append(f"{len(one_way)} lines were {what} (first: {one_way[0]})")
     groups = np.unique(np.stack([measurements.run, measurements.channel]), axis=1, return_inverse=True)[1].ravel()
     means = np.bincount(groups, measurements.value) / np.bincount(groups)
     left = measurements.value - means[groups]
     if np.abs(left).max() <= LEAST_NOISE:  # one kind without noise among others does not harm this scheme
         refuse_unmoved(measurements, left)
-    chosen = "of an order chosen by adjusted-r2" if order is None else f"of order {order}"
     note = (
-        f"Scheme lines (Mou & King 1998): polynomials {chosen} along grid lines. Datum: displacements and rotations "
-        "are zero (mean of both directions) at home's coordinate along each line; straightness without its straight "
-        "line."
+        "Scheme lines (Mou & King 1998): polynomials of an order chosen by adjusted-r2 along grid lines. Datum: "
+        "displacements and rotations are zero (mean of both directions) at home's coordinate along each line; "
+        "straightness without its straight line."
     )
     model = MachineModel(
         machine=measurements.geometry.name,
@@ -116,30 +117,21 @@ def fit_lines(
         origin=ModelOrigin(date or calendar.today().isoformat(), measurements.files, None, note),
     )
     notes = list(dict.fromkeys((*measurements.notes, *notes)))
-    model, held = hold(measurements.geometry, model, measurements.geometry.home if datum is None else datum, np.eye(6))
-    return LinesFit(model, tuple(fits), tuple(notes), held, _misfit(measurements, fits))
+    model, held = hold(measurements.geometry, model, home if datum is None else datum, np.eye(6))
 
+    def spread(name: str) -> dict[int, float]:
+        """Return the RMS of a figure of the polynomials of each kind of channel that have it."""
+        values: dict[int, list[float]] = {}
+        for fit in fits:
+            kind = "rotation" if fit.component >= 3 else "linear" if fit.component == fit.axis else "straightness"
+            values.setdefault(KINDS.index(kind), []).append(getattr(fit, name))
+        finite = {kind: [v for v in of_kind if np.isfinite(v)] for kind, of_kind in sorted(values.items())}
+        return {kind: rms(of_kind) for kind, of_kind in finite.items() if of_kind}
 
-def _misfit(measurements: MeasurementSet, fits: Sequence[LineFit]) -> str:
-    """Return :attr:`LinesFit.misfit`."""
-    repeated: dict[int, float] = {}
-    left: dict[int, float] = {}
-    for kind in np.unique(measurements.kind):
-        members = [fit for fit in fits if _kind(fit) == KINDS[kind]]
-        for spread, values in (
-            (repeated, [fit.repeat_std for fit in members if np.isfinite(fit.repeat_std)]),
-            (left, [fit.residual_std for fit in members]),
-        ):
-            if values:
-                spread[int(kind)] = rms(values)
-    return measurements.misfit(repeated, MISFIT) or measurements.misfit(left, LINES_MISFIT)
-
-
-def _kind(fit: LineFit) -> str:
-    """Return the kind of channel that a polynomial was fitted to."""
-    if fit.component >= 3:
-        return "rotation"
-    return "linear" if fit.component == fit.axis else "straightness"
+    misfit = measurements.misfit(spread("repeat_std"), MISFIT) or measurements.misfit(
+        spread("residual_std"), LINES_MISFIT
+    )
+    return LinesFit(model, measurements, tuple(fits), tuple(notes), held, misfit)
 
 
 # Readings on the grid
@@ -152,7 +144,6 @@ class Readings(NamedTuple):
     component: np.ndarray
     direction: np.ndarray
     run: np.ndarray
-    cycle: np.ndarray
     point: np.ndarray  # (N, 3), commanded place of the measured point in base, m
     node: np.ndarray  # (N, 3), nearest node along each axis; along the line itself without meaning
     value: np.ndarray  # m or rad
@@ -165,71 +156,56 @@ class Readings(NamedTuple):
 
 def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
     """Return the readings on lines parallel to an axis, and notes on omitted ones."""
-    m = measurements
-    axis_of_run = np.array([-1 if run.base_axis is None else run.base_axis for run in m.runs])
-    axis = axis_of_run[m.run]
-    notes = []
+    m, geometry, notes = measurements, measurements.geometry, list[str]()
+    axis = np.array([-1 if run.base_axis is None else run.base_axis for run in m.runs])[m.run]
     others = [m.runs[r].name for r in np.unique(m.run[axis < 0])]
     if others:
         what = "not parallel to an axis of base; scheme lines has no use for them"
         notes.append(f"{len(others)} runs are {what} (first: {others[0]})")
     if (axis < 0).all():
         raise CalibrationError("grid lines", "there are none: no run is parallel to an axis of base")
-    component = _components(m, axis >= 0)
-    along_itself = (component == axis) & (m.channel != CHANNELS.index("linear"))
+    weights = np.abs(m.directions())
+    turned = (axis >= 0) & (weights.max(axis=1) < 1.0 - 1e-9)
+    if turned.any():
+        first = int(turned.argmax())
+        turned_by = np.degrees(np.arccos(np.clip(weights[first].max(), -1.0, 1.0)))
+        problem = f"is read across axes that are turned against those of base by {turned_by:.3g}°"
+        hint = "scheme lines needs a work frame parallel to base, scheme joint does not"
+        raise CalibrationError(f"run {m.runs[m.run[first]].name}", f"{problem}; {hint}")
+    component = weights.argmax(axis=1)
+    along_itself = (axis >= 0) & (component == axis) & (m.channel != CHANNELS.index("linear"))
     if along_itself.any():
         notes.append("straightness along the line itself was left out")
     kept = np.flatnonzero((axis >= 0) & ~along_itself)
-    axis, station = axis[kept], m.station[kept]
+    axis, component, station = axis[kept], component[kept], m.station[kept]
     rotations = m.stations.rotations[station]
     if np.abs(rotations - rotations[0]).max() > 1e-9:
         raise CalibrationError("grid lines", "must all be read at one attitude of the platform: the field has none")
     low, high = m.stations.temperatures[station].min(), m.stations.temperatures[station].max()
     if max(REFERENCE_TEMPERATURE - low, high - REFERENCE_TEMPERATURE) > ASSUMED.least_warming:
         notes.append(f"read at {low:.1f} to {high:.1f} °C; scheme lines models this growth as an error at 20 °C")
-    notes += _command_note(m, np.unique(station))
-    direction = m.stations.sense[station, axis].astype(int)
-    node = np.zeros((len(kept), 3), dtype=int)
-    value = _of_the_model(m)[kept] * np.sign(m.directions()[kept, component[kept]])
-    sloping = m.kind[kept] == KINDS.index("straightness")
-    point = m.points()[station]
-    return Readings(axis, component[kept], direction, m.run[kept], m.cycle[kept], point, node, value, sloping), notes
-
-
-def _of_the_model(measurements: MeasurementSet) -> np.ndarray:
-    """Return readings without the effect of the screws' turning, shape (N,), m or rad."""
-    m = measurements
-    if not m.geometry.screw_lead.any():
-        return m.value
-    turning = station_errors(m, RealMachine(m.geometry, MachineModel(m.geometry.name)))
-    return m.value - (m.directions() * turning[m.station]).sum(axis=1)
-
-
-def _components(measurements: MeasurementSet, wanted: np.ndarray) -> np.ndarray:
-    """Return the index of each reading's component of six, shape (N,), −1 where a mask excludes it."""
-    weights = np.abs(measurements.directions())
-    turned = wanted & (weights.max(axis=1) < 1.0 - 1e-9)
-    if turned.any():
-        run = measurements.runs[measurements.run[turned.argmax()]]
-        turned_by = np.degrees(np.arccos(np.clip(weights[turned.argmax()].max(), -1.0, 1.0)))
-        problem = f"is read across axes that are turned against those of base by {turned_by:.3g}°"
-        raise CalibrationError(
-            f"run {run.name}", f"{problem}; scheme lines needs a work frame parallel to base, scheme joint does not"
-        )
-    return np.where(wanted, weights.argmax(axis=1), -1)
-
-
-def _command_note(measurements: MeasurementSet, stations: np.ndarray) -> list[str]:
-    """Return a note on commands that were not quite nominal; refuse a machine that was compensated."""
-    there, nominal = measurements.stations, Structure.of(measurements.geometry)
-    lengths = strut_lengths_batch(nominal, there.positions[stations], there.rotations[stations])
-    most = float(np.abs(there.commands[stations] - lengths).max())
+    there = m.stations.select(np.unique(station))
+    nominal = strut_lengths_batch(Structure.of(geometry), there.positions, there.rotations)
+    most = float(np.abs(there.commands - nominal).max())
     if most > COMPENSATED:
         problem = f"were read under strut commands up to {most * 1e6:.1f} µm off the nominal lengths: compensated?"
         raise CalibrationError("grid lines", f"{problem} Scheme lines needs the machine as it is")
-    if most <= FOLLOWED:
-        return []
-    return [f"strut commands are up to {most * 1e6:.2f} µm off the nominal lengths, and are taken for nominal"]
+    if most > FOLLOWED:
+        notes.append(f"strut commands are up to {most * 1e6:.2f} µm off the nominal lengths, and are taken for nominal")
+    value = m.value
+    if geometry.screw_lead.any():  # the screws' turning is in every model of this geometry
+        turning = station_errors(m, RealMachine(geometry, MachineModel(geometry.name)))
+        value = value - (m.directions() * turning[m.station]).sum(axis=1)
+    return Readings(
+        axis=axis,
+        component=component,
+        direction=m.stations.sense[station, axis].astype(int),
+        run=m.run[kept],
+        point=m.points()[station],
+        node=np.zeros((len(kept), 3), dtype=int),
+        value=value[kept] * np.sign(m.directions()[kept, component]),
+        sloping=m.kind[kept] == KINDS.index("straightness"),
+    ), notes
 
 
 def _distinct(values: np.ndarray) -> np.ndarray:
@@ -251,111 +227,64 @@ def _grid_of(readings: Readings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return grid[0], grid[1], grid[2]
 
 
-def _nearest_nodes(points: np.ndarray, grid: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the index of the node nearest to each point along each axis, shape (N, 3)."""
-    columns = [np.abs(points[:, axis, None] - nodes).argmin(axis=1) for axis, nodes in enumerate(grid)]
-    return np.stack(columns, axis=1)
-
-
 def _line_name(grid: Sequence[np.ndarray], axis: int, node: Sequence[int]) -> str:
     places = zip(CROSS_AXES[axis], node, strict=True)
     return f"{AXES[axis]} line at " + ", ".join(f"{AXES[a]} {grid[a][n] * 1e3:.1f}" for a, n in places) + " mm"
 
 
 def _check_complete(readings: Readings, grid: Sequence[np.ndarray]) -> None:
-    """Refuse a family of which a line, a channel of a line, or a line's end is missing."""
-    for axis in np.unique(readings.axis):
-        family = readings.select(readings.axis == axis)
-        every = set(product(*(range(len(grid[a])) for a in CROSS_AXES[axis])))
+    """Refuse a family of which a line, a channel of a line, or a line's end is missing: a polynomial is not valid
+    beyond its readings."""
+    for axis in np.unique(readings.axis).tolist():
+        family, cross = readings.select(readings.axis == axis), CROSS_AXES[axis]
+        every = set(product(*(range(len(grid[a])) for a in cross)))
         for component in np.unique(family.component):
-            rows = family.component == component
-            there = {(int(i), int(j)) for i, j in family.node[rows][:, CROSS_AXES[axis]]}
-            if every - there:
-                first = _line_name(grid, axis, min(every - there))
-                what = f"{COMPONENTS[component]} on the {first}"
-                missing = f"of {len(every)} lines of the rectangular grid {len(every - there)} were not measured"
-                raise CalibrationError(what, f"is missing; {missing}")
-        _check_ends(family, int(axis), grid)
-
-
-def _check_ends(family: Readings, axis: int, grid: Sequence[np.ndarray]) -> None:
-    """Refuse a line that ends within the grid: a polynomial is not valid beyond its readings."""
-    low, high = grid[axis][0], grid[axis][-1]
-    for node in sorted({(int(i), int(j)) for i, j in family.node[:, CROSS_AXES[axis]]}):
-        on_line = (family.node[:, CROSS_AXES[axis]] == node).all(axis=1)
-        reach = family.point[on_line, axis]
-        if reach.min() > low + LEAST_TRAVEL or reach.max() < high - LEAST_TRAVEL:
-            problem = f"is read from {reach.min() * 1e3:.1f} to {reach.max() * 1e3:.1f} mm"
-            wanted = f"the grid reaches from {low * 1e3:.1f} to {high * 1e3:.1f} mm"
-            raise CalibrationError(_line_name(grid, axis, node), f"{problem}, but {wanted}")
-
-
-def _datum_of(measurements: MeasurementSet, grid: Sequence[np.ndarray]) -> tuple[np.ndarray, list[str]]:
-    """Return the point where each line is zero, shape (3,), m in ``base``: home's place of the measured point."""
-    home = measurements.geometry.home
-    point = home.position + home.rotation @ measurements.probe
-    datum = np.array([min(max(p, nodes[0]), nodes[-1]) for p, nodes in zip(point, grid, strict=True)])
-    beyond = [name for name, p, d in zip(AXES, point, datum, strict=True) if abs(p - d) > LEAST_TRAVEL]
-    if not beyond:
-        return datum, []
-    return datum, [f"home lies outside the box along {', '.join(beyond)}: lines are zeroed at their end nearest to it"]
+            missing = every - set(map(tuple, family.node[family.component == component][:, cross].tolist()))
+            if missing:
+                what = f"{COMPONENTS[component]} on the {_line_name(grid, axis, min(missing))}"
+                count = f"of {len(every)} lines of the rectangular grid {len(missing)} were not measured"
+                raise CalibrationError(what, f"is missing; {count}")
+        low, high = grid[axis][0], grid[axis][-1]
+        for node in sorted(every):
+            reach = family.point[(family.node[:, cross] == node).all(axis=1), axis]
+            if reach.min() > low + LEAST_TRAVEL or reach.max() < high - LEAST_TRAVEL:
+                problem = f"is read from {reach.min() * 1e3:.1f} to {reach.max() * 1e3:.1f} mm"
+                wanted = f"the grid reaches from {low * 1e3:.1f} to {high * 1e3:.1f} mm"
+                raise CalibrationError(_line_name(grid, axis, node), f"{problem}, but {wanted}")
 
 
 # From readings to polynomials
 
 
-def _priority(component: int, readings: Readings) -> list[int]:
-    """Return the families that read a component: first the one that it belongs to."""
-    own = component % 3
-    measured = [int(axis) for axis in np.unique(readings.axis)]
-    # A displacement is best seen along its own axis; a rotation there is roll, and comes last.
-    return sorted(measured, key=lambda axis: (axis == own) if component >= 3 else (axis != own))
-
-
 def _fit_families(
-    readings: Readings, empty: GridField, order: int | None, datum: np.ndarray
+    readings: Readings, grid: tuple[np.ndarray, np.ndarray, np.ndarray], probe: np.ndarray, zero: np.ndarray
 ) -> tuple[GridField, list[LineFit]]:
     """Return the field and its polynomials: component by component, the family that it belongs to first."""
-    field, fits = empty, []
+    first, second, third = (np.zeros((2, len(grid[a]), len(grid[b]), 6, 0)) for a, b in CROSS_AXES)
+    field, fits = GridField(grid, (first, second, third), probe=probe), list[LineFit]()
     for component in range(6):
-        members = readings.select(readings.component == component)
-        for axis in _priority(component, members):
-            fitted = _fit_family(members, component, axis, field, order, datum)
+        members, own = readings.select(readings.component == component), component % 3
+        # A displacement is best seen along its own axis; a rotation there is roll, and comes last.
+        families = sorted(np.unique(members.axis).tolist(), key=lambda axis: (axis == own) == (component >= 3))
+        for axis in families:
+            family, cross = members.select(members.axis == axis), CROSS_AXES[axis]
+            family = family._replace(value=family.value - _predicted(field, family, component))
+            # Lines whose differences the first family has predicted share the residual.
+            apart = [a for a in cross if a != families[0]]
+            together: dict[tuple[int, ...], list[tuple[int, int]]] = {}
+            for i, j in product(*(range(len(grid[a])) for a in cross)):
+                key = tuple(n for a, n in zip(cross, (i, j), strict=True) if a in apart)
+                together.setdefault(key, []).append((i, j))
+            fitted = list[LineFit]()
+            for key, nodes in together.items():
+                name = _line_name(grid, axis, nodes[0])
+                if len(nodes) > 1:
+                    name += f" and {len(nodes) - 1} beside it along {AXES[families[0]]}"
+                group = family.select((family.node[:, apart] == key).all(axis=1))
+                fitted += _fit_line(group, name, tuple(nodes), grid[axis], zero[axis])
             field = _with_family(field, axis, fitted)
             fits += fitted
     return field, fits
-
-
-def _fit_family(
-    readings: Readings, component: int, axis: int, field: GridField, order: int | None, datum: np.ndarray
-) -> list[LineFit]:
-    """Return the polynomials of the lines along an axis for one component; `field` has the families before this one."""
-    family = readings.select(readings.axis == axis)
-    first = _priority(component, readings)[0]
-    # Lines whose differences the first family has predicted share the residual.
-    shared = None if axis == first else first
-    family = family._replace(value=family.value - _predicted(field, family, component))
-    fits = []
-    for nodes, group in _groups(family, axis, field.grid, shared):
-        name = _line_name(field.grid, axis, nodes[0])
-        if len(nodes) > 1:
-            name += f" and {len(nodes) - 1} beside it along {AXES[first]}"
-        fits += _fit_line(group, name, nodes, field.grid[axis], order, datum[axis])
-    return fits
-
-
-def _fit_notes(fits: Sequence[LineFit], order: int | None) -> list[str]:
-    """Return notes on lines that were read in one direction only, or with too few points for the requested order."""
-    notes = []
-    one_way = list(dict.fromkeys(fit.name for fit in fits if fit.direction == 0))
-    if one_way:
-        what = "not read in both directions; what was read is used for both"
-        notes.append(f"{len(one_way)} lines were {what} (first: {one_way[0]})")
-    short = [fit for fit in fits if order is not None and fit.order < order]
-    if short:
-        what = f"too few points for order {order} and got the highest that they carry"
-        notes.append(f"{len(short)} polynomials have {what} (first: {short[0].name}, order {short[0].order})")
-    return notes
 
 
 def _predicted(field: GridField, readings: Readings, component: int) -> np.ndarray:
@@ -370,60 +299,52 @@ def _predicted(field: GridField, readings: Readings, component: int) -> np.ndarr
     return predicted
 
 
-def _groups(
-    family: Readings, axis: int, grid: Sequence[np.ndarray], shared: int | None
-) -> Iterator[tuple[tuple[tuple[int, int], ...], Readings]]:
-    """Yield the nodes and readings of every line, or of all lines that differ along one axis only."""
-    cross = CROSS_AXES[axis]
-    every = list(product(*(range(len(grid[a])) for a in cross)))
-    together: dict[tuple[int, ...], list[tuple[int, int]]] = {}
-    for node in every:
-        key = tuple(n for a, n in zip(cross, node, strict=True) if a != shared)
-        together.setdefault(key, []).append((node[0], node[1]))
-    for key, nodes in together.items():
-        kept = [a for a in cross if a != shared]
-        yield tuple(nodes), family.select((family.node[:, kept] == key).all(axis=1))
-
-
 def _fit_line(
-    group: Readings, name: str, nodes: tuple[tuple[int, int], ...], along: np.ndarray, order: int | None, datum: float
+    group: Readings, name: str, nodes: tuple[tuple[int, int], ...], along: np.ndarray, zero: float
 ) -> list[LineFit]:
-    """Return the polynomials of a line's directions: two, or one when it was read in one direction only."""
-    axis, component = int(group.axis[0]), int(group.component[0])
+    """Return the polynomials of a line's directions: two, or one when it was read in one direction only.
+
+    They are functions of u, −1 at the first and 1 at the last node. Displacement and rotations are zero at a
+    coordinate, in the mean of both directions; straightness is left without the straight line through both.
+    """
+    axis, component, sloping = int(group.axis[0]), int(group.component[0]), bool(group.sloping.any())
+
+    def parameter(coordinate: np.ndarray | float) -> np.ndarray:
+        return np.asarray((2.0 * coordinate - along[0] - along[-1]) / (along[-1] - along[0]))
+
     ways = sorted(set(group.direction.tolist()) - {0}, reverse=True) or [0]
     group = group.select(np.isin(group.direction, ways))  # readings without direction are not used beside others
-    u = _parameter(group.point[:, axis], along)
-    values = _without_run_zeros(group, u, ways)
-    place, number = _places(group.point[:, axis])
+    values = _without_run_zeros(group, parameter(group.point[:, axis]), ways)
+    place = _distinct(group.point[:, axis])
+    number = np.abs(group.point[:, axis, None] - place).argmin(axis=1)
     beside = np.unique(group.node[:, CROSS_AXES[axis]], axis=0, return_inverse=True)[1].ravel()
-    means = {}
+    u = parameter(place)
+    means, repeats = [], []
     for way in ways:
         rows = group.direction == way
-        means[way] = (
-            _averaged(values[rows], number[rows], len(place)),
-            _spread(values[rows], number[rows], beside[rows]),
-        )
-    if group.sloping.any():
-        means = _straightened(means, _parameter(place, along))
+        means.append(_averaged(values[rows], number[rows], len(place)))
+        same = np.unique(np.stack([beside[rows], number[rows]]), axis=1, return_inverse=True)[1].ravel()
+        left = values[rows] - _averaged(values[rows], same, int(same.max()) + 1)[same]
+        freedom = len(left) - (int(same.max()) + 1)  # readings at one place of one line are repeats
+        repeats.append(float(np.sqrt((left**2).sum() / freedom)) if freedom else float("nan"))
+    if sloping:
+        every, places = np.concatenate(means), np.tile(u, len(means))
+        read = np.isfinite(every)
+        line = Polynomial.fit(places[read], every[read], 1, domain=[-1.0, 1.0])
+        means = [mean - line(u) for mean in means]
     fits = []
-    for way, (mean, repeat) in means.items():
+    for way, mean, repeat in zip(ways, means, repeats, strict=True):
         read = np.isfinite(mean)
-        line = _regress(_parameter(place[read], along), mean[read], order, name, float(along[-1] - along[0]))
-        fits.append(LineFit(name, axis, nodes, component, way, place[read], mean[read], *line, repeat))
-    if not group.sloping.any():
-        fits = _zeroed(fits, float(_parameter(np.array(datum), along)))
+        figures = _regress(u[read], mean[read], name, float(along[-1] - along[0]))
+        fits.append(LineFit(name, axis, nodes, component, way, place[read], mean[read], *figures, repeat))
+    if not sloping:
+        powers = float(parameter(zero))
+        shift = float(np.mean([np.polynomial.polynomial.polyval(powers, fit.coefficients) for fit in fits]))
+        for n, fit in enumerate(fits):
+            coefficients = fit.coefficients.copy()
+            coefficients[0] -= shift
+            fits[n] = replace(fit, coefficients=coefficients, values=fit.values - shift)
     return fits if len(fits) == 2 else [replace(fits[0], direction=0)]
-
-
-def _parameter(coordinate: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Return u, −1 at the first and 1 at the last node, of coordinates along an axis."""
-    return (2.0 * coordinate - along[0] - along[-1]) / (along[-1] - along[0])
-
-
-def _places(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the _distinct places on a line, and each reading's index among them."""
-    places = _distinct(coordinates)
-    return places, np.abs(coordinates[:, None] - places).argmin(axis=1)
 
 
 def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> np.ndarray:
@@ -448,67 +369,24 @@ def _averaged(values: np.ndarray, number: np.ndarray, places: int) -> np.ndarray
     return np.where(count, total / np.maximum(count, 1), np.nan)
 
 
-def _spread(values: np.ndarray, number: np.ndarray, line: np.ndarray) -> float:
-    """Return the standard deviation of readings about their mean at a place of one line; NaN where none is repeated."""
-    repeats = np.unique(np.stack([line, number]), axis=1, return_inverse=True)[1].ravel()
-    freedom = len(values) - (int(repeats.max()) + 1)
-    left = values - _averaged(values, repeats, int(repeats.max()) + 1)[repeats]
-    return float(np.sqrt((left**2).sum() / freedom)) if freedom else float("nan")
+def _regress(u: np.ndarray, values: np.ndarray, name: str, reach: float) -> tuple[np.ndarray, float, float, float]:
+    """Return coefficients in powers of u, R², adjusted R² and the standard deviation of the residuals.
 
-
-def _straightened(means: dict[int, tuple[np.ndarray, float]], u: np.ndarray) -> dict[int, tuple[np.ndarray, float]]:
-    """Return mean readings less the straight line through all of them, both directions together."""
-    values = np.concatenate([mean for mean, _ in means.values()])
-    places = np.tile(u, len(means))
-    read = np.isfinite(values)
-    line = Polynomial.fit(places[read], values[read], 1, domain=[-1.0, 1.0])
-    return {way: (mean - line(u), repeat) for way, (mean, repeat) in means.items()}
-
-
-def _zeroed(fits: list[LineFit], u: float) -> list[LineFit]:
-    """Return a line's polynomials and readings shifted so that the mean of its directions is zero at u."""
-    zero = float(np.mean([np.polynomial.polynomial.polyval(u, fit.coefficients) for fit in fits]))
-    shifted = []
-    for fit in fits:
-        coefficients = fit.coefficients.copy()
-        coefficients[0] -= zero
-        shifted.append(replace(fit, coefficients=coefficients, values=fit.values - zero))
-    return shifted
-
-
-def _regress(
-    u: np.ndarray, values: np.ndarray, order: int | None, name: str, reach: float
-) -> tuple[np.ndarray, float, float, float]:
-    """Return coefficients in powers of u, R², adjusted R² and the standard deviation of the residuals."""
+    The order is that of the largest adjusted R², the lowest of equals.
+    """
     count = len(u)
     if count < FEWEST_POINTS:
         span = f"{count} points in a direction, over {1e3 * reach:.4g} mm"
         wanted = f"{FEWEST_POINTS} are needed: one every {1e3 * reach / (FEWEST_POINTS - 1):.4g} mm or closer"
         raise CalibrationError(name, f"has {span}; {wanted} (step_mm of a campaign)")
-    most = count // POINTS_PER_COEFFICIENT - 1
-    orders = range(most + 1) if order is None else [min(order, most)]
-    candidates = [_polynomial(u, values, k) for k in orders]
-    best = max(candidates, key=lambda fit: fit[2])  # the first of equals: the lowest order
-    return legendre.leg2poly(best[0].coef), *best[1:]
-
-
-def _polynomial(u: np.ndarray, values: np.ndarray, order: int) -> tuple[Legendre, float, float, float]:
-    """Return a polynomial of an order with R², adjusted R² and the residuals' standard deviation."""
-    fit = Legendre.fit(u, values, order, domain=[-1.0, 1.0])
-    rest = float(((values - fit(u)) ** 2).sum())
-    total = float(((values - values.mean()) ** 2).sum())
-    freedom = len(u) - order - 1
-    r2 = 1.0 - rest / total if total > 0.0 else 1.0
-    return fit, r2, 1.0 - (1.0 - r2) * (len(u) - 1) / freedom, float(np.sqrt(rest / freedom))
-
-
-# From polynomials to the field
-
-
-def _no_lines(grid: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return three families that were not measured."""
-    first, second, third = (np.zeros((2, len(grid[a]), len(grid[b]), 6, 0)) for a, b in CROSS_AXES)
-    return first, second, third
+    total, candidates = float(((values - values.mean()) ** 2).sum()), []
+    for order in range(count // POINTS_PER_COEFFICIENT):
+        fit = Legendre.fit(u, values, order, domain=[-1.0, 1.0])
+        rest, freedom = float(((values - fit(u)) ** 2).sum()), count - order - 1
+        r2 = 1.0 - rest / total if total > 0.0 else 1.0
+        adjusted = 1.0 - (1.0 - r2) * (count - 1) / freedom
+        candidates.append((legendre.leg2poly(fit.coef), r2, adjusted, float(np.sqrt(rest / freedom))))
+    return max(candidates, key=lambda one: one[2])
 
 
 def _with_family(field: GridField, axis: int, fits: Sequence[LineFit]) -> GridField:

@@ -17,7 +17,7 @@ import numpy as np
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import MachineModel
 from ..machine.passes import Passes
-from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_KINDS, MeasurementSet, Run
+from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_KINDS, MeasurementSet
 from ..pose import angles_from_rotation, rotation_from_vector
 from ..virtual.instruments import compensated
 
@@ -54,13 +54,47 @@ def family_of_run(measurements: MeasurementSet) -> np.ndarray:
 
 def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
     """Yield the mistakes that leave the poses as they are: signs, units and channels exchanged."""
-    for name, members in _parts(m):
+    family, every = family_of_run(m)[m.run], np.ones(len(m), dtype=bool)
+    # Signs: of families, their kinds, and channels
+    parts = list[tuple[str, np.ndarray]]()
+    for number, name in enumerate(FAMILIES):
+        members = family == number
+        kinds = np.unique(m.kind[members])
+        if members.any() and not members.all():
+            parts.append((name, members))
+        parts += [(f"{name}, {KINDS[k]}", members & (m.kind == k)) for k in kinds if len(kinds) > 1]
+    for channel in np.unique(m.channel):
+        members = m.channel == channel
+        if not members.all():
+            parts.append((CHANNELS[channel], members))
+        if KINDS[m.kind[members][0]] != "linear":
+            of_families = np.unique(family[members])
+            parts += [(f"{FAMILIES[n]}, {CHANNELS[channel]}", members & (family == n)) for n in of_families]
+    for name, members in parts:
         yield Mistake(f"{name}: sign reversed", partial(sign_reversed, m, members))
-    for name, kinds, factor in _in_other_units(m):
-        factors = np.where(np.isin(np.arange(len(KINDS)), kinds), factor, 1.0)
-        yield Mistake(name, partial(m.with_values, factors[m.kind] * m.value), factors)
-    for name, channel in _exchanged(m):
-        yield Mistake(f"{name}: exchanged", partial(replace, m, channel=channel))
+    # Units: of each kind, those of lines together, and all
+    present = np.unique(m.kind)
+    angular = np.array([KINDS[k] in ANGULAR_KINDS for k in present])
+    for which, meant, kinds in (("length", "µm", present[~angular]), ("angle", "µrad", present[angular])):
+        together = [(f"all {which}s", kinds)] if len(kinds) > 1 else []
+        of_lines = [k for k in kinds if KINDS[k] in LINE_KINDS]
+        if 1 < len(of_lines) < len(kinds):
+            together.append((" and ".join(KINDS[k] for k in of_lines), np.array(of_lines)))
+        for (name, chosen), (unit, factor) in product([*together, *((KINDS[k], [k]) for k in kinds)], UNITS[which]):
+            factors = np.where(np.isin(np.arange(len(KINDS)), chosen), factor, 1.0)
+            title = f"{name}: {unit} in place of {meant}"
+            yield Mistake(title, partial(m.with_values, factors[m.kind] * m.value), factors)
+    # Two channels of a kind exchanged, everywhere and in one family of runs
+    for a, b in combinations(np.unique(m.channel), 2):
+        if CHANNELS[a].partition("_")[0] != CHANNELS[b].partition("_")[0]:
+            continue
+        both = (m.channel == a) | (m.channel == b)
+        common = [n for n in np.unique(family[both]) if {a, b} <= set(m.channel[family == n].tolist())]
+        # Along its own line a straightness is none
+        along_lines = CHANNELS[a].startswith("straightness") and (family[both] < 3).any()
+        for name, where in [("", every)] * (not along_lines) + [(f"{FAMILIES[n]}, ", family == n) for n in common]:
+            channel = np.where(both & where, a + b - m.channel, m.channel)
+            yield Mistake(f"{name}{CHANNELS[a]} and {CHANNELS[b]}: exchanged", partial(replace, m, channel=channel))
 
 
 def mistakes_of_check(m: MeasurementSet, model: MachineModel) -> Iterator[Mistake]:
@@ -108,54 +142,6 @@ def _nominal(m: MeasurementSet) -> np.ndarray:
     return strut_lengths_batch(Structure.of(m.geometry), m.stations.positions, m.stations.rotations)
 
 
-def _parts(m: MeasurementSet) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield name and mask of parts whose sign somebody may have reversed: families, their kinds, and channels."""
-    family = family_of_run(m)[m.run]
-    for number, name in enumerate(FAMILIES):
-        members = family == number
-        kinds = np.unique(m.kind[members])
-        if members.any() and not members.all():
-            yield name, members
-        if len(kinds) > 1:
-            for k in kinds:
-                yield f"{name}, {KINDS[k]}", members & (m.kind == k)
-    for channel in np.unique(m.channel):
-        members = m.channel == channel
-        if not members.all():
-            yield CHANNELS[channel], members
-        for number in np.unique(family[members]):
-            if KINDS[m.kind[members][0]] != "linear":
-                yield f"{FAMILIES[number]}, {CHANNELS[channel]}", members & (family == number)
-
-
-def _in_other_units(m: MeasurementSet) -> Iterator[tuple[str, np.ndarray, float]]:
-    """Yield, for each other unit, its name, kinds of reading and their factors: one kind, those of lines together, or
-    all."""
-    present = np.unique(m.kind)
-    angular = np.array([KINDS[k] in ANGULAR_KINDS for k in present])
-    for which, meant, kinds in (("length", "µm", present[~angular]), ("angle", "µrad", present[angular])):
-        together = [(f"all {which}s", kinds)] if len(kinds) > 1 else []
-        of_lines = [k for k in kinds if KINDS[k] in LINE_KINDS]
-        if 1 < len(of_lines) < len(kinds):
-            together.append((" and ".join(KINDS[k] for k in of_lines), np.array(of_lines)))
-        for (name, members), (unit, factor) in product([*together, *((KINDS[k], [k]) for k in kinds)], UNITS[which]):
-            yield f"{name}: {unit} in place of {meant}", np.asarray(members), factor
-
-
-def _exchanged(m: MeasurementSet) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield two channels of a kind exchanged, everywhere and in one family of runs: names, channels of readings."""
-    family, present = family_of_run(m)[m.run], np.unique(m.channel)
-    for a, b in combinations(present, 2):
-        if CHANNELS[a].partition("_")[0] != CHANNELS[b].partition("_")[0]:
-            continue
-        both = (m.channel == a) | (m.channel == b)
-        common = [n for n in np.unique(family[both]) if {a, b} <= set(m.channel[family == n].tolist())]
-        for name, where in [("", both), *((f"{FAMILIES[n]}, ", both & (family == n)) for n in common)]:
-            if where is both and CHANNELS[a].startswith("straightness") and (family[both] < 3).any():
-                continue  # along its own line it is none
-            yield f"{name}{CHANNELS[a]} and {CHANNELS[b]}", np.where(where, a + b - m.channel, m.channel)
-
-
 def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> MeasurementSet:
     """Return a set whose poses, lines and channels stand in axes that are columns of a signed permutation.
 
@@ -178,7 +164,8 @@ def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> Measu
             factor[index] = sign[a] * (handed if axial and kind in ANGULAR_KINDS else 1)
     centre = work.position + (m.centre - work.position) @ in_base.T
     value = factor[m.channel] * m.value
-    renamed = replace(m, channel=channel[m.channel], value=value, centre=centre, runs=_turned_runs(m, in_base))
+    runs = tuple(replace(run, axis=in_base @ run.axis) for run in m.runs)
+    renamed = replace(m, channel=channel[m.channel], value=value, centre=centre, runs=runs)
     return _sent(renamed, *m.geometry.platform_poses(tips @ frame.T, turned), in_base)
 
 
@@ -191,10 +178,6 @@ def _in_order(m: MeasurementSet, order: str) -> MeasurementSet | None:
     about = [rotation_from_vector(angles[:, [a]] * np.eye(3)[a]) for a in ("XYZ".index(axis) for axis in order)]
     turned = about[0] @ about[1] @ about[2]
     return _sent(m, *m.geometry.platform_poses(tips, turned), np.eye(3))
-
-
-def _turned_runs(m: MeasurementSet, turn: np.ndarray) -> tuple[Run, ...]:
-    return tuple(replace(run, axis=turn @ run.axis) for run in m.runs)
 
 
 def _sent(m: MeasurementSet, positions: np.ndarray, rotations: np.ndarray, turn: np.ndarray) -> MeasurementSet:

@@ -15,7 +15,7 @@ quadratic forms of one Gram matrix; coordinate descent finds the most probable s
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from itertools import pairwise, product
 from typing import NamedTuple
@@ -63,20 +63,11 @@ FORCE = "correct it, or write the model all the same (--force) if the machine is
 ALIKE = np.ones(len(KINDS))
 
 
-@dataclass(frozen=True)
-class Alternative:
+class Alternative(NamedTuple):
     """Another way to take the readings."""
 
-    name: str  # "x lines, linear: sign reversed"
     gain: float  # logarithm of the likelihood ratio to the readings as they are
-    better: float  # how many times smaller the noise of the kind that gains most becomes
-    text: str = ""  # what to print in place of both
-
-    def words(self) -> str:
-        """Return the report's words for it; it is also more probable where a machine with smaller errors has the same
-        residuals."""
-        fits = f"{self.better:.3g} times better" if self.better > 1.005 else "as well, by smaller errors of the machine"
-        return self.text or f"{self.name} fits {fits}"
+    text: str  # what is reported of it: "x lines, linear: sign reversed fits 29.8 times better"
 
 
 class Mode(NamedTuple):
@@ -114,7 +105,7 @@ def mixups(
     best = max((other.gain for other in found), default=0.0)
     odds = np.log(ASSUMED.mixup_odds)
     named = [other for other in found if other.gain > max(odds, best - odds)]
-    return [other.words() for other in sorted(named, key=lambda other: -other.gain)]
+    return [other.text for other in sorted(named, key=lambda other: -other.gain)]
 
 
 class _Way(NamedTuple):
@@ -243,8 +234,11 @@ class _Fitted:
         tried = solve(components, problem, components.first, ALIKE, rounds)
         jacobian = float(problem.freedom[self.kinds] @ np.log(mistake.factor[self.kinds]))
         gain = log_evidence(problem, tried) + jacobian - log_evidence(self.problem, as_read) - mistake.choices
+        # How many times smaller the noise of the kind that gains most becomes; the same residuals by a machine with
+        # smaller errors are more probable too
         better = float((as_read.noise * mistake.factor / tried.noise)[self.kinds].max())
-        return Alternative(mistake.name, gain, better)
+        fits = f"{better:.3g} times better" if better > 1.005 else "as well, by smaller errors of the machine"
+        return Alternative(gain, f"{mistake.name} fits {fits}")
 
     def mistakes(self) -> list[Alternative]:
         """Return the most probable mistakes of the table, and of single runs."""
@@ -302,8 +296,7 @@ class _Fitted:
             usual = max(usual, self._by_mode(effect, mode, 1.0, without), key=lambda way: way.evidence)
             amplitude = mistaken.amplitude / UNIT[mode.unit]
             size = f"{amplitude:+.3g} {mode.unit}, {abs(mistaken.amplitude) / usual.deviation:.1f} times what is usual"
-            gain = mistaken.evidence - usual.evidence
-            found.append(Alternative(mode.name, gain, 1.0, f"{mode.name}: {size}: {mode.causes}"))
+            found.append(Alternative(mistaken.evidence - usual.evidence, f"{mode.name}: {size}: {mode.causes}"))
         return found
 
     def _with_mode(self, effect: np.ndarray, mode: Mode, times: float, posterior: Posterior) -> tuple[_Way, Posterior]:

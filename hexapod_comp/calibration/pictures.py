@@ -23,7 +23,7 @@ from ..measurements.readings import AXES, KINDS
 from .fit import ModelFit
 from .lines import LineFit, LinesFit
 from .posterior import COMPONENTS as PREDICTED
-from .posterior import ErrorPredictor, FittedParameters, PredictedError, errors_in_space
+from .posterior import ErrorPredictor, FittedParameters, PredictedError
 
 SAMPLES = 161  # points of a curve
 MAP_NODES = 21  # points along x and y of a map
@@ -102,6 +102,21 @@ def _line_panel(axes: Axes, line: LineFit, grid: Sequence[np.ndarray]) -> None:
     axes.set_title(", ".join(where), fontsize=7)
 
 
+def pictures_of(fit: ModelFit | LinesFit) -> dict[str, Figure]:
+    """Return the pictures of a fit by file name."""
+    geometry = fit.measurements.geometry
+    if isinstance(fit, ModelFit):
+        figures, known, title = {"fit.png": fit_figure(fit)}, fit.parameters, "scheme joint"
+        if fit.model.region is None:
+            return figures
+        figures["left.png"] = before_after_figure(fit)
+    else:
+        figures, known, title = {"lines.png": fitted_lines_figure(fit)}, None, fit.model.name
+    figures["strut_errors.png"] = strut_error_figure(geometry, {title: fit.model})
+    figures["predicted_error.png"] = predicted_error_figure(RealMachine(geometry, fit.model), known)
+    return figures
+
+
 def fit_figure(fit: ModelFit) -> Figure:
     """Show a joint fit: its residuals, and the struts' errors."""
     figure = Figure(figsize=(11, 4.2), layout="constrained")
@@ -117,7 +132,7 @@ def _residual_panel(axes: Axes, fit: ModelFit) -> None:
     kinds = fit.measurements.kind
     edges = np.linspace(-5.0, 5.0, 51)
     for channel in fit.channels:
-        residuals = fit.solution.residuals[kinds == KINDS.index(channel.kind)] / channel.estimated
+        residuals = fit.solution.residuals[kinds == KINDS.index(channel.kind)] / channel.found
         label = f"{channel.kind}, {channel.readings}"
         axes.hist(np.clip(residuals, -5.0, 5.0), edges.tolist(), density=True, histtype="step", label=label)
     axes.plot(edges, np.exp(-0.5 * edges**2) / np.sqrt(2.0 * np.pi), "k:", lw=1.0, label="normal")
@@ -142,15 +157,22 @@ def _strut_panel(axes: Axes, fit: ModelFit) -> None:
 
 
 def before_after_figure(fit: ModelFit) -> Figure:
-    """Map the error in space before compensation, and what is expected after it, at three heights of the box."""
-    if fit.model.region is None:
-        raise CalibrationError("picture of the error in space", "needs readings that span a box")
-    low, high = fit.space.work_box
-    x, y = (np.linspace(low[a], high[a], MAP_NODES) for a in range(2))
-    heights = np.linspace(low[2], high[2], 3)
+    """Map the error in space before compensation, and what is expected after it, at three heights of the box.
+
+    RMS of both directions along x; level tool.
+    """
+    space, geometry = fit.space, fit.measurements.geometry
+    x, y = (np.linspace(*space.work_box[:, a], MAP_NODES) for a in range(2))
+    heights = np.linspace(*space.work_box[:, 2], 3)
     points = np.stack(np.meshgrid(heights, y, x, indexing="ij"), axis=-1)[..., ::-1].reshape(-1, 3)
-    errors = errors_in_space(fit.space, fit.solution.x, fit.covariance, fit.space.places(points))
-    before, left = (part.reshape(3, MAP_NODES, MAP_NODES) * 1e6 for part in errors)
+    level, along_x = np.tile(space.level, (len(points), 1, 1)), np.tile(geometry.work.rotation[:, 0], (len(points), 1))
+    passes = Passes(geometry, space.places(points) - space.level @ space.probe, level, along_x).both_ways()
+    predictor = ErrorPredictor(RealMachine(geometry, fit.model), fit.parameters)
+    aligned = predictor.predict(passes.poses, passes.senses())[1]
+    if aligned is None or aligned.covariance is None:
+        raise CalibrationError("picture of the error in space", "needs readings that span a box")
+    squares = (aligned.values[:, :3] ** 2).sum(axis=1), np.trace(aligned.covariance[:, :3, :3], axis1=1, axis2=2)
+    before, left = (1e6 * np.sqrt(part.reshape(2, 3, MAP_NODES, MAP_NODES).mean(axis=0)) for part in squares)
     # The allowance for errors without a parameter has no place, so it is added everywhere.
     beside = 0.0 if fit.level is None else (fit.level.after * 1e6) ** 2 - np.nanmean(left**2)
     maps = before, np.sqrt(left**2 + max(beside, 0.0))

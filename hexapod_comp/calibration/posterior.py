@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,9 +37,6 @@ from .estimator import Posterior as Estimate
 from .parameters import ParameterSpace
 from .promise import Unexplained
 from .sensitivity import Prediction, carried, derivatives, predict
-
-if TYPE_CHECKING:
-    from .fit import ModelFit
 
 COMPONENTS = ("x", "y", "z", "rx", "ry", "rz")
 """Displacement along, and rotation about, the axes of the work frame."""
@@ -65,14 +62,6 @@ class FittedParameters:
     noise: np.ndarray  # (kinds,), factor on the stated standard deviation of each kind's readings
     # where the model holds the tool; x and covariance are not changed by it; None in old files
     held: HeldDatum | None = None
-
-    @staticmethod
-    def of(fit: ModelFit) -> FittedParameters:
-        """Return the posterior of a fit."""
-        estimate = fit.solution.posterior
-        return FittedParameters(
-            fit.space, fit.solution.x, fit.covariance, estimate.tolerances, estimate.noise, fit.held
-        )
 
 
 # The tool's error to first order
@@ -380,28 +369,6 @@ def expected_error(
         float(np.hypot(before[1], beyond.rotation.stops)),
         *beyond.promised_rotation(sizes[1]),
     )
-
-
-def errors_in_space(
-    space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the error in space without compensation, and the RMS residual error with it, at points (n, 3), m in
-    ``base``.
-
-    Level tool, there and back, the datum aligned over these points; shape (n,), m, NaN out of reach.
-    """
-    level = np.tile(space.level, (len(points), 1, 1))
-    along_x = np.tile(space.geometry.work.rotation[:, 0], (len(points), 1))
-    every = Passes(space.geometry, points - space.level @ space.probe, level, along_x)
-    reachable = every.reachable()
-    before, left = np.full((2, len(points)), np.nan)
-    if reachable.any():
-        stations = stations_of(every.select(reachable).both_ways())
-        errors = FirstOrder.of(space, predict(space, x, stations), stations).aligned()
-        slopes = errors.slopes[:, :3]
-        squares = (errors.values[:, :3] ** 2).sum(axis=1), ((slopes @ covariance) * slopes).sum(axis=(1, 2))
-        before[reachable], left[reachable] = (np.sqrt(part.reshape(2, -1).mean(axis=0)) for part in squares)
-    return before, left
 
 
 def _sizes(square: np.ndarray, drawn: np.ndarray) -> np.ndarray:

@@ -171,28 +171,18 @@ def _parsed(
     largest = (1.0 + 1e-6) * np.sqrt(np.maximum(np.outer(variances, variances), 0.0))  # but for rounding
     if (variances < 0.0).any() or (np.abs(covariance) > largest).any():
         raise InputFileError(path, "covariance", "must be a covariance: no correlation is larger than one")
-    tolerances, noise = array("tolerances", len(space.blocks)), _noise(path, arrays, head.get("kinds"))
+    if head.get("kinds") != list(KINDS):
+        raise InputFileError(path, "head.kinds", f"must be {list(KINDS)}, of the noise factors", head.get("kinds"))
+    tolerances, noise = array("tolerances", len(space.blocks)), array("noise", len(KINDS))
     for name, values in (("tolerances", tolerances), ("noise", noise)):
         if not (values > 0.0).all():
             raise InputFileError(path, name, "must be above zero", values.min())
     held = None
-    if any(name in arrays for name in HELD):  # older files have none
+    if any(name in arrays for name in HELD):
         position, rotation, part, given_up = (array(name, *shape) for name, shape in HELD.items())
         with parsing(path, "datum", PoseError):
             held = HeldDatum(Pose(position, rotation), part, given_up)
     return FittedParameters(space, array("x", n), covariance, tolerances, noise, held)
-
-
-def _noise(path: Path, arrays: dict[str, np.ndarray], kinds: Any) -> np.ndarray:
-    """Return a file's noise factors in the order of KINDS, 1 for those that it lacks; older ones do not name them."""
-    factors = arrays.get("noise", np.zeros((0, 0)))
-    if factors.ndim != 1:
-        raise InputFileError(path, "noise", "must be a list of numbers", list(factors.shape))
-    names = list(KINDS[: len(factors)]) if kinds is None else kinds
-    if not isinstance(names, list) or len(names) != len(factors) or not all(name in KINDS for name in names):
-        raise InputFileError(path, "head.kinds", f"must name the kind of each noise factor, of {list(KINDS)}", names)
-    known = dict(zip(names, factors.tolist(), strict=True))
-    return np.array([known.get(name, 1.0) for name in KINDS])
 
 
 def _fits(value: Any, hint: Any) -> bool:
@@ -221,4 +211,4 @@ def _settings(path: Path, given: Any) -> FitSettings:
             raise InputFileError(path, f"head.settings.{name}", f"must be of the type {words[name]}", value)
     lists = {name: tuple(tuple(v) if isinstance(v, list) else v for v in value)
              for name, value in given.items() if isinstance(value, list)}  # fmt: skip
-    return FitSettings(**{"tracker_frame": "known", **given, **lists})  # files of 0.2 do not say: it was taken so
+    return FitSettings(**{**given, **lists})

@@ -81,10 +81,19 @@ class Unexplained:
     def _interval(self, left: np.ndarray, prior: float, scatter: Scatter) -> Promise:
         """Return the predicted interval without any error of scale.
 
-        Whether the machine or its instrument scatters more than stated is unknown: the lower end omits the scatter.
+        Draws are multivariate t's: the variance's scale has an inverse χ² prior about 1 with `believed` degrees of
+        freedom, which the runs' own degrees of freedom can outweigh. A ratio below 1 does not reduce it: crossing lines
+        predict a line better than the space between lines. Whether the machine or its instrument scatters more than
+        stated is unknown: the lower end omits the scatter.
         """
         size, (low, high) = rms(left), np.percentile(left, [2.5, 97.5])
-        high = max(self.averaged * high, float(np.percentile(left * self._scales(len(left)), 97.5)))
+        scaled = left
+        if np.isfinite(self.believed):
+            places = np.random.default_rng(3).permutation(len(left)) + 0.5  # one draw from each of as many equal shares
+            sums = self.believed + self.freedom * max(1.0, self.ratio)
+            of_draws = gammaincinv(0.5 * (self.believed + self.freedom), places / len(left))
+            scaled = left * np.sqrt(sums / (2.0 * of_draws))
+        high = max(self.averaged * high, float(np.percentile(scaled, 97.5)))
         if low > 0.0:
             down, up = (np.exp(np.hypot(np.log(end / size), TWICE * prior)) for end in (low, high))
             low, high = size / down, size * up
@@ -92,69 +101,34 @@ class Unexplained:
         high = np.linalg.norm([high, ASSUMED.lack_margin * scatter.lack, scatter.most_stops])
         return Promise(float(after), float(low), float(high))
 
-    def _scales(self, count: int) -> np.ndarray:
-        """Return factors on the standard deviations of draws, (count,): draws are multivariate t's.
-
-        The variance's scale has an inverse χ² prior about 1 with `believed` degrees of freedom, which the runs' own
-        degrees of freedom can outweigh. A ratio below 1 does not reduce it: crossing lines predict a line better than
-        the space between lines.
-        """
-        if not np.isfinite(self.believed):
-            return np.ones(count)
-        places = np.random.default_rng(3).permutation(count) + 0.5  # one draw from each of as many equal shares
-        sums = self.believed + self.freedom * max(1.0, self.ratio)
-        return np.sqrt(sums / (2.0 * gammaincinv(0.5 * (self.believed + self.freedom), places / count)))
-
-    def doubts(self) -> list[str]:
-        """Return the causes of doubt about a fit."""
-        listed = []
-        if self.factor > ASSUMED.misfit[1]:
-            listed.append(f"{self._outcome()}: lines, or what they were read with, disagree with each other")
+    def findings(self) -> tuple[list[str], list[str]]:
+        """Return the causes of doubt about a fit, and notes on how the interval was computed."""
+        doubts, notes = [], []
+        if self.factor > 1.0:
+            found = "left out in turn, each run changes the tool more than noise explains"
+            found += f": standard errors are {self.factor:.1f} times as large"
+            if self.factor > ASSUMED.misfit[1]:
+                doubts.append(f"{found}: lines, or what they were read with, disagree with each other")
+            else:
+                notes.append(f"{found}; the expected tool error allows for it")
         if self.drift > ASSUMED.clear * self.drift_error:
             size = f"{self.drift * 1e6:.2g} ppm, as steel's does in {self.drift / STEEL:.2g} K"
             problem = f"the scale of the linear readings changes by {size}, from the first to the last"
-            listed.append(f"{problem}: the model is that of the middle of the campaign")
-        return listed
-
-    def remarks(self) -> list[str]:
-        """Return notes on how the interval was computed."""
-        listed = []
-        if 1.0 < self.factor <= ASSUMED.misfit[1]:
-            listed.append(f"{self._outcome()}; the expected tool error allows for it")
-        lack, stops = (
-            _sizes(getattr(self.displacement, name), getattr(self.rotation, name)) for name in ("lack", "stops")
-        )
-        if lack:
-            listed.append(f"{lack} is in no parameter (discrepancy); the expected tool error allows for it")
-        if stops:
-            problem = "repeated readings scatter more than stated: taken for the machine's own repeatability"
-            listed.append(f"{problem}, {stops}; the expected tool error has it, the lower end has not")
-        return listed
-
-    def as_json(self) -> dict[str, float | str]:
-        """Return this as plain numbers; units are in the keys."""
-        return {
-            "factor": self.factor,
-            "believed_freedom": self.believed,
-            "prior_log_deviation": self.prior,
-            "prior_rotation_log_deviation": self.prior_rotation,
-            **{f"{name}_m": value for name, value in self.displacement._asdict().items()},
-            **{f"{name}_rad": value for name, value in self.rotation._asdict().items()},
-            "drift_m_per_m": self.drift,
-            "drift_error_m_per_m": self.drift_error,
-            "scale_m_per_m": self.scale,
-            "jackknife_variance_ratio": self.ratio,
-            "jackknife_freedom": self.freedom,
-            "factor_by_blocks_left_out": self.averaged,
-        }
-
-    def _outcome(self) -> str:
-        problem = "left out in turn, each run changes the tool more than noise explains"
-        return f"{problem}: standard errors are {self.factor:.1f} times as large"
-
-
-def _sizes(displacement: float, rotation: float) -> str:
-    """Return sizes of a tool error as text; empty if it is zero."""
-    shown = [f"{displacement * 1e6:.2f} µm RMS of the tool's displacement"] if displacement else []
-    shown += [f"{rotation * 1e6:.2f} µrad RMS of its rotation"] if rotation else []
-    return " and ".join(shown)
+            doubts.append(f"{problem}: the model is that of the middle of the campaign")
+        for name in ("lack", "stops"):
+            sizes = [
+                f"{1e6 * getattr(part, name):.2f} {unit}"
+                for part, unit in (
+                    (self.displacement, "µm RMS of the tool's displacement"),
+                    (self.rotation, "µrad RMS of its rotation"),
+                )
+                if getattr(part, name)
+            ]
+            if sizes and name == "lack":
+                notes.append(
+                    f"{' and '.join(sizes)} is in no parameter (discrepancy); the expected tool error allows for it"
+                )
+            elif sizes:
+                problem = "repeated readings scatter more than stated: taken for the machine's own repeatability"
+                notes.append(f"{problem}, {' and '.join(sizes)}; the expected tool error has it, the lower end has not")
+        return doubts, notes

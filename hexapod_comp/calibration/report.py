@@ -1,22 +1,25 @@
-"""Reports of fits, as text and as JSON: scheme ``joint``, and scheme ``lines``."""
+"""Reports of fits, as text and as JSON: scheme ``joint``, and scheme ``lines``.
+
+What is shown as a table is a list of records; its :class:`Column` s give titles, digits and units of the text, and the
+keys of the JSON.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..formats.texts import aligned, number
 from ..machine.field import COMPONENTS
-from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, SAME_ATTITUDE
+from ..measurements.readings import AXES, SAME_ATTITUDE
 from .estimator import SETTLED
-from .fit import ChannelFit, ModelFit, Outlier
-from .lead import ScrewLead
+from .fit import ModelFit, Outlier
 from .lines import LineFit, LinesFit
-from .posterior import BlockSight, Observability, ToolError, UnseenError, listed
-from .thermal import warming_json, warming_text
+from .posterior import Observability, ToolError, UnseenError, listed
+from .thermal import warming_text
 from .trust import TILT
 
 MOST_LISTED, MOST_OF_RUN = 10, 3  # runs with outliers, and outliers of a run, beyond these are counted, not listed
@@ -26,48 +29,130 @@ MOST_RUNS = 5  # number of runs listed with the largest residuals
 # A share of the error of a tilted tool above which a warning is printed, when parameters are not observable
 TRUST = 0.1
 
+# Units in which records are displayed, and the factor of their numbers
+SHOWN_UNITS = {
+    "m": ("um", 1e6),
+    "rad": ("urad", 1e6),
+    "m, rad": ("um, urad", 1e6),
+    "m/m": ("ppm", 1e6),
+    "1/K": ("ppm/K", 1e6),
+    "1": ("ppm/100 %", 1e6),
+    "m/N": ("um/kN", 1e9),
+}
+
+
+class Column(NamedTuple):
+    """A field of records: in text, and in JSON."""
+
+    field: str
+    title: str
+    digits: int | None = None  # None: a text, a whole number, or whether
+    in_unit: bool = False  # of the record: shown in the unit's parts, with the SI unit in its JSON key
+
+
+CHANNELS = (
+    Column("kind", "channel"),
+    Column("readings", "readings"),
+    Column("stated", "stated σ", 2, True),
+    Column("found", "found σ", 2, True),
+    Column("chi_square", "χ²/freedom", 3),
+    Column("held_out", "held out", 2, True),
+)
+DECISIONS = Column("block", "block"), Column("kept", "kept"), Column("evidence", "evidence", 1)
+RUNS = (
+    Column("part", "run"),
+    Column("kind", "channel"),
+    Column("readings", "readings"),
+    Column("value", "χ²/freedom", 3),
+)
+SIGHTS = (
+    Column("name", "block"),
+    Column("parameters", "parameters"),
+    Column("determined", "determined", 1),
+    Column("tolerance", "tolerance", 2, True),
+    Column("error", "median error", 3, True),
+)
+OUTLIERS = tuple(
+    Column(name, "", None, name == "residual") for name in ("source", "run", "channel", "residual", "sigmas")
+)
+
+
+def table(records: Iterable[Any], columns: Sequence[Column]) -> str:
+    """Return records as an aligned table, whose last column is their unit where they have one."""
+    rows = []
+    for record in records:
+        unit, factor = SHOWN_UNITS.get(getattr(record, "unit", ""), ("", 1.0))
+        row = []
+        for column in columns:
+            value = getattr(record, column.field)
+            if column.digits is not None:
+                value = number(value * factor if column.in_unit else value, column.digits)
+            row.append({True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value))
+        rows.append((*row, unit))
+    return aligned((*(column.title for column in columns), ""), rows)
+
+
+def json_records(records: Iterable[Any], columns: Sequence[Column]) -> list[dict[str, Any]]:
+    """Return records for JSON, with the SI unit in the keys."""
+    return [{f"{c.field}_{r.unit}" if c.in_unit else c.field: getattr(r, c.field) for c in columns} for r in records]
+
 
 def fit_report(fit: ModelFit) -> str:
     """Return the report of a fit: residual error, parameters, and what the readings could not show."""
-    doubts = (*fit.verdict.refusals, *fit.verdict.doubts)
-    parts = [
-        *_gross_errors(fit),
-        *(["IN DOUBT:\n" + "\n".join(f"  {doubt}" for doubt in doubts)] if doubts else []),
-        _headline(fit),
-        *expected_text(fit.level, fit.tilted, fit.observability),
-        fit.held.report(),
-        *(["\n".join(f"note: {note}" for note in fit.notes)] if fit.notes else []),
-        _channel_table(fit),
-        *_chi_square_tables(fit),
-        _decision_table(fit),
-        observability_text(fit.observability, fit.unseen_errors),
-        *filter(None, [warming_text(fit.warming)]),
-        *_outliers(fit),
-    ]
-    return "\n\n".join(parts) + "\n"
-
-
-def _headline(fit: ModelFit) -> str:
-    m = fit.measurements
+    m, doubts = fit.measurements, (*fit.refusals, *fit.doubts)
     kept = ", ".join(block.name for block in fit.space.blocks)
     settled = "settled after" if fit.solution.change < SETTLED else "NOT settled after"
-    return (
+    headline = (
         f"machine {m.geometry.name}: {len(m)} readings of {len(m.runs)} runs at {len(m.stations)} stations\n"
         f"scheme joint: {fit.space.size} parameters ({kept}), {settled} {fit.solution.steps} steps"
         + (f"\nscrew lead: {fit.lead}" if fit.lead is not None else "")
     )
+    families = list(dict.fromkeys(c.part for c in fit.chi_squares))
+    known = {(c.kind, c.part): number(c.value, 3) for c in fit.chi_squares}
+    by_family = [(c.kind, *(known.get((c.kind, part), "") for part in families)) for c in fit.channels]
+    gross = sorted((o for o in fit.outliers if abs(o.sigmas) >= GROSS), key=lambda o: -abs(o.sigmas))
+    more = f"; {len(gross) - 1} more beyond {GROSS:g} σ below" if len(gross) > 1 else ""
+    parts = [
+        f"CHECK THIS READING, which looks mistyped: {_outlier_line(gross[0])}{more}" if gross else "",
+        "IN DOUBT:\n" + "\n".join(f"  {doubt}" for doubt in doubts) if doubts else "",
+        headline,
+        expected_text(fit.level, fit.tilted, fit.observability),
+        fit.held.report(),
+        "\n".join(f"note: {note}" for note in fit.notes),
+        "residuals; held out: a line or a pose at a time, noise included\n" + table(fit.channels, CHANNELS),
+    ]
+    if families:
+        parts.append("χ²/freedom by lines and direction; 1: as stated\n" + aligned(("channel", *families), by_family))
+    if len(fit.chi_squares_of_runs) > 1:
+        parts.append("runs that were met worst\n" + table(fit.chi_squares_of_runs[:MOST_RUNS], RUNS))
+    blocks = "blocks; evidence: logarithm of the Bayes factor with the block to without it\n"
+    parts += [
+        blocks + table(fit.decisions, DECISIONS),
+        observability_text(fit.observability, fit.unseen_errors),
+        warming_text(fit.warming),
+        "\n".join(_outlier_lines(fit.outliers)),
+    ]
+    return "\n\n".join(filter(None, parts)) + "\n"
 
 
-def expected_text(level: ToolError | None, tilted: ToolError | None, seen: Observability) -> Iterator[str]:
-    """Yield the tool error with the model, and whether it can be trusted with a tilted tool."""
+def expected_text(level: ToolError | None, tilted: ToolError | None, seen: Observability) -> str:
+    """Return the tool error with the model, and whether it can be trusted with a tilted tool; empty: none is known."""
     if level is None:
-        return
+        return ""
     lines = ["expected tool error at random points of the measured box, both directions, the datum aligned:"]
-    lines.append(f"  level tool:  {tool_error_text(level)}")
-    if tilted is not None:
-        lines.append(f"  tilted 10°:  {tool_error_text(tilted)}")
-        lines += [f"  {doubt}" for doubt in tilt_doubt(tilted, seen)]
-    yield "\n".join(lines)
+    for title, error in (("level tool:  ", level), ("tilted 10°:  ", tilted)):
+        if error is None:
+            continue
+        rotation = f" by the priors: {error.rotation_unknown}"
+        if error.rotation_low is not None and error.rotation_high is not None:
+            rotation = f" ({error.rotation_low * 1e6:.2f}…{error.rotation_high * 1e6:.2f})"
+        removed = 100.0 * (1.0 - error.after / error.before)
+        lines.append(
+            f"  {title}{error.before * 1e6:.2f} → {error.after * 1e6:.3f} µm RMS "
+            f"({error.low * 1e6:.3f}…{error.high * 1e6:.3f} with 95 %), {removed:.1f} % less; "
+            f"rotation {error.rotation_before * 1e6:.1f} → {error.rotation_after * 1e6:.2f} µrad RMS{rotation}"
+        )
+    return "\n".join([*lines, *(f"  {doubt}" for doubt in tilt_doubt(tilted, seen))])
 
 
 def tilt_doubt(tilted: ToolError | None, seen: Observability) -> Iterator[str]:
@@ -82,56 +167,9 @@ def tilt_doubt(tilted: ToolError | None, seen: Observability) -> Iterator[str]:
         )
 
 
-def tool_error_text(error: ToolError) -> str:
-    """Return before, after and the interval of a tool error in µm and µrad."""
-    removed = 100.0 * (1.0 - error.after / error.before)
-    return (
-        f"{error.before * 1e6:.2f} → {error.after * 1e6:.3f} µm RMS "
-        f"({error.low * 1e6:.3f}…{error.high * 1e6:.3f} with 95 %), {removed:.1f} % less; "
-        f"rotation {error.rotation_before * 1e6:.1f} → {error.rotation_after * 1e6:.2f} µrad RMS"
-        + rotation_interval(error)
-    )
-
-
-def rotation_interval(error: ToolError) -> str:
-    """Return the interval of a tool's rotation in µrad, or that there is none."""
-    if error.rotation_low is None or error.rotation_high is None:
-        return f" by the priors: {error.rotation_unknown}"
-    return f" ({error.rotation_low * 1e6:.2f}…{error.rotation_high * 1e6:.2f})"
-
-
-def _channel_table(fit: ModelFit) -> str:
-    header = ("channel", "readings", "stated σ", "found σ", "χ²/freedom", "held out", "")
-    rows = []
-    for c in fit.channels:
-        unit = "urad" if c.kind in ANGULAR_KINDS else "um"
-        cells = (number(c.stated * 1e6, 2), number(c.estimated * 1e6, 2), number(c.chi_square, 3))
-        rows.append((c.kind, str(c.readings), *cells, number(c.held_out * 1e6, 2), unit))
-    return "residuals; held out: a line or a pose at a time, noise included\n" + aligned(header, rows)
-
-
-def _chi_square_tables(fit: ModelFit) -> Iterator[str]:
-    """Yield χ² by channel, family of lines and direction; and the runs with the largest residuals."""
-    parts = list(dict.fromkeys(c.part for c in fit.verdict.chi_squares))
-    known = {(c.kind, c.part): number(c.value, 3) for c in fit.verdict.chi_squares}
-    rows = [(c.kind, *(known.get((c.kind, part), "") for part in parts)) for c in fit.channels]
-    if parts:
-        yield "χ²/freedom by lines and direction; 1: as stated\n" + aligned(("channel", *parts), rows)
-    worst = [(c.part, c.kind, str(c.readings), number(c.value, 3)) for c in fit.verdict.worst_runs[:MOST_RUNS]]
-    if len(fit.verdict.worst_runs) > 1:
-        yield "runs that were met worst\n" + aligned(("run", "channel", "readings", "χ²/freedom"), worst)
-
-
-def _decision_table(fit: ModelFit) -> str:
-    rows = [(d.block, "yes" if d.kept else "no", number(d.evidence, 1)) for d in fit.decisions]
-    head = "blocks; evidence: logarithm of the Bayes factor with the block to without it"
-    return head + "\n" + aligned(("block", "kept", "evidence"), rows)
-
-
 def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ...]) -> str:
     """Return what the data determine: block by block, rank, indices, unseen parameters."""
-    header = ("block", "parameters", "determined", "tolerance", "median error", "")
-    lines = [aligned(header, [_sight_row(b) for b in seen.blocks])]
+    lines = [table(seen.blocks, SIGHTS)]
     lines.append(
         f"{seen.structure_rank} of {seen.structure_size} structure parameters are observable; "
         f"of all {seen.size} parameters {seen.rank} are, condition number {seen.condition:.0f}"
@@ -145,111 +183,60 @@ def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ..
     return "\n".join(lines)
 
 
-# Units in which blocks are displayed, and the factor of the numbers
-SHOWN_UNITS = {
-    "m": ("um", 1e6),
-    "rad": ("urad", 1e6),
-    "m, rad": ("um, urad", 1e6),
-    "m/m": ("ppm", 1e6),
-    "1/K": ("ppm/K", 1e6),
-    "1": ("ppm/100 %", 1e6),
-    "m/N": ("um/kN", 1e9),
-}
-
-
-def _sight_row(b: BlockSight) -> tuple[str, ...]:
-    unit, factor = SHOWN_UNITS[b.unit]
-    cells = (number(b.determined, 1), number(b.tolerance * factor, 2), number(b.error * factor, 3))
-    return (b.name, str(b.parameters), *cells, unit)
-
-
-def _outliers(fit: ModelFit) -> Iterator[str]:
-    """Yield the list of readings that disagree with all others."""
-    if not fit.outliers:
-        return
-    lines = [f"readings that disagree with all others, and got little weight: {len(fit.outliers)}"]
-    runs = Counter(o.run for o in fit.outliers)
+def _outlier_lines(outliers: Sequence[Outlier]) -> Iterator[str]:
+    """Yield the readings that disagree with all others, run by run."""
+    if outliers:
+        yield f"readings that disagree with all others, and got little weight: {len(outliers)}"
+    runs = Counter(o.run for o in outliers)
     for run, count in runs.most_common(MOST_LISTED):
-        of_run = [o for o in fit.outliers if o.run == run]
-        lines.append(f"  run {run}: {count}")
-        lines += [f"    {_outlier_line(o)}" for o in of_run[:MOST_OF_RUN]]
+        yield f"  run {run}: {count}"
+        yield from [f"    {_outlier_line(o)}" for o in outliers if o.run == run][:MOST_OF_RUN]
         if count > MOST_OF_RUN:
-            lines.append(f"    and {count - MOST_OF_RUN} more")
+            yield f"    and {count - MOST_OF_RUN} more"
     if len(runs) > MOST_LISTED:
-        lines.append(f"  and {sum(runs.values()) - sum(n for _, n in runs.most_common(MOST_LISTED))} in other runs")
-    yield "\n".join(lines)
-
-
-def _gross_errors(fit: ModelFit) -> Iterator[str]:
-    """Yield the worst reading, before anything else, if it looks mistyped."""
-    gross = sorted((o for o in fit.outliers if abs(o.sigmas) >= GROSS), key=lambda o: -abs(o.sigmas))
-    if gross:
-        more = f"; {len(gross) - 1} more beyond {GROSS:g} σ below" if len(gross) > 1 else ""
-        yield f"CHECK THIS READING, which looks mistyped: {_outlier_line(gross[0])}{more}"
+        yield f"  and {sum(runs.values()) - sum(n for _, n in runs.most_common(MOST_LISTED))} in other runs"
 
 
 def _outlier_line(o: Outlier) -> str:
-    unit = "urad" if CHANNELS[o.channel].partition("_")[0] in ANGULAR_KINDS else "um"
-    return f"{o.source}: {CHANNELS[o.channel]} is {o.residual * 1e6:.2f} {unit} off ({o.sigmas:.1f} σ)"
+    return f"{o.source}: {o.channel} is {o.residual * 1e6:.2f} {SHOWN_UNITS[o.unit][0]} off ({o.sigmas:.1f} σ)"
 
 
-def as_json(fit: ModelFit) -> dict:
+def as_json(fit: ModelFit) -> dict[str, Any]:
     """Return a fit of scheme joint as plain numbers; SI units are in the keys, or stand beside numbers as ``unit``."""
-    x, errors = fit.solution.x, fit.standard_errors
     labels = [(label, block.unit) for block in fit.space.blocks for label in block.labels]
+    lead = fit.lead
+    if lead is not None:
+        error = None if lead.shown is None else lead.error
+        screws = {"given_m": lead.given, "shown_m": lead.shown, "standard_error_m": error, "used_m": lead.used}
     return {
         "machine": fit.measurements.geometry.name,
         "scheme": "joint",
         "parameters": [
-            {"name": name, "value": v, "standard_error": e, "unit": unit}
-            for (name, unit), v, e in zip(labels, x, errors, strict=True)
+            {"name": name, "value": value, "standard_error": error, "unit": unit}
+            for (name, unit), value, error in zip(labels, fit.solution.x, fit.standard_errors, strict=True)
         ],
         "blocks": fit.decisions,
-        "screw_lead": _lead_json(fit.lead),
-        "channels": [_channel_json(c) for c in fit.channels],
+        "screw_lead": None if lead is None else screws,
+        "channels": json_records(fit.channels, CHANNELS),
         **expected_json(fit.level, fit.tilted, fit.observability, fit.unseen_errors),
         "datum": fit.held.as_json(),
         "settled": fit.solution.change < SETTLED,
-        "doubts": (*fit.verdict.refusals, *fit.verdict.doubts),
-        "unexplained": fit.verdict.unexplained.as_json(),
-        "chi_squares": [c._asdict() for c in fit.verdict.chi_squares],
-        "chi_squares_of_runs": [c._asdict() for c in fit.verdict.worst_runs],
-        "outliers": [_outlier_json(o) for o in fit.outliers],
+        "doubts": (*fit.refusals, *fit.doubts),
+        "unexplained": fit.unexplained,
+        "chi_squares": fit.chi_squares,
+        "chi_squares_of_runs": fit.chi_squares_of_runs,
+        "outliers": json_records(fit.outliers, OUTLIERS),
         "notes": fit.notes,
-        "warming": warming_json(fit.warming),
+        "warming": fit.warming,
     }
-
-
-def _lead_json(lead: ScrewLead | None) -> dict | None:
-    if lead is None:
-        return None
-    error = None if lead.shown is None else lead.error
-    return {"given_m": lead.given, "shown_m": lead.shown, "standard_error_m": error, "used_m": lead.used}
-
-
-def _channel_json(channel: ChannelFit) -> dict:
-    unit = _unit(channel.kind)
-    sizes = {"stated": channel.stated, "found": channel.estimated, "held_out": channel.held_out}
-    sizes = {f"{name}_{unit}": value for name, value in sizes.items()}
-    return {"kind": channel.kind, "readings": channel.readings, "chi_square": channel.chi_square, **sizes}
-
-
-def _outlier_json(outlier: Outlier) -> dict:
-    name = CHANNELS[outlier.channel]
-    residual = {f"residual_{_unit(name.partition('_')[0])}": outlier.residual, "sigmas": outlier.sigmas}
-    return {"source": str(outlier.source), "run": outlier.run, "channel": name, **residual}
-
-
-def _unit(kind: str) -> str:
-    return "rad" if kind in ANGULAR_KINDS else "m"
 
 
 def expected_json(
     level: ToolError | None, tilted: ToolError | None, seen: Observability, unseen_errors: tuple[UnseenError, ...]
-) -> dict:
+) -> dict[str, Any]:
     """Return the keys that a fit and a plan for one share."""
 
-    def error(tool: ToolError | None) -> dict | None:
+    def error(tool: ToolError | None) -> dict[str, Any] | None:
         if tool is None:
             return None
         values = vars(tool).copy()
@@ -260,7 +247,7 @@ def expected_json(
     return {
         "expected_tool_error": error(level),
         "expected_tool_error_tilted": error(tilted),
-        "observability": {**vars(seen), "blocks": [vars(block) for block in seen.blocks]},
+        "observability": seen,
         "unseen_errors": [error.name for error in unseen_errors],
         "unseen_errors_traces": [error.trace for error in unseen_errors],
     }
@@ -285,14 +272,12 @@ def lines_report(fit: LinesFit) -> str:
         order = f"{min(orders)}…{max(orders)}" if min(orders) < max(orders) else str(orders[0])
         worst, median = min(line.r2 for line in members), float(np.median([line.adjusted_r2 for line in members]))
         cells = (number(worst, 3), number(median, 3), f"{np.median(spread):.2f}", f"{spread.max():.2f}")
-        rows.append((AXES[axis], COMPONENTS[component], str(len(members)), order, *cells, _micro(component)))
+        rows.append(
+            (AXES[axis], COMPONENTS[component], str(len(members)), order, *cells, "µm" if component < 3 else "µrad")
+        )
     blocks = [f"{fit.model.name}: {len(fit.lines)} polynomials on a grid of {nodes} nodes", aligned(header, rows)]
     blocks += [fit.held.report(), *(f"note: {note}" for note in fit.notes)]
     return "\n\n".join(blocks) + "\n"
-
-
-def _micro(component: int) -> str:
-    return "µm" if component < 3 else "µrad"
 
 
 def lines_json(fit: LinesFit) -> dict[str, Any]:

@@ -17,9 +17,10 @@ uncertainty.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,7 +31,6 @@ from ..machine.temperatures import (
     REFERENCE_HUMIDITY,
     REFERENCE_TEMPERATURE,
     TIME_CONSTANT_RANGE,
-    LateGrowth,
 )
 from ..measurements.readings import KINDS, MeasurementSet
 from .assumptions import ASSUMED
@@ -161,31 +161,30 @@ def _ratios(courses: list[_Course], least: np.ndarray) -> np.ndarray:
 # Time constants
 
 
-@dataclass(frozen=True)
-class TimeConstants:
-    """Time constants, s, and the standard deviation of the logarithm of each."""
+class TimeConstant(NamedTuple):
+    """How late a part of growth is, s, and the standard deviation of its logarithm; 0: given."""
 
-    values: tuple[float, ...] = ()
-    deviations: tuple[float, ...] = ()
+    value: float
+    deviation: float
 
 
 def estimate_time_constants(
     measurements: MeasurementSet, space: ParameterSpace, progress: Callable[[str], object]
-) -> TimeConstants:
+) -> tuple[TimeConstant, ...]:
     """Return the time constants that readings show beyond a fit without late parts; none without evidence."""
     settings, times = space.settings, measurements.stations.times
     if "late" not in settings.blocks or settings.time_constants is not None or not np.ptp(times) > 0.0:
-        return TimeConstants()
+        return ()
     progress("seeking time constants")
     grid = np.ptp(times) * np.geomspace(1.0 / 200.0, 2.0, 40)  # a sixth apart
     grid = grid[(grid >= TIME_CONSTANT_RANGE[0]) & (grid <= TIME_CONSTANT_RANGE[1])]
     if len(grid) < 3:
-        return TimeConstants()
+        return ()
     estimation = Estimation(measurements, space)
     scan = _Scan(estimation, grid, _tried(estimation))
     best, gain = scan.best(1)
     if gain < ASSUMED.clear_evidence:
-        return TimeConstants()
+        return ()
     # An omitted constant enlarges the noise, which hides a second one: repeat with the noise of the residuals.
     with_best = ParameterSpace(measurements, replace(settings, time_constants=tuple(grid[list(best)].tolist())))
     tried = _tried(Estimation(measurements, with_best))
@@ -244,7 +243,7 @@ class _Scan:
         best = max(gains, key=gains.__getitem__)
         return best, gains[best]
 
-    def refined(self, chosen: tuple[int, ...]) -> TimeConstants:
+    def refined(self, chosen: tuple[int, ...]) -> tuple[TimeConstant, ...]:
         """Return the summits of parabolas through each constant's gain and its neighbours', the others kept.
 
         Deviations use all curvatures together: two constants with similar effects are less certain.
@@ -266,219 +265,152 @@ class _Scan:
                 bends[a, b] = bends[b, a] = -0.25 * sum(w * moved({i: u, j: v}) for u, v, w in ways)
         if (np.linalg.eigvalsh(bends) > 0.0).all():
             deviations[inside] = step * np.sqrt(np.diag(np.linalg.inv(bends)))
-        return TimeConstants(tuple(values.tolist()), tuple(deviations.tolist()))
+        return tuple(map(TimeConstant, values.tolist(), deviations.tolist()))
 
 
 # What a fit tells
 
 
-@dataclass(frozen=True)
-class PartGrowth:
-    """Growth of one kind of part, 1/K."""
+class Change(NamedTuple):
+    """By how much a sensor's readings differ."""
+
+    sensor: str
+    size: float
+    unit: str  # K, or 1: relative humidity
+
+
+class Growth(NamedTuple):
+    """Growth of one kind of part, per unit of its cause."""
 
     part: str  # struts (their mean), base or platform
+    unit: str  # 1/K: by heat; m/m: by humidity from 0 to 1
     stated: float
-    expansion: float
-    deviation: float
-    determined: float  # share of it that comes from the readings
-    late: tuple[float, ...]  # late part of it, by time constant
-
-
-@dataclass(frozen=True)
-class Swelling:
-    """Evidence in readings on the struts' growth by humidity, m/m from 0 to 1."""
-
-    change: float  # of the relative humidity
-    stated: float
-    moisture: float
+    found: float
     deviation: float  # NaN where nothing was fitted
     determined: float  # share of it that comes from the readings
+    late: tuple[float, ...] = ()  # late part of it, by time constant
 
 
 @dataclass(frozen=True)
 class ThermalEvidence:
     """Evidence in readings on heat and humidity."""
 
-    changes: tuple[tuple[str, float], ...]  # of each thermometer that was read, K
+    changes: tuple[Change, ...]  # of each thermometer that was read, and of the humidity where struts swell
     thermometer: str  # the one that represents all parts; empty: each has its own
-    parts: tuple[PartGrowth, ...]  # empty where no expansion was fitted
-    time_constants: TimeConstants
+    growths: tuple[Growth, ...]  # by heat, where an expansion was fitted, and by humidity, where struts swell
+    time_constants: tuple[TimeConstant, ...]
     timed: bool  # whether the readings have times
-    swelling: Swelling | None  # None where struts do not swell
 
     @staticmethod
     def of(
         measurements: MeasurementSet,
         estimation: Estimation,
         solution: Solution,
-        time_constants: TimeConstants,
+        constants: tuple[TimeConstant, ...],
         factor: float,
     ) -> ThermalEvidence:
         """Return the evidence of a fit to readings; deviations are multiplied by a `factor`."""
-        space, stations = estimation.space, measurements.stations
+        space, stations, x = estimation.space, measurements.stations, solution.x
+        late = space.model(x, with_field=False).late_growth
+        if late.time_constants and not constants:  # given
+            constants = tuple(TimeConstant(value, 0.0) for value in late.time_constants)
         read = (stations.temperatures != REFERENCE_TEMPERATURE).any(axis=0)
-        changes = zip(PARTS, np.ptp(stations.temperatures, axis=0).tolist(), read, strict=True)
-        growth = space.model(solution.x, with_field=False).late_growth
-        if growth.time_constants and not time_constants.values:  # given
-            time_constants = TimeConstants(growth.time_constants, (0.0,) * len(growth.time_constants))
-        known, block = _Known.of(estimation, solution, time_constants, factor), space.block("expansion")
+        sizes = np.ptp(stations.temperatures, axis=0).tolist()
+        changes = [Change(name, size, "K") for name, size, known in zip(PARTS, sizes, read, strict=True) if known]
+        covariance, prior = _uncertainty(estimation, solution, constants, factor)
+
+        def fitted(part: str, unit: str, stated: float, where: slice, late_parts: tuple[float, ...] = ()) -> Growth:
+            """Return the mean of some parameters, and how much of it comes from the readings."""
+            variance, before = (float(matrix[where, where].mean()) for matrix in (covariance, prior))
+            known = max(0.0, 1.0 - variance / before)
+            return Growth(part, unit, stated, stated + float(x[where].mean()), math.sqrt(variance), known, late_parts)
+
+        growths, heat, damp = list[Growth](), space.block("expansion"), space.block("moisture")
+        if heat is not None:
+            for part, members in MEMBERS.items():
+                where = slice(heat.part.start + members.start, heat.part.start + members.stop)
+                late_parts = tuple(late.expansion[members].mean(axis=0).tolist())
+                growths.append(fitted(part, "1/K", float(space.stated_expansion[members].mean()), where, late_parts))
+        if space.swells:
+            humidity, stated = np.nan_to_num(stations.humidity, nan=REFERENCE_HUMIDITY), space.settings.strut_moisture
+            changes.append(Change("humidity", float(np.ptp(humidity)), "1"))
+            unknown = Growth("struts", "m/m", stated or 0.0, stated or 0.0, math.nan, 0.0)
+            growths.append(unknown if damp is None else fitted("struts", "m/m", stated or 0.0, damp.part))
         return ThermalEvidence(
-            changes=tuple((name, change) for name, change, is_read in changes if is_read),
+            changes=tuple(changes),
             thermometer=space.settings.thermometer,
-            parts=() if block is None else tuple(_parts(space, solution, known, block.part.start, growth)),
-            time_constants=time_constants if growth.time_constants else TimeConstants(),
+            growths=tuple(growths),
+            time_constants=constants if late.time_constants else (),
             timed=bool(np.isfinite(stations.times).all()),
-            swelling=_swelling(measurements, space, solution, known) if space.swells else None,
         )
 
 
-@dataclass(frozen=True)
-class _Known:
-    """Uncertainty of growth: covariance of all parameters, SI, and the covariance without readings."""
+def _uncertainty(
+    estimation: Estimation, solution: Solution, constants: tuple[TimeConstant, ...], factor: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the covariance of all parameters, SI, including the uncertainty of priors and time constants, and the
+    covariance without readings.
 
-    covariance: np.ndarray
-    prior: np.ndarray
-
-    @staticmethod
-    def of(estimation: Estimation, solution: Solution, constants: TimeConstants, factor: float) -> _Known:
-        """Return the covariance of a fit, including the uncertainty of its priors and time constants.
-
-        The size of a prior is estimated from three numbers at most, which the prior itself pulls towards zero: the
-        covariance is therefore computed with a prior wide enough for any material. Time constants that differ by δ, in
-        the logarithm, change the readings by h·δ, and the parameters by −C·Rᵀ·h·δ. With one thermometer for all, late
-        parts may exist within what the readings allow, even if no time constant was found.
-        """
-        space, noise, problem = estimation.space, solution.posterior.noise, solution.problem
-        least = [LEAST_KNOWN.get(block.name, 0.0) for block in space.blocks]
-        posterior = solve(space, problem, np.maximum(solution.posterior.tolerances, least), noise, rounds=0)
-        covariance, over = physical_covariance(space, posterior), 1.0 / noise[problem.kind]
-        rows = problem.rows.using(posterior.used, over)
-        for deviation, effect in zip(constants.deviations, _effects(estimation, solution.x, constants), strict=False):
+    The size of a prior is estimated from three numbers at most, which the prior itself pulls towards zero: the
+    covariance is therefore computed with a prior wide enough for any material. Time constants that differ by δ, in the
+    logarithm, change the readings by h·δ, and the parameters by −C·Rᵀ·h·δ. With one thermometer for all, late parts may
+    exist within what the readings allow, even if no time constant was found.
+    """
+    space, noise, problem = estimation.space, solution.posterior.noise, solution.problem
+    least = [LEAST_KNOWN.get(block.name, 0.0) for block in space.blocks]
+    posterior = solve(space, problem, np.maximum(solution.posterior.tolerances, least), noise, rounds=0)
+    covariance, over = physical_covariance(space, posterior), 1.0 / noise[problem.kind]
+    rows = problem.rows.using(posterior.used, over)
+    stations, block, step = estimation.measurements.stations, space.block("late"), 0.02
+    if block is not None and constants:
+        growth, per_growth = solution.x[block.part].reshape(len(PARTS), -1), _per_growth(estimation, solution.x)
+        for k, constant in enumerate(constants):
+            shorter, longer = (
+                growth_causes(space.settings, stations, [constant.value * math.exp(way)])[:, :, 1]
+                for way in (-step, step)
+            )
+            later = ((longer - shorter) / (2.0 * step))[estimation.cells.station]
+            effect = estimation.free_of_nuisance((per_growth * later) @ growth[:, k : k + 1])[:, 0]
             moved = space.physical(posterior.covariance @ rows.transposed_times(over * effect))
-            covariance += min(deviation, 1.0) ** 2 * np.outer(moved, moved)
-        times = estimation.measurements.stations.times
-        if space.settings.thermometer and space.block("late") is None and np.ptp(times) > 0.0:
-            constants_unseen = np.ptp(times) * np.array([0.1, 0.5])
-            columns = over[:, None] * _late_columns(estimation, solution.x, constants_unseen, LEAST_KNOWN["late"])
-            shared = rows.transposed_times(columns)
-            moved = posterior.covariance @ shared
-            left = np.eye(len(shared[0])) + columns.T @ columns - shared.T @ moved
-            covariance += space.physical(space.physical(moved @ np.linalg.solve(left, moved.T)).T)
-        return _Known(factor**2 * covariance, space.prior_covariance(posterior.tolerances))
-
-    def of_mean(self, members: slice) -> tuple[float, float]:
-        """Return the standard deviation of the mean of some parameters, and its share that comes from readings."""
-        variance, prior = (float(matrix[members, members].mean()) for matrix in (self.covariance, self.prior))
-        return math.sqrt(variance), max(0.0, 1.0 - variance / prior)
-
-
-def _effects(estimation: Estimation, x: np.ndarray, constants: TimeConstants) -> Iterator[np.ndarray]:
-    """Yield the change of the cells by the logarithm of each time constant, (C,), over their stated noise, free of
-    zeros."""
-    space, stations, step = estimation.space, estimation.measurements.stations, 0.02
-    block = space.block("late")
-    if block is None:
-        return
-    growth, per_growth = x[block.part].reshape(len(PARTS), -1), _per_growth(estimation, x)
-    for k, value in enumerate(constants.values):
-        shorter, longer = (
-            growth_causes(space.settings, stations, [value * math.exp(way)])[:, :, 1] for way in (-step, step)
-        )
-        later = ((longer - shorter) / (2.0 * step))[estimation.cells.station]
-        yield estimation.free_of_nuisance((per_growth * later) @ growth[:, k : k + 1])[:, 0]
-
-
-def _parts(
-    space: ParameterSpace, solution: Solution, known: _Known, start: int, growth: LateGrowth
-) -> Iterator[PartGrowth]:
-    """Yield the growth of each kind of part; the expansions are in the parameters from `start` on."""
-    for name, members in MEMBERS.items():
-        where = slice(start + members.start, start + members.stop)
-        stated = float(space.stated_expansion[members].mean())
-        late = tuple(growth.expansion[members].mean(axis=0).tolist())
-        yield PartGrowth(name, stated, stated + float(solution.x[where].mean()), *known.of_mean(where), late)
-
-
-def _swelling(measurements: MeasurementSet, space: ParameterSpace, solution: Solution, known: _Known) -> Swelling:
-    humidity = np.nan_to_num(measurements.stations.humidity, nan=REFERENCE_HUMIDITY)
-    change, stated, block = float(np.ptp(humidity)), space.settings.strut_moisture or 0.0, space.block("moisture")
-    if block is None:
-        return Swelling(change, stated, stated, math.nan, 0.0)
-    return Swelling(change, stated, stated + float(solution.x[block.part][0]), *known.of_mean(block.part))
-
-
-NOT_DETERMINED = "; these readings do not determine it"
+            covariance += min(constant.deviation, 1.0) ** 2 * np.outer(moved, moved)
+    if space.settings.thermometer and block is None and np.ptp(stations.times) > 0.0:
+        constants_unseen = np.ptp(stations.times) * np.array([0.1, 0.5])
+        columns = over[:, None] * _late_columns(estimation, solution.x, constants_unseen, LEAST_KNOWN["late"])
+        shared = rows.transposed_times(columns)
+        moved = posterior.covariance @ shared
+        left = np.eye(len(shared[0])) + columns.T @ columns - shared.T @ moved
+        covariance += space.physical(space.physical(moved @ np.linalg.solve(left, moved.T)).T)
+    return factor**2 * covariance, space.prior_covariance(posterior.tolerances)
 
 
 def warming_text(warming: ThermalEvidence) -> str:
     """Return the evidence on heat and humidity as text; empty where neither was read."""
-    return "\n".join([*_heat_lines(warming), *_swelling_lines(warming.swelling)])
-
-
-def _heat_lines(warming: ThermalEvidence) -> Iterator[str]:
-    if not warming.changes:
-        return
-    listed = ", ".join(f"{name} {change:.2f} K" for name, change in warming.changes)
-    whose = f"; {warming.thermometer} stands for all parts" if warming.thermometer else ""
-    yield f"heat; change of each thermometer: {listed}{whose}"
-    if not warming.parts:
-        least = f"temperatures changed by less than {ASSUMED.least_warming:g} K, or growth explains nothing"
-        yield f"  expansion is not determined: {least}; what was stated stays"
-    constants = warming.time_constants
-    for p in warming.parts:
-        late = zip(p.late, constants.values, strict=True)
-        listed = "".join(f", {1e6 * value:+.1f} of it late by {number(constant, 0)} s" for value, constant in late)
-        grows = f"{1e6 * p.expansion:.2f} ± {1e6 * p.deviation:.2f} ppm/K (stated {1e6 * p.stated:g})"
-        yield f"  {p.part}: {grows}{listed}{'' if p.determined > SEEN_SHARE else NOT_DETERMINED}"
-    for value, deviation in zip(constants.values, constants.deviations, strict=True):
-        low, high = (number(value * math.exp(2.0 * way * min(deviation, 1.0)), 0) for way in (-1, 1))
-        known = "given" if deviation == 0.0 else f"{low}…{high} s with 95 %" if deviation < 1.0 else "hardly determined"
-        yield f"  time constant {number(value, 0)} s ({known})"
-    if warming.parts and not warming.timed:
-        yield "  the readings have no times (time_s): how late parts follow their thermometers is not known"
-
-
-def _swelling_lines(swelling: Swelling | None) -> Iterator[str]:
-    if swelling is None:
-        return
-    head = f"humidity; changed by {100.0 * swelling.change:.1f} %: struts grow by {1e4 * swelling.moisture:.2f}"
-    stated = f"ppm per % (stated {1e4 * swelling.stated:g})"
-    if math.isnan(swelling.deviation):
-        least = f"it changed by less than {100.0 * ASSUMED.least_damping:g} %, or growth explains nothing"
-        yield f"{head} {stated}, as stated: {least}"
-    else:
-        unsure = "" if swelling.determined > SEEN_SHARE else NOT_DETERMINED
-        yield f"{head} ± {1e4 * swelling.deviation:.2f} {stated}{unsure}"
-
-
-def warming_json(warming: ThermalEvidence) -> dict:
-    """Return the evidence on heat as plain numbers; units are in the keys."""
-    constants, swelling = warming.time_constants, warming.swelling
-    parts = [
-        {
-            "part": p.part,
-            "stated_per_K": p.stated,
-            "expansion_per_K": p.expansion,
-            "standard_error_per_K": p.deviation,
-            "determined": p.determined,
-            "late_per_K": p.late,
-        }
-        for p in warming.parts
-    ]
-    swells = None
-    if swelling is not None:
-        swells = {
-            "humidity_change": swelling.change,
-            "stated": swelling.stated,
-            "moisture": swelling.moisture,
-            "standard_error": None if math.isnan(swelling.deviation) else swelling.deviation,
-            "determined": swelling.determined,
-        }
-    return {
-        "changes_K": dict(warming.changes),
-        "thermometer": warming.thermometer or None,
-        "parts": parts,
-        "time_constants_s": constants.values,
-        "time_constants_relative_error": constants.deviations,
-        "swelling": swells,
-    }
+    lines, known = [], {True: "", False: "; these readings do not determine it"}
+    heat, damp = ([g for g in warming.growths if g.unit == unit] for unit in ("1/K", "m/m"))
+    if listed := ", ".join(f"{c.sensor} {c.size:.2f} K" for c in warming.changes if c.unit == "K"):
+        whose = f"; {warming.thermometer} stands for all parts" if warming.thermometer else ""
+        lines.append(f"heat; change of each thermometer: {listed}{whose}")
+        if not heat:
+            least = f"temperatures changed by less than {ASSUMED.least_warming:g} K, or growth explains nothing"
+            lines.append(f"  expansion is not determined: {least}; what was stated stays")
+        for g in heat:
+            late = zip(g.late, warming.time_constants, strict=True)
+            listed = "".join(f", {1e6 * v:+.1f} of it late by {number(constant.value, 0)} s" for v, constant in late)
+            grows = f"{1e6 * g.found:.2f} ± {1e6 * g.deviation:.2f} ppm/K (stated {1e6 * g.stated:g})"
+            lines.append(f"  {g.part}: {grows}{listed}{known[g.determined > SEEN_SHARE]}")
+        for value, deviation in warming.time_constants:
+            low, high = (number(value * math.exp(2.0 * way * min(deviation, 1.0)), 0) for way in (-1, 1))
+            sure = f"{low}…{high} s with 95 %" if deviation < 1.0 else "hardly determined"
+            lines.append(f"  time constant {number(value, 0)} s ({sure if deviation else 'given'})")
+        if heat and not warming.timed:
+            lines.append("  the readings have no times (time_s): how late parts follow their thermometers is not known")
+    for g in damp:
+        change = next(c.size for c in warming.changes if c.sensor == "humidity")
+        head = f"humidity; changed by {100.0 * change:.1f} %: struts grow by {1e4 * g.found:.2f}"
+        stated = f"ppm per % (stated {1e4 * g.stated:g})"
+        if math.isnan(g.deviation):
+            least = f"it changed by less than {100.0 * ASSUMED.least_damping:g} %, or growth explains nothing"
+            lines.append(f"{head} {stated}, as stated: {least}")
+        else:
+            lines.append(f"{head} ± {1e4 * g.deviation:.2f} {stated}{known[g.determined > SEEN_SHARE]}")
+    return "\n".join(lines)

@@ -10,8 +10,7 @@ supports it. The scale of an instrument, which no reading shows, is stated.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -32,24 +31,21 @@ from .assumptions import ASSUMED
 from .blocks import EXPECTED
 from .estimator import (
     MEDIAN_TO_SIGMA,
-    SETTLED,
     DesignMatrix,
     Estimation,
     Omitted,
     Solution,
     jackknife,
-    physical_covariance,
     whitened_precision,
 )
 from .mistakes import FAMILIES, family_of_run
 from .parameters import FitSettings, ParameterSpace
-from .posterior import FirstOrder, ToolError, box_errors, expected_error
+from .posterior import FirstOrder, box_errors
 from .promise import Scatter, Unexplained
 
 TILT = np.radians(10.0)
 """Tilt at which the report states the tool error of a tilted tool."""
 
-NOT_TILTED = "a field was needed, and measured with a level tool alone: nothing is promised for a tilted one"
 WITHOUT_EFFECT = 1e-4
 """Share of the tool's squared error that the jackknife omits."""
 
@@ -75,57 +71,20 @@ class ChiSquare(NamedTuple):
     value: float  # squared residuals over the stated variance, per degree of freedom
 
 
-@dataclass(frozen=True)
-class Drift:
-    """A scale of all lengths that changes over the campaign, as a polynomial in time."""
-
-    columns: np.ndarray  # (C, terms): its effect on cells, over their noise, in standard deviations of its prior
-    values: np.ndarray  # (terms,), in these standard deviations; empty where the evidence is against a drift
-    covariance: np.ndarray  # (terms, terms)
-
-    @property
-    def change(self) -> tuple[float, float]:
-        """Change of the scale from the first to the last reading and its standard deviation, m/m; (0, 0): none."""
-        if not len(self.values):
-            return 0.0, 0.0
-        size, error = 2.0 * ASSUMED.drift * np.array([abs(self.values[0]), self.covariance[0, 0] ** 0.5])
-        return float(size), float(error)
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The predicted error of a fit, and whether its model may be written."""
-
-    level: ToolError | None  # of a level tool, with unexplained errors; None if nothing can be predicted
-    tilted: ToolError | None  # of one tilted by TILT
-    unexplained: Unexplained  # errors shown by readings that no parameter describes
-    chi_squares: tuple[ChiSquare, ...]  # by kind of channel, of families of lines and of directions
-    worst_runs: tuple[ChiSquare, ...]  # of single runs, the worst first
-    refusals: tuple[str, ...]  # why the model must not be written without force
-    doubts: tuple[str, ...]  # what else is wrong
-    remarks: tuple[str, ...]  # other notes for the reader
-
-    def without_rotation(self, why: str) -> Verdict:
-        """Return the same with no interval for the tool's rotation, which would depend on the priors alone."""
-        level, tilted = (
-            None if error is None else replace(error, rotation_low=None, rotation_high=None, rotation_unknown=why)
-            for error in (self.level, self.tilted)
-        )
-        return replace(self, level=level, tilted=tilted)
-
-
-class LeftOut(NamedTuple):
-    """Blocks that were left out of a fit may still be present."""
-
-    probability: float = 0.0  # probability that any of them is present
-    square: float = 0.0  # expected mean squared error of the tool with all blocks, m²
-
-
 class Residuals:
     """A converged fit's residuals, cell by cell, over the estimated noise, and the resulting tool error."""
 
-    def __init__(self, estimation: Estimation, solution: Solution, drift: Drift) -> None:
+    def __init__(
+        self,
+        estimation: Estimation,
+        solution: Solution,
+        # (C, terms): effect of a drift of the scale on cells, over their noise, in its prior's standard deviations
+        drifting: np.ndarray | None = None,
+        # Change of the scale from the first to the last reading and its standard deviation, m/m; zeros: no drift
+        drift: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
         self.estimation, self.solution, self.drift = estimation, solution, drift
+        self.drifting = np.zeros((len(estimation.cells.kind), 0)) if drifting is None else drifting
         problem, posterior, cells, m = solution.problem, solution.posterior, estimation.cells, estimation.measurements
         scale = 1.0 / posterior.noise[problem.kind]
         # Derivatives by the parameters in use, in their priors' standard deviations
@@ -161,16 +120,16 @@ class Residuals:
     @cached_property
     def omitted(self) -> list[Omitted]:
         """The effect of leaving out each fold on the tool, by the eigenvectors of its squared error."""
-        spread, terms = self.solution.posterior.spread, self.drift.columns.shape[1]
+        spread, terms = self.solution.posterior.spread, self.drifting.shape[1]
         values, vectors = np.linalg.eigh(spread[:, None] * self.metrics[0] * spread)
         # ascending: directions that the priors exclude are omitted
         kept = np.cumsum(values) > WITHOUT_EFFECT * self.expected
         kept[-1] = True
         effects = np.pad(vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0)), ((0, terms), (0, 0)))
         precision = whitened_precision(self.solution.problem, self.solution.posterior)
-        cross, own = self.rows.transposed_times(self.drift.columns), np.eye(terms)
-        precision = np.block([[precision, cross], [cross.T, own + self.drift.columns.T @ self.drift.columns]])
-        rows = self.rows.beside(self.drift.columns)
+        cross, own = self.rows.transposed_times(self.drifting), np.eye(terms)
+        precision = np.block([[precision, cross], [cross.T, own + self.drifting.T @ self.drifting]])
+        rows = self.rows.beside(self.drifting)
         return jackknife(rows, self.residual, precision, self.estimation.cells.fold, effects)
 
     @cached_property
@@ -188,49 +147,10 @@ class Residuals:
         return self.rows.between(posterior.covariance / np.outer(posterior.spread, posterior.spread), first, second)
 
 
-def judge(
-    residuals: Residuals,
-    settings: FitSettings,
-    noise: Mapping[int, float],
-    mixed_up: Sequence[str],
-    left_out: LeftOut,
-) -> Verdict:
-    """Return a converged fit's predicted error and doubts; `noise` was estimated for each kind, m or rad."""
-    solution, measurements, space = residuals.solution, residuals.estimation.measurements, residuals.estimation.space
-    beyond = unexplained(residuals, stated_scale(measurements, settings), left_out)
-    covariance = physical_covariance(space, solution.posterior)
-    # A field that was measured with a level tool has no information on a tilted one.
-    level_only = space.block(FIELDS[0]) is not None and measurements.tilt() < 0.5 * TILT
-    boxes = residuals.level, None if level_only else box_errors(space, solution.x, TILT)
-    level, tilted = (expected_error(errors, covariance, beyond=beyond) for errors in boxes)
-    families, runs = chi_squares(residuals)
-    far_off, doubtful = (measurements.misfit(noise, n) for n in ASSUMED.misfit[:0:-1])
-    refusals, doubts, remarks = [far_off], ["" if far_off else doubtful, *beyond.doubts()], [*beyond.remarks()]
-    if solution.change >= SETTLED:
-        moved = f"a parameter still moves by {solution.change:.2g} standard deviations"
-        doubts.append(f"the fit has not settled: after {solution.steps} steps {moved}")
-    if level is not None and level.after > level.before:
-        refusals.append("the model is not expected to help: the readings determine too little of this machine")
-    if _held_by_priors(residuals):
-        many = f"{len(measurements)} readings do not determine the {space.size} parameters"
-        refusals.append(f"{many}: what they say of the tool comes from the priors")
-    refusals += mixed_up
-    remarks += [_unstated(measurements), NOT_TILTED if level_only else ""]
-    listed = (tuple(filter(None, part)) for part in (refusals, doubts, remarks))
-    return Verdict(level, tilted, beyond, families, runs, *listed)
-
-
-def unexplained(r: Residuals, scale: float, left_out: LeftOut) -> Unexplained:
-    """Return the unexplained errors of a converged fit; `scale` is the standard deviation of that of all readings, m/m.
-
-    The upper end allows for a wrong covariance, as shown by runs, and for the selection of blocks (Bayesian model
-    averaging): with the probability that one of those left out is present, the error with all blocks.
-    """
+def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexplained:
+    """Return the unexplained errors of a converged fit; `averaged` is the factor on the tool's error by averaging over
+    blocks that may have been left out wrongly."""
     ratio, freedom = variance_ratio(r)
-    averaged = 1.0
-    if r.expected > 0.0:
-        averaged += left_out.probability * (left_out.square / r.expected - 1.0)
-    averaged = float(np.sqrt(max(1.0, averaged)))
     clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - 2.0 * ndtr(-ASSUMED.clear)) / freedom
     factor = np.sqrt(ratio) if clear else 1.0
     prior, prior_of_rotation = (_of_priors(r, metric) for metric in r.metrics)
@@ -242,9 +162,9 @@ def unexplained(r: Residuals, scale: float, left_out: LeftOut) -> Unexplained:
         prior_rotation=prior_of_rotation,
         displacement=displacement,
         rotation=rotation,
-        drift=r.drift.change[0],
-        drift_error=r.drift.change[1],
-        scale=scale,
+        drift=r.drift[0],
+        drift_error=r.drift[1],
+        scale=stated_scale(r.estimation.measurements, settings),
         ratio=ratio,
         freedom=freedom,
         averaged=averaged,
@@ -287,7 +207,7 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
     """
     m, cells = estimation.measurements, estimation.cells
     posterior, problem = solution.posterior, solution.problem
-    r = Residuals(estimation, solution, Drift(np.zeros((len(cells.kind), 0)), np.zeros(0), np.zeros((0, 0))))
+    r = Residuals(estimation, solution)
     lengths = ~np.isin(cells.kind, [KINDS.index(kind) for kind in (*ANGULAR_KINDS, "straightness")])
     if len(np.unique(r.run[lengths])) < DRIFT_RUNS:
         return r
@@ -310,9 +230,7 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
         return r
     moved = -gain @ values
     change = r.rows.times(moved / posterior.spread) + columns @ values
-    y, x = posterior.y + moved, np.zeros(estimation.space.size)
-    x[posterior.used] = y
-    known = replace(posterior, y=y, covariance=posterior.covariance + gain @ covariance @ gain.T)
+    known = replace(posterior, y=posterior.y + moved, covariance=posterior.covariance + gain @ covariance @ gain.T)
     of_cells = posterior.noise[problem.kind]
     target = problem.target - of_cells * (columns @ values)
     residuals = solution.residuals - (of_cells * change / problem.scale)[cells.of_reading]
@@ -320,10 +238,11 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
         solution,
         problem=replace(problem, target=target),
         posterior=known,
-        x=estimation.space.physical(x),
+        x=estimation.space.physical(known.every(estimation.space.size)),
         residuals=residuals,
     )
-    return Residuals(estimation, settled, Drift(columns, values, covariance))
+    size, error = 2.0 * ASSUMED.drift * np.array([abs(values[0]), covariance[0, 0] ** 0.5])
+    return Residuals(estimation, settled, columns, (float(size), float(error)))
 
 
 # The discrepancy
@@ -477,7 +396,7 @@ def _of_priors(r: Residuals, metric: np.ndarray) -> float:
     return float(np.sqrt(variance))
 
 
-def _held_by_priors(r: Residuals) -> bool:
+def held_by_priors(r: Residuals) -> bool:
     """Return whether the expected tool error follows from the priors rather than from the readings."""
     metric, posterior, m = r.metrics[0], r.solution.posterior, r.estimation.measurements
     if not metric.any():
@@ -488,7 +407,7 @@ def _held_by_priors(r: Residuals) -> bool:
     return bool(left > HELD * prior and (not lengths.any() or left > np.median(noise[lengths])))
 
 
-def _unstated(m: MeasurementSet) -> str:
+def unstated(m: MeasurementSet) -> str:
     """Return a note on lengths whose noise is assumed, since the machine's own may be part of it; empty if none is."""
     unstated = np.unique(m.kind[~np.isfinite(m.uncertainty)])
     listed = [

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from ..calibration.blocks import HARMONICS
 from ..calibration.evaluation import ModelEvaluation, evaluate_model, evaluation_json, evaluation_text
 from ..calibration.fit import ModelFit, fit_model
-from ..calibration.lines import fit_lines
+from ..calibration.lines import LinesFit, fit_lines
 from ..calibration.parameters import FitSettings
 from ..calibration.posterior import FittedParameters
 from ..calibration.posterior_file import SUFFIX, load_posterior, save_with_posterior
@@ -42,8 +42,6 @@ from . import results
 from .results import Result
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from ..calibration.check import Verification
 
 REFUSED = "NOT WRITTEN: this model is not to be trusted"
@@ -163,66 +161,61 @@ def fit(args: argparse.Namespace) -> int | Result:
         measured = read_measurements(args.files, geometry, args.columns, args.probe_mm)
     datum = None if args.datum is None else geometry.platform_pose(Pose.from_angles(*args.datum))
     try:
-        result = _joint(args, measured, settings, datum) if args.scheme == "joint" else _lines(args, measured, datum)
+        if args.scheme == "joint":
+            with results.stage_line() as say:
+                result: ModelFit | LinesFit = fit_model(measured, settings, say, datum)
+        else:
+            result = fit_lines(measured, datum=datum)
     except CalibrationError:
         results.print_notes(measured.notes)  # they may say why
         raise
-    if beyond := beyond_limits(measured, result.model):
-        result = replace(result, misfit="; ".join(filter(None, (result.misfit, beyond))))
-    if result.misfit and not args.force:
+    misfit = "; ".join(filter(None, (result.misfit, beyond_limits(measured, result.model))))
+    if isinstance(result, ModelFit):
+        text, content, known = fit_report(result), as_json(result), result.parameters
+    else:
+        text, content, known = lines_report(result), lines_json(result), None
+    if misfit and not args.force:
         print("hexapod_comp: error: nothing was written; the report says why, --force writes it", file=sys.stderr)
         return Result(
-            lambda: f"{REFUSED}: {result.misfit}. {ADVICE}\n\n{result.text}",
-            lambda: {**result.content(), "misfit": result.misfit, "written": None},
+            lambda: f"{REFUSED}: {misfit}. {ADVICE}\n\n{text}",
+            lambda: {**content, "misfit": misfit, "written": None},
             code=1,
         )
-    with results.stage("trying the model on the virtual machine"):
-        tried = None if truth is None else _worth(truth, result, measured)
-    return _write(args, result, measured, tried)
+    judged, tried = judge(measured), None
+    if truth is not None:
+        with results.stage("trying the model on the virtual machine"):
+            tried = _worth(truth, result, measured)
+    parts = [text, region_text(result.model.measured, measured.geometry) + "\n"]
+    parts += [standards_text(judged) + "\n"] if judged else []
+    parts += [evaluation_text(tried) + "\n"] if tried else []
+    text = "\n".join([f"{FORCED}: {misfit}. {ADVICE}\n", *parts] if misfit else parts)
+    model = _forced(result.model if args.name is None else replace(result.model, name=args.name), misfit)
+    beside = save_with_posterior(model, known, args.out)
+    more = {
+        "standards": standards_json(judged),
+        "worth": evaluation_json(tried) if tried else None,
+        "measured_box": region_json(model.measured, measured.geometry),
+        "misfit": misfit,
+        "written": args.out,
+        "written_beside": beside,
+    }
+    # The model is written first, since the rest may fail; pictures come last.
+    Result(lambda: f"{text}\nmodel: {args.out}\n{_listed(beside)}", lambda: {**content, **more}).finish(args)
+    if args.report is not None:
+        write_text(args.report, text)
+    if args.certificate is not None and isinstance(result, ModelFit):
+        from ..calibration.certificate import certificate_text, load_details
 
+        with results.stage("writing the certificate"):
+            details = None if args.details is None else load_details(args.details)
+            page = certificate_text(result, model.name, (Path(args.out), *beside), text, details)
+            write_text(args.certificate, page)
+        results.mention(args, f"certificate: {args.certificate}")
+    if args.pictures is not None:
+        from ..calibration.pictures import pictures_of
 
-@dataclass(frozen=True)
-class Fitted:
-    model: MachineModel
-    text: str  # its report
-    content: Callable[[], dict[str, Any]]  # the same for JSON
-    pictures: Callable[[], dict[str, Figure]]
-    misfit: str
-    fitted: FittedParameters | None = None  # covariance of the parameters, and the fit, for scheme joint
-    fit: ModelFit | None = None
-
-
-def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSettings, datum: Pose | None) -> Fitted:
-    with results.stage_line() as say:
-        fit = fit_model(measured, settings, say, datum)
-    fitted = FittedParameters.of(fit)
-
-    def pictures() -> dict[str, Figure]:
-        from ..calibration.pictures import before_after_figure, fit_figure, predicted_error_figure, strut_error_figure
-
-        made = {"fit.png": fit_figure(fit)}
-        if fit.model.region is not None:
-            made["left.png"] = before_after_figure(fit)
-            machine = RealMachine(measured.geometry, fit.model)
-            made["predicted_error.png"] = predicted_error_figure(machine, fitted)
-            made["strut_errors.png"] = strut_error_figure(measured.geometry, {"scheme joint": fit.model})
-        return made
-
-    model = fit.model if args.name is None else replace(fit.model, name=args.name)
-    return Fitted(model, fit_report(fit), lambda: as_json(fit), pictures, fit.misfit, fitted, fit)
-
-
-def _lines(args: argparse.Namespace, measured: MeasurementSet, datum: Pose | None) -> Fitted:
-    fit = fit_lines(measured, name=args.name or "", datum=datum)
-
-    def pictures() -> dict[str, Figure]:
-        from ..calibration.pictures import fitted_lines_figure, predicted_error_figure, strut_error_figure
-
-        of_struts = strut_error_figure(measured.geometry, {fit.model.name: fit.model})
-        predicted = predicted_error_figure(RealMachine(measured.geometry, fit.model), None)
-        return {"lines.png": fitted_lines_figure(fit), "strut_errors.png": of_struts, "predicted_error.png": predicted}
-
-    return Fitted(fit.model, lines_report(fit), lambda: lines_json(fit), pictures, fit.misfit)
+        results.save_pictures(args, lambda: pictures_of(result))
+    return 0
 
 
 def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
@@ -240,47 +233,14 @@ def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
     return f"{problem}, first at {at} mm, tool in work: {breaches[0].error}"
 
 
-def _worth(truth: RealMachine, result: Fitted, measured: MeasurementSet) -> ModelEvaluation:
+def _worth(truth: RealMachine, result: ModelFit | LinesFit, measured: MeasurementSet) -> ModelEvaluation:
     box, geometry = measured.tool_box(), measured.geometry
     if not spans(box):
         raise CalibrationError("--truth", "the readings do not span a box, so the model cannot be judged")
     level = geometry.work.rotation.T @ measured.level() @ geometry.tool.rotation
-    tool = None if result.fit is None else result.fit.level
+    tool = result.level if isinstance(result, ModelFit) else None
     promised = None if tool is None else (tool.low, tool.high)
     return replace(evaluate_model(truth, result.model, box, level=level), promised=promised)
-
-
-def _write(args: argparse.Namespace, result: Fitted, measured: MeasurementSet, tried: ModelEvaluation | None) -> int:
-    judged = judge(measured)
-    parts = [result.text, region_text(result.model.measured, measured.geometry) + "\n"]
-    parts += [standards_text(judged) + "\n"] if judged else []
-    parts += [evaluation_text(tried) + "\n"] if tried else []
-    text = "\n".join(parts)
-    if result.misfit:
-        text = f"{FORCED}: {result.misfit}. {ADVICE}\n\n{text}"
-    beside = save_with_posterior(_forced(result.model, result.misfit), result.fitted, args.out)
-
-    def content() -> dict[str, Any]:
-        more = {"standards": standards_json(judged), "worth": evaluation_json(tried) if tried else None}
-        more["measured_box"] = region_json(result.model.measured, measured.geometry)
-        files = {"misfit": result.misfit, "written": args.out, "written_beside": beside}
-        return {**result.content(), **more, **files}
-
-    # The model is written first, since the rest may fail; pictures come last.
-    Result(lambda: f"{text}\nmodel: {args.out}\n{_listed(beside)}", content).finish(args)
-    if args.report is not None:
-        write_text(args.report, text)
-    if args.certificate is not None and result.fit is not None:
-        from ..calibration.certificate import Filed, certificate_text, load_details
-
-        with results.stage("writing the certificate"):
-            filed = Filed(result.model.name, (Path(args.out), *beside), text)
-            details = None if args.details is None else load_details(args.details)
-            write_text(args.certificate, certificate_text(result.fit, filed, details))
-        results.mention(args, f"certificate: {args.certificate}")
-    if args.pictures is not None:
-        results.save_pictures(args, result.pictures)
-    return 0
 
 
 def _forced(model: MachineModel, reason: str) -> MachineModel:

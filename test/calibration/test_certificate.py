@@ -12,7 +12,7 @@ import pytest
 from calibration_helpers import FEW, campaign, measured, virtual_machine
 
 from hexapod_comp.calibration import certificate
-from hexapod_comp.calibration.certificate import Details, Filed, certificate_text, left_out, load_details
+from hexapod_comp.calibration.certificate import Details, certificate_text, left_out, load_details
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.posterior import UnseenError
 from hexapod_comp.calibration.report import fit_report
@@ -31,11 +31,10 @@ def fit() -> ModelFit:
 
 
 @pytest.fixture
-def filed(fit: ModelFit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Filed:
+def model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(certificate, "_figures", lambda fit: [])  # pictures take most of the time
-    model = tmp_path / "model.yaml"
-    model.write_text("the model")
-    return Filed("a model", (model,), fit_report(fit))
+    (tmp_path / "model.yaml").write_text("the model")
+    return tmp_path / "model.yaml"
 
 
 def cells(text: str) -> list[list[str]]:
@@ -44,11 +43,11 @@ def cells(text: str) -> list[list[str]]:
     return [[re.sub("<.*?>", "", cell) for cell in re.findall(r"<t[hd].*?</t[hd]>", row, re.DOTALL)] for row in rows]
 
 
-def test_it_promises_what_the_report_promises(fit: ModelFit, filed: Filed) -> None:
+def test_it_promises_what_the_report_promises(fit: ModelFit, model: Path) -> None:
     """Before, after and interval are the fit's; U is twice the interval's upper end; hashes are the files'."""
-    table = cells(
-        certificate_text(replace(fit, measurements=replace(fit.measurements, files=(("laser.csv", "ab" * 32),))), filed)
-    )
+    read = replace(fit, measurements=replace(fit.measurements, files=(("laser.csv", "ab" * 32),)))
+    report = fit_report(fit)
+    table = cells(certificate_text(read, "a model", [model], report))
     assert ["model", "model.yaml", hashlib.sha256(b"the model").hexdigest()] in table
     assert ["readings", "laser.csv", "ab" * 32] in table
     rows = {row[0]: row[1:] for row in table}
@@ -62,11 +61,11 @@ def test_it_promises_what_the_report_promises(fit: ModelFit, filed: Filed) -> No
     assert unit == "µm"
     rotation = rows["level tool: rotation"]
     assert rotation[2:] == ["roll is not shown", "", "µrad"], "a linear laser alone promises nothing of it"
-    doubtful = certificate_text(fit, replace(filed, report=f"IN DOUBT: off by <10 times\n\n{filed.report}"))
+    doubtful = certificate_text(fit, "a model", [model], f"IN DOUBT: off by <10 times\n\n{report}")
     assert "</h1><p class=warning><b>Warning.</b> IN DOUBT: off by &lt;10 times</p>" in doubtful
 
 
-def test_strangers_names_are_text(fit: ModelFit, filed: Filed) -> None:
+def test_strangers_names_are_text(fit: ModelFit, model: Path) -> None:
     """Run, file, model, notes, outliers and details may hold anything; nothing of it is obeyed or loaded."""
     m = fit.measurements
     runs = tuple(replace(run, name=HOSTILE + run.name) for run in m.runs)
@@ -74,7 +73,7 @@ def test_strangers_names_are_text(fit: ModelFit, filed: Filed) -> None:
     hostile = replace(m, runs=runs, sources=sources, files=((HOSTILE, HOSTILE),))
     stranger = replace(fit, measurements=hostile, notes=(HOSTILE,), unseen_errors=(UnseenError(HOSTILE, 0.0),))
     details = Details(customer=HOSTILE, instruments=(HOSTILE,), remarks=(HOSTILE,))
-    text = certificate_text(stranger, replace(filed, model=HOSTILE, report=HOSTILE), details)
+    text = certificate_text(stranger, HOSTILE, [model], HOSTILE, details)
     assert "<script" not in text
     assert all(source.startswith("data:image/png;base64,") for source in re.findall(r"<[^>]* src=\"?([^\s\">]*)", text))
     assert text.count("&lt;script&gt;alert(1)&lt;/script&gt;") > len(runs)

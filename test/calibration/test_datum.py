@@ -19,7 +19,7 @@ from hexapod_comp.calibration.datum import unseen_part
 from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
-from hexapod_comp.calibration.posterior import ErrorPredictor, FittedParameters
+from hexapod_comp.calibration.posterior import ErrorPredictor
 from hexapod_comp.calibration.posterior_file import load_posterior, save_with_posterior
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import load_geometry
@@ -98,7 +98,7 @@ def test_another_datum_can_be_given_and_one_out_of_reach_is_refused(unsuspected:
 
 def test_holding_the_datum_leaves_the_deviations_as_they_were_but_for_what_it_moved(tmp_path: Path) -> None:
     fit, home = laser_fit(), small.paper().home
-    fitted = FittedParameters.of(fit)
+    fitted = fit.parameters
     save_with_posterior(fit.model, fitted, tmp_path / "model.yaml")
     model = load_model(tmp_path / "model.yaml", small.paper())
     stored, _ = load_posterior(model, small.paper(), tmp_path / "model.yaml")

@@ -17,7 +17,6 @@ from hexapod_comp.calibration.estimator import (
     DesignMatrix,
     Estimation,
     LinearProblem,
-    Posterior,
     iterate,
     jackknife,
     log_evidence,
@@ -195,17 +194,6 @@ def test_solver_is_least_squares_with_prior_rows():
     np.testing.assert_allclose(answer.determined, hat, atol=1e-9)
 
 
-def left_out(problem: LinearProblem, answer: Posterior) -> np.ndarray:
-    """Return the jackknife's errors at cells whose fold a fit did not see, in standard deviations."""
-    scale, errors = 1.0 / answer.noise[problem.kind], np.full(len(problem.target), np.nan)
-    rows = problem.rows.using(answer.used, scale, answer.spread)
-    residual = scale * problem.target - rows.times(answer.y / answer.spread)
-    precision = whitened_precision(problem, answer)
-    for one in jackknife(rows, residual, precision, problem.fold, np.eye(len(precision))):
-        errors[one.cells] = one.errors
-    return errors
-
-
 def test_held_out_errors_are_those_of_fits_that_left_a_fold_out():
     """Twenty folds of some twelve cells, and one of half of them, each really left out and fitted again.
 
@@ -215,7 +203,6 @@ def test_held_out_errors_are_those_of_fits_that_left_a_fold_out():
     problem = replace(problem, fold=np.where(np.arange(240) < 120, 0, problem.fold))
     tolerances = space.start_tolerances()
     answer = solve(space, problem, tolerances, noise, 0)
-    errors = left_out(problem, answer)
     rows = problem.rows.using(answer.used, 1.0 / noise[problem.kind], answer.spread)
     residual = problem.target / noise[problem.kind] - rows.times(answer.y / answer.spread)
     precision = whitened_precision(problem, answer)
@@ -224,7 +211,7 @@ def test_held_out_errors_are_those_of_fits_that_left_a_fold_out():
         out = problem.fold == fold
         y, covariance = dense(space, problem, tolerances, noise, np.flatnonzero(~out))
         wanted = (problem.target[out] - problem.rows.dense()[out] @ y) / noise[problem.kind[out]]
-        np.testing.assert_allclose(errors[out], wanted, atol=1e-8)
+        np.testing.assert_allclose(one.errors[np.argsort(one.cells)], wanted, atol=1e-8)
         spread = answer.spread
         np.testing.assert_allclose(one.moved, (answer.y - y) / spread, atol=1e-8)
         grown = (covariance - answer.covariance) / np.outer(spread, spread)
@@ -329,9 +316,9 @@ def test_noise_twice_and_three_times_as_stated_is_found():
     plan = small.campaign(noise=(2e-6, 1e-6, 3e-6, 1e-5, 1e-5, 1e-6, 1e-6))
     ours = small.measured(small.virtual_machine(1), plan, 1)
     fit = fit_model(replace(ours, uncertainty=np.full(len(ours), 1e-6)), FEW)
-    found = {channel.kind: channel.estimated / channel.stated for channel in fit.channels}
+    found = {channel.kind: channel.found / channel.stated for channel in fit.channels}
     assert found == {kind: pytest.approx(n, rel=0.16) for kind, n in zip(KINDS[:3], (2.0, 1.0, 3.0), strict=True)}
-    assert all(c.chi_square == pytest.approx((c.estimated / c.stated) ** 2) for c in fit.channels)
+    assert all(c.chi_square == pytest.approx((c.found / c.stated) ** 2) for c in fit.channels)
     assert sum(c.readings for c in fit.channels) == len(ours)
 
 
@@ -352,7 +339,7 @@ def test_gross_errors_are_named_and_do_no_harm(gross: float):
     value = ours.value.copy()
     value[where] += [gross, -gross, gross]
     clean, fit = (fit_model(m, FEW) for m in (ours, ours.with_values(value)))
-    assert {o.source.line for o in fit.outliers} == {n + 2 for n in where}
+    assert {o.source for o in fit.outliers} == {f"shop.csv: line {n + 2}" for n in where}
     assert all(abs(o.residual) == pytest.approx(gross, abs=6e-6) for o in fit.outliers)
     assert [d.kept for d in fit.decisions] == [d.kept for d in clean.decisions]
     deviations = np.sqrt(np.diag(physical_covariance(clean.space, clean.solution.posterior)))

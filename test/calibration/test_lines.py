@@ -85,18 +85,16 @@ def real_fit(geometry, real) -> LinesFit:
     return fit_lines(measure(template(campaign, geometry), campaign, real, 3), date="2025-01-01")
 
 
-@pytest.mark.parametrize("order", [None, 4])
-def test_a_machine_of_the_papers_form_is_found_again(quiet, linear_truth, order):
+def test_a_machine_of_the_papers_form_is_found_again(quiet, linear_truth):
     """Truth: the machine's own coefficients, zero where the fit's lines are; 1e-12 m is the solver's rounding.
 
-    Without noise adjusted R² must take the whole order. Order 4 is capped at 2 on the z-lines, with a note.
+    Without noise adjusted R² must take the whole order.
     """
-    fit = fit_lines(quiet, order)
+    fit = fit_lines(quiet)
     for found, true in zip(fit.model.field.lines, linear_truth.model.field.lines, strict=True):
         assert found == pytest.approx(true, abs=1e-12)
     assert all(nodes == pytest.approx(true) for nodes, true in zip(fit.model.field.grid, GRID, strict=True))
     assert fit.model.region.box == pytest.approx(BOX)
-    assert len([note for note in fit.notes if "too few points" in note]) == (order == 4)
 
 
 @pytest.mark.parametrize("instrument", ["1-D", "5-D"])
@@ -132,13 +130,12 @@ def test_adjusted_r2_finds_a_parabola(geometry):
     assert np.mean(orders == 2) > 0.5
 
 
-def test_the_figures_of_a_straight_line_are_scipys(geometry):
-    """Truth: scipy.stats.linregress on the same mean readings; adjusted R² from its definition by variances."""
-    for line in fit_lines(noisy_lines(geometry), 1).lines[::7]:
-        truth = linregress(line.coordinates, line.values)
-        rest = line.values - truth.intercept - truth.slope * line.coordinates
-        variance = (rest**2).sum() / (len(rest) - 2)
-        assert line.r2 == pytest.approx(truth.rvalue**2, abs=1e-12)
+def test_the_figures_of_a_polynomial_are_those_of_a_regression(geometry):
+    """Truth: scipy.stats.linregress on NumPy's polynomial of the same order; adjusted R² by variances."""
+    for line in fit_lines(noisy_lines(geometry)).lines[::7]:
+        fitted = np.polynomial.Polynomial.fit(line.coordinates, line.values, line.order)(line.coordinates)
+        variance = ((line.values - fitted) ** 2).sum() / (len(fitted) - line.order - 1)
+        assert line.r2 == pytest.approx(linregress(fitted, line.values).rvalue ** 2, abs=1e-12)
         assert line.residual_std == pytest.approx(np.sqrt(variance), rel=1e-9)
         assert line.adjusted_r2 == pytest.approx(1.0 - variance / line.values.var(ddof=1), abs=1e-12)
 
@@ -159,7 +156,7 @@ def test_families_do_not_count_twice(geometry, five):
         families[axis] += rest[:, :1, :1]
     truth = machine_of(geometry, tuple(families))
     campaign = replace(QUIET, instrument="5-D")
-    found = fit_lines(measure(five, campaign, truth, 0), 4).model.field
+    found = fit_lines(measure(five, campaign, truth, 0)).model.field
     points = rng.uniform(*BOX, (200, 3))
     senses = rng.choice([-1.0, 1.0], (200, 3))
     both = zip(points, senses, strict=True)
@@ -173,7 +170,7 @@ def test_families_do_not_count_twice(geometry, five):
 
 def test_one_direction_serves_for_both_with_a_note(quiet, linear_truth):
     forward = quiet.select(quiet.direction == FORWARD)
-    fit = fit_lines(forward, 4)
+    fit = fit_lines(forward)
     for family, true in zip(fit.model.field.lines, linear_truth.model.field.lines, strict=True):
         assert (family[0] == family[1]).all()
         # Its own zero now stands for both: the shape is the forward one's.
@@ -189,7 +186,7 @@ def test_the_work_frame_may_be_turned_by_right_angles(geometry, linear_truth, qu
     fits = []
     for machine in (geometry, turned):
         truth = RealMachine(machine, linear_truth.model)
-        fits.append(fit_lines(measure(template(campaign, machine), campaign, truth, 0), 2).model.field)
+        fits.append(fit_lines(measure(template(campaign, machine), campaign, truth, 0)).model.field)
     for first, second in zip(fits[0].lines, fits[1].lines, strict=True):
         assert first == pytest.approx(second, abs=1e-11)
 

@@ -23,7 +23,6 @@ from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import (
     FirstOrder,
-    FittedParameters,
     box_errors,
     box_stations,
     expected_error,
@@ -161,7 +160,7 @@ def test_the_model_says_for_which_loads_and_the_compensator_warns_outside(tmp_pa
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -9.807),
         (10.0, 0.01, 0.0, 0.08, 0.0, 0.0, -9.807),
     )
-    save_with_posterior(fitted.model, FittedParameters.of(fitted), tmp_path / "model.yaml")
+    save_with_posterior(fitted.model, fitted.parameters, tmp_path / "model.yaml")
     geometry = truth().geometry
     model = load_model(tmp_path / "model.yaml", geometry)
     assert model.origin.loads == fitted.model.origin.loads
@@ -183,7 +182,7 @@ def test_verify_names_the_payload_and_no_temperature(settings: FitSettings) -> N
     The readings are the outward ones of the campaign's own lines. A machine that has grown is not taken for a load.
     """
     fitted = fit(settings)
-    known = FittedParameters.of(fitted)
+    known = fitted.parameters
     told = under(HEAVY, 7)
     told = told.select((told.direction == FORWARD) & (np.arange(len(told)) % 2 == 0))
     untold = replace(told, stations=under(SPINDLE, 1).stations)
@@ -211,7 +210,7 @@ def test_verify_names_the_payload_and_no_temperature(settings: FitSettings) -> N
 def test_a_payload_moves_the_tool_as_the_core_says() -> None:
     """The parameters that stand for 3 kg more, at poses of the readings, against the core with and without them."""
     fitted = fit(TOLD)
-    readings, space = under(SPINDLE, 1), widened(FittedParameters.of(fitted)).space
+    readings, space = under(SPINDLE, 1), widened(fitted.parameters).space
     heavier = replace(
         readings.stations, loads=np.tile([13.0, *SPINDLE.centre, *[np.nan] * 3], (len(readings.stations), 1))
     )
@@ -284,7 +283,7 @@ def test_lost_motion_and_friction_are_fitted_where_forces_change_their_sign() ->
     # machine with a take-up of 1 mN, whose clearances exceed the noise. Without their variance χ² is 5 per number.
     lost_motion = fitted.space.block("lost motion")
     assert lost_motion is not None
-    known, x = FittedParameters.of(fitted), fitted.solution.x.copy()
+    known, x = fitted.parameters, fitted.solution.x.copy()
     x[lost_motion.part] = 20e-6
     wide = widened(replace(known, x=x))
     model = wide.space.model(wide.x)

@@ -46,10 +46,10 @@ def test_what_is_described_is_promised_as_before(readings):
     And by how far any covariance is believed; were it without doubt, by 1.3 at most.
     """
     fit = fit_model(readings, FEW)
-    beyond = fit.verdict.unexplained
+    beyond = fit.unexplained
     assert (beyond.factor, beyond.drift) == (1.0, 0.0)
     assert beyond.displacement == beyond.rotation == Scatter()
-    assert (fit.misfit, fit.verdict.doubts) == ("", ())
+    assert (fit.misfit, fit.doubts) == ("", ())
     before = expected_error(box_errors(fit.space, fit.solution.x), fit.covariance)
     assert beyond.prior < 1e-3
     assert fit.level.low == pytest.approx(before.low, rel=1e-4)
@@ -112,7 +112,7 @@ def test_noise_beyond_the_stated_is_promised(readings):
     """
     noise = 4e-6 * np.random.default_rng(2).standard_normal(len(readings))
     fit = fit_model(readings.with_values(readings.value + noise), FEW)
-    beyond = fit.verdict.unexplained
+    beyond = fit.unexplained
     for part in (beyond.displacement, beyond.rotation):
         assert part == Scatter(lack=pytest.approx(4e-6 * np.sqrt(3.0), rel=0.1))
     assert fit.level.low < 1e-6
@@ -133,7 +133,7 @@ def test_the_machine_s_repeatability_stays_in_use(cycles: int, widest: float):
     It is called repeatability where repeats show it; without repeats it may be an error that is not in the model.
     """
     fit = fit_model(with_stops(cycles, 3), FEW)
-    scatter, found = fit.verdict.unexplained.displacement, pytest.approx(1e-6 * np.sqrt(3.0), rel=0.1)
+    scatter, found = fit.unexplained.displacement, pytest.approx(1e-6 * np.sqrt(3.0), rel=0.1)
     assert (scatter.lack, scatter.stops) == ((found, 0.0) if cycles == 1 else (0.0, found))
     left = held_out(virtual_machine(3), fit.model, BOX, repeatability=1e-6).aligned.rms
     assert fit.level.low < left < fit.level.high < widest * left
@@ -170,7 +170,7 @@ def test_friction_in_the_struts_is_no_repeatability(cycles: int):
     trial, stations = Trial(truth, passes), stations_of(passes)
     errors = trial.errors(lost(stations, trial.commands(fit.model)).commands).aligned().displacement
     errors = errors + 1e-6 * np.random.default_rng(6).standard_normal(errors.shape)
-    left, scatter = float(np.sqrt((errors**2).sum(axis=1).mean())), fit.verdict.unexplained.displacement
+    left, scatter = float(np.sqrt((errors**2).sum(axis=1).mean())), fit.unexplained.displacement
     assert fit.level.low < left < fit.level.high < 2.2 * left
     assert scatter.stops == (0.0 if cycles == 1 else pytest.approx(1e-6 * np.sqrt(3.0), rel=0.15))
     assert scatter.lack > 2.0 * scatter.stops
@@ -178,7 +178,7 @@ def test_friction_in_the_struts_is_no_repeatability(cycles: int):
 
 def test_repeated_readings_tell_repeatability_from_errors_that_stay():
     """Each place has an error of its own besides, 3 µm; three passes differ by noise and stops alone."""
-    scatter = fit_model(with_own_errors(with_stops(3, 3)), FEW).verdict.unexplained.displacement
+    scatter = fit_model(with_own_errors(with_stops(3, 3)), FEW).unexplained.displacement
     assert scatter.stops == pytest.approx(1e-6 * np.sqrt(3.0), rel=0.1)
     assert scatter.lack == pytest.approx(3e-6 * np.sqrt(3.0), rel=0.2)
 
@@ -188,8 +188,8 @@ def test_a_scale_that_drifts_is_measured(readings):
     time = np.linspace(-0.5, 0.5, len(readings))
     growth = 30e-6 * time * readings.along() * (readings.kind == LINEAR)
     fit = fit_model(readings.with_values(readings.value + growth), FEW)
-    assert fit.verdict.unexplained.drift == pytest.approx(30e-6, rel=0.3)
-    assert any("scale of the linear readings" in doubt for doubt in fit.verdict.doubts)
+    assert fit.unexplained.drift == pytest.approx(30e-6, rel=0.3)
+    assert any("scale of the linear readings" in doubt for doubt in fit.doubts)
 
 
 def test_lines_that_differ_from_each_other_widen_the_promise(readings):
@@ -197,8 +197,8 @@ def test_lines_that_differ_from_each_other_widen_the_promise(readings):
     scale = 30e-6 * np.random.default_rng(4).standard_normal(len(readings.runs))
     spoilt = readings.value + scale[readings.run] * readings.along() * (readings.kind == LINEAR)
     fit = fit_model(readings.with_values(spoilt), FEW)
-    assert fit.verdict.unexplained.factor > 1.5
-    covariance = fit.covariance / fit.verdict.unexplained.factor**2
+    assert fit.unexplained.factor > 1.5
+    covariance = fit.covariance / fit.unexplained.factor**2
     assert fit.level.high > 1.5 * expected_error(box_errors(fit.space, fit.solution.x), covariance).high
     np.testing.assert_allclose(np.sqrt(np.diag(fit.covariance)), fit.standard_errors)
 
@@ -208,18 +208,18 @@ def test_chi_square_is_told_by_lines_and_direction(readings):
     spoilt = (family_of_run(readings)[readings.run] == 1) & (readings.kind == STRAIGHTNESS)
     noise = 5e-6 * np.random.default_rng(5).standard_normal(len(readings)) * spoilt
     fit = fit_model(readings.with_values(readings.value + noise), replace(FEW, robust=False))
-    values = {(c.kind, c.part): c.value for c in fit.verdict.chi_squares}
+    values = {(c.kind, c.part): c.value for c in fit.chi_squares}
     assert values["straightness", "y lines"] == pytest.approx(26.0, rel=0.25)
     assert values["straightness", "x lines"] < 2.0
     assert values["linear", "y lines"] < 2.0
-    worst = fit.verdict.worst_runs[0]
+    worst = fit.chi_squares_of_runs[0]
     assert (worst.kind, worst.part[:6]) == ("straightness", "y line")
 
 
 def test_one_run_is_held_by_the_priors(readings):
     fit = fit_model(readings.select(readings.run == 0), SETTINGS)
     assert "do not determine" in fit.misfit
-    assert fit.misfit in "; ".join(fit.verdict.refusals)
+    assert fit.misfit in "; ".join(fit.refusals)
 
 
 def test_a_fit_that_does_not_settle_names_the_runs_that_pull(readings, monkeypatch):
@@ -237,7 +237,7 @@ def test_a_fit_that_does_not_settle_names_the_runs_that_pull(readings, monkeypat
     pull = np.where(readings.run == 3, 50e-6 * along + 20e-6 * along**2, 0.0)  # of another state of the machine
     pulled = readings.with_values(readings.value + pull)
     fit = fit_model(pulled, FEW)
-    assert fit.verdict.doubts[0].startswith(f"with run {name} the fit does not converge: left out")
+    assert fit.doubts[0].startswith(f"with run {name} the fit does not converge: left out")
     assert 3 not in fit.measurements.run
     always = True
     assert f"did not settle; the runs that pull most: {name}" in fit_model(pulled, FEW).misfit

@@ -181,38 +181,16 @@ def test_what_a_fit_knows_comes_back_from_its_file(tmp_path: Path) -> None:
     assert found.space.settings == fitted.space.settings
 
 
-def rewritten(path: Path, noise: np.ndarray | None = None, **head: object) -> None:
-    """Replace noise and entries of the head, None: without it, in the file beside a model, which has its hash."""
+def rewritten(path: Path, **head: object) -> None:
+    """Replace entries of the head, None: without it, in the file beside a model, which has its hash."""
     beside = path.with_name("after the crash.posterior.npz")
     with np.load(beside) as archive:
         arrays = dict(archive)
     changed = json.loads(str(arrays["head"])) | head
     arrays["head"] = np.array(json.dumps({name: value for name, value in changed.items() if value is not None}))
     before = hashlib.sha256(beside.read_bytes()).hexdigest()
-    arrays |= {} if noise is None else {"noise": noise}
     np.savez(beside, **arrays)
     path.write_text(path.read_text().replace(before, hashlib.sha256(beside.read_bytes()).hexdigest()))
-
-
-def test_noise_goes_by_the_names_of_its_kinds(tmp_path: Path) -> None:
-    """Files from before lengths and displacements have five kinds without names; later kinds have another order."""
-    fitted, path = saved(tmp_path)
-    geometry = fitted.space.geometry
-    factors = np.linspace(2.0, 3.0, len(KINDS))
-
-    def stored() -> tuple[FittedParameters | None, str]:
-        return load_posterior(load_model(path, geometry), geometry, path)
-
-    rewritten(path, factors[:5], kinds=None)
-    parameters, why = stored()
-    assert parameters is not None, why
-    np.testing.assert_array_equal(parameters.noise, [*factors[:5], 1.0, 1.0])
-    rewritten(path, factors[::-1], kinds=KINDS[::-1])
-    parameters, why = stored()
-    assert parameters is not None, why
-    np.testing.assert_array_equal(parameters.noise, factors)
-    rewritten(path, factors[:1], kinds=KINDS)
-    assert "head.kinds: must name the kind of each noise factor" in stored()[1]
 
 
 def test_what_is_not_the_models_own_is_not_known(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from foreign_machines import machines
 
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings
-from hexapod_comp.calibration.thermal import warming_json, warming_text, with_courses
+from hexapod_comp.calibration.thermal import warming_text, with_courses
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
@@ -107,17 +107,16 @@ def test_expansions_and_time_constant_come_back():
     """Within three of the standard deviations that the fit states; the struts' mean to 1 ppm/K besides."""
     warming = fit().warming
     wanted = {"struts": (15e-6, -20e-6), "base": (11e-6, 0.0), "platform": (14e-6, 8e-6)}
-    assert [p.part for p in warming.parts] == list(wanted)
-    for part in warming.parts:
-        assert abs(part.expansion - wanted[part.part][0]) < 3.0 * part.deviation, part
-    assert warming.parts[0].expansion == pytest.approx(15e-6, abs=1e-6)
-    (constant,), (deviation,) = warming.time_constants.values, warming.time_constants.deviations
+    assert [growth.part for growth in warming.growths] == list(wanted)
+    for growth in warming.growths:
+        assert abs(growth.found - wanted[growth.part][0]) < 3.0 * growth.deviation, growth
+    assert warming.growths[0].found == pytest.approx(15e-6, abs=1e-6)
+    ((constant, deviation),) = warming.time_constants
     assert abs(np.log(constant / TAU)) < 3.0 * deviation < 0.6
     model, text = fit().model.late_growth, warming_text(warming)
     assert (model.thermometer, model.time_constants) == ("base", (constant,))
     assert "base stands for all parts" in text
     assert "struts: 1" in text
-    assert warming_json(warming)["time_constants_s"] == (constant,)
 
 
 def test_the_noise_of_sensors_is_not_taken_for_growth():
@@ -127,9 +126,9 @@ def test_the_noise_of_sensors_is_not_taken_for_growth():
     noise = 0.02 * np.random.default_rng(5).standard_normal(quiet.stations.temperatures.shape)
     stations = replace(quiet.stations, temperatures=quiet.stations.temperatures + noise)
     settings = replace(SETTINGS, blocks=("expansion",))
-    noisy, known = (fit_model(replace(quiet, stations=s), settings).warming.parts for s in (stations, quiet.stations))
+    noisy, known = (fit_model(replace(quiet, stations=s), settings).warming.growths for s in (stations, quiet.stations))
     for part, undisturbed in zip(noisy, known, strict=True):
-        assert abs(part.expansion - undisturbed.expansion) < 3.0 * undisturbed.deviation, part
+        assert abs(part.found - undisturbed.found) < 3.0 * undisturbed.deviation, part
         assert part.deviation > 0.9 * undisturbed.deviation, part
 
 
@@ -153,13 +152,13 @@ def test_thermometers_that_are_rounded_do_not_override_what_is_stated():
 
 def test_expansions_are_known_no_better_than_the_time_constant():
     """Truth: fits with the time constant a tenth up and down; sizes of priors follow it too, by a little."""
-    (constant,), (deviation,) = fit().warming.time_constants.values, fit().warming.time_constants.deviations
+    ((constant, deviation),) = fit().warming.time_constants
     ends = [
-        fit_model(measured(), replace(SETTINGS, time_constants=(constant * np.exp(way),))).warming.parts
+        fit_model(measured(), replace(SETTINGS, time_constants=(constant * np.exp(way),))).warming.growths
         for way in (-0.1, 0.1)
     ]
-    for part, shorter, longer in zip(fit().warming.parts, *ends, strict=True):
-        moved = deviation * abs(longer.expansion - shorter.expansion) / 0.2
+    for part, shorter, longer in zip(fit().warming.growths, *ends, strict=True):
+        moved = deviation * abs(longer.found - shorter.found) / 0.2
         alone = 0.5 * (shorter.deviation + longer.deviation)
         assert part.deviation == pytest.approx(np.hypot(alone, moved), rel=0.1), part
 
@@ -167,7 +166,7 @@ def test_expansions_are_known_no_better_than_the_time_constant():
 def test_without_a_warm_up_nothing_is_invented():
     """0.3 K are below what a sensor's drift may be: stated expansions stay, and the report says so."""
     cold = fit_model(measured(rise=0.35), replace(SETTINGS, strut_expansion=12e-6))
-    assert cold.warming.parts == ()
+    assert cold.warming.growths == ()
     assert cold.model.late_growth.time_constants == ()
     np.testing.assert_array_equal(cold.model.struts.expansion, 12e-6)
     assert "expansion is not determined" in warming_text(cold.warming)
@@ -194,12 +193,11 @@ def damp(geometry: HexapodGeometry) -> MeasurementSet:
 
 def test_what_humidity_does_to_struts_comes_back(geometry: HexapodGeometry) -> None:
     fitted = fit_model(damp(geometry), DAMP)
-    swelling = fitted.warming.swelling
-    assert swelling is not None
-    assert swelling.change == pytest.approx(0.25)
-    assert abs(swelling.moisture - MOISTURE) < 3.0 * swelling.deviation < 0.3 * MOISTURE
-    assert swelling.determined > 0.9
-    np.testing.assert_allclose(fitted.model.struts.moisture, swelling.moisture, atol=1e-11)  # files have 11 digits
+    (change,), (growth,) = fitted.warming.changes, fitted.warming.growths
+    assert change == ("humidity", pytest.approx(0.25), "1")
+    assert abs(growth.found - MOISTURE) < 3.0 * growth.deviation < 0.3 * MOISTURE
+    assert growth.determined > 0.9
+    np.testing.assert_allclose(fitted.model.struts.moisture, growth.found, atol=1e-11)  # files have 11 digits
 
 
 def test_missing_humidity_is_said_and_counts_as_50_percent(geometry: HexapodGeometry) -> None:
@@ -207,5 +205,4 @@ def test_missing_humidity_is_said_and_counts_as_50_percent(geometry: HexapodGeom
     dry = replace(dry, stations=replace(dry.stations, humidity=np.full(len(dry.stations), np.nan)))
     unknown = fit_model(dry, DAMP)
     assert any("not every reading has its humidity" in note for note in unknown.notes)
-    assert unknown.warming.swelling is not None
-    assert unknown.warming.swelling.change == 0.0
+    assert unknown.warming.changes == (("humidity", 0.0, "1"),)
