@@ -162,8 +162,9 @@ def before_after_figure(fit: ModelFit) -> Figure:
     RMS of both directions along x; level tool.
     """
     space, geometry = fit.space, fit.measurements.geometry
-    x, y = (np.linspace(*space.work_box[:, a], MAP_NODES) for a in range(2))
-    heights = np.linspace(*space.work_box[:, 2], 3)
+    low, high = space.work_box
+    x, y = (np.linspace(low[a], high[a], MAP_NODES) for a in range(2))
+    heights = np.linspace(low[2], high[2], 3)
     points = np.stack(np.meshgrid(heights, y, x, indexing="ij"), axis=-1)[..., ::-1].reshape(-1, 3)
     level, along_x = np.tile(space.level, (len(points), 1, 1)), np.tile(geometry.work.rotation[:, 0], (len(points), 1))
     passes = Passes(geometry, space.places(points) - space.level @ space.probe, level, along_x).both_ways()
