@@ -79,6 +79,8 @@ def certificate_text(
     hashes = [hashlib.sha256(read_bytes(path, MAX_ARCHIVE_BYTES)).hexdigest() for path in files]
     beside = ["model", *("beside it" for _ in files[1:])]
     named = [(what, path.name, digest) for what, path, digest in zip(beside, files, hashes, strict=True)]
+    humidity = m.stations.humidity[np.isfinite(m.stations.humidity)]
+    damp = [number(100.0 * v, 1) for v in (humidity.min(), humidity.max())] if len(humidity) else []
     before, after = judge(m), judge(m.with_values(left_out(fit)))
     return render(
         "certificate.html",
@@ -106,7 +108,7 @@ def certificate_text(
         ],
         named_instruments=[(n, text) for n, text in enumerate(details.instruments or ("",) * len(fit.channels), 1)],
         temperatures=_temperatures(fit),
-        humidity=_humidity(fit),
+        humidity=[("relative humidity", *damp, number(1e4 * fit.model.struts.moisture.max(), 2))] if damp else [],
         tests=list(_tests(before, after)) if before else [],
         circles=_circles(before.circles, after.circles) if before and before.circles else None,
         figures=_figures(fit),
@@ -151,14 +153,6 @@ def _temperatures(fit: ModelFit) -> Rows:
         ends = [number(v, 2) if known else "20 or not recorded" for v in (of_part.min(), of_part.max())]
         rows.append((name, *ends, number(expansion * 1e6, 2)))
     return rows
-
-
-def _humidity(fit: ModelFit) -> Rows:
-    humidity = fit.measurements.stations.humidity
-    if not np.isfinite(humidity).any():
-        return []
-    ends = [number(100.0 * v, 1) for v in (np.nanmin(humidity), np.nanmax(humidity))]
-    return [("relative humidity", *ends, number(1e4 * fit.model.struts.moisture.max(), 2))]
 
 
 def _tests(before: Judged, after: Judged) -> Iterator[dict[str, object]]:

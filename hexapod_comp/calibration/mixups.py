@@ -351,7 +351,12 @@ class _Fitted:
             if 2 * flipped.sum() > len(flipped):  # the majority is right: all of them swapped is another alternative
                 flipped = ~flipped
             try:
-                other = _turned_back(m, flipped[group.ravel()])
+                turned = flipped[group.ravel()]
+                twice = m.stations.select(np.tile(np.arange(len(m.stations)), 2))  # the second time the other way
+                senses = twice.sense * np.repeat([1.0, -1.0], len(m.stations))[:, None]
+                station = m.station + len(m.stations) * turned
+                direction = np.where(turned, -m.direction, m.direction)
+                other = replace(m, stations=replace(twice, sense=senses), station=station, direction=direction)
                 model = _Fitted(Estimation(other, self.space, alone=False), self.bases)
             except (HexapodError, np.linalg.LinAlgError):
                 return []
@@ -526,13 +531,3 @@ def common_modes(estimation: Estimation, space: ParameterSpace) -> Iterator[Mode
         causes += f"that is wrong for all screws; {FORCE}"
         scaled = np.where(members, np.einsum("ci,ci->c", directions[:, :3], away), 0.0)
         yield Mode(f"scale of all {kind} readings", causes, "ppm", scaled, usual)
-
-
-def _turned_back(m: MeasurementSet, readings: np.ndarray) -> MeasurementSet:
-    """Return a set in which some readings, (N,), were taken in the other direction."""
-    twice = m.stations.select(np.tile(np.arange(len(m.stations)), 2))
-    sense = twice.sense.copy()
-    sense[len(m.stations) :] *= -1.0
-    direction = np.where(readings, -m.direction, m.direction)
-    stations = replace(twice, sense=sense)
-    return replace(m, stations=stations, station=m.station + len(m.stations) * readings, direction=direction)

@@ -152,7 +152,11 @@ class Lengths:
                 break
             turn = rotation_from_vector(step[3:] / size) @ turn
             body = np.concatenate([body[:3] + step[:3], size * rotation_vector(turn)])
-        self._refuse_far(body[:3])
+        if np.abs(body[:3]).max() > FAR * ASSUMED.centre:
+            shown = ", ".join(f"{v * 1e3:.1f}" for v in body[:3])
+            problem = f"the lengths of run {self.name} put their centre {shown} mm (in base) off its place in the file"
+            wanted = f"it must be known to {FAR * ASSUMED.centre * 1e3:g} mm"
+            raise CalibrationError("centre", f"{problem}; {wanted}; do places, units and commanded poses fit?")
         u, s, _ = np.linalg.svd(columns / noise, full_matrices=False)
         # Relative to the file's place, the prior's mean: otherwise an offset from it would cost nothing.
         seen = distance - nominal - columns @ off / scale
@@ -167,15 +171,6 @@ class Lengths:
             columns -= columns.mean(axis=0)
         squares, directions = np.linalg.eigh(columns.T @ columns / len(columns))
         return directions * np.where(squares > UNMOVED**2, ASSUMED.centre, ASSUMED.across)
-
-    def _refuse_far(self, place: np.ndarray) -> None:
-        """Raise when the body is at another place, m, than in the file."""
-        if np.abs(place).max() > FAR * ASSUMED.centre:
-            shown = ", ".join(f"{v * 1e3:.1f}" for v in place)
-            problem = f"the lengths of run {self.name} put their centre {shown} mm (in base) off its place in the file"
-            known = f"it must be known to {FAR * ASSUMED.centre * 1e3:g} mm"
-            hint = f"{known}; do places, units and commanded poses fit?"
-            raise CalibrationError("centre", f"{problem}; {hint}")
 
 
 @dataclass(frozen=True)
@@ -273,7 +268,8 @@ class Cells:
         points = m.points()
         zeros, lengths = list[np.ndarray](), list[Lengths]()
         along = np.where((c.square < 0) & (c.kind == KINDS.index("straightness")), c.along, np.nan)
-        for members in _members(c.group):
+        order = np.argsort(c.group, kind="stable")
+        for members in np.split(order, np.flatnonzero(np.diff(c.group[order])) + 1):
             if c.group[members[0]] < 0:
                 continue
             if c.channel[members[0]] == LENGTH:
@@ -300,12 +296,6 @@ class Cells:
             if len(np.unique(self.station[absolute[run == n]])) < FRAME_STATIONS:
                 run[run == n] = -1
         return [Frame(own, points[self.station[own]]) for n in np.unique(run) for own in [absolute[run == n]]]
-
-
-def _members(group: np.ndarray) -> list[np.ndarray]:
-    """Return the cells of each group, by its number."""
-    order = np.argsort(group, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
 
 
 def _left_out_whole(measurements: MeasurementSet) -> np.ndarray:

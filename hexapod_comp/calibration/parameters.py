@@ -140,7 +140,12 @@ class Extent:
     def of(measurements: MeasurementSet) -> Extent:
         """Return where a set was measured."""
         commands, points, work = measurements.stations.commands, measurements.points(), measurements.geometry.work
-        _check_commands(measurements.geometry, commands)
+        stroke = measurements.geometry.limits.stroke
+        low, high = stroke.min() - BEYOND_STROKE, stroke.max() + BEYOND_STROKE
+        if not (low <= commands.min() and commands.max() <= high):
+            span = f"{commands.min():.4g}…{commands.max():.4g} m"
+            problem = f"run over {span}, the struts over {low:.4g}…{high:.4g} m; do units fit?"
+            raise CalibrationError("strut readings", problem)
         in_work = (points - work.position) @ work.rotation
         return Extent(
             commands=np.array([commands.min(), commands.max()]),
@@ -332,13 +337,3 @@ class ParameterSpace:
         """Return the field at points (n, 3), m, passed in directions (n, 3), shape (n, 6), m and rad."""
         draft = self._draft(x)
         return self.field.evaluate(draft.field, draft.reversal, points, sense)
-
-
-def _check_commands(geometry: HexapodGeometry, commands: np.ndarray) -> None:
-    """Refuse strut readings that cannot be lengths of this machine's struts."""
-    stroke, beyond = geometry.limits.stroke, BEYOND_STROKE
-    low, high = stroke.min() - beyond, stroke.max() + beyond
-    if not (low <= commands.min() and commands.max() <= high):
-        span = f"{commands.min():.4g}…{commands.max():.4g} m"
-        problem = f"run over {span}, the struts over {low:.4g}…{high:.4g} m; do units fit?"
-        raise CalibrationError("strut readings", problem)

@@ -23,7 +23,7 @@ from ..measurements.readings import AXES, KINDS
 from .fit import ModelFit
 from .lines import LineFit, LinesFit
 from .posterior import COMPONENTS as PREDICTED
-from .posterior import ErrorPredictor, FittedParameters, PredictedError
+from .posterior import ErrorPredictor, FittedParameters
 
 SAMPLES = 161  # points of a curve
 MAP_NODES = 21  # points along x and y of a map
@@ -118,42 +118,31 @@ def pictures_of(fit: ModelFit | LinesFit) -> dict[str, Figure]:
 
 
 def fit_figure(fit: ModelFit) -> Figure:
-    """Show a joint fit: its residuals, and the struts' errors."""
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    """Show a joint fit: the residuals of each kind of channel compared with pure noise, and each strut's error over its
+    commands, without offset and backlash."""
+    figure, geometry = Figure(figsize=(11, 4.2), layout="constrained"), fit.measurements.geometry
     left, right = figure.subplots(1, 2)
-    _residual_panel(left, fit)
-    _strut_panel(right, fit)
-    figure.suptitle(f"{picture_text(fit.measurements.geometry.name)}: scheme joint, {len(fit.measurements)} readings")
-    return figure
-
-
-def _residual_panel(axes: Axes, fit: ModelFit) -> None:
-    """Show the residuals of each kind of channel compared with pure noise."""
-    kinds = fit.measurements.kind
     edges = np.linspace(-5.0, 5.0, 51)
     for channel in fit.channels:
-        residuals = fit.solution.residuals[kinds == KINDS.index(channel.kind)] / channel.found
+        residuals = fit.solution.residuals[fit.measurements.kind == KINDS.index(channel.kind)] / channel.found
         label = f"{channel.kind}, {channel.readings}"
-        axes.hist(np.clip(residuals, -5.0, 5.0), edges.tolist(), density=True, histtype="step", label=label)
-    axes.plot(edges, np.exp(-0.5 * edges**2) / np.sqrt(2.0 * np.pi), "k:", lw=1.0, label="normal")
-    axes.set(title="residuals", xlabel="residual over the noise found", ylabel="density")
-    axes.legend(fontsize=7)
-
-
-def _strut_panel(axes: Axes, fit: ModelFit) -> None:
-    """Show each strut's error over its commands, without offset and backlash."""
-    struts = fit.model.struts
+        left.hist(np.clip(residuals, -5.0, 5.0), edges.tolist(), density=True, histtype="step", label=label)
+    left.plot(edges, np.exp(-0.5 * edges**2) / np.sqrt(2.0 * np.pi), "k:", lw=1.0, label="normal")
+    left.set(title="residuals", xlabel="residual over the noise found", ylabel="density")
+    left.legend(fontsize=7)
+    struts, commands = fit.model.struts, fit.measurements.stations.commands
     even = replace(struts, cosine=np.zeros_like(struts.cosine), sine=np.zeros_like(struts.sine))
-    machine = RealMachine(fit.measurements.geometry, replace(fit.model, struts=even))
+    machine = RealMachine(geometry, replace(fit.model, struts=even))
     waves = np.hypot(struts.cosine, struts.sine).max(axis=1)
-    commands = fit.measurements.stations.commands
     for strut, name in enumerate(STRUT_NAMES):
         at = np.linspace(commands[:, strut].min(), commands[:, strut].max(), 4 * SAMPLES)
         errors, _ = strut_errors(machine.state, strut, 0.0, at)
         label = f"{name}, wave ±{waves[strut] * 1e6:.1f} µm" if waves.any() else name
-        axes.plot(at * 1e3, (errors - struts.offset[strut]) * 1e6, lw=1.2, color=SIX_COLOURS[strut], label=label)
-    axes.set(title="strut errors: pitch and length map", xlabel="command, mm", ylabel="error, µm")
-    axes.legend(ncols=2, fontsize=7)
+        right.plot(at * 1e3, (errors - struts.offset[strut]) * 1e6, lw=1.2, color=SIX_COLOURS[strut], label=label)
+    right.set(title="strut errors: pitch and length map", xlabel="command, mm", ylabel="error, µm")
+    right.legend(ncols=2, fontsize=7)
+    figure.suptitle(f"{picture_text(geometry.name)}: scheme joint, {len(fit.measurements)} readings")
+    return figure
 
 
 def before_after_figure(fit: ModelFit) -> Figure:
@@ -227,27 +216,22 @@ def predicted_error_figure(machine: RealMachine, fitted: FittedParameters | None
     figure = Figure(figsize=(11, 7), layout="constrained")
     panels = figure.subplots(2, 3, sharex=True, sharey=True)
     for n, axes in enumerate(panels.ravel()):
-        _component_panel(axes, x * 1e3, y * 1e3, aligned, n)
+        component = PREDICTED[n]
+        turn, values = component[0] == "r", np.ma.masked_invalid(aligned.values[:, n].reshape(MAP_NODES, -1) * 1e6)
+        most = max(float(np.abs(values).max()), 1e-6)
+        drawn = axes.contourf(x * 1e3, y * 1e3, values, np.linspace(-most, most, 21), cmap="PuOr")
+        figure.colorbar(drawn, ax=axes, label="µrad" if turn else "µm", shrink=0.65)
+        if aligned.deviations is not None:
+            sigma = aligned.deviations[:, n].reshape(MAP_NODES, -1) * 1e6
+            axes.clabel(axes.contour(x * 1e3, y * 1e3, sigma, 4, colors="black", linewidths=0.6), fontsize=6)
+        title = f"rotation about {component[1]}" if turn else f"displacement along {component}"
+        axes.set(title=title, aspect="equal")
+        if n >= 3:
+            axes.set_xlabel("x in work, mm")
+        if n % 3 == 0:
+            axes.set_ylabel("y in work, mm")
     known = "black lines: one standard deviation" if fitted is not None else "standard deviation not known"
     title = f"{machine.geometry.name}, {machine.model.name}: predicted error of the tool without compensation"
     where = f"z = {height * 1e3:.0f} mm in work, level tool, datum aligned; {known}"
     figure.suptitle(f"{picture_text(title)}\n{where}", fontsize=10)
     return figure
-
-
-def _component_panel(axes: Axes, x_mm: np.ndarray, y_mm: np.ndarray, error: PredictedError, n: int) -> None:
-    """Map one component of errors on a grid of places, and its standard deviation where that is known."""
-    component, shape = PREDICTED[n], (len(y_mm), len(x_mm))
-    turn = component[0] == "r"
-    values = np.ma.masked_invalid(error.values[:, n].reshape(shape) * 1e6)
-    most = max(float(np.abs(values).max()), 1e-6)
-    drawn = axes.contourf(x_mm, y_mm, values, np.linspace(-most, most, 21), cmap="PuOr")
-    axes.figure.colorbar(drawn, ax=axes, label="µrad" if turn else "µm", shrink=0.65)
-    if error.deviations is not None:
-        sigma = error.deviations[:, n].reshape(shape) * 1e6
-        axes.clabel(axes.contour(x_mm, y_mm, sigma, 4, colors="black", linewidths=0.6), fontsize=6)
-    axes.set(title=f"rotation about {component[1]}" if turn else f"displacement along {component}", aspect="equal")
-    if n >= 3:
-        axes.set_xlabel("x in work, mm")
-    if n % 3 == 0:
-        axes.set_ylabel("y in work, mm")

@@ -316,27 +316,24 @@ def box_errors(
     return None if stations is None else FirstOrder.of(space, predict(space, x, stations), stations).aligned()
 
 
-def other_loads(space: ParameterSpace) -> dict[str, tuple[float, ...]]:
-    """Return loads that a machine may be told in place of the first of the readings, by name."""
+def about_other_loads(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, beyond: Unexplained) -> str:
+    """Return the predicted tool error under loads that a machine may be told in place of the first of the readings;
+    empty if no stiffness is stated."""
     load, (mass, *centre, _, _, _) = stated_load(space.settings), space.loads[0]
+    if not load.stiffness.all():
+        return ""
     if math.isnan(mass):
         mass, centre = space.geometry.payload.mass, list(space.geometry.payload.centre)
     down = load.gravity if np.isnan(space.loads[0, 4:]).any() else space.loads[0, 4:]
-    heavier = mass + OTHER_MASS
-    found = {f"{heavier:g} kg": (heavier, *(mass * np.array(centre) / heavier), *down)}
-    if mass > 0.0:
-        found = {"no tool": (0.0, 0.0, 0.0, 0.0, *down), **found}
-    across = np.linalg.svd(down[None])[2][1] * np.linalg.norm(down)
-    return {**found, "gravity turned by 90°": (mass, *centre, *across)}
-
-
-def about_other_loads(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, beyond: Unexplained) -> str:
-    """Return the predicted tool error under loads that no reading had; empty if no stiffness is stated."""
-    if not stated_load(space.settings).stiffness.all():
-        return ""
+    heavier, across = mass + OTHER_MASS, np.linalg.svd(down[None])[2][1] * np.linalg.norm(down)
+    loads = {"no tool": (0.0, 0.0, 0.0, 0.0, *down)} if mass > 0.0 else {}
+    loads |= {
+        f"{heavier:g} kg": (heavier, *(mass * np.array(centre) / heavier), *down),
+        "gravity turned by 90°": (mass, *centre, *across),
+    }
     found = []
-    for name, load in other_loads(space).items():
-        error = expected_error(box_errors(space, x, load=load), covariance, beyond=beyond)
+    for name, row in loads.items():
+        error = expected_error(box_errors(space, x, load=row), covariance, beyond=beyond)
         if error is not None:
             found.append(f"{name} {1e6 * error.after:.2g} µm (95 %: up to {1e6 * error.high:.2g})")
     return f"told another load, a level tool is expected to err by: {', '.join(found)}" if found else ""

@@ -294,10 +294,23 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
     """Return the variances of one kind of readings: all in the stated noise's, except the result."""
     m, estimated = r.estimation.measurements, float(r.solution.posterior.noise[kind] ** 2)
     readings, cells = int((m.kind == kind).sum()), int((r.estimation.cells.kind == kind).sum())
-    repeated, freedom = _repeated(r, kind)
+    # Readings about their cell's mean, in the stated noise
+    members, of_reading = np.flatnonzero(m.kind == kind), r.estimation.cells.of_reading
+    cell, weights = of_reading[members], r.solution.weights[members]
+    values = r.solution.residuals[members] / r.estimation.uncertainty[members]
+    mean = np.bincount(cell, weights * values)[cell] / np.bincount(cell, weights)[cell]
+    freedom = float(readings - cells)
+    repeated = float(((weights * (values - mean)) ** 2).sum()) / max(freedom, 1.0)
     pure, error = (repeated, repeated * np.sqrt(2.0 / freedom)) if freedom >= LEAST_PAIRS else (1.0, 0.0)
     stops = pure - 1.0 if pure - 1.0 > ASSUMED.clear * error else 0.0
-    there, back = _pairs(r, kind)
+    # The cells that were read forward, and those read backward at the same places
+    stations, every = m.stations, r.estimation.cells
+    poses = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(9)
+    pose = different_rows(poses)[1][every.station]
+    key = different_rows(np.stack([r.run, every.channel, pose], axis=1))[1]
+    ways = [np.flatnonzero((every.kind == kind) & (r.direction == way)) for way in (FORWARD, BACKWARD)]
+    _, first, second = np.intersect1d(key[ways[0]], key[ways[1]], return_indices=True)
+    there, back = ways[0][first], ways[1][second]
     unlike, of_readings = estimated - 1.0 - stops, estimated * np.sqrt(2.0 / readings)
     if len(there) >= LEAST_PAIRS:
         # Residuals of cells count in their means' noise, which is smaller than a reading's.
@@ -316,29 +329,6 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
         most_stops=stops + 2.0 * error if stops else 0.0,
     )
     return LackOfFit(*(m.stated_of(kind) ** 2 * np.array(found)).tolist())
-
-
-def _repeated(r: Residuals, kind: int) -> tuple[float, float]:
-    """Return the variance of readings about their cell's mean, over the stated one, and its degrees of freedom."""
-    m, solution, cell = r.estimation.measurements, r.solution, r.estimation.cells.of_reading
-    members = np.flatnonzero(m.kind == kind)
-    cell, weights = cell[members], solution.weights[members]
-    values = solution.residuals[members] / r.estimation.uncertainty[members]
-    total = np.bincount(cell, weights)
-    mean = np.bincount(cell, weights * values)[cell] / total[cell]
-    freedom = float(len(members) - len(np.unique(cell)))
-    return float(((weights * (values - mean)) ** 2).sum()) / max(freedom, 1.0), freedom
-
-
-def _pairs(r: Residuals, kind: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cells of a kind that were read forward, and those read backward at the same places."""
-    cells, stations = r.estimation.cells, r.estimation.measurements.stations
-    poses = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(9)
-    pose = different_rows(poses)[1][cells.station]
-    key = different_rows(np.stack([r.run, cells.channel, pose], axis=1))[1]
-    ways = [np.flatnonzero((cells.kind == kind) & (r.direction == way)) for way in (FORWARD, BACKWARD)]
-    _, first, second = np.intersect1d(key[ways[0]], key[ways[1]], return_indices=True)
-    return ways[0][first], ways[1][second]
 
 
 def _likeness(r: Residuals, there: np.ndarray, back: np.ndarray) -> tuple[float, float]:

@@ -202,14 +202,8 @@ class Outcome(NamedTuple):
         return self.state in ("in use", "proposed")
 
 
-class Stopped(HexapodError):
+class Stopped(Exception):  # no HexapodError: a fit tries other ways after one of these
     """A person has stopped the loop."""
-
-    reason = "person"
-
-
-class Ended(Exception):  # no HexapodError: a fit tries other ways after one of these
-    """A person has stopped the loop in a long calculation."""
 
 
 class Adaptation:
@@ -314,8 +308,8 @@ class Adaptation:
                     self._pause()
                 waits |= step == GUARD
                 steps[step]()
-        except Ended as ended:
-            return self._stopped(str(ended))
+        except Stopped as stopped:
+            return self._stopped(str(stopped))
         except HexapodError as error:
             if error.reason == "person":  # stopped on the way, by whatever asked the machine to
                 return self._stopped(str(error))
@@ -373,7 +367,7 @@ class Adaptation:
         """Report the progress of a long calculation, and end it on request; its step is then repeated later."""
         self._say(text)
         if not self._going_on():
-            raise Ended(f"stopped in a calculation ({text})")
+            raise Stopped(f"stopped in a calculation ({text})")
 
     # ---- the steps ----
 
