@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -22,93 +21,73 @@ from .posterior import POINTS, ErrorPredictor, FittedParameters
 MACHINES_DRAWN = 2000  # for the percentile of the worst pose: 95 % to ± 0.5 %
 
 
-@dataclass(frozen=True)
-class ErrorOverPoses:
-    """Remaining error over some poses, the datum aligned."""
-
-    where: str
-    poses: int
-    rms: np.ndarray  # (2,): displacement, m, and standard deviation of the rotation about the worst axis, rad
-    worst: float  # the same displacement at the worst pose, m
-    at: np.ndarray  # (3,): the tool there, in `work`, m
-    most: float  # stays below this everywhere for nineteen of twenty machines that agree with the readings, m
-    standing: float  # RMS displacement with the datum as the machine stands, m
-
-
-@dataclass(frozen=True)
-class Share:
-    """The remaining error if a block of parameters were known exactly, or with one more measurement."""
-
-    name: str
-    count: int  # its parameters, or readings
-    left: np.ndarray  # (regions,): RMS displacement, m, in the order of Remaining.left
-
-
-@dataclass(frozen=True)
-class Remaining:
-    """The remaining error of a calibration."""
-
-    machine: RealMachine  # as calibrated
-    parameters: int  # number of the fit's parameters
-    left: tuple[ErrorOverPoses, ...]  # in the measured box with a level tool, and in the workspace
-    blocks: tuple[Share, ...]
-    measurements: tuple[Share, ...]  # the one that reduces the error in the workspace most is first
-
-
 def remaining(
     machine: RealMachine,
     fitted: FittedParameters,
     workspace: Poses,
     name: str = "workspace",
     progress: Callable[[str], object] = lambda text: None,
-) -> Remaining:
-    """Return the remaining tool error after a calibration: in its box, and over platform poses in ``base``."""
+) -> dict[str, Any]:
+    """Return the remaining tool error after a calibration: in its box, and over platform poses in ``base``.
+
+    Plain numbers for JSON, with units in the keys; the datum is aligned. `left`: in the measured box with a level tool,
+    and in the workspace; `machines_95` is the error below which nineteen of twenty machines that agree with the
+    readings stay everywhere. `if_known`: if a block of parameters were known exactly; `if_measured`: with one more
+    measurement, the one that leaves least in the workspace first.
+    """
     space, predictor, rng = fitted.space, ErrorPredictor(machine, fitted), np.random.default_rng(7)
     box = measured_region(machine.model)
     in_box = box.poses(rng.uniform(box.box[0], box.box[1], (POINTS, 3)), space.level)
     factor = covariance_factor(fitted.covariance)
-    left, squares = [], []
+    left, squares = [], []  # M, (p, p), of each place: the mean square is tr(M) of independent effects
     for where, poses in (("measured box, level tool", in_box), (name, workspace)):
         progress(where)
-        part, square = _left(predictor, poses, factor, where)
-        left.append(part)
-        squares.append(square)
+        tips, standing, slopes, given_up = predictor.slopes(poses)
+        reached = np.isfinite(slopes).all(axis=(1, 2))
+        tips, effects = tips[reached], np.swapaxes(slopes[reached] @ factor, 1, 2)
+        sizes = root_sum_of_squares(effects)
+        as_it_stands = np.concatenate([standing[reached] @ factor, given_up[reached, :, None]], axis=2)[:, :3]
+        drawn = monte_carlo(effects, MACHINES_DRAWN, percentiles=(95.0,), normal=True)
+        worst, rms = int(sizes[:, 0].argmax()), np.sqrt((sizes**2).mean(axis=0))
+        left.append(
+            {
+                "where": where,
+                "poses": len(tips),
+                "rms_m": float(rms[0]),
+                "rms_rotation_rad": float(rms[1]),  # about the worst axis
+                "worst_m": float(sizes[worst, 0]),
+                "worst_at_m": tips[worst],  # the tool in `work`
+                "machines_95_m": float(drawn.values[0, 0]),
+                "rms_datum_as_it_stands_m": float(np.sqrt((as_it_stands**2).sum(axis=(1, 2)).mean())),
+            }
+        )
+        displacement = effects[..., :3]
+        squares.append(np.einsum("npc,nqc->pq", displacement, displacement, optimize=True) / len(tips))
 
-    def shares(tried: list[tuple[str, int, np.ndarray]]) -> list[Share]:
+    def shares(tried: list[tuple[str, int, np.ndarray]], counted: str) -> list[dict[str, Any]]:
         """Return the remaining error after each of some measurements, (name, count, rows by x), by itself."""
         gains = [ErrorLeft([rows @ factor for *_, rows in tried], square).gains() for square in squares]
         after = np.sqrt(np.maximum([[np.trace(square)] for square in squares] - np.array(gains), 0.0))
-        return [Share(what, count, column) for (what, count, _), column in zip(tried, after.T, strict=True)]
+        return [
+            {"name": what, counted: count, "left_box_m": float(in_box), "left_workspace_m": float(in_workspace)}
+            for (what, count, _), in_box, in_workspace in zip(tried, *after, strict=True)
+        ]
 
     # Knowing a block is measuring its parameters, far better than they are known.
     deviations = np.linalg.norm(factor, axis=1)
     known = np.diag(1e4 / np.where(deviations > 0.0, deviations, 1.0))
-    blocks = shares([(block.name, len(block.labels), known[block.part]) for block in space.blocks])
+    blocks = [(block.name, len(block.labels), known[block.part]) for block in space.blocks]
     progress("measurements")
-    measurements = shares(list(measurable(fitted)))
-    measurements.sort(key=lambda share: share.left[-1])
-    return Remaining(machine, space.size, tuple(left), tuple(blocks), tuple(measurements))
-
-
-def _left(predictor: ErrorPredictor, poses: Poses, factor: np.ndarray, where: str) -> tuple[ErrorOverPoses, np.ndarray]:
-    """Return the remaining error over some poses, and M, (p, p): its mean square is tr(M) of independent effects."""
-    tips, standing, slopes, given_up = predictor.slopes(poses)
-    reached = np.isfinite(slopes).all(axis=(1, 2))
-    tips, effects = tips[reached], np.swapaxes(slopes[reached] @ factor, 1, 2)
-    sizes = root_sum_of_squares(effects)
-    as_it_stands = np.concatenate([standing[reached] @ factor, given_up[reached, :, None]], axis=2)[:, :3]
-    drawn = monte_carlo(effects, MACHINES_DRAWN, percentiles=(95.0,), normal=True)
-    worst = int(sizes[:, 0].argmax())
-    left = ErrorOverPoses(
-        where=where,
-        poses=len(tips),
-        rms=np.sqrt((sizes**2).mean(axis=0)),
-        worst=float(sizes[worst, 0]),
-        at=tips[worst],
-        most=float(drawn.values[0, 0]),
-        standing=float(np.sqrt((as_it_stands**2).sum(axis=(1, 2)).mean())),
-    )
-    return left, np.einsum("npc,nqc->pq", effects[..., :3], effects[..., :3], optimize=True) / len(tips)
+    return {
+        "machine": machine.geometry.name,
+        "model": machine.model.name,
+        "parameters": space.size,
+        "frame": "work",
+        "measured_box": region_json(machine.model.measured, machine.geometry),
+        "left": left,
+        "if_known": shares(blocks, "parameters"),
+        "if_measured": sorted(shares(list(measurable(fitted)), "readings"), key=lambda s: s["left_workspace_m"]),
+    }
 
 
 def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]]:
@@ -136,78 +115,43 @@ def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]
         yield f"tracker, {poses} poses, {f'tilted up to {tilt:g}°' if tilt else 'level'}", len(readings), rows
 
 
-def remaining_text(result: Remaining) -> str:
+def remaining_text(result: dict[str, Any], machine: RealMachine) -> str:
     """Return the remaining error of a calibration as text."""
-    geometry, model = result.machine.geometry, result.machine.model
     head = (
-        f"machine {geometry.name}, model {model.name!r}: what is left of the tool's error after compensation, by the "
-        f"covariance of the fit's {result.parameters} parameters.\n{region_text(model.measured, geometry)}\nThe datum "
-        "is aligned over that box. Where nothing was measured, only what the fit's parameters describe counts."
+        f"machine {result['machine']}, model {result['model']!r}: what is left of the tool's error after compensation, "
+        f"by the covariance of the fit's {result['parameters']} parameters.\n"
+        f"{region_text(machine.model.measured, machine.geometry)}\nThe datum is aligned over that box. Where nothing "
+        "was measured, only what the fit's parameters describe counts."
     )
     titles = ["where", "poses", "RMS µm", "worst pose µm", "there, tool in work: x, y, z mm"]
     titles += ["95 % of machines below µm", "rotation µrad", "datum as it stands, RMS µm"]
     rows = []
-    for part in result.left:
-        sizes = [number(v * 1e6, 2) for v in (part.rms[0], part.worst, part.most, part.rms[1], part.standing)]
-        place = ", ".join(number(v * 1e3, 1) for v in part.at)
-        rows.append((part.where, str(part.poses), *sizes[:2], place, *sizes[2:]))
+    for part in result["left"]:
+        names = ("rms_m", "worst_m", "machines_95_m", "rms_rotation_rad", "rms_datum_as_it_stands_m")
+        sizes = [number(part[name] * 1e6, 2) for name in names]
+        place = ", ".join(number(v * 1e3, 1) for v in part["worst_at_m"])
+        rows.append((part["where"], str(part["poses"]), *sizes[:2], place, *sizes[2:]))
     noise = ", ".join(f"{name} {value * 1e6:g}" for name, value in DEFAULT_UNCERTAINTY.items())
-
-    def shares(given: Iterable[Share], counted: str) -> str:
-        now, table = np.array([part.rms[0] for part in result.left]), []
-        for share in given:
-            less = 100.0 * (1.0 - share.left / now)
-            pairs = ((number(v * 1e6, 2), f"{r:.0f} % less") for v, r in zip(share.left, less, strict=True))
-            table.append((share.name, str(share.count), *(cell for pair in pairs for cell in pair)))
-        return aligned(("", counted, *(title for part in result.left for title in (part.where, ""))), table)
-
-    return "\n\n".join(
-        (
-            head,
-            aligned(titles, rows),
-            "if these parameters were known exactly, RMS µm\n" + shares(result.blocks, "parameters"),
-            f"with one more measurement in the measured box (noise, µm and µrad: {noise}), RMS µm\n"
-            + shares(result.measurements, "readings"),
-        )
-    )
+    blocks = {"if_known": ("if these parameters were known exactly", "parameters")}
+    blocks["if_measured"] = f"with one more measurement in the measured box (noise, µm and µrad: {noise})", "readings"
+    parts = [head, aligned(titles, rows)]
+    for key, (title, counted) in blocks.items():
+        table = []
+        for share in result[key]:
+            row = [share["name"], str(share[counted])]
+            for part, name in zip(result["left"], ("left_box_m", "left_workspace_m"), strict=True):
+                less = 100.0 * (1.0 - share[name] / part["rms_m"])
+                row += [number(share[name] * 1e6, 2), f"{less:.0f} % less"]
+            table.append(row)
+        header = ("", counted, *(text for part in result["left"] for text in (part["where"], "")))
+        parts.append(f"{title}, RMS µm\n{aligned(header, table)}")
+    return "\n\n".join(parts)
 
 
-def measurement_rows(result: Remaining) -> list[dict[str, Any]]:
+def measurement_rows(result: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the measurements for CSV: a record each, µm."""
     return [
-        {"rank": rank, "measurement": share.name, "readings": share.count}
-        | {f"left_{key}_um": float(value) * 1e6 for key, value in zip(("box", "workspace"), share.left, strict=True)}
-        for rank, share in enumerate(result.measurements, start=1)
+        {"rank": rank, "measurement": share["name"], "readings": share["readings"]}
+        | {f"left_{key}_um": share[f"left_{key}_m"] * 1e6 for key in ("box", "workspace")}
+        for rank, share in enumerate(result["if_measured"], start=1)
     ]
-
-
-def remaining_json(result: Remaining) -> dict[str, Any]:
-    """Return the remaining error of a calibration as plain numbers; units are in the keys."""
-
-    def shares(given: Iterable[Share], counted: str) -> list[dict[str, Any]]:
-        return [
-            {"name": s.name, counted: s.count, "left_box_m": s.left[0], "left_workspace_m": s.left[1]} for s in given
-        ]
-
-    return {
-        "machine": result.machine.geometry.name,
-        "model": result.machine.model.name,
-        "parameters": result.parameters,
-        "frame": "work",
-        "measured_box": region_json(result.machine.model.measured, result.machine.geometry),
-        "left": [
-            {
-                "where": part.where,
-                "poses": part.poses,
-                "rms_m": part.rms[0],
-                "rms_rotation_rad": part.rms[1],
-                "worst_m": part.worst,
-                "worst_at_m": part.at,
-                "machines_95_m": part.most,
-                "rms_datum_as_it_stands_m": part.standing,
-            }
-            for part in result.left
-        ],
-        "if_known": shares(result.blocks, "parameters"),
-        "if_measured": shares(result.measurements, "readings"),
-    }

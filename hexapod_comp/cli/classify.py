@@ -94,7 +94,7 @@ def classify(args: argparse.Namespace) -> int | Result:
 def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry, turned: np.ndarray) -> Result:
     from ..calibration.pictures import predicted_error_figure
     from ..calibration.posterior_file import load_posterior
-    from ..calibration.remaining import measurement_rows, remaining, remaining_json, remaining_text
+    from ..calibration.remaining import measurement_rows, remaining, remaining_text
 
     model = load_model(args.model, geometry)
     fitted, unknown = load_posterior(model, geometry, args.model)
@@ -106,8 +106,8 @@ def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry, turn
     with results.stage_line() as say:
         result = remaining(machine, fitted, poses, name, say)
     return Result(
-        lambda: remaining_text(result),
-        lambda: remaining_json(result),
+        lambda: remaining_text(result, machine),
+        lambda: result,
         measurement_rows(result),
         lambda: {"predicted_error.png": predicted_error_figure(machine, fitted)},
     )

@@ -11,6 +11,7 @@ import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import calibration_helpers as small
 import numpy as np
@@ -31,7 +32,7 @@ from hexapod_comp.calibration.posterior import (
     without_trace,
 )
 from hexapod_comp.calibration.posterior_file import load_posterior, save_with_posterior
-from hexapod_comp.calibration.remaining import Remaining, measurable, remaining
+from hexapod_comp.calibration.remaining import measurable, remaining
 from hexapod_comp.calibration.sensitivity import predict
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.formats.paths import config_file
@@ -259,7 +260,7 @@ def fitted(poses: int = 0) -> tuple[RealMachine, FittedParameters]:
 
 
 @cache
-def left_by_lines() -> Remaining:
+def left_by_lines() -> dict[str, Any]:
     return remaining(*fitted(), tilted(), "tilted")
 
 
@@ -269,12 +270,12 @@ def test_the_measurement_that_is_recommended_does_what_is_foretold() -> None:
     Noise and tolerances are found anew, and other poses of the same number are drawn: a quarter is allowed.
     """
     result = left_by_lines()
-    shares = {share.name: share for share in result.measurements}
-    assert TRACKER in [share.name for share in result.measurements[:2]]
-    foretold, now = shares[TRACKER].left[1], result.left[1].rms[0]
+    shares = {share["name"]: share["left_workspace_m"] for share in result["if_measured"]}
+    assert TRACKER in list(shares)[:2]
+    foretold, now = shares[TRACKER], result["left"][1]["rms_m"]
     assert foretold < 0.75 * now
     again = remaining(*fitted(20), tilted(), "tilted")
-    assert again.left[1].rms[0] == pytest.approx(foretold, rel=0.25)
+    assert again["left"][1]["rms_m"] == pytest.approx(foretold, rel=0.25)
 
 
 def test_known_and_measured_are_the_textbooks() -> None:
@@ -286,12 +287,12 @@ def test_known_and_measured_are_the_textbooks() -> None:
     def rms(covariance: np.ndarray) -> float:
         return float(np.sqrt(np.einsum("ncp,pq,ncq->", slopes[:, :3], covariance, slopes[:, :3]) / len(slopes)))
 
-    for block, share in zip(parameters.space.blocks, result.blocks, strict=True):
+    for block, share in zip(parameters.space.blocks, result["if_known"], strict=True):
         part = block.part
         known = sigma - sigma[:, part] @ np.linalg.solve(sigma[part, part], sigma[part])
-        assert share.left[1] == pytest.approx(rms(known), rel=1e-3), block.name
-        assert share.count == len(block.labels)
-    shares = {share.name: share.left[1] for share in result.measurements}
+        assert share["left_workspace_m"] == pytest.approx(rms(known), rel=1e-3), block.name
+        assert share["parameters"] == len(block.labels)
+    shares = {share["name"]: share["left_workspace_m"] for share in result["if_measured"]}
     scale = np.sqrt(np.diag(sigma))
     information = np.linalg.inv(sigma / np.outer(scale, scale))
     for name, _, rows in measurable(parameters):
