@@ -133,8 +133,6 @@ class Assumptions:
     )
     usual_scale: float = assumed(20e-6, "m/m", "scale that screws and instruments may share, 1 σ", "steel by 2 K")
 
-    # Design of measurements (design.py, candidates.py)
-
     def rows(self) -> list[tuple[str, str, str, str]]:
         """Return name, value with unit, meaning and source of every assumption."""
 

@@ -576,8 +576,8 @@ class Solution:
     problem: LinearProblem  # Linearised at the answer
     posterior: Posterior  # The answer
     x: np.ndarray  # (size,): Its parameters, SI
-    residuals: np.ndarray  # (N,): Of each reading, m or rad; and its robust weight, 0…1
-    weights: np.ndarray  # (N,): Of each reading, m or rad; and its robust weight, 0…1
+    residuals: np.ndarray  # (N,): Of each reading, m or rad
+    weights: np.ndarray  # (N,): Robust weight of each reading, 0…1
     steps: int  # Gauss–Newton steps
     change: float  # Largest change of a parameter in the last one, in its standard deviation
 

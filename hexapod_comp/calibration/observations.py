@@ -35,9 +35,7 @@ class Nuisance(NamedTuple):
 
     members: np.ndarray  # (n,): Its cells
     basis: np.ndarray  # (n, k): Orthonormal directions of the cells' values that the unknown moves
-    # (k,): Share of each that the unknown explains, 0…1; the rest remains for the machine. 1: all of it
-    # known of it
-    share: np.ndarray
+    share: np.ndarray  # (k,): Share of each that the unknown explains, 0…1; the rest remains for the machine
 
     def explained(self, values: np.ndarray) -> np.ndarray:
         """Return the most probable contribution of the unknown to its cells' values, shape (n,)."""
@@ -104,10 +102,8 @@ class Lengths:
 
     name: str  # Of the run
     members: np.ndarray  # (n,): Cells
-    # (n, 3): Commanded place of the measured point, and stated place from which its length is read, m in ``base``
-    points: np.ndarray
-    # (n, 3): Commanded place of the measured point, and stated place from which its length is read, m in ``base``
-    centres: np.ndarray
+    points: np.ndarray  # (n, 3): Commanded place of the measured point, m in ``base``
+    centres: np.ndarray  # (n, 3): Stated place from which its length is read, m in ``base``
     known_zero: bool  # Whether the lengths are calibrated
 
     @property
