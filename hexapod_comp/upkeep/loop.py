@@ -207,40 +207,19 @@ class Stopped(Exception):  # no HexapodError: a fit tries other ways after one o
 
 
 class Adaptation:
-    """Calibrates a machine and keeps its model true; everything that it makes is in its folder.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        The machine, with the tool that carries the target.
-    machine : MeasuredMachine
-        Moves and watches.
-    task : Task
-        What is asked.
-    folder : path
-        Of the journal, which is gone on with where it is there.
-    reload : callable, optional
-        Has the machine run the model of a file; without it models are proposed and never run.
-    going_on : callable, optional
-        False stops the loop: at the next stop, or while it waits.
-    say : callable, optional
-        Told what goes on.
-    wait : callable, optional
-        Lets some time pass, s.
-    runs : callable, optional
-        Whether the machine runs the model of a file: one that was switched off and on runs what it was started with.
-    """
+    """Calibrates a machine and keeps its model true; everything that it makes is in its folder."""
 
     def __init__(
         self,
-        geometry: HexapodGeometry,
-        machine: MeasuredMachine,
+        geometry: HexapodGeometry,  # with the tool that carries the target
+        machine: MeasuredMachine,  # moves and watches
         task: Task,
-        folder: str | Path,
-        reload: Callable[[Path], object] | None = None,
-        going_on: Callable[[], bool] = lambda: True,
-        say: Callable[[str], object] = lambda text: None,
-        wait: Callable[[float], object] = time.sleep,
+        folder: str | Path,  # of the journal, which is continued if it exists
+        reload: Callable[[Path], object] | None = None,  # has the machine run a file's model; None: it is only proposed
+        going_on: Callable[[], bool] = lambda: True,  # False stops the loop: at the next stop, or while it waits
+        say: Callable[[str], object] = lambda text: None,  # told what goes on
+        wait: Callable[[float], object] = time.sleep,  # lets some time pass, s
+        # whether the machine runs a file's model: one that was switched off and on runs what it was started with
         runs: Callable[[Path], bool] = lambda path: True,
     ) -> None:
         self._geometry, self._machine, self._task = geometry, Careful(machine), task
