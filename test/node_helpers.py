@@ -223,7 +223,7 @@ class Rig(Bench):
         patch.setattr(
             "hexapod_comp.ros.base.publishers", lambda node, topic: (tuple(sorted(set(self.speakers(topic)))), "")
         )
-        patch.setattr("hexapod_comp.ros.requests.callers", lambda node, service: "/witness")
+        patch.setattr("hexapod_comp.ros.base.callers", lambda node, service: "/witness")
         make = Node.create_subscription
         self.ros_clock = SimpleNamespace(now=lambda: Time(nanoseconds=clock.time_ns(), clock_type=ClockType.ROS_TIME))
         self.witness = Stranger(self, "witness")

@@ -16,8 +16,8 @@ from std_msgs.msg import String
 
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.pose import Pose
+from hexapod_comp.ros.base import ERROR, OK, WARN
 from hexapod_comp.ros.messages import pose_message
-from hexapod_comp.ros.status import ERROR, OK, WARN
 
 __all__ = ["ERROR", "OK", "WARN"]
 

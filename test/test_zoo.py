@@ -400,10 +400,8 @@ def test_run_and_replay(animal: Animal, bench: Any, monkeypatch: pytest.MonkeyPa
     Each motor stands on a step: the tool is off by up to half a step of each strut times its leverage.
     """
     pytest.importorskip("rosbags")
-    from node_recorder import Recorder
-    from replay_helpers import write_bag
-
     from hexapod_comp.ros.client import LoopClient
+    from hexapod_comp.ros.recorder import BagRecorder
 
     # Nodes and client share one interpreter: on a busy computer an answer may take more than its second.
     monkeypatch.setattr(LoopClient.wait_for_answer, "__defaults__", (20.0,))
@@ -415,11 +413,17 @@ def test_run_and_replay(animal: Animal, bench: Any, monkeypatch: pytest.MonkeyPa
     # Nor does a drive that waits for the processor stop the machine.
     patience = {"max_command_age": 0.0, "following_error_limit": 0.0}
     bench.compensator(model_file=animal.model, ramp_rate=0.01, **patience, **files)
-    recorder = Recorder(bench)
     bench.remove_publisher("tool_pose_command")  # only one may command
-    with spinning(bench):
-        found = animal.tells("run", animal.file("poses.csv"), "--attach")
-    recorder.stop()
+    bag, pages = animal.folder / "bag", list[int]()
+    with spinning(bench), BagRecorder(bag) as recorder:
+        recorder.run(lambda: not recorder.journal)
+        listening = threading.Thread(target=recorder.run, args=(lambda: not pages or recorder.journal < pages[0] + 2,))
+        listening.start()
+        try:
+            found = animal.tells("run", animal.file("poses.csv"), "--attach")
+        finally:
+            pages.append(recorder.journal)
+            listening.join()
 
     assert (found["frame"], found["lost"], found["refused"]) == ("work", 0, 0)
     told = lengths([pose["struts"] for pose in found["poses"]])
@@ -429,7 +433,6 @@ def test_run_and_replay(animal: Animal, bench: Any, monkeypatch: pytest.MonkeyPa
     bound = np.abs(leverage(machine, *poses)).sum(axis=2) * STEP / 2.0 + 1e-9
     assert (np.abs(true - expected) < bound).all()
 
-    bag = write_bag(animal.folder / "bag", recorder.messages)
     assert "identical bit for bit" in said("replay", bag)
     found = json.loads(said("replay", bag, "--json"))
     assert found["same"]

@@ -28,11 +28,23 @@ from std_srvs.srv import Trigger
 
 from ..compensation.guards import Sample, StampClock, StampGate
 from ..errors import CommandError
-from ..ros.base import COMMAND_QOS, EVENT_QOS, LATCHED_QOS, STATE_QOS, MachineNode
+from ..ros.base import (
+    COMMAND_QOS,
+    ERROR,
+    EVENT_QOS,
+    LATCHED_QOS,
+    OK,
+    STATE_QOS,
+    WARN,
+    Flow,
+    MachineNode,
+    Refusals,
+    seconds,
+    status_prefix,
+)
 from ..ros.messages import StrutBytes, StrutReader, stamp_of
 from ..ros.parameters import Program, read_table
 from ..ros.process import run
-from ..ros.status import ERROR, OK, WARN, Flow, Refusals, seconds, status_prefix
 from .hal import COUNTS, METRES, HalComponent, pins, pose_from_axes
 
 PARAMETERS = read_table("""

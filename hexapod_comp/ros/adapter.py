@@ -26,11 +26,9 @@ from std_srvs.srv import Trigger
 from ..errors import LONGEST_TEXT, HexapodError
 from ..upkeep.journal import JOURNAL, Journal
 from . import end_with_parent
-from .base import ACKNOWLEDGED_WITHIN, LATCHED_QOS, MachineNode
+from .base import ACKNOWLEDGED_WITHIN, ERROR, LATCHED_QOS, OK, WARN, MachineNode
 from .parameters import Program, read_table
 from .process import run
-from .rclpy_compat import callers
-from .status import ERROR, OK, WARN, status_of
 from .worker import PACKAGE_ROOT
 
 NICENESS = 10  # Of the process: commands come first
@@ -91,8 +89,9 @@ class AdapterNode(MachineNode):
         self._journal = Path(self._options["folder"]).resolve() / JOURNAL
         self.set_hardware_id(self._options["geometry_file"])
         self._states = self.create_publisher(DiagnosticStatus, "~/state", LATCHED_QOS)
-        asked = {"calibrate": self._on_calibrate, "verify": self._on_verify, "stop": self._on_stop}
-        self._asked = {name: self.create_service(Trigger, f"~/{name}", answer) for name, answer in asked.items()}
+        self.create_logged_service(Trigger, "~/calibrate", lambda *_: self._start(CALIBRATING))
+        self.create_logged_service(Trigger, "~/verify", lambda *_: self._start(VERIFYING))
+        self.create_logged_service(Trigger, "~/stop", self._on_stop)
         self._publish_state()
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -113,21 +112,9 @@ class AdapterNode(MachineNode):
 
     # ---- what is asked for ----
 
-    def _on_calibrate(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response:
-        self._note_caller("calibrate")
-        return self._start(CALIBRATING)
-
-    def _on_verify(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response:
-        self._note_caller("verify")
-        return self._start(VERIFYING)
-
     def _on_stop(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response:
-        self._note_caller("stop")
         running = self._interrupt()
         return Trigger.Response(success=True, message="the machine brakes" if running else "nothing was running")
-
-    def _note_caller(self, name: str) -> None:
-        self.note(name, f"{name}: asked for by {callers(self, self._asked[name])}")
 
     def _start(self, state: str) -> Trigger.Response:
         """Start the process; refused while one runs."""
@@ -237,8 +224,7 @@ class AdapterNode(MachineNode):
             "model": self._model,
             "running": str(self._process is not None).lower(),
         }
-        name = f"{self.get_fully_qualified_name()[1:]}: adapt"
-        self._states.publish(status_of(name, self.hardware_id, level, f"{self._state}: {self._text}", values))
+        self._states.publish(self.report("adapt", level, f"{self._state}: {self._text}", values))
 
 
 def _with_package() -> str:

@@ -1,15 +1,21 @@
-"""Shared by the package's lifecycle nodes: topics, timers and services under one guard, log, diagnostics."""
+"""Shared by the package's lifecycle nodes: topics, timers and services under one guard, log, diagnostics.
+
+doc/states.md has every state that compensator and drive report.
+"""
 
 from __future__ import annotations
 
 import copy
 import functools
+import math
+import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
@@ -19,6 +25,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.logging import get_logging_directory
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -26,7 +33,7 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from ..compensation.guards import OneSender, Sample, StampClock
+from ..compensation.guards import EventWindow, OneSender, Sample, StampClock
 from ..errors import LONGEST_TEXT, CommandError, HexapodError, printable
 from .messages import read_message
 from .parameters import Parameter, Parameters
@@ -34,6 +41,7 @@ from .rclpy_compat import (
     Alarm,
     PlainLogger,
     Throttle,
+    callers,
     described,
     end_lifecycle,
     lifecycle_state,
@@ -41,7 +49,6 @@ from .rclpy_compat import (
     publishers,
     sampled,
 )
-from .status import ERROR, OK, WARN, Refusals, joined, log_problem, status_of
 
 
 def profile(depth: int, reliable: bool = True, latched: bool = False) -> QoSProfile:
@@ -83,6 +90,8 @@ OVERRIDES = QoSOverridingOptions(
     )
 )
 
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
 TRANSITIONS = ("on_configure", "on_activate", "on_deactivate", "on_cleanup", "on_shutdown")
 
 CHECK_PERIOD = 0.05  # Period at which a node evaluates its state, s
@@ -90,6 +99,103 @@ STATUS_PERIOD = 1.0  # A status is published at once when level or text change, 
 
 # Longest wait for the last message's acknowledgement: DDS may take 3 s, and dead subscribers never send it
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.4)
+
+
+# ---- what a node reports ----
+
+LEAST_ROOM = 65_536  # A file system with less free space, byte, is full: a few hundred lines of log
+
+
+def status_prefix(namespace: str, node: str) -> str:
+    return f"{namespace.strip('/')}/{node}:".lstrip("/")
+
+
+def status_of(
+    name: str, hardware_id: str, level: bytes, text: str, values: Mapping[str, str], longest: int = LONGEST_TEXT
+) -> DiagnosticStatus:
+    status = DiagnosticStatus(level=level, name=printable(name), hardware_id=printable(hardware_id))
+    status.message = printable(text, longest)
+    status.values = [KeyValue(key=key, value=printable(value, longest)) for key, value in values.items()]
+    return status
+
+
+def joined(findings: Iterable[tuple[bytes, str]]) -> tuple[bytes, str]:
+    """Return level and text of all findings that are not OK, worst first; of the first when all are OK."""
+    listed = list(findings)
+    bad = [finding for finding in listed if finding[0] != OK] or listed[:1]
+    return bad[0][0], "; ".join(text for _, text in bad)
+
+
+def seconds(value: float) -> str:
+    """Return an age as text: ``never`` when it is infinite."""
+    return "never" if value == math.inf else f"{value:.3f}"
+
+
+class Flow:
+    """Counts events; returns their rate and the age of the last one."""
+
+    def __init__(self) -> None:
+        self.count, self.last = 0, -math.inf
+        self._since, self._before, self._rate = time.monotonic(), 0, 0.0
+
+    def tick(self, now: float) -> None:
+        self.count += 1
+        self.last = now
+
+    def age(self, now: float) -> float:
+        return now - self.last
+
+    def rate(self, now: float) -> float:
+        if (span := now - self._since) >= 1.0:
+            self._rate = (self.count - self._before) / span
+            self._since, self._before = now, self.count
+        return self._rate
+
+
+class Refusals:
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self._lately: dict[str, EventWindow] = {}
+        self.last_reason = self.last_text = ""
+
+    @property
+    def total(self) -> int:
+        return sum(self.counts.values())
+
+    def add(self, reason: str, text: str, now: float) -> None:
+        self.counts[reason] += 1
+        self._lately.setdefault(reason, EventWindow()).note(now)
+        self._lately[reason] = self._lately.pop(reason)  # the newest stands last
+        self.last_reason, self.last_text = reason, text
+
+    def recent(self, now: float) -> bool:
+        """Return whether one is recent enough to be shown as an error."""
+        return bool(self.reasons(now))
+
+    def reasons(self, now: float, but: str = "") -> str:
+        """Return all reasons `but` one recent enough to be shown, the newest first: none must hide another."""
+        recent = [reason for reason, lately in self._lately.items() if lately.holds(now)]
+        return ", ".join(reason for reason in reversed(recent) if reason != but)
+
+    def values(self) -> dict[str, str]:
+        counts = {f"refused.{reason}": str(count) for reason, count in sorted(self.counts.items())}
+        return {"refused": str(self.total), **counts}
+
+
+def log_problem(folder: str = "") -> str:
+    """Return why ROS's log cannot be written, empty if it can: only the nodes can report that nothing is written any
+    more. Takes a few microseconds on a local file system."""
+    folder = folder or str(get_logging_directory())
+    try:
+        usage = os.statvfs(folder)
+    except FileNotFoundError:
+        return ""  # nothing is logged to files
+    except OSError as error:
+        return f"log folder lost: {error.strerror}"
+    return f"log disk full: {folder}" if usage.f_bavail * usage.f_frsize < LEAST_ROOM else ""
+
+
+# ---- the node ----
 
 
 class CallbackGuard:
@@ -341,6 +447,17 @@ class MachineNode(LifecycleNode):
         guarded = self.guard.answering(srv_name, srv_type, callback)
         return super().create_service(srv_type, srv_name, guarded, *arguments, **options)
 
+    def create_logged_service(self, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any]) -> Service:
+        """Return a service that logs which nodes may have called: after an accident the first question is who."""
+
+        def logged(request: Any, response: Any) -> Any:
+            name = srv_name.removeprefix("~/")
+            self.note(name, f"{name}: asked for by {callers(self, service)}")
+            return callback(request, response)
+
+        service = self.create_service(srv_type, srv_name, logged)
+        return service
+
     def publish_on(self, message_type: type, topic: str, qos: QoSProfile, deadline: float = 0.0) -> Publisher:
         """Return a publisher; it offers `deadline`, s, between messages, 0: none."""
         qos = copy.copy(qos)
@@ -438,6 +555,13 @@ class MachineNode(LifecycleNode):
         if (line := self._throttle.allow(f"note {cause}", text)) is not None:
             self.get_logger().info(line)
 
+    def report(
+        self, what: str, level: bytes, text: str, values: Mapping[str, str], longest: int = LONGEST_TEXT
+    ) -> DiagnosticStatus:
+        """Return a status of this node: its state, or of something that it does."""
+        name = f"{self.get_fully_qualified_name()[1:]}: {what}"
+        return status_of(name, self.hardware_id, level, text, values, longest)
+
     def set_hardware_id(self, what: str) -> None:
         """Set the hardware_id of this node's status to the machine or component it serves, with the namespace, so that
         two of a kind are distinguished. The status's name stays: an aggregator would otherwise wait for the old one for
@@ -476,7 +600,7 @@ class MachineNode(LifecycleNode):
             self.log_warning("clock", f"the clock was set {'back' if step < 0 else 'forward'} by {abs(step):.3f} s")
         if (level, text) != self._status_shown or now >= self._status_due:
             self._status_shown, self._status_due = (level, text), now + STATUS_PERIOD
-            name, values = f"{self.get_fully_qualified_name()[1:]}: state", {**self.values(now), **self.guard.values()}
-            array = DiagnosticArray(status=[status_of(name, self.hardware_id, level, text, values)])
+            values = {**self.values(now), **self.guard.values()}
+            array = DiagnosticArray(status=[self.report("state", level, text, values)])
             array.header.stamp = self.get_clock().now().to_msg()
             self._diagnostics_pub.publish(array)

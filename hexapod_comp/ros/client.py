@@ -18,10 +18,9 @@ from std_srvs.srv import SetBool, Trigger
 from ..errors import HexapodError, NoAnswerError
 from ..machine.trajectory import Path
 from ..pose import Pose
-from .base import COMMAND_QOS, EVENT_QOS, LATCHED_QOS, NEWEST_QOS, profile
+from .base import COMMAND_QOS, EVENT_QOS, LATCHED_QOS, NEWEST_QOS, profile, status_prefix
 from .messages import StrutReader, message_pose, nanoseconds_of, pose_message
 from .process import RosSession
-from .status import status_prefix
 
 # Answers are all kept until they are read: a recorder must not lose any
 LISTENER_QOS = profile(200)

@@ -12,7 +12,7 @@ import math
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -21,90 +21,43 @@ from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
 from std_msgs.msg import Float64MultiArray
 
 from ..compensation.compensator import Compensator, pack_pose
-from ..compensation.guards import Guard, Sample
-from ..compensation.thermal import Thermometers
-from ..core import Struct
+from ..compensation.guards import Sample
 from ..errors import CommandError, HexapodError, LimitError, TooEarlyError
 from ..machine.temperatures import HUMIDITY, check_part
-from .base import ACKNOWLEDGED_WITHIN, COMMAND_QOS, NEWEST_QOS, MachineNode
-from .interface import (
-    PARAMETERS,
-    PROGRAM,
-    JournalTopics,
-    MachineFiles,
-    Outputs,
-    command_input,
-    frame_ids,
-    temperature_rules,
-)
+from .base import ACKNOWLEDGED_WITHIN, COMMAND_QOS, NEWEST_QOS, seconds
+from .inputs import Loads, PoseInstrument, SensorTopic, command_input
+from .interface import ADVICE, OTHERWISE, PROGRAM, CompensatorState, temperature_rules
 from .messages import StrutBytes, StrutReader, check_frame, period
+from .outputs import JournalTopics, Outputs
 from .process import run
 from .rclpy_compat import Alarm
 from .requests import Requests
-from .sensors import Loads, PoseInstrument, SensorTopic
-from .status import ADVICE, OTHERWISE, CompensatorStatus, seconds
 
 ESTIMATE_PERIOD = 0.02  # Period of pose estimates from the node's own commands without feedback, s
 JITTER = 0.02  # A command that waits no longer than this, s, is not late, nor is an alarm
 
 
-class StateGuard(Guard):
-    """Refuses commands in an unknown frame, and while one of the standing guards has a problem."""
-
-    def __init__(self, frames: dict[str, Struct], status: CompensatorStatus) -> None:
-        self._frames, self._status = frames, status
-
-    def check(self, sample: Sample) -> None:
-        if sample.frame_id not in self._frames:
-            check_frame(sample.frame_id, self._frames)
-        for guard in self._status.standing:
-            if guard.problem:
-                raise CommandError(guard.reason, guard.problem)
-
-
-class Start(Guard):
-    """Lets the first command begin at the struts' known positions, and requires readings if so configured."""
-
-    def __init__(self, compensator: Compensator, status: CompensatorStatus) -> None:
-        self._compensator, self._status = compensator, status
-
-    def check(self, sample: Sample) -> None:
-        status, now = self._status, sample.now
-        if not (status.fresh_start or status.options["require_feedback"]):
-            return
-        fed = status.fed(now)
-        if status.options["require_feedback"] and not fed:
-            since = f"for {seconds(status.feedback.age(now))} s" if status.feedback.count else "yet"
-            raise CommandError("no_feedback", f"no strut_states {since}")
-        if status.fresh_start:
-            self._compensator.reset(status.track.start(now, fed))
-
-
-class CompensatorNode(MachineNode):
+class CompensatorNode(CompensatorState):
     """Lifecycle node around one :class:`Compensator`; arguments are those of ``rclpy`` nodes."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("compensator", PARAMETERS, **options)
-        self._files = MachineFiles(self._options)
-        self._status = CompensatorStatus(self._options, self.clock)
-        self._stamps, self._track, self._flow = self._status.command_stamps, self._status.track, self._status.commands
+        super().__init__(**options)
         self._logged_problem = ""
         self._unestimated = 0  # stamp of an answer whose pose was not estimated yet, ns
-        self._instrument: PoseInstrument | None = None  # present with ``fusion.enabled``
 
     # ---- lifecycle ----
 
     def configure(self) -> None:
-        began, options, files = time.perf_counter(), self._options, self._files
+        began, options, files = time.perf_counter(), self.options, self.files
         geometry = files.geometry()
-        self.compensator = compensator = Compensator(geometry, files.model(geometry), options["ramp_rate"])
+        compensator = Compensator(geometry, files.model(geometry), options["ramp_rate"])
         compensator.check()
         compensator.enable(options["enable_compensation"])
         compensator.set_tool(options["tool"])
-        ids = frame_ids(geometry, options)
-        self._status.apply_parameters()
-        self._frames = {ids[name]: pack_pose(pose) for name, pose in geometry.work_frames.items()}
-        self._open_topics(ids)
+        self.use_machine(compensator)
+        self._frames = {self.ids[name]: pack_pose(pose) for name, pose in geometry.work_frames.items()}
+        self.apply_parameters()
+        self._open_topics()
         what = f"model {compensator.model.name!r}"
         what = "the ideal model, which corrects nothing (parameter model_file)" if files.ideal else what
         took = time.perf_counter() - began
@@ -113,25 +66,25 @@ class CompensatorNode(MachineNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start to answer commands; none that came before is replayed."""
         self._forget_commands()
-        self._track.begin(time.monotonic())
+        self.track.begin(time.monotonic())
         return super().on_activate(state)
 
     def unconfigure(self) -> None:
         self._journal.finish(time.monotonic())
         self._forget_commands()
-        for part in (self._requests, self._pacing):
-            part.close()
-        self._instrument = None
+        self._requests.close()
+        self._pacing.close()
+        self.instrument = None
 
     def on_parameters(self, names: set[str]) -> None:
         """Apply what has been set while the node runs; other parameters are read where they are used."""
-        self._status.apply_parameters()
+        self.apply_parameters()
         if self.configured:
-            self._thermometers.follow(*temperature_rules(self._options))
-            self.compensator.set_ramp_rate(self._options["ramp_rate"])
-            self._loads.apply()
-        if self._instrument is not None:
-            self._instrument.follow()
+            self.thermometers.follow(*temperature_rules(self.options))
+            self.compensator.set_ramp_rate(self.options["ramp_rate"])
+            self.loads.apply()
+            if self.instrument is not None:
+                self.instrument.follow()
 
     def publish_last_status(self) -> None:
         super().publish_last_status()
@@ -140,46 +93,30 @@ class CompensatorNode(MachineNode):
             self._commands.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
             self._outputs.wait()
 
-    def _open_topics(self, ids: dict[str, str]) -> None:
-        compensator, options, names = self.compensator, self._options, self._options["joint_names"]
-        self.set_hardware_id(compensator.geometry.name)
+    def _open_topics(self) -> None:
+        options, names = self.options, self.options["joint_names"]
         deadline, several = options["command_timeout"], options["allow_several_publishers"]
         self._commands = self.publish_on(JointState, "strut_commands", COMMAND_QOS, deadline)
         self._corrections = self.publish_on(JointState, "strut_corrections", COMMAND_QOS, deadline)
         self._command_out, self._correction_out = StrutBytes(names=names), StrutBytes(names=names)
-        self._fastest = compensator.geometry.limits.speed
+        self._fastest = self.compensator.geometry.limits.speed
         self._array, self._array_out = None, Float64MultiArray(data=[0.0] * 6)
         if options["publish_array"]:
             self._array = self.publish_on(Float64MultiArray, "strut_commands_array", COMMAND_QOS, deadline)
-        self._outputs = Outputs(self, compensator, options, self._commands.topic_name)
-        self._reader = StrutReader(names)
-        self._thermometers = Thermometers(*temperature_rules(options))
-        self._input = asked = command_input(compensator, options)
-        self._status.configure(
-            compensator,
-            self._thermometers,
-            ids,
-            self.subscribe_exclusive(asked.kind, asked.topic, self._on_command, several),
-            self.sole_publisher(self._commands, several),
-            self.subscribe_exclusive(JointState, "strut_states", self._on_states, several, NEWEST_QOS),
-        )
-        status, any_thermometer = self._status, "allow_several_thermometers"
-        SensorTopic(self, status, "temperatures", Temperature, self._on_temperature, several=any_thermometer)
-        SensorTopic(self, status, HUMIDITY, RelativeHumidity, self._on_humidity, several=any_thermometer)
-        self._command_guards: tuple[Guard, ...] = (
-            StateGuard(self._frames, status),
-            Start(compensator, status),
-            self._stamps,
-        )
-        self._pacing = Pacing(
-            self, self._process_command, lambda data, error, now: self._refuse(self._input.stamp(data), error, now)
-        )
-        self._requests = Requests(self, status, self._files, self._forget_commands)
-        self._journal = JournalTopics(self, compensator, self._files.sources, ids)
-        self._loads = Loads(self, compensator, status, ids)
+        self._outputs, self._reader, self._input = Outputs(self), StrutReader(names), command_input(self)
+        self.source = self.subscribe_exclusive(self._input.kind, self._input.topic, self._on_command, several)
+        self.own_topic = self.sole_publisher(self._commands, several)
+        self.measuring = self.subscribe_exclusive(JointState, "strut_states", self._on_states, several, NEWEST_QOS)
+        self.standing = self.source, self.own_topic, self.measuring, self.track
+        any_thermometer = "allow_several_thermometers"
+        SensorTopic(self, "temperatures", Temperature, self._on_temperature, several=any_thermometer)
+        SensorTopic(self, HUMIDITY, RelativeHumidity, self._on_humidity, several=any_thermometer)
+        self._pacing = Pacing(self, self._process_command, self._refuse_waiting)
+        self._requests = Requests(self, self._forget_commands)
+        self._journal = JournalTopics(self)
+        self.loads = Loads(self)
         if options["fusion.enabled"]:
-            frames = {ids[name]: pose for name, pose in compensator.geometry.work_frames.items()}
-            self._instrument = PoseInstrument(self, compensator, status, frames)
+            self.instrument = PoseInstrument(self)
         self.every(ESTIMATE_PERIOD, self._estimate_from_commands)
 
     # ---- a command ----
@@ -195,13 +132,19 @@ class CompensatorNode(MachineNode):
 
     def _process_command(self, data: bytes, sample: Sample) -> float:
         """Answer or refuse a command; return the time that it must wait first, s: the struts cannot be there yet."""
-        now, compensator, status = sample.now, self.compensator, self._status
+        now, compensator = sample.now, self.compensator
         try:
             self._input.read(data, sample)
             if sample.values is None:
                 return 0.0
-            for guard in self._command_guards:
-                guard.check(sample)
+            if sample.frame_id not in self._frames:
+                check_frame(sample.frame_id, self._frames)
+            for guard in self.standing:
+                if guard.problem:
+                    raise CommandError(guard.reason, guard.problem)
+            if self.fresh_start or self.options["require_feedback"]:
+                self._begin_at_struts(now)
+            self.command_stamps.check(sample)
             stamp = sample.stamp
             made = stamp * 1e-9 if stamp else math.nan
             compensator.step(sample.values, made, self._frames[sample.frame_id], now)
@@ -220,17 +163,29 @@ class CompensatorNode(MachineNode):
             self._array.publish(self._array_out)
         compensator.published(out := time.monotonic())
         self._journal.answered(when, sample.frame_id, sample.values, (now, out), bool(stamp))
-        self._stamps.accept(sample)
-        self._track.add_command(compensator.command.tolist(), now)
-        self._flow.count += 1
-        self._flow.last = now
-        status.fresh_start, status.last_answered, status.frame_id = False, when, sample.frame_id
+        self.command_stamps.accept(sample)
+        self.track.add_command(compensator.command.tolist(), now)
+        self.commands.count += 1
+        self.commands.last = now
+        self.fresh_start, self.last_answered, self.frame_id = False, when, sample.frame_id
         self._unestimated = when
         return 0.0
 
+    def _begin_at_struts(self, now: float) -> None:
+        """Let the first command begin at the struts' known positions; require readings if so configured."""
+        fed = self.fed(now)
+        if self.options["require_feedback"] and not fed:
+            since = f"for {seconds(self.feedback.age(now))} s" if self.feedback.count else "yet"
+            raise CommandError("no_feedback", f"no strut_states {since}")
+        if self.fresh_start:
+            self.compensator.reset(self.track.start(now, fed))
+
+    def _refuse_waiting(self, data: bytes, error: HexapodError, now: float) -> None:
+        self._refuse(self._input.stamp(data), error, now)
+
     def _refuse(self, stamp: int, error: HexapodError, now: float) -> None:
         self._journal.refused(stamp, error.reason, str(error))
-        self._status.refusals.add(error.reason, str(error), now)
+        self.refusals.add(error.reason, str(error), now)
         self._outputs.stop(True)
         self.log_warning(
             error.reason, f"command refused ({error.reason}): {error}; {ADVICE.get(error.reason, OTHERWISE)}"
@@ -240,44 +195,43 @@ class CompensatorNode(MachineNode):
 
     def _on_states(self, data: bytes, sample: Sample) -> None:
         """Use measured struts, also while the node is inactive: a start begins where they stand."""
-        now, track, status = sample.now, self._track, self._status
+        now, track, instrument = sample.now, self.track, self.instrument
         try:
-            status.measuring.check(sample)
+            self.measuring.check(sample)
             self._reader.sample(data, sample)
-            status.reading_stamps.check(sample)
+            self.reading_stamps.check(sample)
             struts = sample.values or ()
             track.check_stroke(struts)
             # Before the check for a jump: one reading off its command stops the machine, whether strut or encoder
             # fails.
             if self._active and track.follow(struts, now - sample.age):
-                status.bad_feedback.add(track.reason, track.problem, now)
+                self.bad_feedback.add(track.reason, track.problem, now)
             track.check_jump(sample)
             pose = self.compensator.estimate(struts)
             track.accept(sample)
-            status.reading_stamps.accept(sample)
-            status.feedback.count += 1
-            status.feedback.last = now
-            instrument = self._instrument
+            self.reading_stamps.accept(sample)
+            self.feedback.count += 1
+            self.feedback.last = now
             if self._active:
                 self._outputs.estimate(pose if instrument is None else instrument.weighed(pose), sample.stamp)
                 self._outputs.nominal(sample.stamp, track.mean)
                 if instrument is not None:  # last: readings of earlier times go through the same core
                     instrument.add_struts(struts, now - sample.age)
         except HexapodError as error:
-            self.ignore("strut_states", error, status.bad_feedback)
+            self.ignore("strut_states", error, self.bad_feedback)
 
     def _on_temperature(self, message: Temperature, now: float) -> None:
         check_part(name := message.header.frame_id)
-        self.compensator.set_temperature(name, self._thermometers.update(name, message.temperature, now), now)
+        self.compensator.set_temperature(name, self.thermometers.update(name, message.temperature, now), now)
 
     def _on_humidity(self, message: RelativeHumidity, now: float) -> None:
-        self.compensator.set_humidity(self._thermometers.update(HUMIDITY, message.relative_humidity, now), now)
+        self.compensator.set_humidity(self.thermometers.update(HUMIDITY, message.relative_humidity, now), now)
 
     def _estimate_from_commands(self) -> None:
         """Without feedback, estimate the pose from the newest command, at a rate that does not load the loop."""
         stamp, self._unestimated, now = self._unestimated, 0, time.monotonic()
-        instrument = self._instrument if self._status.commands.count else None
-        if not (stamp or instrument) or not self._active or self._status.fed(now):
+        instrument = self.instrument if self.commands.count else None
+        if not (stamp or instrument) or not self._active or self.fed(now):
             return
         try:
             if stamp:
@@ -286,7 +240,7 @@ class CompensatorNode(MachineNode):
             if instrument is not None:
                 instrument.add_struts(self.compensator.command.tolist(), now)
         except HexapodError as error:
-            self._status.bad_feedback.add(error.reason, str(error), time.monotonic())
+            self.bad_feedback.add(error.reason, str(error), time.monotonic())
             self.log_warning("estimate " + error.reason, f"no pose estimate: {error}")
 
     # ---- state ----
@@ -294,37 +248,27 @@ class CompensatorNode(MachineNode):
     def _forget_commands(self) -> None:
         """Forget the last command, but not the struts' commanded positions."""
         self.compensator.reset()
-        if self._instrument is not None:
-            self._instrument.reset()
-        for part in (self._track, self._stamps, self._pacing):
+        if self.instrument is not None:
+            self.instrument.reset()
+        for part in (self.track, self.command_stamps, self._pacing):
             part.reset()
         self._unestimated = self._outputs.answered = 0  # the velocity of the next command is zero
-        self._status.fresh_start = True
-
-    def update_publishers(self) -> None:
-        self._status.update(time.monotonic())
+        self.fresh_start = True
 
     def update(self, now: float) -> None:
-        status = self._status
-        status.update(now)
-        guard = status.problem()
+        super().update(now)
+        guard = self.standing_problem()
         problem = guard.problem if guard is not None and self._active else ""
         if problem and problem != self._logged_problem:
             self.get_logger().error(f"refusing commands: {problem}")
         self._logged_problem = problem
         self._requests.update(now)
         if self._active:
-            self._loads.update()
-        if self._instrument is not None:
-            self._instrument.update(now)
+            self.loads.update()
+        if self.instrument is not None:
+            self.instrument.update(now)
         self._journal.tick(now)
-        self._outputs.stop(not self._active or status.stops(now))
-
-    def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
-        return self._status.findings(now)
-
-    def values(self, now: float) -> dict[str, str]:
-        return self._status.values(now)
+        self._outputs.stop(not self._active or self.stops(now))
 
 
 class Pacing:
@@ -341,14 +285,14 @@ class Pacing:
         process: Callable[[bytes, Sample], float],
         refuse: Callable[[bytes, HexapodError, float], None],
     ) -> None:
-        self._node, self._status, self._process_command, self._refuse = node, node._status, process, refuse
+        self._node, self._process_command, self._refuse = node, process, refuse
         self.waiting: deque[tuple[float, bytes]] = deque()
         self._due = self._stood_still = 0.0
         self._alarm = Alarm(node, node.guard.around("process_next", self._process_next))
 
     @property
     def _longest(self) -> float:
-        return float(self._status.options["catch_up_within"])
+        return float(self._node.options["catch_up_within"])
 
     def begin(self, message: bytes, now: float, wait: float) -> None:
         self._enqueue(message, now)
@@ -357,9 +301,9 @@ class Pacing:
     def add(self, message: bytes, now: float) -> None:
         """Let a command wait behind others."""
         if not self._longest:
-            self._status.dropped += len(self.waiting)
+            self._node.dropped += len(self.waiting)
             self.waiting.clear()
-            self._status.behind.note(now)
+            self._node.behind.note(now)
         elif len(self.waiting) == COMMAND_QOS.depth:
             self._refuse_all(now)
         self._enqueue(message, now)
@@ -374,7 +318,7 @@ class Pacing:
     def _enqueue(self, message: bytes, now: float) -> None:
         # time of arrival, without the time in which the node was not scheduled
         self.waiting.append((now - self._stood_still, message))
-        self._status.waited += 1
+        self._node.waited += 1
 
     def _wait_for_struts(self, now: float, wait: float) -> None:
         self._due = now + wait
@@ -399,7 +343,7 @@ class Pacing:
                 self._wait_for_struts(now, wait)
                 return
             if self._age(came, now) > JITTER:
-                self._status.behind.note(now)
+                self._node.behind.note(now)
             if self.waiting:  # else the command was refused and a reset has cleared the queue
                 self.waiting.popleft()
 

@@ -23,11 +23,10 @@ from ..formats.paths import config_file
 from ..machine.geometry import load_geometry
 from ..pose import Pose
 from ..virtual.instruments import LIVE, TRACKER, LiveFlaws, LiveInstrument
-from .base import LATCHED_QOS, NEWEST_QOS, STATE_QOS, MachineNode
+from .base import LATCHED_QOS, NEWEST_QOS, OK, STATE_QOS, WARN, MachineNode
 from .messages import message_pose, pose_message, stamp_of
 from .parameters import Program, read_table
 from .process import run
-from .status import OK, WARN
 
 SET_UP_TOPIC = "instrument_set_up"
 SEEN_WITHIN = 0.5  # A true pose that is older says no more where the tool is, s

@@ -1,55 +1,37 @@
-"""The compensator's interface: its parameters, the files they name, its inputs and what it publishes.
+"""The compensator's interface and state: its parameters, the files they name, what it knows, counts and reports.
 
-Only the answers to commands are published by the loop itself, in :mod:`.compensator`.
+What it does with all that: :mod:`.compensator`. doc/states.md has every case.
 """
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from builtin_interfaces.msg import Duration, Time
-from geometry_msgs.msg import Point, PoseStamped
-from rclpy.publisher import Publisher
-from sensor_msgs.msg import JointState, TimeReference
-from std_msgs.msg import Bool, ColorRGBA, String, UInt64
-from visualization_msgs.msg import Marker, MarkerArray
 
 from ..compensation.compensator import DEFAULT_RAMP_RATE, Compensator
 from ..compensation.fusion import FusionRules
-from ..compensation.guards import Sample
-from ..compensation.journal import IDEAL_SOURCE, Journal, Source, sources_text
-from ..compensation.thermal import DEFAULT_TIME_CONSTANT, HUMIDITY_RATE, Plausibility
-from ..core import ffi
-from ..core.batch import quaternion_of
-from ..errors import HexapodError
+from ..compensation.guards import EventWindow, Guard, OneSender, StampGate
+from ..compensation.journal import IDEAL_SOURCE, Source
+from ..compensation.thermal import DEFAULT_TIME_CONSTANT, HUMIDITY_RATE, Plausibility, Thermometers
+from ..compensation.track import StrutTrack
 from ..formats.paths import confined_file, confined_opener, folder_of
 from ..machine.geometry import BASE, TOOL, WORK, HexapodGeometry
-from ..machine.kinematics import Structure, forward_error, solve_poses, strut_lengths
 from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL
-from ..machine.robot_description import joint_positions, urdf
-from ..pose import Pose
-from .base import ACKNOWLEDGED_WITHIN, EVENT_QOS, LATCHED_QOS, STATE_QOS, MachineNode, profile
-from .messages import PoseBytes, StrutBytes, StrutReader, command_stamp, period, read_message, read_pose, stamp_of
+from ..machine.temperatures import HUMIDITY, REFERENCE_HUMIDITY
+from .base import ERROR, OK, WARN, Flow, MachineNode, Refusals, seconds
 from .parameters import ParameterError, Program, read_table
 
+if TYPE_CHECKING:
+    from .inputs import Loads, PoseInstrument
+
 POSES, STRUTS = "poses", "struts"  # Values of the parameter ``command_input``
-
-# Whether the node stops the machine is published again after this time, s: late subscribers receive what is latched,
-# but on a busy computer the middleware loses that now and then
-REPEATED_AFTER = 1.0
-
-# Largest time of a message, ns: later validities are limited to it
-LAST_STAMP = 2**31 * 10**9 - 1
-
-# Pages: each counts, and late subscribers need the last snapshot; a recorder's own queue is no longer than this
-JOURNAL_QOS = profile(10, latched=True)
-
+NEAR_SINGULAR = 0.9  # Share of the largest allowed condition number above which diagnostics warn
 RULES = FusionRules()
 
 PARAMETERS = read_table(f"""
@@ -247,252 +229,202 @@ class MachineFiles:
         return Source.read(confined_file(self._options[f"{kind}_file"], folder, kind), confined_opener(folder))
 
 
-# ---- what comes in ----
+# ---- state ----
+
+# What the sender of a refused command should do, by reason
+ADVICE = {
+    "stamp_past": "send the pose again with a new stamp; never skip one that was not answered",
+    "stamp_future": "set the clocks, or send a zero stamp, which means now",
+    "stamp_order": "stamp commands in the order in which they are sent",
+    "step": "go on from the last answered command (last_answered), in steps that the limit allows",
+    "speed": "plan slower, and stamp each pose with the time for which it was computed, not that of sending",
+    "acceleration": "plan more gently, and stamp each pose with the time for which it was computed",
+    "tool_changed": "send where the struts are with the tool in use; the refusal says where that is",
+    "no_feedback": "wait for strut_states; a machine without feedback needs start_without_feedback_after",
+    "following_error": "find out why the struts do not follow, then call ~/reset while the machine stands",
+    "several_publishers": "leave one publisher on the topic",
+    "unknown_publisher": "leave one publisher on the topic, whose node's name can be read",
+}
+
+# The same for all other reasons: a limit, a frame, an invalid message
+OTHERWISE = "mend what the refusal names, and go on from the last answered command (last_answered)"
 
 
-class PoseInput:
-    """Tool poses on ``tool_pose_command``."""
+class CompensatorState(MachineNode):
+    """A compensator node as far as it knows, counts and reports; its parts read and write this.
 
-    topic, kind = "tool_pose_command", PoseStamped
-
-    read = staticmethod(read_pose)
-    """Reads a command into a sample: stamp, frame and the seven numbers of a pose; without values nothing is commanded
-    yet."""
-
-    def stamp(self, data: bytes) -> int:
-        """Return the stamp of a command, ns; 0 if it has none."""
-        sample = Sample(0.0)
-        try:
-            self.read(data, sample)
-        except HexapodError:
-            return 0
-        return sample.stamp
-
-
-class StrutInput(PoseInput):
-    """Nominal strut lengths on ``strut_setpoints``, m, by name: what a controller that plans struts itself commands a
-    machine without errors.
-
-    They become the tool pose of that machine at once: limits, stamps, journal and replay only use poses. The strut
-    readings that such a controller receives are nominal too.
+    Counters, stamps and the track of the struts outlive a configuration; :meth:`use_machine` begins one.
     """
 
-    topic, kind = "strut_setpoints", JointState
+    source: OneSender  # of commands,
+    own_topic: OneSender  # of strut commands beside this node,
+    measuring: OneSender  # and of measured struts
+    standing: tuple[Guard, ...]  # refuse commands while they have a problem
+    loads: Loads
 
-    def __init__(self, compensator: Compensator, names: list[str], frame_id: str) -> None:
-        # the search for the pose starts from its last command
-        self._compensator, self._frame_id = compensator, frame_id
-        self._structure, self._reader = Structure.of(compensator.geometry), StrutReader(names)
+    def __init__(self, **options: Any) -> None:
+        super().__init__("compensator", PARAMETERS, **options)
+        self.options, self.files = self._options, MachineFiles(self._options)
+        self.command_stamps = StampGate("command", self.clock)
+        self.reading_stamps = StampGate("reading", self.clock, capped=True)
+        self.pose_stamps = StampGate("measured pose", self.clock, capped=True)
+        self.track = StrutTrack()
+        # Senders of sensor readings and of the tool's choice: a second one is ignored, and stops nothing
+        self.sensing: dict[str, OneSender] = {}
+        self.commands, self.feedback = Flow(), Flow()  # accepted commands, usable measured struts
+        self.refusals, self.bad_feedback, self.bad_poses = Refusals(), Refusals(), Refusals()
+        self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
+        self.waited = self.dropped = 0  # number of commands that have waited, and that a newer one has replaced
+        self.behind = EventWindow()  # commands were handled late, by more than jitter
+        self.frame_id = ""  # of the last command
+        self.last_answered = 0  # stamp, ns; 0 before the first
+        self.fresh_start = True  # no command is in force
+        self.apply_parameters()
 
-    def read(self, data: bytes, sample: Sample) -> None:  # type: ignore[override]
-        """As for poses; no values while all lengths are NaN: ros2_control publishes NaN until one of its controllers is
-        active. A KinematicsError: no pose near the last command, nor near home, has these lengths."""
-        message = read_message(data, JointState)
-        sample.stamp, sample.frame_id = command_stamp(message.header.stamp), self._frame_id
-        lengths = self._reader.pick(message)
-        if np.isnan(lengths).all():
-            return
-        self._reader.check(lengths.tolist())
-        guesses = [self._compensator.geometry.home]
-        if np.isfinite(self._compensator.nominal).all():  # else there was no command yet
-            guesses.insert(0, self._compensator.platform)
-        for guess in guesses:
-            solved = solve_poses(self._structure, lengths[None], guess, threads=1)
-            if solved.ok[0]:
-                tool = Pose(solved.positions[0], solved.rotations[0]) @ self._compensator.geometry.tool
-                sample.values = (*tool.position.tolist(), *quaternion_of(tool.rotation))
-                return
-        raise forward_error(int(solved.outcomes[0]), float(solved.conditions[0]), self._structure.max_condition)
+    def use_machine(self, compensator: Compensator) -> None:
+        self.compensator, self.ids = compensator, frame_ids(compensator.geometry, self.options)
+        self.thermometers = Thermometers(*temperature_rules(self.options))
+        self.sensing.clear()
+        self.instrument: PoseInstrument | None = None  # present with ``fusion.enabled``
+        self.prediction_problem = self.drift_problem = ""  # why no error is predicted, and no drift compensated
+        self.track.watch(compensator.geometry)
+        self.set_hardware_id(compensator.geometry.name)
 
+    def apply_parameters(self) -> None:
+        """Apply the parameters as they are now; others are read where they are used."""
+        self.command_stamps.max_age = self.options["max_command_age"]
+        self.reading_stamps.max_age = self.pose_stamps.max_age = self.options["max_reading_age"]
+        self.track.limit = self.options["following_error_limit"]
+        self.track.anywhere_after = self.options["start_without_feedback_after"]
 
-def command_input(compensator: Compensator, options: dict[str, Any]) -> PoseInput:
-    """Return the input selected by a node's parameters."""
-    if options["command_input"] == STRUTS:
-        return StrutInput(compensator, options["joint_names"], options["base_frame"])
-    return PoseInput()
-
-
-# ---- what goes out ----
-
-
-def nominal_lengths(compensator: Compensator, measured: np.ndarray) -> np.ndarray:
-    """Return measured struts minus the correction, shape (6,), m, for a controller of nominal lengths.
-
-    With the measured ones it would count the corrections as a distance to go, and at each start from the struts'
-    positions they would be corrected once more. Before the first command the model's correction is used, where it
-    corrects.
-    """
-    if np.isfinite(compensator.correction).all():
-        return measured - compensator.correction
-    if not compensator.enabled:
-        return measured
-    tool = compensator.estimate(measured)
-    pose = Pose(tool[:3], tool[3:].reshape((3, 3)))
-    return strut_lengths(compensator.geometry, pose @ compensator.geometry.tool.inverse())
-
-
-class Outputs:
-    """What a configured compensator publishes beside its answers: estimates, markers of the machine, its description,
-    and what a machine's own safety watches: a heartbeat, how long a command holds, whether commands are refused."""
-
-    def __init__(
-        self, node: MachineNode, compensator: Compensator, options: dict[str, Any], command_topic: str
-    ) -> None:
-        self._node, self._compensator, self._options = node, compensator, options
-        self._frame, self._names = options["base_frame"], options["joint_names"]
-        self.answered = 0  # stamp of the newest command, ns; 0: there is none
-        self._estimates = node.publish_on(PoseStamped, "tool_pose_estimate", STATE_QOS)
-        self._markers = node.create_publisher(MarkerArray, "~/markers", EVENT_QOS)
-        self._heartbeats = node.create_publisher(UInt64, "~/heartbeat", EVENT_QOS)
-        self._validities = node.create_publisher(TimeReference, "~/validity", EVENT_QOS)
-        self._stops = node.create_publisher(Bool, "~/stopped", LATCHED_QOS)
-        self._joints = self._description = self._nominal = None
-        below = options["command_input"] == STRUTS
-        if options["publish_description"]:
-            self._joints = node.create_publisher(JointState, "joint_states", EVENT_QOS)
-            self._description = node.create_publisher(String, "robot_description", LATCHED_QOS)
-            self._description.publish(String(data=urdf(compensator.geometry, self._names, ros2_control=below)))
-        if below:
-            self._nominal = node.publish_on(JointState, "nominal_strut_states", STATE_QOS)
-        self._nominal_out, self._estimate_out = StrutBytes(names=self._names), PoseBytes(self._frame)
-        self._beat, self._validity = UInt64(), TimeReference(source=command_topic)
-        self._stopped: bool | None = None
-        self._stop_said = 0.0
-        self.stop(True)
-        node.at_rate("heartbeat_rate", self._beats)
-        node.at_rate("marker_rate", self._show)
-
-    def estimate(self, pose: np.ndarray, stamp: int) -> None:
-        """Publish a tool pose, shape (12,), position, m, and rotation matrix by rows, where somebody subscribes."""
-        if self._estimates.get_subscription_count():
-            self._estimates.publish(self._estimate_out.made(pose, stamp))
-
-    def nominal(self, stamp: int, mean: Callable[[], np.ndarray]) -> None:
-        """Publish nominal lengths of the measured struts, from which a controller starts and which it holds: the
-        average for struts at rest."""
-        if self._nominal is not None:
-            out, fastest = self._nominal_out, self._compensator.geometry.limits.speed
-            lengths = np.ascontiguousarray(nominal_lengths(self._compensator, mean()))
-            at = ffi.from_buffer("double[6]", lengths)
-            self._nominal.publish(out.made(at, stamp, period(out.stamp, stamp), fastest))
-
-    def stop(self, stopped: bool) -> None:
-        """Publish whether the node stops the machine, when that has changed and every :data:`REPEATED_AFTER`."""
+    def update_publishers(self) -> None:
         now = time.monotonic()
-        if stopped != self._stopped or now - self._stop_said > REPEATED_AFTER:
-            self._stopped, self._stop_said = stopped, now
-            self._stops.publish(Bool(data=stopped))
+        for sender in (self.source, self.own_topic, self.measuring, *self.sensing.values()):
+            sender.update(now)
 
-    def wait(self) -> None:
-        """Wait until the last ~/stopped has arrived."""
-        self._stops.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+    def standing_problem(self) -> Guard | None:
+        return next((guard for guard in self.standing if guard.problem), None)
 
-    def _beats(self) -> None:
-        self._beat.data = (self._beat.data + 1) % 2**64
-        if self._heartbeats.get_subscription_count():
-            self._heartbeats.publish(self._beat)
-        lasting = round(self._options["command_timeout"] * 1e9)
-        if self.answered and lasting and self._validities.get_subscription_count():
-            self._validity.header.stamp = stamp_of(self.answered)
-            self._validity.time_ref = stamp_of(min(self.answered + lasting, LAST_STAMP))
-            self._validities.publish(self._validity)
+    def stops(self, now: float) -> bool:
+        """Return whether an active node refuses commands: by a guard, without readings, or recently."""
+        return self.standing_problem() is not None or self.refusals.recent(now) or self.track.waits(now)
 
-    def _show(self) -> None:
-        """Publish the machine as markers and as the joints of its URDF, where somebody subscribes; before the first
-        command its struts have no corrections."""
-        if not self._node.active:
-            return
-        now, pose = self._node.get_clock().now().to_msg(), self._compensator.platform_estimate
-        geometry = self._compensator.geometry
-        if self._markers.get_subscription_count():
-            correction = np.zeros(6) if np.isnan(self._compensator.nominal).any() else self._compensator.correction
-            self._markers.publish(machine_markers(geometry, *pose, correction, self._frame, now))
-        if self._joints is not None and self._joints.get_subscription_count():
-            positions = joint_positions(geometry, Pose(*pose), self._names)
-            message = JointState(name=list(positions), position=list(positions.values()))
-            message.header.stamp = now
-            self._joints.publish(message)
+    def fed(self, now: float) -> bool:
+        return self.feedback.age(now) <= float(self.options["feedback_timeout"])
 
+    def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
+        compensator, guard, fed = self.compensator, self.standing_problem(), self.fed(now)
+        if guard is not None:
+            yield ERROR, f"refusing commands: {guard.reason}: {guard.problem}"
+        if reasons := self.refusals.reasons(now, guard.reason if guard is not None else ""):
+            yield ERROR, f"refusing commands: {reasons}"
+        disputed = [(topic, sender) for topic, sender in self.sensing.items() if sender.problem]
+        senders = (self.measuring, *(sender for _, sender in disputed))
+        said = next((sender.reason for sender in senders if sender.problem), "")
+        if reasons := self.bad_feedback.reasons(now, said):
+            yield ERROR, f"bad feedback: {reasons}"
+        for topic, sender in disputed:
+            yield ERROR, f"{topic} ignored: {sender.reason}: {sender.problem}"
+        if reasons := self.bad_poses.reasons(now):
+            yield WARN, f"measured poses rejected: {reasons}"
+        if self.failed_reloads.recent(now):
+            yield WARN, "the old model stays"
+        if self.refused_resets.recent(now):
+            yield WARN, "reset refused while the machine moves"
+        if self.refused_tools.recent(now):
+            yield WARN, f"tool refused: {self.refused_tools.last_text}"
+        silent = bool(self.commands.count) and 0.0 < self.options["command_timeout"] < self.commands.age(now)
+        if silent:
+            yield WARN, "no new command"
+        if self.feedback.count and not fed:
+            yield WARN, "feedback lost, pose estimated from own commands"
+        if stale := self.stale(now):
+            yield WARN, f"temperatures stale: {stale}"
+        if HUMIDITY in self.thermometers.stale(now):
+            yield WARN, "humidity stale"
+        if stale := self.loads.stale(now):
+            yield WARN, f"{stale} stale"
+        if self.source.missing(now) and not silent:
+            yield WARN, "running, commands are being missed"
+        if self.behind.holds(now):
+            yield WARN, "running, catching up with commands that came late"
+        fusion = self.instrument.fusion if self.instrument is not None else None
+        held = fusion.held if fusion is not None else ""
+        for problem in filter(None, (self.prediction_problem, self.drift_problem, held)):
+            yield WARN, problem
+        if fusion is not None and 0.0 < self.options["fusion.timeout"] < now - fusion.last:
+            yield WARN, "no measured pose counts" if fusion.count else "waiting for the first measured pose"
+        if self.track.waits(now):
+            yield WARN, "waiting for strut_states: where the struts stand is not known"
+        if not self.commands.count:
+            yield OK, "waiting for the first command"
+        if compensator.condition > NEAR_SINGULAR * compensator.geometry.limits.condition:
+            yield WARN, "running, near a singularity"
+        if compensator.outside_box:
+            yield WARN, "running, outside the box in which the model was measured"
+        yield from ((WARN, text) for text in self.loads.findings())
+        if beyond := compensator.outside_load:
+            yield WARN, f"running, under another load than the model was measured with: {beyond}"
+        if compensator.ramping:
+            yield OK, "running, a change is ramping in"
+        yield OK, "running" if fed else "running, pose estimated from own commands"
 
-class JournalTopics:
-    """``~/journal`` and ``~/files``, which make a recording of a run replayable: the pages of
-    :mod:`hexapod_comp.compensation.journal`, and geometry and model in use, unchanged.
+    def values(self, now: float) -> dict[str, str]:
+        compensator, guard, fed = self.compensator, self.standing_problem(), self.fed(now)
+        model, temperatures, region = compensator.model, compensator.temperatures, compensator.model.measured
+        reason = guard.reason if guard is not None else self.refusals.last_reason
+        set_back = self.command_stamps.sender_set_back + self.reading_stamps.sender_set_back
+        largest = 0.0 if self.fresh_start else float(np.abs(compensator.correction).max())
+        values = {
+            "model": model.name,
+            "tool": compensator.geometry.tool_name,
+            "frame_id": self.frame_id,
+            "datum": str(model.origin.datum or "not known"),
+            "compensation": "on" if compensator.enabled else "off",
+            "ramping": str(compensator.ramping).lower(),
+            "pose_estimated_from": "strut_states" if fed else "own commands",
+            "commanded_by": ", ".join(self.source.names),
+            "measured_by": ", ".join(self.measuring.names),
+            "stale_temperatures": self.stale(now),
+            "commands": str(self.commands.count),
+            "commands_missed": str(self.source.missed),
+            "commands_waited": str(self.waited),
+            "commands_dropped": str(self.dropped),
+            "command_rate_hz": f"{self.commands.rate(now):.1f}",
+            "command_age_s": seconds(self.commands.age(now)),
+            "feedback_rate_hz": f"{self.feedback.rate(now):.1f}",
+            "feedback_age_s": seconds(self.feedback.age(now)),
+            "clock_set_back": str(self.clock.set_back),
+            "clock_set_forward": str(self.clock.set_forward),
+            "senders_clock_set_back": str(set_back),
+            "largest_correction_m": f"{largest:.9f}",
+            "condition_number": f"{compensator.condition:.3f}",
+            "outside_field": str(compensator.outside_field).lower(),
+            "outside_box": str(compensator.outside_box).lower(),
+            "measured_box": "not known" if region is None else region.text(compensator.geometry),
+            "last_refusal": self.refusals.last_text,
+            "what_to_do": ADVICE.get(reason, OTHERWISE) if reason else "",
+            "last_answered": f"{self.last_answered // 10**9}.{self.last_answered % 10**9:09d}",
+            "last_bad_feedback": self.bad_feedback.last_text,
+            "bad_feedback": str(self.bad_feedback.total),
+            "failed_reloads": str(self.failed_reloads.total),
+            "last_failed_reload": self.failed_reloads.last_text,
+            "refused_resets": str(self.refused_resets.total),
+            "refused_tools": str(self.refused_tools.total),
+        }
+        values |= {f"{topic}_by": ", ".join(sender.names) for topic, sender in self.sensing.items()}
+        known = dict(temperatures.values)
+        if (humidity := known.pop(HUMIDITY, None)) is not None:
+            values["humidity_percent"] = f"{100.0 * humidity:.1f}"
+        elif model.struts.moisture.any():
+            values["humidity_percent"] = f"not known, taken as {100.0 * REFERENCE_HUMIDITY:g}"
+        values |= {f"temperature.{name}_degC": f"{value:.2f}" for name, value in known.items()}
+        values |= self.loads.values()
+        if self.instrument is not None:
+            values |= self.instrument.values(now)
+        if (unknown := temperatures.unknown_for(model.late_growth, now)) > 0.0:
+            values["late_parts"] = f"not known for another {unknown:.0f} s: the readings began too short ago"
+        return {**values, **self.refusals.values()}
 
-    Both are reliable and kept for late subscribers, so that a recorder that starts during a motion gets what it needs.
-    Nothing is published while a command is handled: events are stored, and published with :meth:`tick`.
-    """
-
-    def __init__(
-        self, node: MachineNode, compensator: Compensator, sources: dict[str, Source], frame_ids: dict[str, str]
-    ) -> None:
-        self._sources, self._published = sources, dict[str, Source]()
-        self._pages: Publisher = node.create_publisher(String, "~/journal", JOURNAL_QOS)
-        self._files: Publisher = node.create_publisher(String, "~/files", JOURNAL_QOS)
-        self._journal = Journal(compensator, sources, frame_ids, node.get_parameter("joint_names").value)
-        self.answered, self.refused = self._journal.answered, self._journal.refused
-        self.tick(time.monotonic())  # so that no command comes before the first page
-
-    def tick(self, now: float) -> None:
-        """Publish what is due: new files, then a page."""
-        if not self._journal.due(now):
-            return
-        if self._sources != self._published:
-            self._files.publish(String(data=sources_text(self._sources)))
-            self._published = dict(self._sources)
-        self._pages.publish(String(data=self._journal.page(now)))
-
-    def finish(self, now: float) -> None:
-        """Publish a last page, with the answers since the previous one, and wait for its arrival."""
-        self._pages.publish(String(data=self._journal.page(now)))
-        self._pages.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
-
-
-# ---- markers ----
-
-STRUT_DIAMETER = 0.02
-JOINT_DIAMETER = 0.035
-LIFETIME = Duration(sec=1)  # Lifetime of markers: a machine that is not updated disappears instead of seeming alive
-
-GREY = ColorRGBA(r=0.5, g=0.5, b=0.55, a=1.0)
-STEEL = ColorRGBA(r=0.3, g=0.35, b=0.45, a=0.9)
-
-
-def machine_markers(
-    geometry: HexapodGeometry,
-    position: np.ndarray,
-    rotation: np.ndarray,
-    correction: np.ndarray,
-    frame_id: str,
-    stamp: Time,
-) -> MarkerArray:
-    """Return the machine at a platform pose."""
-    base = geometry.base_joints
-    platform = position + geometry.platform_joints @ rotation.T
-    tip = position + rotation @ geometry.tool.position + 0.1 * rotation[:, 2]
-    markers: list[Marker] = []
-    for kind, size, colour, points in (
-        (Marker.LINE_LIST, STRUT_DIAMETER, None, [end for ends in zip(base, platform, strict=True) for end in ends]),
-        (Marker.SPHERE_LIST, JOINT_DIAMETER, GREY, (*base, *platform)),
-        (Marker.LINE_STRIP, STRUT_DIAMETER, STEEL, (*platform, platform[0])),
-        (Marker.LINE_STRIP, STRUT_DIAMETER, GREY, (*base, base[0])),
-        (Marker.ARROW, STRUT_DIAMETER, STEEL, (position, tip)),
-    ):
-        marker = Marker(ns="hexapod", id=len(markers), type=kind, action=Marker.ADD, lifetime=LIFETIME)
-        marker.header.frame_id, marker.header.stamp = frame_id, stamp
-        marker.pose.orientation.w = 1.0
-        marker.scale.x = marker.scale.y = marker.scale.z = size
-        marker.points = [Point(x=x, y=y, z=z) for x, y, z in np.array(points).tolist()]
-        if colour is not None:
-            marker.color = colour
-        else:  # the struts, each in its own colour
-            marker.color.a = 1.0
-            marker.colors = [correction_colour(amount) for amount in correction for _ in range(2)]
-        markers.append(marker)
-    return MarkerArray(markers=markers)
-
-
-def correction_colour(correction: float) -> ColorRGBA:
-    """Return blue for −100 µm, white for 0, red for +100 µm and beyond."""
-    share = max(-1.0, min(1.0, correction / 100e-6))
-    rest = 1.0 - abs(share)
-    return ColorRGBA(r=1.0 if share > 0 else rest, g=rest, b=1.0 if share < 0 else rest, a=1.0)
+    def stale(self, now: float) -> str:
+        return ", ".join(name for name in self.thermometers.stale(now) if name != HUMIDITY)

@@ -31,14 +31,23 @@ from ..machine.geometry import BASE, TOOL, HexapodGeometry
 from ..machine.path import Motion
 from ..machine.trajectory import Path
 from ..pose import Pose, rotation_angle
-from .base import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, LATCHED_QOS, NEWEST_QOS, MachineNode
+from .base import (
+    ACKNOWLEDGED_WITHIN,
+    COMMAND_QOS,
+    ERROR,
+    EVENT_QOS,
+    LATCHED_QOS,
+    NEWEST_QOS,
+    OK,
+    WARN,
+    MachineNode,
+    status_prefix,
+)
 from .interface import frame_ids
 from .messages import message_pose, nanoseconds_of, pose_message, stamp_of
 from .parameters import Program, read_table
 from .process import run
-from .rclpy_compat import callers
-from .status import ERROR, OK, WARN, status_of, status_prefix
-from .worker import Job, Worker
+from .worker import Worker
 
 ANSWERED_WITHIN = 0.4  # A command that the compensator has not answered after this time was refused, s
 IN_FLIGHT = 0.15  # While a command has waited this long for its answer, the path waits too, s
@@ -188,7 +197,7 @@ class MoverNode(MachineNode):
         self.subscribe(String, f"{name}/files", self._on_files, LATCHED_QOS)
         self.subscribe(String, f"{name}/tool", self._on_tool, LATCHED_QOS)
         self.subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
-        self._stop_service = self.create_service(Trigger, "~/stop", self._on_stop)
+        self.create_logged_service(Trigger, "~/stop", self._on_stop)
         self.at_rate("rate", self._tick)
         self._state_due = 0.0
         self._change(IDLE, "no move yet")
@@ -346,17 +355,14 @@ class MoverNode(MachineNode):
             "rate": self._options["rate"],
             "share": self._options["limit_share"],
         }
-        machine = {**self._sources, "folder": None}
         number = self._moves
         self._change(PLANNING, "planning")
         self._worker.ask(
-            Job(
-                "plan_move",
-                arguments,
-                lambda motions: self._begin(number, start, motions),
-                lambda error: self._cannot(number, error),
-                machine,
-            )
+            "plan_move",
+            arguments,
+            lambda motions: self._begin(number, start, motions),
+            lambda error: self._cannot(number, error),
+            {**self._sources, "folder": None},
         )
 
     def _cannot(self, number: int, error: HexapodError) -> None:
@@ -409,7 +415,6 @@ class MoverNode(MachineNode):
         self._path_is_motion = False
 
     def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self.note("stop", f"stop: asked for by {callers(self, self._stop_service)}")
         self._pending = None
         response.success = True
         if self._motion is not None:
@@ -498,8 +503,7 @@ class MoverNode(MachineNode):
             "refusal": self._refusal,
         }
         level = ERROR if self._state == STOPPED and self._by not in ("person",) else OK
-        name = f"{self.get_fully_qualified_name()[1:]}: move"
-        self._states.publish(status_of(name, self.hardware_id, level, f"{self._state}: {self._text}", values))
+        self._states.publish(self.report("move", level, f"{self._state}: {self._text}", values))
         self._state_due = time.monotonic() + (STATE_PERIOD if self._state == MOVING else STANDING_PERIOD)
 
     def update(self, now: float) -> None:

@@ -1,6 +1,4 @@
-"""Requests to a compensator beside commands: reset, switch, another model or tool, travel, predicted error. Possible
-callers are logged: after an accident, the first question is who reset the machine.
-"""
+"""Requests to a compensator beside commands: reset, switch, another model or tool, travel, predicted error."""
 
 from __future__ import annotations
 
@@ -17,29 +15,23 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from ..compensation.compensator import Compensator
 from ..compensation.guards import Sample
 from ..compensation.journal import IDEAL_SOURCE
 from ..errors import CommandError, HexapodError
 from ..machine.geometry import WORK, pose_text
-from ..machine.load import Loading
 from ..machine.model import MachineModel
-from ..machine.temperatures import Temperatures
 from ..pose import Pose
-from .base import EVENT_QOS, LATCHED_QOS, MachineNode
-from .interface import MachineFiles
+from .base import ERROR, EVENT_QOS, LATCHED_QOS, OK
+from .interface import CompensatorState
 from .messages import read_message, stamp_of
-from .rclpy_compat import LateAnswer, callers
-from .status import ERROR, OK, CompensatorStatus, status_of
-from .worker import Job, Worker, WorkerError
+from .rclpy_compat import LateAnswer
+from .worker import Worker, WorkerError
 
 # Reading a model file is abandoned after this time, s; the shipped ones take one second, nearly all of it imports
 LOADED_WITHIN = 30.0
 
 PREDICTION_PERIOD = 0.2  # Period at which a predicted error is requested and published, s
-
-# A failed prediction is repeated after this time, s: at first, and at most, as the wait doubles
-TRY_AGAIN_AFTER = (2.0, 60.0)
+TRY_AGAIN_AFTER = 10.0  # A failed prediction is repeated after this time, s
 
 TRAVEL_PERIOD = 1.0  # Between two messages of ``~/travel``, s
 LONGEST_REASON = 200  # Longest text of the limits that end the travel, characters
@@ -48,18 +40,16 @@ LONGEST_REASON = 200  # Longest text of the limits that end the travel, characte
 class Requests:
     """Services and topics for requests to a configured compensator."""
 
-    def __init__(
-        self, node: MachineNode, status: CompensatorStatus, files: MachineFiles, forget: Callable[[], None]
-    ) -> None:
-        self._node, self._status, self._files, self._forget = node, status, files, forget
+    def __init__(self, node: CompensatorState, forget: Callable[[], None]) -> None:
+        self._node, self._forget = node, forget
         self._worker = Worker()
-        self._enable = node.create_service(SetBool, "~/enable_compensation", self._on_enable)
-        self._reset = node.create_service(Trigger, "~/reset", self._on_reset)
-        self._reload = LateAnswer(node.create_service(Trigger, "~/reload_model", self._on_reload))
+        node.create_logged_service(SetBool, "~/enable_compensation", self._on_enable)
+        node.create_logged_service(Trigger, "~/reset", self._on_reset)
+        self._reload = LateAnswer(node.create_logged_service(Trigger, "~/reload_model", self._on_reload))
         self._loading = False
-        self._tools = ToolChoice(node, status)
-        self._travel = TravelReports(node, status, files, self._worker)
-        self._predicted = PredictedError(node, status, files, self._worker)
+        self._tools = ToolChoice(node)
+        self._travel = TravelReports(node, self._worker)
+        self._predicted = PredictedError(node, self._worker)
 
     def update(self, now: float) -> None:
         self._worker.poll(now)
@@ -72,57 +62,48 @@ class Requests:
         for part in (self._tools, self._travel, self._worker):
             part.close()
 
-    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self._status.compensator.enable(request.data)
-        response.success = True
-        response.message = f"compensation ramps {'in' if request.data else 'out'}"
-        self._node.note("enable", f"{response.message}: asked for by {callers(self._node, self._enable)}")
-        return response
+    def _on_enable(self, request: SetBool.Request, _: SetBool.Response) -> SetBool.Response:
+        self._node.compensator.enable(request.data)
+        return SetBool.Response(success=True, message=f"compensation ramps {'in' if request.data else 'out'}")
 
-    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_reset(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response:
         """Forget the last command and a following error, if the machine stands."""
-        who, now = callers(self._node, self._reset), time.monotonic()
-        if moving := self._status.track.moving(now):
-            response.message = f"refused while the machine moves: {moving}"
-            self._status.refused_resets.add("moving", response.message, now)
-            self._node.log_warning("reset", f"reset {response.message}; asked for by {who}")
-            return response
+        node, now = self._node, time.monotonic()
+        if moving := node.track.moving(now):
+            refusal = f"refused while the machine moves: {moving}"
+            node.refused_resets.add("moving", refusal, now)
+            node.log_warning("reset", f"reset {refusal}")
+            return Trigger.Response(message=refusal)
         self._forget()
-        self._status.track.release()
-        response.success = True
-        response.message = "the next command may be one allowed step from where the struts were known to be last"
-        self._node.note("reset", f"reset: asked for by {who}")
-        return response
+        node.track.release()
+        known = "the next command may be one allowed step from where the struts were known to be last"
+        return Trigger.Response(success=True, message=known)
 
     # ---- the model ----
 
     def _on_reload(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response | None:
-        self._node.note("reload", f"reload: asked for by {callers(self._node, self._reload.service)}")
         if self._loading:
             return Trigger.Response(message="the model is being loaded already")
-        self._loading, machine = True, self._status.compensator.geometry.name
-        if self._files.ideal:
+        self._loading, machine, files = True, self._node.compensator.geometry.name, self._node.files
+        if files.ideal:
             return self._use_model((MachineModel(machine), IDEAL_SOURCE))
-        name, place, folder = self._files.model_place()
-        late = f"{name}: could not be read within {LOADED_WITHIN:g} s; is the disk or the network behind it there?"
+        name, place, folder = files.model_place()
         self._worker.ask(
-            Job(
-                "load_model",
-                {"name": name, "place": place, "folder": folder, "machine": machine},
-                lambda found: self._reload.answer(self._use_model(found)),
-                lambda error: self._reload.answer(self._keep_model(error)),
-                within=LOADED_WITHIN,
-                late=late,
-            )
+            "load_model",
+            {"name": name, "place": place, "folder": folder, "machine": machine},
+            lambda found: self._reload.answer(self._use_model(found)),
+            lambda error: self._reload.answer(self._keep_model(error)),
+            within=LOADED_WITHIN,
+            late=f"{name}: could not be read within {LOADED_WITHIN:g} s; is the disk or the network behind it there?",
         )
         return None
 
     def _use_model(self, found: tuple[MachineModel, Any]) -> Trigger.Response:
-        self._loading, sources = False, self._files.sources
+        self._loading, sources = False, self._node.files.sources
         before = sources["model"]
         model, sources["model"] = found  # the source first: the journal records it with the change
         try:
-            self._status.compensator.set_model(model)
+            self._node.compensator.set_model(model)
         except HexapodError as error:
             sources["model"] = before
             return self._keep_model(error)
@@ -130,7 +111,7 @@ class Requests:
 
     def _keep_model(self, error: HexapodError) -> Trigger.Response:
         self._loading = False
-        self._status.failed_reloads.add(error.reason, str(error), time.monotonic())
+        self._node.failed_reloads.add(error.reason, str(error), time.monotonic())
         self._node.get_logger().warning(f"the old model stays: {error}")
         return Trigger.Response(message=f"the old model stays: {error}")
 
@@ -142,11 +123,11 @@ class ToolChoice:
     while the machine stands.
     """
 
-    def __init__(self, node: MachineNode, status: CompensatorStatus) -> None:
-        self._node, self._compensator, self._status = node, status.compensator, status
-        several = bool(status.options["allow_several_publishers"])
+    def __init__(self, node: CompensatorState) -> None:
+        self._node, self._compensator = node, node.compensator
+        several = bool(node.options["allow_several_publishers"])
         self._sender = node.subscribe_exclusive(String, "select_tool", self._on_message, several)
-        status.sensing["select_tool"] = self._sender
+        node.sensing["select_tool"] = self._sender
         self._publisher = node.create_publisher(String, "~/tool", LATCHED_QOS)
         node.add_on_set_parameters_callback(self._judge)
         node.add_post_set_parameters_callback(self._use)
@@ -164,7 +145,7 @@ class ToolChoice:
                 if not isinstance(name, str):
                     raise CommandError("tool", f"must be str, not {name!r}")
                 geometry.using(tool=name)
-                moving = self._status.track.moving(time.monotonic())
+                moving = self._node.track.moving(time.monotonic())
                 if moving and name != geometry.tool_name:
                     raise CommandError("tool", f"stays {geometry.tool_name!r} while the machine moves: {moving}")
         except HexapodError as error:
@@ -182,35 +163,37 @@ class ToolChoice:
         """Set the parameter. If the commander's choice is refused, its next command must be at the struts' present
         position: commands for the tool that it did not get may follow. A refused choice by another node stops
         nothing."""
-        now, status = sample.now, self._status
-        status.update(now)  # a new publisher may have sent already, and the commander's name may be outdated
+        node, now = self._node, sample.now
+        node.update_publishers()  # a new publisher may have sent already, and the commander's name may be outdated
         try:
             self._sender.check(sample)
             name = read_message(data, String).data
-            result = self._node.set_parameters([Parameter("tool", value=name)])[0]
+            result = node.set_parameters([Parameter("tool", value=name)])[0]
             if not result.successful:
-                if set(self._sender.names) <= set(status.source.names) and not status.track.moving(now):
+                if set(self._sender.names) <= set(node.source.names) and not node.track.moving(now):
                     self._compensator.set_tool(self._compensator.geometry.tool_name)
                 raise CommandError("tool", result.reason)
         except CommandError as error:
-            status.refused_tools.add(error.reason, str(error), now)
-            self._node.log_warning("tool", f"select_tool refused: {error}")
+            node.refused_tools.add(error.reason, str(error), now)
+            node.log_warning("tool", f"select_tool refused: {error}")
 
     def _publish(self) -> None:
         self._publisher.publish(String(data=self._compensator.geometry.tool_name))
 
 
-def situation(compensator: Compensator) -> tuple[str, Temperatures, Loading, dict[str, float]]:
+def situation(node: CompensatorState) -> dict[str, Any]:
     """Return what the worker's process needs beside geometry and model: tool, temperatures, load, outside numbers."""
-    return compensator.geometry.tool_name, compensator.temperatures, compensator.loading, dict(compensator.outside)
+    compensator = node.compensator
+    present = compensator.geometry.tool_name, compensator.temperatures, compensator.loading, dict(compensator.outside)
+    return {"now": present}
 
 
 class TravelReports:
     """``~/travel``, once a second while there are subscribers, and ``~/get_travel``: the tool's travel from the last
     commanded pose, or before the first command from the last measured one."""
 
-    def __init__(self, node: MachineNode, status: CompensatorStatus, files: MachineFiles, worker: Worker) -> None:
-        self._node, self._status, self._files, self._worker = node, status, files, worker
+    def __init__(self, node: CompensatorState, worker: Worker) -> None:
+        self._node, self._worker = node, worker
         self._publisher = node.create_publisher(DiagnosticStatus, "~/travel", EVENT_QOS)
         self._late = LateAnswer(node.create_service(Trigger, "~/get_travel", self._on_request))
         self._busy = self._asked = False
@@ -236,36 +219,32 @@ class TravelReports:
         return None
 
     def _begin(self) -> None:
-        compensator, status = self._status.compensator, self._status
-        names = {frame_id: name for name, frame_id in status.frame_ids.items()}
-        work = names.get(status.frame_id, WORK)  # before the first command the usual one
+        node, compensator = self._node, self._node.compensator
+        names = {frame_id: name for name, frame_id in node.ids.items()}
+        work = names.get(node.frame_id, WORK)  # before the first command the usual one
         if np.isfinite(compensator.nominal).all():
             platform = compensator.platform
-        elif status.feedback.count:
+        elif node.feedback.count:
             platform = Pose(*compensator.platform_estimate)
         else:
             raise CommandError("no_feedback", "no command and no strut_states yet: where the machine is is not known")
         geometry = compensator.geometry.using(work=work)
         pose = geometry.tool_pose(platform)
-        where = f"tool {geometry.tool_name} in {status.frame_ids[work]} at {pose_text(pose)}"
-        asked = {"pose": pose, "work": work, "enabled": compensator.enabled, "now": situation(compensator)}
+        where = f"tool {geometry.tool_name} in {node.ids[work]} at {pose_text(pose)}"
         self._busy = True
         self._worker.ask(
-            Job(
-                "travel",
-                asked,
-                lambda found: self._report(OK, where, *found),
-                lambda error: self._report(ERROR, f"{where}: {error}"),
-                self._files.made_of(),
-            )
+            "travel",
+            {"pose": pose, "work": work, "enabled": compensator.enabled, **situation(node)},
+            lambda found: self._report(OK, where, *found),
+            lambda error: self._report(ERROR, f"{where}: {error}"),
+            node.files.made_of(),
         )
 
     def _report(self, level: bytes, text: str, table: str = "", values: dict[str, str] | None = None) -> None:
         self._busy = self._asked = False
         self._late.answer(Trigger.Response(success=level == OK, message="\n".join(filter(None, (text, table)))))
         if self._publisher.get_subscription_count():
-            name = f"{self._node.get_fully_qualified_name()[1:]}: travel"
-            self._publisher.publish(status_of(name, self._node.hardware_id, level, text, values or {}, LONGEST_REASON))
+            self._publisher.publish(self._node.report("travel", level, text, values or {}, LONGEST_REASON))
 
 
 class PredictedError:
@@ -273,45 +252,38 @@ class PredictedError:
     compensation at the newest command, with its covariance. Computed while there are subscribers.
     """
 
-    def __init__(self, node: MachineNode, status: CompensatorStatus, files: MachineFiles, worker: Worker) -> None:
-        self._node, self._status, self._files, self._worker = node, status, files, worker
+    def __init__(self, node: CompensatorState, worker: Worker) -> None:
+        self._node, self._worker = node, worker
         self._topics = {
             "standing": node.create_publisher(PoseWithCovarianceStamped, "~/predicted_error", EVENT_QOS),
             "aligned": node.create_publisher(PoseWithCovarianceStamped, "~/predicted_error_aligned", EVENT_QOS),
         }
         self._busy, self._asked_for, self._due = False, 0, 0.0
         self._source: Any = None
-        self._wait = TRY_AGAIN_AFTER[0]
 
     def update(self, now: float) -> None:
         """Request the newest pose's prediction, while there are subscribers."""
-        compensator, source = self._status.compensator, self._files.sources["model"]
+        node, compensator, source = self._node, self._node.compensator, self._node.files.sources["model"]
         wanted = any(publisher.get_subscription_count() for publisher in self._topics.values())
         if not wanted or self._source is not source:
-            self._source, self._status.prediction_problem = source, ""
-            self._wait, self._due = TRY_AGAIN_AFTER[0], min(self._due, now)
+            self._source, node.prediction_problem, self._due = source, "", min(self._due, now)
         if not wanted or self._busy or now < self._due or not np.isfinite(compensator.nominal).all():
             return
-        self._busy, self._asked_for, self._due = True, self._status.last_answered, now + PREDICTION_PERIOD
-        asked = {
-            "platform": compensator.platform,
-            "sense": compensator.motion.sense.copy(),
-            "now": situation(compensator),
-        }
-        self._worker.ask(Job("predict", asked, self._publish, self._failed, self._files.made_of()))
+        self._busy, self._asked_for, self._due = True, node.last_answered, now + PREDICTION_PERIOD
+        asked = {"platform": compensator.platform, "sense": compensator.motion.sense.copy(), **situation(node)}
+        self._worker.ask("predict", asked, self._publish, self._failed, node.files.made_of())
 
     def _publish(self, result: dict[str, Any]) -> None:
         """Publish both errors; there is none for a pose that the real machine cannot reach."""
-        self._busy, self._wait, self._status.prediction_problem = False, TRY_AGAIN_AFTER[0], ""
+        self._busy, self._node.prediction_problem = False, ""
         for name, publisher in self._topics.items():
             if (error := result[name]) is not None and np.isfinite(error[0]).all():
-                publisher.publish(error_message(error[0], error[1], self._status.frame_ids[WORK], self._asked_for))
+                publisher.publish(error_message(error[0], error[1], self._node.ids[WORK], self._asked_for))
 
     def _failed(self, error: WorkerError) -> None:
-        self._busy, self._due = False, time.monotonic() + self._wait
-        self._status.prediction_problem = f"no predicted error: {error}"
-        self._node.log_warning("predicted error", f"{self._status.prediction_problem}; tried again in {self._wait:g} s")
-        self._wait = min(2.0 * self._wait, TRY_AGAIN_AFTER[1])
+        self._busy, self._due = False, time.monotonic() + TRY_AGAIN_AFTER
+        problem = self._node.prediction_problem = f"no predicted error: {error}"
+        self._node.log_warning("predicted error", f"{problem}; tried again in {TRY_AGAIN_AFTER:g} s")
 
 
 def error_message(

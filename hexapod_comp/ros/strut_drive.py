@@ -27,11 +27,10 @@ from ..machine.load import Payload
 from ..machine.model import RealMachine
 from ..virtual.machine import DriveParameters, Faults, StrutDrive
 from ..virtual.named import RANDOM, find_model, is_word
-from .base import STATE_QOS, MachineNode
+from .base import ERROR, OK, STATE_QOS, WARN, Flow, MachineNode, Refusals, seconds
 from .messages import StrutBytes, StrutReader, stamp_of, write_pose
 from .parameters import Program, read_table
 from .process import run
-from .status import ERROR, OK, WARN, Flow, Refusals, seconds
 
 LONGEST_PAUSE = 0.25  # After a longer pause (a stopped process), the machine has moved on by no more than this, s
 

@@ -17,7 +17,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any
@@ -39,23 +38,12 @@ class WorkerError(HexapodError):
     reason = "bad_file"
 
 
-@dataclass
-class Job:
-    task: str  # load_model, predict, travel or plan_move
-    arguments: dict[str, Any]
-    done: Callable[[Any], None]  # called with the result, from Worker.poll
-    failed: Callable[[WorkerError], None]
-    machine: dict[str, Any] | None = None  # machine and model, as for Machine
-    within: float | None = None  # longest time, s; then the process is killed
-    late: str = ""  # the error's text then
-
-
 class Worker:
     """The node's side: a thread sends one job at a time to the process; `poll` calls back with the results."""
 
     def __init__(self) -> None:
         self._process, self._thread = _Process(), ThreadPoolExecutor(1, "worker")
-        self._jobs: deque[tuple[Job, Future[Any]]] = deque()
+        self._jobs: deque[tuple[Future[Any], Callable[[Any], None], Callable[[WorkerError], None]]] = deque()
         self._done_at = 0.0
 
     @property
@@ -63,19 +51,31 @@ class Worker:
         """The process; None before it was started, and after it was ended."""
         return self._process.popen
 
-    def ask(self, job: Job) -> None:
-        self._jobs.append((job, self._thread.submit(self._process.do, job)))
+    def ask(
+        self,
+        task: str,
+        arguments: dict[str, Any],
+        done: Callable[[Any], None],
+        failed: Callable[[WorkerError], None],
+        machine: dict[str, Any] | None = None,
+        within: float | None = None,
+        late: str = "",
+    ) -> None:
+        """Have a task (load_model, predict, travel, plan_move) done for machine and model; `poll` passes its result to
+        `done`. After `within`, s, the process is killed, and the error is `late`."""
+        job = self._thread.submit(self._process.do, task, arguments, machine, within, late)
+        self._jobs.append((job, done, failed))
 
     def poll(self, now: float) -> None:
         """Call back with a result; end a process that is idle for IDLE_AFTER."""
-        if self._jobs and self._jobs[0][1].done():
-            job, future = self._jobs.popleft()
+        if self._jobs and self._jobs[0][0].done():
+            job, done, failed = self._jobs.popleft()
             self._done_at = time.monotonic()
-            error = future.exception()
+            error = job.exception()
             if error is None:
-                job.done(future.result())
+                done(job.result())
             else:
-                job.failed(error if isinstance(error, WorkerError) else WorkerError(str(error)))
+                failed(error if isinstance(error, WorkerError) else WorkerError(str(error)))
         elif not self._jobs and self.process is not None and now - self._done_at > IDLE_AFTER:
             self._process.end()
 
@@ -94,14 +94,16 @@ class _Process:
         self._connection: Connection | None = None
         self._machine: dict[str, Any] | None = None  # known to the process already
 
-    def do(self, job: Job) -> Any:
-        """Return the result of a job, or raise a WorkerError."""
+    def do(
+        self, task: str, arguments: dict[str, Any], machine: dict[str, Any] | None, within: float | None, late: str
+    ) -> Any:
+        """Return the result of a task, or raise a WorkerError."""
         if self.popen is None or self.popen.poll() is not None:  # it may have been killed while it was idle
             self._machine = None
-        machine = None if job.machine == self._machine else job.machine
-        self._machine = job.machine or self._machine
+        news = None if machine == self._machine else machine
+        self._machine = machine or self._machine
         try:
-            answer = self.exchange((job.task, machine, job.arguments), job.within)
+            answer = self.exchange((task, news, arguments), within)
         except (EOFError, ConnectionError):
             answer = "the process beside the node ended", None
         except OSError as error:
@@ -109,7 +111,7 @@ class _Process:
         if answer is None or answer[0]:
             if answer is None or self.popen is None or self.popen.poll() is not None:
                 self.end()
-            raise WorkerError(job.late if answer is None else answer[0])
+            raise WorkerError(late if answer is None else answer[0])
         return answer[1]
 
     def exchange(self, request: tuple[Any, ...], within: float | None) -> tuple[str, Any] | None:

@@ -35,11 +35,10 @@ from ..formats.paths import config_file
 from ..machine.geometry import STRUT_NAMES, load_geometry
 from ..machine.model_file import save_model
 from ..pose import Pose
-from ..ros.base import profile
+from ..ros.base import profile, status_prefix
 from ..ros.compensator import CompensatorNode
 from ..ros.messages import message_pose, pose_message
 from ..ros.process import autostart
-from ..ros.status import status_prefix
 from ..ros.strut_drive import StrutDriveNode
 from ..virtual.named import find_model, is_random
 

@@ -8,7 +8,7 @@ import logging
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from http import HTTPStatus
@@ -27,11 +27,10 @@ from ..formats.pages import render
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import solve_pose
 from ..pose import Pose, rotation_angle
-from ..ros.base import EVENT_QOS, NEWEST_QOS, profile
-from ..ros.interface import correction_colour
+from ..ros.base import ERROR, EVENT_QOS, NEWEST_QOS, OK, WARN, profile, status_prefix
 from ..ros.messages import StrutReader, message_pose, nanoseconds_of, read_message
+from ..ros.outputs import correction_colour
 from ..ros.process import QUIET, SPIN_PERIOD, RosSession
-from ..ros.status import ERROR, OK, WARN, status_prefix
 
 # Best effort, so that nobody waits for a slow witness; deep enough that the latencies are those of all commands
 STREAM_QOS = profile(100, reliable=False)
@@ -55,24 +54,15 @@ class WatchedError:
 
 
 @dataclass(frozen=True)
-class Latency:
-    """Times from a command's stamp to the arrival of its strut command here, s; `count` of them."""
-
-    median: float
-    largest: float
-    count: int
-
-
-@dataclass(frozen=True)
 class View:
     platform: Pose | None = None  # ``pose_platform_in_base`` by ``tool_pose_estimate``
     commanded: Pose | None = None
-    corrections: np.ndarray | None = None  # shape (6,): Strut corrections and measured struts, m
-    measured: np.ndarray | None = None  # shape (6,): Strut corrections and measured struts, m
+    corrections: np.ndarray | None = None  # of the struts, shape (6,), m
+    measured: np.ndarray | None = None  # struts, shape (6,), m
     predicted: WatchedError | None = None
     left: WatchedError | None = None
     seen: WatchedError | None = None
-    latency: Latency | None = None  # of the last seconds' commands
+    delays: Sequence[float] = ()  # from the last seconds' commands' stamps to the arrival of the strut commands here, s
     states: dict[str, DiagnosticStatus] = field(default_factory=dict)
 
 
@@ -109,7 +99,6 @@ class Watcher:
         status, _ = self._states.get("compensator", (DiagnosticStatus(), 0.0))
         named = next((entry.value for entry in status.values if entry.key == "tool"), "")
         in_use = self._geometry.tools.get(named, self._geometry.tool)
-        delays = [delay for at, delay in self._delays if now - at <= WINDOW]
         return View(
             platform=None if tool is None else tool @ in_use.inverse(),
             commanded=commanded,
@@ -118,7 +107,7 @@ class Watcher:
             predicted=self._read("compensator/predicted_error", _predicted, now),
             left=self._error(tool, commanded, in_use),
             seen=self._error(true, commanded, self._geometry.tool),
-            latency=Latency(float(np.median(delays)), max(delays), len(delays)) if delays else None,
+            delays=tuple(delay for at, delay in self._delays if now - at <= WINDOW),
             states={name: status for name, (status, at) in self._states.items() if now - at < SILENT_AFTER},
         )
 
@@ -306,9 +295,9 @@ def words(view: View, machine: str) -> str:
     measured = nothing if view.measured is None else [f"{1e3 * value:.4f} mm" for value in view.measured]
     corrections = nothing if view.corrections is None else [f"{1e6 * value:+.1f} µm" for value in view.corrections]
     latency = "no commands"
-    if view.latency is not None:
-        latency = f"median {1e3 * view.latency.median:.2f} ms, largest {1e3 * view.latency.largest:.2f} ms"
-        latency += f", of {view.latency.count} in {WINDOW:g} s"
+    if view.delays:
+        latency = f"median {1e3 * np.median(view.delays):.2f} ms, largest {1e3 * max(view.delays):.2f} ms"
+        latency += f", of {len(view.delays)} in {WINDOW:g} s"
     return render(
         "watch.html",
         machine=machine,

@@ -23,7 +23,7 @@ from benchmarks.faults.judge import judge
 from benchmarks.faults.kinds import KINDS
 from benchmarks.faults.record import Happened, Record, Sent, Status, Struts
 from benchmarks.faults.rig import Rig, refusal_to_mount
-from hexapod_comp.ros.status import log_problem
+from hexapod_comp.ros.base import log_problem
 
 LIMITS = SimpleNamespace(stroke=np.tile([0.33, 0.88], (6, 1)), step=2e-3, correction=2e-3, speed=0.25)
 

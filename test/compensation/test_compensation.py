@@ -119,25 +119,6 @@ def test_the_commands_bring_the_real_machine_to_the_pose(geometry: HexapodGeomet
         assert not record.ramping
 
 
-def test_tool_and_work_offsets_against_scipy() -> None:
-    """platform = work · commanded · tool⁻¹, composed by scipy; the nominal lengths by NumPy."""
-    compensator = Compensator(OFFSET, IDEAL)
-    for pose in tool_poses(OFFSET, 20, 5):
-        record = compensator.correct(pose)
-        rotation, position = composed(WORK, pose)
-        rotation = rotation * Rotation.from_matrix(TOOL.rotation).inv()
-        position = position - rotation.apply(TOOL.position)
-        np.testing.assert_allclose(record.platform_pose.position, position, atol=1e-15)
-        np.testing.assert_allclose(record.platform_pose.rotation, rotation.as_matrix(), atol=1e-14)
-        platform = Pose(position, rotation.as_matrix())
-        np.testing.assert_allclose(record.nominal, nominal_lengths(OFFSET, platform), atol=1e-14)
-        np.testing.assert_allclose(record.command, record.nominal, atol=1e-15)  # the model is ideal
-        np.testing.assert_allclose(record.predicted_error, 0.0, atol=1e-14)
-        np.testing.assert_allclose(OFFSET.platform_pose(pose).position, position, atol=1e-15)
-        back = OFFSET.tool_pose(record.platform_pose)
-        np.testing.assert_allclose(back.position, pose.position, atol=1e-15)
-
-
 def test_both_entries_give_the_same_commands() -> None:
     """Quaternion in, rotation matrix in: the same to rounding, also with a norm that is off by what is allowed."""
     model = model_of(OFFSET, 6)

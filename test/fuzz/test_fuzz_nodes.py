@@ -270,7 +270,7 @@ class FuzzedCompensator(Fuzzed):
             self.struts("strut_states", list(STRUT_NAMES), self.last.tolist(), [0.0] * 6, 0.0)
             before = self.last
             self.pose(move, [], "base", 0.0)
-            assert self.last is not before, self.node._status.refusals.last_text
+            assert self.last is not before, self.node.refusals.last_text
 
 
 @pytest.fixture

@@ -38,8 +38,8 @@ from hexapod_comp.linuxcnc.machine import MachineComponent, main
 from hexapod_comp.machine.geometry import STRUT_NAMES, HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.pose import Pose
+from hexapod_comp.ros.base import ERROR, OK
 from hexapod_comp.ros.process import autostart
-from hexapod_comp.ros.status import ERROR, OK
 
 NODE = "linuxcnc_bridge"
 

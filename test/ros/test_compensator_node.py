@@ -33,12 +33,11 @@ from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.pose import Pose
-from hexapod_comp.ros import keep_discovery_local, rclpy_compat
-from hexapod_comp.ros import status as status_module
+from hexapod_comp.ros import base, keep_discovery_local, rclpy_compat
+from hexapod_comp.ros.base import ERROR, OK, Flow
 from hexapod_comp.ros.compensator import CompensatorNode
 from hexapod_comp.ros.messages import message_pose, pose_message
 from hexapod_comp.ros.rclpy_compat import Throttle
-from hexapod_comp.ros.status import ERROR, OK, Flow
 
 ROUNDING = 1e-12
 """Lengths below a metre, a dozen operations: a few 1e-16 m; the wire is exact. Everything real is 1e-9 m."""
@@ -339,7 +338,7 @@ def test_log_lets_one_line_per_cause_and_second_through(monkeypatch):
 
 def test_rate_and_age_of_a_flow(monkeypatch):
     """250 events in the 2 s since it was made: 125 a second."""
-    monkeypatch.setattr(status_module, "time", SimpleNamespace(monotonic=lambda: 10.0))
+    monkeypatch.setattr(base, "time", SimpleNamespace(monotonic=lambda: 10.0))
     flow = Flow()
     assert flow.age(11.0) == math.inf
     for n in range(250):

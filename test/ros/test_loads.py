@@ -24,8 +24,8 @@ from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
 from hexapod_comp.machine.model_file import save_model
 from hexapod_comp.machine.outside import OutsideTable
 from hexapod_comp.pose import Pose
+from hexapod_comp.ros.base import ERROR, OK, WARN
 from hexapod_comp.ros.messages import pose_message
-from hexapod_comp.ros.status import ERROR, OK, WARN
 
 MODEL = MachineModel("paper", load=Load(stiffness=np.full(6, 20e6), mass=30.0), origin=ModelOrigin("2026-11-24"))
 

@@ -7,20 +7,20 @@ from __future__ import annotations
 
 import math
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from threading import Thread
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseStamped, Quaternion, Transform, Vector3
-from helpers import long_test
 from node_helpers import HOME, Bench, Rig, Voice, closed_form_lengths, model_file, near
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
@@ -31,20 +31,15 @@ from hexapod_comp.cli.app import make_parser
 from hexapod_comp.errors import CommandError, NoAnswerError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import strut_lengths
-from hexapod_comp.machine.model import RealMachine
-from hexapod_comp.measurements.campaign import Campaign, line_run, template
-from hexapod_comp.measurements.collect import Collected, collect
-from hexapod_comp.measurements.readings import KINDS
-from hexapod_comp.pose import Pose, best_motion
+from hexapod_comp.pose import Pose
+from hexapod_comp.ros import collector
 from hexapod_comp.ros.adapter import AdapterNode
 from hexapod_comp.ros.client import LoopClient, Machine, MoveError, MoveState, Sent
 from hexapod_comp.ros.collector import AdaptedMachine, WatchedMachine
 from hexapod_comp.ros.instrument import InstrumentNode
+from hexapod_comp.ros.interface import ADVICE, OTHERWISE
 from hexapod_comp.ros.messages import message_pose, nanoseconds_of, pose_message
 from hexapod_comp.ros.mover import MoverNode
-from hexapod_comp.ros.status import ADVICE, OTHERWISE
-from hexapod_comp.virtual.instruments import measure
-from hexapod_comp.virtual.named import find_model
 
 RATE = 250.0
 """Tool poses sent per second, the mover's default."""
@@ -497,94 +492,76 @@ def test_a_move_that_a_busy_computer_had_refused_is_asked_for_again(
     assert (caught.value.reason, left) == (ends, [])
 
 
-def test_poses_of_a_tracker_whose_beam_is_broken_are_none_and_of_another_frame_a_problem() -> None:
-    machine = object.__new__(WatchedMachine)
-    machine._topic, machine._frame_id, machine._problem, machine._poses = "/pose", "base", "", []
-    machine._on_pose(BAD_REQUESTS[2][1])
-    assert (machine._poses, machine._problem) == ([], "")
-    machine._on_pose(pose_message(HOME, "tracker"))
-    assert (machine._poses, machine._problem) == ([], "/pose: frame_id must be base, not 'tracker'")
+class Watched(WatchedMachine):
+    """A watched machine without nodes: each spin hands over the next message of a list."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
+        monkeypatch.setattr(Machine, "__init__", lambda *_: None)
+        monkeypatch.setattr(collector, "PATIENCE", 0.2)
+        self.node, self.publishers = MagicMock(), 1
+        self.node.resolve_topic_name.side_effect = "/{}".format
+        self.node.count_publishers.side_effect = lambda topic: self.publishers
+        super().__init__("pose", samples=9, **options)
+
+    def look(self, *messages: Any) -> Any:
+        """Return what is observed while these messages come."""
+        coming = iter(messages)
+
+        def spin(_: float) -> None:
+            for message in islice(coming, 1):
+                (self._on_pose if isinstance(message, PoseStamped) else self._on_readings)(message)
+
+        self.spin_once = spin  # type: ignore[method-assign]
+        return self.observe()
 
 
-def collected(bench: Bench, path: Path, campaign: Campaign, kind: str, frame: str = "known", **options: Any) -> Any:
-    """Run collect on a bench's machine; return what it returned or raised."""
-    ended: list[Any] = []
-    topics = (
-        {"topic": "instrument/pose"}
-        if kind == "tracker"
-        else {"topic": "tool_pose_true", "readings": "instrument/readings"}
-    )
-
-    def client() -> None:
-        try:
-            with WatchedMachine(samples=9, tracker_frame=frame, **topics) as machine:
-                geometry = load_geometry("paper")
-                ended.append(collect(campaign, geometry, machine, path, tracker_frame=frame, **options))
-        except Exception as error:
-            ended.append(error)
-
-    thread = Thread(target=client)
-    thread.start()
-    bench.until(lambda: not thread.is_alive(), "the campaign", timeout=120.0)
-    return ended[0]
+def poses_at(*heights: float, frame: str = "base") -> list[PoseStamped]:
+    messages = [pose_message(HOME, frame) for _ in heights]
+    for message, height in zip(messages, heights, strict=True):
+        message.pose.position.z += height
+    return messages
 
 
-def machine(bench: Bench, kind: str, **parameters: object) -> Callable[[Campaign], np.ndarray]:
-    """Add a machine with hidden errors, a mover and an instrument; return what that should read of a campaign."""
-    bench.machine(truth="random:3")
-    bench.add(MoverNode, True, {})
-    bench.add(InstrumentNode, True, {"kind": kind, **EXACT, **parameters})
-    geometry = load_geometry("paper")
-    truth = RealMachine(geometry, find_model("random:3", geometry))
-    return lambda campaign: measure(template(campaign, geometry), campaign, truth, 0).value
+def test_of_a_tracker_the_median_counts_and_half_of_the_poses_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nine poses 1 µm apart, one of them wild by 1 m; a pose that is not finite is a broken beam's."""
+    machine = Watched(monkeypatch)
+    seen = machine.look(*poses_at(*(1e-6 * n for n in range(8)), 1.0))
+    assert seen.pose.position[2] == pytest.approx(HOME.position[2] + 4e-6, abs=1e-12)
+    assert (seen.uncertainty > 0.0).all()
+    assert machine.look(*poses_at(0.0, 0.0, 0.0, math.nan, 0.0)).pose is not None
+    assert machine.look(*poses_at(0.0, 0.0, 0.0, math.nan)) is None
+    machine.publishers = 0
+    with pytest.raises(NoAnswerError, match="nobody publishes /pose"):
+        machine.look()
+    with pytest.raises(CommandError, match="/pose: frame_id must be base, not 'tracker'"):
+        machine.look(*poses_at(0.0, frame="tracker"))
+    free = Watched(monkeypatch, tracker_frame="free")
+    assert free.look(*poses_at(*[0.0] * 9, frame="tracker")).pose is not None, "the first frame is the tracker's"
+    with pytest.raises(CommandError, match="frame_id must be tracker, not 'base'"):
+        free.look(*poses_at(0.0))
 
 
-def small(**more: Any) -> Campaign:
-    box = load_geometry("paper").home.position + np.array([[-0.01, -0.01, -0.01], [0.01, 0.01, 0.01]])
-    kept = {"cell": 0.02, "step": 0.01, "instrument": None, "diagonals": 0, "noise": (0.0,) * len(KINDS), **more}
-    return Campaign(box, **kept)
+def test_a_broken_beam_loses_the_zero_of_single_readings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run of a laser's two channels; what was read before the beam broke counts no more."""
+    confirmed: list[Any] = []
+    machine = Watched(monkeypatch, readings="laser", confirm=confirmed.append)
+    monkeypatch.setattr(machine, "_spin", lambda _: None)
+    run = SimpleNamespace(channels=("linear", "rotation_y", "position_x"), place=HOME)
+    assert machine.set_up(run) == ("linear", "rotation_y")
+    assert confirmed == [run]
 
+    def read(*lengths: float) -> list[JointState]:
+        return [JointState(name=["rotation_y", "linear"], position=[1e-3, length]) for length in lengths]
 
-def broken_at(bench: Bench, stop: int) -> Callable[[int, int, str], None]:
-    """Return a progress that breaks the instrument's beam for 0.3 s on the way to a stop, once."""
-    node = next(node for node in bench.nodes if isinstance(node, InstrumentNode))
-    visited: list[int] = []
-
-    def progress(done: int, of: int, where: str) -> None:
-        visited.append(done)
-        if len(visited) == stop:
-            node._broken_until = time.monotonic() + 0.3
-
-    return progress
-
-
-@long_test
-def test_a_laser_that_reads_wildly_and_whose_beam_breaks_is_collected(bench: Bench, tmp_path: Path) -> None:
-    """A line there and back; the beam is broken on the way to the third stop: the run begins anew."""
-    known, box = machine(bench, "laser", wild_share=0.1), small(poses=1).box
-    campaign = small(runs=(line_run("diagonal", "linear", box, 4, np.eye(3)),))
-    done = collected(bench, tmp_path / "out.csv", campaign, "laser", progress=broken_at(bench, 3))
-    assert isinstance(done, Collected), done
-    off = np.abs(done.measurements.value - known(campaign))
-    assert done.missing == ()
-    assert off.max() < 6e-6, "half of a backlash of 4 µm, steps of the drives, and wild ones within a median"
-
-
-@long_test
-def test_a_tracker_that_stands_anywhere_is_collected_in_two_calls(bench: Bench, tmp_path: Path) -> None:
-    """Up to one rigid motion, which six poses leave open, the file is that of a tracker in base."""
-    known = machine(bench, "tracker", stands_at=[2.0, -1.0, 0.5], stands_turned=[0.3, 1.0, 2.5], frame_id="tracker")
-    campaign, path, left = small(poses=6, tilt=0.05), tmp_path / "out.csv", [True] * 6
-    collected(bench, path, campaign, "tracker", "free", going_on=lambda: left.pop() if left else False)
-    done = collected(bench, path, campaign, "tracker", "free")
-    assert isinstance(done, Collected), done
-    assert done.resumed > 3
-    assert len(done.measurements) == 36
-    points = done.measurements.points()
-    places = [points + value.reshape(-1, 2, 3)[:, 0] for value in (done.measurements.value, known(campaign))]
-    motion = best_motion(*places)
-    assert motion is not None
-    assert np.abs(places[0] @ motion.rotation.T + motion.position - places[1]).max() < 6e-6
+    poses = poses_at(*[0.0] * 9)
+    seen = machine.look(*poses, *read(*(1e-6 * n for n in range(8)), 0.5))
+    assert (seen.channels["linear"][0], seen.channels["rotation_y"][0]) == pytest.approx((4e-6, 1e-3), abs=1e-15)
+    assert not seen.zero_lost
+    broken = machine.look(*poses, *read(7.0, 7.0, math.nan, *[0.0] * 9))
+    assert (broken.channels["linear"][0], broken.zero_lost) == (0.0, True)
+    assert not machine.look(*poses, *read(*[0.0] * 9)).zero_lost, "told once"
+    with pytest.raises(CommandError, match="/laser: linear is missing, there are 'rotation_y'"):
+        machine.look(JointState(name=["rotation_y"], position=[0.0]))
 
 
 # ---- a machine that calibrates itself (its loop: test/upkeep) ----
@@ -633,14 +610,6 @@ def test_a_model_is_named_to_the_compensator_and_runs_by_its_ramp_or_the_old_one
     assert asked(bench, lambda machine: machine.refuse_unreadable(below)) is None
     error = asked(bench, lambda machine: machine.refuse_unreadable(elsewhere))
     assert f"the compensator reads models in {tmp_path} alone: start it with -p model_folder:=FOLDER" in str(error)
-
-
-def test_a_loop_that_shall_not_go_on_brakes_the_move(bench: Bench) -> None:
-    bench.machine(truth="ideal")
-    bench.add(MoverNode, True, {"limit_share": 0.05})
-    error = asked(bench, lambda machine: machine.move(near(HOME, (0.0, 0.0, 0.02)), "base"), lambda: False)
-    assert isinstance(error, MoveError)
-    assert error.reason == "person"
 
 
 @pytest.mark.parametrize("stopped", [False, True])

@@ -6,8 +6,6 @@ What should be said comes from the machine's own forward run; the spread from th
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
-from unittest.mock import MagicMock
 
 import calibration_helpers as small
 import numpy as np
@@ -24,8 +22,7 @@ from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros import requests, worker
-from hexapod_comp.ros.requests import PredictedError
-from hexapod_comp.ros.status import WARN
+from hexapod_comp.ros.base import WARN
 
 STANDING, ALIGNED = "compensator/predicted_error", "compensator/predicted_error_aligned"
 UM = 1e-6
@@ -86,7 +83,7 @@ def test_a_process_begins_with_a_listener_is_started_anew_when_it_dies_and_ends_
     bench, tmp_path, monkeypatch
 ):
     """Killed whenever it may be at work: one that dies without work is started anew, without a word."""
-    monkeypatch.setattr(requests, "TRY_AGAIN_AFTER", (0.3, 60.0))
+    monkeypatch.setattr(requests, "TRY_AGAIN_AFTER", 0.3)
     monkeypatch.setattr(worker, "IDLE_AFTER", 0.5)
     node = bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
     bench.ask(small.paper().home)
@@ -113,31 +110,6 @@ def test_a_process_begins_with_a_listener_is_started_anew_when_it_dies_and_ends_
     bench.witness.destroy_subscription(subscription)
     bench.until(lambda: process.poll() is not None, "the end of the process")
     assert beside.process is None
-
-
-def test_a_process_that_fails_every_time_is_tried_less_and_less_often(monkeypatch):
-    """Truth: the waits double from 2 s to 60 s; a stand-in for the process fails at once."""
-    began = []
-
-    def ask(job):
-        began.append(now)
-        job.failed(worker.WorkerError("it cannot"))
-
-    node = MagicMock()
-    status = SimpleNamespace(prediction_problem="", last_answered=1, compensator=MagicMock(nominal=np.zeros(6)))
-    listeners = node.create_publisher.return_value.get_subscription_count
-    listeners.return_value = 1
-    monkeypatch.setattr(requests, "time", SimpleNamespace(monotonic=lambda: now))
-    files = MagicMock(sources={"geometry": MagicMock(), "model": MagicMock()})
-    topics = PredictedError(node, status, files, SimpleNamespace(ask=ask))
-    for tick in range(1000):
-        now = 100.0 + 0.2 * tick
-        topics.update(now)
-        assert status.prediction_problem == "no predicted error: it cannot"
-    np.testing.assert_allclose(np.diff(began), [2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0], atol=0.21)
-    listeners.return_value = 0
-    topics.update(now)
-    assert status.prediction_problem == ""
 
 
 def test_a_new_model_is_predicted_with(rig, tmp_path):

@@ -64,10 +64,10 @@ from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.ros import base
 from hexapod_comp.ros.compensator import CompensatorNode
+from hexapod_comp.ros.interface import CompensatorState
 from hexapod_comp.ros.messages import period, pose_message
-from hexapod_comp.ros.status import CompensatorStatus
 from hexapod_comp.ros.strut_drive import StrutDriveNode
-from hexapod_comp.ros.worker import Job, Worker
+from hexapod_comp.ros.worker import Worker
 
 DRIVE = "strut_drive"
 STATES = Path(__file__).resolve().parents[2] / "doc" / "states.md"
@@ -114,8 +114,6 @@ def sensor(part: str, temperature: float) -> Callable[[Rig], Temperature]:
     message.header.frame_id = part
     return lambda rig: message
 
-
-TALK = [step for _ in range(3) for step in (feed(0), other(struts(0)))]
 
 WAITING = "waiting for strut_states: where the struts stand is not known"
 UNFED = "no strut_states yet: where the struts stand is not known; a machine without feedback needs"
@@ -185,18 +183,6 @@ STORIES: dict[str, tuple[dict[str, object] | Callable[[Path], dict[str, object]]
             refuses(TWO + "/strut_states", measured_by="/stranger, /witness", end="/strut_states: /stranger, /witness"),
             *(send(), feed(0), seen(strut_commands=1, tool_pose_estimate=1), shows(bad_feedback="1"), leaves),
             *(says(OK, "running", measured_by="/witness"), ask()),
-        ],
-    ),
-    "strangers that both measure": (
-        FED,
-        [ask(), joins("strut_states"), *TALK, says(ERROR, f"refusing commands: {TWO}/strut_states")],
-    ),
-    "twins that both measure": (
-        FED,
-        [
-            *(ask(), joins("strut_states", "witness"), *TALK),
-            says(ERROR, "refusing commands: several_publishers: two publishers of /strut_states speak in turn"),
-            says(OK, "running"),
         ],
     ),
     "several may measure where that is allowed": (
@@ -507,7 +493,7 @@ def test_every_row_names_a_test_that_is_there() -> None:
     assert told == STORIES.keys() | DRIVES.keys()
 
 
-@pytest.mark.parametrize("function", [CompensatorStatus.findings, StrutDriveNode.findings])
+@pytest.mark.parametrize("function", [CompensatorState.findings, StrutDriveNode.findings])
 def test_the_page_has_every_text_of_the_diagnostics(function: Callable[..., object]) -> None:
     """Each level and text that a node's status can have, as the source yields them, stands on the page."""
     page = re.sub(r"[A-Z]{2,}|…", "", STATES.read_text(encoding="utf-8"))
@@ -547,12 +533,11 @@ def test_speeds_depend_on_stamps_alone() -> None:
     assert period(5 * second, 5 * second + 1) == 1e-4
 
 
-@pytest.mark.parametrize("node", ["compensator", DRIVE])
-def test_a_full_log_disk_is_said_beside_everything_else(rig, monkeypatch, node):
+def test_a_full_log_disk_is_said_beside_everything_else(rig, monkeypatch):
     monkeypatch.setattr(base, "log_problem", lambda: "log disk full: /var/log")
-    rig.compensator() if node == "compensator" else rig.drive()
-    rig.until(lambda: rig.status(node), "a status")
-    assert (rig.status(node).level, rig.message(node).endswith("log disk full: /var/log")) == (WARN, True)
+    rig.drive()
+    rig.until(lambda: rig.status(DRIVE), "a status")
+    assert (rig.status(DRIVE).level, rig.message(DRIVE).endswith("log disk full: /var/log")) == (WARN, True)
 
 
 # ---- both nodes ----
@@ -800,29 +785,25 @@ def field(displacement_um: float) -> dict[str, object]:
 
 
 def test_a_model_that_breaks_a_limit_at_the_last_command_moves_nothing(rig, tmp_path):
-    """5 mm of field need more than the 2 mm of correction allowed: said by the service, at once and in words."""
+    """5 mm of field need more than the 2 mm of correction allowed: said by the service, at once and in words. Before
+    the first command the machine is taken to stand at home."""
     path = model_file(tmp_path, struts={"offset_um": 100.0})
     node = rig.compensator(model_file=path, ramp_rate=1.0, command_timeout=0.0)
-    rig.ask(HOME)
-    before = dict(node._files.sources)
+    before = dict(node.files.sources)
     model_file(tmp_path, field=field(5000.0))
+    early = rig.trigger("reload_model")
+    assert (early.success, "is larger than ±2000 µm" in early.message) == (False, True)
+    rig.ask(HOME)
     response = rig.trigger("reload_model")
     assert not response.success
     assert "the old model stays: strut_" in response.message
     assert "is larger than ±2000 µm" in response.message
-    assert node._files.sources == before, "the journal must not name a model that is not in use"
+    assert node.files.sources == before, "the journal must not name a model that is not in use"
     rig.until_status(WARN, "the old model stays")
     for _ in range(3):
         np.testing.assert_allclose(rig.ask(HOME).corrections, -100e-6, rtol=0.0, atol=ROUNDING)
     model_file(tmp_path, field=field(1000.0))
     assert rig.trigger("reload_model").success
-
-
-def test_a_model_is_judged_where_the_machine_stands_at_home_before_the_first_command(rig, tmp_path):
-    rig.compensator(model_file=model_file(tmp_path), command_timeout=0.0)
-    model_file(tmp_path, field=field(5000.0))
-    response = rig.trigger("reload_model")
-    assert (response.success, "is larger than ±2000 µm" in response.message) == (False, True)
 
 
 def test_compensation_is_not_switched_on_where_it_breaks_a_limit(rig, tmp_path):
@@ -870,7 +851,7 @@ def outcome(name: str, arguments: dict, within: float = 60.0) -> list:
     """Have a worker do a job, and return its result or its error."""
     beside, found = Worker(), []
     late = f"could not be read in {within:g} s"
-    beside.ask(Job(name, arguments, found.append, found.append, within=within, late=late))
+    beside.ask(name, arguments, found.append, found.append, within=within, late=late)
     end = time.monotonic() + 60.0
     while not found and time.monotonic() < end:
         beside.poll(time.monotonic())

@@ -25,11 +25,10 @@ from sensor_msgs.msg import JointState, Temperature
 from hexapod_comp.errors import LONGEST_TEXT, CommandError, HexapodError, printable, shorten
 from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
 from hexapod_comp.machine.geometry import STRUT_NAMES
-from hexapod_comp.ros.base import CallbackGuard
+from hexapod_comp.ros.base import ERROR, CallbackGuard
 from hexapod_comp.ros.interface import MachineFiles
 from hexapod_comp.ros.messages import pose_message
 from hexapod_comp.ros.rclpy_compat import publishers
-from hexapod_comp.ros.status import ERROR
 
 FORGED = "base\n[INFO] [1.0] [compensator]: all is well\r\x1b[2J\x1b[31m\u202e"
 """A text that begins a line of its own, clears the terminal, colours it, and turns what follows around."""
@@ -126,8 +125,8 @@ def broken(*_: object, **__: object) -> None:
     ("what", "owner", "method"),
     [
         ("tool_pose_command", "compensator", "step"),
-        ("check_state", "_status", "problem"),
-        ("matching of tool_pose_command", "_status", "update"),
+        ("check_state", "", "standing_problem"),
+        ("matching of tool_pose_command", "", "update_publishers"),
     ],
 )
 def test_a_callback_that_raises_is_counted_and_said_and_the_node_goes_on(rig, monkeypatch, what, owner, method):
@@ -135,7 +134,7 @@ def test_a_callback_that_raises_is_counted_and_said_and_the_node_goes_on(rig, mo
     node = rig.compensator()
     rig.ask(HOME)
     with monkeypatch.context() as patch:
-        patch.setattr(getattr(node, owner), method, broken)
+        patch.setattr(getattr(node, owner) if owner else node, method, broken)
         rig.send(HOME)
         rig.add_publisher("tool_pose_command") if what.startswith("matching") else None
         rig.until(lambda: what in node.guard.values()["last_callback_error"], "the error to be caught")

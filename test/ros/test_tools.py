@@ -29,10 +29,11 @@ from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.pose import Pose
+from hexapod_comp.ros.base import ERROR, OK, WARN
 from hexapod_comp.ros.compensator import CompensatorNode
-from hexapod_comp.ros.interface import STRUTS, StrutInput
+from hexapod_comp.ros.inputs import StrutInput
+from hexapod_comp.ros.interface import STRUTS
 from hexapod_comp.ros.messages import message_pose
-from hexapod_comp.ros.status import ERROR, OK, WARN
 from hexapod_comp.virtual.named import find_model
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -12,10 +12,9 @@ import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from node_helpers import HOME, closed_form_lengths, model_file, near
-from rclpy.qos import DurabilityPolicy
 from sensor_msgs.msg import JointState
 from test_workspace_pictures import RINGS, SECTORS, layers, mesh
-from visualization_msgs.msg import Marker, MarkerArray
+from visualization_msgs.msg import Marker
 
 from hexapod_comp.cli import main
 from hexapod_comp.errors import GeometryError, HexapodError
@@ -24,7 +23,7 @@ from hexapod_comp.pose import Pose
 from hexapod_comp.ros.process import QUIET
 from hexapod_comp.viewer import page as watching
 from hexapod_comp.viewer.page import View, Watcher, WatchPage, same_site, strut_colours, strut_ends, words
-from hexapod_comp.viewer.shells import TOPIC, publish_shells, shell_markers, triangles
+from hexapod_comp.viewer.shells import shell_markers, triangles
 from hexapod_comp.workspace.shells import TRANSLATION, Layer
 
 OFFSETS = np.array([-100.0, -50.0, 0.0, 50.0, 100.0, 200.0])
@@ -48,7 +47,7 @@ def test_what_is_heard_becomes_the_picture(rig, tmp_path):
     def there() -> bool:
         rig.ask(pose)
         view = watcher.view()
-        return view.latency is not None and view.corrections is not None and view.left is not None
+        return bool(view.delays) and view.corrections is not None and view.left is not None
 
     rig.until(there, "the picture of the pose")
     view = watcher.view()
@@ -63,15 +62,14 @@ def test_what_is_heard_becomes_the_picture(rig, tmp_path):
     np.testing.assert_allclose(view.corrections, -1e-6 * OFFSETS, atol=1e-12)
     assert view.left is not None
     assert np.abs(view.left.displacement).max() < 2e-9
-    assert view.latency is not None
-    assert 0.0 < view.latency.median <= view.latency.largest < 5.0
+    assert 0.0 < min(view.delays) <= max(view.delays) < 5.0
 
 
-@pytest.mark.parametrize(("geometry", "close"), [("paper.yaml", 2e-9), ("example_6_6.yaml", 5e-8)])
-def test_the_error_left_is_along_the_axes_of_work(rig, geometry, close):
+def test_the_error_left_is_along_the_axes_of_work(rig):
     """Truth: measured struts are the distances between the joints with the platform 20 µm off along base x, by plain
-    closure; seen from work that is the first row of its rotation. 2e-9 m is the solvers' tolerance; the 6-6 machine's
-    screws turn with their joints, which plain closure leaves out: 0.2 % of the way."""
+    closure; seen from work that is the first row of its rotation. The machine's screws turn with their joints, which
+    plain closure leaves out: 0.2 % of the way."""
+    geometry, close = "example_6_6.yaml", 5e-8
     rig.remove_publisher("strut_states")
     rig.add_publisher("strut_states")
     machine = load_geometry(geometry)
@@ -97,17 +95,6 @@ def test_the_error_left_is_along_the_axes_of_work(rig, geometry, close):
     assert view.left is not None
     assert view.left.turn < 1e-7
     np.testing.assert_allclose(view.measured, measured(Pose(home.position + shift, home.rotation)), atol=1e-12)
-
-
-def test_refusals_in_words(rig):
-    rig.compensator(model_file="ideal")
-    watcher = watched(rig)
-    rig.ask(HOME)
-    rig.send(Pose([0.0, 0.0, 3.0], np.eye(3)))
-    rig.until(lambda: "refusing commands" in words(watcher.view(), "paper"), "the refusal")
-    text = words(watcher.view(), "paper")
-    assert "<td>last refusal</td>" in text.replace(' style="padding-right: 1em"', "")
-    assert "strut_drive" not in watcher.view().states
 
 
 def test_what_is_old_or_no_machine_is_not_known(rig, monkeypatch):
@@ -289,10 +276,3 @@ def test_what_the_markers_hold():
 def test_no_markers_of_nothing(wrong):
     with pytest.raises(GeometryError, match="layers: must be at least one, with finite values"):
         shell_markers(wrong, TRANSLATION, "", STAMP)
-
-
-def test_who_comes_late_sees_the_shells(module_context):
-    node = rclpy.create_node("shells", context=module_context)
-    publisher = publish_shells(node, MarkerArray(markers=markers()))
-    assert (publisher.topic_name, publisher.qos_profile.durability) == (f"/{TOPIC}", DurabilityPolicy.TRANSIENT_LOCAL)
-    node.destroy_node()

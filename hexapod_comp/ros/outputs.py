@@ -1,0 +1,214 @@
+"""What a compensator publishes beside its answers: estimates, the machine's picture, safety outputs, the journal."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from builtin_interfaces.msg import Duration, Time
+from geometry_msgs.msg import Point, PoseStamped
+from sensor_msgs.msg import JointState, TimeReference
+from std_msgs.msg import Bool, ColorRGBA, String, UInt64
+from visualization_msgs.msg import Marker, MarkerArray
+
+from ..compensation.compensator import Compensator
+from ..compensation.journal import Journal, Source, sources_text
+from ..core import ffi
+from ..machine.geometry import HexapodGeometry
+from ..machine.kinematics import strut_lengths
+from ..machine.robot_description import joint_positions, urdf
+from ..pose import Pose
+from .base import ACKNOWLEDGED_WITHIN, EVENT_QOS, LATCHED_QOS, STATE_QOS, profile
+from .interface import STRUTS, CompensatorState
+from .messages import PoseBytes, StrutBytes, period, stamp_of
+
+# Whether the node stops the machine is published again after this time, s: late subscribers receive what is latched,
+# but on a busy computer the middleware loses that now and then
+REPEATED_AFTER = 1.0
+
+# Largest time of a message, ns: later validities are limited to it
+LAST_STAMP = 2**31 * 10**9 - 1
+
+# Pages: each counts, and late subscribers need the last snapshot; a recorder's own queue is no longer than this
+JOURNAL_QOS = profile(10, latched=True)
+
+
+def nominal_lengths(compensator: Compensator, measured: np.ndarray) -> np.ndarray:
+    """Return measured struts minus the correction, shape (6,), m, for a controller of nominal lengths.
+
+    With the measured ones it would count the corrections as a distance to go, and at each start from the struts'
+    positions they would be corrected once more. Before the first command the model's correction is used, where it
+    corrects.
+    """
+    if np.isfinite(compensator.correction).all():
+        return measured - compensator.correction
+    if not compensator.enabled:
+        return measured
+    tool = compensator.estimate(measured)
+    pose = Pose(tool[:3], tool[3:].reshape((3, 3)))
+    return strut_lengths(compensator.geometry, pose @ compensator.geometry.tool.inverse())
+
+
+class Outputs:
+    """What a configured compensator publishes beside its answers: estimates, markers of the machine, its description,
+    and what a machine's own safety watches: a heartbeat, how long a command holds, whether commands are refused."""
+
+    def __init__(self, node: CompensatorState) -> None:
+        self._node, self._compensator = node, node.compensator
+        self._options = options = node.options
+        self._frame, self._names = options["base_frame"], options["joint_names"]
+        self.answered = 0  # stamp of the newest command, ns; 0: there is none
+        self._estimates = node.publish_on(PoseStamped, "tool_pose_estimate", STATE_QOS)
+        self._markers = node.create_publisher(MarkerArray, "~/markers", EVENT_QOS)
+        self._heartbeats = node.create_publisher(UInt64, "~/heartbeat", EVENT_QOS)
+        self._validities = node.create_publisher(TimeReference, "~/validity", EVENT_QOS)
+        self._stops = node.create_publisher(Bool, "~/stopped", LATCHED_QOS)
+        self._joints = self._description = self._nominal = None
+        below = options["command_input"] == STRUTS
+        if options["publish_description"]:
+            self._joints = node.create_publisher(JointState, "joint_states", EVENT_QOS)
+            self._description = node.create_publisher(String, "robot_description", LATCHED_QOS)
+            self._description.publish(String(data=urdf(node.compensator.geometry, self._names, ros2_control=below)))
+        if below:
+            self._nominal = node.publish_on(JointState, "nominal_strut_states", STATE_QOS)
+        self._nominal_out, self._estimate_out = StrutBytes(names=self._names), PoseBytes(self._frame)
+        self._beat, self._validity = UInt64(), TimeReference(source=node.resolve_topic_name("strut_commands"))
+        self._stopped: bool | None = None
+        self._stop_said = 0.0
+        self.stop(True)
+        node.at_rate("heartbeat_rate", self._beats)
+        node.at_rate("marker_rate", self._show)
+
+    def estimate(self, pose: np.ndarray, stamp: int) -> None:
+        """Publish a tool pose, shape (12,), position, m, and rotation matrix by rows, where somebody subscribes."""
+        if self._estimates.get_subscription_count():
+            self._estimates.publish(self._estimate_out.made(pose, stamp))
+
+    def nominal(self, stamp: int, mean: Callable[[], np.ndarray]) -> None:
+        """Publish nominal lengths of the measured struts, from which a controller starts and which it holds: the
+        average for struts at rest."""
+        if self._nominal is not None:
+            out, fastest = self._nominal_out, self._compensator.geometry.limits.speed
+            lengths = np.ascontiguousarray(nominal_lengths(self._compensator, mean()))
+            at = ffi.from_buffer("double[6]", lengths)
+            self._nominal.publish(out.made(at, stamp, period(out.stamp, stamp), fastest))
+
+    def stop(self, stopped: bool) -> None:
+        """Publish whether the node stops the machine, when that has changed and every :data:`REPEATED_AFTER`."""
+        now = time.monotonic()
+        if stopped != self._stopped or now - self._stop_said > REPEATED_AFTER:
+            self._stopped, self._stop_said = stopped, now
+            self._stops.publish(Bool(data=stopped))
+
+    def wait(self) -> None:
+        """Wait until the last ~/stopped has arrived."""
+        self._stops.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+
+    def _beats(self) -> None:
+        self._beat.data = (self._beat.data + 1) % 2**64
+        if self._heartbeats.get_subscription_count():
+            self._heartbeats.publish(self._beat)
+        lasting = round(self._options["command_timeout"] * 1e9)
+        if self.answered and lasting and self._validities.get_subscription_count():
+            self._validity.header.stamp = stamp_of(self.answered)
+            self._validity.time_ref = stamp_of(min(self.answered + lasting, LAST_STAMP))
+            self._validities.publish(self._validity)
+
+    def _show(self) -> None:
+        """Publish the machine as markers and as the joints of its URDF, where somebody subscribes; before the first
+        command its struts have no corrections."""
+        if not self._node.active:
+            return
+        now, pose = self._node.get_clock().now().to_msg(), self._compensator.platform_estimate
+        geometry = self._compensator.geometry
+        if self._markers.get_subscription_count():
+            correction = np.zeros(6) if np.isnan(self._compensator.nominal).any() else self._compensator.correction
+            self._markers.publish(machine_markers(geometry, *pose, correction, self._frame, now))
+        if self._joints is not None and self._joints.get_subscription_count():
+            positions = joint_positions(geometry, Pose(*pose), self._names)
+            message = JointState(name=list(positions), position=list(positions.values()))
+            message.header.stamp = now
+            self._joints.publish(message)
+
+
+class JournalTopics:
+    """``~/journal`` and ``~/files``, which make a recording of a run replayable: the pages of
+    :mod:`hexapod_comp.compensation.journal`, and geometry and model in use, unchanged.
+
+    Both are reliable and kept for late subscribers, so that a recorder that starts during a motion gets what it needs.
+    Nothing is published while a command is handled: events are stored, and published with :meth:`tick`.
+    """
+
+    def __init__(self, node: CompensatorState) -> None:
+        self._sources, self._published = node.files.sources, dict[str, Source]()
+        self._pages = node.create_publisher(String, "~/journal", JOURNAL_QOS)
+        self._files = node.create_publisher(String, "~/files", JOURNAL_QOS)
+        self._journal = Journal(node.compensator, self._sources, node.ids, node.options["joint_names"])
+        self.answered, self.refused = self._journal.answered, self._journal.refused
+        self.tick(time.monotonic())  # so that no command comes before the first page
+
+    def tick(self, now: float) -> None:
+        """Publish what is due: new files, then a page."""
+        if not self._journal.due(now):
+            return
+        if self._sources != self._published:
+            self._files.publish(String(data=sources_text(self._sources)))
+            self._published = dict(self._sources)
+        self._pages.publish(String(data=self._journal.page(now)))
+
+    def finish(self, now: float) -> None:
+        """Publish a last page, with the answers since the previous one, and wait for its arrival."""
+        self._pages.publish(String(data=self._journal.page(now)))
+        self._pages.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+
+
+# ---- markers ----
+
+STRUT_DIAMETER = 0.02
+JOINT_DIAMETER = 0.035
+LIFETIME = Duration(sec=1)  # Lifetime of markers: a machine that is not updated disappears instead of seeming alive
+
+GREY = ColorRGBA(r=0.5, g=0.5, b=0.55, a=1.0)
+STEEL = ColorRGBA(r=0.3, g=0.35, b=0.45, a=0.9)
+
+
+def machine_markers(
+    geometry: HexapodGeometry,
+    position: np.ndarray,
+    rotation: np.ndarray,
+    correction: np.ndarray,
+    frame_id: str,
+    stamp: Time,
+) -> MarkerArray:
+    """Return the machine at a platform pose."""
+    base = geometry.base_joints
+    platform = position + geometry.platform_joints @ rotation.T
+    tip = position + rotation @ geometry.tool.position + 0.1 * rotation[:, 2]
+    markers: list[Marker] = []
+    for kind, size, colour, points in (
+        (Marker.LINE_LIST, STRUT_DIAMETER, None, [end for ends in zip(base, platform, strict=True) for end in ends]),
+        (Marker.SPHERE_LIST, JOINT_DIAMETER, GREY, (*base, *platform)),
+        (Marker.LINE_STRIP, STRUT_DIAMETER, STEEL, (*platform, platform[0])),
+        (Marker.LINE_STRIP, STRUT_DIAMETER, GREY, (*base, base[0])),
+        (Marker.ARROW, STRUT_DIAMETER, STEEL, (position, tip)),
+    ):
+        marker = Marker(ns="hexapod", id=len(markers), type=kind, action=Marker.ADD, lifetime=LIFETIME)
+        marker.header.frame_id, marker.header.stamp = frame_id, stamp
+        marker.pose.orientation.w = 1.0
+        marker.scale.x = marker.scale.y = marker.scale.z = size
+        marker.points = [Point(x=x, y=y, z=z) for x, y, z in np.array(points).tolist()]
+        if colour is not None:
+            marker.color = colour
+        else:  # the struts, each in its own colour
+            marker.color.a = 1.0
+            marker.colors = [correction_colour(amount) for amount in correction for _ in range(2)]
+        markers.append(marker)
+    return MarkerArray(markers=markers)
+
+
+def correction_colour(correction: float) -> ColorRGBA:
+    """Return blue for −100 µm, white for 0, red for +100 µm and beyond."""
+    share = max(-1.0, min(1.0, correction / 100e-6))
+    rest = 1.0 - abs(share)
+    return ColorRGBA(r=1.0 if share > 0 else rest, g=rest, b=1.0 if share < 0 else rest, a=1.0)
