@@ -294,7 +294,7 @@ class MachineNode(LifecycleNode):
         self._status_shown: tuple[bytes, str] | None = None
         self.set_hardware_id("")
         self._tickers: dict[str, Alarm] = {}
-        self._options = Parameters(self, table, self._on_parameters)
+        self._options = Parameters(self, table, self.check_parameters, self._on_parameters)
         self.clock = StampClock(self.simulated_time())
         self._steps_logged = 0
         self.wants_autostart = bool(self._options.get("autostart", True))
@@ -405,6 +405,9 @@ class MachineNode(LifecycleNode):
         for name in names & self._tickers.keys():
             self._tickers[name].set_rate(self._options[name])
         self.on_parameters(names)
+
+    def check_parameters(self, values: dict[str, Any]) -> None:
+        """Refuse, by a ParameterError, values that are allowed, but not now."""
 
     def on_parameters(self, names: set[str]) -> None:
         """Apply parameters that have been set while the node runs; called at other times too, with no names."""

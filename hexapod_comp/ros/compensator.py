@@ -76,6 +76,10 @@ class CompensatorNode(CompensatorState):
         self._pacing.close()
         self.instrument = None
 
+    def check_parameters(self, values: dict[str, Any]) -> None:
+        if self.configured and "tool" in values:
+            self._requests.tools.check(values["tool"])
+
     def on_parameters(self, names: set[str]) -> None:
         """Apply what has been set while the node runs; other parameters are read where they are used."""
         self.apply_parameters()
@@ -83,6 +87,7 @@ class CompensatorNode(CompensatorState):
             self.thermometers.follow(*temperature_rules(self.options))
             self.compensator.set_ramp_rate(self.options["ramp_rate"])
             self.loads.apply()
+            self._requests.tools.apply()
             if self.instrument is not None:
                 self.instrument.follow()
 

@@ -144,9 +144,13 @@ class Parameters(dict[str, Any]):
     """The values of a node's parameters, by name, validated; those that may change are always the ones in force."""
 
     def __init__(
-        self, node: LifecycleNode, table: Sequence[Parameter], changed: Callable[[set[str]], None] = lambda names: None
+        self,
+        node: LifecycleNode,
+        table: Sequence[Parameter],
+        check: Callable[[dict[str, Any]], None],
+        changed: Callable[[set[str]], None],
     ) -> None:
-        self._node, self._changed = node, changed
+        self._node, self._check, self._changed = node, check, changed
         self._table = {parameter.name: parameter for parameter in table}
         for name, parameter in self._table.items():
             try:
@@ -190,6 +194,7 @@ class Parameters(dict[str, Any]):
             if any(parameter.name == USE_SIM_TIME and parameter.value is not clock for parameter in parameters):
                 problem = f"is {str(clock).lower()} for as long as the node runs; set it at the start"
                 raise ParameterError(f"parameter {USE_SIM_TIME}: {problem}")
+            self._check(wanted)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

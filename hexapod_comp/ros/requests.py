@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -24,6 +23,7 @@ from ..pose import Pose
 from .base import ERROR, EVENT_QOS, LATCHED_QOS, OK
 from .interface import CompensatorState
 from .messages import read_message, stamp_of
+from .parameters import ParameterError
 from .rclpy_compat import LateAnswer
 from .worker import Worker, WorkerError
 
@@ -47,7 +47,7 @@ class Requests:
         node.create_logged_service(Trigger, "~/reset", self._on_reset)
         self._reload = LateAnswer(node.create_logged_service(Trigger, "~/reload_model", self._on_reload))
         self._loading = False
-        self._tools = ToolChoice(node)
+        self.tools = ToolChoice(node)
         self._travel = TravelReports(node, self._worker)
         self._predicted = PredictedError(node, self._worker)
 
@@ -59,8 +59,8 @@ class Requests:
     def close(self) -> None:
         """Answer pending requests, and end the worker."""
         self._reload.answer(Trigger.Response(message="the old model stays: the node was cleaned up"))
-        for part in (self._tools, self._travel, self._worker):
-            part.close()
+        self._travel.close()
+        self._worker.close()
 
     def _on_enable(self, request: SetBool.Request, _: SetBool.Response) -> SetBool.Response:
         self._node.compensator.enable(request.data)
@@ -129,35 +129,25 @@ class ToolChoice:
         self._sender = node.subscribe_exclusive(String, "select_tool", self._on_message, several)
         node.sensing["select_tool"] = self._sender
         self._publisher = node.create_publisher(String, "~/tool", LATCHED_QOS)
-        node.add_on_set_parameters_callback(self._judge)
-        node.add_post_set_parameters_callback(self._use)
         self._publish()
 
-    def close(self) -> None:
-        self._node.remove_on_set_parameters_callback(self._judge)
-        self._node.remove_post_set_parameters_callback(self._use)
-
-    def _judge(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        """Refuse an unknown tool, and any while the machine moves."""
+    def check(self, name: str) -> None:
+        """Refuse an unknown tool, and any other while the machine moves."""
         geometry = self._compensator.geometry
         try:
-            for name in (parameter.value for parameter in parameters if parameter.name == "tool"):
-                if not isinstance(name, str):
-                    raise CommandError("tool", f"must be str, not {name!r}")
-                geometry.using(tool=name)
-                moving = self._node.track.moving(time.monotonic())
-                if moving and name != geometry.tool_name:
-                    raise CommandError("tool", f"stays {geometry.tool_name!r} while the machine moves: {moving}")
+            geometry.using(tool=name)
         except HexapodError as error:
-            return SetParametersResult(successful=False, reason=f"parameter tool: {error}")
-        return SetParametersResult(successful=True)
+            raise ParameterError(f"parameter tool: {error}") from error
+        moving = self._node.track.moving(time.monotonic())
+        if moving and name != geometry.tool_name:
+            raise ParameterError(f"parameter tool: stays {geometry.tool_name!r} while the machine moves: {moving}")
 
-    def _use(self, parameters: Sequence[Parameter]) -> None:
-        for name in (parameter.value for parameter in parameters if parameter.name == "tool"):
-            if name != self._compensator.geometry.tool_name:
-                self._compensator.set_tool(name)
-                self._node.note("tool", f"tool {name!r}: the next command must be at the struts' present position")
-                self._publish()
+    def apply(self) -> None:
+        """Use the tool that the parameter names now."""
+        if (name := self._node.options["tool"]) != self._compensator.geometry.tool_name:
+            self._compensator.set_tool(name)
+            self._node.note("tool", f"tool {name!r}: the next command must be at the struts' present position")
+            self._publish()
 
     def _on_message(self, data: bytes, sample: Sample) -> None:
         """Set the parameter. If the commander's choice is refused, its next command must be at the struts' present

@@ -10,7 +10,7 @@ import json
 import re
 import runpy
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from std_msgs.msg import UInt64
 
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
-from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.ros import described
 from hexapod_comp.ros.adapter import AdapterNode
 from hexapod_comp.ros.client import LoopClient
@@ -43,13 +43,28 @@ from hexapod_comp.viewer.page import Watcher
 
 MAKER = runpy.run_path(str(CONFIG.parent / "tools" / "make_parameter_files.py"))
 TABLES = MAKER["TABLES"]
-KINDS = {
-    "compensator": CompensatorNode,
-    "strut_drive": StrutDriveNode,
-    "mover": MoverNode,
-    "instrument": InstrumentNode,
-    "adapter": AdapterNode,
+NODES: dict[str, tuple[type, dict[str, object], set[str]]] = {
+    "compensator": (
+        CompensatorNode,
+        {"publish_array": True},
+        {"/robot_description", *(f"/compensator/{name}" for name in ("files", "journal", "stopped", "tool"))},
+    ),
+    "strut_drive": (StrutDriveNode, {}, set()),
+    "mover": (MoverNode, {}, {"/mover/state"}),
+    "instrument": (InstrumentNode, {"kind": "tracker"}, set()),
+    "adapter": (AdapterNode, {}, {"/adapter/state"}),
+    "linuxcnc_bridge": (LinuxcncBridgeNode, {}, set()),
 }
+"""What each is made with to open all its topics, and what is latched for late subscribers."""
+
+PARAMETRISED = [name for name in NODES if name != "linuxcnc_bridge"]
+
+
+def made(rig: Rig, name: str, start: bool = True, arguments: Sequence[str] = (), **parameters: object) -> Any:
+    """Return a node of a kind; started, its topics are open."""
+    hal = {"hal": StandInHal()} if name == "linuxcnc_bridge" else {}
+    return rig.add(NODES[name][0], start, parameters, cli_args=["--ros-args", *arguments], **hal)
+
 
 COMPENSATOR = "compensator"
 
@@ -143,12 +158,8 @@ def test_another_model_is_taken_by_reload(rig, tmp_path):
 
 
 def test_descriptors_say_range_and_when(rig):
-    rig.compensator(start=False)
-    rig.drive(start=False)
-    rig.add(MoverNode, False, {})
-    rig.add(InstrumentNode, False, {})
-    rig.add(AdapterNode, False, {})
-    for name in KINDS:
+    for name in PARAMETRISED:
+        made(rig, name, False)
         table = TABLES[name]
         request = DescribeParameters.Request(names=[p.name for p in table])
         told = rig.call(DescribeParameters, f"{name}/describe_parameters", request).descriptors
@@ -173,10 +184,10 @@ def in_force(node: Any) -> dict[str, Any]:
     return {p.name: node.get_parameter(p.name).value for p in TABLES[node.get_name()]}
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", PARAMETRISED)
 def test_the_shipped_file_gives_the_defaults_in_any_namespace(rig, name):
     rig.namespace = "/left/cell"
-    node = rig.add(KINDS[name], False, {}, cli_args=["--ros-args", "--params-file", str(MAKER["FILE"])])
+    node = made(rig, name, False, ["--params-file", str(MAKER["FILE"])])
     assert in_force(node) == {p.name: p.default for p in TABLES[name]}
     assert not rig.logged("there is no parameter")
 
@@ -195,23 +206,23 @@ def other_value(parameter: Any) -> Any:
     return not parameter.default if isinstance(parameter.default, bool) else f"{parameter.default}x"
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", PARAMETRISED)
 def test_a_file_of_other_values_is_loaded_also_through_the_launch_file(rig, monkeypatch, tmp_path, name):
     """The launch file gives its own arguments after the file; launch_ros writes them into files, as here."""
     others = {p.name: other_value(p) for p in TABLES[name] if p.name != "model_folder"}
     path = tmp_path / "mine.yaml"
     path.write_text(yaml.safe_dump({f"/**/{name}": {"ros__parameters": others}}))
-    node = rig.add(KINDS[name], False, {}, cli_args=["--ros-args", "--params-file", str(path)])
+    node = made(rig, name, False, ["--params-file", str(path)])
     assert {key: value for key, value in in_force(node).items() if key in others} == others
     arguments = f"params_file:={path}", "model:=table.yaml", "mover:=true", "instrument:=laser", "adapter:=true"
     given = LaunchFile(monkeypatch).start(*arguments)[name]
-    arguments, given = ["--ros-args"], given["parameters"]
+    arguments, given = [], given["parameters"]
     for number, part in enumerate(given):
         if isinstance(part, dict):
             (tmp_path / f"{number}.yaml").write_text(yaml.safe_dump({"/**": {"ros__parameters": part}}))
             part = str(tmp_path / f"{number}.yaml")
         arguments += ["--params-file", part]
-    values = in_force(rig.add(KINDS[name], False, {}, cli_args=arguments))
+    values = in_force(made(rig, name, False, arguments))
     assert values == in_force(node) | {k: v for k, v in given[-1].items() if k in others}
     assert values.get("command_timeout", 3600.0) == 3600.0
     assert values.get("model_file", "table.yaml") == "table.yaml"
@@ -223,38 +234,16 @@ def test_a_file_of_other_values_is_loaded_also_through_the_launch_file(rig, monk
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = ReliabilityPolicy.RELIABLE
 
-NODES = {
-    "compensator": (CompensatorNode, {"command_input": "struts", "publish_array": True}),
-    "strut_drive": (StrutDriveNode, {}),
-    "linuxcnc_bridge": (LinuxcncBridgeNode, {}),
-}
 COMMANDS = {"/strut_setpoints", "/strut_commands", "/strut_corrections", "/strut_commands_array"}
-LATCHED = {
-    "compensator": {
-        *(f"/compensator/{name}" for name in ("files", "journal", "stopped", "tool")),
-        "/robot_description",
-    },
-    "strut_drive": set(),
-    "linuxcnc_bridge": set(),
-}
-"""For late subscribers."""
 READINGS = {"/strut_states", "/temperatures", "/humidity", "/gravity", "/wrench", "/outside"}
 STATES = {"/strut_states", "/tool_pose_estimate", "/nominal_strut_states", "/tool_pose_true"}
-
-
-def made(rig: Rig, name: str, **overrides: object) -> Any:
-    """Return a node whose topics are open."""
-    kind, parameters = NODES[name]
-    hal = {"hal": StandInHal()} if kind is LinuxcncBridgeNode else {}
-    node = rig.add(kind, False, parameters | overrides, **hal)
-    node.trigger_configure()
-    return node
 
 
 @pytest.mark.parametrize("name", NODES)
 def test_default_subscribers_hear_all_that_is_published(rig: Rig, name: str) -> None:
     """Commands reliable, in a queue of a hundred; of states the newest only."""
-    node = made(rig, name)
+    by_struts = {"command_input": "struts"} if name == "compensator" else {}
+    node = made(rig, name, **NODES[name][1], **by_struts)
     for end in node.publishers:
         for wanted in (QoSProfile(depth=10), BEST_EFFORT):
             assert "ERROR" not in str(qos_check_compatible(end.qos_profile, wanted)[0]), end.topic_name
@@ -263,12 +252,13 @@ def test_default_subscribers_hear_all_that_is_published(rig: Rig, name: str) -> 
         if end.topic_name in COMMANDS | STATES:
             queue = 100 if end.topic_name in COMMANDS else 1
             assert (end.qos_profile.depth, end.qos_profile.history) == (queue, HistoryPolicy.KEEP_LAST), end.topic_name
-            reading = name == "compensator" and end.topic_name == "/strut_states"
-            assert end.qos_profile.reliability == (ReliabilityPolicy.BEST_EFFORT if reading else RELIABLE)
+    for end in node.subscriptions:
         if name == "compensator" and end.topic_name in READINGS:
             assert "ERROR" not in str(qos_check_compatible(BEST_EFFORT, end.qos_profile)[0]), end.topic_name
+        elif end.topic_name in COMMANDS:
+            assert end.qos_profile.reliability == RELIABLE, end.topic_name
     kept = {end.topic_name for end in node.publishers if end.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL}
-    assert kept == LATCHED[name]
+    assert kept == NODES[name][2]
 
 
 def test_what_is_named_can_be_overridden_and_nothing_else(rig: Rig) -> None:
@@ -301,36 +291,25 @@ MAY_COMMAND = {
 """Who alone may move the machine."""
 
 
-@dataclass
-class Enclave:
-    """What one enclave may do, as absolute names by right."""
-
-    node: str
-    allowed: dict[str, set[str]] = field(default_factory=lambda: {right: set() for right in RIGHTS})
-
-
-def read_policy(namespace: str = "") -> dict[str, Enclave]:
-    """Return the enclaves of the shipped policy by the last part of their path, for a machine in a namespace."""
+def read_policy(namespace: str = "") -> dict[str, tuple[str, dict[str, set[str]]]]:
+    """Return each enclave of the shipped policy by the last part of its path, for a machine in a namespace: its node,
+    and what that may do, as absolute names by right."""
     builder = ET.TreeBuilder(insert_comments=True)
     root = ET.parse(POLICY, ET.XMLParser(target=builder)).getroot()
     found = {}
     for enclave in root.find("enclaves"):
         profiles = enclave.findall("profiles/profile")
-        entry = Enclave(profiles[0].get("node"))
+        allowed: dict[str, set[str]] = {right: set() for right in RIGHTS}
         for profile in profiles:
             node = profile.get("node")
             place = "" if node == TOOLS else namespace
             for group in profile:
                 rights = [right for right in group.attrib if group.get(right) == "ALLOW"]
                 for name, right in product(group, rights):
-                    entry.allowed[right].add(absolute(name.text, node, place))
-        found[enclave.get("path").rpartition("/")[2]] = entry
+                    whole = name.text if name.text.startswith("/") else f"{place}/{name.text.replace('~', node, 1)}"
+                    allowed[right].add(whole)
+        found[enclave.get("path").rpartition("/")[2]] = profiles[0].get("node"), allowed
     return found
-
-
-def absolute(name: str, node: str, namespace: str) -> str:
-    """Return a policy's name as the graph shows it, for a profile whose ns is `namespace`."""
-    return name if name.startswith("/") else f"{namespace}/{name.replace('~', node, 1)}"
 
 
 def opened(witness: Node, node: str, namespace: str) -> dict[str, set[str]]:
@@ -346,38 +325,31 @@ def opened(witness: Node, node: str, namespace: str) -> dict[str, set[str]]:
 
 def test_nobody_else_may_move_the_machine() -> None:
     for topic, allowed in MAY_COMMAND.items():
-        may = {name for name, enclave in read_policy().items() if topic in enclave.allowed["publish"]}
+        may = {name for name, (_, rights) in read_policy().items() if topic in rights["publish"]}
         assert may == allowed, topic
 
 
-@pytest.mark.parametrize("name", ["compensator", "strut_drive", "mover", "instrument", "adapter", "linuxcnc_bridge"])
+@pytest.mark.parametrize("name", NODES)
 def test_lifecycle_nodes_open_what_the_policy_allows(name: str, rig: Rig) -> None:
     """Nothing more, nothing less, with every optional topic switched on."""
     rig.namespace = "/guarded"  # of its own: the graph still knows nodes of these names from other tests
-    node = {
-        "compensator": lambda: rig.compensator(publish_array=True),
-        "strut_drive": rig.drive,
-        "mover": lambda: rig.add(MoverNode, True, {}),
-        "instrument": lambda: rig.add(InstrumentNode, True, {"kind": "tracker"}),
-        "adapter": lambda: rig.add(AdapterNode, True, {}),
-        "linuxcnc_bridge": lambda: rig.add(LinuxcncBridgeNode, True, {}, hal=StandInHal()),
-    }[name]()
-    enclave = read_policy(rig.namespace)[name]
-    assert enclave.node == name
-    enclave.allowed["publish"] -= {"/guarded/instrument/readings"}  # a laser's, in place of a tracker's pose
+    node = made(rig, name, **NODES[name][1])
+    enclave, allowed = read_policy(rig.namespace)[name]
+    assert enclave == name
+    allowed["publish"] -= {"/guarded/instrument/readings"}  # a laser's, in place of a tracker's pose
     with contextlib.suppress(TimeoutError):  # the comparison says what is missing
-        rig.until(lambda: opened(node, name, rig.namespace) == enclave.allowed, "the graph to be complete", 1.0)
-    assert opened(node, name, rig.namespace) == enclave.allowed
+        rig.until(lambda: opened(node, name, rig.namespace) == allowed, "the graph to be complete", 1.0)
+    assert opened(node, name, rig.namespace) == allowed
 
 
 def test_the_client_opens_what_the_policy_allows() -> None:
     client = LoopClient()
     try:
-        enclave = read_policy()["commander"]
-        assert client.node.get_name() == enclave.node
-        found = opened(client.node, enclave.node, "")
+        name, allowed = read_policy()["commander"]
+        assert client.node.get_name() == name
+        found = opened(client.node, name, "")
         found["publish"] |= {"/select_tool"}  # for controllers that change tools
-        assert found == enclave.allowed
+        assert found == allowed
     finally:
         client.close()
 
@@ -398,16 +370,11 @@ def test_who_only_listens_may_and_opens_nothing_more(tmp_path: Path) -> None:
         look(session.node)
     with RosSession("hexapod_comp_echo", **QUIET) as session:
         look(session.node)
-    witness = policy["witness"].allowed
+    _, witness = policy["witness"]
     assert opens["subscribe"] <= witness["subscribe"]
-    assert {right: opens[right] for right in RIGHTS[:1] + RIGHTS[2:]} == {
-        right: witness[right] for right in RIGHTS[:1] + RIGHTS[2:]
-    }
-    said = {
-        name for name in policy["compensator"].allowed["publish"] if not name.endswith(("_event", "_events", "rosout"))
-    }
-    others = {"/strut_states", "/tool_pose_true", "/tool_pose_command", "/select_tool", "/temperatures", "/humidity"}
-    others |= {"/gravity", "/wrench", "/outside"}
+    assert opens | {"subscribe": witness["subscribe"]} == witness
+    said = {n for n in policy["compensator"][1]["publish"] if not n.endswith(("_event", "_events", "rosout"))}
+    others = {"/tool_pose_true", "/tool_pose_command", "/select_tool", *READINGS}
     by_input = {"/strut_setpoints", "/nominal_strut_states"}  # with command_input: struts
     assert witness["subscribe"] == said | others | by_input
 
@@ -466,21 +433,12 @@ def test_views_name_what_the_nodes_publish(rig: Bench) -> None:
     named = {*scene["topics"], *(panel.get("topicToRender") for panel in layout["configById"].values())} - {None}
     assert named <= {*ends, "/rosout"}
     paths = [path["value"] for panel in layout["configById"].values() for path in panel.get("paths", [])]
-    assert len(paths) == 12
-    for path in paths:
-        topic, field, number = re.fullmatch(r"(/\w+)\.(\w+)\[(\d)\]", path).groups()
-        assert field in ends[topic].msg_type.get_fields_and_field_types()
-        assert int(number) < 6
     curves = [curve.get("name") for curve in ET.parse(VIEWS / "plotjuggler.xml").iter("curve")]
-    assert len(curves) == len(set(curves)) == 30
-    for curve in curves:
-        topic, *parts = curve.split("/")[1:]
-        kind = ends[f"/{topic}"].msg_type.__name__
-        if kind == "JointState":  # PlotJuggler puts the joint's name before its value
-            assert parts[0] in {f"strut_{n}" for n in range(1, 7)}
-            assert parts[1] in ("position", "velocity")
-        else:
-            assert (kind, parts[:2]) == ("PoseStamped", ["pose", "position"])
+    assert (len(paths), len(curves)) == (12, 30)
+    for shown in (*paths, *curves):
+        topic, *parts = re.split(r"[/.\[\]]+", shown.strip("/]"))
+        fields = {*ends[f"/{topic}"].msg_type.get_fields_and_field_types(), *STRUT_NAMES}  # PlotJuggler: joint by name
+        assert parts[0] in fields, shown
 
 
 def test_the_aggregator_waits_for_what_the_nodes_say(rig: Bench) -> None:

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Vector3Stamped, WrenchStamped
-from node_helpers import HOME, RELIABLE, Rig, Stranger, closed_form_lengths, model_file
+from node_helpers import HOME, RELIABLE, Rig, closed_form_lengths, model_file
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -86,26 +87,6 @@ def test_the_struts_follow_gravity_and_wrench(rig: Rig, tmp_path: Path) -> None:
     np.testing.assert_array_equal(settled(rig), commands(Loading.of([0.0, 0.0, -9.8], wrench), pose))
 
 
-@pytest.mark.parametrize(
-    ("topic", "numbers", "frame", "text"),
-    [
-        ("gravity", [0.0, 0.0, -1.0], "base", "gravity: must be 9…10.6 m/s² in all, not 1"),
-        ("gravity", [0.0, 0.0, -9.8], "work", "gravity: frame_id must be base, not 'work'"),
-        ("wrench", [math.inf, 0.0, 0.0, 0.0, 0.0, 0.0], "platform", "wrench: must be six finite numbers"),
-        ("wrench", [0.0] * 6, "base", "wrench: frame_id must be platform or tool, not 'base'"),
-    ],
-)
-def test_what_cannot_be_is_ignored_and_named(
-    rig: Rig, tmp_path: Path, topic: str, numbers: list[float], frame: str, text: str
-) -> None:
-    started(rig, tmp_path)
-    before = settled(rig)
-    publish_gravity(rig, *numbers, frame=frame) if topic == "gravity" else publish_wrench(rig, numbers, frame)
-    values = rig.until_status(ERROR, "bad feedback")
-    assert text in values["last_bad_feedback"]
-    np.testing.assert_array_equal(settled(rig), before)
-
-
 # ---- outside numbers ----
 
 SAG = np.radians([0.0, 90.0, 0.0, 90.0]).reshape(2, 2), np.outer([10e-6, 15e-6, 40e-6, 50e-6], [0.2, 0.0, -1.0])
@@ -157,24 +138,33 @@ def test_the_struts_follow_outside_numbers(rig: Rig, tmp_path: Path) -> None:
         np.testing.assert_array_equal(settled(rig), at(elevation=0.1, rotator=0.2))
 
 
-@pytest.mark.parametrize(
-    ("names", "numbers", "text"),
-    [
-        (["elevation"], [45.0], "outside.elevation: the table holds elevation 0 to 90 deg; is the unit right?"),
-        (["elevation", "rotator"], [0.3], "outside: has 2 names for 1 positions"),
-        (["azimuth"], [0.3], "outside: must name elevation or rotator, not 'azimuth'"),
-    ],
-)
-def test_outside_numbers_that_cannot_be_are_ignored_and_named(
-    rig: Rig, tmp_path: Path, names: list[str], numbers: list[float], text: str
-) -> None:
-    bent(rig, tmp_path)
-    tell(rig, elevation=0.5, rotator=0.2)
-    rig.until(lambda: reached(rig, at(elevation=0.5, rotator=0.2)), "the table's correction")
+def named(rig: Rig, names: list[str], numbers: list[float]) -> None:
     rig.publish("outside", JointState(name=names, position=numbers))
     rig.barrier()
+
+
+BAD_LOADS = [
+    (publish_gravity, (0.0, 0.0, -1.0), "gravity: must be 9…10.6 m/s² in all, not 1"),
+    (partial(publish_gravity, frame="work"), (0.0, 0.0, -9.8), "gravity: frame_id must be base, not 'work'"),
+    (publish_wrench, ([math.inf] + [0.0] * 5,), "wrench: must be six finite numbers"),
+    (publish_wrench, ([0.0] * 6, "base"), "wrench: frame_id must be platform or tool, not 'base'"),
+    (named, (["elevation"], [45.0]), "outside.elevation: the table holds elevation 0 to 90 deg; is the unit right?"),
+    (named, (["elevation", "rotator"], [0.3]), "outside: has 2 names for 1 positions"),
+    (named, (["azimuth"], [0.3]), "outside: must name elevation or rotator, not 'azimuth'"),
+]
+
+
+@pytest.mark.parametrize(("publish", "values", "text"), BAD_LOADS)
+def test_what_cannot_be_is_ignored_and_named(rig: Rig, tmp_path: Path, publish, values: tuple, text: str) -> None:
+    model = replace(MODEL, outside=TABLE)
+    save_model(model, tmp_path / "model.yaml")
+    rig.compensator(model_file=str(tmp_path / "model.yaml"), command_timeout=0.0, ramp_rate=1.0)
+    tell(rig, elevation=0.5, rotator=0.2)
+    rig.step(0.1)
+    before = settled(rig)
+    publish(rig, *values)
     assert text in rig.until_status(ERROR, "bad feedback")["last_bad_feedback"]
-    np.testing.assert_array_equal(settled(rig), at(elevation=0.5, rotator=0.2))
+    np.testing.assert_array_equal(settled(rig), before)
 
 
 def test_a_table_that_refuses_stops_the_machine(rig: Rig, tmp_path: Path) -> None:
@@ -186,17 +176,6 @@ def test_a_table_that_refuses_stops_the_machine(rig: Rig, tmp_path: Path) -> Non
     rig.until_status(ERROR, "refusing commands: outside_table: elevation 91.6732 deg: the table holds elevation 0 to")
     tell(rig, elevation=1.5)
     rig.until(lambda: reached(rig, at(elevation=1.5, rotator=0.2)), "the number inside")
-
-
-def test_two_publishers_of_outside_numbers_move_nothing_and_silence_is_reported(rig: Rig, tmp_path: Path) -> None:
-    bent(rig, tmp_path, outside_timeout=0.3)
-    tell(rig, elevation=0.5, rotator=0.2)
-    rig.until(lambda: reached(rig, at(elevation=0.5, rotator=0.2)), "the table's correction")
-    rig.until_status(WARN, "outside stale")
-    second = Stranger(rig, "second").create_publisher(JointState, "outside")
-    second.publish(JointState(name=["elevation"], position=[1.4]))
-    rig.until_status(ERROR, "outside ignored: several_publishers")
-    np.testing.assert_array_equal(settled(rig), at(elevation=0.5, rotator=0.2))
 
 
 # ---- a pose instrument ----
