@@ -46,7 +46,6 @@ class Requests:
         node.create_logged_service(SetBool, "~/enable_compensation", self._on_enable)
         node.create_logged_service(Trigger, "~/reset", self._on_reset)
         self._reload = LateAnswer(node.create_logged_service(Trigger, "~/reload_model", self._on_reload))
-        self._loading = False
         self.tools = ToolChoice(node)
         self._travel = TravelReports(node, self._worker)
         self._predicted = PredictedError(node, self._worker)
@@ -82,9 +81,9 @@ class Requests:
     # ---- the model ----
 
     def _on_reload(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response | None:
-        if self._loading:
+        if self._worker.busy("load_model"):
             return Trigger.Response(message="the model is being loaded already")
-        self._loading, machine, files = True, self._node.compensator.geometry.name, self._node.files
+        machine, files = self._node.compensator.geometry.name, self._node.files
         if files.ideal:
             return self._use_model((MachineModel(machine), IDEAL_SOURCE))
         name, place, folder = files.model_place()
@@ -99,7 +98,7 @@ class Requests:
         return None
 
     def _use_model(self, found: tuple[MachineModel, Any]) -> Trigger.Response:
-        self._loading, sources = False, self._node.files.sources
+        sources = self._node.files.sources
         before = sources["model"]
         model, sources["model"] = found  # the source first: the journal records it with the change
         try:
@@ -110,7 +109,6 @@ class Requests:
         return Trigger.Response(success=True, message=f"model {model.name!r} ramps in")
 
     def _keep_model(self, error: HexapodError) -> Trigger.Response:
-        self._loading = False
         self._node.failed_reloads.add(error.reason, str(error), time.monotonic())
         self._node.get_logger().warning(f"the old model stays: {error}")
         return Trigger.Response(message=f"the old model stays: {error}")
@@ -186,14 +184,13 @@ class TravelReports:
         self._node, self._worker = node, worker
         self._publisher = node.create_publisher(DiagnosticStatus, "~/travel", EVENT_QOS)
         self._late = LateAnswer(node.create_service(Trigger, "~/get_travel", self._on_request))
-        self._busy = self._asked = False
-        self._due = 0.0
+        self._asked, self._due = False, 0.0
 
     def close(self) -> None:
         self._late.answer(Trigger.Response(message="the node was cleaned up"))
 
     def update(self, now: float) -> None:
-        if not self._busy and now >= self._due and self._publisher.get_subscription_count():
+        if now >= self._due and not self._worker.busy("travel") and self._publisher.get_subscription_count():
             self._due = now + TRAVEL_PERIOD
             try:
                 self._begin()
@@ -201,9 +198,9 @@ class TravelReports:
                 self._report(ERROR, str(error))
 
     def _on_request(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response | None:
-        if self._asked and self._busy:
+        if self._asked:
             raise CommandError("busy", "it is being worked out already")
-        if not self._busy:
+        if not self._worker.busy("travel"):
             self._begin()
         self._asked = True
         return None
@@ -221,7 +218,6 @@ class TravelReports:
         geometry = compensator.geometry.using(work=work)
         pose = geometry.tool_pose(platform)
         where = f"tool {geometry.tool_name} in {node.ids[work]} at {pose_text(pose)}"
-        self._busy = True
         self._worker.ask(
             "travel",
             {"pose": pose, "work": work, "enabled": compensator.enabled, **situation(node)},
@@ -231,7 +227,7 @@ class TravelReports:
         )
 
     def _report(self, level: bytes, text: str, table: str = "", values: dict[str, str] | None = None) -> None:
-        self._busy = self._asked = False
+        self._asked = False
         self._late.answer(Trigger.Response(success=level == OK, message="\n".join(filter(None, (text, table)))))
         if self._publisher.get_subscription_count():
             self._publisher.publish(self._node.report("travel", level, text, values or {}, LONGEST_REASON))
@@ -248,7 +244,7 @@ class PredictedError:
             "standing": node.create_publisher(PoseWithCovarianceStamped, "~/predicted_error", EVENT_QOS),
             "aligned": node.create_publisher(PoseWithCovarianceStamped, "~/predicted_error_aligned", EVENT_QOS),
         }
-        self._busy, self._asked_for, self._due = False, 0, 0.0
+        self._asked_for, self._due = 0, 0.0
         self._source: Any = None
 
     def update(self, now: float) -> None:
@@ -257,21 +253,21 @@ class PredictedError:
         wanted = any(publisher.get_subscription_count() for publisher in self._topics.values())
         if not wanted or self._source is not source:
             self._source, node.prediction_problem, self._due = source, "", min(self._due, now)
-        if not wanted or self._busy or now < self._due or not np.isfinite(compensator.nominal).all():
+        if not wanted or now < self._due or self._worker.busy("predict") or not np.isfinite(compensator.nominal).all():
             return
-        self._busy, self._asked_for, self._due = True, node.last_answered, now + PREDICTION_PERIOD
+        self._asked_for, self._due = node.last_answered, now + PREDICTION_PERIOD
         asked = {"platform": compensator.platform, "sense": compensator.motion.sense.copy(), **situation(node)}
         self._worker.ask("predict", asked, self._publish, self._failed, node.files.made_of())
 
     def _publish(self, result: dict[str, Any]) -> None:
         """Publish both errors; there is none for a pose that the real machine cannot reach."""
-        self._busy, self._node.prediction_problem = False, ""
+        self._node.prediction_problem = ""
         for name, publisher in self._topics.items():
             if (error := result[name]) is not None and np.isfinite(error[0]).all():
                 publisher.publish(error_message(error[0], error[1], self._node.ids[WORK], self._asked_for))
 
     def _failed(self, error: WorkerError) -> None:
-        self._busy, self._due = False, time.monotonic() + TRY_AGAIN_AFTER
+        self._due = time.monotonic() + TRY_AGAIN_AFTER
         problem = self._node.prediction_problem = f"no predicted error: {error}"
         self._node.log_warning("predicted error", f"{problem}; tried again in {TRY_AGAIN_AFTER:g} s")
 

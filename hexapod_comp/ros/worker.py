@@ -43,7 +43,7 @@ class Worker:
 
     def __init__(self) -> None:
         self._process, self._thread = _Process(), ThreadPoolExecutor(1, "worker")
-        self._jobs: deque[tuple[Future[Any], Callable[[Any], None], Callable[[WorkerError], None]]] = deque()
+        self._jobs: deque[tuple[str, Future[Any], Callable[[Any], None], Callable[[WorkerError], None]]] = deque()
         self._done_at = 0.0
 
     @property
@@ -64,12 +64,16 @@ class Worker:
         """Have a task (load_model, predict, travel, plan_move) done for machine and model; `poll` passes its result to
         `done`. After `within`, s, the process is killed, and the error is `late`."""
         job = self._thread.submit(self._process.do, task, arguments, machine, within, late)
-        self._jobs.append((job, done, failed))
+        self._jobs.append((task, job, done, failed))
+
+    def busy(self, task: str) -> bool:
+        """Return whether such a task was asked for and has not been answered."""
+        return any(job[0] == task for job in self._jobs)
 
     def poll(self, now: float) -> None:
         """Call back with a result; end a process that is idle for IDLE_AFTER."""
-        if self._jobs and self._jobs[0][0].done():
-            job, done, failed = self._jobs.popleft()
+        if self._jobs and self._jobs[0][1].done():
+            _, job, done, failed = self._jobs.popleft()
             self._done_at = time.monotonic()
             error = job.exception()
             if error is None:

@@ -87,7 +87,7 @@ def test_a_process_begins_with_a_listener_is_started_anew_when_it_dies_and_ends_
     monkeypatch.setattr(worker, "IDLE_AFTER", 0.5)
     node = bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
     bench.ask(small.paper().home)
-    beside, predicted, seen = node._requests._worker, node._requests._predicted, bench.seen[STANDING]
+    beside, seen = node._requests._worker, bench.seen[STANDING]
     node._requests.update(1e12)
     assert beside.process is None
     subscription = bench.witness.create_subscription(PoseWithCovarianceStamped, STANDING, seen.append, RELIABLE)
@@ -95,7 +95,7 @@ def test_a_process_begins_with_a_listener_is_started_anew_when_it_dies_and_ends_
     first = beside.process.pid
 
     def warned() -> bool:
-        if predicted._busy and beside.process is not None:
+        if beside.busy("predict") and beside.process is not None:
             beside.process.kill()
         return "no predicted error: the process beside the node" in bench.message()
 
