@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from hexapod_comp.machine.limits import Limits
-from hexapod_comp.ros import compensator, strut_drive
+from hexapod_comp.ros import interface, strut_drive
 
 from .record import LINKS, Happened, Record, Sent, Status, Struts, Told
 
@@ -155,10 +155,10 @@ def default_of(node, name: str) -> float:
     return next(float(p.default) for p in node.PARAMETERS if p.name == name)
 
 
-FOLLOWING_LIMIT = default_of(compensator, "following_error_limit")
+FOLLOWING_LIMIT = default_of(interface, "following_error_limit")
 
 SILENCE = {  # which node must report what when a link is silent for longer than a time, s
-    "pose": ("compensator", "no new command|waiting for the first command", default_of(compensator, "command_timeout")),
+    "pose": ("compensator", "no new command|waiting for the first command", default_of(interface, "command_timeout")),
     "command": (
         "strut_drive",
         "no new command|waiting for the first command",
@@ -167,7 +167,7 @@ SILENCE = {  # which node must report what when a link is silent for longer than
     "feedback": (
         "compensator",
         "feedback lost|pose estimated from own commands",
-        default_of(compensator, "feedback_timeout"),
+        default_of(interface, "feedback_timeout"),
     ),
 }
 # … when a link delivers what must be refused, for the reason in the braces. A latched following error refuses every
