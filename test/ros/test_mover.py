@@ -501,6 +501,7 @@ class Watched(WatchedMachine):
         self.node, self.publishers = MagicMock(), 1
         self.node.resolve_topic_name.side_effect = "/{}".format
         self.node.count_publishers.side_effect = lambda topic: self.publishers
+        self.node.get_clock.return_value.now.return_value.nanoseconds = 1
         super().__init__("pose", samples=9, **options)
 
     def look(self, *messages: Any) -> Any:
