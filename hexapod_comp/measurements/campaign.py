@@ -84,8 +84,6 @@ class CampaignRun:
 
     def __post_init__(self) -> None:
         where = f"run {self.name}"
-        if self.instrument not in LISTED_INSTRUMENTS:
-            raise ModelError(where, f"instrument must be one of {', '.join(LISTED_INSTRUMENTS)}", self.instrument)
         if not 1 <= len(self.positions) <= MOST_POINTS:
             raise ModelError(where, f"must have 1 to {MOST_POINTS} points", len(self.positions))
         if (self.instrument in LENGTH_INSTRUMENTS) != (self.centres is not None):
@@ -377,13 +375,6 @@ class Campaign:
             if not 0.0 < getattr(self, name) <= np.ptp(box, axis=0).min() + 1e-9:
                 problem = "must be above zero and no longer than the box's shortest side, m"
                 raise ModelError(name, problem, getattr(self, name))
-        if self.instrument is not None and self.instrument not in INSTRUMENTS:
-            raise ModelError("instrument", f"must be one of {', '.join(INSTRUMENTS)}", self.instrument)
-        if self.diagonals not in DIAGONALS:
-            raise ModelError("diagonals", f"must be one of {DIAGONALS}", self.diagonals)
-        if not (1 <= self.cycles <= MOST_READINGS and 0 <= self.poses <= MOST_READINGS):
-            problem = f"must be 1 or more cycles and 0 or more poses, at most {MOST_READINGS} of each"
-            raise ModelError("cycles, poses", problem, [self.cycles, self.poses])
         if not (self.instrument or self.diagonals or self.poses or self.runs):
             raise ModelError("instrument", "or diagonals, poses or runs: nothing is measured")
         if not 0.0 <= self.tilt < math.inf:

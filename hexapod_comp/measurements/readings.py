@@ -47,7 +47,7 @@ LEAST_SIDE = 1e-6  # A box of which a side is shorter, m, is a line or a plane
 LEAST_NOISE = 1e-9
 # Factor on the assumed noise of an instrument (trackers and cameras apart) above which a unit must be wrong
 COARSEST = 300.0
-LARGEST_READING = 1.0  # no machine errs by more, m or rad
+LARGEST_READING = 1.0  # no machine errs by more, and no instrument's zero lies further off, m or rad
 LEAST_TRAVEL = 1e-6  # components of a line shorter than this, m, are no travel along that axis
 
 
@@ -290,17 +290,6 @@ class MeasurementSet:
     def with_values(self, value: np.ndarray) -> MeasurementSet:
         """Return the same stations with other readings, shape (N,), m or rad."""
         return replace(self, value=value)
-
-
-def refuse_absurd(measurements: MeasurementSet) -> None:
-    """Refuse readings, and uncertainties of readings, that no machine's error can have."""
-    for name, values in (("value", measurements.value), ("uncertainty", measurements.stated)):
-        absurd = np.flatnonzero(~(np.abs(values) <= LARGEST_READING))
-        if len(absurd):
-            first = absurd[0]
-            where = f"{measurements.sources[first]}, {CHANNELS[measurements.channel[first]]}"
-            problem = f"the {name} is {values[first]:g} m or rad (allowed ±{LARGEST_READING:g}); does the unit fit?"
-            raise CalibrationError(where, problem)
 
 
 def refuse_unmoved(measurements: MeasurementSet, left: np.ndarray) -> None:

@@ -28,6 +28,7 @@ from .readings import (
     FROM_PREVIOUS,
     KIND_OF,
     KINDS,
+    LARGEST_READING,
     LEAST_TRAVEL,
     LENGTH,
     LINE_KINDS,
@@ -99,7 +100,6 @@ OF_LINES = np.isin(np.array(KINDS)[KIND_OF], LINE_KINDS)  # whether each channel
 STRAIGHTNESS = np.array([NUMBER_OF[f"straightness_{axis}"] for axis in AXES])
 OWN_LINE = 0.99  # least component of a line's direction along an axis for the line to run along it
 NO_COMMANDS = (math.nan,) * 6  # commanded strut lengths of a reading without any
-LARGEST_READING = 10.0  # no machine errs by more, and no instrument's zero lies further off, m or rad
 SMALLEST_UNCERTAINTY = 1e-12  # no instrument reads better, m or rad; and the square of its inverse is still a number
 
 
@@ -113,7 +113,8 @@ def assemble(
 ) -> MeasurementSet:
     """Return the set of some readings: runs recognised as lines, stations made unique, reach checked."""
     probe = np.array(geometry.tool.position if probe is None else probe, dtype=float)
-    _check_channels(readings)
+    if not readings:
+        raise InputFileError("measurements", "", "hold no reading")
     cycle, direction = (np.array([getattr(r, name) for r in readings]) for name in ("cycle", "direction"))
     channel = np.array([NUMBER_OF[r.channel] for r in readings])
     value, uncertainty = (np.array([getattr(r, name) for r in readings], float) for name in ("value", "uncertainty"))
@@ -214,30 +215,17 @@ def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.
     return centres
 
 
-def _check_channels(readings: Sequence[Reading]) -> None:
-    """Refuse what no instrument reads."""
-    if not readings:
-        raise InputFileError("measurements", "", "hold no reading")
-    for r in readings:
-        if r.channel not in NUMBER_OF:
-            raise InputFileError(r.source.file, _line(r), f"channel must be one of {', '.join(CHANNELS)}", r.channel)
-
-
 def _check_values(readings: Sequence[Reading], value: np.ndarray, uncertainty: np.ndarray) -> None:
-    """Refuse values and uncertainties that no instrument has."""
+    """Refuse values that no machine's error has, and uncertainties that no instrument has."""
     possible = (uncertainty >= SMALLEST_UNCERTAINTY) & (uncertainty <= LARGEST_READING)
     wrong = np.flatnonzero(~((np.abs(value) <= LARGEST_READING) & (np.isnan(uncertainty) | possible)))
     if not len(wrong):
         return
     r = readings[wrong[0]]
     unit = "rad" if KINDS[KIND_OF[NUMBER_OF[r.channel]]] in ANGULAR_KINDS else "m"
-    if not np.isfinite(r.value):
-        raise InputFileError(r.source.file, _line(r), "value must be finite", r.value)
-    if abs(r.value) > LARGEST_READING:
+    if not abs(r.value) <= LARGEST_READING:
         problem = f"value must be within ±{LARGEST_READING:g} {unit}: it is the error, actual minus commanded"
-        raise InputFileError(r.source.file, _line(r), problem, r.value)
-    if r.uncertainty <= 0.0 or np.isinf(r.uncertainty):
-        raise InputFileError(r.source.file, _line(r), "uncertainty must be finite and above zero", r.uncertainty)
+        raise InputFileError(r.source.file, _line(r), f"{problem}; does the unit fit?", r.value)
     problem = f"uncertainty must be {SMALLEST_UNCERTAINTY:g}…{LARGEST_READING:g} {unit}"
     raise InputFileError(r.source.file, _line(r), problem, r.uncertainty)
 
