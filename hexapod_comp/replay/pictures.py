@@ -117,9 +117,8 @@ def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
     figure = _figure(report, "Tool", 5.0)
     positions = tool_positions(report.recording, geometry.work_frames)
     estimates = report.recording.topics["tool_pose_estimate"]
-    both = len(estimates) > 1 and len(positions) > 1
-    panels = figure.subplots(1, 3 if both else 2)
-    for axes, (first, second) in zip(panels, ((0, 1), (0, 2)), strict=False):
+    panels = figure.subplots(1, 2)
+    for axes, (first, second) in zip(panels, ((0, 1), (0, 2)), strict=True):
         if len(estimates):
             points = estimates.values[:, :3] * 1e3
             axes.plot(points[:, first], points[:, second], color=WITHOUT, lw=1.6, label="estimated")
@@ -127,14 +126,6 @@ def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
         axes.set(xlabel=f"{'xyz'[first]} in base, mm", ylabel=f"{'xyz'[second]} in base, mm")
         axes.axis("equal")
     panels[0].legend(fontsize=7)
-    if both:
-        seconds, at = report.seconds, report.since(estimates.when)
-        inside = (at >= seconds[0]) & (at <= seconds[-1])
-        for name, wanted, point in zip("xyz", positions.T, estimates.values[inside, :3].T, strict=True):
-            off = point - np.interp(at[inside], seconds, wanted)
-            panels[2].plot(*_broken(at[inside], off * 1e6), lw=0.8, label=f"{name} in base")
-        panels[2].set(title="estimated − commanded, lag included", xlabel="time, s", ylabel="µm")
-        panels[2].legend(fontsize=7)
     return figure
 
 

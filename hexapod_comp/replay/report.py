@@ -68,10 +68,6 @@ class Report:
     def refusals(self) -> int:
         return len(self.refused) + sum(page.refused_more for _, page in self.recording.pages)
 
-    def since_first_page(self, time: int) -> float:
-        """Return a recorder's time, ns, as seconds since the recorder's first page with answers."""
-        return (time - next(at for at, page in self.recording.pages if len(page.commands))) * 1e-9
-
     @property
     def same(self) -> bool:
         """Whether the replay gives what was recorded, within the tolerance."""
@@ -271,10 +267,11 @@ def _refused(report: Report) -> Part:
     if not report.refusals:
         return [], {}
     unnamed = report.refusals - len(report.refused)
+    began = next(time for time, page in report.recording.pages if len(page.commands))
     counts, rows = Counter(event.entry.values["reason"] for event in report.refused), []
     for reason, count in counts.most_common():
         first = next(event for event in report.refused if event.entry.values["reason"] == reason)
-        when = f"{report.since_first_page(first.time):.2f}"
+        when = f"{(first.time - began) * 1e-9:.2f}"
         rows.append([printable(reason), str(count), when, printable(first.entry.values["text"])])
     title = f"refused commands: {report.refusals}" + (f", {unnamed} of them not named in the journal" * bool(unnamed))
     return [title, aligned(["reason", "count", "first_s", ""], rows)], {}
