@@ -35,8 +35,8 @@ def commands(loading: Loading, pose: Pose) -> np.ndarray:
     return RealMachine(load_geometry("paper"), MODEL, loading=loading).commands_for(pose)[0]
 
 
-def started(rig: Rig, folder: Path, **parameters: object) -> None:
-    save_model(MODEL, folder / "model.yaml")
+def started(rig: Rig, folder: Path, model: MachineModel = MODEL, **parameters: object) -> None:
+    save_model(model, folder / "model.yaml")
     rig.compensator(model_file=str(folder / "model.yaml"), command_timeout=0.0, ramp_rate=1.0, **parameters)
 
 
@@ -93,10 +93,7 @@ SAG = np.radians([0.0, 90.0, 0.0, 90.0]).reshape(2, 2), np.outer([10e-6, 15e-6, 
 TABLE = OutsideTable(("elevation", "rotator"), ("deg", "deg"), tuple(SAG[0]), SAG[1], 0.3 * SAG[1])
 
 
-def bent(rig: Rig, folder: Path, beyond: str = "hold", **parameters: object) -> None:
-    model = MachineModel("paper", outside=replace(TABLE, beyond=beyond), origin=ModelOrigin("2026-11-25"))
-    save_model(model, folder / "model.yaml")
-    rig.compensator(model_file=str(folder / "model.yaml"), command_timeout=0.0, ramp_rate=1.0, **parameters)
+BENT = MachineModel("paper", outside=TABLE, origin=ModelOrigin("2026-11-25"))
 
 
 def tell(rig: Rig, **numbers: float) -> None:
@@ -116,7 +113,7 @@ def reached(rig: Rig, wanted: np.ndarray) -> bool:
 
 def test_the_struts_follow_outside_numbers(rig: Rig, tmp_path: Path) -> None:
     """One by one, with names of other joints among them; beyond the table, in the dead band, while held, and after."""
-    bent(rig, tmp_path)
+    started(rig, tmp_path, BENT)
     nominal = settled(rig)
     tell(rig, elevation=0.5)
     values = rig.until_status(WARN, "the model's table does not count: not known is rotator")
@@ -156,9 +153,7 @@ BAD_LOADS = [
 
 @pytest.mark.parametrize(("publish", "values", "text"), BAD_LOADS)
 def test_what_cannot_be_is_ignored_and_named(rig: Rig, tmp_path: Path, publish, values: tuple, text: str) -> None:
-    model = replace(MODEL, outside=TABLE)
-    save_model(model, tmp_path / "model.yaml")
-    rig.compensator(model_file=str(tmp_path / "model.yaml"), command_timeout=0.0, ramp_rate=1.0)
+    started(rig, tmp_path, replace(MODEL, outside=TABLE))
     tell(rig, elevation=0.5, rotator=0.2)
     rig.step(0.1)
     before = settled(rig)
@@ -169,7 +164,7 @@ def test_what_cannot_be_is_ignored_and_named(rig: Rig, tmp_path: Path, publish, 
 
 def test_a_table_that_refuses_stops_the_machine(rig: Rig, tmp_path: Path) -> None:
     """Until a number inside has come."""
-    bent(rig, tmp_path, beyond="refuse")
+    started(rig, tmp_path, replace(BENT, outside=replace(TABLE, beyond="refuse")))
     tell(rig, elevation=0.5, rotator=0.2)
     rig.until(lambda: reached(rig, at(elevation=0.5, rotator=0.2)), "the table's correction")
     tell(rig, elevation=1.6)

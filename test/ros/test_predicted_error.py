@@ -60,6 +60,13 @@ def test_the_topics_say_what_the_machine_would_do_and_how_well_that_is_known(rig
     sigma, left = (np.sqrt(np.diag(np.array(m.pose.covariance).reshape(6, 6))[:3]) for m in (standing, aligned))
     assert ((sigma > 0.5 * UM) & (sigma < 10 * UM)).all()
     assert (left < 0.5 * sigma).all()
+    small.fitted_model(tmp_path, 60 * UM)
+    loaded = rig.begin("reload_model")
+    rig.until(loaded.done, "the new model", STARTED)
+    assert loaded.result().success
+    rig.until(lambda: rig.seen[STANDING][-1].pose.pose.position.z > 1.5 * position.z, "the new error", STARTED)
+    assert rig.seen[STANDING][-1].pose.pose.position.z == pytest.approx(2.0 * position.z, rel=1e-3)
+    assert not math.isnan(rig.seen[STANDING][-1].pose.covariance[0])  # its own posterior, not the old model's
 
 
 def test_without_a_fit_the_covariance_is_nan_never_zero(rig):
@@ -110,19 +117,3 @@ def test_a_process_begins_with_a_listener_is_started_anew_when_it_dies_and_ends_
     bench.witness.destroy_subscription(subscription)
     bench.until(lambda: process.poll() is not None, "the end of the process")
     assert beside.process is None
-
-
-def test_a_new_model_is_predicted_with(rig, tmp_path):
-    path = small.fitted_model(tmp_path)
-    rig.compensator(model_file=str(path), ramp_rate=1.0)
-    rig.ask(small.paper().home)
-    listen(rig, STANDING)
-    rig.until(lambda: rig.seen[STANDING], "predicted error", STARTED)
-    before = rig.seen[STANDING][-1].pose.pose.position.z
-    small.fitted_model(tmp_path, 60 * UM)
-    loaded = rig.begin("reload_model")
-    rig.until(loaded.done, "the new model", STARTED)
-    assert loaded.result().success
-    rig.until(lambda: rig.seen[STANDING][-1].pose.pose.position.z > 1.5 * before, "the new error", STARTED)
-    assert rig.seen[STANDING][-1].pose.pose.position.z == pytest.approx(2.0 * before, rel=1e-3)
-    assert not math.isnan(rig.seen[STANDING][-1].pose.covariance[0])  # its own posterior, not the old model's
