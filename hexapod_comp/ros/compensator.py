@@ -12,7 +12,6 @@ import math
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -116,7 +115,7 @@ class CompensatorNode(CompensatorState):
         any_thermometer = "allow_several_thermometers"
         SensorTopic(self, "temperatures", Temperature, self._on_temperature, several=any_thermometer)
         SensorTopic(self, HUMIDITY, RelativeHumidity, self._on_humidity, several=any_thermometer)
-        self._pacing = Pacing(self, self._process_command, self._refuse_waiting)
+        self._pacing = Pacing(self)
         self._requests = Requests(self, self._forget_commands)
         self._journal = JournalTopics(self)
         self.loads = Loads(self)
@@ -184,9 +183,6 @@ class CompensatorNode(CompensatorState):
             raise CommandError("no_feedback", f"no strut_states {since}")
         if self.fresh_start:
             self.compensator.reset(self.track.start(now, fed))
-
-    def _refuse_waiting(self, data: bytes, error: HexapodError, now: float) -> None:
-        self._refuse(self._input.stamp(data), error, now)
 
     def _refuse(self, stamp: int, error: HexapodError, now: float) -> None:
         self._journal.refused(stamp, error.reason, str(error))
@@ -284,13 +280,8 @@ class Pacing:
     count. 0: only the newest waits, and those that it replaces are dropped.
     """
 
-    def __init__(
-        self,
-        node: CompensatorNode,
-        process: Callable[[bytes, Sample], float],
-        refuse: Callable[[bytes, HexapodError, float], None],
-    ) -> None:
-        self._node, self._process_command, self._refuse = node, process, refuse
+    def __init__(self, node: CompensatorNode) -> None:
+        self._node = node
         self.waiting: deque[tuple[float, bytes]] = deque()
         self._due = self._stood_still = 0.0
         self._alarm = Alarm(node, node.guard.around("process_next", self._process_next))
@@ -344,7 +335,7 @@ class Pacing:
             if 0.0 < self._longest < self._age(came, now):
                 self._refuse_all(now)
                 return
-            if (wait := self._process_command(message, Sample(now))) > 0.0:
+            if (wait := self._node._process_command(message, Sample(now))) > 0.0:
                 self._wait_for_struts(now, wait)
                 return
             if self._age(came, now) > JITTER:
@@ -357,7 +348,7 @@ class Pacing:
         text = f"commands come faster than the struts may move: {waited:.3f} s behind, allowed {self._longest:g} s"
         while self.waiting:
             error = LimitError("speed", text, waited, self._longest, None, "compensated")
-            self._refuse(self.waiting.popleft()[1], error, now)
+            self._node._refuse(self._node._input.stamp(self.waiting.popleft()[1]), error, now)
 
 
 main = partial(run, CompensatorNode, PROGRAM)
