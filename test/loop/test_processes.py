@@ -284,7 +284,7 @@ def test_help_lists_every_parameter_and_the_topics(name, capsys):
     assert err == ""
     assert out.startswith(f"usage: {name} ")
     assert all(text in out for text in PROGRAMS[name][1:])
-    assert all(f"  {parameter.name}  [" in out for parameter in module.PARAMETERS)
+    assert all(f"  {parameter.name}  [" in out for parameter in module.PROGRAM.parameters)
     assert max(map(len, out.splitlines())) <= 120
 
 
