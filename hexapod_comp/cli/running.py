@@ -147,7 +147,7 @@ def adapt(args: argparse.Namespace) -> Result:
             if outcome.good and checks != 0:
                 outcome = loop.guard(checks)
     return Result(
-        lambda: "\n".join([*adapted(loop.events), f"{outcome.state}: {outcome.text}"]),
+        lambda: "\n".join(adapted(loop.events)),
         lambda: {
             "machine": geometry.name,
             "state": outcome.state,
@@ -186,8 +186,10 @@ def adapted(events: list[dict[str, Any]]) -> Iterator[str]:
                 text = f"{e['text']}; {e['model']} renews {e['of']}"
             case "begun" | "adopted" | "reloaded":
                 text = e.get("model", "")
+            case "ended":
+                text = f"{e['state']}: {e['text']}"
             case _:
-                text = e.get("reason") or e.get("at") or ""
+                text = e.get("reason", "")
         yield f"{e['time']}  {e['event']:<13} {text}".rstrip()
 
 

@@ -40,18 +40,21 @@ def story_figure(told: Told, title: str) -> Figure:
     axes = figure.subplots()
     figure.suptitle(picture_text(title))
     compensated = ("calibrated", "renewed", "repaired")
+    for label, colour in (("not compensated for its state", WITHOUT), ("compensated", WITH)):
+        axes.plot([], [], ".-", color=colour, label=f"{label}: at a stop, and RMS")
     for chapter in told.chapters:
         minutes, errors = np.array(chapter.times) / 60.0, np.maximum(chapter.errors() * 1e6, FLOOR)
-        colour = WITH if chapter.title in compensated else WITHOUT
+        colour, whole = WITH if chapter.title in compensated else WITHOUT, rms(errors)
         axes.plot(minutes, errors, ".", color=colour)
-        axes.hlines(rms(errors), minutes[0], minutes[-1], color=colour, lw=2.0)
+        axes.hlines(whole, minutes[0], minutes[-1], color=colour, lw=2.0)
         axes.axvline(minutes[0], color="0.6", lw=0.8)
         axes.annotate(
-            chapter.title, (minutes[0], 1.0), (3, -4), xycoords=("data", "axes fraction"), textcoords="offset points",
-            rotation=90, va="top",
+            f"{chapter.title}: {whole:.3g} µm", (minutes[0], 1.0), (3, -4), xycoords=("data", "axes fraction"),
+            textcoords="offset points", rotation=90, va="top",
         )  # fmt: skip
-    axes.axhline(told.promised * 1e6, color="black", ls="--", lw=1.0, label="promised after the calibration (95 %)")
-    axes.set(xlabel="time of the machine, min", ylabel="tool error at a stop, datum aligned, µm", yscale="log")
-    axes.set_ylim(top=20.0 * axes.get_ylim()[1])  # room for the titles of the chapters
+    axes.axhline(told.promised * 1e6, color="black", ls="--", lw=1.0, label="promised RMS in the whole box (95 %)")
+    axes.set(xlabel="time of the machine, min", ylabel="tool error, datum aligned, µm", yscale="log")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.set_ylim(top=100.0 * axes.get_ylim()[1])  # room for the titles of the chapters
     axes.legend(loc="lower left")
     return figure

@@ -7,24 +7,22 @@ minutes; the node only starts and stops it and publishes, on ``~/state``, what i
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from std_srvs.srv import Trigger
 
 from ..errors import LONGEST_TEXT, HexapodError
-from ..upkeep.journal import JOURNAL, Journal
+from ..upkeep.journal import ENDED, JOURNAL, Event, Journal
 from . import end_with_parent
 from .base import ACKNOWLEDGED_WITHIN, ERROR, LATCHED_QOS, OK, WARN, MachineNode
 from .parameters import Program, read_table
@@ -76,11 +74,11 @@ class AdapterNode(MachineNode):
 
     def _forget(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
-        self._output: IO[bytes] | None = None  # what the process prints: its result
-        self._stopping, self._reason = False, ""  # it was told to end; why it was interrupted
+        self._stopping = False  # it was told to end
         self._state, self._text, self._step, self._model = IDLE, "nothing was asked for yet", "", ""
         self._next = ""  # what is due when `check_every` is over: a check, or what was interrupted
-        self._ended, self._size = time.monotonic(), -1  # when, and how large the journal was when it was read
+        self._ended = time.monotonic()
+        self._begun = 0  # where in the journal those before it end, bytes
 
     # ---- lifecycle ----
 
@@ -123,7 +121,7 @@ class AdapterNode(MachineNode):
         if self._process is not None:
             return Trigger.Response(message=f"{self._state} already: ~/stop ends it")
         options, namespace = self._options, self.get_namespace()
-        words = ["adapt", "--json", "--machine", options["geometry_file"], "--folder", str(self._journal.parent)]
+        words = ["adapt", "--machine", options["geometry_file"], "--folder", str(self._journal.parent)]
         words += ["--goal-um", repr(options["goal"] * 1e6), "--topic", options["topic"]]
         words += ["--samples", str(options["samples"]), *(["--reload"] if options["reload"] else [])]
         words += ["--verify"] if state == VERIFYING else []
@@ -131,19 +129,17 @@ class AdapterNode(MachineNode):
         environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": _with_package()}
         if environment.get("ROS_SECURITY_ENABLE", "").lower() == "true":
             environment["ROS_SECURITY_ENCLAVE_OVERRIDE"] = CHILD_ENCLAVE
-        self._output = tempfile.TemporaryFile()  # noqa: SIM115 (closed when the process has ended)
-        self._stopping = False
+        self._stopping, self._step = False, ""
+        self._begun = self._journal.read_bytes().rfind(b"\n") + 1 if self._journal.exists() else 0
         self._process = subprocess.Popen(
             [sys.executable, "-m", "hexapod_comp", *words],
             env=environment,
             stdin=subprocess.DEVNULL,
-            stdout=self._output,
+            stdout=subprocess.DEVNULL,  # the journal has all of it
             start_new_session=True,  # so that Ctrl-C reaches it through the node alone
             preexec_fn=partial(end_with_parent, signal.SIGINT),  # it brakes the machine when the node is killed
         )
         os.setpriority(os.PRIO_PROCESS, self._process.pid, NICENESS)
-        # The newest step in the journal is of the run before until this one writes another
-        self._step, self._size = "", self._journal.stat().st_size if self._journal.exists() else -1
         self._change(state, "starting")
         return Trigger.Response(success=True, message=f"{state}; ~/state says what comes of it")
 
@@ -159,9 +155,13 @@ class AdapterNode(MachineNode):
 
     def update(self, now: float) -> None:
         if self._process is not None:
-            self._read_journal()
-            if (code := self._process.poll()) is not None:
-                self._finish(code)
+            code = self._process.poll()  # before the journal is read, which has all then that it wrote
+            events = self._events()
+            if events and events[-1]["event"] not in (self._step, ENDED):
+                self._step = events[-1]["event"]
+                self._change(self._state, self._step)
+            if code is not None:
+                self._finish(code, events[-1] if events else {})
         elif self._active and self._next and 0.0 < self._options["check_every"] < now - self._ended:
             self._start(self._next)
 
@@ -172,43 +172,25 @@ class AdapterNode(MachineNode):
     def values(self, now: float) -> dict[str, str]:
         return {"state": self._state, "step": self._step}
 
-    def _read_journal(self) -> None:
-        """Publish the newest step where there is one."""
+    def _events(self) -> list[Event]:
+        """Return what the process has written into the journal; it says itself what is wrong with that."""
         try:
-            size = self._journal.stat().st_size
-            if size == self._size:
-                return
-            self._size, events = size, Journal.read(self._journal)
+            return Journal.read(self._journal, self._begun)
         except (HexapodError, OSError):
-            return  # it is being made; the process says what is wrong with it
-        if events and events[-1]["event"] != self._step:
-            self._step, self._reason = events[-1]["event"], str(events[-1].get("reason", ""))
-            self._change(self._state, self._step)
+            return []
 
-    def _finish(self, code: int) -> None:
-        """Publish how a process ended."""
-        self._read_journal()  # with what it wrote last
-        output, self._process, self._output = self._output, None, None
-        self._ended, begun = time.monotonic(), self._state
-        content: dict[str, Any] = {}
-        if output is not None:
-            with output:
-                output.seek(0)
-                try:
-                    content = json.loads(output.read() or b"{}")
-                except ValueError:
-                    content = {}
-        self._model = str(content.get("model") or "")
-        if "state" in content:
-            self._change(str(content["state"]), str(content["text"]))
+    def _finish(self, code: int, last: Event) -> None:
+        """Publish how a process ended, by the last event that it has written."""
+        begun, self._process, self._ended = self._state, None, time.monotonic()
+        ended = last.get("event") == ENDED
+        if ended:
+            self._model = str(self._journal.parent / last["model"]) if last["model"] else ""
+            self._change(last["state"], last["text"])
         elif self._stopping:
             self._change("stopped", "before anything was done")
-        elif self._step == "interrupted":
-            self._change(FAILED, self._reason)
         else:
             self._change(FAILED, f"the process ended with {code}; its last words are in the log")
-        again = self._state == FAILED and self._step == "interrupted"
-        self._next = VERIFYING if self._state in GOOD else begun if again else ""
+        self._next = VERIFYING if self._state in GOOD else begun if ended and self._state == FAILED else ""
 
     def _change(self, state: str, text: str) -> None:
         self._state, self._text = state, text[:LONGEST_TEXT]

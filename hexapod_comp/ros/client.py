@@ -30,6 +30,8 @@ TRACK_QOS = profile(200, reliable=False)
 # A command without an answer after this time is lost, s: a busy computer may delay it by seconds
 ANSWER_TIMEOUT = 5.0
 
+FOUND_WITHIN, READY_WITHIN = 10.0, 30.0  # A mover, and one that has just been started and knows its machine, s
+
 # States of a standing mover, one a second, that do not mention a request: it will never receive it. Clocks do not tell:
 # on a busy computer it may be received a minute later.
 UNMENTIONED = 5
@@ -251,8 +253,8 @@ class MoveState:
 class Machine(RosSession):
     """A running machine with a mover: moves its tool and waits until it has arrived.
 
-    The machine's nodes are in a namespace, and the mover has a name. A NoAnswerError: no mover that is ready was found
-    within 10 s.
+    The machine's nodes are in a namespace, and the mover has a name. A NoAnswerError: no mover was found within 10 s,
+    or it was not ready within 30 s.
     """
 
     def __init__(self, namespace: str = "", mover: str = "mover") -> None:
@@ -266,7 +268,9 @@ class Machine(RosSession):
             DiagnosticStatus, f"{mover}/state", self._on_state, LATCHED_QOS
         ).topic_name
         try:
-            self.wait(self._connected, 10.0, f"the node {mover}, with a compensator and its pose estimate")
+            self.wait(lambda: self.node.count_publishers(self._states), FOUND_WITHIN, f"the node {mover}")
+            what = f"the node {mover} to be ready: it needs an active compensator's machine and pose estimate"
+            self.wait(self._connected, READY_WITHIN, what)
         except NoAnswerError:
             self.close()
             raise

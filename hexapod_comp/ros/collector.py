@@ -27,14 +27,13 @@ from ..measurements.readings import ABSOLUTE_KINDS, LEAST_NOISE
 from ..measurements.set_up import KNOWN
 from ..pose import Pose, middle_pose
 from .base import LATCHED_QOS, NEWEST_QOS, SENSOR_QOS
-from .client import Machine, MoveError, MoveState
+from .client import READY_WITHIN, Machine, MoveError, MoveState
 from .instrument import SET_UP_TOPIC
 from .messages import message_pose, nanoseconds_of, pose_message, pose_numbers, stamp_of
 
 MEDIAN_TO_SIGMA = 1.4826  # Standard deviation of a normal distribution over the median of its absolute values
 OF_A_MEDIAN = math.sqrt(math.pi / 2.0)  # Its standard deviation, times √n, over that of a reading
 ASKED_AGAIN = 2  # How often a refused move is: a busy computer's commands come late, and nodes are restarted
-READY_WITHIN = 30.0  # A mover, or a compensator below it, that is restarted knows the machine again within this time, s
 LEAST_SAMPLES = 3  # of which a median is taken
 PATIENCE = 2.0  # Fewer than half of a stop's readings within this time, s, are a broken beam
 ANSWERED_WITHIN = 60.0  # A model is read within 30 s, or refused

@@ -54,6 +54,7 @@ IN_FLIGHT = 0.15  # While a command has waited this long for its answer, the pat
 RESUMED = 5  # Number of new plans of a delayed move, from the last answered pose, before it is given up
 # Reasons that refuse all commands until an operator acts; other refusals may be due to a busy computer
 STANDING = ("following_error", "several_publishers", "unknown_publisher", "no_feedback", "tool_changed")
+PLANNER_KEPT = 600.0  # After the last plan, s: a new process takes a second, and on a busy computer half a minute
 ESTIMATE_WITHIN = 1.0  # An older estimate does not give the machine's pose, s
 STATE_PERIOD, STANDING_PERIOD = 0.1, 1.0  # Periods of ~/state while the machine moves, and while it stands, s
 
@@ -185,7 +186,7 @@ class MoverNode(MachineNode):
 
     def configure(self) -> None:
         name = self._options["compensator"]
-        self._worker = Worker()
+        self._worker = Worker(PLANNER_KEPT)
         self._states = self.create_publisher(DiagnosticStatus, "~/state", LATCHED_QOS)
         self._diagnosed = status_prefix(self.get_namespace(), name)
         self.subscribe(PoseStamped, "move_to", self._on_move_to, EVENT_QOS)

@@ -41,7 +41,8 @@ class WorkerError(HexapodError):
 class Worker:
     """The node's side: a thread sends one job at a time to the process; `poll` calls back with the results."""
 
-    def __init__(self) -> None:
+    def __init__(self, idle_after: float = IDLE_AFTER) -> None:
+        self._idle_after = idle_after
         self._process, self._thread = _Process(), ThreadPoolExecutor(1, "worker")
         self._jobs: deque[tuple[str, Future[Any], Callable[[Any], None], Callable[[WorkerError], None]]] = deque()
         self._done_at = 0.0
@@ -71,7 +72,7 @@ class Worker:
         return any(job[0] == task for job in self._jobs)
 
     def poll(self, now: float) -> None:
-        """Call back with a result; end a process that is idle for IDLE_AFTER."""
+        """Call back with a result; end a process that is idle for `idle_after`, s."""
         if self._jobs and self._jobs[0][1].done():
             _, job, done, failed = self._jobs.popleft()
             self._done_at = time.monotonic()
@@ -80,7 +81,7 @@ class Worker:
                 done(job.result())
             else:
                 failed(error if isinstance(error, WorkerError) else WorkerError(str(error)))
-        elif not self._jobs and self.process is not None and now - self._done_at > IDLE_AFTER:
+        elif not self._jobs and self.process is not None and now - self._done_at > self._idle_after:
             self._process.end()
 
     def close(self) -> None:

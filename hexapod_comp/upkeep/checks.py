@@ -8,19 +8,18 @@ import numpy as np
 from scipy.special import chdtri
 
 from ..calibration.assumptions import ASSUMED
-from ..calibration.parameters import ParameterSpace
 from ..calibration.posterior import FittedParameters
 from ..calibration.sensitivity import predict
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths_batch
-from ..measurements.campaign import Campaign, CampaignRun
-from ..measurements.readings import CHANNELS, KINDS, MeasurementSet
+from ..measurements.campaign import CampaignRun
+from ..measurements.readings import KINDS, MeasurementSet
 
 PLACES = 16  # of a check: each shows six numbers, and a strut's backlash in the direction in which it was reached
 CLEAR = max(ASSUMED.worn_backlash)  # A strut that has come further since it turned back has a direction, m
 SAMPLES, TRIES = 101, 32  # of a way at which struts are looked at; places that are tried, before the best is used
 BEYOND = 0.01  # A promise is broken where readings of a model that keeps it err so much in this share of checks
-DISPLACEMENTS = ("linear", "straightness", "position")
+LEAST_READ = 8  # Fewer places at which the tool's pose was read are no check
 
 
 def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, seed: int, name: str) -> CampaignRun:
@@ -47,57 +46,6 @@ def _since_turning(geometry: HexapodGeometry, start: np.ndarray, end: np.ndarray
     return float(np.where(outwards, lengths[-1] - lengths.min(axis=0), lengths.max(axis=0) - lengths[-1]).min())
 
 
-def check_campaign(
-    geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, seed: int, name: str = "check"
-) -> Campaign:
-    """Return the campaign that has check readings alone."""
-    side = float(np.ptp(box, axis=0).min())
-    runs = (check_run(geometry, box, level, seed, name),)
-    return Campaign(box, side, side, instrument=None, diagonals=0, level=level, runs=runs)
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """The verdict of readings that were not used in a fit on the error that it has predicted."""
-
-    promised: float  # upper end of the tool error that was promised, RMS of the displacement, m
-    found: float  # the same as the readings have it, their noise taken off, m; 0 where noise explains them
-    excess: float  # squared differences over the largest to expect of a promise that is kept; above 1: it is broken
-
-    @property
-    def kept(self) -> bool:
-        """Whether the readings confirm the promise."""
-        return self.excess <= 1.0
-
-
-def judge_promise(fitted: FittedParameters, readings: MeasurementSet, promised: float) -> Judgement:
-    """Return whether readings not used in a fit deviate from its model by no more than its promised error, m.
-
-    What a promise does not include is left free: where the machine stands as a whole, the zero of a displacement read
-    along a line, the slope of a straightness. What is left after these has variance promised²/3 + noise² where the
-    promise is just kept: its sum has a χ² distribution.
-    """
-    chosen, directions, left, noise = _differences(fitted, readings, DISPLACEMENTS)
-    absolute, along, squares, freedom, expected = _of_kind(chosen, "position"), chosen.along(), 0.0, 0, 0.0
-    group = np.where(absolute, -1, len(CHANNELS) * chosen.run + chosen.channel)
-    for number in np.unique(group):
-        members = group == number
-        if number < 0:
-            unknown = _rigid(fitted.space, chosen, directions)[members]
-        else:
-            slope = KINDS[int(chosen.kind[members][0])] == "straightness"
-            unknown = np.vander(along[members], 1 + slope, increasing=True)
-        rest = left[members] - unknown @ np.linalg.lstsq(unknown, left[members], rcond=None)[0]
-        free = max(int(members.sum()) - unknown.shape[1], 0)
-        squares += float(rest @ rest)
-        expected += free * float(np.mean(noise[members] ** 2))
-        freedom += free
-    allowed = (freedom * promised**2 / 3.0 + expected) / max(freedom, 1)
-    most = float(chdtri(max(freedom, 1), BEYOND)) * allowed
-    found = np.sqrt(max(3.0 * (squares - expected) / max(freedom, 1), 0.0))
-    return Judgement(promised, float(found), squares / most)
-
-
 @dataclass(frozen=True)
 class Whole:
     """The place of base, workpiece and instrument relative to each other, by check readings."""
@@ -111,37 +59,32 @@ class Whole:
         return way if way > ASSUMED.surely * np.sqrt(len(self.motion)) * error else 0.0
 
 
-def stands(fitted: FittedParameters, readings: MeasurementSet) -> Whole | None:
-    """Return the shift and turn of everything, which no model of the machine contains; None if no position was read."""
-    chosen, directions, left, noise = _differences(fitted, readings, ("position",))
-    if not len(left):
-        return None
-    unknown = _rigid(fitted.space, chosen, directions)
-    unknown[:, 3:] /= 0.5 * float(np.linalg.norm(np.ptp(fitted.space.work_box, axis=0)))
-    motion, *_ = np.linalg.lstsq(unknown, left, rcond=None)
-    variance = max(float(np.mean(noise**2)), float(np.mean((left - unknown @ motion) ** 2)))
-    return Whole(motion, float(np.sqrt(variance * np.linalg.inv(unknown.T @ unknown).diagonal().max())))
+@dataclass(frozen=True)
+class Judgement:
+    """What held-out readings say of a model, and of a promise."""
+
+    found: float  # tool error, RMS of the displacement, their noise taken off, m; 0 where noise explains them
+    excess: float  # squared differences over the largest to expect of a promise that is kept; above 1: it is broken
+    whole: Whole
 
 
-def _of_kind(readings: MeasurementSet, *kinds: str) -> np.ndarray:
-    return np.isin(np.array(KINDS)[readings.kind], kinds)
+def judge(fitted: FittedParameters, readings: MeasurementSet, promised: float) -> Judgement:
+    """Return by how much the tool's measured places differ from a model, where no more than `promised` is left, m.
 
-
-def _differences(
-    fitted: FittedParameters, readings: MeasurementSet, kinds: tuple[str, ...]
-) -> tuple[MeasurementSet, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the readings of some kinds, their directions, their differences from the fit, and their noise."""
-    chosen = readings.select(_of_kind(readings, *kinds))
-    errors, directions = predict(fitted.space, fitted.x, chosen.stations).errors[chosen.station], chosen.directions()
-    return (
-        chosen,
-        directions,
-        chosen.value - (directions * errors).sum(axis=1),
-        chosen.stated * fitted.noise[chosen.kind],
-    )
-
-
-def _rigid(space: ParameterSpace, readings: MeasurementSet, directions: np.ndarray) -> np.ndarray:
-    """Return the derivatives of some readings by a shift, m, and a turn about the box's centre, rad, (n, 6)."""
-    arms = readings.points()[readings.station] - space.places(space.work_box.mean(axis=0))
-    return np.concatenate([directions[:, :3], np.cross(arms, directions[:, :3])], axis=1)
+    What a promise does not include is free: where the machine stands as a whole. What is left after that has variance
+    promised²/3 + noise² where the promise is just kept: its sum has a χ² distribution.
+    """
+    chosen, space = readings.select(np.array(KINDS)[readings.kind] == "position"), fitted.space
+    errors, directions = predict(space, fitted.x, chosen.stations).errors[chosen.station], chosen.directions()
+    left = chosen.value - (directions * errors).sum(axis=1)
+    noise = float(np.mean((chosen.stated * fitted.noise[chosen.kind]) ** 2))
+    arms = chosen.points()[chosen.station] - space.places(space.work_box.mean(axis=0))
+    farthest = 0.5 * float(np.linalg.norm(np.ptp(space.work_box, axis=0)))
+    rigid = np.concatenate([directions[:, :3], np.cross(arms, directions[:, :3]) / farthest], axis=1)
+    motion, *_ = np.linalg.lstsq(rigid, left, rcond=None)
+    rest, free = left - rigid @ motion, len(left) - len(motion)
+    found = np.sqrt(max(3.0 * (rest @ rest / free - noise), 0.0))
+    most = float(chdtri(free, BEYOND)) * (promised**2 / 3.0 + noise)
+    variance = max(noise, float(np.mean(rest**2)))
+    error = np.sqrt(variance * np.linalg.inv(rigid.T @ rigid).diagonal().max())
+    return Judgement(float(found), float(rest @ rest) / most, Whole(motion, float(error)))

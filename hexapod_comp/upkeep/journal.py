@@ -15,6 +15,7 @@ from ..errors import InputFileError
 from ..formats.json import json_content, json_text
 
 JOURNAL = "journal.jsonl"  # its name in the loop's folder
+ENDED = "ended"  # the event with which a run of the loop ends, unless it is killed
 LEFT_WITHIN = 10.0  # A process that was told to end brakes the machine and leaves the folder within this time, s
 
 Event = dict[str, Any]
@@ -42,9 +43,11 @@ class Journal:
                 file.truncate(len((whole + "\n").encode()) if whole else 0)
 
     @staticmethod
-    def read(path: Path) -> list[Event]:
-        """Return the events of a journal that somebody else writes, without a line that is being written."""
-        return list(_parsed(path, path.read_text(encoding="utf-8", errors="replace").rpartition("\n")[0]))
+    def read(path: Path, start: int = 0) -> list[Event]:
+        """Return the events of a journal that somebody else writes, from a byte on, without a line that is being
+        written; none where there is no journal."""
+        text = path.read_bytes()[start:].decode("utf-8", errors="replace") if path.exists() else ""
+        return list(_parsed(path, text.rpartition("\n")[0]))
 
     def add(self, event: str, **content: Any) -> Event:
         """Write an event, with the time."""

@@ -46,8 +46,8 @@ from ..measurements.collect import MeasuredMachine, SetUpError, collect
 from ..measurements.files import read_measurements
 from ..measurements.readings import UNKNOWN, MeasurementSet
 from .careful import Careful
-from .checks import Whole, check_campaign, check_run, judge_promise, stands
-from .journal import JOURNAL, Event, Journal
+from .checks import LEAST_READ, Whole, check_run, judge
+from .journal import ENDED, JOURNAL, Event, Journal
 
 GIVEN = "given"  # in place of the name of a planned campaign
 IN_USE = "model.yaml"  # the adopted model, always under this name, its posterior beside it
@@ -146,7 +146,7 @@ class State:
                 return State(**kept, stuck=f"{e['text']}: {e['reason']}")
             case "refused":
                 return replace(one, refused=e["reason"])
-        return one  # stopped, interrupted: they change nothing
+        return one  # a run that has ended changes nothing
 
     def _checked(self, e: Event) -> State:
         """Return the state after a check: one that is good, spoilt by one reading, or contradicts the model."""
@@ -184,15 +184,14 @@ def next_step(state: State, checks: int | None, may_reload: bool) -> str:
 
 def begun_with(folder: str | Path) -> Event:
     """Return what the newest calibration in a folder was begun with: machine, goal_m, box_m, level; empty: nothing."""
-    path = Path(folder) / JOURNAL
-    events = Journal.read(path) if path.exists() else []
+    events = Journal.read(Path(folder) / JOURNAL)
     return next((e for e in reversed(events) if e["event"] == "begun"), {})
 
 
 class Outcome(NamedTuple):
     """How a run of the loop ended."""
 
-    state: str  # in use, proposed, changed, refused, stopped
+    state: str  # in use, proposed, changed, refused, stopped; in the journal also failed
     text: str
     model: Path | None  # the model in use, or the one that is proposed
 
@@ -287,33 +286,30 @@ class Adaptation:
                     self._pause()
                 waits |= step == GUARD
                 steps[step]()
-        except Stopped as stopped:
-            return self._stopped(str(stopped))
-        except HexapodError as error:
-            if error.reason == "person":  # stopped on the way, by whatever asked the machine to
-                return self._stopped(str(error))
-            self._note("interrupted", reason=str(error))
-            raise
+        except (Stopped, HexapodError) as error:
+            if not isinstance(error, Stopped) and error.reason != "person":  # as of a move that a person has stopped
+                self._ended("failed", str(error))
+                raise
+            return self._ended("stopped", f"{error}; the same command goes on from there")
         return self._outcome()
 
-    def _stopped(self, where: str) -> Outcome:
-        self._note("stopped", at=where)
-        return Outcome("stopped", f"{where}; the same command goes on from there", self._model_path())
+    def _ended(self, state: str, text: str) -> Outcome:
+        """Write how a run of the loop has ended, and return it."""
+        name = (PROPOSED if self._has(PROPOSED) else IN_USE) if self.state.in_use else None
+        self._note(ENDED, state=state, text=text, model=name)
+        return Outcome(state, text, None if name is None else self._folder / name)
 
     def _outcome(self) -> Outcome:
-        state, path = self.state, self._model_path()
+        state = self.state
         if state.refused:
-            return Outcome("refused", state.refused, path)
+            return self._ended("refused", state.refused)
         if state.stuck:
-            return Outcome("changed", state.stuck, path)
+            return self._ended("changed", state.stuck)
         name = "in use" if state.reloaded else "proposed"
         kept = f"tool error up to {state.kept * 1e6:.2f} µm RMS (95 %), datum aligned"
         promise = f"{'no promise' if np.isnan(state.kept) else kept}; borne out by {state.checks} later checks"
         last = next((e for e in reversed(self.events) if e["event"] == "checked"), {})
-        return Outcome(name, promise + moved_text(last), path)
-
-    def _model_path(self) -> Path | None:
-        return self._folder / (PROPOSED if self._has(PROPOSED) else IN_USE) if self.state.in_use else None
+        return self._ended(name, promise + moved_text(last))
 
     def _note(self, event: str, **content: Any) -> None:
         self.state = self.state.after(self._journal.add(event, **content))
@@ -345,8 +341,7 @@ class Adaptation:
     def _say_or_stop(self, text: str) -> None:
         """Report the progress of a long calculation, and end it on request; its step is then repeated later."""
         self._say(text)
-        if not self._going_on():
-            raise Stopped(f"stopped in a calculation ({text})")
+        self._stop_if_asked(f"stopped in a calculation ({text})")
 
     # ---- the steps ----
 
@@ -441,27 +436,34 @@ class Adaptation:
         # A check that was stopped begins anew: whatever stopped it may have changed the machine
         (self._folder / name).unlink(missing_ok=True)
         self._say(f"checking {model}")
-        campaign = check_campaign(self._geometry, self._task.box, self._task.level, number, name=f"check {number}")
+        task = self._task
+        side = float(np.ptp(task.box, axis=0).min())
+        run = check_run(self._geometry, task.box, task.level, number, f"check {number}")
+        campaign = Campaign(task.box, side, side, instrument=None, diagonals=0, level=task.level, runs=(run,))
         _, missing = self._measured(campaign, name)
+        if (usable := len(np.unique(self._readings([name]).station))) < LEAST_READ:
+            problem = f"{usable} of {len(run.positions)} readings of {name} are usable, and a check needs {LEAST_READ}"
+            raise CommandError("instrument", f"{problem}: at {len(missing)} places the instrument read nothing")
         verification, fitted = self._verified(model, [name])
-        judged = None if np.isnan(promised) else judge_promise(fitted, verification.measurements, promised)
-        kept = verification.verdict == VALID if judged is None else judged.kept
+        judged = judge(fitted, verification.measurements, promised)
+        kept = verification.verdict == VALID if np.isnan(promised) else judged.excess <= 1.0
         spoilt = not kept and verification.verdict != VALID and verification.candidates[0].family == READING
         good = kept and not (verification.verdict == NAMED and verification.candidates[0].family in EVENTS)
-        whole = stands(fitted, verification.measurements)
+        first = next((e for e in self.events if e["event"] == "checked" and e["model"] == model), None)
+        before = judged.whole if first is None else Whole(np.array(first["stands_m"]), first["stands_error_m"])
         write_text(self._folder / f"{name}.report.txt", verification_report(verification))
         self._note(
             "checked",
-            stands_m=None if whole is None else whole.motion.tolist(),
-            stands_error_m=None if whole is None else whole.error,
-            moved_m=self._moved(model, whole),
+            stands_m=judged.whole.motion.tolist(),
+            stands_error_m=judged.whole.error,
+            moved_m=judged.whole.moved(before),
             number=number,
             readings=name,
             model=model,
             good=good,
             spoilt=spoilt,
-            found_m=None if judged is None else judged.found,
-            promised_m=None if judged is None else judged.promised,
+            found_m=None if np.isnan(promised) else judged.found,
+            promised_m=None if np.isnan(promised) else promised,
             missing=list(missing),
             verdict=verification.verdict,
             usual=verification.usual,
@@ -471,14 +473,6 @@ class Adaptation:
             ],
             text=happened(verification),
         )
-
-    def _moved(self, model: str, whole: Whole | None) -> float:
-        """Return by how much everything has moved as a whole since the first check of a model, m."""
-        checks = (e for e in self.events if e["event"] == "checked" and e["model"] == model and e.get("stands_m"))
-        first = next(checks, None)
-        if whole is None or first is None:
-            return 0.0
-        return whole.moved(Whole(np.array(first["stands_m"]), first["stands_error_m"]))
 
     def _give_up(self) -> None:
         """End with a candidate that two checks contradict, or where an instrument spoils check after check."""

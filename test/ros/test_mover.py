@@ -227,6 +227,8 @@ def test_bad_requests_are_refused_and_the_present_move_goes_on(moved: Moved) -> 
     assert moved.ended() == "arrived"
     assert moved.value("request") == str(good)
     assert apart(message_pose(moved.sent[-1]), near(HOME, (0.0, 0.0, 0.03))) < 1e-12
+    moved.node._worker.poll(time.monotonic() + 60.0)
+    assert moved.node._worker.process is not None, "the next move need not wait for a new process"
     moved.node.trigger_deactivate()
     moved.ask("move_to", HOME)
     assert "the mover is not active" in moved.value("refusal")
@@ -693,7 +695,8 @@ def test_the_node_starts_reports_and_stops_a_calibration(
     """The journal is the test's."""
     node = adapter("exec sleep 100")
     assert rig.call(Trigger, "adapter/stop").message == "nothing was running"
-    (tmp_path / "journal.jsonl").write_text('{"event": "stopped"}\n', encoding="utf-8")
+    journal, before = tmp_path / "journal.jsonl", '{"event": "ended", "state": "stopped"}\n'
+    journal.write_text(before + '{"event": "chec', encoding="utf-8")
     assert rig.call(Trigger, "adapter/calibrate").success
     process = node._process
     assert make_parser().parse_args(process.args[3:]).verb == "adapt"
@@ -701,8 +704,7 @@ def test_the_node_starts_reports_and_stops_a_calibration(
     assert (refused.success, refused.message) == (False, "calibrating already: ~/stop ends it")
     node._check_state()  # reads the journal
     assert (node._step, node._text) == ("", "starting"), "the step of the run before is none of this one"
-    journal = '{"event": "begun", "machine": "paper", "goal_m": 3e-06}\n{"event": "pla'
-    (tmp_path / "journal.jsonl").write_text(journal, encoding="utf-8")
+    journal.write_text(before + '{"event": "begun", "machine": "paper"}\n{"event": "pla', encoding="utf-8")
     rig.until(lambda: node._step == "begun", "the step")
     assert rig.call(Trigger, "adapter/stop").message == "the machine brakes"
     process.wait()
@@ -717,7 +719,7 @@ def test_a_process_that_ends_without_a_result_is_reported(rig: Rig, adapter: Cal
     rig.until(lambda: node._state == "failed", "its end")
     assert node._text.startswith("the process ended with 2")
     assert node._next == "", "it would fail again"
-    node._state, node._step, node._reason = "verifying", "interrupted", "refusal: several_publishers: /mover, /other"
-    node._finish(1)
-    assert (node._state, node._text) == ("failed", "refusal: several_publishers: /mover, /other")
+    node._state, reason = "verifying", "refusal: several_publishers: /mover, /other"
+    node._finish(1, {"event": "ended", "state": "failed", "text": reason, "model": None})
+    assert (node._state, node._text) == ("failed", reason)
     assert node._next == "verifying", "an interrupted check is not the last one"

@@ -91,10 +91,10 @@ def test_a_process_begins_with_a_listener_is_started_anew_when_it_dies_and_ends_
 ):
     """Killed whenever it may be at work: one that dies without work is started anew, without a word."""
     monkeypatch.setattr(requests, "TRY_AGAIN_AFTER", 0.3)
-    monkeypatch.setattr(worker, "IDLE_AFTER", 0.5)
     node = bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
     bench.ask(small.paper().home)
     beside, seen = node._requests._worker, bench.seen[STANDING]
+    beside._idle_after = 0.5
     node._requests.update(1e12)
     assert beside.process is None
     subscription = bench.witness.create_subscription(PoseWithCovarianceStamped, STANDING, seen.append, RELIABLE)

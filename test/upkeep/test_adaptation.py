@@ -41,6 +41,8 @@ from hexapod_comp.virtual.watched import Instrument, VirtualMachine
 # What is wrong with the machine, and all that is fitted: a fit takes half a second then
 BLOCKS = ("pitch", "backlash")
 
+RESULTS = ("in use", "proposed", "refused", "changed")  # ends of runs that nobody and nothing has interrupted
+
 PROMISE = 1.0  # The drawn machines err by some ten µm, datum aligned; a fit to a hundred stops leaves a tenth of one
 
 
@@ -85,7 +87,9 @@ class Rig:
         )
 
     def names(self) -> list[str]:
-        return [event["event"] for event in Journal(self.folder / "journal.jsonl").events]
+        """Return what was done, and what has interrupted it."""
+        events = Journal(self.folder / "journal.jsonl").events
+        return [e["state"] if e["event"] == "ended" else e["event"] for e in events if e.get("state") not in RESULTS]
 
 
 @pytest.fixture(scope="module")
@@ -194,8 +198,19 @@ def test_an_instrument_that_reads_nothing_is_named_and_may_be_mended(
         patched.setattr(rig.machine, "observe", lambda: None)
         with pytest.raises(InputFileError, match="the instrument read nothing"):
             rig.loop().calibrate()
-    assert rig.names()[-1] == "interrupted"
+    assert rig.names()[-1] == "failed"
     assert next_step(rig.loop().state, 0, True) == "collect"
+
+
+def test_a_check_of_which_little_was_read_counts_for_nothing(again: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The beam reaches the lower third of the box alone."""
+    observe, (low, high) = again.machine.observe, again.task.box[:, 2]
+    within = low + (high - low) / 3.0
+    monkeypatch.setattr(again.machine, "observe", lambda: observe() if again.machine._at.position[2] < within else None)
+    with pytest.raises(CommandError, match=r"\d of 16 readings of .*_check.csv are usable, and a check needs 8"):
+        again.loop().guard(1)
+    assert again.names()[-1] == "failed"
+    assert next_step(again.loop().state, 1, True) == "guard"
 
 
 # ---- what check readings contradict ----
@@ -262,7 +277,7 @@ def test_a_knocked_strut_is_named_and_repaired(again: Rig) -> None:
     assert again.left() <= 1.5 * before < knocked
     assert load_model(again.folder / "model.yaml", again.geometry).origin.note.startswith("renewed from")
     names, after = again.names(), again.left()
-    cut(again, names.index("adopted", 8), b"{")  # killed when the repair had been checked
+    cut(again, -3, b"{")  # killed when the repair had been checked
     assert again.loop().guard(0).state == "in use"
     assert (again.names(), again.left()) == (names, pytest.approx(after))
 
