@@ -103,8 +103,8 @@ def adapt(args: argparse.Namespace) -> Result:
     """Calibrate a running machine, or check the model that came of it; 0 when a model is borne out by its checks."""
     from ..ros import received_signals
     from ..ros.collector import AdaptedMachine
-    from ..upkeep.journal import sole_user
-    from ..upkeep.loop import IN_USE, Adaptation, Task, begun_with
+    from ..upkeep.journal import IN_USE, sole_user
+    from ..upkeep.loop import Adaptation, Task, begun_with
     from ..workspace.reach import machine_box
     from .fitting import fit_settings
 

@@ -22,7 +22,7 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from std_srvs.srv import Trigger
 
 from ..errors import LONGEST_TEXT, HexapodError
-from ..upkeep.journal import ENDED, JOURNAL, Event, Journal
+from ..upkeep.journal import ENDED, IN_USE, JOURNAL, Event, Journal
 from . import end_with_parent
 from .base import ACKNOWLEDGED_WITHIN, ERROR, LATCHED_QOS, OK, WARN, MachineNode
 from .parameters import Program, read_table
@@ -85,6 +85,8 @@ class AdapterNode(MachineNode):
     def configure(self) -> None:
         self._forget()
         self._journal = Path(self._options["folder"]).resolve() / JOURNAL
+        if (self._journal.parent / IN_USE).exists():
+            self._next = VERIFYING  # of the node before this one
         self.set_hardware_id(self._options["geometry_file"])
         self._states = self.create_publisher(DiagnosticStatus, "~/state", LATCHED_QOS)
         self.create_logged_service(Trigger, "~/calibrate", lambda *_: self._start(CALIBRATING))
@@ -190,7 +192,8 @@ class AdapterNode(MachineNode):
             self._change("stopped", "before anything was done")
         else:
             self._change(FAILED, f"the process ended with {code}; its last words are in the log")
-        self._next = VERIFYING if self._state in GOOD else begun if ended and self._state == FAILED else ""
+        interrupted = self._state == FAILED and (ended or code < 0)  # or killed; else it would fail again
+        self._next = VERIFYING if self._state in GOOD else begun if interrupted else ""
 
     def _change(self, state: str, text: str) -> None:
         self._state, self._text = state, text[:LONGEST_TEXT]

@@ -51,6 +51,9 @@ from .worker import Worker
 
 ANSWERED_WITHIN = 0.4  # A command that the compensator has not answered after this time was refused, s
 IN_FLIGHT = 0.15  # While a command has waited this long for its answer, the path waits too, s
+# The path waits also while the tool is further behind than its way of LAG, s, and BEHIND, m, half of what the
+# compensator allows, for CAUGHT_UP_WITHIN, s, at most: drives hardly faster than the path never make up for a stall.
+LAG, BEHIND, CAUGHT_UP_WITHIN = 0.1, 1e-3, 2.0
 RESUMED = 5  # Number of new plans of a delayed move, from the last answered pose, before it is given up
 # Reasons that refuse all commands until an operator acts; other refusals may be due to a busy computer
 STANDING = ("following_error", "several_publishers", "unknown_publisher", "no_feedback", "tool_changed")
@@ -151,6 +154,8 @@ class MoverNode(MachineNode):
         self._index = 0
         self._pending: Request | None = None  # planned when the machine stands
         self._stamp = 0  # of the last command, ns
+        self._sent: deque[np.ndarray] = deque()  # positions of the last LAG
+        self._with_it = 0.0  # when the tool was last seen not to be behind
         self._unanswered: deque[tuple[int, float, Pose]] = deque()  # stamps, when they were sent, and poses
         self._answered: Pose | None = None  # the last pose that the compensator has answered
         self._ended = self._near_since = 0.0
@@ -439,7 +444,7 @@ class MoverNode(MachineNode):
         # Stamped with the times for which they were computed; after a pause the path continues from there
         stamp = max(self._stamp + period, now - period) if self._stamp else now
         held_up = self._unanswered and time.monotonic() - self._unanswered[0][1] > IN_FLIGHT
-        if stamp > now + period or held_up:
+        if stamp > now + period or held_up or self._is_behind():
             return
         if self._path is not None:
             self._held = self._path.pose(min(self._index, len(self._path) - 1))
@@ -447,9 +452,24 @@ class MoverNode(MachineNode):
         message = pose_message(self._held, self._options["base_frame"])
         message.header.stamp, self._stamp = stamp_of(stamp), stamp
         self._unanswered.append((stamp, time.monotonic(), self._held))
+        self._sent.append(self._held.position)
+        if len(self._sent) > LAG * self._options["rate"]:
+            self._sent.popleft()
         self._commands.publish(message)
         if self._path is not None and self._index >= len(self._path):
             self._next()
+
+    def _is_behind(self) -> bool:
+        """Return whether the path shall wait for the tool to catch up."""
+        now = time.monotonic()
+        if self._path is not None and self._held is not None and self._sent and self._estimate is not None:
+            pose, came = self._estimate
+            behind = np.linalg.norm(self._held.position - pose.position)
+            way = np.linalg.norm(self._held.position - self._sent[0])
+            if now - came < ESTIMATE_WITHIN and behind > way + BEHIND:
+                return now - self._with_it < CAUGHT_UP_WITHIN
+        self._with_it = now
+        return False
 
     def _settle(self, now: float) -> None:
         """Report the arrival of a tool that stays at its target, or that it does not reach it."""

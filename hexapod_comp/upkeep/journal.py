@@ -15,6 +15,7 @@ from ..errors import InputFileError
 from ..formats.json import json_content, json_text
 
 JOURNAL = "journal.jsonl"  # its name in the loop's folder
+IN_USE = "model.yaml"  # beside it: the adopted model, always under this name, with its posterior
 ENDED = "ended"  # the event with which a run of the loop ends, unless it is killed
 LEFT_WITHIN = 10.0  # A process that was told to end brakes the machine and leaves the folder within this time, s
 

@@ -47,10 +47,9 @@ from ..measurements.files import read_measurements
 from ..measurements.readings import UNKNOWN, MeasurementSet
 from .careful import Careful
 from .checks import LEAST_READ, Whole, check_run, judge
-from .journal import ENDED, JOURNAL, Event, Journal
+from .journal import ENDED, IN_USE, JOURNAL, Event, Journal
 
 GIVEN = "given"  # in place of the name of a planned campaign
-IN_USE = "model.yaml"  # the adopted model, always under this name, its posterior beside it
 PROPOSED = "proposed.yaml"  # a later one, until somebody permits that it is run
 
 CAMPAIGNS = 3  # of a calibration, each planned where the fits before have not reached the goal; then it is refused
@@ -278,9 +277,12 @@ class Adaptation:
             REPAIR: self._repair,
         }
         try:
-            if may_reload and self.state.reloaded and not self._runs(self._folder / IN_USE):
-                self._note("restarted", reason="the compensator did not run the model in use")
-            while (step := next_step(self.state, checks, may_reload)) != END:
+            while True:
+                # A check holds whatever model runs, by its strut lengths: it does not show that it is another
+                if may_reload and self.state.reloaded and not self._runs(self._folder / IN_USE):
+                    self._note("restarted", reason="the compensator did not run the model in use")
+                if (step := next_step(self.state, checks, may_reload)) == END:
+                    break
                 self._stop_if_asked("stopped")
                 if step == GUARD and waits:
                     self._pause()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
@@ -32,7 +33,7 @@ from hexapod_comp.errors import CommandError, NoAnswerError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import strut_lengths
 from hexapod_comp.pose import Pose
-from hexapod_comp.ros import collector
+from hexapod_comp.ros import collector, mover
 from hexapod_comp.ros.adapter import AdapterNode
 from hexapod_comp.ros.client import LoopClient, Machine, MoveError, MoveState, Sent
 from hexapod_comp.ros.collector import AdaptedMachine, WatchedMachine
@@ -275,6 +276,26 @@ def test_a_move_goes_on_when_a_busy_computer_has_held_it_up(moved: Moved, stall:
     assert apart(message_pose(moved.sent[-1]), near(HOME, (0.0, 0.0, 0.05))) < 1e-12
     told = np.array([message.position for message in moved.rig.seen["strut_commands"]])
     assert np.abs(np.diff(told, axis=0)).max() < 2e-3, "nothing steps"
+
+
+def test_the_path_waits_for_a_tool_that_is_behind_but_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 18 mm/s, with drives of 20 mm/s that have stood for 0.2 s: 3.6 mm, of which 1.8 mm are the usual 0.1 s."""
+    node, now = object.__new__(MoverNode), [100.0]
+    monkeypatch.setattr(mover.time, "monotonic", lambda: now[0])
+    node._path, node._with_it = object(), now[0]  # type: ignore[assignment]
+    node._sent = deque([np.zeros(3), np.array([1.8e-3, 0.0, 0.0])])
+    node._held = Pose(node._sent[-1], np.eye(3))
+
+    def behind(distance: float, age: float = 0.0) -> bool:
+        node._estimate = Pose([1.8e-3 - distance, 0.0, 0.0], np.eye(3)), now[0] - age
+        return node._is_behind()
+
+    assert [behind(1.8e-3), behind(2.7e-3), behind(2.9e-3), behind(3.6e-3)] == [False, False, True, True]
+    assert not behind(3.6e-3, age=1.5), "a stale estimate is none"
+    now[0] += 1.9
+    assert behind(3.6e-3)
+    now[0] += 0.2
+    assert not behind(3.6e-3), "a strut that is stuck: the compensator reports it"
 
 
 def test_a_machine_that_does_not_follow_ends_the_move(moved: Moved) -> None:
@@ -723,3 +744,9 @@ def test_a_process_that_ends_without_a_result_is_reported(rig: Rig, adapter: Cal
     node._finish(1, {"event": "ended", "state": "failed", "text": reason, "model": None})
     assert (node._state, node._text) == ("failed", reason)
     assert node._next == "verifying", "an interrupted check is not the last one"
+    node._state = "verifying"
+    node._finish(-9, {})
+    assert (node._text[:25], node._next) == ("the process ended with -9", "verifying"), "nor is one that was killed"
+    (node._journal.parent / "model.yaml").touch()
+    node.configure()
+    assert node._next == "verifying", "and a node that was restarted checks the model that it finds"

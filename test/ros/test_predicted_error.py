@@ -21,7 +21,7 @@ from hexapod_comp.machine.kinematics import Structure, strut_lengths
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.pose import Pose
-from hexapod_comp.ros import requests, worker
+from hexapod_comp.ros import requests
 from hexapod_comp.ros.base import WARN
 
 STANDING, ALIGNED = "compensator/predicted_error", "compensator/predicted_error_aligned"

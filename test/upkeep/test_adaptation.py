@@ -25,7 +25,7 @@ from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.errors import CalibrationError, CommandError, InputFileError
 from hexapod_comp.loop.story import demo_place
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.machine.model import RealMachine
+from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.measurements.campaign import Campaign
 from hexapod_comp.measurements.collect import Observation
@@ -369,12 +369,31 @@ def test_a_check_that_was_stopped_begins_anew(again: Rig) -> None:
     assert again.machine.stops == stopped + 2 * whole
 
 
-def test_a_compensator_that_was_restarted_gets_its_model_again(again: Rig) -> None:
-    again.reloaded.clear()
-    loop = Adaptation(again.geometry, again.machine, again.task, again.folder, again.reload, runs=lambda path: False)
+@pytest.mark.parametrize("stops", [0, 9])
+def test_a_compensator_that_was_restarted_gets_its_model_again(stops: int, again: Rig) -> None:
+    """Before a check, or during it: a check holds whatever model runs, and does not show that it is another."""
+    move, at, running = again.machine.move, again.machine.stops + stops, [True]
+
+    def moved(pose: Pose) -> None:
+        if again.machine.stops == at and stops:
+            restart()
+        move(pose)
+
+    def restart() -> None:
+        again.machine.reload(MachineModel(again.geometry.name))
+        running[0] = False
+
+    def reload(path: Path) -> None:
+        again.reload(path)
+        running[0] = True
+
+    again.machine.move = moved  # type: ignore[method-assign]
+    if not stops:
+        restart()
+    loop = Adaptation(again.geometry, again.machine, again.task, again.folder, reload, runs=lambda _: running[0])
     assert loop.guard(1).state == "in use"
-    assert again.names()[-3:] == ["restarted", "reloaded", "checked"]
-    assert again.reloaded == [again.folder / "model.yaml"]
+    renewed = ["restarted", "reloaded"]
+    assert again.names()[7:] == (["checked", *renewed] if stops else [*renewed, "checked"])
 
 
 def test_a_fit_or_a_plan_ends_when_a_person_stops_it(again: Rig) -> None:
