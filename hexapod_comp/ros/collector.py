@@ -213,8 +213,8 @@ class AdaptedMachine(WatchedMachine):
     ) -> None:
         super().__init__(topic, namespace, samples)
         self._going_on = going_on
-        self._arrived: MoveState | None = None  # at the target of the newest move,
-        self._target: tuple[Pose, tuple[Any, ...], dict[str, Any]]  # which was asked for so
+        self._arrived: MoveState | None = None  # at the target of the newest move
+        self._targets = list[tuple[Pose, tuple[Any, ...], dict[str, Any]]]()  # as they were asked for, the newest two
         services = (Trigger, "reload_model"), (SetParameters, "set_parameters"), (GetParameters, "get_parameters")
         self._reload_model, self._set, self._get = (
             self.node.create_client(kind, f"compensator/{name}") for kind, name in services
@@ -223,8 +223,18 @@ class AdaptedMachine(WatchedMachine):
     def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
         """Move the tool and return when it has arrived; brake when it shall not go on: a MoveError, ``person``.
 
-        Where another client has the tool moved, wait until that has ended, and ask again.
+        Where another client has the tool moved, wait until that has ended, and come from the target before again: a
+        strut's backlash is that of the way on which it arrives.
         """
+        self._targets = [*self._targets[-1:], (pose, arguments, options)]
+        try:
+            return self._travel(self._targets[-1:])
+        except HexapodError:
+            self._targets.pop()
+            raise
+
+    def _travel(self, left: list[tuple[Pose, tuple[Any, ...], dict[str, Any]]]) -> MoveState:
+        """Move to the targets that are left; to the newest two where others have moved the tool meanwhile."""
         braked = 0  # the request that was: one that is asked for again is a new one
 
         def watch(state: MoveState) -> None:
@@ -234,15 +244,18 @@ class AdaptedMachine(WatchedMachine):
                 self._stop.call_async(Trigger.Request())
 
         while True:
+            pose, arguments, options = left[0]
             try:
                 self._arrived = super().move(pose, *arguments, **{"progress": watch, **options})
             except MoveError as error:
                 if error.reason != "replaced":
                     raise
                 self._wait_for_others()
+                left = self._targets
             else:
-                self._target = pose, arguments, options
-                return self._arrived
+                left = left[1:]
+                if not left:
+                    return self._arrived
 
     def _wait_for_others(self) -> None:
         restarted = self._arrived is not None and self.last.moves < self._arrived.moves
@@ -260,8 +273,7 @@ class AdaptedMachine(WatchedMachine):
             if self._arrived is None or self.last.request == self._arrived.request:
                 return seen
             self._wait_for_others()
-            pose, arguments, options = self._target
-            self.move(pose, *arguments, **options)
+            self._travel(self._targets)
 
     def reload(self, path: Path) -> None:
         """Have the compensator load a model file, which ramps in; if it refuses, the old model stays, and so does the
