@@ -170,7 +170,8 @@ def rotation_from_vector(vector: np.ndarray) -> np.ndarray:
     """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3), rad (Rodrigues)."""
     vector = np.asarray(vector, dtype=float)
     angle = np.sqrt((vector * vector).sum(axis=-1))[..., None, None]
-    sine, cosine = np.sinc(angle / np.pi), 0.5 * np.sinc(0.5 * angle / np.pi) ** 2  # sin θ / θ and (1 − cos θ) / θ²
+    size = np.where(angle > 0.0, angle, 1.0)
+    sine, cosine = np.sin(angle) / size, 2.0 * (np.sin(0.5 * angle) / size) ** 2  # sin θ / θ and (1 − cos θ) / θ²
     outer = vector[..., :, None] * vector[..., None, :]
     return np.cos(angle) * np.eye(3) + sine * _cross_matrix(vector) + cosine * outer
 
