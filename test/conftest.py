@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 pytest_plugins = ("hexapod_comp.testing",)  # where the package is not installed
 
-OWN_NODE_FIXTURES = {"ros_context", "module_context", "client"}
+OWN_NODE_FIXTURES = {"module_context", "client"}
 
 # Folders of tests that wait for nodes more than they compute, those of the longest tests first
 WAITING = ("test/loop/", "test/benchmarks/", "test/linuxcnc/", "test/ros/")
@@ -66,12 +66,6 @@ def unsuspected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hexapod_comp.calibration.fit.mixups", lambda *_: [])
 
 
-@pytest.fixture
-def ros_context(hexapod_context: Context) -> Context:
-    """Give a private rclpy context."""
-    return hexapod_context
-
-
 @pytest.fixture(scope="module")
 def module_context(hexapod_domain: int) -> Iterator[Context]:
     """Give a context that the tests of a module share, for nodes that are never spun."""
@@ -81,11 +75,11 @@ def module_context(hexapod_domain: int) -> Iterator[Context]:
 
 
 @pytest.fixture
-def bench(ros_context: Context, capfd: pytest.CaptureFixture[str]) -> Iterator[Bench]:
+def bench(hexapod_context: Context, capfd: pytest.CaptureFixture[str]) -> Iterator[Bench]:
     """Give a bench with this project's usual machine."""
     from node_helpers import Bench
 
-    with Bench(ros_context, capfd) as made:
+    with Bench(hexapod_context, capfd) as made:
         yield made
 
 

@@ -88,8 +88,8 @@ def garbled(topic: str, random: np.random.Generator) -> bytes:
 
 
 @pytest.fixture
-def stranger(ros_context: Any) -> Iterator[Node]:
-    node = rclpy.create_node("stranger", context=ros_context, namespace="hostile")
+def stranger(hexapod_context: Any) -> Iterator[Node]:
+    node = rclpy.create_node("stranger", context=hexapod_context, namespace="hostile")
     yield node
     node.destroy_node()
 

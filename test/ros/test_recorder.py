@@ -227,14 +227,14 @@ def test_the_rate_is_of_the_last_messages_and_the_mean_of_all():
     assert intervals.rate == pytest.approx(56 / 8.0)
 
 
-def test_what_cannot_be_read_is_said_and_does_not_end_it(ros_context):
+def test_what_cannot_be_read_is_said_and_does_not_end_it(hexapod_context):
     """Bytes of none of the type, and a text of 1 MB: each is a message all the same."""
     import rclpy
     from rclpy.serialization import serialize_message
 
     from hexapod_comp.ros.echo import Echo
 
-    node, received = rclpy.create_node("echoing", context=ros_context), []
+    node, received = rclpy.create_node("echoing", context=hexapod_context), []
     node.create_publisher(String, "said", 1)
     try:
         echo = Echo(node, lambda seconds: None, "said", received.append)
@@ -253,11 +253,11 @@ def test_what_cannot_be_read_is_said_and_does_not_end_it(ros_context):
 
 
 @pytest.mark.parametrize("latched", [False, True], ids=["best_effort", "latched"])
-def test_the_verb_prints_what_is_published(ros_context, capfd, latched):
+def test_the_verb_prints_what_is_published(hexapod_context, capfd, latched):
     """Best effort or latched: the subscription follows what is offered, or nothing would come."""
     import rclpy
 
-    node = rclpy.create_node("publisher_of_strut_states", context=ros_context)
+    node = rclpy.create_node("publisher_of_strut_states", context=hexapod_context)
     qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
     if latched:
         qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -280,11 +280,11 @@ def test_the_verb_prints_what_is_published(ros_context, capfd, latched):
     assert json.loads(capfd.readouterr().out)["data"] == "probe"
 
 
-def test_a_topic_that_nobody_publishes_is_refused_with_a_close_one(ros_context, capfd, monkeypatch):
+def test_a_topic_that_nobody_publishes_is_refused_with_a_close_one(hexapod_context, capfd, monkeypatch):
     import rclpy
 
     monkeypatch.setattr("hexapod_comp.ros.echo.DISCOVERY_TIME", 1.0)
-    node = rclpy.create_node("publisher_of_commands", context=ros_context)
+    node = rclpy.create_node("publisher_of_commands", context=hexapod_context)
     node.create_publisher(String, "strut_commands", 1)
     try:
         assert cli.main(["echo", "strut_comands"]) == 2
