@@ -23,7 +23,6 @@ from ..measurements.iso230 import (
     CIRCLES_STANDARD,
     COLUMNS,
     DIAGONALS_STANDARD,
-    CircularTest,
     Judged,
     figure_cells,
     judge,
@@ -110,7 +109,6 @@ def certificate_text(
         temperatures=_temperatures(fit),
         humidity=[("relative humidity", *damp, number(1e4 * fit.model.struts.moisture.max(), 2))] if damp else [],
         tests=list(_tests(before, after)) if before else [],
-        circles=_circles(before.circles, after.circles) if before and before.circles else None,
         figures=_figures(fit),
         unseen=unseen,
         datum=fit.held.report(),
@@ -156,7 +154,7 @@ def _temperatures(fit: ModelFit) -> Rows:
 
 
 def _tests(before: Judged, after: Judged) -> Iterator[dict[str, object]]:
-    """Yield the tests of ISO 230-2 and 230-6, each figure before → after, µm."""
+    """Yield the tests of ISO 230-2, 230-6 and 230-4, each figure before → after, µm; a dash: not possible."""
     pairs = (
         [(f"{AXES_STANDARD}, lines along the axes, both directions", before.axes, after.axes)] if before.axes else []
     )
@@ -169,23 +167,15 @@ def _tests(before: Judged, after: Judged) -> Iterator[dict[str, object]]:
             rows.append((name, f"{len(test.targets)} × {test.cycles}", *cells))
         worst = [largest(tests) for tests in (old, new)]
         ends = [f"{name[0]} {' → '.join(number(w[name] * 1e6, 2) for w in worst)} µm" for name in worst[0]]
-        yield {
-            "title": title,
-            "header": ("run", "targets × cycles", *COLUMNS.values()),
-            "rows": rows,
-            "largest": ", ".join(ends),
-            "notes": notes_of(old),
-        }
-
-
-def _circles(before: dict[str, CircularTest], after: dict[str, CircularTest]) -> dict[str, object]:
-    """Return the tests of circles: each figure before → after, µm, a dash where a test is not possible."""
-    rows = []
-    for name, test in before.items():
-        cells = figure_cells(CIRCLE_COLUMNS, 2, test.figures, after[name].figures)
-        rows.append((name, number(test.radius * 1e3, 1), *cells))
-    header = ("run", "radius mm", *CIRCLE_COLUMNS.values())
-    return {"title": f"{CIRCLES_STANDARD}, circles", "header": header, "rows": rows, "notes": notes_of(before)}
+        header = ("run", "targets × cycles", *COLUMNS.values())
+        yield {"title": title, "header": header, "rows": rows, "largest": ", ".join(ends), "notes": notes_of(old)}
+    if before.circles:
+        rows = []
+        for name, circle in before.circles.items():
+            cells = figure_cells(CIRCLE_COLUMNS, 2, circle.figures, after.circles[name].figures)
+            rows.append((name, number(circle.radius * 1e3, 1), *cells))
+        header, notes = ("run", "radius mm", *CIRCLE_COLUMNS.values()), notes_of(before.circles)
+        yield {"title": f"{CIRCLES_STANDARD}, circles", "header": header, "rows": rows, "largest": "", "notes": notes}
 
 
 def left_out(fit: ModelFit) -> np.ndarray:

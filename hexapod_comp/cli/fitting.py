@@ -78,18 +78,7 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
 def plan(args: argparse.Namespace) -> Result:
     """Predict what a campaign determines, or propose one for a goal; 1 when the goal cannot be met."""
     from ..calibration.candidates import MeasuringBox
-    from ..calibration.design import (
-        TIMES,
-        Goal,
-        Times,
-        plan,
-        plan_json,
-        plan_report,
-        proposal_json,
-        proposal_report,
-        propose,
-        remarks,
-    )
+    from ..calibration import design
 
     geometry = load_geometry(args.machine)
     campaign = results.load_campaign(args, geometry)
@@ -100,29 +89,29 @@ def plan(args: argparse.Namespace) -> Result:
             say("laying out the readings")
             measured = template(campaign, geometry, args.seed, args.campaign)
             say(f"what {len(measured)} readings determine")
-            result = plan(measured, campaign, fit_settings(args))
-        return Result(lambda: plan_report(result), lambda: plan_json(result))
-    times = dict(TIMES)
+            result = design.plan(measured, campaign, fit_settings(args))
+        return Result(lambda: design.plan_report(result), lambda: design.plan_json(result))
+    times = dict(design.TIMES)
     for name, numbers in args.time or ():
         if name not in times:
             raise CalibrationError("--time", f"must be of one of {', '.join(times)}, not {name}")
-        times[name] = Times(*numbers)
+        times[name] = design.Times(*numbers)
     given: dict[str, Any] = {"instruments": tuple(args.instruments.split(","))} if args.instruments is not None else {}
     given |= {"seconds": args.hours * 3600.0} if args.hours is not None else {}
     tool = geometry.payload
     loads = [load_row(Payload(mass, tool.centre)) for mass in args.tools_kg or ()]
     loads += [load_row(tool, check_gravity("--gravity", vector)) for vector in args.gravity or ()]
     given["loads"] = tuple(loads)
-    goal = Goal(args.goal_um * 1e-6, float(np.radians(args.tilt_deg or 0.0)), times=times, **given)
+    goal = design.Goal(args.goal_um * 1e-6, float(np.radians(args.tilt_deg or 0.0)), times=times, **given)
     place = MeasuringBox(geometry, campaign.box, campaign.level, goal.tilt)
     with results.stage_line() as say:
-        proposal = propose(place, goal, fit_settings(args), campaign, say)
+        proposal = design.propose(place, goal, fit_settings(args), campaign, say)
     results.print_notes(_detours(geometry, proposal.campaign))
     if args.out is not None:
-        write_text(args.out, campaign_text(proposal.campaign, remarks(proposal)))
+        write_text(args.out, campaign_text(proposal.campaign, design.remarks(proposal)))
     return Result(
-        lambda: proposal_report(proposal) + (f"\ncampaign: {args.out}\n" if args.out else ""),
-        lambda: {**proposal_json(proposal), "written": args.out},
+        lambda: design.proposal_report(proposal) + (f"\ncampaign: {args.out}\n" if args.out else ""),
+        lambda: {**design.proposal_json(proposal), "written": args.out},
         code=0 if proposal.met else 1,
     )
 

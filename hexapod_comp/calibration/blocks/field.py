@@ -114,15 +114,12 @@ class SmoothField:
 
 
 class _Field(Block):
-    """Three components of the field, each with its own coefficients of the basis."""
+    """Errors of which each of the six components has its own coefficients of a basis."""
 
-    first: int  # of its components
+    owner: np.ndarray  # component of each parameter
 
     def __init__(self, smooth: SmoothField) -> None:
-        self.smooth, count = smooth, len(smooth.terms)
-        self._owner = np.repeat(np.arange(self.first, self.first + 3), count)  # component of each parameter
-        self.labels = tuple(f"{COMPONENTS[self.first + c]} {t}" for c in range(3) for t in smooth.terms)
-        self.root = np.diag(np.tile(smooth.prior, 3))
+        self.smooth = smooth
 
     @classmethod
     def of(cls, facts: Facts) -> _Field:
@@ -131,7 +128,20 @@ class _Field(Block):
 
     def moving(self, components: np.ndarray) -> np.ndarray:
         """Each component has its own parameters."""
-        return np.flatnonzero(np.isin(self._owner, components))
+        return np.flatnonzero(np.isin(self.owner, components))
+
+
+class FieldDisplacement(_Field):
+    """Displacement along x, y, z."""
+
+    name, unit, tolerance = "field displacement", "m", 5e-6
+    first = 0  # of its three components
+
+    def __init__(self, smooth: SmoothField) -> None:
+        super().__init__(smooth)
+        self.owner = np.repeat(np.arange(self.first, self.first + 3), len(smooth.terms))
+        self.labels = tuple(f"{COMPONENTS[self.first + c]} {t}" for c in range(3) for t in smooth.terms)
+        self.root = np.diag(np.tile(smooth.prior, 3))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
         """The terms at the point, by each direction's share of the component."""
@@ -149,37 +159,22 @@ class _Field(Block):
         draft.field[self.first : self.first + 3] = x.reshape(3, -1)
 
 
-class FieldDisplacement(_Field):
-    """Displacement along x, y, z."""
-
-    name, unit, tolerance, first = "field displacement", "m", 5e-6, 0
-
-
-class FieldRotation(_Field):
+class FieldRotation(FieldDisplacement):
     """Rotation about x, y, z."""
 
     name, unit, tolerance, first = "field rotation", "rad", 20e-6, 3
 
 
-class FieldReversal(Block):
+class FieldReversal(_Field):
     """Forward minus backward along x, y, z, of all six components."""
 
     name, unit, tolerance = "field reversal", "m, rad", 1e-6
 
     def __init__(self, smooth: SmoothField) -> None:
-        self.smooth, count = smooth, len(smooth.reversal_terms)
-        self._owner = np.repeat(np.tile(np.arange(6), 3), count)
+        super().__init__(smooth)
+        self.owner = np.repeat(np.tile(np.arange(6), 3), len(smooth.reversal_terms))
         self.labels = tuple(f"{c} {t} reversal {a}" for a in AXES for c in COMPONENTS for t in smooth.reversal_terms)
         self.root = np.diag(np.tile(smooth.reversal_prior, 18))
-
-    @classmethod
-    def of(cls, facts: Facts) -> FieldReversal:
-        """Every machine may have it."""
-        return cls(facts.smooth)
-
-    def moving(self, components: np.ndarray) -> np.ndarray:
-        """Each component has its own parameters."""
-        return np.flatnonzero(np.isin(self._owner, components))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
         """Half the terms, by the direction of motion along each axis."""
