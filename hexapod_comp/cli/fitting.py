@@ -77,8 +77,8 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
 
 def plan(args: argparse.Namespace) -> Result:
     """Predict what a campaign determines, or propose one for a goal; 1 when the goal cannot be met."""
-    from ..calibration.candidates import MeasuringBox
     from ..calibration import design
+    from ..calibration.candidates import MeasuringBox
 
     geometry = load_geometry(args.machine)
     campaign = results.load_campaign(args, geometry)
