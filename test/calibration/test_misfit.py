@@ -96,14 +96,6 @@ def test_an_interval_is_widened_by_each_cause_in_its_way():
     assert turned.promised_rotation(one) == pytest.approx((2e-6, 1e-6, np.sqrt(1.0 + 2.25 * 3.0) * 1e-6))
 
 
-def with_own_errors(readings: MeasurementSet) -> MeasurementSet:
-    """Return readings of a machine of which each place has an error of its own, 3 µm along each axis."""
-    points = readings.points()[readings.station].round(6)
-    place = np.unique(points, axis=0, return_inverse=True)[1].ravel()
-    own = 3e-6 * np.random.default_rng(1).standard_normal((place.max() + 1, 3))
-    return readings.with_values(readings.value + (readings.directions()[:, :3] * own[place]).sum(axis=1))
-
-
 def test_noise_beyond_the_stated_is_promised(readings):
     """Four times the stated noise: in doubt, above three times, but written, below ten.
 
@@ -174,13 +166,6 @@ def test_friction_in_the_struts_is_no_repeatability(cycles: int):
     assert fit.level.low < left < fit.level.high < 2.2 * left
     assert scatter.stops == (0.0 if cycles == 1 else pytest.approx(1e-6 * np.sqrt(3.0), rel=0.15))
     assert scatter.lack > 2.0 * scatter.stops
-
-
-def test_repeated_readings_tell_repeatability_from_errors_that_stay():
-    """Each place has an error of its own besides, 3 µm; three passes differ by noise and stops alone."""
-    scatter = fit_model(with_own_errors(with_stops(3, 3)), FEW).unexplained.displacement
-    assert scatter.stops == pytest.approx(1e-6 * np.sqrt(3.0), rel=0.1)
-    assert scatter.lack == pytest.approx(3e-6 * np.sqrt(3.0), rel=0.2)
 
 
 def test_a_scale_that_drifts_is_measured(readings):
