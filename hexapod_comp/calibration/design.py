@@ -645,12 +645,11 @@ def plan_report(plan: Plan) -> str:
         f"machine {m.geometry.name}: {len(m)} readings of {len(m.runs)} runs at {len(m.stations)} stations, "
         f"{plan.space.size} parameters"
     )
-    expected = [
-        f"{part}\n  {stops_text(plan.stops)}" for part in expected_text(plan.level, plan.tilted, plan.observability)
-    ]
+    expected = expected_text(plan.level, plan.tilted, plan.observability)
+    counted = [f"{expected}\n  {stops_text(plan.stops)}"] if expected else []
     seen = observability_text(plan.observability, plan.unseen_errors)
     elsewhere = [f"that holds for the loads of the readings; {plan.elsewhere}"] if plan.elsewhere else []
-    parts = [head, *expected, seen, *elsewhere]
+    parts = [head, *counted, seen, *elsewhere]
     return "\n\n".join(parts) + "\n"
 
 

@@ -302,6 +302,7 @@ def test_plan_says_what_will_be_determined(done: Calibration, tmp_path: Path) ->
     code, out, err = hexapod("plan", five, *JOINT)
     assert (code, err) == (0, "")
     assert "machine paper: 3976 readings of 25 runs at 500 stations, 57 parameters" in out
+    assert re.search(r"\n  level tool:  .*\n  tilted 10°:  .*\n", out)
     assert "14 of 33 structure parameters are observable; of all 57 parameters " in out
     assert "that the readings do not show: roll of x, roll of y, roll of z (no reading shows it)\n" in out
     content = json.loads(hexapod("plan", done.campaign, *JOINT, "--json")[1])
