@@ -24,7 +24,7 @@ import pytest
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from hal_stand_in import StandInHal
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from node_helpers import CONFIG, HOME, RELIABLE, Bench, closed_form_lengths, near
 from scipy.spatial.transform import Rotation
@@ -456,6 +456,7 @@ EVENT = st.tuples(
 
 @settings(deadline=None)
 @given(st.lists(EVENT, max_size=60), st.sampled_from(["zero", "hold"]), st.floats(1e-6, 1.0))
+@example([(0.1, [0.0] * 5 + [math.nan], True)], "zero", 1e-3)
 def test_never_too_fast_too_far_or_not_a_number(events, on_loss, ramp_rate):
     """Any corrections at any times, with the clock standing, jumping, going back, or not being one; what is refused
     changes nothing: not even the age, so that a compensator that sends nonsense counts as lost."""
@@ -515,6 +516,9 @@ def test_corrections_ramp_in_and_out_in_proportion():
     assert loop.guard.status is GuardStatus.RETURNING
     assert loop.run(2)[-1] == [0.0] * 6
     assert loop.guard.status is GuardStatus.OFF
+    loop.enabled, loop.target = True, [0.05 * value for value in TARGET]
+    loop.run(1)
+    assert loop.guard.status is GuardStatus.RAMPING
 
 
 @pytest.mark.parametrize(("on_loss", "status"), [("zero", GuardStatus.WAITING), ("hold", GuardStatus.HOLDING)])
@@ -522,6 +526,9 @@ def test_a_compensator_that_is_lost_half_way_and_comes_back(on_loss, status):
     """Corrections stay at the last target for 0.1 s, then return to zero or stay; another target is reached from there
     at 1 µm a cycle."""
     loop = Loop(on_loss)
+    silent = CorrectionGuard(loop.guard._rules)
+    silent.update(0.0, True)
+    assert silent.status is GuardStatus.WAITING, "nothing was accepted yet"
     loop.run(50)
     assert loop.guard.status is GuardStatus.RAMPING
     loop.target = list(loop.guard.output)
