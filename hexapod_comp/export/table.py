@@ -106,8 +106,12 @@ def make_table(
     held = _outside_field(machine, passes)
     if held:
         left_out.append(f"{held} of {len(passes)} rows are outside the field's box: its boundary value is held")
-    struts, backlash = _strut_corrections(machine, passes)
-    values = (struts, backlash, _pose_corrections(passes, struts))
+    commands = []
+    for sense in (0.0, 1.0, -1.0):
+        senses = np.hstack([np.sign(passes.directions), np.full((len(passes), 6), sense)])
+        commands.append(model_commands([machine] * len(passes), passes.poses, senses)[0])
+    struts = commands[0] - passes.nominal_commands()
+    values = (struts, commands[1] - commands[2], _pose_corrections(passes, struts))
     return GridTable((nodes[0], nodes[1], nodes[2]), *(v.reshape(2, *shape, 6) for v in values)), left_out
 
 
@@ -146,15 +150,6 @@ def _outside_field(machine: RealMachine, passes: Passes) -> int:
         problem = f"{at(passes.positions[row])}: the measured point is outside the field's box {corners} mm in base"
         raise OutsideFieldError(problem, points[row], field.box)
     return int(outside.sum())
-
-
-def _strut_corrections(machine: RealMachine, passes: Passes) -> tuple[np.ndarray, np.ndarray]:
-    """Return corrections without backlash, shape (N, 6), and backlash, shape (N, 6), m."""
-    commands = []
-    for sense in (0.0, 1.0, -1.0):
-        senses = np.hstack([np.sign(passes.directions), np.full((len(passes), 6), sense)])
-        commands.append(model_commands([machine] * len(passes), passes.poses, senses)[0])
-    return commands[0] - passes.nominal_commands(), commands[1] - commands[2]
 
 
 def _pose_corrections(passes: Passes, corrections: np.ndarray) -> np.ndarray:

@@ -382,7 +382,10 @@ def write_loading(state: Struct, loading: Loading) -> None:
 def members(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str] = ("", "")) -> dict[str, Any]:
     """Return the values of ``hc_model``."""
     model_texts = {"machine": model.machine, "model": model.name, "date": model.origin.date or ""}
-    tool = geometry.tool
+    tool, late = geometry.tool, model.late_growth
+    constants, expansion = np.zeros(MOST_TIME_CONSTANTS), np.zeros((len(PARTS), MOST_TIME_CONSTANTS))
+    count = len(late.time_constants)
+    constants[:count], expansion[:, :count] = late.time_constants, late.expansion
     return {
         **model_texts,
         "geometry_sha256": hashes[0],
@@ -401,7 +404,12 @@ def members(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, s
             "pieces": model.struts.spline_coefficients(),
         },
         "field": model.field.members(),
-        "late": _late(model),
+        "late": {
+            "count": count,
+            "time_constants": constants,
+            "expansion": expansion,
+            "sensors": [late.sensor_of(part) for part in range(len(PARTS))],
+        },
         "load": model.load.members(geometry),
         "axis_threshold": model.field.reversal_threshold,
         "strut_threshold": model.reversal_threshold,
@@ -424,15 +432,6 @@ def _body(geometry: HexapodGeometry, model: MachineModel, index: int) -> dict[st
 
 def _pose(pose: Pose) -> dict[str, Any]:
     return {"position": pose.position, "rotation": pose.rotation}
-
-
-def _late(model: MachineModel) -> dict[str, Any]:
-    late = model.late_growth
-    count = len(late.time_constants)
-    constants, expansion = np.zeros(MOST_TIME_CONSTANTS), np.zeros((len(PARTS), MOST_TIME_CONSTANTS))
-    constants[:count], expansion[:, :count] = late.time_constants, late.expansion
-    sensors = [late.sensor_of(part) for part in range(len(PARTS))]
-    return {"count": count, "time_constants": constants, "expansion": expansion, "sensors": sensors}
 
 
 def commanded_box(geometry: HexapodGeometry, model: MachineModel) -> np.ndarray:

@@ -95,7 +95,10 @@ def draw_model(geometry: HexapodGeometry, bounds: ImperfectionBounds, seed: int,
         platform = platform[first_of_same(geometry.platform_joints)]
     struts, field = _draw_struts(geometry, bounds, rng), _draw_field(bounds, rng)
     if any(bounds.harmonics):
-        struts = _with_harmonics(struts, bounds.harmonics, seed)
+        own, shape = seeded(seed, "harmonics"), (6, MOST_HARMONICS - 1)
+        amplitude, phase = own.uniform(*bounds.harmonics, shape), own.uniform(0.0, 2.0 * np.pi, shape)
+        cosine = np.hstack([struts.cosine, amplitude * np.cos(phase)])
+        struts = replace(struts, cosine=cosine, sine=np.hstack([struts.sine, amplitude * np.sin(phase)]))
     expansion, bodies = rng.uniform(*bounds.strut_expansion, 6), rng.uniform(*bounds.body_expansion, 2)
     model = MachineModel(
         machine=geometry.name,
@@ -175,14 +178,6 @@ def _draw_struts(geometry: HexapodGeometry, bounds: ImperfectionBounds, rng: np.
         period=np.full(6, bounds.wave_period),
         backlash=rng.uniform(*bounds.backlash, 6),
     )
-
-
-def _with_harmonics(struts: StrutErrors, bounds: tuple[float, float], seed: int) -> StrutErrors:
-    rng = seeded(seed, "harmonics")
-    shape = 6, MOST_HARMONICS - 1
-    amplitude, phase = rng.uniform(*bounds, shape), rng.uniform(0.0, 2.0 * np.pi, shape)
-    cosine, sine = amplitude * np.cos(phase), amplitude * np.sin(phase)
-    return replace(struts, cosine=np.hstack([struts.cosine, cosine]), sine=np.hstack([struts.sine, sine]))
 
 
 def _draw_field(bounds: ImperfectionBounds, rng: np.random.Generator) -> GridField:
