@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from foreign_machines import machines, with_frames
-from strategies import PAPER_FILE, paper_geometry
+from strategies import PAPER_FILE, paper_geometry, skewed_geometry
 
 from hexapod_comp.errors import FrameError, GeometryError, InputFileError
 from hexapod_comp.machine.doubts import doubts, joint_doubts, twist_per_lead
