@@ -81,7 +81,7 @@ class Recorded(VirtualMachine):
         self.time, chapter = self.time + STOP, self.chapters[-1]
         chapter.times.append(self.time)
         chapter.targets.append((self.geometry.work @ pose).position)
-        chapter.actual.append(self._drive.true_tool_pose().position)
+        chapter.actual.append(self.tool.position)
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,7 @@ class VirtualMachine:
         truth: MachineModel,
         instrument: Instrument | None = None,
         seed: int = 0,
+        parameters: DriveParameters | None = None,
     ) -> None:
         self.geometry, self.truth, self.instrument = geometry, truth, instrument or Instrument()
         self.stops = 0
@@ -54,7 +55,7 @@ class VirtualMachine:
         self._in_base = replace(self._in_base, limits=far)
         self._core = Compensator(self._in_base, MachineModel(geometry.name))
         self._at = geometry.home @ geometry.tool
-        self._drive = StrutDrive(RealMachine(self._in_base, truth), DriveParameters(), seed)
+        self._drive = StrutDrive(RealMachine(self._in_base, truth), parameters, seed)
 
     def move(self, pose: Pose) -> None:
         """Go straight to a tool pose in work, and come to rest; a LimitError, ``limit``, where a limit forbids it."""
@@ -72,6 +73,11 @@ class VirtualMachine:
             self._at = target if share == 1.0 else before
         self.stops += 1
 
+    @property
+    def tool(self) -> Pose:
+        """True tool pose in ``base``."""
+        return self._drive.true_tool_pose()
+
     def _send(self, tool_in_base: Pose) -> None:
         """Command a pose, and let the drives get there."""
         command = self._core.correct(tool_in_base).command
@@ -86,7 +92,7 @@ class VirtualMachine:
         jump = self._rng.standard_normal((2, 3)) * 200e-6
         if draws[0] < instrument.broken:
             return None
-        true, sigma = self._drive.true_tool_pose(), np.array([instrument.position, instrument.rotation])
+        true, sigma = self.tool, np.array([instrument.position, instrument.rotation])
         off = noise * sigma[:, None] + (draws[1] < instrument.wild) * jump
         seen = Pose(true.position + off[0], rotation_from_vector(off[1]) @ true.rotation)
         temperatures = tuple(self._drive.machine.temperatures.at(name) for name in Temperatures.NAMES)
@@ -113,4 +119,4 @@ class VirtualMachine:
     def error(self, pose: Pose) -> np.ndarray:
         """Return the tool's deviation from a commanded pose in work, m, along the axes of base."""
         self.move(pose)
-        return np.asarray(self._drive.true_tool_pose().position - (self.geometry.work @ pose).position)
+        return np.asarray(self.tool.position - (self.geometry.work @ pose).position)

@@ -330,7 +330,7 @@ def test_a_run_whose_zero_was_lost_begins_anew_and_comes_out_the_same(tmp_path: 
 
     def move(pose: Pose) -> None:
         go(pose)
-        if untold.moves == 40:
+        if untold.stops == 40:
             untold.instrument.zero()
 
     untold.move = move  # type: ignore[method-assign]
