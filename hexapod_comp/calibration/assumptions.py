@@ -117,7 +117,9 @@ class Assumptions:
     )
     drift: float = assumed(11.5e-6, "m/m", "prior of the scale's change over a campaign", "steel by 1 K")
     clear: float = assumed(3.0, "σ", "significance of a drift, a discrepancy or a difference between runs", "1 in 370")
-    lack_margin: float = assumed(1.5, "", "largest ratio of a discrepancy elsewhere to that at the readings", "chosen")
+    lack_margin: float = assumed(
+        1.5, "", "largest ratio of a discrepancy elsewhere to that at the readings", "benchmarks.promise --ablate"
+    )
     fine_terms: float = assumed(
         0.3, "", "uncertainty of a field's fine terms given the coarse ones, log", "factor of 1.35"
     )
