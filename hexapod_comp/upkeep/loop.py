@@ -425,6 +425,8 @@ class Adaptation:
             if not short and task.goal is not None and not (promised is not None and promised <= task.goal):
                 had = "nothing" if promised is None else f"{promised * 1e6:.2f} µm"
                 short = f"the fit promises {had} (95 %), and the goal is {task.goal * 1e6:.2f} µm"
+            if short and fit.lead is not None and fit.lead.used is None:
+                short += "; the screws' lead is not known (--lead-mm), so that their periodic error is not fitted"
             save_with_posterior(fit.model, fit.parameters, self._folder / name)
         write_text(self._folder / f"{name}.report.txt", report or short)
         self._note("fitted", number=number, model=name, promised_m=promised, enough=not short, short=short)

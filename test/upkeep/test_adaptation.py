@@ -260,6 +260,17 @@ def test_a_goal_that_three_campaigns_do_not_reach_is_refused(tmp_path: Path, mon
     assert planned == pytest.approx([0.7e-6, 0.35e-6, 0.175e-6])
 
 
+def test_a_fit_without_the_screws_lead_says_what_would_help(again: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    cut(again, 3)
+    lead = SimpleNamespace(used=None)
+    fit = SimpleNamespace(level=None, misfit="readings are off", lead=lead, model=None, parameters=None)
+    for name, result in (("fit_model", fit), ("fit_report", ""), ("save_with_posterior", None)):
+        monkeypatch.setattr(upkeep, name, lambda *_, result=result: result)
+    outcome = again.loop().calibrate()
+    assert outcome.state == "refused"
+    assert "not to be trusted: readings are off; the screws' lead is not known (--lead-mm)" in outcome.text
+
+
 # ---- changes, named and repaired ----
 
 
