@@ -51,7 +51,7 @@ class VirtualMachine:
         self.geometry, self.truth, self.instrument = geometry, truth, instrument or Instrument()
         self.stops = 0
         self._rng, self._in_base = np.random.default_rng([seed, 30]), commanded_in_base(geometry)
-        far = replace(self._in_base.limits, step=FARTHEST)
+        far = replace(self._in_base.limits, step=FARTHEST, acceleration=0.0)  # commands have no times
         self._in_base = replace(self._in_base, limits=far)
         self._core = Compensator(self._in_base, MachineModel(geometry.name))
         self._at = geometry.home @ geometry.tool
