@@ -78,7 +78,7 @@ class Criterion(Protocol):
     """A criterion for choosing candidates; it stores those already chosen."""
 
     def gains(self, allowed: np.ndarray) -> np.ndarray:
-        """Return the improvement by each allowed candidate."""
+        """Return by how much the plan's criterion would improve if each allowed candidate were added."""
 
     def add(self, n: int) -> None:
         """Add a candidate to those chosen."""

@@ -465,7 +465,7 @@ class Estimation:
         return shares
 
     def _stated_unknowns(self) -> tuple[np.ndarray, list[Nuisance]]:
-        """Return one over the cells' stated noise, (C,), and the instruments' unknowns, at the nominal machine."""
+        """Return 1/σ of each cell by its stated noise, (C,), and the instruments' unknowns, for the nominal machine."""
         scale = np.sqrt(np.bincount(self.cells.of_reading, self.uncertainty**-2))
         values = np.zeros(len(scale))
         return scale, self.unknowns(self.cells.directions.copy(), np.zeros((len(scale), 6)), values, scale)[1]

@@ -391,8 +391,10 @@ def _choose(
 
 
 def _carried_over(start: Start, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return parameters, tolerances and noise of a start in another space; missing parameters are zero, missing
-    tolerances the first guess."""
+    """Return a start's parameters, tolerances and noise, arranged for another set of blocks.
+
+    Blocks that the start does not have begin with zero parameters and the first guess of their tolerances.
+    """
     old, given, sizes, noise = start
     x, tolerances = np.zeros(space.size), space.start_tolerances()
     for n, block in enumerate(space.blocks):

@@ -33,7 +33,7 @@ ROUND = (0.5e-3, 0.025 * 0.0254)
 
 @dataclass(frozen=True)
 class ScrewLead:
-    """The screws' lead by settings, geometry and readings."""
+    """The screws' lead: as given by settings or geometry, and as detected in the readings."""
 
     given: float | None  # by the settings or the geometry, m
     shown: float | None  # the period that the readings show, m; None: none

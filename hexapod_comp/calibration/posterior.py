@@ -298,7 +298,7 @@ def box_stations(space: ParameterSpace, tilt: float = 0.0, load: Sequence[float]
 
 
 def stations_of(passes: Passes) -> Stations:
-    """Return the stations of some passes, commanded with nominal lengths, at 20 °C."""
+    """Return the stations at which passes command nominal strut lengths with the whole machine at 20 °C."""
     return Stations(
         **vars(Surroundings.usual(len(passes))),
         positions=passes.positions,

@@ -172,7 +172,8 @@ def _parsed(
     if (variances < 0.0).any() or (np.abs(covariance) > largest).any():
         raise InputFileError(path, "covariance", "must be a covariance: no correlation is larger than one")
     if head.get("kinds") != list(KINDS):
-        raise InputFileError(path, "head.kinds", f"must be {list(KINDS)}, of the noise factors", head.get("kinds"))
+        problem = f"must be {list(KINDS)}: the kinds of channel, in the order of the noise factors"
+        raise InputFileError(path, "head.kinds", problem, head.get("kinds"))
     tolerances, noise = array("tolerances", len(space.blocks)), array("noise", len(KINDS))
     for name, values in (("tolerances", tolerances), ("noise", noise)):
         if not (values > 0.0).all():

@@ -410,7 +410,10 @@ def unstated(m: MeasurementSet) -> str:
 
 
 def chi_squares(r: Residuals) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare, ...]]:
-    """Return χ² by kind of channel for families of lines and for directions, and run by run, the worst first."""
+    """Return χ² per degree of freedom of each kind of channel: by line family and by direction of motion; and by run.
+
+    The runs are sorted by χ², the largest first.
+    """
     m, solution, of_reading = r.estimation.measurements, r.solution, r.estimation.cells.of_reading
     freedom = 1.0 - (r.taken / np.bincount(of_reading))[of_reading]
     squares = (solution.weights * solution.residuals / r.estimation.uncertainty) ** 2

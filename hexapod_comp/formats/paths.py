@@ -79,7 +79,7 @@ def confined_opener(folder: Path | None) -> Callable[[str, int], int]:
 
 
 def _refuse_elsewhere(name: str | os.PathLike[str], path: Path, folder: Path | None) -> None:
-    """Raise when a file, by its path without links, is neither in a folder nor shipped."""
+    """Raise if a file, its links resolved, is neither in `folder` nor in the folder of the shipped configurations."""
     folders = [place.resolve() for place in (folder, config_folder()) if place is not None]
     if not any(path.is_relative_to(place) for place in folders):
         places = " and ".join(str(place) for place in folders)

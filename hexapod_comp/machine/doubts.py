@@ -38,7 +38,10 @@ def doubts(geometry: HexapodGeometry) -> tuple[str, ...]:
 
 
 def joint_doubts(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
-    """Yield suspicious places of the joints at home; both (6, 3), m, in ``base``."""
+    """Yield warnings about joint coordinates that look wrong: unusual radius (a wrong unit?) or order of the joints.
+
+    `base` and `platform` are the joints in ``base`` with the platform at home, shape (6, 3), m.
+    """
     for name, joints in (("base", base), ("platform", platform)):
         radius = float(np.linalg.norm(joints - joints.mean(axis=0), axis=1).max())
         if not USUAL_RADII[0] <= radius <= USUAL_RADII[1]:

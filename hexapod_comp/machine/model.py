@@ -188,7 +188,7 @@ class MotionState:
 
 
 class RealMachine:
-    """A geometry with its model at given temperatures, to be run both ways.
+    """A geometry with its errors at given temperatures, for inverse and forward kinematics.
 
     Parameters
     ----------
@@ -478,4 +478,4 @@ def with_datum_held(
         if geometry.screw_lead.any():
             axes = back @ rotation_from_vector(model.base_axes_turn)
             model = replace(model, base_axes_turn=rotation_vector(axes))
-    raise NotConvergedError("the whole machine cannot be moved so that the tool stays at the datum", limit=ROUNDS)
+    raise NotConvergedError("no shift and turn of the machine brings the tool to its nominal datum pose", limit=ROUNDS)

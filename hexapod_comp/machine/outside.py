@@ -174,7 +174,9 @@ def read_numbers(numbers: Mapping[str, Any]) -> dict[str, float]:
 
 
 def load_outside(path: str | Path) -> OutsideTable:
-    """Read a table of errors from CSV: x, y, z, lengths, rx, ry, rz, angles, and one or two outside numbers.
+    """Read a table of the tool's error over one or two outside numbers from CSV.
+
+    Columns x, y, z are displacements, rx, ry, rz rotations; the others are outside numbers: elevation, for instance.
 
     Parameters
     ----------

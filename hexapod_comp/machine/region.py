@@ -19,7 +19,7 @@ PARALLEL = 1e-9  # Directions whose components differ by less are parallel
 
 @dataclass(frozen=True)
 class Region:
-    """A box of places of a point of the platform."""
+    """A box in which one point of the platform, the measured one, may be placed."""
 
     box: np.ndarray = term(
         "region", "mm", "lowest and highest place of the measured point", (2, 3), MISSING, checked=False
@@ -75,7 +75,7 @@ class Region:
 
 
 def region_text(region: Region | None, geometry: HexapodGeometry) -> str:
-    """Return the region of a model's measurement as text; also if it is not known."""
+    """Return the box in which a model was measured as text; "none" if the model does not state it."""
     return "measured box: none" if region is None else f"measured box: {region.text(geometry)}"
 
 

@@ -168,7 +168,7 @@ def collect(
 
 
 class _Collecting:
-    """A campaign that is being measured: what was found so far, and how the instruments stand."""
+    """A campaign in progress: the readings taken so far, and the poses of the instruments as far as they are known."""
 
     def __init__(
         self,

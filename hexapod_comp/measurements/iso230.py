@@ -356,7 +356,7 @@ def notes_of(tests: Mapping[str, PositioningTest] | Mapping[str, CircularTest]) 
 
 
 def figure_cells(columns: Iterable[str], digits: int, *figures: Mapping[str, float]) -> list[str]:
-    """Return figures by their symbols, µm, of one test or before → after; a dash where a test cannot tell."""
+    """Return one cell per column, µm: the figure of one test, or "before → after" of two; "–" if the test has none."""
     return [
         " → ".join(number(part[key] * 1e6, digits) for part in figures) if key in figures[0] else "–" for key in columns
     ]

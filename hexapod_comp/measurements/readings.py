@@ -152,8 +152,8 @@ class MeasurementSet:
     value, uncertainty : ndarray, shape (N,)
         m or rad; NaN where the uncertainty is not known.
     centre : ndarray, shape (N, 3)
-        From where lengths are read, about, m in ``base``; NaN for other readings. The centres of one run belong to one
-        body, whose place and attitude are unknown.
+        Approximate point from which a length is read (ball bar, tracker), m in ``base``; NaN for other readings. The
+        centres of one run belong to one body, whose place and attitude are unknown.
     sources : tuple of FileLine
         Where each reading stands.
     files : tuple of (str, str)
@@ -268,7 +268,7 @@ class MeasurementSet:
         return ((self.points()[self.station] - origins[self.run]) * axes[self.run]).sum(axis=1)
 
     def square_levers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return by how much a square that turns moves each straightness, m per rad, and its axis in the work frame.
+        """Return the change of each straightness reading per angle by which its square turns, m/rad, and the axis, 0…2.
 
         Shape (N,) each. A face along a turns about ω to ω × a: seen along s, the third of these axes, by ω × a · s. Of
         a line that is not parallel to an axis the lever is shorter; other readings have none.

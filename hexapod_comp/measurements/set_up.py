@@ -176,7 +176,7 @@ def check_nudges(
             if abs(own) < NUDGE_TOLERANCE and exchanged:
                 raise SetUpError(f"{channel} reads what {channels[exchanged[0]]} should: are the channels exchanged?")
             if abs(own + 1.0) < tolerances[i]:
-                raise SetUpError(f"{channel} reads reversed: its sign")
+                raise SetUpError(f"{channel} reads with reversed sign: change the sign of this channel")
             size = f"{sizes[i] * 1e3:g} {'mrad' if dimension(channel) == 'angle' else 'mm'}"
             text = f"{channel} reads {own:.4g} times the {size} by which the tool was moved"
             unit = _unit(own, UNITS[dimension(channel)], NUDGE_TOLERANCE)
@@ -239,6 +239,6 @@ class WayCheck:
         if abs(slope - 1.0) > LARGEST_SCALE_ERROR + slack:
             text = f"{self._channel} reads {slope:.4g} times the commanded way"
             if abs(slope + 1.0) < LARGEST_SCALE_ERROR + slack:
-                raise SetUpError(f"{text}: it reads reversed, its sign")
+                raise SetUpError(f"{text}: its sign is reversed: change the sign of this channel")
             unit = _unit(slope, UNITS["length"], LARGEST_SCALE_ERROR + slack)
             raise SetUpError(f"{text}: {unit or 'is its beam along the line, is its scale right'}?")

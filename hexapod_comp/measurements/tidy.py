@@ -246,7 +246,11 @@ class _TidyFile:
             self._exact.append((text, unit))
 
     def _numbered_visits(self) -> Iterator[tuple]:
-        """Yield for each row what readings taken together share; a sequence may come back to a place."""
+        """Yield the key of each row's visit: readings taken at one stop have the same key.
+
+        Where the direction follows from the previous place the key counts the visits, since the sequence may return
+        to a place.
+        """
         count, before = 0, None
         for r in self._rows:
             place = (r.run, r.cycle, r.direction, id(r.pose))

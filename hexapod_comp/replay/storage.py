@@ -143,7 +143,7 @@ def _in_records(
         if kind == MESSAGE:
             number, _, time, _ = MESSAGE_HEAD.unpack_from(body)
             if time >= LATEST:
-                raise ValueError(f"has a message with the time {time} ns")
+                raise ValueError(f"has a message whose time stamp of {time} ns exceeds 2⁶³ − 1")
             if number in channels:
                 yield Message(*channels[number], time, body[MESSAGE_HEAD.size :])
         elif kind == CHUNK:

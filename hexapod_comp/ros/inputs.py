@@ -177,7 +177,10 @@ class Loads:
         self._compensator.set_load(Loading.of(gravity, self._wrench))
 
     def update(self) -> None:
-        """Pass the newest outside numbers to the compensator: periodically, as each change makes a model."""
+        """Pass the newest outside numbers to the compensator if they move the tool by more than ``outside_dead_band``.
+
+        It is called periodically, not by each message, since each change builds a new model.
+        """
         compensator, options = self._compensator, self._node.options
         if options["outside_hold"] or self._table.problem or self._numbers.items() <= compensator.outside.items():
             return

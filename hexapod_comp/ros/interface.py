@@ -306,7 +306,7 @@ class CompensatorState(MachineNode):
         return next((guard for guard in self.standing if guard.problem), None)
 
     def stops(self, now: float) -> bool:
-        """Return whether an active node refuses commands: by a guard, without readings, or recently."""
+        """Return whether an active node refuses commands: a guard acts, no readings came, or one was refused lately."""
         return self.standing_problem() is not None or self.refusals.recent(now) or self.track.waits(now)
 
     def fed(self, now: float) -> bool:

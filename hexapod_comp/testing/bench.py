@@ -372,7 +372,7 @@ class Bench:
         return {entry.key: entry.value for entry in hits[0].values}
 
     def logged(self, part: str) -> list[str]:
-        """Return what nodes have logged up to now and contains a part, oldest first, without time and name."""
+        """Return the log lines so far that contain `part`, the oldest first, without time stamp and node name."""
         self._log += self._capture.readouterr().err if self._capture else ""
         texts = [match[1] for line in self._log.splitlines() if (match := LOG_LINE.fullmatch(line))]
         return [text for text in texts if part in text]

@@ -59,7 +59,10 @@ class Shell:
 
 
 def shell(reach: Reach, rings: int, sectors: int) -> Shell:
-    """Find the boundary of a reach along rays from its centre, spread over a spheroid as flat as the reach."""
+    """Find the boundary of the reachable workspace along rays from its centre.
+
+    The rays go through a spheroid with the workspace's ratio of height to width, at equal steps of its angles.
+    """
     geometry, origin, size = reach.geometry, reach.centre, np.ptp(reach.box, axis=0)
     elevation = np.linspace(-0.5 * np.pi, 0.5 * np.pi, rings)[:, None]
     azimuth = np.linspace(0.0, 2.0 * np.pi, sectors + 1)

@@ -256,7 +256,7 @@ def test_a_ball_bars_file_has_distances_from_any_zero(tmp_path: Path) -> None:
 
 
 MISTAKES = [
-    ({"scale": -1.0}, "linear reads reversed: its sign"),
+    ({"scale": -1.0}, "linear reads with reversed sign"),
     ({"scale": 1e6}, "µm read as m"),
     ({"scale": 2.0}, "twice the way"),
     ({"scale": 1.05}, "linear reads 1.05 times the commanded way"),
@@ -285,7 +285,7 @@ def turned(c: dict[str, float], angle: float = np.radians(15.0)) -> dict[str, fl
 
 # What a driver or a set-up may get wrong, as changes of the channels c that are published
 WRONG = {
-    "rotation_z reads reversed": lambda c: {"rotation_z": -c["rotation_z"]},
+    "rotation_z reads with reversed sign": lambda c: {"rotation_z": -c["rotation_z"]},
     "rotation_y reads 5[67].* degrees read as rad": lambda c: in_unit(c, 57.29578),
     "arcsec read as rad": lambda c: in_unit(c, 206264.8),
     "rotation_y reads what rotation_z should": lambda c: {"rotation_y": c["rotation_z"], "rotation_z": c["rotation_y"]},

@@ -36,8 +36,8 @@ class BacklashMap(LengthMap):
 
     @classmethod
     def of(cls, facts: Facts) -> BacklashMap:
-        """Every screw may wear. The spline through every second knot is written exactly at all knots of the length
-        map."""
+        """Every screw may wear. The backlash is a spline whose knots are every second knot of the length map; a model
+        stores its values at all knots of that map, from which the same spline follows."""
         knots = map_knots(*facts.region.commands)
         block = cls(knots[np.linspace(0, len(knots) - 1, max(2, (len(knots) - 1) // 2 + 1)).round().astype(int)])
         block.model_knots = knots
