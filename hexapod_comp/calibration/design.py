@@ -326,7 +326,7 @@ class Proposal:
 
 
 class Aim:
-    """The tool error of the goal, by parameters z of unit prior."""
+    """The tool error of the goal as a quadratic form of z, the parameters scaled to unit prior variance."""
 
     def __init__(self, space: ParameterSpace, goal: Goal, stops: float = 0.0) -> None:
         self.stops = stops  # repeatability, RMS over all three axes, m: no model reduces it
@@ -525,7 +525,7 @@ class Detectability:
         self.now = self._value(self.taken)
 
     def _value(self, chosen: np.ndarray) -> float:
-        """Return the log odds with a subset of the contrasts."""
+        """Return the log odds of the wanted changes over all others if only a subset of the contrasts is read."""
         single = self.single[chosen][:, self.read[chosen].any(axis=0)]
         effects = [(change, effect[chosen]) for change, effect in self.effects]
         effects += wrong_readings(single, [""] * single.shape[1])

@@ -189,7 +189,7 @@ def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
     most = float(np.abs(there.commands - nominal).max())
     if most > COMPENSATED:
         problem = f"were read under strut commands up to {most * 1e6:.1f} µm off the nominal lengths: compensated?"
-        raise CalibrationError("grid lines", f"{problem} Scheme lines needs the machine as it is")
+        raise CalibrationError("grid lines", f"{problem} Scheme lines needs readings of the uncompensated machine")
     if most > FOLLOWED:
         notes.append(f"strut commands are up to {most * 1e6:.2f} µm off the nominal lengths, and are taken for nominal")
     value = m.value
@@ -259,7 +259,10 @@ def _check_complete(readings: Readings, grid: Sequence[np.ndarray]) -> None:
 def _fit_families(
     readings: Readings, grid: tuple[np.ndarray, np.ndarray, np.ndarray], probe: np.ndarray, zero: np.ndarray
 ) -> tuple[GridField, list[LineFit]]:
-    """Return the field and its polynomials: component by component, the family that it belongs to first."""
+    """Return the field and its polynomials, fitted to one family of lines after the other for each component.
+
+    A displacement is fitted to the lines along its own axis first, a rotation to those along its own axis last.
+    """
     first, second, third = (np.zeros((2, len(grid[a]), len(grid[b]), 6, 0)) for a, b in CROSS_AXES)
     field, fits = GridField(grid, (first, second, third), probe=probe), list[LineFit]()
     for component in range(6):

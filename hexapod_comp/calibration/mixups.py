@@ -228,7 +228,7 @@ class _Fitted:
         values is scaled too (Jacobian).
 
         It starts from the first guess, as the fit does: from noise that a mistake has inflated it might not find back.
-        `early`: after few rounds, and against the readings as they are after as few.
+        With `early`, both this alternative and the readings as they are get :data:`FEW_ROUNDS` rounds of estimation.
         """
         as_read, rounds = (self.early, FEW_ROUNDS) if early else (self.posterior, ROUNDS)
         tried = solve(components, problem, components.first, ALIKE, rounds)

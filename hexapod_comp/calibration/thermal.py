@@ -70,7 +70,7 @@ def with_courses(measurements: MeasurementSet) -> MeasurementSet:
     """Return readings whose stations have the smoothed courses of temperatures and humidity, instead of raw sensor
     readings.
 
-    Readings without times have a course for each run, at an even pace.
+    If the readings have no times, each run gets its own course, with its stations equally spaced in time.
     """
     stations = measurements.stations
     read = np.column_stack([stations.temperatures, stations.humidity])
@@ -238,7 +238,7 @@ class _Scan:
         return float(0.5 * moment @ np.linalg.solve(matrix, moment) - 0.5 * np.linalg.slogdet(matrix)[1])
 
     def best(self, count: int) -> tuple[tuple[int, ...], float]:
-        """Return this number of constants of the grid with the largest gain, and the gain."""
+        """Return the `count` time constants of the grid that increase the log evidence most, and by how much."""
         gains = {chosen: self.gain(chosen) for chosen in combinations(range(len(self._grid)), count)}
         best = max(gains, key=gains.__getitem__)
         return best, gains[best]
@@ -246,7 +246,8 @@ class _Scan:
     def refined(self, chosen: tuple[int, ...]) -> tuple[TimeConstant, ...]:
         """Return the summits of parabolas through each constant's gain and its neighbours', the others kept.
 
-        Deviations use all curvatures together: two constants with similar effects are less certain.
+        Their standard deviations come from the matrix of all second derivatives, so two constants with similar
+        effects get larger ones.
         """
 
         def moved(ways: dict[int, int]) -> float:

@@ -368,8 +368,8 @@ def _of_priors(r: Residuals, metric: np.ndarray) -> float:
     """Return the uncertainty of the logarithm of an expected tool error, as the sizes of priors are estimates.
 
     A size that n parameters determine is known to 1/√(2n) of itself, and moves the squared error by its prior's share
-    of it: with C = (N + T⁻²)⁻¹, tr(M·C·T⁻²·C)/tr(M·C). For a length map or a field, coarse terms determine the size and
-    fine ones are assumed to be in proportion.
+    of it: with C = (N + T⁻²)⁻¹, tr(M·C·T⁻²·C)/tr(M·C). For a length map or a field, the readings determine the coarse
+    terms; the fine terms are assumed to scale with them.
     """
     posterior = r.solution.posterior
     expected = float(np.vdot(metric, posterior.covariance))

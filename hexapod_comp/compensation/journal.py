@@ -288,7 +288,7 @@ def read_sources(text: str) -> dict[str, Source]:
             text_or_none = None if entry["text"] is None else str(entry["text"])
             sources[key] = Source(str(entry["name"]), text_or_none, str(entry["sha256"]))
     except KeyError as error:
-        raise JournalError(f"not a message with files: {error} is missing") from error
+        raise JournalError(f"not a files message of the journal: the entry {error} is missing") from error
     for key, source in sources.items():
         if source.text is not None and Source.of("", source.text).sha256 != source.sha256:
             raise JournalError(f"the {key}'s text does not have the hash that stands beside it")

@@ -79,8 +79,8 @@ class StrutTrack(Guard):
     def check_jump(self, sample: Sample) -> None:
         """Raise a LimitError, ``jump``, for measured struts further from the last ones than a machine can have moved.
 
-        A strut that has really jumped is accepted once the time in which it could have moved there has passed, by
-        stamps or by arrival, whichever is longer: transports delay.
+        A strut that has really jumped is accepted once the time since the last sample suffices to move that far: by
+        the stamps or by the arrivals, whichever is longer, since transport delays messages.
         """
         both = sample.stamp and self._read_stamp
         by_stamp = (sample.stamp - self._read_stamp) * 1e-9 if both else -math.inf

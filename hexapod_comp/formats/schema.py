@@ -71,7 +71,7 @@ Shape = tuple[int | None, ...]  # lengths of an array's axes; None leaves one fr
 
 @cache
 def spellings(dimension: str) -> dict[str, float]:
-    """Return the units of a quantity with their sizes, in every spelling: µm and μm too, where um is."""
+    """Return a quantity's units with their sizes in SI: those with the prefix u also with both characters µ."""
     units = UNITS[dimension]
     return units | {micro + unit[1:]: size for unit, size in units.items() if unit[0] == "u" for micro in MICROS}
 

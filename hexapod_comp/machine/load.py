@@ -133,7 +133,7 @@ def reciprocal(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Load:
-    """The struts' stretch under load; the structure's joints and the struts' errors are those without weight."""
+    """The struts' stretch under load; joints and strut errors of the other terms are those of the unloaded machine."""
 
     stiffness: np.ndarray = term(
         "load", "N_per_um", "of a strut with both joints along its axis; 0: rigid", PER_STRUT, least=0.0, largest=1e12

@@ -122,7 +122,7 @@ class Visit(NamedTuple):
 
 @dataclass(frozen=True)
 class Collected:
-    """What :func:`collect` leaves."""
+    """Result of :func:`collect`."""
 
     measurements: MeasurementSet
     resumed: int  # number of stops that the file had already

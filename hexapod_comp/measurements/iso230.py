@@ -363,7 +363,7 @@ def figure_cells(columns: Iterable[str], digits: int, *figures: Mapping[str, flo
 
 
 def circle_table(tests: Mapping[str, CircularTest]) -> str:
-    """Return the figures of several circles, one row each, µm; a dash where a test cannot tell."""
+    """Return the figures of several circles, one row each, µm; "–" for a figure that a test does not have."""
     rows = []
     for name, test in tests.items():
         cells = figure_cells(CIRCLE_COLUMNS, 3, test.figures)

@@ -305,7 +305,8 @@ def _lengths(
         platform = geometry.platform_poses(measured[0], measured[1])
         zero = (strut_lengths_batch(structure, *platform) - travel).mean(axis=0)
         shift = ", ".join(f"{name} {value * 1e3:+.3f}" for name, value in zip(STRUT_NAMES, zero - home, strict=True))
-        notes.append(f"{table.path}: lengths at reading zero from the measured poses, mm from home: {shift}")
+        text = "strut lengths at reading zero were determined from the measured poses"
+        notes.append(f"{table.path}: {text}; minus the lengths at home, mm: {shift}")
     return zero + travel
 
 

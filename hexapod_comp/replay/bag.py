@@ -243,7 +243,7 @@ def _messages(path: Path, files: list[Path], packing: str, size: int) -> Iterato
 
 
 def _unreadable(path: Path, file: Path | None, error: Exception, key: str = "") -> InputFileError:
-    """Return the error for an exception on damaged bytes."""
+    """Return the error to raise for an exception that damaged bytes have caused."""
     # Parts of a file raise many types: struct.error, KeyError, errors of two decompressors and of a
     # database, of rosbags; hence `except Exception` where it is called.
     if isinstance(error, UnpackingError):

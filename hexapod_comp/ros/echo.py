@@ -202,7 +202,7 @@ class Echo:
 
 
 class MessageIntervals:
-    """Counts messages and the times between them, s: of all, and of those of the last :data:`RATE_WINDOW`."""
+    """Counts messages, and measures the time between two, s: of all messages, and of the last :data:`RATE_WINDOW`."""
 
     def __init__(self) -> None:
         self.count = 0

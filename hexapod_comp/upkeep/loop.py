@@ -182,7 +182,7 @@ def next_step(state: State, checks: int | None, may_reload: bool) -> str:
 
 
 def begun_with(folder: str | Path) -> Event:
-    """Return what the newest calibration in a folder was begun with: machine, goal_m, box_m, level; empty: nothing."""
+    """Return the inputs of the newest calibration in a folder: machine, goal_m, box_m, level; empty without one."""
     events = Journal.read(Path(folder) / JOURNAL)
     return next((e for e in reversed(events) if e["event"] == "begun"), {})
 

@@ -327,7 +327,7 @@ class PhysicalMachine(RealMachine):
         return outcome, condition
 
     def start(self, rigid: tuple[np.ndarray, np.ndarray], sense: np.ndarray) -> None:
-        """Put MuJoCo's machine to rest where its struts carry it."""
+        """Put MuJoCo's machine to rest in the pose at which the struts' forces balance the weight."""
         settled = self._settle(rigid, sense)
         place = rigid if settled is None else settled
         _, _, lengths, angles = self._struts_at(*place)

@@ -212,6 +212,6 @@ def _faces(points: np.ndarray, wedge: float) -> tuple[np.ndarray, tuple[np.ndarr
 
 
 def _of_faces(values: np.ndarray, corners: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the mean of the four corners' values of faces given by their first corner."""
+    """Return each face's mean over its four corner values; `corners` are the indices of its first corner."""
     i, j = corners
     return 0.25 * (values[i, j] + values[i, j + 1] + values[i + 1, j + 1] + values[i + 1, j])

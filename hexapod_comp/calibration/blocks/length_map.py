@@ -11,7 +11,7 @@ from .block import Draft, Facts, Linkage, StrutBlock
 
 
 def map_knots(low: float, high: float) -> np.ndarray:
-    """Return equidistant knots over the commands seen, m."""
+    """Return equidistant knots over the range of commanded strut lengths, m."""
     span = max(high - low, ASSUMED.knot_distance)
     return np.linspace(low, low + span, int(np.ceil(span / ASSUMED.knot_distance)) + 1)
 
@@ -35,7 +35,7 @@ class LengthMap(StrutBlock):
 
     @classmethod
     def of(cls, facts: Facts) -> LengthMap:
-        """Every screw may have one, over the commands seen."""
+        """Every screw may have one; its knots span the strut lengths commanded in the measurement."""
         return cls(map_knots(*facts.region.commands))
 
     def weights(self, commands: np.ndarray) -> np.ndarray:
