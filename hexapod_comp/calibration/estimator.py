@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs
 
 from ..errors import CalibrationError, KinematicsError, ModelError
-from ..measurements.readings import KINDS, LEAST_NOISE, MeasurementSet
+from ..measurements.readings import KINDS, LEAST_NOISE, MeasurementSet, refuse_impossible
 from .assumptions import ASSUMED
 from .blocks.block import Linkage
 from .blocks.load import unsettled_lengths
@@ -364,6 +364,7 @@ class Estimation:
     """Readings against parameters."""
 
     def __init__(self, measurements: MeasurementSet, space: ParameterSpace, alone: bool = True) -> None:
+        refuse_impossible(measurements)
         self.measurements, self.space = measurements, space
         self.cells = Cells.of(measurements)
         self.uncertainty = measurements.stated

@@ -292,6 +292,17 @@ class MeasurementSet:
         return replace(self, value=value)
 
 
+def refuse_impossible(measurements: MeasurementSet) -> None:
+    """Refuse values that no reading has, as :func:`.runs.assemble` does: sets may have been changed since."""
+    impossible = np.flatnonzero(~(np.abs(measurements.value) <= LARGEST_READING))
+    if len(impossible):
+        first = impossible[0]
+        where = f"{measurements.sources[first]}, {CHANNELS[measurements.channel[first]]}"
+        value = measurements.value[first]
+        problem = f"the value is {value:g} m or rad, allowed ±{LARGEST_READING:g}; does the unit fit?"
+        raise CalibrationError(where, problem)
+
+
 def refuse_unmoved(measurements: MeasurementSet, left: np.ndarray) -> None:
     """Refuse a kind of reading that shows nothing: an instrument without any noise would have infinite weight."""
     for k in np.unique(measurements.kind):

@@ -22,7 +22,7 @@ from hexapod_comp.calibration.posterior import box_errors, expected_error, stati
 from hexapod_comp.calibration.promise import Scatter, Unexplained
 from hexapod_comp.calibration.report import fit_report
 from hexapod_comp.calibration.trust import stated_scale
-from hexapod_comp.errors import ModelError
+from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
 from hexapod_comp.machine.passes import random_passes
 from hexapod_comp.machine.trial import Trial
@@ -253,3 +253,12 @@ def test_stated_scale(readings):
         FitSettings(alignment=np.nan)
     with pytest.raises(ModelError, match="scale"):
         FitSettings(scale=-1e-6)
+
+
+@pytest.mark.parametrize("value", [1e308, np.nan])
+def test_a_set_changed_in_python_names_a_value_that_no_reading_has(readings, value):
+    """Files are refused where they are read; a set may be changed afterwards."""
+    spoilt = readings.value.copy()
+    spoilt[5] = value
+    with pytest.raises(CalibrationError, match=r"campaign, .*the value is"):
+        fit_model(readings.with_values(spoilt), FEW)
