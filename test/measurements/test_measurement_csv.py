@@ -43,7 +43,7 @@ def read(folder: Path, rows: str, header: str = HEADER) -> MeasurementSet:
     ("channel", "value", "unit", "si"),
     [
         ("linear", "1.5", "um", 1.5e-6),
-        ("rotation_y", "180", "deg", np.pi),
+        ("rotation_y", "45", "deg", 0.25 * np.pi),
         ("roll", "4", "mrad", 4e-3),
     ],
 )
