@@ -285,9 +285,8 @@ def _noise(
     problem: LinearProblem, kinds: np.ndarray, normal: np.ndarray, moment: np.ndarray, posterior: Posterior
 ) -> np.ndarray:
     """Return new noise factors: squared residuals over the remaining degrees of freedom; sums of some kinds."""
-    result, y = posterior.noise.copy(), posterior.y
-    for k, information, sums in zip(kinds, normal, moment, strict=True):
-        rest = problem.square[k] - 2.0 * y @ sums + y @ information @ y
+    result = posterior.noise.copy()
+    for k, information, rest in zip(kinds, normal, _unmet(problem, kinds, normal, moment, posterior.y), strict=True):
         freedom = problem.freedom[k] - np.vdot(posterior.covariance, information) / result[k] ** 2
         if freedom > LEAST_FREEDOM and rest > 0.0:
             result[k] = np.sqrt(rest / freedom)
@@ -318,10 +317,19 @@ def log_evidence(problem: LinearProblem, posterior: Posterior) -> float:
     MacKay (1992), Neural Computation 4, 415: the likelihood of the best parameters, times the Occam factor of their
     priors.
     """
-    kinds = np.unique(problem.kind)
-    weights, moment = posterior.noise[kinds] ** -2, problem.moment[np.ix_(kinds, posterior.used)]
-    unmet = weights @ (problem.square[kinds] - moment @ posterior.y)
+    kinds, used, y = np.unique(problem.kind), posterior.used, posterior.y
+    normal, moment = problem.normal[np.ix_(kinds, used, used)], problem.moment[np.ix_(kinds, used)]
+    weights = posterior.noise[kinds] ** -2
+    # A sum of squares: where the equations are ill-conditioned, y is not their solution, and makes it larger
+    unmet = weights @ _unmet(problem, kinds, normal, moment, y) + ((y / posterior.spread) ** 2).sum()
     return float(-0.5 * (unmet + posterior.log_determinant - problem.freedom[kinds] @ np.log(weights)))
+
+
+def _unmet(
+    problem: LinearProblem, kinds: np.ndarray, normal: np.ndarray, moment: np.ndarray, y: np.ndarray
+) -> np.ndarray:
+    """Return the squared residuals of each kind for parameters y, (kinds,), over the stated noise."""
+    return np.maximum(problem.square[kinds] - 2.0 * moment @ y + normal @ y @ y, 0.0)
 
 
 def whitened_precision(problem: LinearProblem, posterior: Posterior) -> np.ndarray:

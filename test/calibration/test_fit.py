@@ -238,6 +238,19 @@ def test_evidence_is_that_of_the_readings_distribution():
     assert log_bayes_factor(space, posteriors[0], "wave") == pytest.approx(truth[0] - truth[2], rel=1e-6)
 
 
+def test_evidence_of_ill_conditioned_readings_is_not_above_that_of_readings_met_exactly():
+    """Readings of 10⁵ times their noise, as in another unit, of a machine that five directions nearly describe."""
+    space, problem, noise = random_problem()
+    rng, start = np.random.default_rng(0), space.start_tolerances()
+    rows = rng.standard_normal((240, 5)) @ rng.standard_normal((5, space.size))
+    rows += 1e-5 * rng.standard_normal((240, space.size))
+    target = rows @ (1e5 * rng.standard_normal(space.size))
+    huge = problem_of(rows / space.spread(start), target, problem.kind, problem.fold)
+    found = solve(space, huge, 1e5 * start, noise, rounds=0)
+    met = -0.5 * (found.log_determinant + 2.0 * huge.freedom @ np.log(found.noise))
+    assert log_evidence(huge, found) <= met
+
+
 def test_tolerances_and_noise_are_the_most_probable_ones(monkeypatch: pytest.MonkeyPatch):
     """At the fixed point the evidence has no slope along any log tolerance or log noise factor.
 
