@@ -20,7 +20,6 @@ import numpy as np
 
 from ..core import Status
 from ..errors import CalibrationError
-from ..machine.arrays import rms
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import FOLLOWED, RealMachine
 from ..machine.passes import Passes, Poses, random_directions
@@ -358,7 +357,7 @@ def expected_error(
         parts = errors.values[:, :3], errors.values[:, 3:]
         before = [float(np.sqrt((part**2).sum(axis=1).mean())) for part in parts]
     else:
-        before = [rms(_sizes(square, _drawn(prior))) for square in squares]
+        before = [float(np.sqrt((square * prior).sum())) for square in squares]
     sizes = [_sizes(square, drawn) for square in squares]
     return ToolError(
         float(np.hypot(before[0], beyond.displacement.stops)),
@@ -374,10 +373,13 @@ def _sizes(square: np.ndarray, drawn: np.ndarray) -> np.ndarray:
 
 
 def _drawn(covariance: np.ndarray) -> np.ndarray:
-    """Return draws of parameters with a covariance, shape (size, DRAWS)."""
+    """Return draws of parameters with a covariance, shape (size, DRAWS).
+
+    By its symmetric root: eigenvectors alone turn by rounding, and draws would depend on the threads of BLAS.
+    """
     values, vectors = np.linalg.eigh(covariance)
     z = np.random.default_rng(SEED).standard_normal((len(covariance), DRAWS))
-    return np.asarray(vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * z))
+    return np.asarray(vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * (vectors.T @ z)))
 
 
 # What the readings determine
