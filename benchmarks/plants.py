@@ -31,6 +31,7 @@ from hexapod_comp.machine.arrays import rms
 from hexapod_comp.machine.load import STANDARD_GRAVITY, Load, Loading, Payload
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.robot_description import foot_frames
+from hexapod_comp.machine.surroundings import load_row
 from hexapod_comp.measurements.campaign import Campaign, campaign_readings
 from hexapod_comp.measurements.readings import DEFAULT_UNCERTAINTY, FROM_PREVIOUS, FileLine, MeasurementSet
 from hexapod_comp.measurements.runs import assemble, joined
@@ -134,13 +135,12 @@ class Bench:
     ) -> MeasurementSet:
         """Return what instruments read under a payload, which the readings name where it is told."""
         laid = self.laid if laid is None else laid
-        row = (*(payload.mass, *payload.centre), *[np.nan] * 3)
-        loads = np.tile(row, (len(laid.stations), 1))
+        loads = np.tile(load_row(payload), (len(laid.stations), 1))
         read = measure(
             replace(laid, stations=replace(laid.stations, loads=loads)), self.plan, self.truth(payload), seed
         )
         known = SPINDLE if not told else payload
-        loads = np.tile((known.mass, *known.centre, *[np.nan] * 3), (len(laid.stations), 1))
+        loads = np.tile(load_row(known), (len(laid.stations), 1))
         return replace(read, stations=replace(read.stations, loads=loads))
 
     def left(

@@ -12,7 +12,7 @@ from hexapod_comp.workspace.budget import load_budget
 from hexapod_comp.workspace.effects import effects
 from hexapod_comp.workspace.pictures import shells_figure
 from hexapod_comp.workspace.ranking import FACTORS, FIGURES, RankingRow
-from hexapod_comp.workspace.reach import orientations, reach
+from hexapod_comp.workspace.reach import orientations, reach, reaches
 from hexapod_comp.workspace.shells import TRANSLATION, Layer, shell
 from hexapod_comp.workspace.study import LAYERS, RINGS, SECTORS, Study, classify
 
@@ -57,7 +57,7 @@ TABLE_1 = (
 def study(cells: int = 30, progress: Callable[[int], object] = lambda poses: None) -> Study:
     """Classify the shipped positioning unit; parameters as ``hexapod_comp classify`` has them."""
     geometry = load_geometry(MACHINE)
-    reached = tuple(reach(geometry, turned, cells) for turned in orientations(geometry, (TILTS, TILTS, (0.0,))))
+    reached = reaches(geometry, orientations(geometry, (TILTS, TILTS, (0.0,))), cells)
     return classify(geometry, load_budget(BUDGET), reached, progress=progress)
 
 

@@ -301,7 +301,9 @@ def _fit(
     if held_by_priors(residuals):
         many = f"{len(measurements)} readings do not determine the {space.size} parameters"
         refusals.append(f"{many}: what they say of the tool comes from the priors")
-    notes = [*measurements.notes, *_about_inputs(measurements, space, lead, solution, beyond), *backlash]
+    loads = measured_loads(stated_load(space.settings), space.geometry, measurements.stations)
+    elsewhere = about_other_loads(space, solution.x, covariance, beyond) if loads else ""
+    notes = [*measurements.notes, *_about_inputs(measurements, space, lead, loads, elsewhere), *backlash]
     noisy = [f"{c.kind} {c.found / c.stated:.1f} times" for c in channels if c.found > ASSUMED.misfit[0] * c.stated]
     if noisy:
         problem = (
@@ -317,7 +319,6 @@ def _fit(
     if level is not None:
         note += f", expected tool error {level.after * 1e6:.3f} µm RMS, up to {level.high * 1e6:.3f} (95 %)"
     lengths = [c.held_out for c in channels if c.kind not in ANGULAR_KINDS]
-    loads = measured_loads(stated_load(space.settings), space.geometry, measurements.stations)
     left = rms(lengths) if lengths else None
     origin = ModelOrigin(date.today().isoformat(), measurements.files, left, note, loads=loads)
     as_solved = replace(space.model(solution.x.round(DIGITS)), origin=origin)
@@ -453,20 +454,21 @@ def _about_inputs(
     measurements: MeasurementSet,
     space: ParameterSpace,
     lead: ScrewLead | None,
-    solution: Solution,
-    beyond: Unexplained,
+    loads: Sequence[Sequence[float]],
+    elsewhere: str,
 ) -> Iterator[str]:
-    """Yield notes on loads, lead, temperatures and humidity, as stated or missing: what the fit made of them."""
-    loads = np.array(measured_loads(stated_load(space.settings), space.geometry, measurements.stations))
-    if len(loads):
-        low, high = loads[:, 0].min(), loads[:, 0].max()
+    """Yield notes on loads, lead, temperatures and humidity, as stated or missing: what the fit made of them.
+
+    `loads` are those of the readings, `elsewhere` is the error predicted under others.
+    """
+    if loads:
+        rows = np.array(loads)
+        low, high = rows[:, 0].min(), rows[:, 0].max()
         masses = f"a tool of {low:g} kg" if low == high else f"tools of {low:g} to {high:g} kg"
-        directions = len(np.unique(loads[:, 4:], axis=0))
+        directions = len(np.unique(rows[:, 4:], axis=0))
         gravity = "one direction of gravity" if directions == 1 else f"{directions} directions of gravity"
-        covariance = physical_covariance(space, solution.posterior)
-        elsewhere = about_other_loads(space, solution.x, covariance, beyond)
-        elsewhere = f"; {elsewhere}" if elsewhere else ", for no struts' stiffness is stated (--load)"
-        yield f"read with {masses} and {gravity}: the promise holds for these{elsewhere}"
+        others = f"; {elsewhere}" if elsewhere else ", for no struts' stiffness is stated (--load)"
+        yield f"read with {masses} and {gravity}: the promise holds for these{others}"
     if lead is not None and lead.given is not None and lead.shown is not None and not lead.agrees:
         problem = f"the screws' errors repeat every {lead.shown * 1e3:.4g} mm by the readings"
         yield f"{problem}, not with the given lead of {lead.given * 1e3:.6g} mm: is it right?"

@@ -115,20 +115,14 @@ class Unexplained:
             size = f"{self.drift * 1e6:.2g} ppm, as steel's does in {self.drift / STEEL:.2g} K"
             problem = f"the scale of the linear readings changes by {size}, from the first to the last"
             doubts.append(f"{problem}: the model is that of the middle of the campaign")
-        for name in ("lack", "stops"):
-            sizes = [
-                f"{1e6 * getattr(part, name):.2f} {unit}"
-                for part, unit in (
-                    (self.displacement, "µm RMS of the tool's displacement"),
-                    (self.rotation, "µrad RMS of its rotation"),
-                )
-                if getattr(part, name)
-            ]
-            if sizes and name == "lack":
-                notes.append(
-                    f"{' and '.join(sizes)} is in no parameter (discrepancy); the expected tool error allows for it"
-                )
-            elif sizes:
-                problem = "repeated readings scatter more than stated: taken for the machine's own repeatability"
-                notes.append(f"{problem}, {' and '.join(sizes)}; the expected tool error has it, the lower end has not")
+        if lack := self._sizes("lack"):
+            notes.append(f"{lack} is in no parameter (discrepancy); the expected tool error allows for it")
+        if stops := self._sizes("stops"):
+            problem = "repeated readings scatter more than stated: taken for the machine's own repeatability"
+            notes.append(f"{problem}, {stops}; the expected tool error has it, the lower end has not")
         return doubts, notes
+
+    def _sizes(self, name: str) -> str:
+        """Return a part of displacement and rotation as text; empty if both are zero."""
+        parts = (self.displacement, "µm RMS of the tool's displacement"), (self.rotation, "µrad RMS of its rotation")
+        return " and ".join(f"{1e6 * getattr(part, name):.2f} {unit}" for part, unit in parts if getattr(part, name))

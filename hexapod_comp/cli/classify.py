@@ -22,7 +22,7 @@ from ..machine.model_file import load_model
 from ..workspace import study as studies
 from ..workspace.budget import load_budget
 from ..workspace.ranking import ranking_rows
-from ..workspace.reach import orientations, reach
+from ..workspace.reach import orientations, reaches
 from ..workspace.shells import TRANSLATION, Layer
 from ..workspace.study import COMBINED_POSES, Study, as_json, mesh_effects, random_poses, report, shells_of
 from . import results
@@ -49,7 +49,7 @@ def classify(args: argparse.Namespace) -> int | Result:
     budget = load_budget(path)
     with file_errors(path):  # refuse errors that do not fit the machine before the work starts
         budget.single_errors(geometry)
-    reached = tuple(reach(geometry, rotation, args.cells) for rotation in turned)
+    reached = reaches(geometry, turned, args.cells)
     names = tuple(f"α {math.degrees(a):g}°, β {math.degrees(b):g}°" for a, b in product(args.tilt_deg, args.tilt_deg))
     with results.progress_bar(sum(int(one.within.sum()) for one in reached), " poses") as bar:
         study = studies.classify(
@@ -100,7 +100,7 @@ def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry, turn
     fitted, unknown = load_posterior(model, geometry, args.model)
     if fitted is None:
         raise CommandError("model", f"what the calibration of {args.model} leaves is not known: {unknown}")
-    reached = tuple(reach(geometry, rotation, args.cells) for rotation in turned)
+    reached = reaches(geometry, turned, args.cells)
     poses, machine = random_poses(reached, COMBINED_POSES, args.seed), RealMachine(geometry, model)
     name = f"workspace, α and β of {', '.join(f'{math.degrees(tilt):g}' for tilt in args.tilt_deg)}°"
     with results.stage_line() as say:

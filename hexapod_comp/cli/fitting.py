@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -160,14 +161,16 @@ def fit(args: argparse.Namespace) -> int | Result:
         raise
     misfit = "; ".join(filter(None, (result.misfit, beyond_limits(measured, result.model))))
     if isinstance(result, ModelFit):
-        text, content, known = fit_report(result), as_json(result), result.parameters
+        text, known = fit_report(result), result.parameters
+        content: Callable[[], dict[str, Any]] = partial(as_json, result)
     else:
-        text, content, known = lines_report(result), lines_json(result), None
+        text, known = lines_report(result), None
+        content = partial(lines_json, result)
     if misfit and not args.force:
         print("hexapod_comp: error: nothing was written; the report says why, --force writes it", file=sys.stderr)
         return Result(
             lambda: f"{REFUSED}: {misfit}. {ADVICE}\n\n{text}",
-            lambda: {**content, "misfit": misfit, "written": None},
+            lambda: {**content(), "misfit": misfit, "written": None},
             code=1,
         )
     judged, tried = judge(measured), None
@@ -189,7 +192,7 @@ def fit(args: argparse.Namespace) -> int | Result:
         "written_beside": beside,
     }
     # The model is written first, since the rest may fail; pictures come last.
-    Result(lambda: f"{text}\nmodel: {args.out}\n{_listed(beside)}", lambda: {**content, **more}).finish(args)
+    Result(lambda: f"{text}\nmodel: {args.out}\n{_listed(beside)}", lambda: {**content(), **more}).finish(args)
     if args.report is not None:
         write_text(args.report, text)
     if args.certificate is not None and isinstance(result, ModelFit):

@@ -52,6 +52,7 @@ class MachineComponent:
     def __init__(self, machine: RealMachine, units: str = "mm", name: str = "hexapod_machine", hal: Any = None):
         self._machine, self._metres = machine, METRES[units]
         self._motion, self._guess = MotionState(), machine.geometry.home
+        self._base_in_work, self._platform_in_tool = machine.geometry.work.inverse(), machine.geometry.tool.inverse()
         self.component = HalComponent(name, PINS, hal)
         self._read = self.component.reader(*STRUTS, "tool-offset", *AXES)
         self._write, self._write_valid = self.component.writer(*TRUE, *ERRORS), self.component.writer("valid")
@@ -63,7 +64,7 @@ class MachineComponent:
         command = Pose.from_quaternion(read[7:10] * self._metres, np.array(quaternion_from_axes(*read[10:])))
         geometry, field = self._machine.geometry, self._machine.model.field
         commanded = Pose(command.position - up + command.rotation @ up, command.rotation)
-        wanted = geometry.work @ commanded @ geometry.tool.inverse()
+        wanted = geometry.work @ commanded @ self._platform_in_tool
         # Directions of motion, which the truth's backlash and field depend on
         point = np.concatenate([wanted.position + wanted.rotation @ field.probe, struts])
         thresholds = field.reversal_threshold, self._machine.model.reversal_threshold
@@ -73,7 +74,7 @@ class MachineComponent:
         except KinematicsError:
             self._write_valid([False])
             return
-        tool = geometry.work.inverse() @ platform @ geometry.tool
+        tool = self._base_in_work @ platform @ geometry.tool
         position = tool.position - tool.rotation @ up + up
         error = position - command.position
         lengths = np.concatenate([position, [np.linalg.norm(error)], error]) / self._metres

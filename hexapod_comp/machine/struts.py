@@ -144,14 +144,11 @@ def natural_spline(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
     Coefficients of (x − the piece's first knot), the highest power first. SciPy's CubicSpline takes 14 MB to load.
     """
     width, slope = np.diff(knots)[:, None], np.diff(values, axis=0) / np.diff(knots)[:, None]
-    bends = np.zeros(values.shape)  # second derivatives at the knots: a tridiagonal system, solved by elimination
-    diagonal, right = 2.0 * (width[1:] + width[:-1]), 6.0 * np.diff(slope, axis=0)
-    for i in range(1, len(right)):
-        share = width[i] / diagonal[i - 1]
-        diagonal[i] -= share * width[i]
-        right[i] -= share * right[i - 1]
-    for i in reversed(range(len(right))):
-        bends[i + 1] = (right[i] - width[i + 1] * bends[i + 2]) / diagonal[i]
+    bends = np.zeros(values.shape)  # second derivatives at the knots, zero at both ends
+    inner, beside = np.arange(len(knots) - 2), np.diff(knots)[1:-1]
+    matrix = np.diag(2.0 * (knots[2:] - knots[:-2]))
+    matrix[inner[:-1], inner[1:]] = matrix[inner[1:], inner[:-1]] = beside
+    bends[1:-1] = np.linalg.solve(matrix, 6.0 * np.diff(slope, axis=0))
     first, last = bends[:-1], bends[1:]
     return np.stack(
         [(last - first) / (6.0 * width), 0.5 * first, slope - width * (2.0 * first + last) / 6.0, values[:-1]]

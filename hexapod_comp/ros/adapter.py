@@ -78,7 +78,7 @@ class AdapterNode(MachineNode):
         self._state, self._text, self._step, self._model = IDLE, "nothing was asked for yet", "", ""
         self._next = ""  # what is due when `check_every` is over: a check, or what was interrupted
         self._ended = time.monotonic()
-        self._begun = 0  # where in the journal those before it end, bytes
+        self._begun = self._read = 0  # bytes of the journal: of the runs before; when it was read last
 
     # ---- lifecycle ----
 
@@ -158,7 +158,10 @@ class AdapterNode(MachineNode):
     def update(self, now: float) -> None:
         if self._process is not None:
             code = self._process.poll()  # before the journal is read, which has all then that it wrote
-            events = self._events()
+            size = self._journal_size()
+            if code is None and size == self._read:
+                return
+            self._read, events = size, self._events()
             if events and events[-1]["event"] not in (self._step, ENDED):
                 self._step = events[-1]["event"]
                 self._change(self._state, self._step)
@@ -173,6 +176,12 @@ class AdapterNode(MachineNode):
 
     def values(self, now: float) -> dict[str, str]:
         return {"state": self._state, "step": self._step}
+
+    def _journal_size(self) -> int:
+        try:
+            return self._journal.stat().st_size
+        except OSError:  # it is being made
+            return 0
 
     def _events(self) -> list[Event]:
         """Return what the process has written into the journal; it says itself what is wrong with that."""

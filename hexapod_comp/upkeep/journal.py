@@ -47,7 +47,11 @@ class Journal:
     def read(path: Path, start: int = 0) -> list[Event]:
         """Return the events of a journal that somebody else writes, from a byte on, without a line that is being
         written; none where there is no journal."""
-        text = path.read_bytes()[start:].decode("utf-8", errors="replace") if path.exists() else ""
+        if not path.exists():
+            return []
+        with path.open("rb") as file:
+            file.seek(start)
+            text = file.read().decode("utf-8", errors="replace")
         return list(_parsed(path, text.rpartition("\n")[0]))
 
     def add(self, event: str, **content: Any) -> Event:

@@ -445,11 +445,12 @@ class Adaptation:
         run = check_run(self._geometry, task.box, task.level, number, f"check {number}")
         campaign = Campaign(task.box, side, side, instrument=None, diagonals=0, level=task.level, runs=(run,))
         _, missing = self._measured(campaign, name)
-        if (usable := len(np.unique(self._readings([name]).station))) < LEAST_READ:
+        measured = self._readings([name])
+        if (usable := len(np.unique(measured.station))) < LEAST_READ:
             problem = f"{usable} of {len(run.positions)} readings of {name} are usable, and a check needs {LEAST_READ}"
             raise CommandError("instrument", f"{problem}: at {len(missing)} places the instrument read nothing")
-        verification, fitted = self._verified(model, [name])
-        judged = judge(fitted, verification.measurements, promised)
+        verification, fitted = self._verified(model, measured)
+        judged = judge(fitted, measured, promised)
         kept = verification.verdict == VALID if np.isnan(promised) else judged.excess <= 1.0
         spoilt = not kept and verification.verdict != VALID and verification.candidates[0].family == READING
         good = kept and not (verification.verdict == NAMED and verification.candidates[0].family in EVENTS)
@@ -501,15 +502,14 @@ class Adaptation:
         measured = read_measurements([self._folder / name for name in names], self._geometry)
         return measured.select(measured.direction != UNKNOWN)
 
-    def _verified(self, model: str, readings: list[str]) -> tuple[Verification, FittedParameters]:
+    def _verified(self, model: str, readings: MeasurementSet) -> tuple[Verification, FittedParameters]:
         """Return what readings say of a model, and what its fit knows."""
         path = self._folder / model
         machine_model = load_model(path, self._geometry)
         fitted, unknown = load_posterior(machine_model, self._geometry, path)
         if fitted is None:
             raise CalibrationError("model", f"{path} cannot be checked: {unknown}")
-        measured = self._readings(readings)
-        return verify_model(machine_model, fitted, measured), fitted
+        return verify_model(machine_model, fitted, readings), fitted
 
     def _adopt(self) -> None:
         """Name the candidate as the model in use; where one is there already it is only proposed without permission."""
@@ -543,8 +543,8 @@ class Adaptation:
         number, name = self._name("model", ".yaml")
         # Both checks together; where a wild reading spoils that, the newest alone
         tried = []
-        for readings in (state.doubts, state.doubts[-1:]):
-            verification, fitted = self._verified(state.in_use, list(readings))
+        for names in (state.doubts, state.doubts[-1:]):
+            verification, fitted = self._verified(state.in_use, self._readings(names))
             reason = refusal(verification)
             if verification.verdict == VALID:
                 reason = "both checks together do not show what has changed, but break the promise"

@@ -174,6 +174,11 @@ def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: 
         box = grown
 
 
+def reaches(geometry: HexapodGeometry, rotations: np.ndarray, cells: int = 40) -> tuple[Reach, ...]:
+    """Compute the reach of a machine at each of some orientations, shape (M, 3, 3); see :func:`reach`."""
+    return tuple(reach(geometry, rotation, cells) for rotation in rotations)
+
+
 def possible_box(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
     """Return a box outside which no pose of an orientation can lie, m in the work frame, shape (2, 3)."""
     at_origin, turned = geometry.platform_poses(np.zeros((1, 3)), rotation[None])
