@@ -26,7 +26,7 @@ from ..measurements.readings import MeasurementSet, spans
 from .blocks import ERRORS, Block, growth
 from .blocks.block import Draft, Facts
 from .blocks.field import SmoothField
-from .blocks.load import as_loaded, stated_load
+from .blocks.load import stated_load, undetermined_load_blocks
 
 LEADS = 0.1e-3, 1.0  # shortest and longest of a screw, m
 LARGEST_EXPANSION, LARGEST_MOISTURE = 100e-6, 1e-2  # 1/K: three times zinc's; m/m from dry to damp: more than wood's
@@ -182,8 +182,8 @@ class ParameterSpace:
     def __init__(self, measurements: MeasurementSet | tuple[HexapodGeometry, Extent], settings: FitSettings) -> None:
         self.loads = np.full((1, 7), np.nan)
         if isinstance(measurements, MeasurementSet):
-            thermometer, hidden = growth.as_warmed(settings, measurements.stations)
-            hidden |= as_loaded(settings, measurements.geometry, measurements.stations)
+            thermometer, hidden = growth.undetermined_growth(settings, measurements.stations)
+            hidden |= undetermined_load_blocks(settings, measurements.geometry, measurements.stations)
             shown = tuple(name for name in settings.blocks if name not in hidden)
             settings = replace(settings, thermometer=thermometer, blocks=shown)
             loads = measurements.stations.loads

@@ -15,7 +15,7 @@ import pytest
 from calibration_helpers import SETTINGS, campaign, paper, tool_error, virtual_machine
 from helpers import long_test
 
-from hexapod_comp.calibration.blocks.load import as_loaded, refuse_half_stated
+from hexapod_comp.calibration.blocks.load import refuse_half_stated, undetermined_load_blocks
 from hexapod_comp.calibration.changes import PAYLOAD, TEMPERATURE, CheckReadings, payload_changes, widened
 from hexapod_comp.calibration.check import NAMED, VALID, refusal, verification_report, verify_model
 from hexapod_comp.calibration.estimator import Estimation
@@ -276,8 +276,8 @@ def test_lost_motion_and_friction_are_fitted_where_forces_change_their_sign() ->
     )
     assert after < 0.5 * before
     high = Campaign(np.array([[-0.05, -0.05, 0.45], [0.05, 0.05, 0.55]]), 0.1, 0.05)
-    assert "lost motion" in as_loaded(told, paper(), template(high, paper()).stations)
-    assert "lost motion" not in as_loaded(told, paper(), readings.stations)
+    assert "lost motion" in undetermined_load_blocks(told, paper(), template(high, paper()).stations)
+    assert "lost motion" not in undetermined_load_blocks(told, paper(), readings.stations)
 
     # Clearances that go to their ends at once, where the model is on its line between them, are no change: the same
     # machine with a take-up of 1 mN, whose clearances exceed the noise. Without their variance χ² is 5 per number.

@@ -1,4 +1,4 @@
-"""The errors that a machine may have, one file each; see doc/architecture.md, "Add an error term"."""
+"""Registry of the blocks (error terms) that a fit can estimate; doc/architecture.md tells how to add an error term."""
 
 from .backlash import Backlash, BacklashMap
 from .block import Block
@@ -30,12 +30,12 @@ ERRORS: tuple[type[Block], ...] = (
     LostMotion,
     Friction,
 )
-"""The registry: all blocks, in the order of the parameter vector."""
+"""All classes of blocks. The parameter vector holds the parameters of the blocks in this order."""
 
 WAVES = {wave.name: wave.times for wave in (Wave, Wave2, Wave3, Wave4)}
-"""Blocks of the screw waves, with the number of periods a turn."""
+"""Name of each block of screw waves → number of periods of its wave in one turn of the screw."""
 
 HARMONICS = tuple(name for name, times in WAVES.items() if times > 1)
 
 EXPECTED = ("pitch", "wave", "backlash", "expansion", "moisture", "late", "compliance", "lost motion", "friction")
-"""Errors that every screw has, and growth; a length map, wear or a field need not exist."""
+"""Blocks that every machine is expected to need. A machine may have no harmonics, length map, wear or field."""

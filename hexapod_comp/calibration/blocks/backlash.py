@@ -1,4 +1,4 @@
-"""Backlash: a strut's nut lags its screw by half of it in either direction; wear varies it along the stroke."""
+"""Backlash: a strut's nut lags its screw by half the backlash in either direction; wear varies it along the stroke."""
 
 from __future__ import annotations
 
@@ -11,46 +11,45 @@ from .length_map import LengthMap, map_knots
 
 
 class Backlash(StrutBlock):
-    """b of each strut: δl = −b/2 · its direction of motion."""
+    """Backlash b of each strut, which changes its length by δl = −b/2 · s, with s = ±1 its direction of motion."""
 
     name, unit, tolerance = "backlash", "m", 5e-6
 
     @classmethod
     def of(cls, facts: Facts) -> Backlash:
-        """Every screw may have it."""
+        """Return the block for any machine: every screw may have backlash."""
         return cls()
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """−1/2 · direction."""
+        """Return −1/2 · direction of motion, the derivative of each strut's length by its backlash, (M, 6, 1)."""
         return -0.5 * linkage.stations.sense[:, 3:, None]
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Negative backlash, which noise can produce, is written as zero: the fit has refused larger values."""
+        """Write the backlashes into a model; a small negative one is noise and becomes zero. The fit refuses others."""
         draft.struts["backlash"] = np.maximum(x, 0.0)
 
 
 class BacklashMap(LengthMap):
-    """Variation of the backlash along a worn screw: smoother than a length map, with every second of its knots."""
+    """Variation of the backlash along a worn screw: a spline with half as many knots as the length map's."""
 
     name, unit, tolerance = "backlash map", "m", 2e-6
 
     @classmethod
     def of(cls, facts: Facts) -> BacklashMap:
-        """Every screw may wear. The backlash is a spline whose knots are every second knot of the length map; a model
-        stores its values at all knots of that map, from which the same spline follows."""
+        """Return the block for any machine. Its knots are every second knot of the length map."""
         knots = map_knots(*facts.region.commands)
         block = cls(knots[np.linspace(0, len(knots) - 1, max(2, (len(knots) - 1) // 2 + 1)).round().astype(int)])
         block.model_knots = knots
         return block
 
-    model_knots: np.ndarray  # the length map's knots, which models have
+    model_knots: np.ndarray  # knots of the length map, m: a model file has one list of knots for both maps
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """−1/2 · direction, where the nut stands."""
+        """Return −1/2 · direction of motion · spline weights at the strut command, (M, 6, knots)."""
         return -0.5 * linkage.stations.sense[:, 3:, None] * self.weights(linkage.stations.commands)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Written at the length map's knots."""
+        """Write the spline's values at the length map's knots, from which the same spline follows, into a model."""
         if x.any():
             draft.struts |= {
                 "map_knots": self.model_knots,
@@ -59,10 +58,10 @@ class BacklashMap(LengthMap):
 
 
 def without_negative(blocks: Sequence[Block], x: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return parameters and directions that mean the same machine without negative backlash.
+    """Return parameters and directions of motion that describe the same machine without a negative backlash.
 
-    A nut cannot lead its screw, but an estimate can be negative: by noise, or for swapped directions. Backlash −b in
-    one direction is b in the other; if it were clamped here, the fit would add it again in every step.
+    Noise or swapped directions can make an estimated backlash negative. A backlash −b has the same effect as b with
+    the opposite direction. If the estimate were clamped to zero, the fit would step to the negative value again.
     """
     backlash = next((block for block in blocks if isinstance(block, Backlash)), None)
     if backlash is None:

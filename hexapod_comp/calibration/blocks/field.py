@@ -1,7 +1,7 @@
-"""The field: errors that neither struts nor joints explain, six components as polynomials over the measured box.
+"""The field: errors that neither struts nor joints explain, as polynomials of six components over the measured box.
 
-Displacement, rotation, and the part of both that changes sign with the direction of motion (reversal) are separate
-blocks.
+Three blocks describe it: displacement, rotation, and reversal (displacement and rotation that change sign with the
+direction of motion).
 """
 
 from __future__ import annotations
@@ -16,19 +16,18 @@ from ...measurements.readings import AXES, LEAST_SIDE
 from ..assumptions import ASSUMED
 from .block import DIGITS, Block, Columns, Draft, Errors, Facts, Linkage
 
-GRID_TOLERANCE = 30e-9  # largest error of a grid relative to its polynomial, m or rad: below readings
-MOST_NODES = 17  # nodes of a field along its longest axis, so that the model file stays readable
-CHECKS = 400  # random points at which a grid is checked
+GRID_TOLERANCE = 30e-9  # largest allowed difference of grid and polynomial, m or rad: well below a laser's noise
+MOST_NODES = 17  # largest number of grid nodes along the longest axis, so that the model file stays readable
+CHECKS = 400  # number of random points at which a grid is compared with its polynomial
 
 COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")
 
 
 class SmoothField:
-    """Products of Legendre polynomials in x, y, z over a box, the degree in proportion to its sides.
+    """A basis of functions on a box: products ("terms") of Legendre polynomials in x, y and z.
 
-    A side of length zero has no powers; every degree along a shorter side counts for more than one along the longest,
-    so that the field is equally smooth in all directions. The part that depends on the direction of motion has fewer
-    terms.
+    A shorter side of the box has a lower degree, so that the field is equally smooth along x, y and z; a side of length
+    zero has degree 0. The reversal, which changes sign with the direction of motion, uses fewer terms.
     """
 
     def __init__(self, box: np.ndarray, degree: int) -> None:
@@ -37,16 +36,17 @@ class SmoothField:
         self._sides = np.where(flat, 0.0, np.ptp(self.box, axis=0))
         cost = np.sqrt(max(self._sides.max(), 1e-3) / np.where(flat, 1.0, self._sides))
         self.degree = degree
-        self.powers, self.prior = _terms(degree, cost, flat)  # (terms, 3) along x, y, z; relative size of the priors
+        # Degrees of each term along x, y, z, (terms, 3); relative standard deviation of its prior, (terms,)
+        self.powers, self.prior = _terms(degree, cost, flat)
         self.reversal_powers, self.reversal_prior = _terms(min(degree, ASSUMED.reversal_degree), cost, flat)
         self.terms, self.reversal_terms = _names(self.powers), _names(self.reversal_powers)
 
     def basis(self, points: np.ndarray) -> np.ndarray:
-        """Return the terms' values at points (n, 3), m; held at the box; shape (n, terms)."""
+        """Return the terms' values at points (n, 3), m, or at the box's nearest point if outside; shape (n, terms)."""
         return self._products(points, self.powers)
 
     def reversal_basis(self, points: np.ndarray) -> np.ndarray:
-        """Return :meth:`basis` for the terms that depend on the direction of motion."""
+        """Return the reversal terms' values at points (n, 3), m; otherwise the same as :meth:`basis`."""
         return self._products(points, self.reversal_powers)
 
     def _products(self, points: np.ndarray, powers: np.ndarray) -> np.ndarray:
@@ -58,16 +58,16 @@ class SmoothField:
     def evaluate(
         self, coefficients: np.ndarray, reversal: np.ndarray, points: np.ndarray, sense: np.ndarray
     ) -> np.ndarray:
-        """Return the field at points, shape (n, 6), m and rad."""
+        """Return the field at points (n, 3), m, passed in directions `sense` (n, 3), ±1; shape (n, 6), m and rad."""
         turning = np.einsum("nt,act,na->nc", self.reversal_basis(points), reversal, 0.5 * sense)
         return self.basis(points) @ coefficients.T + turning
 
     def as_grid(self, coefficients: np.ndarray, reversal: np.ndarray) -> GridField:
-        """Return the field as grid lines, with enough of them that interpolation adds nothing visible.
+        """Return the field as polynomials along grid lines, accurate to GRID_TOLERANCE or with MOST_NODES nodes.
 
-        Terms that do not depend on the direction of motion are on the lines along the axis of their highest power:
-        across it their powers are small, and bilinear interpolation is exact up to 1. Terms that change sign with the
-        motion along an axis are on the lines along that axis.
+        Between the lines the grid is interpolated bilinearly, which is exact for degree 1. A term is therefore put on
+        the lines along the axis of its highest degree; across that axis its degrees are low. A reversal term that
+        changes sign with the motion along an axis is put on the lines along that axis.
         """
         points = np.random.default_rng(0).uniform(self.box[0], self.box[1], (CHECKS, 3))
         sense = np.where(np.arange(CHECKS)[:, None] % 2, 1.0, -1.0) * np.ones(3)
@@ -81,8 +81,7 @@ class SmoothField:
             nodes = 2 * nodes - 1
 
     def _on_lines(self, coefficients: np.ndarray, reversal: np.ndarray, nodes: int) -> GridField:
-        """Return the field on a grid with this number of nodes along the longest axis, and the same spacing along the
-        others."""
+        """Return the field on an equally spaced grid that has `nodes` nodes along the longest side of the box."""
         share = self._sides / max(self._sides.max(), 1e-3)
         counts = np.maximum(2, np.ceil(share * (nodes - 1)).astype(int) + 1)
         grid = tuple(np.linspace(self.box[0, a], self.box[1, a], n) for a, n in enumerate(counts))
@@ -100,42 +99,42 @@ class SmoothField:
         return GridField((grid[0], grid[1], grid[2]), (families[0], families[1], families[2]))
 
     def _family(self, grid: tuple, axis: int, coefficients: np.ndarray, powers: np.ndarray) -> np.ndarray:
-        """Return the polynomials in u of the lines along an axis, shape (n, m, 6, powers)."""
+        """Return the coefficients of the polynomials along the lines of an axis, −1 ≤ u ≤ 1, (n, m, 6, powers of u)."""
         first, second = CROSS_AXES[axis]
         degree = int(powers.max(initial=0))
         if not len(powers):
             return np.zeros((len(grid[first]), len(grid[second]), 6, 1))
         across = [legendre.legvander(np.linspace(-1.0, 1.0, len(grid[a])), degree) for a in (first, second)]
         weights = np.einsum("nt,mt->nmt", across[0][:, powers[:, first]], across[1][:, powers[:, second]])
-        monomials = np.zeros((degree + 1, degree + 1))  # P_n in powers of u
+        monomials = np.zeros((degree + 1, degree + 1))  # row n: coefficients of the Legendre polynomial P_n
         for n, row in enumerate(monomials):
             row[: n + 1] = legendre.leg2poly([0.0] * n + [1.0])
         return np.einsum("nmt,ct,tp->nmcp", weights, coefficients, monomials[powers[:, axis]])
 
 
 class _Field(Block):
-    """Errors of which each of the six components has its own coefficients of a basis."""
+    """A part of the field: each component of the error is a linear combination of the basis with its own parameters."""
 
-    owner: np.ndarray  # component of each parameter
+    owner: np.ndarray  # (parameters,): index of the component that each parameter changes
 
     def __init__(self, smooth: SmoothField) -> None:
         self.smooth = smooth
 
     @classmethod
     def of(cls, facts: Facts) -> _Field:
-        """Every machine may have it."""
+        """Return the block for any machine."""
         return cls(facts.smooth)
 
     def moving(self, components: np.ndarray) -> np.ndarray:
-        """Each component has its own parameters."""
+        """Return the indices of the parameters that belong to these components."""
         return np.flatnonzero(np.isin(self.owner, components))
 
 
 class FieldDisplacement(_Field):
-    """Displacement along x, y, z."""
+    """The field's displacement along x, y, z."""
 
     name, unit, tolerance = "field displacement", "m", 5e-6
-    first = 0  # of its three components
+    first = 0  # index of the first of the block's three components of the error
 
     def __init__(self, smooth: SmoothField) -> None:
         super().__init__(smooth)
@@ -144,7 +143,7 @@ class FieldDisplacement(_Field):
         self.root = np.diag(np.tile(smooth.prior, 3))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """The terms at the point, by each direction's share of the component."""
+        """Return the columns: value of each term at the measured point times the component of the direction w."""
         basis = self.smooth.basis(linkage.points) * (self.smooth.prior if whitened else 1.0)
 
         def columns(errors: Errors) -> np.ndarray:
@@ -155,18 +154,18 @@ class FieldDisplacement(_Field):
         return columns
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Written into its three components."""
+        """Write the coefficients of the block's three components into a model."""
         draft.field[self.first : self.first + 3] = x.reshape(3, -1)
 
 
 class FieldRotation(FieldDisplacement):
-    """Rotation about x, y, z."""
+    """The field's rotation about x, y, z."""
 
     name, unit, tolerance, first = "field rotation", "rad", 20e-6, 3
 
 
 class FieldReversal(_Field):
-    """Forward minus backward along x, y, z, of all six components."""
+    """The field with forward motion minus the field with backward motion along x, y, z, in all six components."""
 
     name, unit, tolerance = "field reversal", "m, rad", 1e-6
 
@@ -177,7 +176,7 @@ class FieldReversal(_Field):
         self.root = np.diag(np.tile(smooth.reversal_prior, 18))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Half the terms, by the direction of motion along each axis."""
+        """Return the columns: half of each term, signed by the motion along each axis, times a component of w."""
         basis = self.smooth.reversal_basis(linkage.points) * (self.smooth.reversal_prior if whitened else 1.0)
         half = 0.5 * linkage.stations.sense[:, :3]
 
@@ -188,12 +187,12 @@ class FieldReversal(_Field):
         return columns
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Written by axis of motion and component."""
+        """Write the coefficients into a model, by axis of motion, component and term."""
         draft.reversal[:] = x.reshape(draft.reversal.shape)
 
 
 def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the powers (n, 3) of all terms up to a degree, and the relative size of their priors (n,)."""
+    """Return the degrees (n, 3) of the terms with degrees · cost ≤ degree, and their priors' relative sizes (n,)."""
     every = np.array(list(itertools.product(range(degree + 1), repeat=3)))
     total = every @ cost
     bilinear = (every.max(axis=1) <= 1) & (every.sum(axis=1) <= 2)  # squareness, twist and roll are always included
@@ -203,4 +202,5 @@ def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray,
 
 
 def _names(powers: np.ndarray) -> tuple[str, ...]:
+    """Return a name of each term, such as ``x2y1``; ``1`` for the constant."""
     return tuple("".join(f"{a}{n}" for a, n in zip("xyz", p, strict=True) if n) or "1" for p in powers)

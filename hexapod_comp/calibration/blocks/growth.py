@@ -1,7 +1,7 @@
-"""Growth of struts, base and platform: by heat, at once or late, and by the air's humidity.
+"""Growth of struts, base and platform with temperature, at once or with a delay ("late"), and with the air's humidity.
 
-Parts grow in proportion to their thermometers above 20 °C; :mod:`hexapod_comp.machine.temperatures` describes the delay
-of late parts.
+A part grows in proportion to its thermometer's temperature above 20 °C; :mod:`hexapod_comp.machine.temperatures`
+describes the delay as a first-order lag.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
 
 
 def per_growth(linkage: Linkage) -> np.ndarray:
-    """Return the lengthening of each strut per relative growth of struts 1-6, base and platform, (M, 6, 8), m."""
+    """Return the derivative of strut lengths by the relative growth of struts 1-6, base, platform, (M, 6, 8), m."""
     along = [np.einsum("mik,mik->mi", linkage.directions, joints) for joints in (linkage.base_joints, -linkage.arms)]
     struts = np.eye(6) * linkage.lengths[:, None]
     return np.concatenate([struts, np.stack(along, axis=2)], axis=2)
 
 
 def growth_columns(linkage: Linkage) -> np.ndarray:
-    """Return ∂e by the relative growth of struts 1-6, base and platform at each station, shape (M, 6, 8), m and rad."""
+    """Return the derivative of e by the relative growth of struts 1-6, base, platform, (M, 6, 8), m and rad."""
     return linkage.per_length @ per_growth(linkage)
 
 
 def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return the sources of growth, (M, 8, 1 + K), K: thermometers above 20 °C, and how far late parts lag."""
+    """Return each part's temperature above 20 °C, then its lag by each of K time constants, (M, 8, 1 + K), K."""
     sensors = LateGrowth(thermometer=settings.thermometer)
     read = stations.temperatures[:, [sensors.sensor_of(part) for part in range(len(PARTS))]]
     above = (read - REFERENCE_TEMPERATURE)[..., None]
@@ -43,14 +43,14 @@ def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence
 
 
 def growth_root(terms: int, struts: float = ASSUMED.struts_warmed_alike) -> np.ndarray:
-    """Return the root of the prior's correlation between the parts' growth, shape (8·terms, 8·terms)."""
+    """Return the matrix root of the prior's correlation of the growths, (8·terms, 8·terms); of two struts: `struts`."""
     alike = np.eye(len(PARTS))
     alike[:6, :6] += struts * (1.0 - np.eye(6))
     return np.kron(np.linalg.cholesky(alike), np.eye(terms))
 
 
-def as_warmed(settings: FitSettings, stations: Stations) -> tuple[str, set[str]]:
-    """Return the stations' thermometer, if there is only one, and the blocks of growth that they cannot determine."""
+def undetermined_growth(settings: FitSettings, stations: Stations) -> tuple[str, set[str]]:
+    """Return the only thermometer ('' if several) and the growth blocks that these stations cannot determine."""
     temperatures = stations.temperatures
     seen = np.flatnonzero((temperatures != REFERENCE_TEMPERATURE).any(axis=0))
     thermometer = settings.thermometer or (PARTS[seen[0]] if len(seen) == 1 else "")
@@ -62,7 +62,7 @@ def as_warmed(settings: FitSettings, stations: Stations) -> tuple[str, set[str]]
 
 
 class Expansion(Block):
-    """Growth of each part by its thermometer, 1/K, beyond the stated expansion; struts of one material grow alike."""
+    """Thermal expansion of struts 1-6, base and platform minus the stated one, 1/K; the struts have one material."""
 
     name, unit, tolerance = "expansion", "1/K", 10e-6
 
@@ -73,15 +73,15 @@ class Expansion(Block):
 
     @classmethod
     def of(cls, facts: Facts) -> Expansion | None:
-        """Every machine may have it; whether temperatures changed enough is decided before, in the settings' blocks."""
+        """Return the block for any machine; :func:`undetermined_growth` has excluded stations of one temperature."""
         return cls(facts.settings)
 
     def causes(self, stations: Stations) -> np.ndarray:
-        """Return the sources of growth, (M, 8, terms), K."""
+        """Return the temperatures that make the parts grow, (M, 8, terms), K."""
         return growth_causes(self._settings, stations, ())
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Every part lengthens the struts by its growth."""
+        """Return the columns: derivative of the error by each part's growth times the part's temperatures."""
         grown, causes = per_growth(linkage), self.causes(linkage.stations)
 
         def columns(errors: Errors) -> np.ndarray:
@@ -92,12 +92,12 @@ class Expansion(Block):
         return columns
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """It is added to the stated expansion."""
+        """Add the parameters to the stated expansions of a model."""
         draft.growth = draft.growth + x
 
 
 class Late(Expansion):
-    """Late part of a part's growth, 1/K, for each time constant."""
+    """Late expansion of struts 1-6, base and platform for each time constant, 1/K."""
 
     name, unit, tolerance = "late", "1/K", 10e-6
 
@@ -108,20 +108,20 @@ class Late(Expansion):
 
     @classmethod
     def of(cls, facts: Facts) -> Late | None:
-        """Where time constants are known."""
+        """Return the block if the settings have time constants, else None."""
         return cls(facts.settings) if facts.settings.time_constants else None
 
     def causes(self, stations: Stations) -> np.ndarray:
-        """By how much the late parts lag behind their thermometers, K."""
+        """Return the lag of each part behind its thermometer for each time constant, (M, 8, time constants), K."""
         return growth_causes(self._settings, stations, self._constants)[..., 1:]
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Written as one column per time constant."""
+        """Write the late expansions into a model, one column for each time constant."""
         draft.late = x.reshape(len(PARTS), -1)
 
 
 class Moisture(StrutBlock):
-    """Growth of all struts, of one material, m/m from dry to damp air, beyond the stated swelling."""
+    """Swelling of all struts, m/m from relative humidity 0 to 1, minus the stated swelling; one parameter."""
 
     name, unit, tolerance = "moisture", "1", 1e-4
 
@@ -131,19 +131,19 @@ class Moisture(StrutBlock):
 
     @classmethod
     def of(cls, facts: Facts) -> Moisture | None:
-        """For struts that are stated to swell."""
+        """Return the block if the settings state the struts' swelling (0 included), else None."""
         return cls() if facts.settings.strut_moisture is not None else None
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Length times humidity relative to the reference."""
+        """Return strut length times (humidity − reference humidity), (M, 6, 1), m; 0 if humidity is unknown."""
         damp = np.nan_to_num(linkage.stations.humidity - REFERENCE_HUMIDITY)
         return (linkage.lengths * damp[:, None])[..., None]
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """One parameter for all struts."""
+        """Return one column, the sum of the six struts' columns, since all struts share the parameter."""
         each = super().design(linkage, whitened)
         return lambda errors: each(errors).sum(axis=1, keepdims=True)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """It is added to the stated expansion."""
+        """Add the parameter to the stated swelling of a model."""
         draft.struts["moisture"] = draft.struts["moisture"] + x

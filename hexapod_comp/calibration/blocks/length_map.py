@@ -1,4 +1,4 @@
-"""Length map: the smooth length error of a screw along its stroke, as a natural cubic spline."""
+"""Length map: the smooth length error of each strut's screw along its stroke, as a natural cubic spline."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ def map_knots(low: float, high: float) -> np.ndarray:
 
 
 def map_root(knots: np.ndarray) -> np.ndarray:
-    """Return a root of the Matérn 5/2 correlation between the knots of one strut, shape (n, n)."""
+    """Return the matrix root of the Matérn 5/2 correlation between the n knots of one strut, shape (n, n)."""
     d = np.sqrt(5.0) * np.abs(knots[:, None] - knots) / ASSUMED.map_correlation
     return np.linalg.cholesky((1.0 + d + d * d / 3.0) * np.exp(-d) + 1e-9 * np.eye(len(knots)))
 
 
 class LengthMap(StrutBlock):
-    """The map's values at its knots, strut by strut."""
+    """Length error of each strut at each knot of the spline, strut by strut."""
 
     name, unit, tolerance = "map", "m", 5e-6
 
@@ -35,11 +35,11 @@ class LengthMap(StrutBlock):
 
     @classmethod
     def of(cls, facts: Facts) -> LengthMap:
-        """Every screw may have one; its knots span the strut lengths commanded in the measurement."""
+        """Return the block for any machine; its knots span the strut lengths commanded in the measurement."""
         return cls(map_knots(*facts.region.commands))
 
     def weights(self, commands: np.ndarray) -> np.ndarray:
-        """Return the contribution of each knot's value at some commands (…), shape (…, knots); held outside."""
+        """Return the weight of each knot's value at commands (…), m, or at the end knot if outside; (…, knots)."""
         inside = np.clip(commands, *self.knots[[0, -1]])
         piece = np.clip(np.searchsorted(self.knots, inside, side="right") - 1, 0, len(self.knots) - 2)
         along = (inside - self.knots[piece])[..., None]
@@ -49,10 +49,10 @@ class LengthMap(StrutBlock):
         return values
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """The spline's weights."""
+        """Return the weights of the spline's knots at each strut command, (M, 6, knots)."""
         return self.weights(linkage.stations.commands)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Written at its knots, which become the model's."""
+        """Write the knots and the values at them into a model; all-zero values write nothing."""
         if x.any():
             draft.struts |= {"map_knots": self.knots, "map_values": x.reshape(6, -1)}

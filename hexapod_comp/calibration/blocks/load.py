@@ -1,5 +1,4 @@
-"""How far struts yield under load, beyond the stated values: compliance, lost motion by force, friction of their
-bearings."""
+"""Compliance, lost motion and bearing friction of struts under load, as fitted corrections of the stated values."""
 
 from __future__ import annotations
 
@@ -23,12 +22,12 @@ if TYPE_CHECKING:
 
 
 def stated_load(settings: FitSettings) -> Load:
-    """Return the load block of the settings; a rigid one if they state none."""
+    """Return the load block that the settings state; rigid struts if they state none."""
     return Load.from_numbers(settings.load) if settings.load else Load()
 
 
 def refuse_half_stated(measurements: MeasurementSet) -> None:
-    """Raise CalibrationError where some readings state a payload, and that of the others is unknown."""
+    """Reject measurements in which some readings state a payload and others do not, unless the tool's mass is known."""
     blank, tool = np.isnan(measurements.stations.loads[:, 0]), measurements.geometry.payload
     if blank.any() and not blank.all() and not tool.mass:
         where = measurements.sources[int(blank[measurements.station].argmax())]
@@ -38,25 +37,25 @@ def refuse_half_stated(measurements: MeasurementSet) -> None:
 
 
 def payloads(geometry: HexapodGeometry, stations: Stations) -> np.ndarray:
-    """Return mass, kg, and its centre in platform, m, carried at stations, (M, 4): as stated, else the tool's."""
+    """Return the payload's mass, kg, and centre in platform, m, at M stations, (M, 4); the tool's if not stated."""
     tool = geometry.payload
     return np.where(np.isnan(stations.loads[:, :1]), [tool.mass, *tool.centre], stations.loads[:, :4])
 
 
 def directions_of_gravity(load: Load, stations: Stations) -> np.ndarray:
-    """Return gravity in base at stations, m/s², (M, 3): as stated, else the load block's."""
+    """Return gravity in base at M stations, m/s², (M, 3); the load block's gravity if a station states none."""
     return np.where(np.isnan(stations.loads[:, 4:5]), load.gravity, stations.loads[:, 4:])
 
 
 def weights(load: Load, geometry: HexapodGeometry, stations: Stations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return mass, kg, (M,), mass times its centre in platform, kg m, (M, 3), and gravity, m/s², (M, 3)."""
+    """Return the carried mass, kg, (M,), mass · centre in platform, kg m, (M, 3), and gravity in base, m/s², (M, 3)."""
     payload, gravity = payloads(geometry, stations), directions_of_gravity(load, stations)
     moment = load.mass * load.centre + payload[:, :1] * payload[:, 1:]
     return load.mass + payload[:, 0], moment, gravity
 
 
 def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) -> tuple[tuple[float, ...], ...]:
-    """Return the different loads of stations, for :attr:`.ModelOrigin.loads`; none if no load is stated."""
+    """Return up to MOST_LOADS distinct loads of stations, for :attr:`.ModelOrigin.loads`; () if no load is stated."""
     if np.isnan(stations.loads).all() and not geometry.payload.mass and not load.bends:
         return ()
     rows = np.hstack([payloads(geometry, stations), directions_of_gravity(load, stations)]).round(3)
@@ -66,24 +65,24 @@ def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) ->
 
 
 def bearing_forces(linkage: Linkage) -> np.ndarray:
-    """Return the force of each strut's bearings on the platform when they resist with 1 N m, (M, 6, 3), N."""
+    """Return the force on the platform, (M, 6, 3), N, from each strut's bearings if their friction torque is 1 N m."""
     u, motion, axes = linkage.directions, linkage.stations.sense[:, None, :3], linkage.geometry.base_axes
     slow = SLIDING * np.maximum(np.linalg.norm(motion, axis=2), 1.0)
-    if axes is not None:  # two bearings of a cardan joint turn
+    if axes is not None:  # cardan joints, each with two bearings that turn
         yoke = np.cross(axes, u)
         share = np.linalg.norm(yoke, axis=2, keepdims=True)
         first = yoke / np.maximum(share, SLIDING)
         sides = (first, first / np.maximum(share, SLIDING)), (np.cross(first, u),) * 2
         force = sum(np.clip((motion * n).sum(axis=2) / slow, -1.0, 1.0)[..., None] * along for n, along in sides)
-    else:
+    else:  # ball joints
         across = motion - (motion * u).sum(axis=2, keepdims=True) * u
         force = across / np.maximum(np.linalg.norm(across, axis=2), slow)[..., None]
     return -force / linkage.lengths[..., None]
 
 
-@lru_cache(maxsize=1)  # three blocks ask for the same linkage's
-def by_friction(linkage: Linkage) -> np.ndarray:
-    """Return the struts' tensions by 1 N m in the bearings of each strut, (M, 6, 6), N."""
+@lru_cache(maxsize=1)  # three blocks need this result for the same linkage
+def tensions_per_friction(linkage: Linkage) -> np.ndarray:
+    """Return the six tensions (axis 1) per 1 N m of friction torque in each strut's bearings (axis 2), (M, 6, 6), N."""
     forces = bearing_forces(linkage)
     wrenches = np.concatenate([forces, np.cross(linkage.arms, forces)], axis=2)
     return np.stack([linkage.tensions(wrenches[:, n]) for n in range(6)], axis=2)
@@ -91,35 +90,35 @@ def by_friction(linkage: Linkage) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def tensions(linkage: Linkage) -> np.ndarray:
-    """Return the struts' tensions under weight and friction at a linkage's stations, (M, 6), N."""
+    """Return the struts' tensions under weight and friction at M stations, (M, 6), N; positive if pulled."""
     load = linkage.load
     mass, moment, gravity = weights(load, linkage.geometry, linkage.stations)
     torque = np.cross(np.einsum("mij,mj->mi", linkage.rotations, moment), gravity)
     pulled = linkage.tensions(np.concatenate([mass[:, None] * gravity, torque], axis=1))
-    return pulled + by_friction(linkage) @ load.friction if load.friction.any() else pulled
+    return pulled + tensions_per_friction(linkage) @ load.friction if load.friction.any() else pulled
 
 
 def taken_up(linkage: Linkage) -> np.ndarray:
-    """Return the share of half its lost motion by which each strut is longer at a linkage's stations, (M, 6), −1…1."""
+    """Return tension / take-up force, limited to ±1, (M, 6): 1 lengthens a strut by half its lost motion."""
     return np.clip(tensions(linkage) / linkage.load.take_up, -1.0, 1.0)
 
 
 def unsettled_lengths(linkage: Linkage) -> np.ndarray:
-    """Return the standard deviation of the struts' lengths where the take-up exceeds their tension, (M, 6), m.
+    """Return the strut lengths' standard deviation, (M, 6), m, which is above zero where |tension| < take-up force.
 
-    A clearance rests at one of its ends. Which one depends on a force that is not known better than the take-up, so the
-    model lengthens the strut by the mean of both, weighted by their probabilities. A strut whose own clearance hardly
-    shows has the usual one of the six.
+    A strut with clearance rests at one end of the clearance. If its tension is smaller than the take-up force, the end
+    is uncertain, and the model uses the mean length, weighted by the probabilities of the ends. A clearance smaller
+    than the RMS of all six counts as that RMS, because the readings may not determine it.
     """
     usual = np.maximum(linkage.load.lost_motion, rms(linkage.load.lost_motion))
     deviation: np.ndarray = 0.5 * usual * np.sqrt(1.0 - taken_up(linkage) ** 2)
     return deviation
 
 
-def as_loaded(settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> set[str]:
-    """Return the blocks of load that stations cannot determine: under forces of one sign a strut only looks longer.
+def undetermined_load_blocks(settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> set[str]:
+    """Return the load blocks that stations cannot determine, from the strut tensions in the nominal machine.
 
-    Forces are those of the nominal machine.
+    Lost motion needs a strut whose tension changes its sign: otherwise it looks like a length offset.
     """
     load, hidden = stated_load(settings), {"compliance", "lost motion", "friction"}
     if not settings.load or not len(stations):
@@ -138,9 +137,9 @@ def as_loaded(settings: FitSettings, geometry: HexapodGeometry, stations: Statio
 
 
 class LoadBlock(Block):
-    """A term of the load block, one number a strut, beyond what is stated; those of one machine's struts are alike."""
+    """A load term's fitted minus stated value, one number for each strut; the prior correlates the six numbers."""
 
-    term: ClassVar[str]  # its name in Draft.load
+    term: ClassVar[str]  # key of the term in Draft.load
 
     def __init__(self, facts: Facts) -> None:
         self.labels = tuple(f"{strut} {self.name}" for strut in STRUT_NAMES)
@@ -148,25 +147,25 @@ class LoadBlock(Block):
 
     @classmethod
     def of(cls, facts: Facts) -> LoadBlock | None:
-        """Only if a stiffness is stated; whether readings determine it is decided before, in the settings' blocks."""
+        """Return the block if all stiffnesses are stated, else None."""
         return cls(facts) if stated_load(facts.settings).stiffness.all() else None
 
     @abstractmethod
     def stretched(self, linkage: Linkage) -> np.ndarray:
-        """Return by how much each number lengthens the struts, (M, 6, 6)."""
+        """Return the derivative of the strut lengths (axis 1) by each strut's number (axis 2), (M, 6, 6)."""
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Each number lengthens struts, and each strut moves the measured point by its gain per length."""
+        """Return the columns: derivative of the error by strut lengths times :meth:`stretched`."""
         factors = self.stretched(linkage) @ (self.root if whitened else np.eye(6))
         return lambda errors: np.einsum("ns,nsp->np", errors.gains, factors[errors.at])
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Added to the stated value; a small negative one is noise, and is kept."""
+        """Write fitted minus stated values into a model; a value that noise makes slightly negative is kept."""
         draft.load[self.term] = x
 
 
 class Compliance(LoadBlock):
-    """c of each strut, m/N: δl = c · its tension."""
+    """Compliance c of each strut, m/N, which lengthens it by δl = c · tension."""
 
     name, unit, tolerance, term, stated = "compliance", "m/N", 15e-9, "compliance", True
 
@@ -177,36 +176,36 @@ class Compliance(LoadBlock):
         self.root = compliance[:, None] / compliance.mean() * self.root
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
-        """The struts' tensions."""
+        """Return each strut's tension, N, on the diagonals: dl/dc = tension."""
         return tensions(linkage)[..., None] * np.eye(6)
 
 
 class LostMotion(LoadBlock):
-    """By how much a strut is longer when it is pulled than when it is pushed, c: δl = c/2 · the sign of its tension.
+    """Lost motion c: a pulled strut is longer than a pushed one by c, so δl = ±c/2 by the sign of the tension.
 
-    Near zero tension it is in proportion to the tension.
+    If |tension| is smaller than the take-up force, δl is proportional to the tension.
     """
 
     name, unit, tolerance, term = "lost motion", "m", 3e-6, "lost_motion"
 
     @classmethod
     def of(cls, facts: Facts) -> LoadBlock | None:
-        """For a machine whose load is stated, also with rigid struts."""
+        """Return the block if the settings state a load, even with rigid struts, else None."""
         return cls(facts) if facts.settings.load else None
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
-        """Half the sign of the struts' tensions."""
+        """Return half of :func:`taken_up` on the diagonals: dl/dc is between −1/2 and 1/2."""
         return 0.5 * taken_up(linkage)[..., None] * np.eye(6)
 
 
 class Friction(LoadBlock):
-    """Torque of each bearing of a strut against its turning, N m: it changes all tensions by the motion's direction."""
+    """Friction torque of each strut's bearings, N m, which changes all six tensions with the direction of motion."""
 
     name, unit, tolerance, term = "friction", "N m", 0.5, "friction"
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
-        """Stretch by the struts' tensions, and the reversal of lost motions."""
+        """Return the change of length by compliance and lost motion per change of tension, times the latter."""
         load = linkage.load
-        turning = np.abs(taken_up(linkage)) < 1.0
-        per_newton = load.compliance + 0.5 * load.lost_motion / load.take_up * turning
-        return per_newton[..., None] * by_friction(linkage)
+        within_take_up = np.abs(taken_up(linkage)) < 1.0
+        per_newton = load.compliance + 0.5 * load.lost_motion / load.take_up * within_take_up
+        return per_newton[..., None] * tensions_per_friction(linkage)

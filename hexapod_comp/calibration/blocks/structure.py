@@ -1,4 +1,4 @@
-"""Structure: the real places of the twelve joints, and the struts' offsets."""
+"""Structure: deviations of the twelve joints from their nominal positions, and the struts' length offsets."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from .block import Block, Columns, Draft, Errors, Facts, Linkage
 
 
 class Structure(Block):
-    """Deviations of six base joints and of the platform's ball joints, x, y, z each; then six offsets of length."""
+    """Deviations (x, y, z) of the six base joints and of each platform ball joint, then six strut length offsets."""
 
     name, unit, tolerance = "structure", "m", 100e-6
 
-    def __init__(self, groups: np.ndarray) -> None:
+    def __init__(self, groups: np.ndarray) -> None:  # (6,): index of each strut's ball joint on the platform
         count = int(groups.max()) + 1
         labels = [f"base {i + 1} {a}" for i in range(6) for a in AXES]
         labels += [f"platform {g + 1} {a}" for g in range(count) for a in AXES]
@@ -24,11 +24,11 @@ class Structure(Block):
 
     @classmethod
     def of(cls, facts: Facts) -> Structure:
-        """Every fit has it."""
+        """Return the block for any machine; every fit has it."""
         return cls(facts.platform_groups)
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """A base joint moves against its strut; a platform joint with it, for all struts at that joint."""
+        """Return the columns: a base joint moved along u acts as a longer strut, a platform joint as a shorter one."""
         u = linkage.directions
         in_platform = -np.einsum("nij,nki->nkj", linkage.rotations, u)
 
@@ -41,7 +41,7 @@ class Structure(Block):
         return columns
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Joint deviations are written into both bodies; equal ones for coinciding joints."""
+        """Write joint deviations and offsets into a model; struts that share a platform joint get equal deviations."""
         joints = x[:-6].reshape(-1, 3)
         draft.machine |= {"base_deviation": joints[:6], "platform_deviation": joints[6:][self._groups]}
         draft.struts["offset"] = x[-6:]

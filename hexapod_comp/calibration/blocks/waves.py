@@ -1,4 +1,4 @@
-"""Screw waves: a screw's error repeats with its turn, and several times a turn (harmonics)."""
+"""Screw waves: length errors of a strut that repeat once in each turn of its screw, or 2 to 4 times (harmonics)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .block import Draft, Facts, Linkage, StrutBlock
 
 
 class Wave(StrutBlock):
-    """A and B of each strut: δl = A·cos(nkc) + B·sin(nkc), with 2π/k the lead and c the command."""
+    """Amplitudes A and B of each strut: δl = A·cos(2πnc/p) + B·sin(2πnc/p), with command c, lead p, n = `times`."""
 
     name, unit, tolerance, times = "wave", "m", 5e-6, 1
 
@@ -19,32 +19,32 @@ class Wave(StrutBlock):
 
     @classmethod
     def of(cls, facts: Facts) -> Wave | None:
-        """Only where the lead is known."""
+        """Return the block if the leads of all screws are known, else None."""
         return cls(facts.periods) if np.isfinite(facts.periods).all() else None
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Cosine and sine of the screw's turn."""
+        """Return cosine and sine of the wave's phase, the derivatives of strut length by A and B, (M, 6, 2)."""
         phase = 2.0 * np.pi * self.times * linkage.stations.commands / self._periods
         return np.stack([np.cos(phase), np.sin(phase)], axis=-1)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """One column of the model's harmonics."""
+        """Write A and B into the model's column for this harmonic."""
         draft.struts["cosine"][:, self.times - 1], draft.struts["sine"][:, self.times - 1] = x.reshape(6, 2).T
 
 
 class Wave2(Wave):
-    """The second harmonic."""
+    """Screw wave with two periods in a turn (second harmonic)."""
 
     name, tolerance, times = "wave 2", 1e-6, 2
 
 
 class Wave3(Wave):
-    """The third harmonic."""
+    """Screw wave with three periods in a turn (third harmonic)."""
 
     name, tolerance, times = "wave 3", 1e-6, 3
 
 
 class Wave4(Wave):
-    """The fourth harmonic."""
+    """Screw wave with four periods in a turn (fourth harmonic)."""
 
     name, tolerance, times = "wave 4", 1e-6, 4
