@@ -1,8 +1,8 @@
-"""Assumptions of calibration about machines, instruments and numbers: every constant of this package, with unit and
-source.
+"""Assumptions of the calibration about machines, instruments and statistics: every constant, with unit and source.
 
-Use ``ASSUMED.name``. Numbers given by the readings or textbooks do not belong here; a number that tunes a bar needs an
-ablation in benchmarks/ on machines that were not used to find it. ``fit --assumptions`` prints the table.
+Use ``ASSUMED.name``. A number that readings or textbooks give does not belong here. A number chosen so that a benchmark
+reaches its limit needs an ablation in benchmarks/, on machines that were not used to choose it. ``fit --assumptions``
+prints the table.
 """
 
 from __future__ import annotations
@@ -12,147 +12,149 @@ from typing import Any
 
 
 def assumed(value: Any, unit: str, what: str, source: str) -> Any:
-    """Return a dataclass field: a default with its unit ('' for a pure number), meaning and source."""
+    """Return a dataclass field with a default `value`, its unit ('' for a pure number), meaning and source."""
     return field(default=value, metadata={"unit": unit, "what": what, "source": source})
 
 
 @dataclass(frozen=True)
 class Assumptions:
-    """All constants of the calibration room."""
+    """All assumed constants of the calibration."""
 
     # Estimator (estimator.py)
-    huber: float = assumed(2.5, "σ", "residuals beyond lose weight in proportion", "Huber 1981: 99 % efficient")
-    outlier: float = assumed(5.0, "σ", "residuals beyond are listed", "1 in 1.7 million by chance")
-    hyperprior: float = assumed(0.1, "", "parameters that a first tolerance counts as", "or empty blocks collapse")
+    huber: float = assumed(2.5, "σ", "residual from which Huber's weight falls below 1", "Huber 1981: 99 % efficient")
+    outlier: float = assumed(5.0, "σ", "a larger residual is listed as outlier", "noise: 1 in 1.7 million readings")
+    hyperprior: float = assumed(0.1, "parameters", "weight of a first tolerance", "keeps an unused block's above 0")
 
     # Observations (observations.py)
-    centre: float = assumed(5e-3, "m", "error of a centre's stated place, 1 σ of each axis", "by a rule")
+    centre: float = assumed(5e-3, "m", "error of the stated centre of lengths, 1 σ per axis", "measured with a ruler")
     across: float = assumed(
-        0.3e-3, "m", "the same where lengths hardly depend on it", "it acts with the machine's error alone"
+        0.3e-3, "m", "the same in directions that hardly change lengths", "machine errors alone make it act"
     )
 
     # Selection (selection.py)
-    least_evidence: float = assumed(2.0, "", "log Bayes factor above which a block is kept", "one number 2 σ from zero")
+    least_evidence: float = assumed(2.0, "", "log Bayes factor from which a block is kept", "one parameter at 2 σ")
 
     # Blocks (blocks/)
-    knot_distance: float = assumed(17e-3, "m", "largest distance of a length map's knots", "a wave of 60 mm has 3.5")
+    knot_distance: float = assumed(17e-3, "m", "largest distance of a length map's knots", "3.5 knots in a 60 mm wave")
     map_correlation: float = assumed(
-        40e-3, "m", "correlation length of a length map's errors", "Matérn 5/2; ground screws"
+        40e-3, "m", "correlation length of a screw's length errors", "Matérn 5/2 prior; typical of ground screws"
     )
     field_decay: float = assumed(
-        0.6, "", "ratio of the priors of one degree of the field and the next", "fields are smooth"
+        0.6, "", "prior of the field's terms of one degree over that of the next lower degree", "fields are smooth"
     )
-    reversal_degree: int = assumed(2, "", "degree of the field's part that depends on direction", "few reversals read")
-    struts_alike: float = assumed(0.998, "", "correlation of the struts' expansions", "one material: 5 % apart")
-    struts_warmed_alike: float = assumed(0.9, "", "the same by another part's thermometer", "loaded, cooled unlike")
-    least_warming: float = assumed(0.5, "K", "change that determines an expansion", "3 µm on 0.5 m of steel")
+    reversal_degree: int = assumed(2, "", "largest degree of the field's reversal", "readings contain few reversals")
+    struts_alike: float = assumed(0.998, "", "prior correlation of the struts' expansions", "same material: 5 % apart")
+    struts_warmed_alike: float = assumed(
+        0.9, "", "the same correlation if one thermometer represents all parts", "load and cooling differ by strut"
+    )
+    least_warming: float = assumed(0.5, "K", "change of temperature needed to fit expansion", "3 µm on 0.5 m of steel")
     least_damping: float = assumed(
-        0.1, "", "change of humidity that determines swelling", "5 µm on 0.5 m of carbon fibre"
+        0.1, "", "change of relative humidity needed to fit swelling", "5 µm on 0.5 m of carbon fibre"
     )
     alike: float = assumed(
-        0.75, "", "correlation of the struts' stiffnesses, clearances, and frictions", "benchmarks.plants --alike"
+        0.75, "", "prior correlation of the struts' stiffnesses, clearances and frictions", "benchmarks.plants --alike"
     )
-    stated_stiffness: float = assumed(0.1, "", "error of a stated stiffness, 1 σ", "catalogues of ball screws: ±10 %")
+    stated_stiffness: float = assumed(0.1, "", "relative error of a stated stiffness, 1 σ", "ball screw catalogues")
 
     # Posterior (posterior.py, datum.py)
-    seen: float = assumed(1.0, "σ", "change of all readings above which a direction is observable", "one σ of noise")
+    seen: float = assumed(1.0, "σ", "change of all readings from which an error counts as observable", "their noise")
 
     # Lead (lead.py)
-    lead_odds: float = assumed(
-        25.0, "", "log odds that establish a period, against none and any other", "look-elsewhere"
-    )
+    lead_odds: float = assumed(25.0, "", "log odds of a screw lead over no lead or any other", "many leads are tried")
 
     # Thermal (thermal.py)
-    rate_persistence: float = assumed(3600.0, "s", "how long the rate of a temperature persists", "machines and rooms")
-    clear_evidence: float = assumed(10.0, "", "log evidence that establishes a time constant", "odds of 22,000 : 1")
-    known_expansion: float = assumed(20e-6, "1/K", "expansion that is plausible for any material", "aluminium: 23e-6")
-    known_moisture: float = assumed(5e-4, "m/m", "swelling that is plausible for any material", "polymers, dry to damp")
+    rate_persistence: float = assumed(3600.0, "s", "correlation time of a temperature's rate", "machines and rooms")
+    clear_evidence: float = assumed(10.0, "", "log Bayes factor that establishes a time constant", "odds of 22,000 : 1")
+    known_expansion: float = assumed(20e-6, "1/K", "least prior σ of expansion for its reported error", "aluminium")
+    known_moisture: float = assumed(5e-4, "m/m", "the same for swelling, from dry to damp air", "polymers")
 
-    # Changes of a machine since its fit (changes.py, check.py); each has several standard deviations, equally likely
+    # Changes of a machine since its fit (changes.py, check.py). A tuple lists equally likely standard deviations.
     prior_odds: tuple[float, ...] = assumed(
         (1.0, 1.0, 1.0, 1.0, 0.125, 0.25, 0.5),
         "",
-        "of datum, strut, temperature, payload, ageing, a wrong reading and all others",
-        "ageing as likely as each of the last one's four groups: each can represent the other",
+        "prior odds of a change of datum, strut, temperature, payload, ageing, of a wrong reading, of other changes",
+        "ageing is as likely as one of the four groups of other changes, because either can represent the other",
     )
     moved: tuple[float, ...] = assumed(
-        (3e-6, 1e-5, 3e-5, 1e-4, 3e-4), "m", "how far joints, struts or the datum may have moved", "wear to crash"
+        (3e-6, 1e-5, 3e-5, 1e-4, 3e-4), "m", "displacement of a joint, a strut or the datum", "from wear to a crash"
     )
     grown: tuple[float, ...] = assumed(
-        (4e-6, 12e-6, 36e-6, 120e-6), "m/m", "growth of a body", "steel by a third of a kelvin to ten kelvin"
+        (4e-6, 12e-6, 36e-6, 120e-6), "m/m", "thermal growth of a part", "steel warmed by 0.33 K to 10 K"
     )
     loaded: tuple[float, ...] = assumed((1.0, 3.0, 10.0, 30.0), "kg", "change of a payload", "a probe to a workpiece")
-    stiffness: float = assumed(20e6, "N/m", "of a strut with its joints where none is stated", "ball screws of 16 mm")
+    stiffness: float = assumed(20e6, "N/m", "stiffness of a strut with its joints if not stated", "16 mm ball screws")
     aged: tuple[float, ...] = assumed(
-        (0.02, 0.05, 0.1, 0.2), "tolerances", "ageing of everything", "joints by 2 to 20 µm of 100"
+        (0.02, 0.05, 0.1, 0.2), "tolerances", "ageing of all parameters together", "joints: 2 to 20 µm of 100 µm"
     )
     bent: tuple[float, ...] = assumed(
-        (0.5, 1.0, 2.0, 4.0, 8.0), "tolerances", "a smooth field's growth", "5 µm and 20 µrad"
+        (0.5, 1.0, 2.0, 4.0, 8.0), "tolerances", "change of the field", "its tolerances are 5 µm and 20 µrad"
     )
     worn_pitch: tuple[float, ...] = assumed(
-        (1e-5, 3e-5, 1e-4, 3e-4), "m/m", "wear of one screw's pitch", "up to several classes of ISO 3408"
+        (1e-5, 3e-5, 1e-4, 3e-4), "m/m", "change of one screw's pitch by wear", "up to several classes of ISO 3408"
     )
     worn_backlash: tuple[float, ...] = assumed(
-        (1e-6, 3e-6, 1e-5, 3e-5), "m", "wear of one screw's backlash", "preload lost"
+        (1e-6, 3e-6, 1e-5, 3e-5), "m", "change of one screw's backlash by wear", "loss of the nut's preload"
     )
     wrong_reading: tuple[float, ...] = assumed(
-        (5.0, 20.0, 100.0, 1000.0), "σ", "size of one wrong reading", "a slip of a digit"
+        (5.0, 20.0, 100.0, 1000.0), "σ", "error of a single wrong reading", "one wrong digit"
     )
     scattered: tuple[float, ...] = assumed(
-        (2.0, 5.0, 20.0, 100.0), "σ", "additional scatter of all readings", "air, vibration"
+        (2.0, 5.0, 20.0, 100.0), "σ", "additional scatter of all readings", "air turbulence, vibration"
     )
-    false_alarms: float = assumed(
-        0.01, "", "share of unchanged machines that may be reported as changed", "usual level"
-    )
+    false_alarms: float = assumed(0.01, "", "share of unchanged machines reported as changed", "usual test level")
     sure: float = assumed(
-        0.9, "", "share of the probability at which one kind of change is stated", "chosen: 10 % wrong"
+        0.9, "", "probability from which a check names one kind of change", "10 % of such statements may be wrong"
     )
-    surely: float = assumed(4.0, "σ", "size beyond which changes, or a negative backlash, are certain", "1 in 16,000")
+    surely: float = assumed(4.0, "σ", "size from which a change or a negative backlash is certain", "1 in 16,000")
     # Trust (trust.py, promise.py)
     misfit: tuple[float, float, float] = assumed(
-        (1.5, 3.0, 10.0), "", "noise found over noise stated: noted, in doubt, refused", "χ² of 2.25, 9, 100"
+        (1.5, 3.0, 10.0),
+        "",
+        "found σ / stated σ that causes a note, a doubt, a refusal",
+        "χ² of 2.25, 9, 100",
     )
     jackknife_prior: float = assumed(
-        3.0, "", "degrees of freedom assigned to a covariance", "most likely by benchmarks.promise --ablate"
+        3.0, "", "degrees of freedom of the prior on a covariance's scale", "most likely by benchmarks.promise --ablate"
     )
-    drift: float = assumed(11.5e-6, "m/m", "prior of the scale's change over a campaign", "steel by 1 K")
-    clear: float = assumed(3.0, "σ", "significance of a drift, a discrepancy or a difference between runs", "1 in 370")
+    drift: float = assumed(11.5e-6, "m/m", "change of scale during a campaign, 1 σ", "steel warmed by 1 K")
+    clear: float = assumed(
+        3.0, "σ", "significance of a drift, a discrepancy or a difference between runs", "by chance in 1 of 370"
+    )
     lack_margin: float = assumed(
-        1.5, "", "largest ratio of a discrepancy elsewhere to that at the readings", "benchmarks.promise --ablate"
+        1.5, "", "largest ratio of a discrepancy between readings to that at readings", "benchmarks.promise --ablate"
     )
     fine_terms: float = assumed(
-        0.3, "", "uncertainty of a field's fine terms given the coarse ones, log", "factor of 1.35"
+        0.3, "", "uncertainty (log) of a field's fine terms, scaled from its coarse terms", "factor of 1.35"
     )
     scales: tuple = assumed(
-        (("linear", 0.5e-6), ("length", 0.5e-6), ("position", 10e-6)), "m/m", "scale of an instrument, 1 σ", "classes"
+        (("linear", 0.5e-6), ("length", 0.5e-6), ("position", 10e-6)),
+        "m/m",
+        "error of an instrument's scale by kind of channel, 1 σ",
+        "classes of lasers, ball bars, trackers",
     )
-    alignment: float = assumed(0.5e-3, "rad", "beam's angle to its line, 1 σ", "set up over half a metre")
+    alignment: float = assumed(0.5e-3, "rad", "angle of a laser beam to its line, 1 σ", "aligned over half a metre")
 
     # Mix-ups (mixups.py)
-    mixup_odds: float = assumed(1e4, "", "prior odds against any one mix-up", "1 campaign in 100, some 100 ways")
+    mixup_odds: float = assumed(1e4, "", "prior odds against any one mix-up", "100 kinds, in 1 of 100 campaigns")
     mistaken: float = assumed(
-        10.0, "", "ratio of a mistake common to all readings to the usual deviation", "1 mm; 200 ppm"
+        10.0, "", "size of a mistake in all readings over the usual deviation", "joints by 1 mm, scale by 200 ppm"
     )
-    usual_scale: float = assumed(20e-6, "m/m", "scale that screws and instruments may share, 1 σ", "steel by 2 K")
+    usual_scale: float = assumed(20e-6, "m/m", "error of scale of screws or instruments, 1 σ", "steel warmed by 2 K")
 
     def rows(self) -> list[tuple[str, str, str, str]]:
         """Return name, value with unit, meaning and source of every assumption."""
 
         def shown(value: Any) -> str:
             if isinstance(value, tuple):
-                named = bool(value) and isinstance(value[0], str)  # of what, and its value
+                named = bool(value) and isinstance(value[0], str)  # a pair of a name and its value
                 return (" " if named else ", ").join(map(shown, value))
             return value if isinstance(value, str) else f"{value:g}"
 
-        return [
-            (
-                f.name,
-                f"{shown(getattr(self, f.name))} {f.metadata['unit']}".strip(),
-                f.metadata["what"],
-                f.metadata["source"],
-            )
-            for f in fields(self)
-        ]
+        rows = []
+        for f in fields(self):
+            value = f"{shown(getattr(self, f.name))} {f.metadata['unit']}".strip()
+            rows.append((f.name, value, f.metadata["what"], f.metadata["source"]))
+        return rows
 
 
 ASSUMED = Assumptions()

@@ -1,4 +1,4 @@
-"""What could be measured in a box: runs of every instrument within the limits of the nominal machine."""
+"""Candidates for a measurement: runs of each instrument in a box, within the limits of the nominal machine."""
 
 from __future__ import annotations
 
@@ -28,25 +28,25 @@ from ..pose import rotation_from_angles
 from ..workspace.reach import first_limits
 from .parameters import ParameterSpace
 
-TILTS = (10.0, 5.0, 2.0)  # of scattered poses, °: the first within reach
+TILTS = (10.0, 5.0, 2.0)  # tilts of scattered poses, °; the first tilt that the machine reaches is used
 FEW_POINTS, USUAL_POINTS = (5, 13), (13,)
-# Points of a line, by instrument: few at little cost, or enough to resolve the screws' waves
+# Numbers of points on a candidate line, by instrument: few, which costs little, or enough to resolve the screws' waves
 LINE_POINTS = {"linear": (8, 21), "5-D": FEW_POINTS, "6-D": FEW_POINTS}
-# The same with each point read once, in alternating directions: more places for as many readings
+# Numbers of points on a line whose points are read once each, forward and backward in turn: more places per reading
 ALTERNATE_POINTS = {"linear": (4, 6, 10), "5-D": (4, 8), "6-D": (4, 8)}
 
 
 @dataclass(frozen=True)
 class MeasuringBox:
-    """The box and the attitudes of a measurement."""
+    """The box and the tool attitudes in which a machine is to be measured."""
 
     geometry: HexapodGeometry  # the machine as designed
     box: np.ndarray  # (2, 3): lowest and highest corner of the tool's positions, m in the work frame
     level: np.ndarray  # (3, 3): attitude of the level tool in the work frame
-    tilt: float  # largest tilt of the tool from there, rad
+    tilt: float  # largest tilt of the tool from `level`, rad
 
     def attitudes(self) -> list[tuple[str, np.ndarray]]:
-        """Return the level attitude and, where the tool tilts, four tilted ones, with their names."""
+        """Return names and rotations: ``level`` and, if `tilt` is above zero, four attitudes tilted about ±x and ±y."""
         names = {"level": (0.0, 0.0)}
         if self.tilt > 0.0:
             shown = f"{np.degrees(self.tilt):g}°"
@@ -55,16 +55,16 @@ class MeasuringBox:
         return [(name, self.turned(self.tilt * np.array(about))) for name, about in names.items()]
 
     def turned(self, about: np.ndarray) -> np.ndarray:
-        """Return the tool's attitude(s) after small tilts about x and y of the work frame, shape (..., 2), rad."""
+        """Return the tool's attitudes, (..., 3, 3), tilted by small angles (..., 2), rad, about x and y of work."""
         return np.asarray(rotation_from_angles(np.concatenate([about, 0.0 * about[..., :1]], axis=-1)) @ self.level)
 
     def reaches(self, positions: np.ndarray, rotations: np.ndarray, threads: int | None = 1) -> np.ndarray:
-        """Return which poses of the tool the nominal machine's limits allow, shape (n,)."""
+        """Return for each of n tool poses whether the nominal machine's limits allow it, (n,)."""
         return first_limits(self.geometry, positions, rotations, threads=threads)[0] == Status.OK
 
 
 def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[CampaignRun]:
-    """Return the candidate runs, all within the limits of the nominal machine; a GeometryError if there are none."""
+    """Return candidate runs within the limits of the nominal machine; raise GeometryError if there is none."""
     runs: list[CampaignRun] = []
     lines = list(_lines(place)) if any(name in LINE_INSTRUMENTS for name in instruments) else []
     for instrument in instruments:
@@ -87,7 +87,7 @@ def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[Campaign
 
 
 def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield name, ends (2, 3), m, and attitude of each line, cut at the limits."""
+    """Yield name, ends (2, 3), m, and attitude of each line along an axis or diagonal of the box, cut at the limits."""
     low, size = place.box[0], np.ptp(place.box, axis=0)
     level, tilted = [], []
     for axis, (a, b) in enumerate(CROSS_AXES):
@@ -96,14 +96,14 @@ def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
             ends[:, [a, b]] = low[[a, b]] + 0.5 * np.array([first, second]) * size[[a, b]]
             where = f"{AXES[a]} {ends[0, a] * 1e3:.0f}, {AXES[b]} {ends[0, b] * 1e3:.0f}"
             level.append((f"{AXES[axis]} at {where}", ends))
-            if (first == 1) == (second == 1):  # no middle of a face
+            if (first == 1) == (second == 1):  # edges and centre line of the box, not centre lines of its faces
                 tilted.append(level[-1])
     of_box = [(f"diagonal {n}", ends) for n, ends in enumerate(diagonals(place.box), start=1)]
     level += of_box
     tilted += of_box[:4]
 
-    share = np.linspace(0.0, 1.0, 41)  # points that are checked
-    least = 0.4  # lines of which a smaller share is within the limits are omitted
+    share = np.linspace(0.0, 1.0, 41)  # points at which a line is compared with the limits, as shares of its length
+    least = 0.4  # a line is omitted if a smaller share of its length is within the limits
     for attitude, rotation in place.attitudes():
         for name, ends in level if attitude == "level" else tilted:
             points = ends[0] + share[:, None] * (ends[1] - ends[0])
@@ -113,8 +113,7 @@ def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
 
 
 def _longest(within: np.ndarray) -> tuple[int, int]:
-    """Return first and last index of the longest stretch within the limits, without the last point where a limit ends
-    it."""
+    """Return first and last index of the longest stretch of True, shortened by one point at an end set by a limit."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], within, [False]]).astype(int)))
     if not len(edges):
         return 0, -1
@@ -136,7 +135,7 @@ def _sets_of_poses(place: MeasuringBox) -> Iterator[tuple[np.ndarray, np.ndarray
 
 
 def _circles(place: MeasuringBox) -> Iterator[CampaignRun]:
-    """Yield circles of a ball bar in the box: in three planes each, level and tilted; of 100 mm, or what fits."""
+    """Yield ball bar circles in each plane of the box, level and tilted; radius 100 mm, or less in a small box."""
     sides = np.ptp(place.box, axis=0)
     for attitude, rotation in place.attitudes():
         for plane, axes in PLANES.items():
@@ -151,7 +150,7 @@ def _circles(place: MeasuringBox) -> Iterator[CampaignRun]:
 
 
 def _shares(corners: bool) -> Iterator[np.ndarray]:
-    """Yield places of a box, in shares of its sides: its middle, the middles of its faces, and its corners."""
+    """Yield the box's centre, the centres of its faces and, if `corners`, its corners, in shares of its sides."""
     for index in np.ndindex(3, 3, 3):
         off = sum(i != 1 for i in index)
         if off in (0, 1) or (corners and off == 3):
@@ -159,7 +158,7 @@ def _shares(corners: bool) -> Iterator[np.ndarray]:
 
 
 def _tilted_at(place: MeasuringBox) -> Iterator[CampaignRun]:
-    """Yield R-tests in the box, for a tool that tilts: one ball, the tool turning about it."""
+    """Yield R-tests: the tool tilts about a fixed ball in the box. Yield nothing if the tool must stay level."""
     if place.tilt == 0.0:
         return
     count = 13
@@ -172,8 +171,8 @@ def _tilted_at(place: MeasuringBox) -> Iterator[CampaignRun]:
 
 
 def _lengths(place: MeasuringBox) -> Iterator[CampaignRun]:
-    """Yield sets of poses read from a tracking interferometer that stands beside a lower corner of the box."""
-    off = 0.3  # how far outside the box, in shares of its sides
+    """Yield sets of poses whose distances a tracking interferometer beside a lower corner of the box reads."""
+    off = 0.3  # distance of the interferometer from the box along each axis, as a share of its side
     for corner in np.ndindex(2, 2):
         share = np.array([*(side + off * (2 * side - 1) for side in corner), -off])
         station = (place.box[0] + share * np.ptp(place.box, axis=0)).round(4)
@@ -186,7 +185,7 @@ def _millimetres(place: np.ndarray) -> str:
     return ", ".join(f"{value * 1e3:.0f}" for value in place)
 
 
-# Readings in the box of a fit
+# Templates of readings in the box of a fit
 
 
 def laid_out(
@@ -197,10 +196,13 @@ def laid_out(
     tilts: Sequence[float] = (0.0,),
     instrument: str = "6-D",
 ) -> tuple[MeasurementSet, float]:
-    """Return possible readings in a fit's box: `lines` across each direction with diagonals, and scattered poses."""
+    """Return a template of readings in a fit's box, and the tilt used, °: the first of `tilts` within reach.
+
+    On the box's shortest side there are `lines` grid lines (0: no grid, no diagonals) and `readings` points of a line.
+    """
     box, side, geometry = space.work_box, float(np.ptp(space.work_box, axis=0).min()), space.geometry
     if side <= 0.0:
-        raise CalibrationError("fit", "has measured no box in which readings could be laid out")
+        raise CalibrationError("fit", "was made with readings that span no box, so no readings can be proposed in it")
     level = geometry.work.rotation.T @ space.level @ geometry.tool.rotation
     grid = Campaign(box, side / max(lines - 1, 1), side / (readings - 1), instrument, 4, poses=poses, level=level)
     if not lines:
@@ -208,14 +210,14 @@ def laid_out(
     for tilt in tilts:
         try:
             return template(replace(grid, tilt=float(np.radians(tilt))), geometry), tilt
-        except InputFileError:  # out of reach
+        except InputFileError:  # some pose is out of reach
             if tilt == tilts[-1]:
                 raise
     raise ValueError("no tilts")
 
 
 def places(readings: MeasurementSet) -> Iterator[tuple[str, tuple[str, ...], np.ndarray]]:
-    """Yield each line and each scattered pose of readings: place, channels, and the readings' numbers."""
+    """Yield each line and each scattered pose: text of its place, its channels, and the indices of its readings."""
     on_line = np.array([run.is_line for run in readings.runs])[readings.run]
     key = np.where(on_line, -1 - readings.run, readings.station)
     tips, _ = readings.geometry.tool_poses(readings.stations.positions, readings.stations.rotations)

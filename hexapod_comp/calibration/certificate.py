@@ -40,12 +40,12 @@ if TYPE_CHECKING:
 
 FORMAT, VERSION = "hexapod_comp/certificate", 1
 COVERAGE = 2.0  # coverage factor k of expanded uncertainties: about 95 %
-MOST_RUNS = 200  # runs beyond these are counted, not listed
+MOST_RUNS = 200  # largest number of runs that the certificate lists; it only counts further runs
 
 
 @dataclass(frozen=True)
 class Details:
-    """Information that the readings do not contain: a details file; what is missing is left to be written by hand."""
+    """Content of a details file: facts that readings do not contain. A missing fact is left blank."""
 
     number: Annotated[str, Text()] = ""
     customer: Annotated[str, Text()] = ""
@@ -54,12 +54,13 @@ class Details:
     measured_on: Annotated[str, Text()] = ""
     operator: Annotated[str, Text()] = ""
     environment: Annotated[str, Text()] = ""
-    instruments: Annotated[tuple[str, ...], Names(what="texts")] = ()  # type, serial number, calibration of each
+    # One text for each instrument: type, serial number, calibration
+    instruments: Annotated[tuple[str, ...], Names(what="texts")] = ()
     remarks: Annotated[tuple[str, ...], Names(what="texts")] = ()
 
 
 def load_details(path: str | Path) -> Details:
-    """Read a details file (YAML)."""
+    """Return the details read from a YAML file."""
     return read_whole(Details, read_yaml(input_file(path, "details"), FORMAT, VERSION))
 
 
@@ -68,13 +69,13 @@ def certificate_text(
 ) -> str:
     """Return the certificate of a fit of scheme ``joint``, as HTML.
 
-    `model` is its name, `files` are the model's file and those beside it, which must have been written; `report` is
-    the fit's as printed, whose warnings before its first machine line open the certificate.
+    `model` is the model's name. `files` are the written model file and the files beside it. `report` is the printed
+    report of the fit; its warnings, which precede the line "machine …", open the certificate.
     """
     m, details, seen = fit.measurements, details or Details(), fit.observability
-    unseen = f"{seen.structure_rank} of {seen.structure_size} parameters of the structure are seen by these readings."
+    unseen = f"The readings determine {seen.structure_rank} of {seen.structure_size} parameters of the structure."
     if fit.unseen_errors:
-        unseen += f" Errors that they do not show: {listed(fit.unseen_errors)}."
+        unseen += f" Errors that the readings do not show: {listed(fit.unseen_errors)}."
     hashes = [hashlib.sha256(read_bytes(path, MAX_ARCHIVE_BYTES)).hexdigest() for path in files]
     beside = ["model", *("beside it" for _ in files[1:])]
     named = [(what, path.name, digest) for what, path, digest in zip(beside, files, hashes, strict=True)]
@@ -122,7 +123,7 @@ Rows = list[tuple[object, ...]]
 
 
 def _result(fit: ModelFit) -> Rows:
-    """Return the machine's error before and after compensation, µm and µrad; none without a predicted interval."""
+    """Return rows of the tool's error before and after compensation, µm and µrad; no rows if nothing is predicted."""
     if fit.level is None:
         return []
     rows: Rows = []
@@ -142,7 +143,7 @@ def _result(fit: ModelFit) -> Rows:
 
 
 def _temperatures(fit: ModelFit) -> Rows:
-    """Return each part with its temperatures while it was measured, and its expansion."""
+    """Return a row for each part: name, lowest and highest temperature in the readings, °C, and expansion, ppm/K."""
     values, model = fit.measurements.stations.temperatures, fit.model
     rows: Rows = []
     expansions = (*model.struts.expansion, model.base_expansion, model.platform_expansion)
@@ -154,7 +155,7 @@ def _temperatures(fit: ModelFit) -> Rows:
 
 
 def _tests(before: Judged, after: Judged) -> Iterator[dict[str, object]]:
-    """Yield the tests of ISO 230-2, 230-6 and 230-4, each figure before → after, µm; a dash: not possible."""
+    """Yield the tests of ISO 230-2, 230-6 and 230-4; figures are "before → after", µm, or a dash if not possible."""
     pairs = (
         [(f"{AXES_STANDARD}, lines along the axes, both directions", before.axes, after.axes)] if before.axes else []
     )
@@ -179,8 +180,7 @@ def _tests(before: Judged, after: Judged) -> Iterator[dict[str, object]]:
 
 
 def left_out(fit: ModelFit) -> np.ndarray:
-    """Return each reading minus the prediction of a model fitted without that reading's line or pose, (N,), m or
-    rad."""
+    """Return each reading minus its prediction by a model fitted without its line or pose, (N,), m or rad."""
     m, solution = fit.measurements, fit.solution
     cell = Cells.of(m).of_reading
     weights = solution.weights / m.stated**2
@@ -190,12 +190,12 @@ def left_out(fit: ModelFit) -> np.ndarray:
 
 
 def _figures(fit: ModelFit) -> list[tuple[str, Figure]]:
-    """Return the error maps and the residuals, with their captions."""
+    """Return pairs of caption and figure: the error maps before and after compensation, and the residuals."""
     from .pictures import before_after_figure, residuals_by_run_figure
 
     figures = []
     if fit.model.region is not None:
-        text = "Error in space before compensation, and what is expected after it, at three heights of the measured box"
+        text = "Tool error before compensation and expected error after it, at three heights of the measured box"
         figures.append((text, before_after_figure(fit)))
-    text = "Residual of each reading, over its stated standard uncertainty; the band is ± U (k = 2)"
+    text = "Residual of each reading divided by its stated standard uncertainty; the band is ± 2 (k = 2)"
     return [*figures, (text, residuals_by_run_figure(fit))]
