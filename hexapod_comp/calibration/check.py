@@ -216,7 +216,7 @@ def _misread(
         if most + jacobian < odds:  # though all readings were as expected
             continue
         try:
-            tried = mistake.undone()
+            tried = mistake.corrected()
             if tried is None:
                 continue
             if of_lines and tried.stations is m.stations and tried.channel is m.channel:

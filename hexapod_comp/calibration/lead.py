@@ -1,8 +1,8 @@
-"""The lead of the screws, estimated from the readings: the period of the struts' errors.
+"""The lead of the screws, estimated from the readings: it is the period of the struts' errors over strut length.
 
-The residuals of a fit without screw waves are searched for periods: first strut by strut with Fourier transforms over
-the commands, then, about the strongest lines, with all other parameters free. A period is reported when the readings
-prefer it to every other one by far more than noise would.
+The search uses the residuals of a fit without screw waves. A Fourier transform over each strut's commanded lengths
+gives the strongest frequencies. Near each of them, the frequency is refined with all other parameters free. A period is
+reported when its log odds against every other period, and against no period, exceed `lead_odds` (assumptions.py).
 """
 
 from __future__ import annotations
@@ -17,32 +17,34 @@ from .assumptions import ASSUMED
 from .blocks import WAVES
 from .estimator import MEDIAN_TO_SIGMA, Estimation, LinearProblem, Posterior, at_once, solve
 
-LEAST_FREEDOM = 200.0  # fewest readings beyond the parameters that determine a period
-MOST_READINGS = 2500  # first range of the search
-WAVE_AMPLITUDE = 10e-6  # prior of amplitudes while periods are compared, m: loose
-AGREES, CLOSE = 6.0, 5e-3  # a given or a round lead agrees within, σ, and as a share
+LEAST_FREEDOM = 200.0  # with fewer degrees of freedom no period is searched for
+MOST_READINGS = 2500  # of larger sets a random sample of this size is searched first
+WAVE_AMPLITUDE = 10e-6  # standard deviation of the amplitudes' prior while periods are compared, m
+# The detected lead agrees with a given or a round lead if they differ by less than AGREES standard errors; with a given
+# lead also if they differ by less than the share CLOSE of the detected lead
+AGREES, CLOSE = 6.0, 5e-3
 
-SHORTEST, LONGEST = 1e-3, 30e-3  # range of the search, m: longer waves are as smooth as a length map
+SHORTEST, LONGEST = 1e-3, 30e-3  # periods searched, m; a longer wave looks like a length map
 
 GRID_STEP = SHORTEST / 32.0
-"""Of the transforms, m: 0.3 % of a wave of the shortest period is lost."""
+"""Step of strut length in the Fourier transforms, m; rounding to it costs 0.3 % of a wave of the shortest period."""
 
 ROUND = (0.5e-3, 0.025 * 0.0254)
-"""Screws are made with leads that are whole multiples of one of these, m."""
+"""Common leads are whole multiples of 0.5 mm or of 0.025 inch, m."""
 
 
 @dataclass(frozen=True)
 class ScrewLead:
     """The screws' lead: as given by settings or geometry, and as detected in the readings."""
 
-    given: float | None  # by the settings or the geometry, m
-    shown: float | None  # the period that the readings show, m; None: none
-    error: float  # its standard error, m
-    odds: float  # log odds by which they prefer it to any other period and to none
+    given: float | None  # lead from the settings or the geometry, m; None: not given
+    shown: float | None  # period detected in the readings, m; None: no period was detected
+    error: float  # standard error of the detected period, m
+    odds: float  # log odds of the detected period against every other period and against no period
 
     @property
     def used(self) -> float | None:
-        """The period to be fitted, m: the given one, else the detected one, or the round number near that."""
+        """The period to be fitted, m: the given lead, else the detected period, rounded if a common lead agrees."""
         if self.given is not None or self.shown is None:
             return self.given
         within = AGREES * self.error
@@ -52,8 +54,7 @@ class ScrewLead:
 
     @property
     def agrees(self) -> bool:
-        """Whether the given lead explains the shown one, as one of its harmonics; True if there is nothing to
-        compare."""
+        """Whether the detected period is a harmonic of the given lead; True if either of the two is unknown."""
         if self.given is None or self.shown is None:
             return True
         misses = [abs(self.given / n - self.shown) for n in range(1, MOST_HARMONICS + 1)]
@@ -65,95 +66,95 @@ class ScrewLead:
             return f"{given or 'not known'}; the readings do not show it"
         shown = f"{self.shown * 1e3:.4f} ± {self.error * 1e3:.4f} mm shown by the readings"
         if self.given is None:
-            return f"{shown}, {self.used * 1e3:.6g} mm taken"  # type: ignore[operator]
+            return f"{shown}, {self.used * 1e3:.6g} mm used in the fit"  # type: ignore[operator]
         return f"{given}, {shown}{'' if self.agrees else ': THEY DISAGREE'}"
 
 
 def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
-    """Return the lead that readings show, with the given one; `problem` is at the nominal machine.
+    """Return the given and the detected lead of the screws; `problem` is linearised at the nominal machine.
 
-    With many readings a random part is tried first; that is enough to check a given lead.
+    More than MOST_READINGS readings are sampled first. All readings are searched if the sample shows no lead and no
+    lead is given.
     """
     space, measurements = estimation.space, estimation.measurements
     given = float(space.periods[0]) if np.isfinite(space.periods).all() else None
-    every = estimation, problem
+    whole = estimation, problem
     if len(measurements) > MOST_READINGS:
-        some = np.zeros(len(measurements), dtype=bool)
-        some[np.random.default_rng(0).choice(len(measurements), MOST_READINGS, replace=False)] = True
-        estimation = Estimation(measurements.select(some), space, alone=False)
+        sampled = np.zeros(len(measurements), dtype=bool)
+        sampled[np.random.default_rng(0).choice(len(measurements), MOST_READINGS, replace=False)] = True
+        estimation = Estimation(measurements.select(sampled), space, alone=False)
         problem, _ = estimation.linearise(np.zeros(space.size), np.ones(MOST_READINGS))
     odds, best, posterior = _strongest(estimation, problem)
     if given is None and len(measurements) > MOST_READINGS:
-        estimation, problem = every
+        estimation, problem = whole
         if odds < ASSUMED.lead_odds:
             odds, best, posterior = _strongest(estimation, problem)
     if best is None or odds < ASSUMED.lead_odds:
         return ScrewLead(given, None, np.inf, odds)
-    # Until here the waves counted as noise, which gave the priors too much weight.
-    quiet = solve(space, problem, posterior.tolerances, posterior.noise * best.noise, rounds=0)
-    rest = _Rest(estimation, problem, quiet)
-    if rest.freedom >= LEAST_FREEDOM:  # a quiet fit of few readings has no information on its noise
-        best = rest.line(best.frequency)
+    # So far the estimated noise contained the waves, so the readings had too little weight: solve again without them
+    quieter = solve(space, problem, posterior.tolerances, posterior.noise * best.noise, rounds=0)
+    residuals = _Residuals(estimation, problem, quieter)
+    if residuals.freedom >= LEAST_FREEDOM:  # otherwise the noise of these residuals cannot be estimated
+        best = residuals.line(best.frequency)
     if not np.isfinite(best.error):
         return ScrewLead(given, None, np.inf, odds)
     return ScrewLead(given, float(1.0 / best.frequency), float(best.error / best.frequency**2), odds)
 
 
 def _strongest(estimation: Estimation, problem: LinearProblem) -> tuple[float, Line | None, Posterior]:
-    """Return the odds of the most probable period, that period, and the fit without waves."""
+    """Return the log odds of the most probable period, its line, and the posterior of the fit without waves."""
     space = estimation.space
     tolerances = np.where([b.name in WAVES for b in space.blocks], 0.0, space.start_tolerances())
     posterior = solve(space, problem, tolerances, np.ones(problem.normal.shape[0]), 5)
-    rest = _Rest(estimation, problem, posterior)
-    if rest.freedom < LEAST_FREEDOM:
+    residuals = _Residuals(estimation, problem, posterior)
+    if residuals.freedom < LEAST_FREEDOM:
         return 0.0, None, posterior
-    spectrum = rest.spectrum()
-    best = _fundamental(rest, spectrum)
-    rivals = _rivals(rest.frequencies, spectrum, best.frequency, rest.span)
-    others = at_once(lambda f: rest.line(f, 1), rivals, len(problem.target))
-    return min([best.odds, *(best.odds - other.odds for other in others)]), best, posterior
+    spectrum = residuals.spectrum()
+    best = _fundamental(residuals, spectrum)
+    rivals = _rivals(residuals.frequencies, spectrum, best.frequency, residuals.span)
+    lines = at_once(lambda f: residuals.line(f, 1), rivals, len(problem.target))
+    return min([best.odds, *(best.odds - rival.odds for rival in lines)]), best, posterior
 
 
 class Line(NamedTuple):
-    """A frequency of the errors and its harmonics."""
+    """A spatial frequency of the struts' errors, fitted together with its harmonics."""
 
-    frequency: float  # 1/m
-    error: float  # its standard error
-    odds: float  # log odds against no such errors
-    noise: float  # its residual, over the residual without it
+    frequency: float  # of the fundamental, 1/m
+    error: float  # standard error of the frequency, 1/m
+    odds: float  # log odds of waves with this frequency against no waves
+    noise: float  # standard deviation of the residuals with these waves fitted, in units of the noise without them
 
 
-class _Rest:
-    """The residuals of a fit without screw waves, and their derivatives by the six lengths, over the noise."""
+class _Residuals:
+    """Residuals of a fit without screw waves, and their derivatives by the six strut lengths, divided by the noise."""
 
     def __init__(self, estimation: Estimation, problem: LinearProblem, posterior: Posterior) -> None:
         over_noise = 1.0 / posterior.noise[problem.kind]
         self._problem, self._posterior, self._over_noise = problem, posterior, over_noise
-        left = over_noise * (problem.target - problem.rows.times(posterior.every(problem.rows.shape[1])))
-        cut = ASSUMED.huber * MEDIAN_TO_SIGMA * np.median(np.abs(left))
-        self.left = np.clip(left, -cut, cut)
+        residuals = over_noise * (problem.target - problem.rows.times(posterior.every(problem.rows.shape[1])))
+        limit = ASSUMED.huber * MEDIAN_TO_SIGMA * np.median(np.abs(residuals))
+        self.residuals = np.clip(residuals, -limit, limit)
         self.gains = over_noise[:, None] * problem.per_length
         self.commands = estimation.measurements.stations.commands[estimation.cells.station]
         self.span = float(np.ptp(self.commands, axis=0).max())
-        self.square = float(self.left @ self.left)
+        self.square = float(self.residuals @ self.residuals)
         self.freedom = float(problem.freedom.sum() - posterior.determined.sum())
         self._size = 2 ** int(np.ceil(np.log2(4.0 * self.span / GRID_STEP + 1.0)))
-        every = np.arange(self._size // 2 + 1) / (self._size * GRID_STEP)
-        self._searched = (every >= 1.0 / LONGEST) & (every <= 1.0 / SHORTEST)
-        self.frequencies = every[self._searched]
+        frequencies = np.arange(self._size // 2 + 1) / (self._size * GRID_STEP)
+        self._searched = (frequencies >= 1.0 / LONGEST) & (frequencies <= 1.0 / SHORTEST)
+        self.frequencies = frequencies[self._searched]
 
     def spectrum(self) -> np.ndarray:
-        """Return the reduction of the sum of squares by a wave of each frequency, as if struts and readings were
-        independent."""
+        """Return by how much a wave of each frequency lowers the sum of squares, if the struts were independent."""
         power = np.zeros(len(self.frequencies))
         for gain, commands in zip(self.gains.T, self.commands.T, strict=True):
             bins = ((commands - commands.min()) / GRID_STEP).round().astype(int)
-            line = np.fft.rfft(np.bincount(bins, gain * self.left, self._size), self._size)[self._searched]
+            line = np.fft.rfft(np.bincount(bins, gain * self.residuals, self._size), self._size)[self._searched]
             power += np.abs(line) ** 2 / max(0.5 * gain @ gain, np.finfo(float).tiny)
         return power
 
     def line(self, frequency: float, harmonics: int = MOST_HARMONICS) -> Line:
-        """Return the best frequency near one, with at most this number of harmonics, all other parameters free."""
+        """Return the best line near `frequency`, with at most `harmonics` harmonics and all other parameters free."""
         harmonics = int(np.clip(1.0 / (SHORTEST * frequency), 1, harmonics))
         parameters = 12 * harmonics + 1
         half_width, start = 0.5 / self.span, frequency
@@ -165,21 +166,19 @@ class _Rest:
             if abs(frequency + step - start) > half_width:
                 break
             frequency += step
-            if abs(step) < 0.1 * error:  # a Newton step squares the error
+            if abs(step) < 0.1 * error:  # Newton converges quadratically: a further step would be far smaller
                 break
         return Line(frequency, error, self._odds(less, parameters), noise)
 
     def _odds(self, less: float, parameters: int) -> float:
-        """Return the log odds of an explanation that lowers the sum of squares, at the noise of its residuals."""
-        left = max(self.square - less, 1e-6 * self.square)
-        return 0.5 * self.freedom * float(np.log(self.square / left)) - parameters
+        """Return the log odds of `parameters` more parameters that lower the sum of squares by `less` (Akaike)."""
+        remaining = max(self.square - less, 1e-6 * self.square)
+        return 0.5 * self.freedom * float(np.log(self.square / remaining)) - parameters
 
     def _step_to(self, frequency: float, harmonics: int) -> tuple[float, float, float]:
-        """Return the reduction of the sum of squares by waves of a frequency, the step to a better one, its error at
-        noise 1.
+        """Return how much waves of a frequency lower the sum of squares, the Newton step, and its error at noise 1.
 
-        If readings cannot distinguish a frequency from all others, to rounding, the step is zero, with an infinite
-        error.
+        If the readings cannot distinguish this frequency from others, the step is zero and its error infinite.
         """
         orders = np.arange(1, harmonics + 1)
         first = np.exp(2.0j * np.pi * frequency * self.commands)[:, None]
@@ -199,34 +198,34 @@ class _Rest:
         return less, float(together[-1]), float(np.sqrt(covariance[-1, -1]))
 
     def _free(self, columns: np.ndarray) -> np.ndarray:
-        """Return columns free of the instruments' unknowns."""
+        """Return columns with the instruments' nuisance parameters projected out."""
         for part in self._problem.unknowns:
             part.project_out(columns)
         return columns
 
     def _shared(self, columns: np.ndarray) -> np.ndarray:
-        """Return the products of columns with the derivatives by all other parameters."""
+        """Return the products of columns (C, n) with the cells' derivatives by the fit's parameters, (used, n)."""
         return self._problem.rows.transposed_times(self._over_noise[:, None] * columns)[self._posterior.used]
 
     def _solved(self, columns: np.ndarray, shared: np.ndarray, loose: int = 0) -> tuple[np.ndarray, float, np.ndarray]:
-        """Return factors of columns (C, n), their reduction of the sum of squares, and their covariance.
+        """Return the fitted factors of columns (C, n), by how much they lower the sum of squares, and their covariance.
 
-        `shared` are theirs of :meth:`_shared`; the other parameters are free within their priors, and the last `loose`
-        columns have none.
+        `shared` is `_shared(columns)`. The fit's other parameters are free within their priors; the factors of the last
+        `loose` columns have no prior.
         """
         precision = columns.T @ columns - shared.T @ self._posterior.covariance @ shared
         tight = len(precision) - loose
         precision[np.diag_indices(tight)] += WAVE_AMPLITUDE**-2
         covariance = np.linalg.pinv(precision, hermitian=True)
-        moment = columns.T @ self.left
+        moment = columns.T @ self.residuals
         factors = covariance @ moment
         return factors, float(moment @ factors), covariance
 
 
 def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return amplitudes (2, harmonics, 6) shrunk by the share of noise, harmonic by harmonic (James & Stein).
+    """Return amplitudes (2, harmonics, 6), each harmonic shrunk by the share of noise in it (James & Stein 1961).
 
-    The noise of an absent harmonic would count as information about the frequency, most of all that of the highest.
+    Otherwise the noise of a harmonic that the screw does not have would count as information about the frequency.
     """
     result, numbers = amplitudes.copy(), np.arange(amplitudes.size).reshape(amplitudes.shape)
     for n in range(amplitudes.shape[1]):
@@ -237,26 +236,25 @@ def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     return result
 
 
-def _fundamental(rest: _Rest, spectrum: np.ndarray) -> Line:
-    """Return the frequency of which the strongest line is a harmonic: the highest that explains as much as any.
+def _fundamental(residuals: _Residuals, spectrum: np.ndarray) -> Line:
+    """Return the fundamental of the strongest frequency f: f, f/2, f/3, …, the highest within `lead_odds` of the best.
 
-    Parts of it are tried only where one of their other harmonics stands out of the spectrum.
+    A fraction f/n is tried only where another of its harmonics exceeds three times the spectrum's median.
     """
-    strongest = rest.frequencies[spectrum.argmax()]
-    lines = [rest.line(strongest)]
+    strongest = residuals.frequencies[spectrum.argmax()]
+    lines = [residuals.line(strongest)]
     for n in range(2, MOST_HARMONICS + 1):
-        others = np.array([m * strongest / n for m in range(1, MOST_HARMONICS + 1) if m % n])
-        at = np.searchsorted(rest.frequencies, others[others <= rest.frequencies[-1]])
-        stands_out = spectrum[np.minimum(at, len(spectrum) - 1)].max() > 3.0 * np.median(spectrum)
-        if strongest / n >= 1.0 / LONGEST and stands_out:
-            lines.append(rest.line(strongest / n))
+        harmonics = np.array([m * strongest / n for m in range(1, MOST_HARMONICS + 1) if m % n])
+        at = np.searchsorted(residuals.frequencies, harmonics[harmonics <= residuals.frequencies[-1]])
+        peak = spectrum[np.minimum(at, len(spectrum) - 1)].max() > 3.0 * np.median(spectrum)
+        if strongest / n >= 1.0 / LONGEST and peak:
+            lines.append(residuals.line(strongest / n))
     return next(line for line in lines if line.odds > max(other.odds for other in lines) - ASSUMED.lead_odds)
 
 
 def _rivals(frequencies: np.ndarray, spectrum: np.ndarray, best: float, span: float) -> np.ndarray:
-    """Return the frequencies of the strongest lines that are no harmonics of the best one."""
+    """Return the frequencies of the spectrum's four highest peaks that are not harmonics of the best frequency."""
     peaks = np.flatnonzero((spectrum[1:-1] >= spectrum[:-2]) & (spectrum[1:-1] >= spectrum[2:])) + 1
-    turns = frequencies[peaks] / best
-    apart = np.abs(turns - np.maximum(np.round(turns), 1.0)) * best * span > 1.5
-    others = peaks[apart]
-    return frequencies[others[np.argsort(-spectrum[others])][:4]]
+    order = frequencies[peaks] / best
+    rivals = peaks[np.abs(order - np.maximum(np.round(order), 1.0)) * best * span > 1.5]
+    return frequencies[rivals[np.argsort(-spectrum[rivals])][:4]]

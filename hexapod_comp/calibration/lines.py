@@ -1,15 +1,16 @@
-"""Scheme ``lines``, Mou & King's: a polynomial along each measured grid line, separate for forward and backward.
+"""Scheme ``lines`` of Mou & King (1998): a polynomial along each measured grid line, separate for both directions.
 
-A laser's zero relative to the next line's is not known, nor the slope of a straightness beam. So the mean of both
-directions of a displacement along a line, and of rotations, is set to zero at home's coordinate along the line; each
-direction keeps half of the backlash. From a straightness its least-squares line is subtracted. The position and bending
-of the planes through home (1-D data), or the squareness of the axes and the twists of the planes (5-D data) remain in
-the machine.
+A laser's zero differs from line to line and is unknown; so is the slope of a straightness beam. Therefore displacements
+along a line, and rotations, are shifted until the mean of both directions is zero at home's coordinate along the line;
+each direction keeps half of the backlash. From straightness the least-squares line is subtracted. Some errors are not
+compensated: the position and bending of the planes through home (1-D readings), or the squareness of the axes and the
+twist of the planes (5-D readings).
 
-The three families of a field add up, but all cross in the grid's nodes and see the same errors there. So each component
-belongs first to one family (a displacement to the lines along it; a rotation to the first of x, y, z that reads it as
-pitch or yaw); the others share one polynomial for its residual, averaged over lines that differ only in the first
-family's coordinate. On twenty virtual machines the residual was 18.1 µm of 27.9; 18.3 where all readings were added.
+The field is the sum of three families of lines, along x, y and z. They cross in the grid's nodes and read the same
+errors there. So each component is fitted first to one family: a displacement to the lines along its own axis, a
+rotation to the first axis whose lines read it as pitch or yaw. The residual is fitted to the other families, with one
+polynomial for all lines that differ only in the first family's coordinate. On twenty virtual machines this scheme left
+18.1 µm of 27.9 µm; fitting all families to the same readings and adding them left 18.3 µm.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ from ..virtual.instruments import station_errors
 from .assumptions import ASSUMED
 from .datum import HeldDatum, hold
 
-# Commands further off the nominal lengths than this, m, are a compensation's; than that, worth a note
+# Strut commands that differ from the nominal lengths by more than COMPENSATED, m, are refused as compensated; by more
+# than FOLLOWED, m, they are noted
 COMPENSATED, FOLLOWED = 10e-6, 0.1e-6
-# A line of 17 points gets at most 5 coefficients, one of 9 gets 3: no more than the readings can carry
-POINTS_PER_COEFFICIENT = 3
-FEWEST_POINTS = 2 * POINTS_PER_COEFFICIENT  # below this not even a straight line is possible
-# Repeated readings may scatter by this factor more than stated, and readings may lie this far off their polynomial,
-# which leaves out the screws' waves (on the shipped machine 15 times a rotation's noise)
+POINTS_PER_COEFFICIENT = 3  # a line of 17 points gets at most 5 coefficients, a line of 9 points at most 3
+FEWEST_POINTS = 2 * POINTS_PER_COEFFICIENT  # a straight line has two coefficients
+# Largest ratio to the stated noise: of the scatter of repeated readings, and of the residuals of the polynomials, which
+# contain the screw waves (on the shipped machine 15 times the noise of a rotation)
 MISFIT, LINES_MISFIT = 10.0, 100.0
 DIRECTIONS = (1, -1)  # forward, backward: the order of a field's polynomials
 
@@ -51,18 +52,18 @@ DIRECTIONS = (1, -1)  # forward, backward: the order of a field's polynomials
 class LineFit:
     """One polynomial and the quality of its fit."""
 
-    name: str  # of the line, or of the lines that share the polynomial
-    axis: int  # along which it runs
-    nodes: tuple[tuple[int, int], ...]  # indices across, in the order of CROSS_AXES, of each line that it represents
+    name: str  # name of the line, or of the lines that share the polynomial
+    axis: int  # index of the axis along which the line runs
+    nodes: tuple[tuple[int, int], ...]  # node indices of each line along its two CROSS_AXES
     component: int  # index into machine.field.COMPONENTS
-    direction: int  # 1, -1, or 0 for a line that was read in one direction, or in none, and represents both
+    direction: int  # 1 or -1; 0 if the line was not read in both directions: then the polynomial serves for both
     coordinates: np.ndarray  # (n,), along the axis, m in base
-    values: np.ndarray  # (n,), mean readings minus the datum and the other families' part, m or rad
+    values: np.ndarray  # (n,), mean readings without the datum and without the families fitted before, m or rad
     coefficients: np.ndarray  # (order + 1,), powers of u, which runs from -1 to 1 over the box
     r2: float
     adjusted_r2: float
     residual_std: float  # with n - order - 1 degrees of freedom, m or rad
-    repeat_std: float  # of one reading about its mean over the repeated ones; NaN where nothing was repeated
+    repeat_std: float  # standard deviation of repeated readings of one place, m or rad; NaN without repeats
 
     @property
     def order(self) -> int:
@@ -74,16 +75,16 @@ class LineFit:
 class LinesFit:
     """Result of scheme ``lines`` for a machine's readings."""
 
-    model: MachineModel  # the field; the rest is nominal, except the base if holding the datum moves it
+    model: MachineModel  # the field on a nominal machine, whose base may be moved to hold the datum
     measurements: MeasurementSet
     lines: tuple[LineFit, ...]
-    notes: tuple[str, ...]  # notes on odd, omitted or assumed inputs
+    notes: tuple[str, ...]  # notes on readings that were left out, and on assumptions
     held: HeldDatum
-    misfit: str = ""  # why the model is not to be trusted: repeats that scatter, or readings far off their polynomials
+    misfit: str = ""  # reason to refuse the model: repeats scatter too much, or residuals are too large; empty: none
 
 
 def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datum: Pose | None = None) -> LinesFit:
-    """Fit Mou & King's polynomials to a rectangular grid of lines: of the orders with the largest adjusted R²."""
+    """Fit Mou & King's polynomials to a rectangular grid of lines; their orders have the largest adjusted R²."""
     readings, notes = _grid_readings(measurements)
     grid = _grid_of(readings)
     nearest = [np.abs(readings.point[:, axis, None] - nodes).argmin(axis=1) for axis, nodes in enumerate(grid)]
@@ -94,20 +95,20 @@ def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datu
     zero = np.array([min(max(p, nodes[0]), nodes[-1]) for p, nodes in zip(point, grid, strict=True)])
     if beyond := [AXES[a] for a in range(3) if abs(point[a] - zero[a]) > LEAST_TRAVEL]:
         where = f"home lies outside the box along {', '.join(beyond)}"
-        notes.append(f"{where}: lines are zeroed at their end nearest to it")
+        notes.append(f"{where}: the polynomials are zero at the end of the box nearest to home")
     field, fits = _fit_families(readings, grid, measurements.probe, zero)
     if one_way := list(dict.fromkeys(fit.name for fit in fits if fit.direction == 0)):
-        what = "not read in both directions; what was read is used for both"
-        notes.append(f"{len(one_way)} lines were {what} (first: {one_way[0]})")
+        what = "lines were not read in both directions; their polynomials are used for both"
+        notes.append(f"{len(one_way)} {what} (first: {one_way[0]})")
     groups = np.unique(np.stack([measurements.run, measurements.channel]), axis=1, return_inverse=True)[1].ravel()
     means = np.bincount(groups, measurements.value) / np.bincount(groups)
     left = measurements.value - means[groups]
-    if np.abs(left).max() <= LEAST_NOISE:  # one kind without noise among others does not harm this scheme
+    if np.abs(left).max() <= LEAST_NOISE:  # refuse only if no kind of readings varies: this scheme needs no noise
         refuse_unmoved(measurements, left)
     note = (
-        "Scheme lines (Mou & King 1998): polynomials of an order chosen by adjusted-r2 along grid lines. Datum: "
-        "displacements and rotations are zero (mean of both directions) at home's coordinate along each line; "
-        "straightness without its straight line."
+        "Scheme lines (Mou & King 1998): polynomials along grid lines, their order chosen by adjusted R². Datum: the "
+        "mean of both directions of displacements and rotations is zero at home's coordinate along each line; the "
+        "least-squares line is subtracted from straightness."
     )
     model = MachineModel(
         machine=measurements.geometry.name,
@@ -120,7 +121,7 @@ def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datu
     model, held = hold(measurements.geometry, model, home if datum is None else datum, np.eye(6))
 
     def spread(name: str) -> dict[int, float]:
-        """Return the RMS of a figure of the polynomials of each kind of channel that have it."""
+        """Return the RMS of a standard deviation, an attribute of `LineFit`, for each kind of channel."""
         values: dict[int, list[float]] = {}
         for fit in fits:
             kind = "rotation" if fit.component >= 3 else "linear" if fit.component == fit.axis else "straightness"
@@ -138,30 +139,30 @@ def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datu
 
 
 class Readings(NamedTuple):
-    """Readings on grid lines; every array has one entry a reading."""
+    """Readings on grid lines; every array has one entry for each of N readings."""
 
-    axis: np.ndarray  # of the line
-    component: np.ndarray
-    direction: np.ndarray
+    axis: np.ndarray  # index of the axis along which the line runs
+    component: np.ndarray  # index into machine.field.COMPONENTS
+    direction: np.ndarray  # 1 forward, -1 backward, 0 not known
     run: np.ndarray
-    point: np.ndarray  # (N, 3), commanded place of the measured point in base, m
-    node: np.ndarray  # (N, 3), nearest node along each axis; along the line itself without meaning
+    point: np.ndarray  # (N, 3), commanded position of the measured point in base, m
+    node: np.ndarray  # (N, 3), index of the nearest node along each axis; has no meaning along the line
     value: np.ndarray  # m or rad
     sloping: np.ndarray  # whether the beam's slope is unknown
 
     def select(self, mask: np.ndarray) -> Readings:
-        """Return those in a mask or at indices."""
+        """Return the readings that a mask or an array of indices selects."""
         return Readings(*(array[mask] for array in self))
 
 
 def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
-    """Return the readings on lines parallel to an axis, and notes on omitted ones."""
+    """Return the readings on lines parallel to an axis of base, and notes on readings that were left out."""
     m, geometry, notes = measurements, measurements.geometry, list[str]()
     axis = np.array([-1 if run.base_axis is None else run.base_axis for run in m.runs])[m.run]
     others = [m.runs[r].name for r in np.unique(m.run[axis < 0])]
     if others:
-        what = "not parallel to an axis of base; scheme lines has no use for them"
-        notes.append(f"{len(others)} runs are {what} (first: {others[0]})")
+        what = "runs are not parallel to an axis of base; scheme lines does not use them"
+        notes.append(f"{len(others)} {what} (first: {others[0]})")
     if (axis < 0).all():
         raise CalibrationError("grid lines", "there are none: no run is parallel to an axis of base")
     weights = np.abs(m.directions())
@@ -169,7 +170,7 @@ def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
     if turned.any():
         first = int(turned.argmax())
         turned_by = np.degrees(np.arccos(np.clip(weights[first].max(), -1.0, 1.0)))
-        problem = f"is read across axes that are turned against those of base by {turned_by:.3g}°"
+        problem = f"is read along axes that are turned against the axes of base by {turned_by:.3g}°"
         hint = "scheme lines needs a work frame parallel to base, scheme joint does not"
         raise CalibrationError(f"run {m.runs[m.run[first]].name}", f"{problem}; {hint}")
     component = weights.argmax(axis=1)
@@ -180,20 +181,22 @@ def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
     axis, component, station = axis[kept], component[kept], m.station[kept]
     rotations = m.stations.rotations[station]
     if np.abs(rotations - rotations[0]).max() > 1e-9:
-        raise CalibrationError("grid lines", "must all be read at one attitude of the platform: the field has none")
+        problem = "must all be read at one attitude of the platform: the field does not depend on the attitude"
+        raise CalibrationError("grid lines", problem)
     low, high = m.stations.temperatures[station].min(), m.stations.temperatures[station].max()
     if max(REFERENCE_TEMPERATURE - low, high - REFERENCE_TEMPERATURE) > ASSUMED.least_warming:
-        notes.append(f"read at {low:.1f} to {high:.1f} °C; scheme lines models this growth as an error at 20 °C")
+        notes.append(f"read at {low:.1f} to {high:.1f} °C; scheme lines takes thermal growth for an error at 20 °C")
     there = m.stations.select(np.unique(station))
     nominal = strut_lengths_batch(Structure.of(geometry), there.positions, there.rotations)
     most = float(np.abs(there.commands - nominal).max())
     if most > COMPENSATED:
-        problem = f"were read under strut commands up to {most * 1e6:.1f} µm off the nominal lengths: compensated?"
-        raise CalibrationError("grid lines", f"{problem} Scheme lines needs readings of the uncompensated machine")
+        problem = f"were read at strut commands that differ by up to {most * 1e6:.1f} µm from the nominal lengths"
+        hint = "scheme lines needs readings of the uncompensated machine"
+        raise CalibrationError("grid lines", f"{problem}; {hint}")
     if most > FOLLOWED:
-        notes.append(f"strut commands are up to {most * 1e6:.2f} µm off the nominal lengths, and are taken for nominal")
+        notes.append(f"strut commands differ by up to {most * 1e6:.2f} µm from the nominal lengths: ignored")
     value = m.value
-    if geometry.screw_lead.any():  # the screws' turning is in every model of this geometry
+    if geometry.screw_lead.any():  # every model of this geometry corrects the rotation of the screws
         turning = station_errors(m, RealMachine(geometry, MachineModel(geometry.name)))
         value = value - (m.directions() * turning[m.station]).sum(axis=1)
     return Readings(
@@ -209,20 +212,21 @@ def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
 
 
 def _distinct(values: np.ndarray) -> np.ndarray:
-    """Return the sorted values, of those closer than :data:`LEAST_TRAVEL` only the first."""
+    """Return the sorted values without each value that is closer than :data:`LEAST_TRAVEL` to the one before."""
     ordered = np.unique(values)
     return ordered[np.append(True, np.diff(ordered) > LEAST_TRAVEL)]
 
 
 def _grid_of(readings: Readings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the nodes along x, y, z, m: the places of the lines, or their ends where none crosses."""
+    """Return the nodes along x, y, z, m: the coordinates of the lines that cross an axis, or the ends of its lines."""
     grid = []
     for axis, name in enumerate(AXES):
         along = readings.point[readings.axis == axis, axis]
         across = readings.point[readings.axis != axis, axis]
         nodes = _distinct(across) if len(across) else np.array([along.min(), along.max()])
         if len(nodes) < 2:
-            raise CalibrationError("grid", f"lines stand at one {name} only ({nodes[0] * 1e3:g} mm); two are needed")
+            problem = f"all lines have the same {name} ({nodes[0] * 1e3:g} mm); at least two values are needed"
+            raise CalibrationError("grid", problem)
         grid.append(nodes)
     return grid[0], grid[1], grid[2]
 
@@ -233,8 +237,10 @@ def _line_name(grid: Sequence[np.ndarray], axis: int, node: Sequence[int]) -> st
 
 
 def _check_complete(readings: Readings, grid: Sequence[np.ndarray]) -> None:
-    """Refuse a family of which a line, a channel of a line, or a line's end is missing: a polynomial is not valid
-    beyond its readings."""
+    """Refuse a grid in which a line, a channel of a line or an end of a line was not measured.
+
+    A polynomial is not valid beyond its readings.
+    """
     for axis in np.unique(readings.axis).tolist():
         family, cross = readings.select(readings.axis == axis), CROSS_AXES[axis]
         every = set(product(*(range(len(grid[a])) for a in cross)))
@@ -242,7 +248,7 @@ def _check_complete(readings: Readings, grid: Sequence[np.ndarray]) -> None:
             missing = every - set(map(tuple, family.node[family.component == component][:, cross].tolist()))
             if missing:
                 what = f"{COMPONENTS[component]} on the {_line_name(grid, axis, min(missing))}"
-                count = f"of {len(every)} lines of the rectangular grid {len(missing)} were not measured"
+                count = f"{len(missing)} of {len(every)} lines of the rectangular grid were not measured"
                 raise CalibrationError(what, f"is missing; {count}")
         low, high = grid[axis][0], grid[axis][-1]
         for node in sorted(every):
@@ -259,20 +265,17 @@ def _check_complete(readings: Readings, grid: Sequence[np.ndarray]) -> None:
 def _fit_families(
     readings: Readings, grid: tuple[np.ndarray, np.ndarray, np.ndarray], probe: np.ndarray, zero: np.ndarray
 ) -> tuple[GridField, list[LineFit]]:
-    """Return the field and its polynomials, fitted to one family of lines after the other for each component.
-
-    A displacement is fitted to the lines along its own axis first, a rotation to those along its own axis last.
-    """
+    """Return the field and its polynomials; each component is fitted to one family of lines after the other."""
     first, second, third = (np.zeros((2, len(grid[a]), len(grid[b]), 6, 0)) for a, b in CROSS_AXES)
     field, fits = GridField(grid, (first, second, third), probe=probe), list[LineFit]()
     for component in range(6):
         members, own = readings.select(readings.component == component), component % 3
-        # A displacement is best seen along its own axis; a rotation there is roll, and comes last.
+        # Lines along a displacement's own axis come first; lines along a rotation's own axis, where it is roll, last.
         families = sorted(np.unique(members.axis).tolist(), key=lambda axis: (axis == own) == (component >= 3))
         for axis in families:
             family, cross = members.select(members.axis == axis), CROSS_AXES[axis]
             family = family._replace(value=family.value - _predicted(field, family, component))
-            # Lines whose differences the first family has predicted share the residual.
+            # Lines that differ only in the first family's coordinate share a polynomial.
             apart = [a for a in cross if a != families[0]]
             together: dict[tuple[int, ...], list[tuple[int, int]]] = {}
             for i, j in product(*(range(len(grid[a])) for a in cross)):
@@ -291,7 +294,7 @@ def _fit_families(
 
 
 def _predicted(field: GridField, readings: Readings, component: int) -> np.ndarray:
-    """Return the errors that a field predicts for readings, shape (N,); an axis at rest has no direction."""
+    """Return one component of the field's error at each reading, shape (N,), m or rad."""
     predicted = np.zeros(len(readings.value))
     if not any(family[:, :, :, component].any() for family in field.lines):
         return predicted
@@ -305,10 +308,10 @@ def _predicted(field: GridField, readings: Readings, component: int) -> np.ndarr
 def _fit_line(
     group: Readings, name: str, nodes: tuple[tuple[int, int], ...], along: np.ndarray, zero: float
 ) -> list[LineFit]:
-    """Return the polynomials of a line's directions: two, or one when it was read in one direction only.
+    """Return a line's polynomials for both directions, or one polynomial if the line was read in one direction only.
 
-    They are functions of u, −1 at the first and 1 at the last node. Displacement and rotations are zero at a
-    coordinate, in the mean of both directions; straightness is left without the straight line through both.
+    They are functions of u, −1 at the first and 1 at the last node. Displacements and rotations are shifted so that the
+    mean of both directions is 0 at the coordinate `zero`; from straightness a common straight line is subtracted.
     """
     axis, component, sloping = int(group.axis[0]), int(group.component[0]), bool(group.sloping.any())
 
@@ -316,7 +319,7 @@ def _fit_line(
         return np.asarray((2.0 * coordinate - along[0] - along[-1]) / (along[-1] - along[0]))
 
     ways = sorted(set(group.direction.tolist()) - {0}, reverse=True) or [0]
-    group = group.select(np.isin(group.direction, ways))  # readings without direction are not used beside others
+    group = group.select(np.isin(group.direction, ways))  # readings of unknown direction only if there are no others
     values = _without_run_zeros(group, parameter(group.point[:, axis]), ways)
     place = _distinct(group.point[:, axis])
     number = np.abs(group.point[:, axis, None] - place).argmin(axis=1)
@@ -351,7 +354,7 @@ def _fit_line(
 
 
 def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> np.ndarray:
-    """Return values in which the runs have a common zero (and slope, where a beam's is unknown)."""
+    """Return the values with all runs shifted to a common zero (and turned to a common slope, for straightness)."""
     runs, run = np.unique(group.run, return_inverse=True)
     if len(runs) == 1:
         return group.value
@@ -366,20 +369,20 @@ def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> n
 
 
 def _averaged(values: np.ndarray, number: np.ndarray, places: int) -> np.ndarray:
-    """Return the mean reading at each place, NaN where there is none."""
+    """Return the mean of the values at each place, NaN at a place without values; `number` assigns them to places."""
     count = np.bincount(number, minlength=places)
     total = np.bincount(number, weights=values, minlength=places)
     return np.where(count, total / np.maximum(count, 1), np.nan)
 
 
 def _regress(u: np.ndarray, values: np.ndarray, name: str, reach: float) -> tuple[np.ndarray, float, float, float]:
-    """Return coefficients in powers of u, R², adjusted R² and the standard deviation of the residuals.
+    """Return the coefficients in powers of u, R², adjusted R² and the standard deviation of the residuals.
 
-    The order is that of the largest adjusted R², the lowest of equals.
+    The order has the largest adjusted R²; of orders with the same adjusted R², the lowest. `reach` is for the message.
     """
     count = len(u)
     if count < FEWEST_POINTS:
-        span = f"{count} points in a direction, over {1e3 * reach:.4g} mm"
+        span = f"{count} points in one direction, over {1e3 * reach:.4g} mm"
         wanted = f"{FEWEST_POINTS} are needed: one every {1e3 * reach / (FEWEST_POINTS - 1):.4g} mm or closer"
         raise CalibrationError(name, f"has {span}; {wanted} (step_mm of a campaign)")
     total, candidates = float(((values - values.mean()) ** 2).sum()), []
@@ -393,7 +396,7 @@ def _regress(u: np.ndarray, values: np.ndarray, name: str, reach: float) -> tupl
 
 
 def _with_family(field: GridField, axis: int, fits: Sequence[LineFit]) -> GridField:
-    """Return a field to whose family along an axis some polynomials were added."""
+    """Return the field with some polynomials added to its lines along an axis."""
     old = field.lines[axis]
     powers = max(old.shape[4], *(len(fit.coefficients) for fit in fits))
     family = np.zeros((*old.shape[:4], powers))

@@ -1,7 +1,7 @@
-"""Mistakes in taking readings: what may have been mixed up, and the readings with that corrected.
+"""Mistakes that a file of readings may contain, each with the readings as they are after its correction.
 
-They are one table, each row a mistake's name and the readings with this mistake corrected. Signs, units and labels of
-channels change readings alone; other frames and orders of angles change the poses at which they were taken.
+Wrong signs, units and labels of channels change the readings alone. Wrong frames and orders of angles change the poses
+at which the readings were taken.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_K
 from ..pose import angles_from_rotation, rotation_from_vector
 from ..virtual.instruments import compensated
 
-PARALLEL = 0.999  # cosine from which a line is parallel to an axis
+PARALLEL = 0.999  # a line is parallel to an axis if the cosine of the angle between them is larger
 
 FAMILIES = ("x lines", "y lines", "z lines", "other lines", "other runs")
-"""Families of runs, by direction in the work frame."""
+"""Families of runs: by the direction of a line in the work frame; `other runs` are no lines."""
 
 UNITS = {
     "length": (("µinch", 0.0254), ("0.1 µm", 0.1), ("0.01 mm", 10.0), ("mm", 1e3), ("nm", 1e-3)),
     "angle": (("arcsec", np.pi / 0.648), ("mrad", 1e3), ("mdeg", np.pi / 0.18)),
 }
-"""Units that readings may have though their file states µm or µrad."""
+"""Units in which readings may be although their file states µm or µrad, with their size in µm or µrad."""
 
 TURNS = ((1, "by 90°"), (2, "by 180°"), (3, "by -90°"))
 
 
 class Mistake(NamedTuple):
-    """One way in which readings may have been mixed up."""
+    """One mistake that a file of readings may contain."""
 
-    name: str  # "x lines, linear: sign reversed"
-    undone: Callable[[], MeasurementSet | None]  # the readings without it; None: these cannot have it
-    factor: np.ndarray = np.ones(len(KINDS))  # (kinds,): by which it changes the unit of each kind of channel
-    choices: float = 0.0  # logarithm of how many equally probable mistakes this one was chosen from
+    name: str  # for example "x lines, linear: sign reversed"
+    corrected: Callable[[], MeasurementSet | None]  # returns the corrected readings; None: the mistake is impossible
+    factor: np.ndarray = np.ones(len(KINDS))  # (kinds,): corrected value over value in the file, of each kind
+    choices: float = 0.0  # logarithm of the number of equally probable mistakes from which this one was selected
 
 
 def family_of_run(measurements: MeasurementSet) -> np.ndarray:
-    """Return the index into :data:`FAMILIES` of each run."""
+    """Return the index into :data:`FAMILIES` of each run, shape (runs,)."""
     axes = np.array([run.axis for run in measurements.runs]).reshape(-1, 3) @ measurements.geometry.work.rotation
     parallel = np.abs(axes) > PARALLEL
     family = np.where(parallel.any(axis=1), parallel.argmax(axis=1), 3)
@@ -53,9 +53,9 @@ def family_of_run(measurements: MeasurementSet) -> np.ndarray:
 
 
 def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
-    """Yield the mistakes that leave the poses as they are: signs, units and channels exchanged."""
+    """Yield the mistakes that do not change the poses: wrong signs, wrong units, and exchanged channels."""
     family, every = family_of_run(m)[m.run], np.ones(len(m), dtype=bool)
-    # Signs: of families, their kinds, and channels
+    # Reversed sign of a family of runs, of one kind of reading in it, and of a channel
     parts = list[tuple[str, np.ndarray]]()
     for number, name in enumerate(FAMILIES):
         members = family == number
@@ -72,7 +72,7 @@ def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
             parts += [(f"{FAMILIES[n]}, {CHANNELS[channel]}", members & (family == n)) for n in of_families]
     for name, members in parts:
         yield Mistake(f"{name}: sign reversed", partial(sign_reversed, m, members))
-    # Units: of each kind, those of lines together, and all
+    # Wrong unit of one kind of reading, of all kinds read along lines together, and of all kinds together
     present = np.unique(m.kind)
     angular = np.array([KINDS[k] in ANGULAR_KINDS for k in present])
     for which, meant, kinds in (("length", "µm", present[~angular]), ("angle", "µrad", present[angular])):
@@ -84,13 +84,13 @@ def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
             factors = np.where(np.isin(np.arange(len(KINDS)), chosen), factor, 1.0)
             title = f"{name}: {unit} in place of {meant}"
             yield Mistake(title, partial(m.with_values, factors[m.kind] * m.value), factors)
-    # Two channels of a kind exchanged, everywhere and in one family of runs
+    # Two channels of a kind exchanged, in all runs or in one family of runs
     for a, b in combinations(np.unique(m.channel), 2):
         if CHANNELS[a].partition("_")[0] != CHANNELS[b].partition("_")[0]:
             continue
         both = (m.channel == a) | (m.channel == b)
         common = [n for n in np.unique(family[both]) if {a, b} <= set(m.channel[family == n].tolist())]
-        # Along its own line a straightness is none
+        # Exchanged in all runs, a straightness would be along its own line, which no instrument reads
         along_lines = CHANNELS[a].startswith("straightness") and (family[both] < 3).any()
         for name, where in [("", every)] * (not along_lines) + [(f"{FAMILIES[n]}, ", family == n) for n in common]:
             channel = np.where(both & where, a + b - m.channel, m.channel)
@@ -98,10 +98,10 @@ def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
 
 
 def mistakes_of_check(m: MeasurementSet, model: MachineModel) -> Iterator[Mistake]:
-    """Yield what may be wrong with readings that check a model."""
+    """Yield the mistakes that check readings of a model may contain; they include a compensation wrongly on or off."""
     if has_nominal_commands(m):
         yield Mistake("taken with this model running (--compensated)", partial(compensated, m, model))
-        yield from (mistake for mistake in mistakes_of_place(m) if mistake.name.endswith(": exchanged"))
+        yield from (mistake for mistake in mistakes_of_poses(m) if mistake.name.endswith(": exchanged"))
     else:
         off = replace(m.stations, commands=_nominal(m))
         yield Mistake("taken with the compensation off", partial(replace, m, stations=off))
@@ -109,8 +109,8 @@ def mistakes_of_check(m: MeasurementSet, model: MachineModel) -> Iterator[Mistak
     yield from mistakes(m)
 
 
-def mistakes_of_place(m: MeasurementSet) -> Iterator[Mistake]:
-    """Yield the mistakes that change the poses: frames exchanged, mirrored and turned, other orders of angles."""
+def mistakes_of_poses(m: MeasurementSet) -> Iterator[Mistake]:
+    """Yield the mistakes that change the poses: axes exchanged or mirrored, frames turned, other orders of angles."""
     for a, b in combinations(range(3), 2):
         order = np.eye(3)
         order[[a, b]] = order[[b, a]]
@@ -125,16 +125,16 @@ def mistakes_of_place(m: MeasurementSet) -> Iterator[Mistake]:
     for axes in permutations(AXES):
         if axes != ("y", "x", "z"):  # R = Ry(β)·Rx(α)·Rz(γ)
             title = f"angles: turned about {', '.join(axes)} in turn"
-            yield Mistake(title, partial(_in_order, m, "".join(axes).upper()))
+            yield Mistake(title, partial(_with_angle_order, m, "".join(axes).upper()))
 
 
 def sign_reversed(m: MeasurementSet, members: np.ndarray) -> MeasurementSet:
-    """Return a set in which some readings, (N,), have the other sign."""
+    """Return the measurement set with the sign of the readings in the mask `members`, (N,), reversed."""
     return m.with_values(np.where(members, -m.value, m.value))
 
 
 def has_nominal_commands(m: MeasurementSet) -> bool:
-    """Return whether the struts' lengths equal those of the nominal machine at the poses: then nobody measured them."""
+    """Return whether all strut commands are the nominal strut lengths at the stations' poses (within 1 nm)."""
     return np.allclose(m.stations.commands, _nominal(m), rtol=0.0, atol=1e-9)
 
 
@@ -143,9 +143,9 @@ def _nominal(m: MeasurementSet) -> np.ndarray:
 
 
 def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> MeasurementSet:
-    """Return a set whose poses, lines and channels stand in axes that are columns of a signed permutation.
+    """Return the set corrected for a file whose x, y and z are the columns of `frame`, a signed permutation.
 
-    A mirrored file has the signs of its columns reversed, rotations among them, unless these are `axial` vectors.
+    A mirror of x reverses x and rotations about x; with `axial` it reverses x and rotations about y and z.
     """
     tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
     handed = round(float(np.linalg.det(frame)))
@@ -166,22 +166,22 @@ def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> Measu
     value = factor[m.channel] * m.value
     runs = tuple(replace(run, axis=in_base @ run.axis) for run in m.runs)
     renamed = replace(m, channel=channel[m.channel], value=value, centre=centre, runs=runs)
-    return _sent(renamed, *m.geometry.platform_poses(tips @ frame.T, turned), in_base)
+    return _at_poses(renamed, *m.geometry.platform_poses(tips @ frame.T, turned), in_base)
 
 
-def _in_order(m: MeasurementSet, order: str) -> MeasurementSet | None:
-    """Return a set whose angles were applied in another order; None where the tool was level."""
+def _with_angle_order(m: MeasurementSet, order: str) -> MeasurementSet | None:
+    """Return the measurement set with its angles applied in another order; None if no pose has two angles or more."""
     tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
     angles = angles_from_rotation(tools)
     if (np.abs(angles) > 1e-6).sum(axis=1).max() < 2:
         return None
     about = [rotation_from_vector(angles[:, [a]] * np.eye(3)[a]) for a in ("XYZ".index(axis) for axis in order)]
     turned = about[0] @ about[1] @ about[2]
-    return _sent(m, *m.geometry.platform_poses(tips, turned), np.eye(3))
+    return _at_poses(m, *m.geometry.platform_poses(tips, turned), np.eye(3))
 
 
-def _sent(m: MeasurementSet, positions: np.ndarray, rotations: np.ndarray, turn: np.ndarray) -> MeasurementSet:
-    """Return a set with other poses, and directions turned in the same way; measured strut lengths are kept."""
+def _at_poses(m: MeasurementSet, positions: np.ndarray, rotations: np.ndarray, turn: np.ndarray) -> MeasurementSet:
+    """Return the set at other platform poses, directions of motion rotated by `turn`; measured strut lengths stay."""
     moving = Passes(m.geometry, positions, rotations, m.stations.sense[:, :3] @ turn.T)
     commands = moving.nominal_commands() if has_nominal_commands(m) else m.stations.commands
     stations = replace(m.stations, positions=positions, rotations=rotations, commands=commands, sense=moving.senses())

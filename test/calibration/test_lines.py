@@ -251,18 +251,18 @@ def skewed(geometry: HexapodGeometry) -> MeasurementSet:
 
 
 REFUSED = {
-    r"dx on the x line at y 101.6, z 451.6 mm: is missing; of 15 lines .* 1 were": lambda m: m.select(
+    r"dx on the x line at y 101.6, z 451.6 mm: is missing; 1 of 15 lines": lambda m: m.select(
         ~line_of(m, "x line at y 101.6, z 451.6")
     ),
     r"x line at y 0.0, z 350.0 mm: is read from -203.2 to 177.8 mm": lambda m: m.select(
         ~(line_of(m, "x line at y 0.0, z 350.0") & (m.points()[m.station][:, 0] > 0.19))
     ),
-    r"has 5 points in a direction, over 406\.4 mm; 6 are needed: one every 81\.28 mm": lambda m: template(
+    r"has 5 points in one direction, over 406\.4 mm; 6 are needed: one every 81\.28 mm": lambda m: template(
         replace(QUIET, cell=0.1016, step=0.1016), m.geometry
     ),
-    "turned against those of base": lambda m: skewed(m.geometry),
+    "turned against the axes of base": lambda m: skewed(m.geometry),
     "at one attitude": with_a_tilted_line,
-    "compensated": lambda m: compensated(m, MachineModel(m.geometry.name, base_deviation=np.full((6, 3), 1e-5))),
+    "uncompensated machine": lambda m: compensated(m, MachineModel(m.geometry.name, base_deviation=np.full((6, 3), 1e-5))),
 }
 
 

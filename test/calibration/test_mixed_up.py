@@ -185,5 +185,5 @@ def test_the_evidence_of_a_common_mode_is_that_of_a_normal_distribution(readings
     rows, target, noise = fitted.rows * p.spread, fitted.problem.target, p.noise[fitted.problem.kind]
     plain = rows @ rows.T + np.diag(noise**2)
     with_mode = multivariate_normal.logpdf(target, cov=plain + np.outer(effect, effect) * (3.0 * mode.usual) ** 2)
-    gain = fitted._by_mode(effect, mode, 3.0, p).evidence - log_evidence(fitted.problem, p)
+    gain = fitted._mode_fit(effect, mode, 3.0, p).evidence - log_evidence(fitted.problem, p)
     assert gain == pytest.approx(with_mode - multivariate_normal.logpdf(target, cov=plain), rel=1e-6, abs=1e-6)
