@@ -498,11 +498,11 @@ class Estimation:
         unknowns += [of_square(n, scale[n], self.cells.lever[n], self.cells.group[n]) for n in self._squares]
         for lengths in self._lengths:
             n = lengths.members
-            expected[n], directions[n, :3], parts = lengths.seen(errors[n, :3], values[n], scale[n])
+            expected[n], directions[n, :3], parts = lengths.linearise(errors[n, :3], values[n], scale[n])
             unknowns += parts
         for frame in self._frames:
             n = frame.members
-            expected[n], directions[n], part = frame.seen(directions[n], errors[n], values[n], scale[n])
+            expected[n], directions[n], part = frame.linearise(directions[n], errors[n], values[n], scale[n])
             unknowns.append(part)
         return expected, unknowns
 

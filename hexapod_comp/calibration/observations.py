@@ -1,10 +1,11 @@
-"""Observations: cells of repeated readings, and the nuisance parameters of the instruments that read them.
+"""Observations: cells of repeated readings, and the nuisance parameters of the instruments.
 
-Nuisance are zeros, the slopes of beams, and the start of a length. A length is read from a centre c to the
-measured point p + e: it is |p + e − c| − |p − c₀| + zero longer than commanded, with c₀ the centre's place in the file.
-The centres of a run belong to one body, c = m + R·(c₀ − m) + δ, with m their mean. δ and R are fitted to the readings
-for every parameter vector (variable projection): a centre may be millimetres off its place, and errors need not be
-small compared with the length.
+Nuisance parameters are the unknown zeros of instruments, the slopes of straightness beams, the centres of lengths and
+the frames of trackers. A length is measured from a centre c to the measured point p + e. It exceeds the commanded
+length by |p + e − c| − |p − c₀| + zero, where c₀ is the centre's position in the file. All centres of a run belong to
+one body: c = m + R·(c₀ − m) + δ, with m their mean. δ and R are fitted to the readings for every parameter vector
+(variable projection). So a centre may be millimetres off its position in the file, and errors need not be small
+compared with the length.
 """
 
 from __future__ import annotations
@@ -21,31 +22,31 @@ from ..measurements.readings import ABSOLUTE_KINDS, KINDS, LEAST_TRAVEL, LENGTH,
 from ..pose import rotation_from_vector, rotation_vector
 from .assumptions import ASSUMED
 
-FAR = 5.0  # a centre further off its stated place is refused, σ of its prior
-UNMOVED = 1e-3  # change of lengths by a body's motion that hardly shows it: a circle's centre
-FRAME_STATIONS = 4  # tracker runs with fewer stations share a frame: six unknowns need three
-FRAME_RANK = 1e-9  # smaller relative motions of readings are rounding
+FAR = 5.0  # a centre that is more than FAR standard deviations of its prior off its position in the file is refused
+UNMOVED = 1e-3  # if a unit motion of a body changes its lengths by less (RMS), they hardly determine this motion
+FRAME_STATIONS = 4  # tracker runs with fewer stations share a frame; its six unknowns need at least three stations
+FRAME_RANK = 1e-9  # singular values below this share of the largest are rounding
 
 ROUNDS, SETTLED = 20, 1e-10
-"""Most Gauss–Newton steps to a body's place, and the step, m, at which it has converged."""
+"""Largest number of Gauss–Newton steps to the pose of a body, and the step, m, below which it has converged."""
 
 
 class Nuisance(NamedTuple):
-    """The unknowns of one channel of one run, in units of the standard deviation of its cells."""
+    """The nuisance parameters of one group of cells, in units of the cells' standard deviation."""
 
-    members: np.ndarray  # (n,): Its cells
-    basis: np.ndarray  # (n, k): Orthonormal directions of the cells' values that the unknown moves
-    share: np.ndarray  # (k,): Share of each that the unknown explains, 0…1; the rest remains for the machine
+    members: np.ndarray  # (n,): Numbers of the cells
+    basis: np.ndarray  # (n, k): Orthonormal directions in which the nuisance parameters change the cells' values
+    share: np.ndarray  # (k,): Share of each direction that the nuisance parameters explain, 0…1; 1: all of it
 
     def explained(self, values: np.ndarray) -> np.ndarray:
-        """Return the most probable contribution of the unknown to its cells' values, shape (n,)."""
+        """Return the part of the cells' values, (n,), that the nuisance parameters most probably explain."""
         return self.basis @ (self.share * (self.basis.T @ values[self.members]))
 
     def project_out(self, values: np.ndarray, where: np.ndarray | slice | None = None) -> None:
-        """Subtract from the cells' values, (C,) or (C, n), in place, the part that the unknown may explain.
+        """Project the nuisance parameters out of the cells' values, (C,) or (C, n), in place.
 
-        Values with the covariance I + B·Bᵀ, B the unknown's columns in its standard deviations, become values with the
-        covariance I. `where` gives the positions of the cells' values if they are not at their numbers.
+        Values with the covariance I + B·Bᵀ, where B are the nuisance columns times their standard deviations, get the
+        covariance I. `where` gives the rows of the cells' values, if these are not the cells' numbers.
         """
         where = self.members if where is None else where
         weight = 1.0 - np.sqrt(1.0 - self.share)
@@ -54,7 +55,7 @@ class Nuisance(NamedTuple):
 
 
 def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: np.ndarray) -> Nuisance:
-    """Return the slope that groups of cells share, free of their zeros."""
+    """Return the nuisance slope that several groups of cells share, with the zero of each group projected out."""
     slope = scale * lever
     for own in (group == n for n in np.unique(group)):
         zero = scale[own] / np.linalg.norm(scale[own])
@@ -63,7 +64,7 @@ def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: 
 
 
 class Zeros:
-    """Groups of cells with an unknown zero each, and the slope along a line where `along`, (C,), is not NaN."""
+    """Groups of cells with one unknown zero each, and an unknown slope each where `along`, (C,), m, is not NaN."""
 
     def __init__(self, groups: Sequence[np.ndarray], along: np.ndarray) -> None:
         self._order = np.concatenate(groups) if groups else np.zeros(0, dtype=int)
@@ -81,7 +82,7 @@ class Zeros:
         return np.repeat(of_group, self._count)
 
     def unknowns(self, scale: np.ndarray) -> list[Nuisance]:
-        """Return them for cells whose values have one over these standard deviations, (C,)."""
+        """Return the nuisance parameters of all groups; `scale`, (C,), is one over the cells' standard deviations."""
         if not self.groups:
             return []
         zero = scale[self._order]
@@ -98,37 +99,37 @@ class Zeros:
 
 @dataclass(frozen=True)
 class Lengths:
-    """The lengths of one run."""
+    """The lengths of one run, whose centres belong to one body of unknown pose."""
 
-    name: str  # Of the run
-    members: np.ndarray  # (n,): Cells
-    points: np.ndarray  # (n, 3): Commanded place of the measured point, m in ``base``
-    centres: np.ndarray  # (n, 3): Stated place from which its length is read, m in ``base``
+    name: str  # Name of the run
+    members: np.ndarray  # (n,): Numbers of the cells
+    points: np.ndarray  # (n, 3): Commanded position of the measured point, m in ``base``
+    centres: np.ndarray  # (n, 3): Position of the centre in the file, from which the length is read, m in ``base``
     known_zero: bool  # Whether the lengths are calibrated
 
     @property
     def count(self) -> int:
-        """Number of the unknowns."""
+        """Number of nuisance parameters."""
         return (not self.known_zero) + (6 if self._arms().any() else 3)
 
     def _arms(self) -> np.ndarray:
-        """Return the centres minus their mean, shape (n, 3), m; exactly zero where all are one point."""
+        """Return the centres minus their mean, shape (n, 3), m; exactly zero if all centres are one point."""
         arms = self.centres - self.centres.mean(axis=0)
         return arms if np.abs(arms).max() > LEAST_TRAVEL else np.zeros_like(arms)
 
-    def seen(
+    def linearise(
         self, displacement: np.ndarray, value: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
-        """Return the information in these lengths, once their body is at its most probable place.
+        """Return the predicted changes of length (n,), the directions of errors that cause them, and the nuisance.
 
-        Where the residual of the lengths is larger than their noise, it is used as the noise. Otherwise, far from the
-        solution, a circle's centre would be moved out of its plane, where it hardly changes the lengths, to explain the
-        machine's errors.
+        The body of the centres is first moved to its most probable pose. Residuals larger than the noise count as the
+        noise: otherwise, far from the solution, a circle's centre would move out of the circle's plane, where it hardly
+        changes the lengths, to explain the machine's errors.
         """
         known = 0 if self.known_zero else 1
         zero = Nuisance(self.members, (scale / np.linalg.norm(scale))[:, None][:, :known], np.ones(known))
         arms = self._arms()
-        size = float(np.linalg.norm(arms, axis=1).max()) or 1.0  # m; turns are counted by how far they move a centre
+        size = float(np.linalg.norm(arms, axis=1).max()) or 1.0  # m: a turn counts as the way of the farthest centre
         nominal = np.linalg.norm(self.points - self.centres, axis=1)
         root = self._prior(arms / size)
         body, turn = np.zeros(6), np.eye(3)
@@ -149,17 +150,17 @@ class Lengths:
             turn = rotation_from_vector(step[3:] / size) @ turn
             body = np.concatenate([body[:3] + step[:3], size * rotation_vector(turn)])
         if np.abs(body[:3]).max() > FAR * ASSUMED.centre:
-            shown = ", ".join(f"{v * 1e3:.1f}" for v in body[:3])
-            problem = f"the lengths of run {self.name} put their centre {shown} mm (in base) off its place in the file"
-            wanted = f"it must be known to {FAR * ASSUMED.centre * 1e3:g} mm"
-            raise CalibrationError("centre", f"{problem}; {wanted}; do places, units and commanded poses fit?")
+            shift = ", ".join(f"{v * 1e3:.1f}" for v in body[:3])
+            problem = f"by the lengths of run {self.name} it is {shift} mm (in base) off its position in the file"
+            wanted = f"at most {FAR * ASSUMED.centre * 1e3:g} mm is allowed"
+            raise CalibrationError("centre", f"{problem}; {wanted}; check centres, units and commanded poses")
         u, s, _ = np.linalg.svd(columns / noise, full_matrices=False)
-        # Relative to the file's place, the prior's mean: otherwise an offset from it would cost nothing.
-        seen = distance - nominal - columns @ off / scale
-        return seen, n, [zero, Nuisance(self.members, u, s**2 / (1.0 + s**2))]
+        # The prior's mean is the position in the file: without this term a centre's offset from it would cost nothing.
+        predicted = distance - nominal - columns @ off / scale
+        return predicted, n, [zero, Nuisance(self.members, u, s**2 / (1.0 + s**2))]
 
     def _prior(self, arms: np.ndarray) -> np.ndarray:
-        """Return the root of the covariance of the body's place and turn, shape (6, 6), m; `arms` have the size 1."""
+        """Return a root of the prior covariance of the body's shift and turn, (6, 6), m; the largest arm is 1 long."""
         n = self.points - self.centres
         n /= np.linalg.norm(n, axis=1, keepdims=True)
         columns = np.hstack([n, np.cross(arms, n)])
@@ -171,34 +172,33 @@ class Lengths:
 
 @dataclass(frozen=True)
 class Frame:
-    """The place of a tracker: readings of one set-up, in a frame that is only roughly the work frame.
+    """The readings of one set-up of a tracker, whose frame is only roughly the work frame.
 
-    A frame off by the rotation R and the shift d about c shows the point p + e at c + Rᵀ·(p + e − c − d), and the
-    attitude error r as that of Rᵀ·exp(r). R and d are fitted for every parameter vector; no prior holds them near the
-    nominal ones.
+    In a frame that is off by the rotation R about a point c and by the shift d, the point p + e is read at
+    c + Rᵀ·(p + e − c − d), and the attitude exp(r) is read as Rᵀ·exp(r). R and d are fitted for every parameter vector,
+    without a prior.
     """
 
-    members: np.ndarray  # (n,): cells
-    points: np.ndarray  # (n, 3): commanded place of the measured point, m in base
+    members: np.ndarray  # (n,): numbers of the cells
+    points: np.ndarray  # (n, 3): commanded position of the measured point, m in base
 
-    def seen(
+    def linearise(
         self, directions: np.ndarray, errors: np.ndarray, value: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, Nuisance]:
-        """Return the predicted values of these cells, the directions (n, 6) of errors that change them, and the six
-        unknowns.
+        """Return the predicted values of the cells, the directions (n, 6) of errors that change them, and the nuisance.
 
-        `directions` (n, 6) are those of a right frame, `errors` (n, 6) those of the machine, `value` and `scale` (n,)
-        what was read and one over its standard deviation.
+        `directions` (n, 6) are valid for R = I; `errors` (n, 6) are the machine's, m and rad; `value` (n,) are the
+        readings and `scale` (n,) is one over their standard deviation.
         """
         centre = self.points.mean(axis=0)
-        size = float(np.linalg.norm(self.points - centre, axis=1).max()) or 1.0  # m; turns are counted by it
+        size = float(np.linalg.norm(self.points - centre, axis=1).max()) or 1.0  # m: a turn counts as the farthest way
         shift, turn, attitude = np.zeros(3), np.eye(3), rotation_from_vector(errors[:, 3:])
         for _ in range(ROUNDS):
             away = self.points + errors[:, :3] - centre - shift
             shown = centre + away @ turn - self.points
             turned = rotation_vector(turn.T @ attitude)
             expected = (directions[:, :3] * shown).sum(axis=1) + (directions[:, 3:] * turned).sum(axis=1)
-            moving = directions[:, 3:] + 0.5 * np.cross(turned, directions[:, 3:])  # of a rotation vector, by a turn
+            moving = directions[:, 3:] + 0.5 * np.cross(turned, directions[:, 3:])  # change of `turned` by a small turn
             along = np.hstack([directions[:, :3] @ turn.T, moving @ turn.T])
             turning = np.cross(away, along[:, :3]) + along[:, 3:]
             u, s, v = np.linalg.svd(-scale[:, None] * np.hstack([along[:, :3], turning / size]), full_matrices=False)
@@ -213,24 +213,24 @@ class Frame:
 
 @dataclass(frozen=True)
 class Cells:
-    """Readings of one channel at one station are one cell: they differ by noise only."""
+    """The cells of a measurement set: repeated readings of one channel at one station, which differ by noise only."""
 
     of_reading: np.ndarray  # (N,): Cell of each reading
     first: np.ndarray  # (C,): First reading of each cell
-    station: np.ndarray  # (C,): Of each cell
-    channel: np.ndarray  # (C,): Of each cell
-    kind: np.ndarray  # (C,): Of each cell
-    group: np.ndarray  # (C,): One channel of one run, whose unknowns its cells share; -1: absolute readings have none
-    directions: np.ndarray  # (C, 6): w of each cell; of a length, from its centre's place in the file
+    station: np.ndarray  # (C,): Station of each cell
+    channel: np.ndarray  # (C,): Index into CHANNELS of each cell
+    kind: np.ndarray  # (C,): Index into KINDS of each cell
+    group: np.ndarray  # (C,): Number of the channel of a run whose zero the cell shares; -1: an absolute reading
+    directions: np.ndarray  # (C, 6): Direction of errors that the cell reads; a length's is from its centre in the file
     along: np.ndarray  # (C,): Commanded coordinate along the line, m
-    lever: np.ndarray  # (C,): Its change by a square's rotation, m per rad
-    square: np.ndarray  # (C,): Number of the square and its axis whose slope it has; -1: its group has its own, or none
+    lever: np.ndarray  # (C,): Change of the cell's value by a rotation of its optical square, m per rad
+    square: np.ndarray  # (C,): Number of the optical square and its axis that give the slope; -1: no shared slope
     # (C,): Fold of cross-validation: a line's run, a ball bar's circle, or a scattered pose
     fold: np.ndarray
 
     @staticmethod
     def of(measurements: MeasurementSet) -> Cells:
-        """Return the cells of a set."""
+        """Return the cells of a measurement set."""
         m = measurements
         centre = different_rows(np.nan_to_num(m.centre))[1]
         first, of_reading = different_rows(np.stack([m.station, m.channel, centre], axis=1))
@@ -259,7 +259,7 @@ class Cells:
         )
 
     def groups(self, measurements: MeasurementSet) -> tuple[Zeros, list[Lengths]]:
-        """Return the channels of runs that have a zero, and their slopes along lines; and lengths."""
+        """Return the groups of cells with an unknown zero, and the lengths of each run; absolute readings have none."""
         c, m = self, measurements
         points = m.points()
         zeros, lengths = list[np.ndarray](), list[Lengths]()
@@ -279,13 +279,12 @@ class Cells:
         return Zeros(zeros, along), lengths
 
     def squares(self) -> list[np.ndarray]:
-        """Return, for each square and axis, all cells of the groups whose slope is that of the square about the
-        axis."""
+        """Return for each optical square and axis the cells of all groups whose slope its rotation gives."""
         numbers = np.unique(self.square[self.square >= 0])
         return [np.flatnonzero(np.isin(self.group, self.group[self.square == n])) for n in numbers]
 
     def frames(self, measurements: MeasurementSet) -> list[Frame]:
-        """Return the set-ups of trackers: runs of position and attitude; those of few stations are one set-up."""
+        """Return the set-ups of trackers, one for each run; runs of fewer than FRAME_STATIONS stations share one."""
         m, absolute = measurements, np.flatnonzero(self.group < 0)
         run, points = m.run[self.first[absolute]], m.points()
         for n in np.unique(run):
@@ -295,7 +294,7 @@ class Cells:
 
 
 def _left_out_whole(measurements: MeasurementSet) -> np.ndarray:
-    """Return which runs are left out as a whole, shape (runs,): lines, and circles of one length about one centre."""
+    """Return which runs cross-validation leaves out as a whole, (runs,): lines, and ball-bar circles of one centre."""
     m = measurements
     whole = np.array([run.is_line for run in m.runs])
     of_length = m.channel == LENGTH

@@ -44,7 +44,7 @@ def ball(points: int, radius: float, centre: np.ndarray) -> np.ndarray:
 def left_of(lengths: Lengths, displacement: np.ndarray, value: np.ndarray) -> np.ndarray:
     """Return what is left of lengths, m, once their unknowns have explained what they can."""
     scale = np.full(len(value), 1.0 / UM)
-    expected, _, unknowns = lengths.seen(displacement, value, scale)
+    expected, _, unknowns = lengths.linearise(displacement, value, scale)
     left = scale * (value - expected)
     for unknown in unknowns:
         left[unknown.members] -= unknown.explained(left)
@@ -83,7 +83,7 @@ def test_a_centre_at_another_place_is_refused() -> None:
     points = ball(30, 0.2, centre)
     lengths = Lengths("bar 3", np.arange(30), points, np.tile(centre, (30, 1)), False)
     read = np.linalg.norm(points - centre - [0.05, 0.0, 0.0], axis=1)
-    with pytest.raises(CalibrationError, match=r"run bar 3 put their centre .* must be known to 25 mm"):
+    with pytest.raises(CalibrationError, match=r"by the lengths of run bar 3 .* at most 25 mm is allowed"):
         left_of(lengths, np.zeros((30, 3)), read - 0.2)
 
 

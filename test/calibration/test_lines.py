@@ -262,7 +262,7 @@ REFUSED = {
     ),
     "turned against the axes of base": lambda m: skewed(m.geometry),
     "at one attitude": with_a_tilted_line,
-    "uncompensated machine": lambda m: compensated(m, MachineModel(m.geometry.name, base_deviation=np.full((6, 3), 1e-5))),
+    "uncompensated": lambda m: compensated(m, MachineModel(m.geometry.name, base_deviation=np.full((6, 3), 1e-5))),
 }
 
 
