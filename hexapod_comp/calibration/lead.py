@@ -18,6 +18,7 @@ from .blocks import WAVES
 from .estimator import MEDIAN_TO_SIGMA, Estimation, LinearProblem, Posterior, at_once, solve
 
 LEAST_FREEDOM = 200.0  # with fewer degrees of freedom no period is searched for
+MOST_STEPS = 8  # Newton steps to the best frequency: they converge quadratically, the clipping of outliers linearly
 MOST_READINGS = 2500  # of larger sets a random sample of this size is searched first
 WAVE_AMPLITUDE = 10e-6  # standard deviation of the amplitudes' prior while periods are compared, m
 # The detected lead agrees with a given or a round lead if they differ by less than AGREES standard errors; with a given
@@ -130,14 +131,14 @@ class _Residuals:
 
     def __init__(self, estimation: Estimation, problem: LinearProblem, posterior: Posterior) -> None:
         over_noise = 1.0 / posterior.noise[problem.kind]
-        self._problem, self._posterior, self._over_noise = problem, posterior, over_noise
-        residuals = over_noise * (problem.target - problem.rows.times(posterior.every(problem.rows.shape[1])))
-        limit = ASSUMED.huber * MEDIAN_TO_SIGMA * np.median(np.abs(residuals))
-        self.residuals = np.clip(residuals, -limit, limit)
+        self._unknowns, self._covariance = problem.unknowns, posterior.covariance
+        self._rows, self._target = problem.rows.using(posterior.used, over_noise), over_noise * problem.target
+        self._fit = self._target - self._beyond(self._target)  # without waves
+        self.residuals = _clipped(self._target - self._fit)
         self.gains = over_noise[:, None] * problem.per_length
         self.commands = estimation.measurements.stations.commands[estimation.cells.station]
         self.span = float(np.ptp(self.commands, axis=0).max())
-        self.square = float(self.residuals @ self.residuals)
+        self.square = float((self._fit + self.residuals) @ self._beyond(self._fit + self.residuals))
         self.freedom = float(problem.freedom.sum() - posterior.determined.sum())
         self._size = 2 ** int(np.ceil(np.log2(4.0 * self.span / GRID_STEP + 1.0)))
         frequencies = np.arange(self._size // 2 + 1) / (self._size * GRID_STEP)
@@ -153,14 +154,23 @@ class _Residuals:
             power += np.abs(line) ** 2 / max(0.5 * gain @ gain, np.finfo(float).tiny)
         return power
 
+    def _beyond(self, values: np.ndarray) -> np.ndarray:
+        """Return values (C,) minus their fit by all parameters except the waves, within the priors."""
+        return values - self._rows.times(self._covariance @ self._rows.transposed_times(values))
+
     def line(self, frequency: float, harmonics: int = MOST_HARMONICS) -> Line:
-        """Return the best line near `frequency`, with at most `harmonics` harmonics and all other parameters free."""
+        """Return the best line near `frequency`, with at most `harmonics` harmonics and all other parameters free.
+
+        Residuals are clipped about the fit with the waves of the previous step (Huber's modified residuals). Clipped
+        about a fit without waves, large waves would lose their peaks, and the frequency would be biased.
+        """
         harmonics = int(np.clip(1.0 / (SHORTEST * frequency), 1, harmonics))
         parameters = 12 * harmonics + 1
-        half_width, start = 0.5 / self.span, frequency
-        for _ in range(4):
-            less, step, deviation = self._step_to(frequency, harmonics)
-            noise = np.sqrt(max(self.square - less, 1e-6 * self.square) / (self.freedom - parameters))
+        half_width, start, fit = 0.5 / self.span, frequency, self._fit
+        for _ in range(MOST_STEPS):
+            values = fit + _clipped(self._target - fit)
+            fit, square, step, deviation = self._step_to(frequency, harmonics, values)
+            noise = np.sqrt(np.square(values - fit).sum() / (self.freedom - parameters))
             error = noise * deviation
             step = float(np.clip(step, -half_width, half_width))
             if abs(frequency + step - start) > half_width:
@@ -168,58 +178,62 @@ class _Residuals:
             frequency += step
             if abs(step) < 0.1 * error:  # Newton converges quadratically: a further step would be far smaller
                 break
-        return Line(frequency, error, self._odds(less, parameters), noise)
+        # Each of the further parameters costs 1 (Akaike).
+        odds = 0.5 * self.freedom * float(np.log(self.square / square)) - parameters
+        return Line(frequency, error, odds, noise)
 
-    def _odds(self, less: float, parameters: int) -> float:
-        """Return the log odds of `parameters` more parameters that lower the sum of squares by `less` (Akaike)."""
-        remaining = max(self.square - less, 1e-6 * self.square)
-        return 0.5 * self.freedom * float(np.log(self.square / remaining)) - parameters
+    def _step_to(self, frequency: float, harmonics: int, values: np.ndarray) -> tuple[np.ndarray, float, float, float]:
+        """Fit waves of a frequency and all other parameters to values (C,).
 
-    def _step_to(self, frequency: float, harmonics: int) -> tuple[float, float, float]:
-        """Return how much waves of a frequency lower the sum of squares, the Newton step, and its error at noise 1.
-
-        If the readings cannot distinguish this frequency from others, the step is zero and its error infinite.
+        Return the fit (C,), the sum of squares that remains (residuals and priors), the Newton step of the frequency,
+        and the step's standard error at noise 1. If the readings cannot distinguish this frequency from others, the
+        step is zero and its error infinite.
         """
         orders = np.arange(1, harmonics + 1)
         first = np.exp(2.0j * np.pi * frequency * self.commands)[:, None]
         turns = np.cumprod(np.repeat(first, harmonics, axis=1), axis=1)
         c, s = self.gains[:, None] * turns.real, self.gains[:, None] * turns.imag
         waves = self._free(np.concatenate([c, s], axis=1).reshape(len(c), -1))
-        shared = self._shared(waves)
-        amplitudes, less, covariance = self._solved(waves, shared)
-        noise = max(self.square - less, 1e-6 * self.square) / (self.freedom - amplitudes.size)
-        a, b = _shrunk(amplitudes.reshape(2, -1, 6), noise * covariance)
+        shared = self._rows.transposed_times(waves)
+        beyond = self._beyond(values)
+        amplitudes, covariance = self._solved(waves, shared, beyond)
+        residual = beyond - self._beyond(waves @ amplitudes)
+        square = float(values @ residual)
+        variance = float(residual @ residual) / (self.freedom - amplitudes.size)
+        a, b = _shrunk(amplitudes.reshape(2, -1, 6), variance * covariance)
         turning = 2.0 * np.pi * self.commands[:, None] * orders[:, None]
         slope = self._free(((b * c - a * s) * turning).sum(axis=(1, 2))[:, None])
-        every = np.hstack([waves, slope]), np.hstack([shared, self._shared(slope)])
-        together, _, covariance = self._solved(*every, loose=1)
+        every = np.hstack([waves, slope]), np.hstack([shared, self._rows.transposed_times(slope)])
+        together, covariance = self._solved(*every, beyond, loose=1)
         if not covariance[-1, -1] > 0.0:
-            return less, 0.0, np.inf
-        return less, float(together[-1]), float(np.sqrt(covariance[-1, -1]))
+            return values - residual, square, 0.0, np.inf
+        return values - residual, square, float(together[-1]), float(np.sqrt(covariance[-1, -1]))
 
     def _free(self, columns: np.ndarray) -> np.ndarray:
         """Return columns with the instruments' nuisance parameters projected out."""
-        for part in self._problem.unknowns:
+        for part in self._unknowns:
             part.project_out(columns)
         return columns
 
-    def _shared(self, columns: np.ndarray) -> np.ndarray:
-        """Return the products of columns (C, n) with the cells' derivatives by the fit's parameters, (used, n)."""
-        return self._problem.rows.transposed_times(self._over_noise[:, None] * columns)[self._posterior.used]
+    def _solved(
+        self, columns: np.ndarray, shared: np.ndarray, beyond: np.ndarray, loose: int = 0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the factors of columns (C, n) fitted to `beyond`, (C,), and their covariance.
 
-    def _solved(self, columns: np.ndarray, shared: np.ndarray, loose: int = 0) -> tuple[np.ndarray, float, np.ndarray]:
-        """Return the fitted factors of columns (C, n), by how much they lower the sum of squares, and their covariance.
-
-        `shared` is `_shared(columns)`. The fit's other parameters are free within their priors; the factors of the last
-        `loose` columns have no prior.
+        `beyond` is from :meth:`_beyond`; `shared` holds the products of the columns with the derivatives by the fit's
+        other parameters, which are free within their priors; the factors of the last `loose` columns have no prior.
         """
-        precision = columns.T @ columns - shared.T @ self._posterior.covariance @ shared
+        precision = columns.T @ columns - shared.T @ self._covariance @ shared
         tight = len(precision) - loose
         precision[np.diag_indices(tight)] += WAVE_AMPLITUDE**-2
         covariance = np.linalg.pinv(precision, hermitian=True)
-        moment = columns.T @ self.residuals
-        factors = covariance @ moment
-        return factors, float(moment @ factors), covariance
+        return covariance @ (columns.T @ beyond), covariance
+
+
+def _clipped(residuals: np.ndarray) -> np.ndarray:
+    """Return residuals limited to the size from which on Huber's weights are below 1."""
+    limit = ASSUMED.huber * MEDIAN_TO_SIGMA * np.median(np.abs(residuals))
+    return np.clip(residuals, -limit, limit)
 
 
 def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:

@@ -429,6 +429,15 @@ def test_leads_of_all_sizes_are_read_off(seed: int, true: float):
     assert lead.used == pytest.approx(true * MM, rel=1e-3)
 
 
+def test_waves_far_above_the_noise_do_not_bias_the_lead():
+    """30 µm at 0.2 µm noise, beside a length map: residuals clipped about a fit without waves had lost their peaks, and
+    the lead was 190 standard errors off."""
+    measured = of_waves(3, wave=(30e-6, 45e-6), wave_period=10.0 * MM, length_map=2e-6)
+    lead = lead_of(measured, replace(HARMONICS, blocks=BLOCKS))
+    assert lead.shown == pytest.approx(10.0 * MM, abs=4.0 * lead.error)
+    assert lead.error < 1e-4 * lead.shown
+
+
 def test_round_leads_are_taken_as_such():
     """10 mm, and 0.5 in: leads are made so. 3.7 mm is taken as it is shown, as is what is not known well enough."""
     shown = [ScrewLead(None, value * MM, 2e-6, 100.0).used for value in (10.0031, 12.6985, 3.7)]
