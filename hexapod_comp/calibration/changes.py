@@ -1,7 +1,8 @@
-"""What may have happened to a machine since its fit, weighed by Bayes factors of a few check readings.
+"""Possible changes of a machine since its fit, compared by the Bayes factors of a few check readings.
 
-The readings of an unchanged machine scatter about its model by N(0, S), S = J·Σ·Jᵀ + noise. A change moves parameters
-by A·θ, θ ~ N(0, s²), with several scales s, equally likely: under it they are N(0, S + s²·J·A·Aᵀ·Jᵀ).
+Readings of an unchanged machine deviate from its model by N(0, S), with S = J·Σ·Jᵀ + noise, J their derivatives by the
+parameters and Σ the parameters' covariance. A change moves the parameters by A·θ, θ ~ N(0, s²), where several scales s
+are equally likely. Readings of a machine with this change are N(0, S + s²·J·A·Aᵀ·Jᵀ).
 """
 
 from __future__ import annotations
@@ -30,43 +31,43 @@ from .posterior import FittedParameters, box_stations
 from .sensitivity import derivatives, predict
 from .trust import TILT
 
-MOST_READINGS = 500  # of a check; more are a calibration
-UNCHANGED_DRAWS = 4000  # machines drawn to find the false alarms: 1 % to ± 0.16 %
+MOST_READINGS = 500  # largest number of readings of a check; more are a calibration
+UNCHANGED_DRAWS = 4000  # number of unchanged machines drawn, which gives a false alarm rate of 1 % to ± 0.16 %
 DATUM, STRUT, TEMPERATURE, PAYLOAD = "datum", "strut", "temperature", "payload"
 AGEING, READING, OTHER = "ageing", "reading", "other"
-# Kinds of change with their names. Few readings can repair all but payload and the last two.
+# Kinds of change and their names. A few readings can correct the model for all kinds but the payload and the last two.
 FAMILIES = {
     DATUM: "the datum has moved",
     STRUT: "a strut's offset has changed",
-    TEMPERATURE: "a temperature acts",
+    TEMPERATURE: "a temperature has changed",
     PAYLOAD: "the payload has changed",
     AGEING: "the whole machine has aged",
     READING: "a single reading is wrong",
-    OTHER: "it has changed in a way that none of these explains",
+    OTHER: "the machine has changed in another way",
 }
 
-HEAVIER = "heavier or lighter"  # the name of a change of the payload in its centre
-# weight relative to the trace: parameters that represent a payload then stay small at the corners of the box too
+HEAVIER = "heavier or lighter"  # name of a change of the payload's mass whose centre of mass stays
+# Ridge relative to the trace of the normal matrix, so that the parameters that represent a payload stay small
 RIDGE = 1e-8
-LEAST_MASS = 1e-3  # kg, of a platform after a change of the payload
-ROUNDING = 1e-9  # directions of readings or effects that are smaller, relative to the largest, are rounding
+LEAST_MASS = 1e-3  # smallest mass of the platform after a change of the payload, kg
+ROUNDING = 1e-9  # relative size below which a singular value, or a distance in m, counts as rounding error
 
 
 @dataclass(frozen=True)
 class Change:
-    """One possible change: parameters move by `columns`·θ, θ ~ N(0, scale²)."""
+    """A possible change of a machine: its parameters move by `columns`·θ, θ ~ N(0, scale²)."""
 
-    family: str  # of FAMILIES
+    family: str  # kind of change, a key of FAMILIES
     name: str
-    scales: np.ndarray  # (m,): standard deviations of θ
-    columns: np.ndarray | None = None  # (size, k), SI; None: readings have changed, not the machine
-    # label, factor, unit of each θ; empty: they have no meaning one by one
+    scales: np.ndarray  # (m,): standard deviations of θ, equally likely
+    columns: np.ndarray | None = None  # (size, k), SI; None: an error of readings, not a change of the machine
+    # Label, factor from SI and unit of each θ for reports; empty if a single θ has no physical meaning
     shown: tuple[tuple[str, float, str], ...] = ()
-    group: str = ""  # similar changes of a kind; all groups of a kind are equally likely beforehand
+    group: str = ""  # group of similar changes; all groups of a kind are equally likely before the readings
 
 
 def widened(fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS) -> FittedParameters:
-    """Return a fit's result in a space with more blocks; these are zero and, so far, certain."""
+    """Return a fit's result in a space with more blocks, whose parameters are zero and have zero covariance."""
     old = fitted.space
     kept = {block.name for block in old.blocks}
     settings = replace(old.settings, blocks=tuple(name for name in BLOCKS if name in kept or name in blocks))
@@ -81,8 +82,7 @@ def widened(fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS) -> Fitte
 
 
 def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Change]:
-    """Return the possible changes of a machine, in a space that has all blocks; the blocks of its fit, `modelled`, may
-    age."""
+    """Return the possible changes of a machine in a space that has all blocks; the fitted blocks `modelled` may age."""
     geometry, unit = space.geometry, np.eye(space.size)
     start, count = space.blocks[0].part.start, int(space.platform_groups.max()) + 1
     base = start + np.arange(18).reshape(6, 3)
@@ -93,7 +93,7 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
     def shown(names: Sequence[str], factor: float = 1e6, what: str = "µm") -> tuple[tuple[str, float, str], ...]:
         return tuple((name, factor, what) for name in names)
 
-    # The datum turns about the box's centre; a turn is counted by how far it moves the box's corners.
+    # The datum turns about the box's centre; the θ of a turn is the distance, m, by which it moves the box's corners.
     size = 0.5 * float(np.linalg.norm(np.ptp(space.work_box, axis=0))) or 1.0
     arms, rigid = geometry.base_joints - space.places(space.work_box.mean(axis=0)), np.zeros((space.size, 6))
     for n, axis in enumerate(geometry.work.rotation.T):
@@ -113,37 +113,35 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
     for name, labels, columns in (
         ("struts", ["struts"], grown[:, :1]),
         ("base", ["base"], grown[:, 1:2]),
-        ("all alike", ["all"], grown.sum(axis=1, keepdims=True)),
-        ("each by itself", bodies, grown),
+        ("all parts equally", ["all"], grown.sum(axis=1, keepdims=True)),
+        ("each part separately", bodies, grown),
     ):
         changes.append(Change(TEMPERATURE, name, growths, columns, shown(labels, 1e6, "ppm")))
 
     changes += payload_changes(space)
 
-    # Ageing and a bend can represent each other: if one's scales were coarser, the other would win, whichever is true.
+    # Ageing and a bend of the field have similar effects. With coarser scales for either, the other would always win.
     prior = space.physical(np.diag(space.spread(space.start_tolerances())))
     owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
     aged, bend = prior[:, np.isin(owner, modelled)], prior[:, np.isin(owner, ("field displacement", "field rotation"))]
-    changes.append(Change(AGEING, "all of it, a little", np.array(ASSUMED.aged), aged))
+    changes.append(Change(AGEING, "small changes of all parameters", np.array(ASSUMED.aged), aged))
     for body, joints in (("base", base), ("platform", platform)):
         for n, places in enumerate(joints, start=1):
             changes.append(Change(OTHER, f"{body} joint {n}", lengths, unit[:, places], shown(AXES), "joints"))
     for name, ends, what in (("pitch", ASSUMED.worn_pitch, "ppm"), ("backlash", ASSUMED.worn_backlash, "µm")):
-        for strut, column in zip(STRUT_NAMES, unit.T[owner == name], strict=False):  # no such block: none
-            screw = Change(
-                OTHER, f"{name} of {strut}", np.array(ends), column[:, None], shown([strut], 1e6, what), "screws"
-            )
-            changes.append(screw)
+        for strut, column in zip(STRUT_NAMES, unit.T[owner == name], strict=False):  # nothing without the block `name`
+            label = shown([strut], 1e6, what)
+            changes.append(Change(OTHER, f"{name} of {strut}", np.array(ends), column[:, None], label, "screws"))
     changes.append(Change(OTHER, "a smooth bend in space", np.array(ASSUMED.bent), bend, group="bend"))
     return changes
 
 
 def payload_changes(space: ParameterSpace) -> list[Change]:
-    """Return a change of the payload, in the machine's centre or beside it, as parameters with the same effect.
+    """Return changes of the payload's mass, and of mass and centre, as parameters that move the tool in the same way.
 
-    The stretch of struts under a weight is a smooth function of the pose; over the measured box, level and tilted, the
-    most probable parameters with that effect represent it. Where no stiffness is stated, all struts have an assumed
-    one, and masses are those for this stiffness.
+    The stretch of struts under a weight is a smooth function of the pose. The most probable parameters that have this
+    effect on poses of the measured box, level and tilted, represent it. If no stiffness is stated, the struts have
+    ASSUMED.stiffness, and the reported masses hold for this stiffness. No box: no changes.
     """
     stations = [box_stations(space, tilt) for tilt in (0.0, TILT)]
     if stations[0] is None or stations[1] is None:
@@ -151,7 +149,7 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
     load, zero, parts = stated_load(space.settings), np.zeros(space.size), []
     known = bool(load.stiffness.all())
     compliance = load.compliance if known else np.full(6, 1.0 / ASSUMED.stiffness)
-    aside = across(space, load)
+    aside = arms_across_gravity(space, load)
     for at in filter(None, stations):
         prediction = predict(space, zero, at)
         linkage = Linkage(prediction, space.probe, at)
@@ -163,7 +161,7 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
     rows, errors = (np.concatenate(each) for each in zip(*parts, strict=True))
     rows[:, 3:] *= space.geometry.characteristic_length
     errors[:, 3:] *= space.geometry.characteristic_length
-    # none that depends on load or warmth
+    # Blocks whose errors depend neither on load nor on temperature
     smooth = ("structure", "pitch", "map", "field displacement", "field rotation")
     owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
     prior = space.physical(np.diag(space.spread(space.start_tolerances())))[:, np.isin(owner, smooth)]
@@ -176,69 +174,72 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
     shown = (("mass", 1.0, unit), *((f"moment {n}", radius, unit.replace("kg", "kg m", 1)) for n in (1, 2)))
     return [
         Change(PAYLOAD, HEAVIER, sizes, columns[:, :1], shown[:1]),
-        Change(PAYLOAD, "with its centre elsewhere too", sizes, columns, shown),
+        Change(PAYLOAD, "mass and its centre", sizes, columns, shown),
     ]
 
 
-def heavier(space: ParameterSpace, change: np.ndarray) -> ParameterSpace:
-    """Return the parameters of the same machine with a payload changed as in :func:`payload_changes`, (1 or 3,)."""
+def with_payload_change(space: ParameterSpace, change: np.ndarray) -> ParameterSpace:
+    """Return the space of the same machine with a payload changed by θ of :func:`payload_changes`, (1 or 3,)."""
     load, aside = stated_load(space.settings), np.append(change[1:], np.zeros(3 - len(change)))
     mass = max(load.mass + change[0], LEAST_MASS)
-    moment = load.mass * load.centre + space.level.T @ (across(space, load).T @ aside)
+    moment = load.mass * load.centre + space.level.T @ (arms_across_gravity(space, load).T @ aside)
     other = copy.copy(space)
     other.settings = replace(space.settings, load=replace(load, mass=mass, centre=moment / mass).numbers())
     return other
 
 
-def across(space: ParameterSpace, load: Load) -> np.ndarray:
-    """Return the two arms across gravity in base, of the machine's size, beside which a payload may sit, (2, 3), m."""
+def arms_across_gravity(space: ParameterSpace, load: Load) -> np.ndarray:
+    """Return two vectors in base, perpendicular to gravity and each other, as long as the machine's size, (2, 3), m."""
     arms: np.ndarray = space.geometry.characteristic_length * np.linalg.svd(load.gravity[None])[2][1:]
     return arms
 
 
 def consistency(cut: float) -> float:
-    """Return E[min(|z|, cut)²] of a standard normal z: the variance that Huber's proposal 2 finds of good readings."""
+    """Return E[min(|z|, cut)²], z ~ N(0, 1): the variance that Huber's proposal 2 estimates from normal residuals."""
     return float(chdtr(3, cut**2) + cut**2 * chdtrc(1, cut**2))
 
 
 def reading_noise(fitted: FittedParameters) -> np.ndarray:
-    """Return the factor on the stated standard deviation of single readings of each kind, (kinds,), by a fit."""
+    """Return the fitted standard deviation of one reading of each kind over the stated one, (kinds,)."""
     return fitted.noise / np.sqrt(consistency(ASSUMED.huber) if fitted.space.settings.robust else 1.0)
 
 
 @dataclass(frozen=True)
 class CheckReadings:
-    """Check readings with the prediction of a model and its fit, as n numbers free of the instruments' unknowns."""
+    """Check readings as n independent numbers, free of the instruments' unknowns, and their prediction by a fit.
 
-    residuals: np.ndarray  # (n,): deviations from the fit's prediction, in standard deviations
-    rows: np.ndarray  # (n, size): derivatives by the parameters
-    noise: np.ndarray  # (n, n): their covariance if the machine is known
-    single: np.ndarray  # (n, places): effect of one reading that is wrong by one of its standard deviations
-    names: tuple[str, ...]  # of the places
-    seen: np.ndarray = field(repr=False)  # (n, places): the numbers, as orthonormal combinations of the places
-    kind: np.ndarray  # (places,): kind of channel
-    weights: csr_array = field(repr=False)  # (places, N): of readings in the value of their place, in its deviations
-    # What a change of the payload, (1 or 3,), does to the numbers, where a lost motion makes that no straight line
+    Readings of one channel at one place are a cell. The numbers are orthonormal combinations of the cells' values.
+    """
+
+    residuals: np.ndarray  # (n,): numbers minus the fit's prediction, over the stated standard deviation
+    rows: np.ndarray  # (n, size): derivatives of the numbers by the parameters
+    noise: np.ndarray  # (n, n): covariance of the numbers if the parameters are exact
+    single: np.ndarray  # (n, cells): effect on the numbers if a cell is wrong by one standard deviation
+    names: tuple[str, ...]  # names of the cells
+    seen: np.ndarray = field(repr=False)  # (n, cells): the orthonormal combinations
+    kind: np.ndarray  # (cells,): kind of channel
+    weights: csr_array = field(repr=False)  # (cells, N): weight of each reading in its cell's value over its deviation
+    # Effect on the numbers of a change θ of the payload, (1 or 3,); None if it is linear (no lost motion)
     loaded: Callable[[np.ndarray], np.ndarray] | None = field(default=None, repr=False)
 
     @staticmethod
     def of(fitted: FittedParameters, measurements: MeasurementSet, x: np.ndarray | None = None) -> CheckReadings:
-        """Return readings with a fit in a space that has all blocks; linearised at `x` if given."""
+        """Return the numbers and their prediction by a fit in a space with all blocks, linearised at `x` or the fit."""
         space = fitted.space
         away = float(np.abs(measurements.probe - space.probe).max())
         if away > ROUNDING:
-            problem = f"are of a point {away * 1e3:.4g} mm from that of the fit; give its place (--probe-mm)"
+            problem = f"are of a point {away * 1e3:.4g} mm away from the point of the fit; give it (--probe-mm)"
             raise CalibrationError("measurements", problem)
         estimation = Estimation(measurements, space, alone=False)
         cells = estimation.cells
         if len(cells.kind) > MOST_READINGS:
-            problem = f"{len(cells.kind)} readings at distinct places are no check"
-            raise CalibrationError("measurements", f"{problem} (at most {MOST_READINGS}); fit them")
+            problem = f"{len(cells.kind)} readings at distinct places are too many for a check"
+            raise CalibrationError("measurements", f"{problem} (at most {MOST_READINGS}); fit a model to them")
         linear, _ = estimation.linearise(fitted.x if x is None else x, np.ones(len(measurements)), unsettled=False)
         free, sizes, _ = np.linalg.svd(estimation.free_of_nuisance(np.eye(len(cells.kind))))
         seen = free[:, sizes > ROUNDING * sizes.max(initial=0.0)].T
         if not len(seen):
-            problem = "determine nothing: the zeros of their runs account for all of them; read more places of each run"
+            problem = "determine nothing: the unknown zeros of the runs explain them all; read more places in each run"
             raise CalibrationError("measurements", problem)
         rows, sigma = seen @ space.unwhitened(linear.rows.dense()), reading_noise(fitted)[cells.kind]
         m = measurements
@@ -251,13 +252,14 @@ class CheckReadings:
         noise, prediction = (seen * sigma**2) @ seen.T, predict(space, fitted.x, m.stations)
         if prediction.load.lost_motion.any():
             gains, deviations = estimation.of_unsettled(prediction)
-            at = cells.station[:, None] == np.unique(cells.station)  # a strut's end is one for all cells of a station
+            # At one station, all cells have each strut at the same end of its lost motion.
+            at = cells.station[:, None] == np.unique(cells.station)
             ends = np.einsum("cn,cs->cns", at, gains * deviations).reshape(len(cells.kind), -1)
             unsettled = seen @ estimation.free_of_nuisance(ends)
             noise += unsettled @ unsettled.T
 
         def loaded(change: np.ndarray) -> np.ndarray:
-            moved = predict(heavier(space, change), fitted.x, m.stations).errors - prediction.errors
+            moved = predict(with_payload_change(space, change), fitted.x, m.stations).errors - prediction.errors
             of_cells = (cells.directions * moved[cells.station]).sum(axis=1)
             return seen @ estimation.free_of_nuisance(of_cells[:, None])[:, 0]
 
@@ -274,32 +276,31 @@ class CheckReadings:
         )
 
     def changed_by(self, values: np.ndarray) -> CheckReadings:
-        """Return these readings with other values, (N,), of channels whose directions do not depend on the values."""
+        """Return the check after `values`, (N,), are added to readings whose directions do not depend on values."""
         return replace(self, residuals=self.residuals + self.seen @ (self.weights @ values))
 
     def covariance(self, of_parameters: np.ndarray) -> np.ndarray:
-        """Return the readings' covariance for a covariance of the parameters, shape (n, n)."""
+        """Return the covariance of the numbers for a covariance of the parameters, shape (n, n)."""
         return self.noise + self.rows @ of_parameters @ self.rows.T
 
     def chi_square(self, of_parameters: np.ndarray | float = 0.0) -> float:
-        """Return the squared deviations over the expected ones for a covariance of the parameters, per number."""
+        """Return χ² per number for a covariance of the parameters, by default zero (exact parameters)."""
         covariance = self.noise if np.isscalar(of_parameters) else self.covariance(np.asarray(of_parameters))
         return float(self.residuals @ np.linalg.solve(covariance, self.residuals)) / len(self.residuals)
 
     def log_density(self, of_parameters: np.ndarray, residuals: np.ndarray | None = None) -> float:
-        """Return the logarithm of the density of the readings, or of other residuals, of an unchanged machine."""
+        """Return the log density of the residuals, by default those of the readings, for an unchanged machine."""
         covariance, r = self.covariance(of_parameters), self.residuals if residuals is None else residuals
         square = float(r @ np.linalg.solve(covariance, r))
         return -0.5 * (square + float(np.linalg.slogdet(covariance)[1]) + len(r) * math.log(2.0 * math.pi))
 
     @property
     def freedom(self) -> np.ndarray:
-        """How many of the numbers are of each kind of channel, (kinds,)."""
+        """The number of degrees of freedom of each kind of channel, (kinds,); their sum is n."""
         return np.bincount(self.kind, (self.seen**2).sum(axis=0), len(KINDS))
 
     def effects(self, changes: Sequence[Change], of_parameters: np.ndarray) -> Iterator[tuple[Change, np.ndarray]]:
-        """Yield the possible explanations with their effects (n, k): changes, one wrong reading, or more scatter in
-        all."""
+        """Yield each explanation with its effect (n, k): each change, each wrong reading, scatter of all readings."""
         for change in changes:
             effect = self.rows @ change.columns
             if change.family == PAYLOAD and self.loaded is not None:
@@ -310,10 +311,10 @@ class CheckReadings:
     def _secant(
         self, change: Change, slope: np.ndarray, covariance: np.ndarray, exact: Callable[[np.ndarray], np.ndarray]
     ) -> np.ndarray:
-        """Return an effect that is exact at the most probable change: Broyden's update of its slope.
+        """Return `slope` after Broyden's update, so that the effect is exact at the most probable change θ.
 
-        The signs of forces give the likelihood steps and several maxima, so Nelder and Mead's search starts from the
-        best of several changes.
+        The likelihood has steps and several maxima where a strut's force changes its sign. Therefore the search is that
+        of Nelder and Mead, from the best of several values of θ.
         """
         inverse, most = np.linalg.inv(covariance), float(change.scales.max())
 
@@ -323,9 +324,8 @@ class CheckReadings:
 
         weighted = slope.T @ inverse
         starts = [np.linalg.solve(weighted @ slope + np.eye(len(weighted)) / most**2, weighted @ self.residuals)]
-        starts += [
-            way * size * np.eye(len(weighted))[0] for size in (*change.scales, 0.5 * most) for way in (-1.0, 1.0)
-        ]
+        first = np.eye(len(weighted))[0]
+        starts += [way * size * first for size in (*change.scales, 0.5 * most) for way in (-1.0, 1.0)]
         best = min(starts, key=unlikely)
         simplex = best + np.vstack([np.zeros(len(best)), np.eye(len(best))])
         theta = minimize(
@@ -336,43 +336,43 @@ class CheckReadings:
 
 
 def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
-    """Yield that one of some readings is wrong, or all scatter, by the effect (n, places) of a standard deviation."""
+    """Yield for each cell that it is wrong, then that all scatter; `single`, (n, cells): effect of 1 σ of each cell."""
     for name, column in zip(names, single.T, strict=True):
         yield Change(READING, name, np.array(ASSUMED.wrong_reading)), column[:, None]
-    yield Change(OTHER, "each reading by itself", np.array(ASSUMED.scattered), group="scatter"), single
+    yield Change(OTHER, "larger scatter of all readings", np.array(ASSUMED.scattered), group="scatter"), single
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A change in coordinates in which the readings of an unchanged machine are N(0, 1)."""
+    """A change in whitened coordinates, in which the readings of an unchanged machine are N(0, 1)."""
 
     change: Change
-    directions: np.ndarray  # (n, k), orthonormal
-    gains: np.ndarray  # (k,): effect of θ = 1 along them
-    least_gain: float  # of all θ; 0 where one moves no reading
-    log_prior: float = 0.0  # of each of its scales
+    directions: np.ndarray  # (n, k): orthonormal directions in which the change moves the readings
+    gains: np.ndarray  # (k,): singular values of the effect of θ along the directions
+    least_gain: float  # smallest effect of any θ of size 1; 0 if some θ moves no reading
+    log_prior: float = 0.0  # log prior probability of each scale of the change
 
     @staticmethod
     def of(change: Change, effect: np.ndarray, log_prior: float = 0.0) -> Hypothesis:
-        """Return a change with its effect (n, k) on whitened readings."""
-        if effect.shape[1] == 1:  # most of them: no need to decompose
+        """Return the hypothesis of a change with its effect (n, k) on whitened readings."""
+        if effect.shape[1] == 1:  # most changes: one column needs no decomposition
             gains = np.linalg.norm(effect, axis=0)
             directions = effect / (gains or 1.0)
         else:
             directions, gains, _ = np.linalg.svd(effect, full_matrices=False)
-        felt = gains > ROUNDING * max(gains.max(initial=0.0), 1.0)
-        least = float(gains.min(initial=np.inf)) if felt.sum() == effect.shape[1] else 0.0
-        return Hypothesis(change, directions[:, felt], gains[felt], least, log_prior)
+        kept = gains > ROUNDING * max(gains.max(initial=0.0), 1.0)
+        least = float(gains.min(initial=np.inf)) if kept.sum() == effect.shape[1] else 0.0
+        return Hypothesis(change, directions[:, kept], gains[kept], least, log_prior)
 
     def log_bayes_factors(self, z: np.ndarray) -> np.ndarray:
-        """Return log evidence over that of no change for whitened readings (N, n), scale by scale: (N, m)."""
+        """Return the log Bayes factor of the change over no change for N sets of whitened readings (N, n): (N, m)."""
         grown = np.outer(self.change.scales**2, self.gains**2)
         along = (z @ self.directions) ** 2
         return 0.5 * (along @ (grown / (1.0 + grown)).T - np.log1p(grown).sum(axis=1))
 
 
 class Evidence:
-    """Changes with their effects (n, k) on readings whose covariance is known for an unchanged machine."""
+    """Bayes factors of changes with effects (n, k) on readings; `covariance` (n, n) holds for an unchanged machine."""
 
     def __init__(self, covariance: np.ndarray, effects: Iterable[tuple[Change, np.ndarray]]) -> None:
         self._whitening = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -386,20 +386,19 @@ class Evidence:
             self.hypotheses.append(Hypothesis.of(change, self._whitening @ effect, log_prior))
 
     def log_weights(self, readings: np.ndarray) -> list[np.ndarray]:
-        """Return the log weight of each hypothesis over that of no change for sets of readings (N, n): (N, m) each."""
+        """Return log(prior · Bayes factor over no change) of each hypothesis for N sets of readings (N, n): (N, m)."""
         return self._of_whitened(readings @ self._whitening.T)
 
     def log_evidence(self, readings: np.ndarray) -> float:
-        """Return the log evidence of a machine that may have changed, with even prior odds, over that of no change."""
-        return float(
-            np.logaddexp.reduce([0.0, *np.concatenate(self.log_weights(readings[None]), axis=1)[0]])
-        ) - math.log(2.0)
+        """Return the log Bayes factor of "changed or not, with even prior odds" over "not changed"."""
+        weights = np.concatenate(self.log_weights(readings[None]), axis=1)[0]
+        return float(np.logaddexp.reduce([0.0, *weights])) - math.log(2.0)
 
     def _of_whitened(self, z: np.ndarray) -> list[np.ndarray]:
         return [h.log_bayes_factors(z) + h.log_prior for h in self.hypotheses]
 
     def probability_unchanged(self, readings: np.ndarray) -> float:
-        """Return the share of checks in which an unchanged machine's readings deviate as much as these, or more."""
+        """Return the p-value: share of checks of an unchanged machine with at least these odds of a change."""
         z = np.random.default_rng(11).standard_normal((UNCHANGED_DRAWS, len(readings)))
         z = np.vstack([self._whitening @ readings, z])
         changed = np.logaddexp.reduce(np.concatenate(self._of_whitened(z), axis=1), axis=1)
@@ -408,14 +407,14 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Explanation:
-    """Mean and covariance of the parameters' difference from the fit's under one explanation of the readings."""
+    """Mean and covariance of parameters minus the fit's parameters, under one explanation of the check readings."""
 
     mean: np.ndarray  # (size,), SI
     covariance: np.ndarray  # (size, size)
 
     @staticmethod
     def of(check: CheckReadings, fitted: FittedParameters, change: Change | None, scale: float = 0.0) -> Explanation:
-        """Return the parameters' posterior given the readings and a change of one scale; None: no change."""
+        """Return the parameters' posterior given the readings and a `change` of one `scale`; None: no change."""
         prior = fitted.covariance
         if change is not None and change.columns is not None:
             prior = prior + scale**2 * change.columns @ change.columns.T

@@ -1,4 +1,4 @@
-"""Is a model still valid, and if not: what has happened, and can few readings renew the model?"""
+"""Check a model with a few readings: is it still valid, which change is most probable, can the readings renew it?"""
 
 from __future__ import annotations
 
@@ -50,24 +50,24 @@ class Candidate:
     """A possible change, and its probability given the readings."""
 
     change: Change
-    probability: float  # among all changes, given that there is one
-    scale: float  # the most probable of its scales
-    coefficients: np.ndarray  # (k,): size of each θ of Change.shown, SI; empty where they have no meaning one by one
-    deviations: np.ndarray  # (k,): their standard errors
+    probability: float  # given that exactly one change has happened
+    scale: float  # most probable scale of the change
+    coefficients: np.ndarray  # (k,): estimate of each θ of Change.shown, SI; empty if Change.shown is
+    deviations: np.ndarray  # (k,): standard errors of the coefficients
 
     @property
     def family(self) -> str:
-        """The change's kind, one of FAMILIES."""
+        """Kind of the change, a key of FAMILIES."""
         return self.change.family
 
     @property
     def name(self) -> str:
-        """The change's name."""
+        """Name of the change."""
         return self.change.name
 
     @property
     def sizes(self) -> list[dict[str, Any]]:
-        """Each displayed θ: name, value, standard_error and unit, for JSON and text."""
+        """Name, value, standard_error and unit of each θ of Change.shown, for JSON and text."""
         return [
             {"name": label, "value": value * factor, "standard_error": deviation * factor, "unit": unit}
             for (label, factor, unit), value, deviation in zip(
@@ -78,36 +78,36 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Verification:
-    """Result of check readings for a model.
+    """Result of the check of a model with a few readings.
 
     Attributes
     ----------
     model : MachineModel
-        The model.
+        The checked model.
     measurements : MeasurementSet
-        The readings.
+        The check readings.
     independent : int
-        Number of independent values: readings minus their instruments' unknowns (zeros, slopes, frames).
+        Number of independent values: readings minus the unknowns of their instruments (zeros, slopes, frames).
     chi_square : float
-        Their squared differences from the model over those to expect of an unchanged machine, per number.
+        χ² per independent value against the model, with the covariance expected for an unchanged machine.
     usual : float
-        In which share of checks an unchanged machine reads as strangely as this.
+        Share of checks in which readings of an unchanged machine deviate as much as these (p-value).
     false_alarms : float
-        It is called changed where that is no more than this.
+        Significance level: the machine counts as changed if `usual` is not larger.
     families : dict of str to float
-        Probability of each kind of change, given that there is one.
+        Probability of each kind of change, given that one change has happened.
     candidates : tuple of Candidate
-        The best of each kind, the most probable kind first.
+        Most probable change of each kind, sorted by the probability of the kind.
     visible : dict of str to float
-        Smallest change that is surely seen, of the datum and a strut, m, and by a temperature, m/m; infinite where
-        some are not seen at all.
+        Smallest change that the readings detect for certain: of the datum and of any strut, m, and growth by
+        temperature, m/m; infinite if some change of the kind has no effect on the readings.
     tool : tuple of float or None
-        What the most probable change does to the tool: RMS displacement as the machine stands and with the datum
-        aligned, m; None where it is no change of the machine, or the model has no box.
+        RMS displacement of the tool by the most probable change, without and with the datum aligned, m; None if a
+        reading is wrong rather than the machine changed, or if the model has no box.
     settling : tuple of Settling
-        Where it is undecided: readings that would tell the two most probable kinds apart.
+        If the verdict is undecided: readings that would best distinguish the two most probable kinds.
     doubts : tuple of str
-        What the readings may be instead, by name: of an unchanged machine, in another unit, with another sign, ….
+        Mistakes (a wrong unit, a wrong sign, …) that would explain the readings of an unchanged machine.
     """
 
     model: MachineModel
@@ -140,23 +140,23 @@ def verify_model(
     measurements: MeasurementSet,
     false_alarms: float = ASSUMED.false_alarms,
 ) -> Verification:
-    """Return whether a model still holds, and if not, the most probable change.
+    """Return whether a model is still valid and, if not, the most probable change of the machine.
 
     Parameters
     ----------
     model, fitted : MachineModel, FittedParameters
-        The model, and what its fit knows (:func:`~.posterior.load_posterior`).
+        The model, and the parameters of its fit with their covariance (:func:`~.posterior.load_posterior`).
     measurements : MeasurementSet
-        Check readings, at best 6 to 20, spread over the box.
+        Check readings, preferably 6 to 20, spread over the box.
     false_alarms : float
-        Share of unchanged machines that may be called changed.
+        Share of unchanged machines that may be reported as changed.
 
     Raises
     ------
     CalibrationError
-        Readings of another point than the fit's, readings that determine nothing, or too many of them.
+        If the readings are of another point than the fit's, determine nothing, or are more than 500.
     ModelError
-        A share of false alarms that is none.
+        If `false_alarms` is not between 0 and 1.
     """
     if not 0.0 < false_alarms < 1.0:
         raise ModelError("false_alarms", "must be above 0 and below 1", false_alarms)
@@ -188,24 +188,24 @@ def verify_model(
 
 
 def _beyond_loads(model: MachineModel, fitted: FittedParameters, readings: MeasurementSet) -> list[str]:
-    """Return notes on readings taken under loads outside the model's, with the tool error predicted there."""
+    """Return notes on readings under loads that the model was not measured with, and the tool error predicted then."""
     found, usual = dict[str, str](), Unexplained(believed=ASSUMED.jackknife_prior)
     for row in measured_loads(model.load, readings.geometry, readings.stations):
-        said = beyond_loads(model.origin.loads, Payload(row[0], (row[1], row[2], row[3])), row[4:])
-        if said and said not in found:
+        load = beyond_loads(model.origin.loads, Payload(row[0], (row[1], row[2], row[3])), row[4:])
+        if load and load not in found:
             errors = box_errors(fitted.space, fitted.x, load=row) if model.load.stiffness.all() else None
-            there = expected_error(errors, fitted.covariance, beyond=usual)
-            found[said] = "" if there is None else f"; there the model, told so, leaves up to {um(there.high)} (95 %)"
-    return [f"read under another load than the model: {said}{promised}" for said, promised in found.items()]
+            error = expected_error(errors, fitted.covariance, beyond=usual)
+            found[load] = "" if error is None else f"; predicted tool error with it: up to {um(error.high)} (95 %)"
+    return [f"read under another load than the model: {load}{promise}" for load, promise in found.items()]
 
 
 def _misread(
     check: CheckReadings, fitted: FittedParameters, evidence: Evidence, model: MachineModel, m: MeasurementSet
 ) -> list[str]:
-    """Return the names of mistakes after whose correction the readings are probably those of an unchanged machine.
+    """Return the names of mistakes whose correction makes the readings probable for an unchanged machine.
 
-    Each is judged by its Bayes factor over the uncorrected readings of a machine that may have changed. The best is
-    returned with those that the readings do not distinguish from it, as in :func:`.mixups.mixups`.
+    The criterion is a Bayes factor: corrected readings of an unchanged machine over uncorrected readings of a machine
+    that may have changed. All mistakes within the odds ASSUMED.mixup_odds of the best one are returned.
     """
     as_read = check.log_density(fitted.covariance) + evidence.log_evidence(check.residuals)
     most = check.log_density(fitted.covariance, np.zeros(len(check.residuals))) - as_read
@@ -213,7 +213,7 @@ def _misread(
     of_lines = bool(np.isin(m.kind, [KINDS.index(kind) for kind in LINE_KINDS]).all())
     for mistake in mistakes_of_check(m, model):
         jacobian = float(check.freedom @ np.log(mistake.factor))
-        if most + jacobian < odds:  # though all readings were as expected
+        if most + jacobian < odds:  # below the limit even if the correction removed every residual
             continue
         try:
             tried = mistake.corrected()
@@ -223,7 +223,7 @@ def _misread(
                 other = check.changed_by(tried.value - m.value)
             else:
                 other = CheckReadings.of(fitted, tried)
-        except HexapodError:  # out of reach that way
+        except HexapodError:  # the corrected poses are out of reach
             continue
         gain = other.log_density(fitted.covariance) + jacobian - as_read
         better = math.sqrt(check.chi_square(fitted.covariance) / other.chi_square(fitted.covariance))
@@ -235,7 +235,7 @@ def _misread(
 def _candidates(
     check: CheckReadings, fitted: FittedParameters, evidence: Evidence
 ) -> tuple[dict[str, float], tuple[Candidate, ...]]:
-    """Return the probability of each kind, and its best explanation, the most probable kind first."""
+    """Return the probability of each kind of change, and the most probable change of each kind, sorted by these."""
     weights = [logs[0] for logs in evidence.log_weights(check.residuals[None])]
     shares = np.exp(np.array([np.logaddexp.reduce(w) for w in weights]) - np.logaddexp.reduce(np.concatenate(weights)))
     changes = [hypothesis.change for hypothesis in evidence.hypotheses]
@@ -257,7 +257,7 @@ def _candidates(
 
 
 def _visible(evidence: Evidence) -> dict[str, float]:
-    """Return the smallest change of a kind that is certainly detected, for any strut, body or direction."""
+    """Return the smallest size at which a change of any strut, any body, any direction is ASSUMED.surely σ."""
     sizes: dict[str, float] = {}
     for hypothesis in evidence.hypotheses:
         family = hypothesis.change.family
@@ -268,70 +268,68 @@ def _visible(evidence: Evidence) -> dict[str, float]:
 
 
 def _tool(model: MachineModel, fitted: FittedParameters, change: Explanation) -> tuple[float, float] | None:
-    """Return the tool's displacement in the measured box by a change, RMS, as it stands and with the datum aligned,
-    m."""
+    """Return the RMS displacement of the tool in the measured box, without and with the datum aligned, m."""
     space, region = fitted.space, model.measured
-    if region is None:  # no box in which a datum could be aligned
+    if region is None:  # the datum can be aligned only in a box
         return None
     places = np.random.default_rng(5).uniform(region.box[0], region.box[1], (100, 3))
     try:
         _, *slopes, _ = ErrorPredictor(RealMachine(space.geometry, model), fitted).slopes(
             region.poses(places, space.level)
         )
-    except CalibrationError:  # hardly any pose of the box can be reached
+    except CalibrationError:  # too few poses of the box can be reached
         return None
-    standing, aligned = (np.linalg.norm(part[:, :3] @ change.mean, axis=1) for part in slopes)
-    return rms(standing[np.isfinite(standing)]), rms(aligned[np.isfinite(aligned)])
+    sizes = (np.linalg.norm(part[:, :3] @ change.mean, axis=1) for part in slopes)
+    absolute, aligned = (rms(size[np.isfinite(size)]) for size in sizes)
+    return absolute, aligned
 
 
 @dataclass(frozen=True)
 class Update:
-    """A renewed model."""
+    """A model renewed from check readings."""
 
     model: MachineModel
-    fitted: FittedParameters  # the new posterior of its parameters
-    chi_square: float  # squared residuals over their noise, per independent number
+    fitted: FittedParameters  # the new posterior of the parameters
+    chi_square: float  # χ² of the readings against the new model, by their noise alone, per independent value
 
 
 def refusal(verification: Verification) -> str:
-    """Return why few readings cannot renew a model; empty if they can."""
+    """Return why the check readings cannot renew a model; empty if they can."""
     best = verification.candidates[0].change
     if verification.doubts:
-        return f"the readings may be others than they are taken for: {verification.doubts[0]}"
+        return f"the readings may contain a mistake: {verification.doubts[0]}"
     if verification.verdict == VALID:
         return ""
     if verification.verdict == UNEXPLAINED:
-        return "the machine has changed in a way that few readings cannot repair: measure a campaign and fit anew"
+        return "the machine has changed in a way that few readings cannot correct: measure a campaign and fit again"
     if best.family == PAYLOAD:
-        advice = (
-            "state what it weighs now (payload_kg in the readings, mass_kg of the tool) beside the struts' stiffness"
-        )
-        return f"the payload has probably changed, {best.name}: {advice}, or measure with it and fit anew"
+        advice = "state its mass (payload_kg in the readings or mass_kg of the tool) and the struts' stiffness"
+        return f"the payload has probably changed ({best.name}): {advice}, or measure a campaign and fit again"
     if best.family == READING:
-        return f"a single reading is probably wrong: {best.name}; take it again"
+        return f"a single reading is probably wrong: {best.name}; take this reading again"
     if best.family == OTHER:
-        return "it is open whether few readings can repair what has changed: take those that verify proposes as well"
+        return "the change is not identified: take the readings that verify proposes, and verify all readings together"
     return ""
 
 
 def update_model(
     model: MachineModel, fitted: FittedParameters, measurements: MeasurementSet, verification: Verification
 ) -> Update:
-    """Return a model renewed from few readings.
+    """Return a model renewed from check readings.
 
     Parameters
     ----------
     model, fitted : MachineModel, FittedParameters
-        The model so far, and what its fit knows.
+        The old model, and the parameters of its fit with their covariance.
     measurements : MeasurementSet
-        The readings.
+        The check readings.
     verification : Verification
-        What :func:`verify_model` makes of them.
+        The result of :func:`verify_model` for these readings.
 
     Raises
     ------
     CalibrationError
-        Readings that were counted before.
+        If the model already contains some of the readings.
     """
     counted = {digest for _, digest in model.origin.sources}
     for name, digest in measurements.files:
@@ -349,7 +347,7 @@ def update_model(
         x = prior.x + answer.mean
     known = replace(prior, x=x, covariance=answer.covariance)
     best = verification.candidates[0].change
-    reason = f"{FAMILIES[best.family]}: {best.name}" if changed else "it held"
+    reason = f"{FAMILIES[best.family]}: {best.name}" if changed else "the old model was valid"
     origin = replace(
         model.origin,
         date=date.today().isoformat(),
@@ -364,7 +362,7 @@ def update_model(
         outside=model.outside,
         origin=origin,
     )
-    if known.held is not None:  # the datum stays where neither old nor new readings show it
+    if known.held is not None:  # the tool is still held at the datum in directions that no reading shows
         estimation = Estimation(measurements, known.space, alone=False)
         part = unseen_part(estimation, known.tolerances[0], known.noise, known.held.pose, known.held.part)
         new, held = hold(known.space.geometry, new, known.held.pose, part)
@@ -373,7 +371,7 @@ def update_model(
 
 
 def _mixture(check: CheckReadings, prior: FittedParameters, changes: list[Change], negligible: float) -> Explanation:
-    """Return mean and covariance of the parameters over all changes by their probabilities; none: nothing changed."""
+    """Return mean and covariance of the parameters, averaged over `changes` by their probabilities, or without any."""
     if not changes:
         return Explanation.of(check, prior, None)
     evidence = Evidence(check.covariance(prior.covariance), check.effects(changes, prior.covariance))
@@ -395,7 +393,7 @@ def _mixture(check: CheckReadings, prior: FittedParameters, changes: list[Change
     return Explanation(mean, covariance)
 
 
-# What they print
+# Reports
 
 
 def verification_report(result: Verification) -> str:
@@ -409,7 +407,7 @@ def verification_report(result: Verification) -> str:
     ]
     if result.doubts:
         parts.insert(0, "IN DOUBT:\n" + "\n".join(f"  {doubt}" for doubt in result.doubts))
-    slack = 1e-3  # m: so far outside the box is still in it
+    slack = 1e-3  # distance outside the box, m, up to which a place counts as inside
     inside = region is None or region.contains(m.stations.positions, m.stations.rotations, slack)
     if not np.all(inside):
         outside = np.logical_not(inside)
@@ -417,45 +415,45 @@ def verification_report(result: Verification) -> str:
     if m.notes:
         parts.append("\n".join(f"note: {note}" for note in m.notes))
     if result.verdict != VALID:
-        least = 0.001  # kinds of change less probable than this are not listed
+        least = 0.001  # smallest probability of a kind of change that is listed
         rows = [
             (FAMILIES[c.family], number(100.0 * result.families[c.family], 1), _described(c))
             for c in result.candidates
             if result.families[c.family] >= least
         ]
-        parts.append(aligned(("kind of change", "%", "its best explanation"), rows))
+        parts.append(aligned(("kind of change", "%", "best explanation"), rows))
     if result.settling:
         first, second = (FAMILIES[c.family] for c in result.candidates[:2])
         reads = [(s.name, str(s.readings), ", ".join(s.channels), _odds(s.odds)) for s in result.settling]
-        table = aligned(("read", "readings", "channels", "odds to expect"), reads)
-        parts.append(f'to tell "{first}" from "{second}", with the instruments used so far\n{table}')
+        table = aligned(("line or pose", "readings", "channels", "expected odds"), reads)
+        parts.append(f'readings that best distinguish "{first}" from "{second}", with these instruments:\n{table}')
     return "\n\n".join([*parts, "\n".join(_visible_text(result))]) + "\n"
 
 
 def _verdict(result: Verification) -> Iterator[str]:
-    """Yield whether the model is valid, and the most probable change."""
+    """Yield the lines of a report that state whether the model is valid, and the most probable change."""
     best, percent = result.candidates[0], f"{100.0 * result.usual:.2g} %"
+    usual = "readings of an unchanged machine deviate as much as these in"
     if result.verdict == VALID:
-        yield f"VALID: a machine that has not changed reads as strangely as this in {percent} of checks"
+        yield f"VALID: {usual} {percent} of checks"
     else:
-        nothing = "in a way that no motion of the datum, strut, temperature, payload or ageing explains"
+        nothing = "in a way that no change of datum, strut, temperature, payload or age explains"
         yield "CHANGED: " + {
             NAMED: f"{FAMILIES[best.family]}: {_described(best)}",
             UNDECIDED: f"either {', or '.join(FAMILIES[c.family] for c in result.candidates[:2])}",
-        }.get(result.verdict, f"{nothing} (nearest: {_described(best)})")
-        share = f"in {'fewer than ' if result.usual < 1e-3 else ''}{percent}"
-        yield f"a machine that has not changed reads as strangely as this {share} of checks"
+        }.get(result.verdict, f"{nothing} (most probable: {_described(best)})")
+        yield f"{usual} {'fewer than ' if result.usual < 1e-3 else ''}{percent} of checks"
         doubted = [c.name for c in result.candidates[: 1 + (result.verdict == UNDECIDED)] if c.family == READING]
-        yield from (f"take {name} again: the machine itself need not have changed" for name in doubted)
-    yield f"χ² {result.chi_square:.3g} per number against the model and what its fit knows"
+        yield from (f"take {name} again: perhaps only this reading is wrong" for name in doubted)
+    yield f"χ² {result.chi_square:.3g} per independent value, by the covariance of the fit and the noise"
     if result.tool is not None:
-        standing, with_datum = (1e6 * size for size in result.tool)
-        text = f"{standing:.3g} µm RMS in the measured box, {with_datum:.3g} µm with the datum aligned"
-        yield f"what the most probable change does to the tool: {text}"
+        absolute, with_datum = (1e6 * size for size in result.tool)
+        text = f"{absolute:.3g} µm RMS in the measured box, {with_datum:.3g} µm with the datum aligned"
+        yield f"tool error by the most probable change: {text}"
 
 
 def _described(candidate: Candidate) -> str:
-    """Return a candidate's name, with sizes where they have a meaning."""
+    """Return a change's name and the estimated sizes of :attr:`Candidate.sizes`, as text."""
     sizes = {s["name"]: f"{s['value']:+.3g} ± {s['standard_error']:.2g} {s['unit']}" for s in candidate.sizes}
     if len(sizes) < 2:
         return " by ".join((candidate.name, *sizes.values()))
@@ -463,34 +461,35 @@ def _described(candidate: Candidate) -> str:
 
 
 def _odds(logarithm: float) -> str:
-    most = 1e6  # odds above this are all the same to a reader
+    most = 1e6  # larger odds are not distinguished in a report
     return f"{math.exp(logarithm):.3g} : 1" if logarithm < math.log(most) else "over a million : 1"
 
 
 def _visible_text(result: Verification) -> Iterator[str]:
-    """Yield the smallest changes that these readings certainly show."""
-    most = 1e-3  # m or m/m: larger ones are not worth listing
-    for family, name, unit in ((STRUT, "any strut's offset", "µm"), (TEMPERATURE, "growth by temperature", "ppm")):
+    """Yield the smallest changes that these readings detect for certain."""
+    most = 1e-3  # m or m/m: a larger smallest change counts as not detectable
+    for family, name, unit in (
+        (STRUT, "a change of any strut's offset", "µm"),
+        (TEMPERATURE, "growth by temperature", "ppm"),
+    ):
         size = result.visible.get(family, math.inf)
         if size > most:
-            yield f"these readings do not surely show {name}"
+            yield f"these readings do not always detect {name}"
         else:
-            yield f"these readings surely show {name} from {1e6 * size:.2g} {unit} on"
+            yield f"these readings always detect {name} of {1e6 * size:.2g} {unit} or more"
     if result.visible.get(DATUM, math.inf) > most:
-        yield "these readings do not show, or not in all directions, where base and workpiece stand as a whole"
+        yield "these readings do not detect every displacement and rotation of the base or workpiece as a whole"
 
 
 def update_report(update: Update, written: str) -> str:
-    """Return the result of a renewal as text."""
-    head = (
-        f"renewed; χ² of the readings against the new model: {update.chi_square:.3g} per number, by their noise alone"
-    )
-    held = update.fitted.held
+    """Return the report of a model renewed from check readings; `written` is the name of its file."""
+    size = f"{update.chi_square:.3g} per independent value, by their noise alone"
+    head, held = f"renewed; χ² of the readings against the new model: {size}", update.fitted.held
     return "\n\n".join([head, *([held.report()] if held else []), f"model: {written}\n"])
 
 
 def verification_json(result: Verification) -> dict:
-    """Return a check as plain numbers; units are in the keys, or beside numbers as ``unit``."""
+    """Return the result of a check for JSON; the unit of a number is in its key, or beside it as ``unit``."""
     return {
         "machine": result.measurements.geometry.name,
         "model": result.model.name,

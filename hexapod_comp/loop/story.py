@@ -167,7 +167,7 @@ def tell(
 def _complaints(events: list[dict[str, Any]], promised: float, left: dict[str, float], strut: int) -> Iterator[str]:
     """Yield each change that no repair has named, and each chapter whose error is above the predicted one."""
     repairs = [e["text"] for e in events if e["event"] == "repaired"]
-    for wanted in ("a temperature acts", f"a strut's offset has changed: {STRUT_NAMES[strut]}"):
+    for wanted in ("a temperature has changed", f"a strut's offset has changed: {STRUT_NAMES[strut]}"):
         if not any(text.startswith(wanted) for text in repairs):
             yield f"no repair says: {wanted}"
     for title in ("calibrated", "renewed", "repaired"):

@@ -201,12 +201,12 @@ def test_what_readings_cannot_tell_stays_open_and_says_what_would_settle_it() ->
     joint that has moved explains it as well."""
     result = with_one_wrong(8)
     assert (result.verdict, result.candidates[0].family) == (NAMED, READING)
-    assert "take it again" in refusal(result)
+    assert "take this reading again" in refusal(result)
     result = with_one_wrong(1)
     assert result.verdict == UNDECIDED
     assert {c.family for c in result.candidates[:2]} == {READING, OTHER}
     assert refusal(result)
-    assert "odds to expect" in verification_report(result)
+    assert "expected odds" in verification_report(result)
 
 
 def test_readings_of_an_unchanged_machine_taken_for_something_else_are_recognised() -> None:
@@ -233,7 +233,7 @@ def test_what_is_in_no_hypothesis_is_not_named() -> None:
     moved[2:4] += [30e-6, -40e-6, 30e-6]
     result = verify_model(fitted().model, fitted().known, check(replace(fitted().truth, platform_deviation=moved)))
     assert result.verdict == UNEXPLAINED
-    assert "fit anew" in refusal(result)
+    assert "fit again" in refusal(result)
     assert verification_json(result)["verdict"] == "unexplained"
     assert abs(sum(result.families.values()) - 1.0) < 1e-9
     assert set(result.families) == set(FAMILIES)

@@ -190,7 +190,7 @@ def test_verify_names_the_payload_and_no_temperature(settings: FitSettings) -> N
     best = found.candidates[0]
     assert (found.verdict, best.family) == (NAMED, PAYLOAD)
     assert found.families[TEMPERATURE] < 0.01
-    assert "state what it weighs now" in refusal(found)
+    assert "state its mass" in refusal(found)
     assert "CHANGED: the payload has changed" in verification_report(found)
     if settings is TOLD:
         mass = best.sizes[0]
