@@ -1,8 +1,9 @@
-"""Where a machine stands as a whole: the part that readings do not show, and the pose at which it is held.
+"""Datum: the part of the whole machine's position and attitude that readings do not show is held at a datum pose.
 
-If the whole machine is shifted and turned, a laser line reads the same: its zero and its beam's place are unknown.
-Otherwise only the priors would decide the part that readings do not show. So it is held where a workshop needs it: at a
-datum pose the model does not move the tool, and a workpiece zero set there stays valid.
+If the whole machine is shifted and turned, a laser line reads the same, because its zero and its beam's position are
+unknown. A fit would determine the unseen part by its priors alone. Therefore the model is shifted and turned so that
+the tool does not move at the datum pose, as far as readings do not show where it is: a workpiece zero set there stays
+valid.
 """
 
 from __future__ import annotations
@@ -25,46 +26,41 @@ from .sensitivity import carried
 
 @dataclass(frozen=True)
 class HeldDatum:
-    """A datum, and the part of the tool's displacement, m, and rotation, rad, in ``base``, that is held at zero
-    there."""
+    """A datum pose, and the part of the tool's error there that the model holds at zero."""
 
     pose: Pose  # pose_platform_in_base
-    part: np.ndarray  # (6, 6), a projection
-    # (6,), the tool's displacement and rotation by the priors alone: the model does not contain the held part
-    given_up: np.ndarray
+    part: np.ndarray  # (6, 6): projection of displacement, m, and rotation, rad, in base onto the held part
+    given_up: np.ndarray  # (6,): displacement, m, and rotation, rad, of the tool at the datum before it was held
 
     @property
     def held(self) -> int:
-        """The number of the six ways to shift and turn the whole machine in which the tool is held."""
+        """How many of the six ways to shift and turn the whole machine are held."""
         return round(float(np.trace(self.part)))
 
     @property
     def datum(self) -> Datum:
-        """Its text in a model file."""
+        """The datum as it is written into a model file."""
         return Datum.at(self.pose, self.held)
 
     def moved(self, arms: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """Return the machine's motion by holding, at places that are arms (N, 3), m, from the tool at the datum.
+        """Return the motion that holding the datum has removed, (N, 6), m and rad, along and about columns of `axes`.
 
-        Shape (N, 6), m and rad, along and about the columns of `axes`, (3, 3) in ``base``.
+        `arms`, (N, 3), m, are vectors from the tool at the datum to N points; `axes`, (3, 3), are in ``base``.
         """
         there = np.kron(np.eye(2), axes).T @ self.part @ self.given_up
         return carried(np.tile(there[:, None], (len(arms), 1, 1)), arms)[:, :, 0]
 
     def report(self) -> str:
-        """Return the number of directions in which the datum is held, and why, as text."""
+        """Return text on the directions in which the datum is held, and the reason."""
         lengths = np.linalg.norm(self.given_up[:3]) * 1e6, np.linalg.norm(self.given_up[3:]) * 1e6
-        moved = "{:.2f} µm and {:.2f} µrad".format(*lengths)
-        of_six = f"Of six ways to shift and turn the whole machine the readings do not show {self.held}; in these the"
-        text = {
-            0: f"The readings show where the machine stands as a whole; the model moves the tool there by {moved}",
-            len(self.part): "The readings do not show where the machine stands as a whole, so it stays where it is: "
-            f"there the model moves the tool by nothing. Not held, it would move it by {moved}",
-        }.get(self.held, f"{of_six} model moves the tool there by nothing. Not held, it would move it by {moved}")
-        return f"datum: {self.datum}\n  {text}."
+        moved = "the tool at the datum by {:.2f} µm and {:.2f} µrad".format(*lengths)
+        shown = {0: "all", len(self.part): "none of the"}.get(self.held, f"{len(self.part) - self.held} of the")
+        seen = f"The readings show {shown} six ways to shift and turn the whole machine"
+        rest = f"; {self.held} are held. Otherwise the model would move" if self.held else ". The model moves"
+        return f"datum: {self.datum}\n  {seen}{rest} {moved}."
 
     def as_json(self) -> dict[str, Any]:
-        """Return the same as plain numbers; units are in the keys."""
+        """Return the datum as plain numbers for JSON; units are in the keys."""
         return {
             "platform_position_m": self.datum.position,
             "platform_angles_rad": self.datum.angles,
@@ -75,18 +71,18 @@ class HeldDatum:
 
 
 def refuse_unreachable(geometry: HexapodGeometry, pose: Pose) -> None:
-    """Refuse a datum, ``pose_platform_in_base``, that a limit of the machine forbids."""
+    """Reject a datum, ``pose_platform_in_base``, that a limit of the machine forbids."""
     refusal = geometry.refusal(pose.position, pose.rotation, strut_lengths(Structure.of(geometry), pose))
     if refusal is not None:
-        raise CalibrationError("datum", f"is a pose that the machine cannot take: {refusal}")
+        raise CalibrationError("datum", f"is a pose that the machine cannot reach: {refusal}")
 
 
 def hold(
     geometry: HexapodGeometry, model: MachineModel, pose: Pose, part: np.ndarray
 ) -> tuple[MachineModel, HeldDatum]:
-    """Return a model in which a part of the tool's error at a pose is zero, rounded as in a model file, and that part.
+    """Return a model in which the `part` of the tool's error at a pose is zero, rounded as in a file, and its datum.
 
-    A pose that a limit of the machine forbids is refused.
+    Raise CalibrationError if a limit of the machine forbids the pose.
     """
     refuse_unreachable(geometry, pose)
     given_up = tool_move(geometry, model, pose)
@@ -99,12 +95,13 @@ def hold(
 def unseen_part(
     estimation: Estimation, tolerance: float, noise: np.ndarray, pose: Pose, before: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the part of the tool's error at a pose that is a motion of the whole machine that readings do not show.
+    """Return the projection, (6, 6), onto those motions of the whole machine that the readings do not show.
 
-    A motion is seen when one of the structure's `tolerance`, m, changes the readings, free of their instruments'
-    unknowns (zeros, a beam's direction, a tracker's frame), by more than their `noise`, factors on the stated. `before`
-    is the part that earlier readings did not show either. The result, (6, 6), projects displacement, m, and rotation,
-    rad, in ``base``; rotations weigh as displacements at the machine's characteristic length.
+    It acts on displacement, m, and rotation, rad, of the tool at a pose in ``base``. The readings show a motion of size
+    `tolerance`, m, if it changes them by more than ASSUMED.seen times their noise; the changes that the instruments'
+    unknowns (zeros, beam directions, tracker frames) explain do not count. `noise`, (kinds,), is a factor on the stated
+    noise. `before` is the projection onto the motions that earlier readings did not show. A rotation counts as the
+    displacement that it causes at the machine's characteristic length.
     """
     measurements, cells = estimation.measurements, estimation.cells
     geometry = measurements.geometry
@@ -121,6 +118,6 @@ def unseen_part(
 
 
 def _range(projection: np.ndarray) -> np.ndarray:
-    """Return orthonormal columns that span the null space of an orthogonal projection, shape (n, k)."""
+    """Return orthonormal columns that span the range of an orthogonal projection (n, n), shape (n, k)."""
     shares, directions = np.linalg.eigh(0.5 * (projection + projection.T))
     return directions[:, shares > 0.5]

@@ -1,8 +1,8 @@
-"""What to measure: what each candidate would show, and the best of them by a criterion.
+"""Design of measurements: predict what readings would determine, and choose the best runs before anyone measures.
 
-One planner (:class:`Greedy`) chooses the candidate that gains most for what it costs, again and again, before anyone
-measures. Its criterion is its argument: :class:`ErrorLeft`, the tool's mean square error (an I-optimal design), for
-campaigns; :class:`Detectability`, the Bayes factor of what may happen to a machine, for checks.
+A greedy planner (:class:`Greedy`) adds the candidate with the largest gain per cost, one after the other. The gain is
+that of a criterion: :class:`ErrorLeft`, the tool's mean square error (an I-optimal design), for campaigns;
+:class:`Detectability`, the log odds of naming a change of the machine correctly, for checks.
 """
 
 from __future__ import annotations
@@ -54,19 +54,19 @@ from .promise import Scatter, Unexplained
 from .report import expected_json, expected_text, observability_text
 from .trust import TILT
 
-FAINT = 0.05  # directions with a smaller effect on readings are omitted, σ
-LEAST_REACHED = 0.3  # share of the box in which the tool must reach the wanted tilt
+FAINT = 0.05  # a direction of the parameters that changes all readings by less than this, σ, is omitted
+LEAST_REACHED = 0.3  # smallest share of the box in which the tool must reach the goal's tilt
 
 
 def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) -> tuple[np.ndarray, Cells]:
-    """Return how the parameters y move readings, (cells, size), over their stated noise and free of nuisances."""
+    """Return the readings' derivatives by y over their stated noise, free of nuisance parameters, (cells, size)."""
     estimation = Estimation(readings, space, alone=False)
     problem, _ = estimation.linearise(x, np.ones(len(readings)))
     return problem.rows.dense(), estimation.cells
 
 
 def information_of_fit(fitted: FittedParameters, readings: MeasurementSet) -> tuple[np.ndarray, Cells]:
-    """Return :func:`information` by the parameters x of a fit, at its solution."""
+    """Return the same as :func:`information`, by the parameters x, at the solution of a fit."""
     rows, cells = information(fitted.space, readings, fitted.x)
     return fitted.space.unwhitened(rows), cells
 
@@ -75,43 +75,44 @@ def information_of_fit(fitted: FittedParameters, readings: MeasurementSet) -> tu
 
 
 class Criterion(Protocol):
-    """A criterion for choosing candidates; it stores those already chosen."""
+    """A criterion for choosing candidates, which stores the candidates chosen so far."""
 
     def gains(self, allowed: np.ndarray) -> np.ndarray:
-        """Return by how much the plan's criterion would improve if each allowed candidate were added."""
+        """Return the improvement of the criterion by each allowed candidate, if it alone were added."""
 
     def add(self, n: int) -> None:
-        """Add a candidate to those chosen."""
+        """Add candidate `n` to the chosen candidates."""
 
 
 C = TypeVar("C", bound=Criterion)
 
 
 class Greedy(Generic[C]):
-    """Candidates chosen one by one, each time the one with the largest gain per cost, within a budget."""
+    """A greedy planner: it chooses candidates one by one, each time the largest gain per cost, within a budget."""
 
     def __init__(
         self,
         criterion: C,
-        costs: np.ndarray,  # of each candidate
-        needs: Sequence[str] = (),  # instrument to set up for it; none by default
-        putting_up: Mapping[str, float] | None = None,  # cost of that set-up
-        # index of the candidate that must be chosen before it, or -1: then each is chosen once
+        costs: np.ndarray,  # cost of each candidate
+        needs: Sequence[str] = (),  # name of the set-up that each candidate needs; by default none
+        set_up_costs: Mapping[str, float] | None = None,  # name of a set-up → its cost, once
+        # Index of the candidate that must be chosen before each candidate, or -1; each is then chosen at most once
         after: np.ndarray | None = None,
     ) -> None:
-        self.criterion, self.costs, self.putting_up = criterion, costs, putting_up or {}
+        self.criterion, self.costs, self.set_up_costs = criterion, costs, set_up_costs or {}
         self.needs = list(needs) or [""] * len(costs)
         self.after = after
         self.picks: list[int] = []
         self.spent = 0.0
 
     def totals(self) -> np.ndarray:
-        """Return the total cost after each candidate."""
-        up = {self.needs[n] for n in self.picks}
-        return self.spent + self.costs + [0.0 if name in up else self.putting_up.get(name, 0.0) for name in self.needs]
+        """Return the total cost of the plan if each candidate alone were added, its set-up included."""
+        done = {self.needs[n] for n in self.picks}
+        set_ups = [0.0 if name in done else self.set_up_costs.get(name, 0.0) for name in self.needs]
+        return self.spent + self.costs + set_ups
 
     def extend(self, budget: float, enough: Callable[[], bool] = lambda: False, most: int = 400) -> None:
-        """Choose candidates until the goal is met, no affordable one has a gain, or `most` have been chosen."""
+        """Choose candidates until `enough()`, no candidate within the budget has a gain, or `most` were added."""
         most += len(self.picks)
         while len(self.picks) < most and not enough():
             totals = self.totals()
@@ -131,8 +132,9 @@ class Greedy(Generic[C]):
 class ErrorLeft:
     """Criterion of an I-optimal design: the mean square tr(M·C) of the tool's error.
 
-    In parameters z of unit variance before, readings A of unit noise, free of nuisances, turn their covariance C into
-    C − CAᵀ(I + ACAᵀ)⁻¹AC, whatever they will read. C is held in the directions that any candidate sees.
+    C is the covariance of the parameters z, whose prior variance is 1, and A the derivatives of a candidate's readings
+    by z, over their noise and free of nuisances. These readings change C to C − CAᵀ(I + ACAᵀ)⁻¹AC, independent of their
+    values. C is stored only for the directions that some candidate shows.
     """
 
     def __init__(self, seen: Sequence[np.ndarray], square: np.ndarray) -> None:
@@ -142,20 +144,21 @@ class ErrorLeft:
         self.basis = vectors[:, values > FAINT**2]
         self.rows, self.inner = rows @ self.basis, np.eye(self.basis.shape[1])
         values, vectors = np.linalg.eigh(square)
-        kept = values > 1e-9 * values[-1]  # the others add next to nothing to the tool's error
+        kept = values > 1e-9 * values[-1]  # the omitted directions contribute less than 1e-9 of the largest one
         root = self.basis.T @ (vectors[:, kept] * np.sqrt(values[kept]))
         self.known, self.shown = self.rows.copy(), self.rows @ root  # A·C and A·C·√M
 
     @property
     def covariance(self) -> np.ndarray:
-        """C, shape (size, size)."""
+        """C after the chosen candidates, shape (size, size)."""
         return self._whole(self.inner)
 
     def _whole(self, inner: np.ndarray) -> np.ndarray:
+        """Return C from its part `inner` in the basis; in all other directions C is the prior's identity."""
         return np.asarray(np.eye(len(self.basis)) + self.basis @ (inner - np.eye(len(inner))) @ self.basis.T)
 
     def gains(self, allowed: np.ndarray | None = None) -> np.ndarray:
-        """Return by how much each candidate lowers the mean square error, m²."""
+        """Return the reduction of the tool's mean square error by each candidate, m²."""
         gains = np.zeros(len(self.parts))
         for n, part in enumerate(self.parts):
             if part.start < part.stop and (allowed is None or allowed[n]):
@@ -164,7 +167,7 @@ class ErrorLeft:
         return gains
 
     def add(self, n: int) -> None:
-        """Add a candidate's readings; it may be added repeatedly."""
+        """Add the readings of candidate `n`, which may have been added before."""
         part = self.parts[n]
         known, shown = self.known[part].copy(), self.shown[part].copy()
         gain = np.linalg.solve(self._variance(part), known @ self.rows.T).T
@@ -181,25 +184,25 @@ class ErrorLeft:
         return self._whole(np.linalg.inv(np.eye(self.basis.shape[1]) + times * self.rows.T @ self.rows))
 
 
-# A campaign that is given
+# Prediction for a given campaign
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Prediction for a campaign."""
+    """Prediction of what the readings of a campaign would determine."""
 
-    measurements: MeasurementSet  # its readings, without values
+    measurements: MeasurementSet  # readings of the campaign, with values of zero
     space: ParameterSpace
     observability: Observability
     unseen_errors: tuple[UnseenError, ...]  # machine errors that the readings will not show
-    level: ToolError | None  # after a fit, repeatability included; `before`: machines within the tolerances
-    tilted: ToolError | None
-    stops: float  # the machine's repeatability as stated, RMS over all three axes, m; 0 where none is
-    elsewhere: str  # what is expected under loads that no reading will have
+    level: ToolError | None  # expected tool error, level, for machines within the tolerances; repeatability included
+    tilted: ToolError | None  # the same for a tool tilted by :data:`~.trust.TILT`
+    stops: float  # stated repeatability of the machine, RMS over all three axes, m; 0 if not stated
+    elsewhere: str  # text on the tool error under loads that the readings will not have
 
 
 def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings) -> Plan:
-    """Return what the readings of a campaign's template would determine on a machine within the tolerances."""
+    """Return the prediction for a campaign on machines within the tolerances; `measurements` are its template."""
     space = ParameterSpace(measurements, settings)
     estimation = Estimation(measurements, space)
     x, tolerances = np.zeros(space.size), space.start_tolerances()
@@ -216,29 +219,29 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
 
 
 def noise_factors(campaign: Campaign) -> np.ndarray:
-    """Return the noise of each kind of channel over the default, (kinds,), the machine's repeatability included."""
+    """Return noise and repeatability of each kind of channel over DEFAULT_UNCERTAINTY, (kinds,)."""
     default = np.array([DEFAULT_UNCERTAINTY[kind] for kind in KINDS])
     stops = np.where(np.isin(KINDS, ("rotation", "attitude")), 0.0, campaign.repeatability)
     return np.maximum(np.hypot(campaign.noise, stops), 1e-3 * default) / default
 
 
-# A campaign for a goal
+# Campaigns proposed for a goal
 
 
 @dataclass(frozen=True)
 class Times:
-    """How long an instrument takes, s."""
+    """Durations of the work with an instrument, s."""
 
-    first: float  # to put it up
+    first: float  # to install the instrument
     run: float  # to set up one run
-    stop: float  # for each stop of the machine with its readings
+    stop: float  # for each stop of the machine, with its readings
 
     def of(self, run: CampaignRun, cycles: int) -> float:
-        """Return how long a run takes, s."""
+        """Return the duration of a run without the instrument's installation, s."""
         return self.run + self.stop * run.count(cycles) / len(run.channels)
 
 
-# Times of an experienced machinist, by instrument; for these there are candidate runs
+# Instruments that have candidate runs, with the times of an experienced machinist
 TIMES = {
     "linear": Times(1200.0, 480.0, 4.0),
     "straightness": Times(1200.0, 900.0, 4.0),
@@ -255,18 +258,18 @@ TIMES = {
 
 @dataclass(frozen=True)
 class Goal:
-    """A goal; a :class:`CalibrationError` reports impossible values."""
+    """A goal of a calibration and the means for it; impossible values raise :class:`CalibrationError`."""
 
-    error: float  # allowed RMS tool error, the datum aligned, m
-    tilt: float = 0.0  # of the tool, up to which the goal holds, rad
+    error: float  # largest RMS tool error, the datum aligned, m
+    tilt: float = 0.0  # largest tilt of the tool at which the goal must be met, rad
     instruments: tuple[str, ...] = ("linear",)  # available instruments, of TIMES
     seconds: float = 4.0 * 3600.0  # available time
     times: Mapping[str, Times] = field(default_factory=lambda: TIMES)
-    # under which the goal must hold too when the model is told, and readings may be made: as in Surroundings.loads
+    # Further loads (as in Surroundings.loads) under which the goal must be met too, and readings can be taken
     loads: tuple[tuple[float, ...], ...] = ()
 
     def __post_init__(self) -> None:
-        largest = 60.0  # degrees: no hexapod tilts further
+        largest = 60.0  # largest tilt, degrees: no hexapod tilts further
         if not 0.0 < self.error < np.inf:
             raise CalibrationError("goal", f"must be finite and above zero, not {self.error * 1e6:g} µm")
         if not 0.0 <= self.tilt <= np.radians(largest):
@@ -275,39 +278,39 @@ class Goal:
             raise CalibrationError("hours", f"must be finite and above zero, not {self.seconds / 3600.0:g}")
         unknown = set(self.instruments) - set(TIMES)
         if unknown or not self.instruments or len(set(self.instruments)) < len(self.instruments):
-            problem = f"must be one or more of {', '.join(TIMES)}, each once"
+            problem = f"must be one or more of {', '.join(TIMES)}, each at most once"
             raise CalibrationError("instruments", f"{problem}, not {', '.join(self.instruments) or 'none'}")
         for name, times in self.times.items():
             numbers = (times.first, times.run, times.stop)
             if not (all(0.0 <= value < np.inf for value in numbers) and times.stop > 0.0):
-                problem = f"must be finite, not negative, a stop above zero, not {numbers} s"
+                problem = f"must be finite and not negative, the time of a stop above zero, not {numbers} s"
                 raise CalibrationError(f"times of {name}", problem)
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """A plan for a goal; errors are those of the tool, the machine's repeatability included, RMS, m."""
+    """A campaign proposed for a goal; errors are RMS errors of the tool, repeatability of the machine included, m."""
 
     goal: Goal
     campaign: Campaign  # the runs in measuring order
     space: ParameterSpace  # the parameters to be fitted
-    before: dict[str, float]  # the error before, `level` and, where the goal tilts, `tilted`
-    expected: dict[str, float]  # and after
+    before: dict[str, float]  # ``level`` and, if the goal has a tilt, ``tilted``, each with its load → error before
+    expected: dict[str, float]  # the same keys → expected error with the model
     seconds: float  # duration of the measurement
-    all_of_them: float  # the worse error after all candidates,
-    unseen: float  # and after enough repeats of them that noise no longer counts
-    shares: dict[str, float]  # of blocks, and of the repeatability, in the remaining mean square error
-    needed: float | None  # seconds in which the goal would be met; None if these candidates do not meet it
-    loads: tuple[str, ...]  # load of each run, empty for that of the machine file
+    with_all: float  # largest expected error if all candidates were measured once
+    unseen: float  # the same if they were repeated until noise no longer matters
+    shares: dict[str, float]  # share of each block, and of the repeatability, in the expected mean square error
+    needed: float | None  # duration after which the goal would be met, s; None if these candidates do not meet it
+    loads: tuple[str, ...]  # load of each run as text; empty for the load of the machine file
 
     @property
     def worst(self) -> float:
-        """The larger of the expected errors, m."""
+        """The largest expected error, m."""
         return max(self.expected.values())
 
     @property
     def met(self) -> bool:
-        """Whether the goal is met."""
+        """Whether the largest expected error is within the goal."""
         return self.worst <= self.goal.error
 
     @property
@@ -316,8 +319,8 @@ class Proposal:
         return sum(run.count(self.campaign.cycles) for run in self.campaign.runs)
 
     @property
-    def each(self) -> list[float]:
-        """Duration of each run, the instrument's set-up included in its first, s."""
+    def durations(self) -> list[float]:
+        """Duration of each run, s; that of an instrument's first run includes its installation."""
         runs = self.campaign.runs
         set_up = [(run.instrument, load) for run, load in zip(runs, self.loads, strict=True)]
         first = [n == 0 or one != set_up[n - 1] for n, one in enumerate(set_up)]
@@ -326,10 +329,10 @@ class Proposal:
 
 
 class Aim:
-    """The tool error of the goal as a quadratic form of z, the parameters scaled to unit prior variance."""
+    """Mean square tool error at the goal's tilts and loads, as quadratic forms of parameters z of prior variance 1."""
 
     def __init__(self, space: ParameterSpace, goal: Goal, stops: float = 0.0) -> None:
-        self.stops = stops  # repeatability, RMS over all three axes, m: no model reduces it
+        self.stops = stops  # repeatability of the machine, RMS over all three axes, m: no model reduces it
         tilts = {"level": 0.0} | ({"tilted": goal.tilt} if goal.tilt > 0.0 else {})
         self.parts = {
             name + load_text(load): self._square(space, angle, load)
@@ -344,19 +347,19 @@ class Aim:
         errors = box_errors(space, np.zeros(space.size), tilt, load)
         reached = 0.0 if errors is None else len(errors.places) / (2.0 * POINTS)
         if errors is None or reached < LEAST_REACHED:
-            problem = f"{np.degrees(tilt):g}° is within the limits at {100.0 * reached:.0f} % of the box only"
-            raise CalibrationError("tilt", f"{problem}, {100.0 * LEAST_REACHED:g} % are needed")
+            problem = f"{np.degrees(tilt):g}° is within the limits in only {100.0 * reached:.0f} % of the box"
+            raise CalibrationError("tilt", f"{problem}; at least {100.0 * LEAST_REACHED:g} % are needed")
         spread = space.spread(space.start_tolerances())
         return np.asarray(spread[:, None] * space.whitened(space.whitened(errors.mean_squares[0]).T) * spread)
 
     def errors(self, covariance: np.ndarray) -> dict[str, float]:
-        """Return the RMS tool error for a covariance, level and tilted, m."""
+        """Return the RMS tool error for a covariance of z, by tilt and load, m."""
         squares = {name: (square * covariance).sum() + self.stops**2 for name, square in self.parts.items()}
         return {name: float(np.sqrt(square)) for name, square in squares.items()}
 
 
 def seen_by(space: ParameterSpace, campaign: Campaign, measured: MeasurementSet) -> list[np.ndarray]:
-    """Return each run's derivatives, (k, size): readings over their noise by parameters over their tolerances."""
+    """Return, for each run, k independent derivatives of its readings over their noise by z, (k, size)."""
     rows, cells = information(space, measured, np.zeros(space.size))
     rows *= space.spread(space.start_tolerances()) / noise_factors(campaign)[cells.kind][:, None]
     run_of_station = np.empty(len(measured.stations), dtype=int)
@@ -369,7 +372,7 @@ def seen_by(space: ParameterSpace, campaign: Campaign, measured: MeasurementSet)
 
 
 def region(place: MeasuringBox, runs: Sequence[CampaignRun]) -> Extent:
-    """Return the region that runs of a box cover, as far as parameters depend on it."""
+    """Return the region of a measurement with these runs in a box, as far as parameters depend on it."""
     geometry = place.geometry
     positions, rotations = (np.concatenate([getattr(run, name) for run in runs]) for name in ("positions", "rotations"))
     lengths = strut_lengths_batch(Structure.of(geometry), *geometry.platform_poses(positions, rotations))
@@ -392,8 +395,8 @@ def propose(
     base: Campaign | None = None,
     progress: Callable[[str], object] = lambda text: None,
 ) -> Proposal:
-    """Return the runs to measure for a goal, in measuring order; `base` gives noise, beam slope, stops and cycles."""
-    progress("what could be measured")
+    """Return the runs to measure for a goal, in measuring order; noise, beam slope, stops and cycles are `base`'s."""
+    progress("collecting candidate runs")
     runs = candidates(place, goal.instruments)
     space = ParameterSpace((place.geometry, region(place, runs)), settings)
     side = float(np.ptp(place.box, axis=0).min())
@@ -405,10 +408,10 @@ def propose(
         base, instrument=None, diagonals=0, poses=0, box=place.box, cell=side, step=side, runs=tuple(runs[:1])
     )
     seen, read_under = list[np.ndarray](), list[str]()
-    together = 40  # runs laid out at once: bounds the memory
+    together = 40  # number of runs computed together, which bounds the memory
     for load in (None, *goal.loads):
         for start in range(0, len(runs), together):
-            progress(f"what {len(runs)} runs would show{load_text(load)}: {start}")
+            progress(f"predicting the readings of {len(runs)} runs{load_text(load)}: {start}")
             part = (replace(run, name=f"{n}") for n, run in enumerate(runs[start : start + together]))
             batch = replace(base, runs=tuple(part))
             laid = template(batch, place.geometry)
@@ -418,11 +421,11 @@ def propose(
             seen += seen_by(space, batch, laid)
         read_under += [load_text(load)] * len(runs)
 
-    each, runs = len(runs), runs * (1 + len(goal.loads))  # under each load the same runs
+    per_load, runs = len(runs), runs * (1 + len(goal.loads))  # the same runs under each load
     costs = np.array([goal.times[run.instrument].of(run, base.cycles) for run in runs])
-    # Another load means that the instrument is set up anew
+    # After a change of the load, an instrument is installed again
     needs = [run.instrument + load for run, load in zip(runs, read_under, strict=True)]
-    putting_up = {need: goal.times[run.instrument].first for run, need in zip(runs, needs, strict=True)}
+    set_up_costs = {need: goal.times[run.instrument].first for run, need in zip(runs, needs, strict=True)}
 
     def left(choice: Greedy[ErrorLeft]) -> float:
         return max(aim.errors(choice.criterion.covariance).values())
@@ -430,32 +433,33 @@ def propose(
     def chosen(set_ups: Sequence[str]) -> Greedy[ErrorLeft]:
         progress(f"choosing runs of {', '.join(set_ups)}")
         nothing = np.zeros((0, space.size))
-        of_these = [rows if need in set_ups else nothing for rows, need in zip(seen, needs, strict=True)]
-        choice = Greedy(ErrorLeft(of_these, aim.square), costs, needs, putting_up)
+        allowed = [rows if need in set_ups else nothing for rows, need in zip(seen, needs, strict=True)]
+        choice = Greedy(ErrorLeft(allowed, aim.square), costs, needs, set_up_costs)
         choice.extend(goal.seconds, lambda: left(choice) <= goal.error)
         return choice
 
-    # All instruments, or one of them alone, and all loads, or fewer: that saves setting up the others.
+    # Plans with all instruments and with each alone, with all loads and with fewer, which save installations
     first, *others = dict.fromkeys(read_under)
     fewer = [(first, *others), (first,), *((first, other) for other in others)]
-    alone = [(name,) for name in goal.instruments] if len(goal.instruments) > 1 and any(putting_up.values()) else []
-    ways = [
+    alone = [(name,) for name in goal.instruments] if len(goal.instruments) > 1 and any(set_up_costs.values()) else []
+    sets = [
         [name + load for load in loads for name in names] for loads in fewer for names in (goal.instruments, *alone)
     ]
-    tries = [chosen(way) for way in dict.fromkeys(map(tuple, ways))]
+    tries = [chosen(set_ups) for set_ups in dict.fromkeys(map(tuple, sets))]
     best = min(tries, key=lambda t: (left(t) > goal.error, t.spent if left(t) <= goal.error else left(t)))
     if not best.picks:
-        raise CalibrationError("hours", f"are too few: the shortest run takes {best.totals().min() / 3600.0:.2g} h")
-    progress("what limits it")
+        shortest = f"{best.totals().min() / 3600.0:.2g} h"
+        raise CalibrationError("hours", f"are too few: the shortest run takes {shortest} with its set-up")
+    progress("finding what limits the result")
     covariance, seconds, picks = best.criterion.covariance, best.spent, tuple(best.picks)
-    repeated = 1e4  # repeats after which only errors that the instruments do not see remain
-    all_of_them, unseen = (max(aim.errors(tries[0].criterion.after_all(n)).values()) for n in (1.0, repeated))
+    repeated = 1e4  # number of repeats after which only errors that the instruments do not show remain
+    with_all, unseen = (max(aim.errors(tries[0].criterion.after_all(n)).values()) for n in (1.0, repeated))
     needed = seconds if left(best) <= goal.error else None
     expected = aim.errors(covariance)
-    if needed is None and all_of_them <= goal.error:  # continued, to report the time that the goal would take
+    if needed is None and with_all <= goal.error:  # continue the plan to find the time that the goal would take
         tries[0].extend(np.inf, lambda: left(tries[0]) <= goal.error, most=25)
         needed = tries[0].spent if left(tries[0]) <= goal.error else None
-    order = sorted(picks, key=lambda n: (n // each, goal.instruments.index(runs[n].instrument), n))
+    order = sorted(picks, key=lambda n: (n // per_load, goal.instruments.index(runs[n].instrument), n))
     named = tuple(replace(runs[n], name=f"{k}: {runs[n].name}{read_under[n]}") for k, n in enumerate(order, start=1))
     of_parameter, total = (aim.square * covariance).sum(axis=1), (aim.square * covariance).sum() + aim.stops**2
     shares = {block.name: float(of_parameter[block.part].sum() / total) for block in space.blocks}
@@ -467,7 +471,7 @@ def propose(
         before=aim.errors(np.eye(space.size)),
         expected=expected,
         seconds=seconds,
-        all_of_them=all_of_them,
+        with_all=with_all,
         unseen=unseen,
         shares=dict(sorted(shares.items(), key=lambda item: -item[1])),
         needed=needed,
@@ -475,13 +479,13 @@ def propose(
     )
 
 
-# Readings that check a fit
+# Readings proposed for a check
 
-# What a proposed check must detect: a light collision, m; a kelvin of steel, m/m; another tool, kg, where a stiffness
-# is stated
+# Changes that a proposed check must detect: a strut's offset after a light collision, m; growth of the struts, m/m, of
+# steel by 1 K; the mass of another tool, kg, if a load is stated
 CRASH, WARMTH, TOOL_CHANGED = 20e-6, 12e-6, 10.0
-CHECK_READINGS = 12  # of a proposed check: 20 µm are named in 95 % (benchmarks.upkeep)
-# Channels of each instrument of a check: on diagonals the displacement alone; of rotations pitch and yaw, no roll
+CHECK_READINGS = 12  # readings of a proposed check, which name a strut that moved by 20 µm in 95 % (benchmarks.upkeep)
+# Channels that a check reads with each instrument; diagonals are read by "linear" alone, and roll is not read
 READ_BY = {
     "linear": ("linear",),
     "straightness": ("straightness_x", "straightness_y", "straightness_z"),
@@ -492,7 +496,7 @@ READ_BY = {
 
 
 class Detectability:
-    """Criterion: log odds of a crash of each strut, growth of all, and another payload, over all other changes."""
+    """Criterion of a check: log odds of naming a moved strut, grown struts or another payload, if it happened."""
 
     def __init__(self, fitted: FittedParameters, readings: MeasurementSet, contrasts: Sequence[np.ndarray]) -> None:
         wide = widened(fitted)
@@ -508,24 +512,24 @@ class Detectability:
             sizes[PAYLOAD, HEAVIER] = TOOL_CHANGED
         self.wanted = [(c.family, c.name) for c in changes if (c.family, c.name) in sizes]
         self.moved = [sizes[c.family, c.name] * e[:, 0] for c, e in self.effects if (c.family, c.name) in sizes]
-        self.taken = np.zeros(0, dtype=int)
-        self.now = self._value(self.taken)
+        self.chosen = np.zeros(0, dtype=int)  # indices of the contrasts of the chosen candidates
+        self.value = self._log_odds(self.chosen)
 
     def gains(self, allowed: np.ndarray) -> np.ndarray:
-        """Return the gain in log odds by each allowed candidate."""
+        """Return the gain in log odds by each allowed candidate; zero for the others."""
         tries = [
-            self._value(np.concatenate([self.taken, numbers])) if ok else self.now
+            self._log_odds(np.concatenate([self.chosen, numbers])) if ok else self.value
             for numbers, ok in zip(self.of_candidate, allowed, strict=True)
         ]
-        return np.array(tries) - self.now
+        return np.array(tries) - self.value
 
     def add(self, n: int) -> None:
-        """Add a candidate's readings."""
-        self.taken = np.concatenate([self.taken, self.of_candidate[n]])
-        self.now = self._value(self.taken)
+        """Add the readings of candidate `n`."""
+        self.chosen = np.concatenate([self.chosen, self.of_candidate[n]])
+        self.value = self._log_odds(self.chosen)
 
-    def _value(self, chosen: np.ndarray) -> float:
-        """Return the log odds of the wanted changes over all others if only a subset of the contrasts is read."""
+    def _log_odds(self, chosen: np.ndarray) -> float:
+        """Return the log odds of the right change over wrong ones by some contrasts, over all wanted changes."""
         single = self.single[chosen][:, self.read[chosen].any(axis=0)]
         effects = [(change, effect[chosen]) for change, effect in self.effects]
         effects += wrong_readings(single, [""] * single.shape[1])
@@ -533,7 +537,7 @@ class Detectability:
         of_scales = evidence.log_weights(np.array(self.moved)[:, chosen])
         weights = np.array([log_sum(w, axis=1) for w in of_scales])
         seen = [(change.family, change.name) for change, _ in effects]
-        # Several struts at once are neither the right strut nor another one; any temperature is a temperature.
+        # "Several struts" is neither a right nor a wrong strut; every temperature change is right for grown struts.
         right = np.array([[a == b or a[0] == b[0] != STRUT for b in self.wanted] for a in seen])
         wrong = np.array([[a[0] != b[0] or (a != b and a[1] in STRUT_NAMES) for b in self.wanted] for a in seen])
         for_it, against = (log_sum(np.where(of, weights, -np.inf), axis=0) for of in (right, wrong))
@@ -545,11 +549,11 @@ def propose_check(
     readings: int = CHECK_READINGS,
     instruments: Sequence[str] = ("linear", "rotation"),
 ) -> MeasurementSet:
-    """Return the check readings to take with some instruments of :data:`READ_BY`; values are NaN."""
+    """Return the check readings to take with `instruments` of :data:`READ_BY`; their values are NaN."""
     for name in instruments:
         if name not in READ_BY:
             raise CalibrationError("instruments", f"must be of {', '.join(READ_BY)}, not {name!r}")
-    least, most = 6, 60  # fewer determine next to nothing; more are better planned as a campaign
+    least, most = 6, 60  # fewer readings determine almost nothing; for more readings a campaign is better
     if not least <= readings <= most:
         raise CalibrationError("readings", f"must be {least}…{most}, not {readings}")
     channels = [CHANNELS.index(name) for instrument in instruments for name in READ_BY[instrument]]
@@ -561,7 +565,7 @@ def propose_check(
     every = every.select(np.isin(every.channel, channels) & (every.direction != BACKWARD))
     candidates = _contrasts(every)
     every = every.select(np.isin(np.arange(len(every)), np.concatenate([added for _, added, _ in candidates])))
-    contrasts, members, after = zip(*_contrasts(every), strict=True)  # of those that any of them reads
+    contrasts, members, after = zip(*_contrasts(every), strict=True)  # now of the candidates' readings alone
     costs = np.array([float(len(added)) for added in members])
     choice = Greedy(Detectability(fitted, every, contrasts), costs, after=np.array(after))
     choice.extend(float(readings))
@@ -570,7 +574,7 @@ def propose_check(
 
 
 def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]]:
-    """Return candidates: orthonormal contrasts free of zeros and slopes, the readings each adds, and its parents."""
+    """Return candidates: contrasts (k, N) free of zeros and slopes, readings added, candidate needed before or −1."""
     along, result = every.along(), []
 
     def row(members: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -596,18 +600,18 @@ def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]
 
 @dataclass(frozen=True)
 class Settling:
-    """Readings that would distinguish two explanations."""
+    """Readings that would distinguish two explanations of check readings."""
 
     name: str  # a line with its ends, or a pose
-    channels: tuple[str, ...]  # what to read there
+    channels: tuple[str, ...]  # channels to read there
     readings: int
-    odds: float  # expected log odds for the true explanation over the wrong one, for the worse case
+    odds: float  # expected log odds of the true explanation over the false one; the smaller if either is true
 
 
 def settle(
     fitted: FittedParameters, measured: MeasurementSet, explanations: tuple[Explanation, Explanation]
 ) -> list[Settling]:
-    """Return the three readings that would best distinguish two explanations of `measured`, with its instruments."""
+    """Return the three lines or poses that best distinguish two explanations, with the instruments of `measured`."""
     space, kinds = fitted.space, np.unique(measured.kind)
     by_pose = np.isin(np.array(KINDS)[kinds], ABSOLUTE_KINDS)
     sets = [laid_out(space, lines=2)] if not by_pose.all() else []
@@ -629,13 +633,13 @@ def settle(
 
 
 def _divergence(difference: np.ndarray, right: np.ndarray, wrong: np.ndarray) -> float:
-    """Return the Kullback–Leibler divergence of two normal distributions."""
+    """Return the Kullback–Leibler divergence of two normal distributions, N(0, right) from N(difference, wrong)."""
     solved = np.linalg.solve(wrong, np.column_stack([right, difference]))
     logs = np.linalg.slogdet(wrong)[1] - np.linalg.slogdet(right)[1]
     return 0.5 * float(np.trace(solved[:, :-1]) - len(right) + difference @ solved[:, -1] + logs)
 
 
-# What plans and proposals print
+# Reports
 
 
 def plan_report(plan: Plan) -> str:
@@ -648,13 +652,13 @@ def plan_report(plan: Plan) -> str:
     expected = expected_text(plan.level, plan.tilted, plan.observability)
     counted = [f"{expected}\n  {stops_text(plan.stops)}"] if expected else []
     seen = observability_text(plan.observability, plan.unseen_errors)
-    elsewhere = [f"that holds for the loads of the readings; {plan.elsewhere}"] if plan.elsewhere else []
+    elsewhere = [f"the expected error holds for the loads of the readings; {plan.elsewhere}"] if plan.elsewhere else []
     parts = [head, *counted, seen, *elsewhere]
     return "\n\n".join(parts) + "\n"
 
 
 def plan_json(plan: Plan) -> dict:
-    """Return a plan as plain numbers; units as in a fit's."""
+    """Return a plan as plain numbers for JSON, with the keys and units of a fit."""
     return {
         "machine": plan.measurements.geometry.name,
         "readings": len(plan.measurements),
@@ -665,7 +669,7 @@ def plan_json(plan: Plan) -> dict:
 
 
 def load_text(load: Sequence[float] | None) -> str:
-    """Return the load of a run as the end of its name; empty for that of the machine file."""
+    """Return the load of a run as text to append to its name; empty for None, the load of the machine file."""
     if load is None:
         return ""
     gravity = "" if np.isnan(load[4]) else f", gravity ({', '.join(f'{g:g}' for g in load[4:])}) m/s²"
@@ -673,14 +677,14 @@ def load_text(load: Sequence[float] | None) -> str:
 
 
 def stops_text(stops: float) -> str:
-    """Return the part of a planned tool error that is the machine's repeatability: RMS over all three axes, m."""
+    """Return text whether a planned tool error includes the repeatability `stops`, RMS over all three axes, m."""
     if stops:
-        return f"counted in: the machine's repeatability, {stops * 1e6:.3g} µm RMS over all three axes"
-    return "not counted: the machine's repeatability, for none is stated (--repeatability-um)"
+        return f"included: the machine's repeatability, {stops * 1e6:.3g} µm RMS over all three axes"
+    return "not included: the machine's repeatability, which is not stated (--repeatability-um)"
 
 
 def proposal_report(plan: Proposal) -> str:
-    """Return the report of a proposed plan: goal, prediction, limiting factor, runs in their order."""
+    """Return the report of a proposed campaign: goal, expected error, limiting factor, runs in measuring order."""
     expected = ["expected tool error at random points of the box, both directions, the datum aligned:"]
     for name, after in plan.expected.items():
         tilt, _, load = name.partition(", ")
@@ -691,24 +695,24 @@ def proposal_report(plan: Proposal) -> str:
     expected.append(f"  {stops_text(plan.campaign.stops)}")
     if plan.goal.loads:
         under = ", ".join(load.removeprefix(", ") or "as in the machine file" for load in dict.fromkeys(plan.loads))
-        expected.append(f"loads to read under: {len(set(plan.loads))} of {1 + len(plan.goal.loads)} ({under})")
+        expected.append(f"loads of the readings: {len(set(plan.loads))} of {1 + len(plan.goal.loads)} ({under})")
     rows = [
         [run.name, str(len(run.positions)), str(run.count(plan.campaign.cycles)), number(seconds / 60.0, 0), "min"]
-        for run, seconds in zip(plan.campaign.runs, plan.each, strict=True)
+        for run, seconds in zip(plan.campaign.runs, plan.durations, strict=True)
     ]
     used = {run.instrument: plan.goal.times[run.instrument] for run in plan.campaign.runs}
     assumed = [
-        f"  {name}: {t.first / 60.0:g} min to put it up, {t.run / 60.0:g} min a run, {t.stop:g} s a stop"
+        f"  {name}: {t.first / 60.0:g} min to install it, {t.run / 60.0:g} min for each run, {t.stop:g} s for each stop"
         for name, t in used.items()
     ]
-    head = f"{plan.readings} readings in {plan.seconds / 3600.0:.2f} h, in measuring order, if"
+    head = f"{plan.readings} readings in {plan.seconds / 3600.0:.2f} h, in measuring order, with these times:"
     runs = "\n".join([head, *assumed, aligned(("run", "places", "readings", "takes", ""), rows)])
     name = f"machine {plan.space.geometry.name}: {_goal(plan)}"
     return "\n\n".join([name, "\n".join(expected), verdict(plan), runs]) + "\n"
 
 
 def proposal_json(plan: Proposal) -> dict[str, Any]:
-    """Return a proposed plan as plain numbers; units are in the keys."""
+    """Return a proposed campaign as plain numbers for JSON; units are in the keys."""
     goal = plan.goal
     return {
         "machine": plan.space.geometry.name,
@@ -722,20 +726,21 @@ def proposal_json(plan: Proposal) -> dict[str, Any]:
         "expected_m": plan.expected,
         "takes_s": plan.seconds,
         "needed_s": plan.needed,
-        "all_candidates_m": plan.all_of_them,
+        "all_candidates_m": plan.with_all,
         "unseen_m": plan.unseen,
         "repeatability_m": plan.campaign.stops,
         "shares": plan.shares,
         "loads": len(set(plan.loads)),
         "readings": plan.readings,
         "runs": [
-            {**run.content(), "takes_s": seconds} for run, seconds in zip(plan.campaign.runs, plan.each, strict=True)
+            {**run.content(), "takes_s": seconds}
+            for run, seconds in zip(plan.campaign.runs, plan.durations, strict=True)
         ],
     }
 
 
 def remarks(plan: Proposal) -> list[str]:
-    """Return the comment at the top of the campaign's file."""
+    """Return the lines of the comment at the top of a proposed campaign's file."""
     return [
         f"Proposed for machine {plan.space.geometry.name}: {_goal(plan)}.",
         f"Expected: {', '.join(f'{name} {um(value)}' for name, value in plan.expected.items())} RMS, datum aligned.",
@@ -744,39 +749,36 @@ def remarks(plan: Proposal) -> list[str]:
 
 
 def verdict(plan: Proposal) -> str:
-    """Report whether the goal is met and, if not, the limiting factor."""
+    """Return text whether the goal is met and, if not, what limits the error."""
     if plan.met:
         return f"the goal is met: {um(plan.worst)} in {plan.seconds / 3600.0:.1f} h"
     goal, named, stops = um(plan.goal.error), ", ".join(plan.goal.instruments), plan.campaign.stops
     if stops > plan.goal.error:
-        beyond = f"its stops alone are {um(stops)} off, {um(stops - plan.goal.error)} more than the goal"
-        limit = f"the machine's repeatability: {beyond}, and no model takes that away"
+        beyond = f"{um(stops)} alone, {um(stops - plan.goal.error)} more than the goal"
+        limit = f"the machine's repeatability, {beyond}; no model reduces it"
     elif plan.needed is not None:
-        limit = f"time: {plan.needed / 3600.0:.1f} h would do"
+        limit = f"time; the goal takes {plan.needed / 3600.0:.1f} h"
     elif plan.unseen > plan.goal.error:
-        left = f"{um(plan.unseen)} would be left by any number of readings of {named} in this box"
-        limit = f"what these instruments do not see: {left}"
-    elif plan.all_of_them > plan.goal.error:
-        limit = f"the instruments' noise: all runs considered, once each, leave {um(plan.all_of_them)}"
+        left = f"any number of readings of {named} in this box leaves {um(plan.unseen)}"
+        limit = f"machine errors that these instruments do not show; {left}"
+    elif plan.with_all > plan.goal.error:
+        limit = f"the instruments' noise; all candidate runs, once each, leave {um(plan.with_all)}"
     else:
-        limit = f"time: many more runs would do; all considered leave {um(plan.all_of_them)}"
-    least = 0.1  # smaller shares of blocks in the remaining error are not listed
+        limit = f"time; the goal takes many more runs, and all candidate runs together leave {um(plan.with_all)}"
+    least = 0.1  # smallest share of a block in the expected error that is listed
     blocks = [f"{name} {100.0 * share:.0f} %" for name, share in plan.shares.items() if share >= least]
-    return "\n".join(
-        [
-            f"the goal is NOT met: {um(plan.worst)} can be had in {plan.goal.seconds / 3600.0:g} h, not {goal}",
-            f"  what limits it is {limit}",
-            f"  of what is left: {', '.join(blocks)}",
-        ]
-    )
+    reached = f"{um(plan.worst)} is expected after {plan.goal.seconds / 3600.0:g} h, not {goal}"
+    left = f"shares of the expected mean square error: {', '.join(blocks)}"
+    return f"the goal is NOT met: {reached}\n  limited by {limit}\n  {left}"
 
 
 def um(value: float) -> str:
-    """Return a length in µm, three digits."""
+    """Return a length in µm with three digits, as text."""
     return f"{value * 1e6:#.3g} µm"
 
 
 def _goal(plan: Proposal) -> str:
+    """Return the goal with its instruments and time, as text."""
     goal = plan.goal
     tilt = f" with the tool level and tilted by {np.degrees(goal.tilt):g}°" if goal.tilt else ""
     return f"goal {um(goal.error)} RMS{tilt}, with {', '.join(goal.instruments)} in {goal.seconds / 3600.0:g} h"

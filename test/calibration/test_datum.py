@@ -92,7 +92,7 @@ def test_another_datum_can_be_given_and_one_out_of_reach_is_refused(unsuspected:
     model = fit_model(readings, replace(small.FEW, blocks=()), datum=pose).model
     assert np.abs(tool_move(small.paper(), model, pose)).max() < STILL
     assert np.abs(tool_move(small.paper(), model, small.paper().home)).max() > 1e-6
-    with pytest.raises(CalibrationError, match="a pose that the machine cannot take"):
+    with pytest.raises(CalibrationError, match="a pose that the machine cannot reach"):
         fit_model(readings, replace(small.FEW, blocks=()), datum=Pose(np.array([0.0, 0.0, 2.0]), np.eye(3)))
 
 

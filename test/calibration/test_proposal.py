@@ -67,7 +67,7 @@ def test_what_limits_a_goal() -> None:
     assert not blind.met
     assert blind.unseen > blind.goal.error
     assert blind.needed is None
-    assert "do not see" in verdict(blind)
+    assert "these instruments do not show" in verdict(blind)
     short = proposed(1.5 * UM, 0.0, ("linear",), 1.0)
     assert not short.met
     assert short.needed is not None
@@ -92,7 +92,7 @@ def test_the_machine_s_repeatability_counts() -> None:
     beyond = proposed(1.5 * UM, 0.0, ("linear",), 1.0, loose)
     assert not beyond.met
     assert beyond.needed is None
-    assert "its stops alone are 1.73 µm off, 0.232 µm more than the goal" in verdict(beyond)
+    assert "repeatability, 1.73 µm alone, 0.232 µm more than the goal" in verdict(beyond)
 
 
 def test_no_time_at_all_and_tilts_beyond_the_limits(tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_no_time_at_all_and_tilts_beyond_the_limits(tmp_path: Path) -> None:
         proposed(1.0 * UM, 0.0, ("linear",), 0.2)
     geometry = load_geometry(machines()["unit"].write(tmp_path / "machine.yaml"))  # its base joints end at 18°
     place = MeasuringBox(geometry, machines()["unit"].box, np.eye(3), np.radians(30.0))
-    with pytest.raises(CalibrationError, match="tilt: 30° is within the limits at 0 % of the box only"):
+    with pytest.raises(CalibrationError, match="tilt: 30° is within the limits in only 0 % of the box"):
         propose(place, Goal(1.0 * UM, np.radians(30.0)), FitSettings(blocks=()))
 
 
@@ -175,7 +175,7 @@ def test_a_goal_under_other_loads_says_under_how_many_to_read() -> None:
         assert list(plan_of.expected) == names
         assert plan_of.met
         assert len(set(plan_of.loads)) == loads
-        assert f"loads to read under: {loads} of 2" in proposal_report(plan_of)
+        assert f"loads of the readings: {loads} of 2" in proposal_report(plan_of)
     first = [load == "" for load in many.loads]
     assert first == sorted(first, reverse=True), "the load is changed once"
     with pytest.raises(CalibrationError, match="need the stiffness of the struts"):
