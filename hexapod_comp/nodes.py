@@ -1,4 +1,4 @@
-"""The old name of :mod:`hexapod_comp.ros`, for one version: its modules are found under this name too."""
+"""Alias of :mod:`hexapod_comp.ros` from version 0.2, kept for one version: its modules can be imported from here."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Start the compensator and the simulated machine: ``ros2 launch hexapod_comp machine.launch.py``.
 
-``--show-args`` lists the arguments. With a real machine: ``simulate:=false geometry:=/path/mine.yaml``.
+``--show-args`` lists the arguments. For a real machine add ``simulate:=false geometry:=/path/mine.yaml``.
 """
 
 import os
@@ -21,17 +21,12 @@ from launch_ros.actions import Node
 from hexapod_comp.formats.paths import config_file
 
 FLAG = ["true", "false"]
-MOVERS = (
-    "autostart",
-    "use_sim_time",
-    "base_frame",
-    "work_frame",
-    "frame_prefix",
-)  # What mover has of compensator's parameters
-ADAPTERS = ("autostart", "use_sim_time", "geometry_file")  # and what adapter has
+# Parameters of the compensator that mover and adapter also have
+MOVER_PARAMETERS = ("autostart", "use_sim_time", "base_frame", "work_frame", "frame_prefix")
+ADAPTER_PARAMETERS = ("autostart", "use_sim_time", "geometry_file")
 RANGES = ["LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT"]
 DESCRIBED = f"{shlex.quote(sys.executable)} -m hexapod_comp.ros.described"
-"""Starts robot_state_publisher with the URDF that the compensator publishes: of the machine that it runs."""
+"""Command that starts robot_state_publisher with the URDF that the compensator publishes."""
 
 LOCAL_UNLESS_SET = EnvironmentVariable("ROS_AUTOMATIC_DISCOVERY_RANGE", default_value="LOCALHOST")
 
@@ -40,37 +35,40 @@ def generate_launch_description() -> LaunchDescription:
     """Return the launch description: its arguments, then the nodes."""
     argument = DeclareLaunchArgument
     arguments = [
-        argument("namespace", default_value="", description="Holds this machine's nodes and topics."),
-        argument("geometry", default_value="", description="Geometry file; empty: as in the node."),
-        argument("model", default_value="", description="Model file; empty: ideal, corrects nothing."),
+        argument("namespace", default_value="", description="Namespace of this machine's nodes and topics."),
+        argument("geometry", default_value="", description="Geometry file; empty: the nodes' default."),
+        argument("model", default_value="", description="Model file; empty: ideal, which corrects nothing."),
         argument(
-            "model_folder", default_value="", description="Models may be reloaded from it; empty: the model's own."
+            "model_folder", default_value="", description="Folder of allowed models; empty: the model file's folder."
         ),
-        argument("truth", default_value="", description="What strut_drive hides; empty: as in the node."),
-        argument("params_file", default_value="", description="Parameters of both nodes (YAML)."),
+        argument("truth", default_value="", description="strut_drive's truth_file; empty: the node's default."),
+        argument("params_file", default_value="", description="Parameters of all nodes (YAML)."),
         argument(
-            "autostart", default_value="", choices=["", *FLAG], description="Activate unasked; empty: as in the node."
+            "autostart",
+            default_value="",
+            choices=["", *FLAG],
+            description="Activate at start; empty: the nodes' default.",
         ),
         argument("simulate", default_value="true", choices=FLAG, description="Start strut_drive too."),
-        argument("mover", default_value="false", choices=FLAG, description="Start mover too: it commands the tool."),
-        argument("adapter", default_value="false", choices=FLAG, description="Start adapter too: it calibrates."),
+        argument("mover", default_value="false", choices=FLAG, description="Start mover too, which moves the tool."),
+        argument("adapter", default_value="false", choices=FLAG, description="Start adapter too, which calibrates."),
         argument(
             "instrument",
             default_value="",
             choices=["", "tracker", "laser", "ball_bar"],
-            description="Start this virtual instrument too.",
+            description="Virtual instrument to start too; empty: none.",
         ),
         argument("description", default_value="false", choices=FLAG, description="Start robot_state_publisher."),
         argument("rviz", default_value="false", choices=FLAG, description="Start RViz and robot_state_publisher."),
-        argument("frame_prefix", default_value="", description="In front of all frames, as left/ of left/base."),
-        argument("use_sim_time", default_value="false", choices=FLAG, description="Take time from /clock."),
+        argument("frame_prefix", default_value="", description="Prefix of all frames; left/ gives left/base."),
+        argument("use_sim_time", default_value="false", choices=FLAG, description="Use the time on /clock."),
         argument("log_level", default_value="info", description="debug, info, warn or error."),
         argument("enclaves", default_value="/hexapod_comp", description="Folder of the nodes' SROS 2 enclaves."),
         argument(
             "discovery_range",
             default_value=LOCAL_UNLESS_SET,
             choices=RANGES,
-            description="Who may find the nodes: what the environment says, else LOCALHOST.",
+            description="ROS_AUTOMATIC_DISCOVERY_RANGE of the nodes.",
         ),
     ]
     known = {declared.name for declared in arguments}
@@ -80,16 +78,16 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _refuse_unknown(context: LaunchContext, known: set[str]) -> None:
-    """Refuse arguments of a command line that starts this file and that nobody would read: misspelt ones."""
+    """Raise a ValueError for unknown (misspelt) arguments of a command line that starts this launch file."""
     if not any(Path(word).name == Path(__file__).name for word in sys.argv):
-        return  # another launch file includes this one: the arguments are its own
+        return  # another launch file includes this one: the arguments belong to the other file
     unknown = sorted({word.partition(":=")[0] for word in context.argv if ":=" in word} - known)
     if unknown:
         raise ValueError(f"no argument {', '.join(unknown)}; there are {', '.join(sorted(known))}")
 
 
 def _nodes(context: LaunchContext) -> list[Node]:
-    """Return the nodes for the arguments given; what is left empty stays at the node's own default."""
+    """Return the actions that start the nodes; an empty argument leaves the node's own default."""
 
     def given(name: str) -> str:
         return LaunchConfiguration(name).perform(context)
@@ -109,10 +107,10 @@ def _nodes(context: LaunchContext) -> list[Node]:
     if given("simulate") == "true":
         nodes.append(_node("strut_drive", given, [*files, common | truth]))
     if given("mover") == "true":
-        frames = {key: value for key, value in (common | model).items() if key in MOVERS}
+        frames = {key: value for key, value in (common | model).items() if key in MOVER_PARAMETERS}
         nodes.append(_node("mover", given, [*files, frames]))
     if given("adapter") == "true":
-        nodes.append(_node("adapter", given, [*files, {k: v for k, v in common.items() if k in ADAPTERS}]))
+        nodes.append(_node("adapter", given, [*files, {k: v for k, v in common.items() if k in ADAPTER_PARAMETERS}]))
     if given("instrument"):
         nodes.append(_node("instrument", given, [*files, common | {"kind": given("instrument")}]))
     if "true" in (given("description"), given("rviz")):
@@ -123,7 +121,7 @@ def _nodes(context: LaunchContext) -> list[Node]:
 
 
 def _check_installed(package: str) -> None:
-    """Refuse to start when another package's node is missing: launch would find out with the compensator running."""
+    """Raise a RuntimeError if another package's node is missing, before launch has started any node."""
     try:
         program = Path(get_package_prefix(package), "lib", package, package)
     except PackageNotFoundError:
@@ -134,7 +132,7 @@ def _check_installed(package: str) -> None:
 
 
 def _node(executable: str, given: Callable[[str], str], parameters: list) -> Node:
-    """Return the action that starts one node; its environment alone carries the discovery range."""
+    """Return the action that starts one node, with the discovery range in the node's environment only."""
     return Node(
         package="hexapod_comp",
         executable=executable,
@@ -148,7 +146,7 @@ def _node(executable: str, given: Callable[[str], str], parameters: list) -> Nod
 
 
 def _helper(package: str, given: Callable[[str], str], parameters: list, **others: Any) -> Node:
-    """Return the action that starts another package's node of the same name, beside the machine's."""
+    """Return the action that starts the node of another package, whose executable has the package's name."""
     _check_installed(package)
     return Node(
         package=package,
@@ -162,7 +160,7 @@ def _helper(package: str, given: Callable[[str], str], parameters: list, **other
 
 
 def _view(prefix: str) -> str:
-    """Return a file for RViz: the shipped one, with a prefix a copy whose frames have it."""
+    """Return the shipped configuration of RViz, or with a prefix a temporary copy whose frames have the prefix."""
     shipped = config_file("views/machine.rviz")
     if not prefix:
         return str(shipped)
@@ -170,7 +168,7 @@ def _view(prefix: str) -> str:
     view["Visualization Manager"]["Global Options"]["Fixed Frame"] = f"{prefix}base"
     for display in view["Visualization Manager"]["Displays"]:
         if "TF Prefix" in display:
-            display["TF Prefix"] = prefix.removesuffix("/")  # RViz puts the slash itself
+            display["TF Prefix"] = prefix.removesuffix("/")  # RViz adds the slash itself
         if "Frames" in display:
             display["Frames"] = {name if " " in name else prefix + name: on for name, on in display["Frames"].items()}
     with NamedTemporaryFile("w", suffix=".rviz", delete=False, encoding="utf-8") as copy:

@@ -42,7 +42,7 @@ def table(parameters: tuple[Parameter, ...]) -> str:
         f"| `{p.name}` | `{shown(p.default)}` | {_allowed(p)} | {p.taken.name.lower()} | {p.meaning} |"
         for p in parameters
     ]
-    return "\n".join(["| parameter | default | allowed | taken | meaning |", "|---|---|---|---|---|", *rows])
+    return "\n".join(["| parameter | default | allowed | applied | meaning |", "|---|---|---|---|---|", *rows])
 
 
 def _allowed(parameter: Parameter) -> str:
@@ -62,7 +62,7 @@ def file() -> str:
     for node, parameters in TABLES.items():
         lines: list[str] = []
         for p in parameters:
-            lines += textwrap.wrap(f"# {p.described()}; taken {p.taken.value}", 110, subsequent_indent="# ")
+            lines += textwrap.wrap(f"# {p.described()}; applied {p.taken.value}", 110, subsequent_indent="# ")
             value = yaml.safe_dump([p.default], default_flow_style=True, width=200).strip()
             lines.append(f"{p.name}: {value[1:-1]}")
         text += f"\n/**/{node}:\n  ros__parameters:\n" + textwrap.indent("\n".join(lines), "    ") + "\n"

@@ -415,7 +415,7 @@ class LinuxcncBridgeNode(MachineNode):
         level, text = self._judged(now)
         if text != self._last_text:
             self._last_text = text
-            (self.note if level == OK else self.log_warning)(text, text)
+            (self.log_action if level == OK else self.log_warning)(text, text)
         yield level, text
 
     def _judged(self, now: float) -> tuple[bytes, str]:

@@ -1,4 +1,4 @@
-"""The ROS side: nodes and what they share."""
+"""The ROS nodes, and the code that several nodes share."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from collections.abc import Callable
 from functools import partial
 from types import FrameType
 
-# Where Fast DDS looks for a user's profile: up to version 2 (ROS 2 Jazzy), and from version 3
+# Environment variables that name the user's XML profile for Fast DDS: up to version 2 (ROS 2 Jazzy), and from version 3
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
-_LIBC = ctypes.CDLL(None)  # at import: end_with_parent runs between fork and exec
+_LIBC = ctypes.CDLL(None)  # loaded at import, since end_with_parent runs between fork and exec
 
 
 def start(module: str) -> int:
-    """Run a program's module; without the compiled core print one line that tells how to build it.
+    """Run the `main` of a program's module; if the C core is not compiled, print one line that says how to build it.
 
-    A signal while the module is loaded ends the process at once: nothing needs to be closed yet.
+    A signal that arrives while the module is loaded ends the process at once, since nothing is open yet.
     """
     _handle_stop_signals(lambda *_: os._exit(0))
     try:
@@ -34,10 +34,10 @@ def start(module: str) -> int:
 
 
 def received_signals() -> list[int]:
-    """Return a list to which SIGINT, SIGTERM and SIGHUP are appended, from now on, instead of their usual effect.
+    """Return a list to which SIGINT, SIGTERM and SIGHUP are appended from now on, instead of their usual effect.
 
-    Not an event: setting one acquires its lock, and the signal may have interrupted the holder, a main thread about to
-    wait for the event or another signal's handler. Then the process would deadlock.
+    The list is used rather than a `threading.Event`: setting an Event acquires its lock, which the interrupted code may
+    hold (the main thread about to wait, or another signal's handler), and then the process would deadlock.
     """
     received: list[int] = []
     _handle_stop_signals(lambda number, _: received.append(number))
@@ -45,16 +45,16 @@ def received_signals() -> list[int]:
 
 
 def _handle_stop_signals(handler: Callable[[int, FrameType | None], object]) -> None:
-    """Let a function handle the signals that end a program; a hang-up that nohup ignores stays ignored."""
+    """Install a handler for the signals that end a program; SIGHUP stays ignored if nohup has had it ignored."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number is not signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, handler)
 
 
 def open_streams() -> None:
-    """Open those of stdin, stdout and stderr that were closed when the process began: rclpy's executor needs a stderr.
+    """Open each of stdin, stdout and stderr that was closed when the process began: rclpy's executor needs a stderr.
 
-    Otherwise the next file or socket would get the number of a closed one, and with it the output of libraries.
+    Otherwise the next file or socket would get the closed stream's number, and libraries would write into it.
     """
     for number in (0, 1, 2):
         try:
@@ -67,32 +67,32 @@ def open_streams() -> None:
 
 
 def avoid_shared_memory() -> None:
-    """Let Fast DDS receive by UDP only, unless the user has a profile of their own.
+    """Have Fast DDS receive by UDP only, unless the user has set a profile of their own.
 
-    A process killed while it holds a lock in another's shared memory stalls that other for seconds.
-    The environment of this process, and so of its children, is changed, before ROS is initialised in it.
+    A process that is killed while it holds a lock in another process's shared memory stalls that process for seconds.
+    This function changes the environment of this process and its children; call it before ROS is initialised.
     """
     from ..formats.paths import config_folder
 
     if not any(os.environ.get(name) for name in PROFILE_VARIABLES):
         os.environ[PROFILE_VARIABLES[0]] = str(config_folder() / "fastdds.xml")
-        # Without it ROS overrides a profile's settings of shared memory.
+        # Without this variable ROS overrides the profile's settings of shared memory.
         os.environ.setdefault("RMW_FASTRTPS_USE_QOS_FROM_XML", "1")
 
 
 def keep_discovery_local() -> None:
-    """Keep discovery to this machine, and out of shared memory, unless the user's environment says otherwise."""
+    """Limit ROS discovery to this computer and avoid shared memory, unless the user's environment sets otherwise."""
     avoid_shared_memory()
     if "ROS_STATIC_PEERS" not in os.environ:
         os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
 def end_with_parent(number: signal.Signals = signal.SIGTERM) -> None:
-    """Have Linux send this process a signal when its parent dies, for any reason."""
+    """Have Linux send this process the signal `number` when its parent process dies, for whatever reason."""
     _LIBC.prctl(1, number)  # PR_SET_PDEATHSIG
 
 
-# The executables of setup.py
+# Entry points of the executables that setup.py installs
 start_compensator, start_strut_drive, start_mover, start_instrument, start_adapter = (
     partial(start, f"{__name__}.{node}") for node in ("compensator", "strut_drive", "mover", "instrument", "adapter")
 )

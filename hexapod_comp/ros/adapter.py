@@ -1,8 +1,8 @@
 """The adapter node: a machine that calibrates itself on request, and checks its model periodically.
 
-It runs ``hexapod_comp adapt`` as a process beside it, which has the machine moved and measured and computes for
-minutes; the node only starts and stops it and publishes, on ``~/state``, what its journal says. Run it with
-``ros2 run hexapod_comp adapter`` or ``python -m hexapod_comp.ros.adapter``.
+The node runs ``hexapod_comp adapt`` as a separate process, which moves and measures the machine and computes for
+minutes. The node only starts and stops this process, and publishes the progress found in its journal on ``~/state``.
+Run the node with ``ros2 run hexapod_comp adapter`` or ``python -m hexapod_comp.ros.adapter``.
 """
 
 from __future__ import annotations
@@ -29,36 +29,37 @@ from .parameters import Program, read_table
 from .process import run
 from .worker import PACKAGE_ROOT
 
-NICENESS = 10  # Of the process: commands come first
-CHILD_ENCLAVE = "/hexapod_comp/calibrator"  # its rights, where SROS 2 is on
+NICENESS = 10  # lower CPU priority of the adapt process, so that commands are answered first
+CHILD_ENCLAVE = "/hexapod_comp/calibrator"  # SROS 2 enclave with the adapt process's access rights
 
 IDLE, CALIBRATING, VERIFYING, FAILED = "idle", "calibrating", "verifying", "failed"
-GOOD = ("in use", "proposed")  # how the verb says that a model is borne out
+GOOD = ("in use", "proposed")  # final states of the verb `adapt` for a model that its check readings confirm
 
 PARAMETERS = read_table("""
-autostart | true |  | start | configure and activate at the start
+autostart | true |  | start | configure and activate when the process starts
 geometry_file | paper.yaml |  | configure | geometry file: a path or the name of a shipped one
-folder | adapted |  | configure | folder of the journal, readings and models; what it has begun goes on
-goal | 3.0e-6 | 1e-9 to 0.01 m | configure | RMS tool error that may be left, with 95 %, the datum aligned
-topic | tool_pose_true |  | configure | poses of the tool in base, from a tracker or motion capture
-samples | 25 | 3 to 10000 | configure | poses of which the median is taken, three times at each stop
-reload | false |  | always | have the compensator run each model that its checks bear out; else they are proposed
-check_every | 0.0 | 0 to 1e7 s | always | check the model, or go on with what was interrupted, this long after the last
-    run; 0 = when it is asked for
+folder | adapted |  | configure | folder of the journal, readings and models; an interrupted run in it is continued
+goal | 3.0e-6 | 1e-9 to 0.01 m | configure | largest RMS tool error accepted after calibration, with 95 % probability
+    and the datum aligned
+topic | tool_pose_true |  | configure | topic of measured tool poses in base, from a tracker or motion capture
+samples | 25 | 3 to 10000 | configure | number of poses in each median; three medians are taken at each stop
+reload | false |  | always | load each model that the check readings confirm into the compensator; false: propose it
+check_every | 0.0 | 0 to 1e7 s | always | time after the last run at which the model is checked, or an interrupted run
+    is continued; 0 = only on request
 """)
 
 TOPICS = """
-out  ~/state      DiagnosticStatus, latched: idle, calibrating, verifying; and how that ended: in use, proposed,
+out  ~/state      DiagnosticStatus, latched: idle, calibrating or verifying; after a run its result: in use, proposed,
                   changed, refused, stopped, failed
      /diagnostics
-ask  ~/calibrate  Trigger: calibrate, or go on with what was begun; returns at once
-     ~/verify     Trigger: check the model now, and repair it where the machine has changed
-     ~/stop       Trigger: brake the machine and end; ~/calibrate or ~/verify goes on from there
+ask  ~/calibrate  Trigger: calibrate, or continue an interrupted calibration; returns at once
+     ~/verify     Trigger: check the model now, and repair it if the machine has changed
+     ~/stop       Trigger: brake the machine and end the run; ~/calibrate or ~/verify continues it
 """
 
 PROGRAM = Program(
     "adapter",
-    "Calibrates a running machine and keeps its model true.",
+    "Calibrates a running machine, and checks and repairs its model.",
     PARAMETERS,
     TOPICS,
     "-p goal:=3.0e-6 -p reload:=true -p check_every:=3600.0",
@@ -66,27 +67,27 @@ PROGRAM = Program(
 
 
 class AdapterNode(MachineNode):
-    """Lifecycle node that runs the verb ``adapt``; arguments are those of ``rclpy`` nodes."""
+    """Lifecycle node that runs the verb ``adapt`` as a process; `options` are those of rclpy's nodes."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("adapter", PARAMETERS, **options)
-        self._forget()
+        self._clear_state()
 
-    def _forget(self) -> None:
+    def _clear_state(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
-        self._stopping = False  # it was told to end
-        self._state, self._text, self._step, self._model = IDLE, "nothing was asked for yet", "", ""
-        self._next = ""  # what is due when `check_every` is over: a check, or what was interrupted
+        self._stopping = False  # the process has been sent SIGINT
+        self._state, self._text, self._step, self._model = IDLE, "no calibration or check was requested yet", "", ""
+        self._next = ""  # run to start `check_every` after the last one: VERIFYING, CALIBRATING, or "" for none
         self._ended = time.monotonic()
-        self._begun = self._read = 0  # bytes of the journal: of the runs before; when it was read last
+        self._begun = self._read = 0  # journal size, byte, when the present run began, and when it was last read
 
     # ---- lifecycle ----
 
     def configure(self) -> None:
-        self._forget()
+        self._clear_state()
         self._journal = Path(self._options["folder"]).resolve() / JOURNAL
         if (self._journal.parent / IN_USE).exists():
-            self._next = VERIFYING  # of the node before this one
+            self._next = VERIFYING  # the folder holds a model from an earlier start of the node
         self.set_hardware_id(self._options["geometry_file"])
         self._states = self.create_publisher(DiagnosticStatus, "~/state", LATCHED_QOS)
         self.create_logged_service(Trigger, "~/calibrate", lambda *_: self._start(CALIBRATING))
@@ -95,33 +96,35 @@ class AdapterNode(MachineNode):
         self._publish_state()
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Brake the machine and end what runs."""
+        """Stop a calibration or check that is running; its process brakes the machine first."""
         self._interrupt()
         return super().on_deactivate(state)
 
     def unconfigure(self) -> None:
-        """Let a process that still runs brake the machine and end by itself."""
+        """Stop a calibration or check that is running, without waiting until its process has ended."""
         self._interrupt()
 
     def publish_last_status(self) -> None:
-        """Stop a calibration or check that still runs, and publish `stopped` before the node ends."""
+        """Stop a calibration or check that is running, and publish `stopped` and the last status."""
         if self._process is not None:
             self._interrupt()
             self._change("stopped", "the node ended")
             self._states.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+        super().publish_last_status()
 
-    # ---- what is asked for ----
+    # ---- services ----
 
     def _on_stop(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response:
         running = self._interrupt()
-        return Trigger.Response(success=True, message="the machine brakes" if running else "nothing was running")
+        text = "the machine brakes" if running else "no calibration or check was running"
+        return Trigger.Response(success=True, message=text)
 
     def _start(self, state: str) -> Trigger.Response:
-        """Start the process; refused while one runs."""
+        """Start the adapt process for CALIBRATING or VERIFYING; refuse while another one runs."""
         if not self._active:
             return Trigger.Response(message="the node is not active")
         if self._process is not None:
-            return Trigger.Response(message=f"{self._state} already: ~/stop ends it")
+            return Trigger.Response(message=f"already {self._state}: call ~/stop to end it")
         options, namespace = self._options, self.get_namespace()
         words = ["adapt", "--machine", options["geometry_file"], "--folder", str(self._journal.parent)]
         words += ["--goal-um", repr(options["goal"] * 1e6), "--topic", options["topic"]]
@@ -137,16 +140,16 @@ class AdapterNode(MachineNode):
             [sys.executable, "-m", "hexapod_comp", *words],
             env=environment,
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,  # the journal has all of it
-            start_new_session=True,  # so that Ctrl-C reaches it through the node alone
-            preexec_fn=partial(end_with_parent, signal.SIGINT),  # it brakes the machine when the node is killed
+            stdout=subprocess.DEVNULL,  # the journal has the same content
+            start_new_session=True,  # so that Ctrl-C reaches the process only through the node
+            preexec_fn=partial(end_with_parent, signal.SIGINT),  # the process brakes the machine if the node is killed
         )
         os.setpriority(os.PRIO_PROCESS, self._process.pid, NICENESS)
         self._change(state, "starting")
-        return Trigger.Response(success=True, message=f"{state}; ~/state says what comes of it")
+        return Trigger.Response(success=True, message=f"{state}; ~/state reports progress and result")
 
     def _interrupt(self) -> bool:
-        """Have the process brake the machine and end, as Ctrl-C does; return whether one runs."""
+        """Send SIGINT, as Ctrl-C does, to a running process, which then brakes and ends; return whether one ran."""
         if self._process is None:
             return False
         self._stopping = True
@@ -157,7 +160,7 @@ class AdapterNode(MachineNode):
 
     def update(self, now: float) -> None:
         if self._process is not None:
-            code = self._process.poll()  # before the journal is read, which has all then that it wrote
+            code = self._process.poll()  # first: an ended process has written all its events, which are read next
             size = self._journal_size()
             if code is None and size == self._read:
                 return
@@ -180,28 +183,29 @@ class AdapterNode(MachineNode):
     def _journal_size(self) -> int:
         try:
             return self._journal.stat().st_size
-        except OSError:  # it is being made
+        except OSError:  # the process has not created the journal yet
             return 0
 
     def _events(self) -> list[Event]:
-        """Return what the process has written into the journal; it says itself what is wrong with that."""
+        """Return the present run's events; none if the journal cannot be read, which the process reports itself."""
         try:
             return Journal.read(self._journal, self._begun)
         except (HexapodError, OSError):
             return []
 
     def _finish(self, code: int, last: Event) -> None:
-        """Publish how a process ended, by the last event that it has written."""
+        """Publish the result of an ended process, from its exit code and the `last` event that it wrote."""
         begun, self._process, self._ended = self._state, None, time.monotonic()
         ended = last.get("event") == ENDED
         if ended:
             self._model = str(self._journal.parent / last["model"]) if last["model"] else ""
             self._change(last["state"], last["text"])
         elif self._stopping:
-            self._change("stopped", "before anything was done")
+            self._change("stopped", "before the first step was completed")
         else:
-            self._change(FAILED, f"the process ended with {code}; its last words are in the log")
-        interrupted = self._state == FAILED and (ended or code < 0)  # or killed; else it would fail again
+            self._change(FAILED, f"the process ended with {code}; its last messages are in the log")
+        # Try again after a reported failure or a kill by a signal; any other exit code would only be repeated.
+        interrupted = self._state == FAILED and (ended or code < 0)
         self._next = VERIFYING if self._state in GOOD else begun if interrupted else ""
 
     def _change(self, state: str, text: str) -> None:
@@ -222,7 +226,7 @@ class AdapterNode(MachineNode):
 
 
 def _with_package() -> str:
-    """Return PYTHONPATH for a process that finds this package wherever it runs."""
+    """Return a PYTHONPATH with which a process can import this package from any working directory."""
     return os.pathsep.join([str(PACKAGE_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
 
 

@@ -1,6 +1,6 @@
-"""Shared by the package's lifecycle nodes: topics, timers and services under one guard, log, diagnostics.
+"""Base class of the package's lifecycle nodes: guarded topics, timers and services; log; diagnostics.
 
-doc/states.md has every state that compensator and drive report.
+doc/states.md lists every state that compensator and drive report.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from .rclpy_compat import (
 
 
 def profile(depth: int, reliable: bool = True, latched: bool = False) -> QoSProfile:
-    """Return the QoS of a topic that keeps its last `depth` messages; latched: also for late subscribers."""
+    """Return the QoS of a topic that keeps its last `depth` messages; if latched, late subscribers receive them too."""
     return QoSProfile(
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
@@ -60,20 +60,20 @@ def profile(depth: int, reliable: bool = True, latched: bool = False) -> QoSProf
     )
 
 
-# Commands: each must arrive. A hundred wait while a busy processor pauses for 0.1 s at 1 kHz, or lost ones are
-# repeated.
+# Commands, each of which must arrive: up to a hundred wait while a busy processor pauses for 0.1 s at 1 kHz, or while
+# lost messages are sent again.
 COMMAND_QOS = profile(100)
 
-# Publishers of states: the newest only, to reliable subscribers too, as those with rclpy's defaults are
+# Publishers of states: only the newest message is kept; reliable, since subscribers with rclpy's defaults require it
 STATE_QOS = profile(1)
 
-# Subscriptions of states, however published: only the newest counts, an old one need not be repeated
+# Subscriptions of states from reliable or best-effort publishers: only the newest message is kept, none is sent again
 NEWEST_QOS = profile(1, reliable=False)
 
-# Subscriptions of sensors, for any publisher's QoS
+# Subscriptions of sensors, from reliable or best-effort publishers
 SENSOR_QOS = profile(10, reliable=False)
 
-# Rare messages, each of which counts: diagnostics, markers
+# Rare messages that must not be lost: diagnostics, markers, requests for moves
 EVENT_QOS = profile(10)
 
 # A state that late subscribers must receive too
@@ -95,7 +95,7 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 TRANSITIONS = ("on_configure", "on_activate", "on_deactivate", "on_cleanup", "on_shutdown")
 
 CHECK_PERIOD = 0.05  # Period at which a node evaluates its state, s
-STATUS_PERIOD = 1.0  # A status is published at once when level or text change, and after this time, s
+STATUS_PERIOD = 1.0  # Longest time between two published statuses, s; a change of level or text is published at once
 
 # Longest wait for the last message's acknowledgement: DDS may take 3 s, and dead subscribers never send it
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.4)
@@ -103,7 +103,7 @@ ACKNOWLEDGED_WITHIN = Duration(seconds=0.4)
 
 # ---- what a node reports ----
 
-LEAST_ROOM = 65_536  # A file system with less free space, byte, is full: a few hundred lines of log
+LEAST_ROOM = 65_536  # Free space, byte, below which the log's file system is reported as full: a few hundred log lines
 
 
 def status_prefix(namespace: str, node: str) -> str:
@@ -120,19 +120,19 @@ def status_of(
 
 
 def joined(findings: Iterable[tuple[bytes, str]]) -> tuple[bytes, str]:
-    """Return level and text of all findings that are not OK, worst first; of the first when all are OK."""
+    """Return level of the first, and texts of all findings that are not OK, worst first; the first if all are OK."""
     listed = list(findings)
     bad = [finding for finding in listed if finding[0] != OK] or listed[:1]
     return bad[0][0], "; ".join(text for _, text in bad)
 
 
 def seconds(value: float) -> str:
-    """Return an age as text: ``never`` when it is infinite."""
+    """Return an age in s as text; ``never`` for infinity, the age of an event that has not occurred."""
     return "never" if value == math.inf else f"{value:.3f}"
 
 
 class Flow:
-    """Counts events; returns their rate and the age of the last one."""
+    """Counter of events, with their rate over about the last second, Hz, and the age of the last event, s."""
 
     def __init__(self) -> None:
         self.count, self.last = 0, -math.inf
@@ -153,9 +153,11 @@ class Flow:
 
 
 class Refusals:
+    """Counts of refused messages by reason, and the reasons that are recent enough to be shown in the status."""
+
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self._lately: dict[str, EventWindow] = {}
+        self._windows: dict[str, EventWindow] = {}
         self.last_reason = self.last_text = ""
 
     @property
@@ -164,17 +166,18 @@ class Refusals:
 
     def add(self, reason: str, text: str, now: float) -> None:
         self.counts[reason] += 1
-        self._lately.setdefault(reason, EventWindow()).note(now)
-        self._lately[reason] = self._lately.pop(reason)  # the newest stands last
+        window = self._windows.pop(reason, EventWindow())
+        window.note(now)
+        self._windows[reason] = window  # at the end of the dict: the newest reason is the last
         self.last_reason, self.last_text = reason, text
 
     def recent(self, now: float) -> bool:
-        """Return whether one is recent enough to be shown as an error."""
+        """Return whether any refusal is recent enough to be shown (see EventWindow)."""
         return bool(self.reasons(now))
 
     def reasons(self, now: float, but: str = "") -> str:
-        """Return all reasons `but` one recent enough to be shown, the newest first: none must hide another."""
-        recent = [reason for reason, lately in self._lately.items() if lately.holds(now)]
+        """Return the reasons of recent refusals as a text, the newest first, without the reason `but`."""
+        recent = [reason for reason, window in self._windows.items() if window.holds(now)]
         return ", ".join(reason for reason in reversed(recent) if reason != but)
 
     def values(self) -> dict[str, str]:
@@ -183,8 +186,7 @@ class Refusals:
 
 
 def log_problem(folder: str = "") -> str:
-    """Return why ROS's log cannot be written, empty if it can: only the nodes can report that nothing is written any
-    more. Takes a few microseconds on a local file system."""
+    """Return why ROS's log cannot be written, empty if it can: the log itself cannot report this."""
     folder = folder or str(get_logging_directory())
     try:
         usage = os.statvfs(folder)
@@ -199,15 +201,15 @@ def log_problem(folder: str = "") -> str:
 
 
 class CallbackGuard:
-    """The guard around everything that ROS calls in a node: it catches and counts what a callback raises.
+    """Wrapper around all callbacks of a node, which catches, counts and logs every exception that they raise.
 
-    A message, a timer, an event or a request must not end a running machine's node, whoever sent it and whatever the
-    error. An exception caught here was not foreseen elsewhere, so it is an error for a second. A service also answers:
-    anyone may request a transition that is not allowed now, and rclpy raises then.
+    No message, timer, event or request may end the node of a running machine. No other code has expected an exception
+    that is caught here, so the status shows an error for a second. A service's wrapper also sends a refusal as answer:
+    rclpy raises, for instance, when a client requests a transition that is not allowed in the present state.
     """
 
-    def __init__(self, warn: Callable[[str, str], None], complain: Callable[[str, str], None]) -> None:
-        self._warn, self._complain = warn, complain  # log with a cause, for throttling
+    def __init__(self, log_warning: Callable[[str, str], None], log_error: Callable[[str, str], None]) -> None:
+        self._log_warning, self._log_error = log_warning, log_error  # arguments: cause, for throttling, and text
         self._caught, self._requests = Refusals(), Refusals()
         self.request = ""  # name of the service that is answering; empty between requests
 
@@ -215,12 +217,12 @@ class CallbackGuard:
         """Count and log an exception of a callback."""
         text = printable(f"{what}: {described(error)}", LONGEST_TEXT)
         self._caught.add(what, text, time.monotonic())
-        self._complain(what, f"error in a callback, the node goes on: {text}")
+        self._log_error(what, f"error in a callback, the node keeps running: {text}")
 
     def around(self, what: str, callback: Callable[..., Any], otherwise: Any = None) -> Callable[..., Any]:
-        """Return a callback that never raises; it returns `otherwise` instead."""
+        """Return a wrapped callback that returns `otherwise` when the callback raises."""
 
-        @functools.wraps(callback)  # rclpy inspects the number of arguments of callbacks
+        @functools.wraps(callback)  # rclpy inspects the number of a callback's arguments
         def guarded(*arguments: Any, **keywords: Any) -> Any:
             try:
                 return callback(*arguments, **keywords)
@@ -231,17 +233,16 @@ class CallbackGuard:
         return guarded
 
     def answering(self, name: str, kind: Any, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """Return a service's callback that refuses a request when the given one raises: unset fields of the response
-        are false or empty."""
+        """Return a wrapped service callback that answers with false, empty fields and the error when it raises."""
 
         def answer(request: Any, response: Any) -> Any:
             self.request = name
             try:
                 return callback(request, response)
-            except Exception as error:  # rclpy's own errors, Python's where it does not check: of many kinds
+            except Exception as error:  # of any kind: rclpy's own errors, and Python's where rclpy checks nothing
                 text, refusal = printable(str(error), LONGEST_TEXT), kind.Response()
                 self._requests.add(name, text, time.monotonic())
-                self._warn(name, f"{name} refused: {text}")
+                self._log_warning(name, f"{name} refused: {text}")
                 if isinstance(refusal, SetParameters.Response):
                     refusal.results = [SetParametersResult(reason=text) for _ in request.parameters]
                 elif hasattr(refusal, "message"):
@@ -265,24 +266,24 @@ class CallbackGuard:
 
 
 class MachineNode(LifecycleNode):
-    """A lifecycle node with a table of parameters. ROS calls everything here through a :class:`CallbackGuard`.
+    """A lifecycle node with a table of parameters, whose callbacks all run inside a :class:`CallbackGuard`.
 
-    A node overrides `configure`, which opens its topics, timers and services: all that was opened since then is closed
-    with its configuration. `findings` and `values` are its state.
+    A subclass overrides `configure`, which opens its topics, timers and services; cleanup closes all of them. It
+    overrides `findings` and `values`, which make up its status in `/diagnostics`.
 
     A user may override the QoS of topics by parameters. rclpy writes the overrides into the given profile, so every
-    topic gets its own copy. A ParameterError reports a parameter's invalid value.
+    topic gets its own copy. A parameter with an invalid value raises a ParameterError.
     """
 
     def __init__(self, name: str, table: Sequence[Parameter] = (), **options: Any) -> None:
         self._active = self.configured = False
         self._throttle = Throttle()
         self.guard = CallbackGuard(self.log_warning, self.log_error)
-        for change in TRANSITIONS:  # rclpy would swallow their exceptions silently
+        for change in TRANSITIONS:  # rclpy would catch their exceptions without a message
             setattr(self, change, self.guard.around(change, getattr(self, change), TransitionCallbackReturn.ERROR))
         super().__init__(name, **options)
         self._logger = PlainLogger(self.get_logger().name, lambda: bool(self.guard.request))
-        for service in self.services:  # create_service does not make the lifecycle's services
+        for service in self.services:  # the lifecycle's services, which rclpy does not make by create_service
             callback = service.callback
             callback = possible_only(self, callback) if service.srv_type is ChangeState else callback
             service.callback = self.guard.answering(service.srv_name, service.srv_type, callback)
@@ -311,14 +312,14 @@ class MachineNode(LifecycleNode):
         return self._active
 
     def configure(self) -> None:
-        """Make what the node needs, and open its topics; a HexapodError leaves it unconfigured."""
+        """Read the files that the node needs and open its topics; a HexapodError leaves the node unconfigured."""
 
     def unconfigure(self) -> None:
-        """End what `configure` has made beside topics, timers and services."""
+        """End what `configure` has started beside topics, timers and services: processes, for example."""
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Configure; after an error the node is as before."""
-        self._permanent = self._open_ends()
+        """Configure the node; after an error, close everything that was opened meanwhile."""
+        self._permanent = self._entities()
         try:
             with self.rolled_back_on_error():
                 self.configure()
@@ -340,40 +341,40 @@ class MachineNode(LifecycleNode):
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Close what was opened since `configure`."""
+        """Close the topics, timers and services that were opened since `configure` began."""
         self._active = self.configured = False
         self.unconfigure()
         self._close_since(self._permanent)
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop permanently: publish the last status, then close everything, so that nothing more is published."""
+        """Publish the last status, then close all topics, timers and services, so that nothing more is published."""
         self.publish_last_status()
         if state.state_id != State.PRIMARY_STATE_UNCONFIGURED:
             self.on_cleanup(state)
         return super().on_shutdown(state)
 
     def publish_last_status(self) -> None:
-        """Publish the last status of a configured node, and wait until it has arrived."""
+        """Publish the last status, `not active`, of a configured node; wait up to 0.4 s until it has arrived."""
         if self.configured:
             self._active = False
             self._check_state()
             self._diagnostics_pub.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
     def destroy_node(self) -> None:
-        """Leave ROS at once, with the lifecycle services."""
+        """Destroy the node together with its timers' threads and its lifecycle services."""
         for ticker in self._tickers.values():
             ticker.close()
         super().destroy_node()
         end_lifecycle(self)
 
-    def _open_ends(self) -> list[Any]:
+    def _entities(self) -> list[Any]:
         return [*self.timers, *self.subscriptions, *self.services, *self.clients, *self.publishers]
 
     @contextmanager
     def rolled_back_on_error(self) -> Iterator[None]:
-        """Close everything opened in this block if it raises, so that the node is as before."""
-        before = self._open_ends()
+        """Close all topics, timers and services that are opened in this block if the block raises."""
+        before = self._entities()
         try:
             yield
         except BaseException:
@@ -384,9 +385,9 @@ class MachineNode(LifecycleNode):
         for ticker in self._tickers.values():
             ticker.close()
         self._tickers.clear()
-        self.close_ends(*(end for end in self._open_ends() if end not in before))
+        self.close_entities(*(entity for entity in self._entities() if entity not in before))
 
-    def close_ends(self, *ends: Publisher | Subscription | Service | Timer | Client | None) -> None:
+    def close_entities(self, *entities: Publisher | Subscription | Service | Timer | Client | None) -> None:
         kinds: tuple[tuple[type, Callable[[Any], Any]], ...] = (
             (Publisher, self.destroy_publisher),
             (Subscription, self.destroy_subscription),
@@ -394,10 +395,10 @@ class MachineNode(LifecycleNode):
             (Timer, self.destroy_timer),
             (Client, self.destroy_client),
         )
-        for end in ends:
+        for entity in entities:
             for kind, destroy in kinds:
-                if isinstance(end, kind):
-                    destroy(end)
+                if isinstance(entity, kind):
+                    destroy(entity)
 
     # ---- parameters and time ----
 
@@ -407,25 +408,25 @@ class MachineNode(LifecycleNode):
         self.on_parameters(names)
 
     def check_parameters(self, values: dict[str, Any]) -> None:
-        """Refuse, by a ParameterError, values that are allowed, but not now."""
+        """Raise a ParameterError for values within their range that cannot be set in the node's present state."""
 
     def on_parameters(self, names: set[str]) -> None:
-        """Apply parameters that have been set while the node runs; called at other times too, with no names."""
+        """Apply the named parameters, which have been set while the node runs."""
 
     def simulated_time(self) -> Callable[[], int] | None:
-        """Return a function that reads the simulated time, ns; None if the time is the system's."""
+        """Return a function that reads the simulated time, ns; None if the node uses the system's clock."""
         simulated = bool(self.get_parameter("use_sim_time").value)
         return (lambda: int(self.get_clock().now().nanoseconds)) if simulated else None
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
-        """Return a timer on a clock that cannot be set: the node's own would stop while it is set back.
+        """Return a timer with this period, s, on the monotonic clock: the node's clock may be set back.
 
-        Its period stays, and it is never reset: see :class:`~.rclpy_compat.Alarm`.
+        Never change its period or reset it, see :class:`~.rclpy_compat.Alarm`.
         """
         return self.create_timer(period, callback, clock=self._steady)
 
     def at_rate(self, name: str, callback: Callable[[], None]) -> Alarm:
-        """Return a timer whose rate is a parameter, which may change at any time; 0: never."""
+        """Return a timer whose rate, Hz, is the parameter `name`, which may change at any time; 0: never."""
         self._tickers[name] = ticker = Alarm(self, self.guard.around(name, callback), self._options[name])
         return ticker
 
@@ -446,23 +447,23 @@ class MachineNode(LifecycleNode):
     def create_service(
         self, srv_type: Any, srv_name: str, callback: Callable[..., Any], *arguments: Any, **options: Any
     ) -> Service:
-        """Return a service that refuses a request where its callback raises."""
+        """Return a service that answers with a refusal when its callback raises."""
         guarded = self.guard.answering(srv_name, srv_type, callback)
         return super().create_service(srv_type, srv_name, guarded, *arguments, **options)
 
     def create_logged_service(self, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any]) -> Service:
-        """Return a service that logs which nodes may have called: after an accident the first question is who."""
+        """Return a service that logs, at each call, which nodes may have called it."""
 
         def logged(request: Any, response: Any) -> Any:
             name = srv_name.removeprefix("~/")
-            self.note(name, f"{name}: asked for by {callers(self, service)}")
+            self.log_action(name, f"{name}: asked for by {callers(self, service)}")
             return callback(request, response)
 
         service = self.create_service(srv_type, srv_name, logged)
         return service
 
     def publish_on(self, message_type: type, topic: str, qos: QoSProfile, deadline: float = 0.0) -> Publisher:
-        """Return a publisher; it offers `deadline`, s, between messages, 0: none."""
+        """Return a publisher whose QoS promises a message at least every `deadline`, s; 0: no deadline."""
         qos = copy.copy(qos)
         qos.deadline = Duration(seconds=deadline)
         return self.create_publisher(message_type, topic, qos, qos_overriding_options=OVERRIDES)
@@ -470,7 +471,7 @@ class MachineNode(LifecycleNode):
     def subscribe(
         self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
     ) -> Subscription:
-        """Return a subscription of what any node may publish; what cannot be read, or is too long, is ignored."""
+        """Subscribe to a topic with any number of publishers; unreadable and too long messages are ignored."""
 
         def receive(data: bytes) -> None:
             try:
@@ -490,10 +491,10 @@ class MachineNode(LifecycleNode):
         several: bool,
         qos: QoSProfile = COMMAND_QOS,
     ) -> OneSender:
-        """Subscribe to what only one node may publish, unless `several` may; return the guard of its sender.
+        """Subscribe to a topic that only one node may publish, unless `several`; return the guard against a second one.
 
-        The callback gets the message's bytes, so that it need not read what is too long. Where the middleware tells
-        that a publisher comes or goes, or a message shows a second one, :meth:`update_publishers` is called at once.
+        The callback receives the message's bytes, so that it can reject a long one unparsed. When a publisher comes or
+        goes, or a sequence number shows a second one, :meth:`update_publishers` is called at once.
         """
 
         full = self.resolve_topic_name(topic)
@@ -501,7 +502,7 @@ class MachineNode(LifecycleNode):
         sender = OneSender(full, lambda: int(subscription.get_publisher_count()), names, several)
 
         def on_matched() -> None:
-            if subscription in self.subscriptions:  # the event of one that has been closed meanwhile
+            if subscription in self.subscriptions:  # events may still arrive after the subscription was closed
                 self.update_publishers()
 
         caught = functools.partial(self.guard.caught, topic)
@@ -518,8 +519,7 @@ class MachineNode(LifecycleNode):
         return sender
 
     def _when_matched(self, topic: str, events: type, make: Callable[..., Any], callback: Callable[[], None]) -> Any:
-        """Make an end of a topic that calls back, where the middleware can tell, when one at the other end comes or
-        goes."""
+        """Make a publisher or subscription, with `callback` for its counterparts coming or going if rmw supports it."""
         try:
             guarded = self.guard.around(f"matching of {topic}", lambda _: callback())
             return make(event_callbacks=events(matched=guarded))
@@ -527,10 +527,10 @@ class MachineNode(LifecycleNode):
             return make()
 
     def update_publishers(self) -> None:
-        """Update who publishes what only one node may; called when a publisher comes or goes, and periodically."""
+        """Update the guards of topics with one allowed publisher: every 50 ms, and when a publisher comes or goes."""
 
     def sole_publisher(self, own: Publisher, several: bool) -> OneSender:
-        """Return the guard of a topic that only this node may publish, unless `several` may."""
+        """Return a guard that reports any other publisher of this node's topic, unless `several` are allowed."""
         count = functools.partial(self.count_publishers, own.topic_name)
         names = functools.partial(publishers, self, own.topic_name)
         return OneSender(own.topic_name, count, names, several, self.get_fully_qualified_name())
@@ -538,59 +538,59 @@ class MachineNode(LifecycleNode):
     # ---- log and diagnostics ----
 
     def log_warning(self, cause: str, text: str) -> None:
-        """Log a warning, once per cause and second."""
+        """Log a warning, at most once per second for each cause."""
         if (line := self._throttle.allow(cause, text)) is not None:
             self.get_logger().warning(line, throttled=True)
 
     def log_error(self, cause: str, text: str) -> None:
-        """Log an error, once per cause and second."""
+        """Log an error, at most once per second for each cause."""
         if (line := self._throttle.allow(cause, text)) is not None:
             self.get_logger().error(line, throttled=True)
 
     def ignore(self, what: str, error: HexapodError, counts: Refusals, reason: str = "") -> None:
-        """Count and log a message that an active node rejects, by the error's reason unless another is given."""
+        """Count and log a message that an active node rejects, under `reason`, or if this is empty the error's."""
         if self._active:
             counts.add(reason := reason or error.reason, str(error), time.monotonic())
             self.log_warning(f"{what} {reason}", f"{what} ignored: {error}")
 
-    def note(self, cause: str, text: str) -> None:
-        """Log an action, once per cause and second."""
-        if (line := self._throttle.allow(f"note {cause}", text)) is not None:
-            self.get_logger().info(line)
+    def log_action(self, cause: str, text: str) -> None:
+        """Log an action at level info, at most once per second for each cause."""
+        if (line := self._throttle.allow(f"action {cause}", text)) is not None:
+            self.get_logger().info(line, throttled=True)
 
     def report(
         self, what: str, level: bytes, text: str, values: Mapping[str, str], longest: int = LONGEST_TEXT
     ) -> DiagnosticStatus:
-        """Return a status of this node: its state, or of something that it does."""
+        """Return a DiagnosticStatus named after this node and `what`; texts are cut to `longest` characters."""
         name = f"{self.get_fully_qualified_name()[1:]}: {what}"
         return status_of(name, self.hardware_id, level, text, values, longest)
 
     def set_hardware_id(self, what: str) -> None:
-        """Set the hardware_id of this node's status to the machine or component it serves, with the namespace, so that
-        two of a kind are distinguished. The status's name stays: an aggregator would otherwise wait for the old one for
-        ever."""
+        """Set the hardware_id of this node's status to the namespace and the machine or component that it serves.
+
+        It distinguishes two machines of a kind. The status's name never changes, since an aggregator would keep waiting
+        for the old name."""
         self.hardware_id = f"{self.get_namespace()}/{what}".strip("/")
         self._status_due = 0.0
 
     def update(self, now: float) -> None:
-        """Do what is due every :data:`CHECK_PERIOD` of a configured node, before its state is judged."""
+        """Do the periodic work of a configured node, every :data:`CHECK_PERIOD`, before its status is evaluated."""
         self.update_publishers()
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
-        """Yield level and text of an active node's findings, worst first."""
+        """Yield the conditions of an active node that its status reports, as level and text, worst first."""
         yield OK, "running"
 
     def values(self, now: float) -> dict[str, str]:
-        """Return all else of the node's state as key and value."""
+        """Return the further key-value pairs of the node's status."""
         return {}
 
     def _renew_status(self) -> None:
-        """Let a new subscriber get the status with the next check: what was published before its discovery is lost to
-        it."""
+        """Publish the status at the next check, for a subscriber that has just been discovered."""
         self._status_due = 0.0
 
     def _check_state(self) -> None:
-        """Publish the state when it is due, with the guard's findings; log steps of the clock."""
+        """Publish the status if it has changed or a second has passed; log when the clock was set."""
         now = time.monotonic()
         self.update(now)
         findings = self.findings(now) if self._active else [(WARN, "not active")]

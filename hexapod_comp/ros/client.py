@@ -1,5 +1,5 @@
-"""Clients of the nodes: :class:`LoopClient` sends poses one by one, for ``run`` and benchmarks;
-:class:`Machine` has the mover move the tool."""
+"""Clients of the nodes: :class:`LoopClient` sends tool poses to the compensator, for ``run`` and benchmarks;
+:class:`Machine` sends targets to the mover."""
 
 from __future__ import annotations
 
@@ -22,41 +22,42 @@ from .base import COMMAND_QOS, EVENT_QOS, LATCHED_QOS, NEWEST_QOS, profile, stat
 from .messages import StrutReader, message_pose, nanoseconds_of, pose_message
 from .process import RosSession
 
-# Answers are all kept until they are read: a recorder must not lose any
-LISTENER_QOS = profile(200)
+LISTENER_QOS = profile(200)  # of the compensator's answers, none of which may be lost
 
 TRACK_QOS = profile(200, reliable=False)
 
-# A command without an answer after this time is lost, s: a busy computer may delay it by seconds
+# A command that is not answered within this time, s, counts as lost; a busy computer may delay an answer by seconds
 ANSWER_TIMEOUT = 5.0
 
-FOUND_WITHIN, READY_WITHIN = 10.0, 30.0  # A mover, and one that has just been started and knows its machine, s
+FOUND_WITHIN, READY_WITHIN = 10.0, 30.0  # Longest wait, s, until a mover is found, and until it is ready
 
-# States of a standing mover, one a second, that do not mention a request: it will never receive it. Clocks do not tell:
-# on a busy computer it may be received a minute later.
+# A mover that publishes this many states at standstill (one a second) without mentioning a request has not received it.
+# Elapsed time is no criterion: a busy computer may deliver the request a minute later.
 UNMENTIONED = 5
 
 
 @dataclass
 class Sent:
-    sent_at: float  # monotonic times, s; NaN while unanswered
-    refused: int  # number of commands refused before, and of those refused for their age
-    too_old: int
+    """A tool pose command that was sent, and the compensator's answer."""
+
+    sent_at: float  # monotonic time, s
+    refused: int  # number of commands that the compensator had refused before this one
+    too_old: int  # number of commands among `refused` that were older than `max_command_age`
     message: PoseStamped
-    answered_at: float = float("nan")  # monotonic times, s; NaN while unanswered
-    command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # shape (6,): The answer, m
-    correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # shape (6,): The answer, m
+    answered_at: float = float("nan")  # monotonic time, s; NaN while unanswered
+    command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # strut lengths, m; NaN while unanswered
+    correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # of the struts, m; NaN while unanswered
 
 
 class LoopClient(RosSession):
-    """Commands the compensator and subscribes to all its topics."""
+    """A client that sends tool poses to a compensator and records its answers, estimates and diagnostics."""
 
     def __init__(self, frame_id: str = "base", namespace: str = "") -> None:
         super().__init__("hexapod_comp_client", namespace)
         self._frame_id, self._reader = frame_id, StrutReader()
-        self.sent: dict[int, Sent] = {}  # by their stamps, ns
+        self.sent: dict[int, Sent] = {}  # sent commands by their stamps, ns
         self.diagnostics: dict[str, str] = {}  # values of the compensator's newest status
-        self.true_count = 0  # received true poses
+        self.true_count = 0  # number of true poses received
         self._status_name = status_prefix(self.node.get_namespace(), "compensator")
         self._counted_before: tuple[int, int] | None = None
         self._newest: dict[str, PoseStamped] = {}
@@ -86,7 +87,7 @@ class LoopClient(RosSession):
         for status in message.status:
             if status.name.startswith(self._status_name):
                 self.diagnostics = {entry.key: entry.value for entry in status.values}
-                if "commands" in self.diagnostics:  # a node that is not configured yet has none
+                if "commands" in self.diagnostics:  # the status of an unconfigured node has no counts
                     self._counted_before = self._counted_before or self._counts()
 
     @property
@@ -108,23 +109,23 @@ class LoopClient(RosSession):
         return message_pose(self._newest[topic])
 
     def connected(self) -> bool:
-        """Return whether commands reach a compensator and its answers and pose estimates arrive."""
+        """Return whether a configured compensator has been discovered and its pose estimates arrive."""
         return (
             self._publisher.get_subscription_count() > 0
             and self.node.count_publishers("strut_commands") > 0
             and "tool_pose_estimate" in self._newest
             and self._enable.service_is_ready()
-            and "commands" in self.diagnostics  # a node that is not configured yet has none
+            and "commands" in self.diagnostics  # the status of an unconfigured node has no counts
         )
 
     def _counts(self) -> tuple[int, int]:
         return int(self.diagnostics["commands"]), int(self.diagnostics["refused"])
 
     def counted(self) -> tuple[int, int]:
-        """Return how many of this client's commands the compensator has accepted and refused.
+        """Return how many commands the compensator has accepted and refused since this client's first diagnostics.
 
-        Commands that it does not count within two diagnostics periods are lost. Other clients' commands count as ours:
-        there should be none.
+        Wait up to 2.5 s until the two counts add up to all sent commands. There must be no other client: its commands
+        would be counted too.
         """
         accepted_before, refused_before = self._counted_before or (0, 0)
         end = time.monotonic() + 2.5
@@ -140,7 +141,7 @@ class LoopClient(RosSession):
         self.wait(future.done, 5.0, "the service enable_compensation")
 
     def send(self, pose: Pose) -> Sent:
-        """Send one command and return its record, to which the answer will be added."""
+        """Send one command and return its record, which receives the answer later."""
         return self._send(pose_message(pose, self._frame_id))
 
     def _send(self, message: PoseStamped) -> Sent:
@@ -151,14 +152,14 @@ class LoopClient(RosSession):
         return entry
 
     def _refused(self) -> tuple[int, int]:
-        """Return how many commands were refused so far, and how many of them for their age."""
+        """Return how many commands were refused so far, and how many of these for their age (`stamp_past`)."""
         return int(self.diagnostics.get("refused", "0")), int(self.diagnostics.get("refused.stamp_past", "0"))
 
     def wait_for_answer(self, entry: Sent, timeout: float = ANSWER_TIMEOUT) -> Sent:
-        """Wait until command and correction have arrived; return the record that was answered.
+        """Wait until strut command and correction have arrived; return the answered record, or raise a NoAnswerError.
 
-        A pose that a busy computer delivered too late is sent again, with a new stamp: the machine waits, and the next
-        pose on a path would be too far from its position.
+        A command that was refused for its age is sent again with a new stamp: the machine has not moved, and the next
+        pose of a path would be more than one allowed step away. Then the returned record is that of the new command.
         """
         end = entry.sent_at + timeout
         while not (np.isfinite(entry.command[0]) and np.isfinite(entry.correction[0])):
@@ -175,10 +176,10 @@ class LoopClient(RosSession):
         return entry
 
     def stream(self, path: Path, progress: Callable[[int], object]) -> list[Sent]:
-        """Send a path at its rate and return the records; `progress` is called with each number of commands sent.
+        """Send a path at its rate and return the records; call `progress(1)` after each command.
 
-        A command waits for the answer to the previous one, so that a stall of any process delays the path and causes no
-        jump.
+        Each command waits for the answer to the previous one, so that a process that stalls delays the path instead of
+        causing a jump.
         """
         entries: list[Sent] = []
         messages = [pose_message(path.pose(n), self._frame_id) for n in range(len(path))]
@@ -195,7 +196,7 @@ class LoopClient(RosSession):
         return entries
 
     def hold(self, pose: Pose, rate: float, until: Callable[[], bool], timeout: float, what: str) -> Sent:
-        """Send one pose repeatedly, as a controller at standstill does, until a condition holds."""
+        """Send one pose at `rate`, Hz, until the condition holds; a NoAnswerError naming `what` after `timeout`, s."""
         end = time.monotonic() + timeout
         while True:
             entry = self.wait_for_answer(self.send(pose))
@@ -208,7 +209,7 @@ class LoopClient(RosSession):
                 raise NoAnswerError(f"waited {timeout:g} s in vain for {what}")
 
     def settled(self) -> Callable[[], bool]:
-        """Return a condition: the true tool has not moved by more than 20 nm over the last 25 readings."""
+        """Return a condition that holds when the last 25 true tool positions differ by less than 20 nm in each axis."""
         history: deque[np.ndarray] = deque(maxlen=25)
         seen = self.true_count
 
@@ -224,7 +225,7 @@ class LoopClient(RosSession):
 
 
 class MoveError(HexapodError):
-    """A move was refused, or ended before its target; ``reason`` is the cause: limit, refusal, person, …"""
+    """A move was refused or ended before its target; ``reason`` is the mover's cause: limit, refusal, person, …"""
 
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(f"{reason}: {text}")
@@ -233,28 +234,30 @@ class MoveError(HexapodError):
 
 @dataclass(frozen=True)
 class MoveState:
+    """A state that the mover has published on ``~/state``."""
+
     state: str  # idle, planning, moving, settling, arrived, stopped
     text: str
-    share: float  # of the way, 0 to 1
+    share: float  # completed share of the move's duration, 0 to 1
     time_left: float  # s
-    stopped_by: str  # empty: it was not stopped
-    request: int  # stamp of the message that asked for it, ns
+    stopped_by: str  # cause of the stop; empty: the move was not stopped
+    request: int  # stamp of the message that requested the move, ns
     refused_request: int  # stamp of the newest refused message, ns
     refusal: str
-    ready: bool = True  # the mover knows the machine, and where its tool stands
-    moves: int = 0  # that the mover has begun since it was started
+    ready: bool = True  # the mover knows the machine and the present pose of its tool
+    moves: int = 0  # number of moves that the mover has begun since it was started
 
     @property
     def stands(self) -> bool:
-        """Whether no move is planned or under way."""
+        """Whether no move is being planned, executed or settled."""
         return self.state in ("idle", "arrived", "stopped")
 
 
 class Machine(RosSession):
-    """A running machine with a mover: moves its tool and waits until it has arrived.
+    """A client of a running machine's mover: it moves the tool and waits until the tool has arrived.
 
-    The machine's nodes are in a namespace, and the mover has a name. A NoAnswerError: no mover was found within 10 s,
-    or it was not ready within 30 s.
+    `namespace` is the namespace of the machine's nodes, `mover` the mover node's name. A NoAnswerError is raised if no
+    mover is found within 10 s, or if it is not ready within 30 s.
     """
 
     def __init__(self, namespace: str = "", mover: str = "mover") -> None:
@@ -289,15 +292,17 @@ class Machine(RosSession):
         timeout: float = 3600.0,
         progress: Callable[[MoveState], object] = lambda state: None,
     ) -> MoveState:
-        """Move the tool along a straight line, with the shortest turn, and return the last state when it has arrived.
+        """Move the tool along a straight line, with the shortest rotation; return the last state when it has arrived.
 
-        It has arrived when its estimate, from measured struts, has stayed within the mover's tolerances of the target
-        for the settling time. A move in progress is braked first, and its caller gets a MoveError, ``replaced``.
+        The tool has arrived when its estimate, from measured struts, has stayed within the mover's tolerances of the
+        target for the settling time. A move in progress is braked first; its caller gets a MoveError, ``replaced``.
 
-        The target is ``pose_tool_in_work``, m, or in another frame: ``base`` or a named work frame. A `relative` move
-        goes on from where the tool stands, along and about the frame's axes; its frame may also be ``tool``. After
-        `timeout`, s, the move is stopped. A MoveError: it was refused or stopped, ``reason`` is the cause. A
-        NoAnswerError: the mover has ended or not received it, or the tool had not arrived in time.
+        `pose` is the target of the tool, m, in the frame `frame_id`: ``work``, ``base`` or a named work frame. If
+        `relative`, it is a displacement from the tool's present pose, along and about the frame's axes, and the frame
+        may also be ``tool``. After `timeout`, s, the move is stopped.
+
+        Raises a MoveError, whose ``reason`` is the cause, if the move was refused or stopped. Raises a NoAnswerError if
+        the mover has ended or not received the request, or if the tool has not arrived within `timeout`.
         """
         self.catch_up()
         stamp = self.node.get_clock().now()
@@ -324,9 +329,9 @@ class Machine(RosSession):
                 elif restarted:
                     raise MoveError("restarted", "the mover was restarted")
                 elif begun:
-                    raise MoveError("replaced", "another move was asked for")
+                    raise MoveError("replaced", "another move was requested")
                 elif state.stands and (unmentioned := unmentioned + 1) >= UNMENTIONED:
-                    raise NoAnswerError("the mover stands, and has not received the request")
+                    raise NoAnswerError("the mover is at standstill and has not received the request")
             elif self.node.count_publishers(self._states) == 0:
                 raise NoAnswerError("the mover has ended")
             if time.monotonic() > end:
@@ -334,10 +339,10 @@ class Machine(RosSession):
                 raise NoAnswerError(f"the tool has not arrived within {timeout:g} s, and was stopped")
 
     def stop(self) -> None:
-        """Brake within the struts' limits; returns when the tool stands."""
+        """Brake within the struts' limits, and return when the mover reports standstill."""
         future = self._stop.call_async(Trigger.Request())
         self.wait(future.done, ANSWER_TIMEOUT, "the mover's answer to stop")
-        self.wait(lambda: self.state is not None and self.state.stands, 60.0, "rest")
+        self.wait(lambda: self.state is not None and self.state.stands, 60.0, "the standstill of the tool")
 
     def _connected(self) -> bool:
         found = self._to.get_subscription_count() and self._by.get_subscription_count()

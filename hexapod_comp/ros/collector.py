@@ -1,5 +1,5 @@
-"""A running machine that :func:`~hexapod_comp.measurements.collect.collect` measures: moved by the mover, watched on a
-topic of poses, a topic of single readings, or both; and one that calibrates itself."""
+"""Running machines that :func:`~hexapod_comp.measurements.collect.collect` and ``adapt`` measure: the mover moves the
+tool, and instruments publish its poses on one topic, single readings (lengths, angles) on another, or both."""
 
 from __future__ import annotations
 
@@ -31,24 +31,27 @@ from .client import READY_WITHIN, Machine, MoveError, MoveState
 from .instrument import SET_UP_TOPIC
 from .messages import message_pose, nanoseconds_of, pose_message, pose_numbers, stamp_of
 
-MEDIAN_TO_SIGMA = 1.4826  # Standard deviation of a normal distribution over the median of its absolute values
-OF_A_MEDIAN = math.sqrt(math.pi / 2.0)  # Its standard deviation, times √n, over that of a reading
-ASKED_AGAIN = 2  # How often a refused move is: a busy computer's commands come late, and nodes are restarted
-LEAST_SAMPLES = 3  # of which a median is taken
-PATIENCE = 2.0  # Fewer than half of a stop's readings within this time, s, are a broken beam
-ANSWERED_WITHIN = 60.0  # A model is read within 30 s, or refused
-SET_UP_WITHIN = Duration(seconds=2)  # Who sets instruments up by topic hears of a run within this time
+# Standard deviation of a normal distribution, divided by its median absolute deviation
+MEDIAN_TO_SIGMA = 1.4826
+# Standard deviation of a median of n readings, times √n, divided by the standard deviation of one reading
+OF_A_MEDIAN = math.sqrt(math.pi / 2.0)
+REPEATS = 2  # A move that was refused for late commands or a restarted node is requested again this many times
+LEAST_SAMPLES = 3  # Least number of readings in a median
+PATIENCE = 2.0  # If fewer than half of a stop's readings arrive within this time, s, the beam counts as broken
+ANSWERED_WITHIN = 60.0  # Longest wait for a service's answer, s; the compensator gives up a model after 30 s
+SET_UP_WITHIN = Duration(seconds=2)  # Longest wait until the subscribers of `instrument_set_up` have received a run
 
 
 class WatchedMachine(Machine):
-    """A machine with a mover, and instruments that publish on topics: poses of the tool (PoseStamped) on `topic`, in
-    ``base``, or in any frame where `tracker_frame` is ``free``; single ones (JointState: channels, m or rad) on
-    `readings`: lines, lengths and displacements then come from there, and NaN says that a beam is broken and its zero
-    lost.
+    """A machine with a mover and with instruments that publish on topics.
 
-    At each stop the median of `samples` readings that came after the tool had settled is taken, so that single wild
-    ones count for nothing; fewer than half within PATIENCE count as a broken beam. `confirm` is called with each
-    run that an instrument of single readings is set up for, and returns when it is.
+    Tool poses (PoseStamped) arrive on `topic`, in ``base``, or in any one frame if `tracker_frame` is ``free``. If
+    `readings` names a topic (JointState: channels, m or rad), lines, lengths and displacements are taken from it; a NaN
+    means that the beam is broken and its zero lost.
+
+    Each stop gives the median of `samples` readings received after the tool has settled, so that single outliers have
+    no effect. Fewer than half of them within PATIENCE count as a broken beam. `confirm` is called with each run for
+    which an instrument of single readings must be set up, and returns when it is.
     """
 
     def __init__(
@@ -64,8 +67,8 @@ class WatchedMachine(Machine):
         self._frame_id, self._confirm = "base" if tracker_frame == KNOWN else "", confirm
         self._poses, self._struts = list[tuple[Pose, float]](), list[np.ndarray]()
         self._read, self._zero_lost = list[tuple[list[float], float]](), False
-        self._own, self._wants_pose = tuple[str, ...](), True  # channels that are read themselves in this run
-        self._warmth: dict[str, float] = {}
+        self._own, self._wants_pose = tuple[str, ...](), True  # channels taken from `readings`; poses are needed
+        self._temperatures: dict[str, float] = {}  # newest temperature of each part, °C
         self._gravity: tuple[float, ...] | None = None
         super().__init__(namespace)
         node = self.node
@@ -79,7 +82,7 @@ class WatchedMachine(Machine):
             node.create_subscription(JointState, readings, self._on_readings, SENSOR_QOS)
             self._set_up = node.create_publisher(PoseStamped, SET_UP_TOPIC, LATCHED_QOS)
 
-    # ---- what comes in ----
+    # ---- received messages ----
 
     def _on_pose(self, message: PoseStamped) -> None:
         frame_id = message.header.frame_id
@@ -88,7 +91,7 @@ class WatchedMachine(Machine):
             self._problem = f"{self._topic}: frame_id must be {self._frame_id}, not {shorten(frame_id)}"
             return
         if not all(map(math.isfinite, pose_numbers(message))):
-            return  # its beam is broken
+            return  # the tracker's beam is broken
         try:
             self._poses.append((message_pose(message), nanoseconds_of(message.header.stamp) * 1e-9))
         except HexapodError as error:
@@ -114,19 +117,18 @@ class WatchedMachine(Machine):
     def _on_temperature(self, message: Temperature) -> None:
         low, high = TEMPERATURE_RANGE
         if message.header.frame_id in Temperatures.NAMES and low <= message.temperature <= high:
-            self._warmth[message.header.frame_id] = message.temperature
+            self._temperatures[message.header.frame_id] = message.temperature
 
     def _on_gravity(self, message: Vector3Stamped) -> None:
         vector = message.vector.x, message.vector.y, message.vector.z
         if message.header.frame_id == "base" and EARTH[0] <= math.hypot(*vector) <= EARTH[1]:
             self._gravity = vector
 
-    # ---- what collect asks ----
+    # ---- called by collect ----
 
     def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
-        """Move as :meth:`.Machine.move` does; repeat a move whose commands were refused for their delay, and where
-        mover or compensator was restarted on the way."""
-        for _ in range(ASKED_AGAIN):
+        """Move as :meth:`.Machine.move` does; repeat a move that ended by a refused command or a restarted mover."""
+        for _ in range(REPEATS):
             try:
                 return super().move(pose, *arguments, **options)
             except MoveError as error:
@@ -140,7 +142,7 @@ class WatchedMachine(Machine):
         return super().move(pose, *arguments, **options)
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
-        """Publish the run's place for whoever sets the instrument up, and wait for the confirmation."""
+        """Publish a run's line or centre on `instrument_set_up`, wait for `confirm`; return its channels."""
         self._own = () if not self._readings else tuple(
             channel for channel in run.channels if channel.partition("_")[0] not in ABSOLUTE_KINDS
         )  # fmt: skip
@@ -151,7 +153,7 @@ class WatchedMachine(Machine):
             self._set_up.publish(message)
             self._set_up.wait_for_all_acked(SET_UP_WITHIN)
             self._confirm(run)
-            self._spin(0.1)  # what is still on the way is of the run before
+            self._spin(0.1)  # readings that arrive in this time belong to the run before
         self._zero_lost = False
         return self._own
 
@@ -161,9 +163,9 @@ class WatchedMachine(Machine):
             self.spin_once(0.02)
 
     def observe(self) -> Observation | None:
-        """Return the medians of the next messages; None where too few arrive in time."""
-        for heard in (self._poses, self._struts, self._read):
-            heard.clear()
+        """Return the medians of the next messages; None if too few arrive within PATIENCE: the beam is broken."""
+        for received in (self._poses, self._struts, self._read):
+            received.clear()
         self._problem = ""
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end and not self._problem:
@@ -175,7 +177,7 @@ class WatchedMachine(Machine):
         if not self._enough(max(LEAST_SAMPLES, self._samples // 2)):
             wanted = [self._topic] * self._wants_pose + [self._readings] * bool(self._own)
             if silent := [topic for topic in wanted if self.node.count_publishers(topic) == 0]:
-                raise NoAnswerError(f"nobody publishes {silent[0]}")
+                raise NoAnswerError(f"no node publishes {silent[0]}")
             return None
         pose, uncertainty, channels = None, np.full(6, math.nan), {}
         if self._wants_pose:
@@ -189,7 +191,7 @@ class WatchedMachine(Machine):
             pose,
             uncertainty,
             tuple(np.mean(self._struts, axis=0).tolist()) if self._struts else None,
-            tuple(self._warmth[name] for name in Temperatures.NAMES) if len(self._warmth) == 8 else None,
+            tuple(self._temperatures[name] for name in Temperatures.NAMES) if len(self._temperatures) == 8 else None,
             (self._read if self._own else self._poses)[-1][1],
             channels,
             lost,
@@ -202,7 +204,7 @@ class WatchedMachine(Machine):
 
 
 class AdaptedMachine(WatchedMachine):
-    """A machine with mover, compensator and an instrument that publishes poses of its tool; `going_on` false brakes."""
+    """A machine with mover, compensator and a tracker, for ``adapt``; it brakes when `going_on` returns false."""
 
     def __init__(
         self,
@@ -213,18 +215,18 @@ class AdaptedMachine(WatchedMachine):
     ) -> None:
         super().__init__(topic, namespace, samples)
         self._going_on = going_on
-        self._arrived: MoveState | None = None  # at the target of the newest move
-        self._targets = list[tuple[Pose, tuple[Any, ...], dict[str, Any]]]()  # as they were asked for, the newest two
+        self._arrived: MoveState | None = None  # state at the arrival of the newest move
+        self._targets = list[tuple[Pose, tuple[Any, ...], dict[str, Any]]]()  # arguments of the newest two moves
         services = (Trigger, "reload_model"), (SetParameters, "set_parameters"), (GetParameters, "get_parameters")
         self._reload_model, self._set, self._get = (
             self.node.create_client(kind, f"compensator/{name}") for kind, name in services
         )
 
     def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
-        """Move the tool and return when it has arrived; brake when it shall not go on: a MoveError, ``person``.
+        """Move the tool and return when it has arrived; if `going_on` returns false, brake: a MoveError, ``person``.
 
-        Where another client has the tool moved, wait until that has ended, and come from the target before again: a
-        strut's backlash is that of the way on which it arrives.
+        If another client moves the tool meanwhile, wait until it stands, then repeat the previous target and this one:
+        a strut's backlash depends on the direction from which it arrives.
         """
         self._targets = [*self._targets[-1:], (pose, arguments, options)]
         try:
@@ -234,8 +236,8 @@ class AdaptedMachine(WatchedMachine):
             raise
 
     def _travel(self, left: list[tuple[Pose, tuple[Any, ...], dict[str, Any]]]) -> MoveState:
-        """Move to the targets that are left; to the newest two where others have moved the tool meanwhile."""
-        braked = 0  # the request that was: one that is asked for again is a new one
+        """Move to the targets in `left`; if another client has moved the tool meanwhile, to the newest two."""
+        braked = 0  # stamp, ns, of the request that was braked; a repeated move has a new stamp and is braked too
 
         def watch(state: MoveState) -> None:
             nonlocal braked
@@ -260,38 +262,37 @@ class AdaptedMachine(WatchedMachine):
     def _wait_for_others(self) -> None:
         restarted = self._arrived is not None and self.last.moves < self._arrived.moves
         what = "the mover was restarted" if restarted else "another client moves the tool"
-        self.node.get_logger().warning(f"{what}: waiting until it stands")
+        self.node.get_logger().warning(f"{what}: waiting until the tool stands")
         while not self.last.stands:
             if not self._going_on():
                 raise MoveError("person", "stopped while another client moved the tool")
             self.spin_once(0.02)
 
     def observe(self) -> Observation | None:
-        """Observe as a watched machine; anew where another client has moved the tool meanwhile."""
+        """Observe as a WatchedMachine; if another client has moved the tool meanwhile, move back and observe again."""
         while True:
-            seen = super().observe()
+            observation = super().observe()
             if self._arrived is None or self.last.request == self._arrived.request:
-                return seen
+                return observation
             self._wait_for_others()
             self._travel(self._targets)
 
     def reload(self, path: Path) -> None:
-        """Have the compensator load a model file, which ramps in; if it refuses, the old model stays, and so does the
-        parameter."""
+        """Have the compensator load a model file, which ramps in; after a refusal restore its `model_file`."""
         (before,) = self._parameters("model_file")
         for client in (self._reload_model, self._set):
             self.wait(client.service_is_ready, 10.0, "the services of the compensator")
         wanted = str(path.resolve())
-        self._name_model(wanted)
+        self._set_model_file(wanted)
         answer = self._call(self._reload_model, Trigger.Request())
         if not answer.success:
-            self._name_model(before)
-            raise CommandError("reload", f"the compensator did not take {wanted}: {answer.message}")
+            self._set_model_file(before)
+            raise CommandError("reload", f"the compensator did not load {wanted}: {answer.message}")
 
     def refuse_unreadable(self, path: Path) -> None:
-        """Refuse a model file that the compensator would not open, before anything is measured for it.
+        """Raise a CommandError, before anything is measured, if the compensator would refuse a file in this folder.
 
-        A name relative to the compensator's own folder cannot be checked from here: its reload will refuse it.
+        A folder that the compensator knows by a relative name cannot be checked here: the reload may refuse the file.
         """
         folder, model = self._parameters("model_folder", "model_file")
         name = folder or model
@@ -300,24 +301,24 @@ class AdaptedMachine(WatchedMachine):
             not Path(name).expanduser().is_absolute() or path.resolve().is_relative_to(own.resolve())
         ):
             return
-        places = "shipped models alone" if own is None else f"models in {own} alone"
+        places = "shipped models" if own is None else f"models in {own}"
         advice = f"start it with -p model_folder:=FOLDER, in which {path.resolve()} and its geometry file are"
-        raise CommandError("reload", f"the compensator reads {places}: {advice}")
+        raise CommandError("reload", f"the compensator reads only {places}: {advice}")
 
     def runs(self, path: Path) -> bool:
-        """Return whether the compensator's model is the one of a file."""
+        """Return whether the compensator's parameter `model_file` names this file."""
         return self._parameters("model_file") == [str(path.resolve())]
 
     def _parameters(self, *names: str) -> list[str]:
         self.wait(self._get.service_is_ready, 10.0, "the services of the compensator")
         return [str(value.string_value) for value in self._call(self._get, GetParameters.Request(names=names)).values]
 
-    def _name_model(self, name: str) -> None:
+    def _set_model_file(self, name: str) -> None:
         value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=name)
         request = SetParameters.Request(parameters=[Parameter(name="model_file", value=value)])
         (result,) = self._call(self._set, request).results
         if not result.successful:
-            raise CommandError("reload", f"the compensator keeps its model_file: {result.reason}")
+            raise CommandError("reload", f"the compensator refused the parameter model_file: {result.reason}")
 
     def _call(self, client: Any, request: Any) -> Any:
         future = client.call_async(request)
@@ -326,7 +327,7 @@ class AdaptedMachine(WatchedMachine):
 
 
 def _median(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the median of samples (n, k), and its standard deviation (k,)."""
+    """Return the medians, shape (k,), of n samples, shape (n, k), and their standard deviations, shape (k,)."""
     middle = np.median(numbers, axis=0)
     spread = MEDIAN_TO_SIGMA * np.median(np.abs(numbers - middle), axis=0)
     return middle, np.maximum(spread * OF_A_MEDIAN / math.sqrt(len(numbers)), LEAST_NOISE)

@@ -1,9 +1,9 @@
-"""The compensator node: tool pose commands in, compensated strut commands and pose estimates out.
+"""The compensator node: receives tool pose commands, publishes compensated strut commands and pose estimates.
 
-It holds no mathematics. A command is parsed, passes the guards, goes through the core, is published, written into the
-journal and added to the track of the struts: :meth:`CompensatorNode._process_command`. A reading passes its own guards,
-and is estimated and published: :meth:`CompensatorNode._on_states`. Run it with ``ros2 run hexapod_comp compensator`` or
-``python -m hexapod_comp.ros.compensator``; doc/nodes.md lists topics, services and parameters.
+:meth:`CompensatorNode._process_command` parses a command, checks it by the guards, computes strut lengths in the core,
+publishes them, and writes them into the journal and the track of the struts. :meth:`CompensatorNode._on_states` checks
+measured struts and publishes the pose estimate. The node holds no mathematics. Run it with ``ros2 run hexapod_comp
+compensator`` or ``python -m hexapod_comp.ros.compensator``; doc/nodes.md lists topics, services and parameters.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from .process import run
 from .rclpy_compat import Alarm
 from .requests import Requests
 
-ESTIMATE_PERIOD = 0.02  # Period of pose estimates from the node's own commands without feedback, s
-JITTER = 0.02  # A command that waits no longer than this, s, is not late, nor is an alarm
+ESTIMATE_PERIOD = 0.02  # Without feedback, poses are estimated from the node's own commands with this period, s
+JITTER = 0.02  # A command that waits, or an alarm that is delayed, by up to this time, s, does not count as late
 
 
 class CompensatorNode(CompensatorState):
-    """Lifecycle node around one :class:`Compensator`; arguments are those of ``rclpy`` nodes."""
+    """Lifecycle node around one :class:`Compensator`; `options` are those of rclpy's nodes."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._logged_problem = ""
-        self._unestimated = 0  # stamp of an answer whose pose was not estimated yet, ns
+        self._unestimated = 0  # stamp of the newest answer if its pose has not been estimated yet, ns; 0: none
 
     # ---- lifecycle ----
 
@@ -63,7 +63,7 @@ class CompensatorNode(CompensatorState):
         self.get_logger().info(f"configured machine {geometry.name!r} with {what} in {took:.2f} s")
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Start to answer commands; none that came before is replayed."""
+        """Start to answer commands; commands received before the activation are dropped."""
         self._forget_commands()
         self.track.begin(time.monotonic())
         return super().on_activate(state)
@@ -80,7 +80,7 @@ class CompensatorNode(CompensatorState):
             self._requests.tools.check(values["tool"])
 
     def on_parameters(self, names: set[str]) -> None:
-        """Apply what has been set while the node runs; other parameters are read where they are used."""
+        """Apply parameters that were set while the node runs; all others are read each time they are used."""
         self.apply_parameters()
         if self.configured:
             self.thermometers.follow(*temperature_rules(self.options))
@@ -135,7 +135,7 @@ class CompensatorNode(CompensatorState):
             self._pacing.begin(data, now, wait)
 
     def _process_command(self, data: bytes, sample: Sample) -> float:
-        """Answer or refuse a command; return the time that it must wait first, s: the struts cannot be there yet."""
+        """Answer or refuse a command and return 0, or return how long, s, it must wait for the struts' speed limit."""
         now, compensator = sample.now, self.compensator
         try:
             self._input.read(data, sample)
@@ -157,10 +157,10 @@ class CompensatorNode(CompensatorState):
         except HexapodError as error:
             self._refuse(sample.stamp, error, now)
             return 0.0
-        when, outputs = stamp or self.get_clock().now().nanoseconds, self._outputs  # zero means now
+        when, outputs = stamp or self.get_clock().now().nanoseconds, self._outputs  # a zero stamp means now
         speed_over, outputs.answered = period(outputs.answered, when), when
         self._commands.publish(self._command_out.made(compensator.command_at, when, speed_over, self._fastest))
-        if self._corrections.get_subscription_count():  # a publication takes longer than all the rest
+        if self._corrections.get_subscription_count():  # publishing takes longer than the computation
             self._corrections.publish(self._correction_out.made(compensator.correction_at, when))
         if self._array is not None:
             self._array_out.data = compensator.command.tolist()
@@ -176,7 +176,7 @@ class CompensatorNode(CompensatorState):
         return 0.0
 
     def _begin_at_struts(self, now: float) -> None:
-        """Let the first command begin at the struts' known positions; require readings if so configured."""
+        """Let the first command start at the struts' known positions; refuse it if required readings are missing."""
         fed = self.fed(now)
         if self.options["require_feedback"] and not fed:
             since = f"for {seconds(self.feedback.age(now))} s" if self.feedback.count else "yet"
@@ -195,7 +195,7 @@ class CompensatorNode(CompensatorState):
     # ---- a reading ----
 
     def _on_states(self, data: bytes, sample: Sample) -> None:
-        """Use measured struts, also while the node is inactive: a start begins where they stand."""
+        """Check measured struts, track them and estimate the pose; also while inactive, for the start's position."""
         now, track, instrument = sample.now, self.track, self.instrument
         try:
             self.measuring.check(sample)
@@ -203,8 +203,8 @@ class CompensatorNode(CompensatorState):
             self.reading_stamps.check(sample)
             struts = sample.values or ()
             track.check_stroke(struts)
-            # Before the check for a jump: one reading off its command stops the machine, whether strut or encoder
-            # fails.
+            # Compare with the commands before the check for a jump: a single reading far from the command must stop the
+            # machine, whether a strut or an encoder fails.
             if self._active and track.follow(struts, now - sample.age):
                 self.bad_feedback.add(track.reason, track.problem, now)
             track.check_jump(sample)
@@ -216,7 +216,7 @@ class CompensatorNode(CompensatorState):
             if self._active:
                 self._outputs.estimate(pose if instrument is None else instrument.weighed(pose), sample.stamp)
                 self._outputs.nominal(sample.stamp, track.mean)
-                if instrument is not None:  # last: readings of earlier times go through the same core
+                if instrument is not None:  # last, since it evaluates earlier readings with the same core
                     instrument.add_struts(struts, now - sample.age)
         except HexapodError as error:
             self.ignore("strut_states", error, self.bad_feedback)
@@ -229,7 +229,7 @@ class CompensatorNode(CompensatorState):
         self.compensator.set_humidity(self.thermometers.update(HUMIDITY, message.relative_humidity, now), now)
 
     def _estimate_from_commands(self) -> None:
-        """Without feedback, estimate the pose from the newest command, at a rate that does not load the loop."""
+        """Publish a pose estimate from the newest command while no measured struts arrive, every 20 ms."""
         stamp, self._unestimated, now = self._unestimated, 0, time.monotonic()
         instrument = self.instrument if self.commands.count else None
         if not (stamp or instrument) or not self._active or self.fed(now):
@@ -247,7 +247,7 @@ class CompensatorNode(CompensatorState):
     # ---- state ----
 
     def _forget_commands(self) -> None:
-        """Forget the last command, but not the struts' commanded positions."""
+        """Forget the last command and waiting commands; the track keeps the struts' last known positions."""
         self.compensator.reset()
         if self.instrument is not None:
             self.instrument.reset()
@@ -273,11 +273,11 @@ class CompensatorNode(CompensatorState):
 
 
 class Pacing:
-    """Commands that arrive sooner than the struts may move, bunched on the way or in a burst after a pause: they wait,
-    in their order, for up to the parameter ``catch_up_within``, s.
+    """Queue of commands that arrive faster than the struts' speed limit allows, bunched or in a burst after a pause.
 
-    All waiting ones are refused when one has waited longer; time in which the node itself was not scheduled does not
-    count. 0: only the newest waits, and those that it replaces are dropped.
+    They wait, in their order, for up to the parameter ``catch_up_within``, s; when one has waited longer, all waiting
+    commands are refused. Time in which this process was not scheduled does not count. If the parameter is 0, only the
+    newest command waits, and the commands that it replaces are dropped.
     """
 
     def __init__(self, node: CompensatorNode) -> None:
@@ -295,7 +295,7 @@ class Pacing:
         self._wait_for_struts(now, wait)
 
     def add(self, message: bytes, now: float) -> None:
-        """Let a command wait behind others."""
+        """Add a command to waiting ones; a full queue is refused as a whole first."""
         if not self._longest:
             self._node.dropped += len(self.waiting)
             self.waiting.clear()
@@ -312,7 +312,7 @@ class Pacing:
         self._alarm.close()
 
     def _enqueue(self, message: bytes, now: float) -> None:
-        # time of arrival, without the time in which the node was not scheduled
+        # stored time: time of arrival minus all time in which the node was not scheduled
         self.waiting.append((now - self._stood_still, message))
         self._node.waited += 1
 
@@ -324,7 +324,7 @@ class Pacing:
         return now - self._stood_still - came
 
     def _process_next(self) -> None:
-        """Answer the waiting commands that the struts can follow by now."""
+        """Answer the waiting commands that the struts' speed limit allows by now."""
         if (late := time.monotonic() - self._due) > JITTER:
             self._stood_still += late
         if not self._node.active:
@@ -340,12 +340,12 @@ class Pacing:
                 return
             if self._age(came, now) > JITTER:
                 self._node.behind.note(now)
-            if self.waiting:  # else the command was refused and a reset has cleared the queue
+            if self.waiting:  # empty if a reset has cleared the queue while the command was processed
                 self.waiting.popleft()
 
     def _refuse_all(self, now: float) -> None:
         waited = self._age(self.waiting[0][0], now)
-        text = f"commands come faster than the struts may move: {waited:.3f} s behind, allowed {self._longest:g} s"
+        text = f"commands come faster than the struts may move: waited {waited:.3f} s, allowed {self._longest:g} s"
         while self.waiting:
             error = LimitError("speed", text, waited, self._longest, None, "compensated")
             self._node._refuse(self._node._input.stamp(self.waiting.popleft()[1]), error, now)

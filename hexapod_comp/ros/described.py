@@ -1,9 +1,9 @@
 """Start a program with the URDF that the compensator publishes: ``python -m hexapod_comp.ros.described PROGRAM ...``.
 
-robot_state_publisher takes the URDF as a parameter when it starts. The geometry and joint names may be in any of the
-compensator's parameter files, so only the compensator knows its URDF. This program waits for it, writes it into a
-parameter file, and then replaces itself by the requested program, with that file as its last argument. The topic stays
-the compensator's: that program's own copy of the URDF goes to a topic below its own name.
+robot_state_publisher takes the URDF as a parameter when it starts. Only the compensator knows its URDF, since geometry
+and joint names may come from any of its parameter files. This program waits for the URDF, writes it into a parameter
+file, and then replaces itself by the requested program, with this file as its last argument. Only the compensator
+publishes ``robot_description``; the requested program's copy is remapped to ``~/robot_description``.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from .process import SPIN_PERIOD, RosSession
 
 TOPIC = "robot_description"
 
-WARN_AFTER = 5.0  # Without a URDF for this time the log reports what is missing, s
+WARN_AFTER = 5.0  # Period, s, of a warning in the log while no URDF has arrived
 
 
 def wait_for_description(arguments: Sequence[str]) -> str:
-    """Return the URDF on ``robot_description``, for a program's ROS arguments: namespace, remappings, enclave."""
+    """Return the URDF published on ``robot_description``; `arguments`: program with its namespace and remappings."""
     found: list[String] = []
     with RosSession("description_listener", arguments=arguments, start_parameter_services=False) as session:
         node = session.node
@@ -38,7 +38,7 @@ def wait_for_description(arguments: Sequence[str]) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the program of the arguments in this process, once the URDF is known."""
+    """Wait for the URDF, then run the program named by the first argument in this process, with the others."""
     program, *arguments = sys.argv[1:] if argv is None else argv
     try:
         text = wait_for_description([program, *arguments])
@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parameters = {"/**": {"ros__parameters": {TOPIC: text}}}
     with NamedTemporaryFile("w", prefix="description_", suffix=".yaml", delete=False, encoding="utf-8") as file:
         yaml.safe_dump(parameters, file)
-    own_topic = ["-r", f"{TOPIC}:=~/{TOPIC}"]  # the topic itself stays the compensator's
+    own_topic = ["-r", f"{TOPIC}:=~/{TOPIC}"]  # only the compensator publishes the topic itself
     os.execv(program, [program, *arguments, "--ros-args", *own_topic, "--params-file", file.name])
     raise AssertionError("execv does not return")
 

@@ -1,4 +1,4 @@
-"""A topic's messages with units, rate and age, without the ``ros2`` command: the verb ``echo``."""
+"""The verb ``echo``: the messages of a topic with units, rate and age, without the command ``ros2``."""
 
 from __future__ import annotations
 
@@ -25,17 +25,16 @@ from ..pose import Pose
 from .base import profile
 from .messages import nanoseconds_of, read_message
 
-DISCOVERY_TIME = 3.0  # How long a topic may take to be discovered, s; Fast DDS needs 0.1 to 1 s
-RATE_WINDOW = 2.0  # Window of the rate, s
-QUEUE = 1000  # Messages that may wait while the terminal is slow: a second of commands
+DISCOVERY_TIME = 3.0  # Longest wait for the discovery of a topic, s; Fast DDS needs 0.1 to 1 s
+RATE_WINDOW = 2.0  # Time over which the rate is averaged, s
+QUEUE = 1000  # Messages that may wait while the terminal is slow: one second of commands at 1 kHz
 
 ANGLES = ("alpha", "beta", "gamma")
 LEVELS = {b"\x00": "OK", b"\x01": "WARN", b"\x02": "ERROR", b"\x03": "STALE"}
 
 
 class MessageField(NamedTuple):
-    """A number or text of a message; the unit is in the form of JSON keys: mm, um, deg, urad, mm_s, degC, percent,
-    s."""
+    """A number or text of a message with its unit in ASCII: mm, um, deg, urad, mm_s, degC, percent, s; empty: none."""
 
     name: str
     value: Any
@@ -43,26 +42,26 @@ class MessageField(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Name with unit, as in the package's other JSON and CSV."""
+        """Name and unit, such as ``x_mm``, as in the package's other JSON and CSV output."""
         return f"{self.name}_{self.unit}" if self.unit else self.name
 
 
-# Units for display, where they differ from those in keys
+# How units are displayed if this differs from their form in keys
 UNITS = {"um": "µm", "urad": "µrad", "deg": "°", "mm_s": "mm/s", "degC": "°C", "percent": "%"}
 
-# Digits after the point: a nanometre; SI numbers of foreign topics get nine
+# Digits after the decimal point by unit: lengths to a nanometre; numbers without a known unit have nine
 DIGITS = {"mm": 6, "um": 3, "deg": 6, "urad": 3, "mm_s": 3, "degC": 2, "percent": 1, "s": 6, "m": 9, "rad": 9}
 
 
 def message_fields(topic: str, message: Any) -> list[MessageField]:
-    """Return a message's numbers with their units; types and topics that are not the package's are shown in SI."""
+    """Return a message's numbers with units for display; messages of unknown types are shown in SI."""
     if isinstance(message, PoseStamped):
         p, q = message.pose.position, message.pose.orientation
         quaternion, rows = (q.x, q.y, q.z, q.w), [MessageField("frame", message.header.frame_id)]
         rows += [MessageField(axis, value * 1e3, "mm") for axis, value in zip("xyz", (p.x, p.y, p.z), strict=True)]
         try:
             degrees = np.degrees(Pose.from_quaternion((0.0, 0.0, 0.0), quaternion).angles()).tolist()
-        except HexapodError:  # not of norm 1: show what was sent
+        except HexapodError:  # the quaternion's norm is not 1: show it as received
             return rows + [MessageField(f"q{axis}", value) for axis, value in zip("xyzw", quaternion, strict=True)]
         return rows + [MessageField(name, angle, "deg") for name, angle in zip(ANGLES, degrees, strict=True)]
     if isinstance(message, PoseWithCovarianceStamped):  # a small displacement and rotation vector
@@ -107,7 +106,7 @@ def _strut_rows(
 
 
 def _plain_rows(prefix: str, value: Any) -> Iterator[MessageField]:
-    """Yield the fields of any message, in SI, by their dotted names; long sequences by their first items."""
+    """Yield the fields of any message, in SI, with dotted names; of a sequence only the first twelve items."""
     if isinstance(value, Time | Duration):
         yield MessageField(prefix, value.sec + value.nanosec * 1e-9, "s")
     elif hasattr(value, "get_fields_and_field_types"):
@@ -124,14 +123,16 @@ def _plain_rows(prefix: str, value: Any) -> Iterator[MessageField]:
 
 
 class EchoedMessage(NamedTuple):
+    """A received message, ready for display."""
+
     topic: str  # full name
     rows: list[MessageField]
-    stamp: float  # of its header, s since 1970; NaN where it has none
-    age: float
-    rate: float  # of the last messages, Hz; NaN for the first one
+    stamp: float  # stamp of the header, s since 1970; NaN if there is none
+    age: float  # time of receipt minus stamp, s; NaN without a stamp
+    rate: float  # rate over the last RATE_WINDOW, Hz; NaN for the first message
 
     def text(self) -> str:
-        """Return it as text: a line with rate and age, then a line for each number."""
+        """Return the message as text: a line with topic, rate and age, then a line for each field."""
         parts = [self.topic]
         parts += [f"{self.rate:.1f} Hz"] if math.isfinite(self.rate) else []
         parts += [f"{self.age * 1e3:.1f} ms old"] if math.isfinite(self.age) else ["no stamp"]
@@ -144,13 +145,16 @@ class EchoedMessage(NamedTuple):
         return "\n".join(lines)
 
     def record(self) -> dict[str, Any]:
-        """Return it as one flat object, units in the keys."""
+        """Return the message as one flat JSON object, with units in the keys."""
         head = {"topic": self.topic, "stamp_s": self.stamp, "age_ms": self.age * 1e3, "rate_hz": self.rate}
         return {**head, **{row.key.strip(): row.value for row in self.rows}}
 
 
 class Echo:
-    """Subscribes to one topic of any type, with the QoS that its publishers offer."""
+    """A subscription of one topic of any type, with a QoS that all its publishers can serve.
+
+    The constructor waits up to DISCOVERY_TIME for a publisher. `receive` is called with each message.
+    """
 
     def __init__(
         self, node: Node, spin_once: Callable[[float], None], topic: str, receive: Callable[[EchoedMessage], None]
@@ -158,11 +162,11 @@ class Echo:
         self._node, self._receive = node, receive
         try:
             self.topic = node.resolve_topic_name(topic)
-        except RuntimeError as error:  # rcl's, with the place in its sources
+        except RuntimeError as error:  # raised by rcl; its text ends with a position in rcl's sources
             raise HexapodError(
                 f"{printable(topic)!r} is not a valid topic name: {str(error).partition(', at ')[0]}"
             ) from error
-        self.intervals = MessageIntervals()  # times between the messages so far
+        self.intervals = MessageIntervals()
         end = time.monotonic() + DISCOVERY_TIME
         while not (publishers := node.get_publishers_info_by_topic(self.topic)):
             if time.monotonic() >= end:
@@ -170,7 +174,7 @@ class Echo:
                 close = get_close_matches(self.topic, known, n=3)
                 listed = f"published are: {', '.join(known) or 'none'}"
                 listed = f"did you mean {' or '.join(close)}?" if close else listed
-                problem = f"nobody publishes {self.topic} in this ROS domain (waited {DISCOVERY_TIME:g} s)"
+                problem = f"no node publishes {self.topic} in this ROS domain (waited {DISCOVERY_TIME:g} s)"
                 raise HexapodError(f"{problem}; {listed}")
             spin_once(0.05)
         name = str(publishers[0].topic_type)
@@ -180,7 +184,7 @@ class Echo:
         except (ImportError, AttributeError) as error:
             text = f"messages of type {name} cannot be read: {package} is not installed here"
             raise HexapodError(text) from error
-        # Reliable and latched only where all publishers are: a stricter subscription would get nothing.
+        # Reliable and latched only if all publishers are: a publisher that offers less would send nothing.
         offered = [info.qos_profile for info in publishers]
         reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
         latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
@@ -202,7 +206,7 @@ class Echo:
 
 
 class MessageIntervals:
-    """Counts messages, and measures the time between two, s: of all messages, and of the last :data:`RATE_WINDOW`."""
+    """Number of messages of a topic, their rates, and the shortest and longest time between two of them, s."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -223,16 +227,16 @@ class MessageIntervals:
 
     @property
     def rate(self) -> float:
-        """Mean rate, Hz; NaN for fewer than two messages."""
+        """Mean rate of all messages, Hz; NaN for fewer than two messages."""
         return _rate(self.count, self._recent[-1] - self._first) if self.count else math.nan
 
     @property
     def recent_rate(self) -> float:
-        """The same of the last messages."""
+        """Mean rate of the messages within the last :data:`RATE_WINDOW`, Hz; NaN for fewer than two messages."""
         return _rate(len(self._recent), self._recent[-1] - self._recent[0]) if self.count else math.nan
 
     def text(self) -> str:
-        """Return it as text, as ``ros2 topic hz`` does."""
+        """Return count, mean rate and extreme intervals as text, similar to ``ros2 topic hz``."""
         if self.count < 2:
             return f"messages: {self.count}"
         between = f"{self.shortest * 1e3:.1f} to {self.longest * 1e3:.1f} ms apart"
@@ -248,6 +252,6 @@ def _rate(count: int, span: float) -> float:
 
 
 def published_topics(node: Node) -> dict[str, str]:
-    """Return the published topics, by name, each with its type."""
+    """Return the types of all published topics by the topics' names, sorted."""
     topics = sorted(node.get_topic_names_and_types())
     return {name: kinds[0] for name, kinds in topics if node.count_publishers(name)}

@@ -1,8 +1,7 @@
-"""What a compensator reads: commands, as poses or struts; temperatures, loads, outside numbers, measured poses.
+"""Topics that a compensator subscribes to: commands, loads, external quantities such as elevation, measured poses.
 
-Each topic of readings is handled in the same way: one publisher, a minimum period, a valid message; then its handler,
-which raises an error about the content. A rejected reading, or a second publisher, is counted and reported, and stops
-nothing.
+:class:`SensorTopic` checks each topic of readings: one publisher, a minimum period, a valid message. Its handler raises
+an error about the content. A rejected reading or a second publisher is counted and reported, but stops no command.
 """
 
 from __future__ import annotations
@@ -31,26 +30,25 @@ from .base import SENSOR_QOS, seconds
 from .interface import STRUTS, CompensatorState
 from .messages import StrutReader, check_frame, command_stamp, message_pose, read_message, read_pose
 
-WRENCH_PERIOD = 0.01  # A wrench that arrives sooner after the last one, s, is ignored: each ramps in, and is journalled
+WRENCH_PERIOD = 0.01  # Least time between two wrenches, s: each starts a ramp and is written into the journal
 
 POSE_TOPIC = "tool_pose_measured"
 POSE_MESSAGES = {"pose_with_covariance": PoseWithCovarianceStamped, "pose": PoseStamped}
-FEED_PERIOD = 1.0  # Period at which the drift is passed to the compensation, s: it is slow, and each time makes a model
+FEED_PERIOD = 1.0  # Period at which the slow drift is passed to the compensation, s: each time builds a new model
 
 # ---- commands ----
 
 
 class PoseInput:
-    """Tool poses on ``tool_pose_command``."""
+    """The input of commands as tool poses on ``tool_pose_command``."""
 
     topic, kind = "tool_pose_command", PoseStamped
 
     read = staticmethod(read_pose)
-    """Reads a command into a sample: stamp, frame and the seven numbers of a pose; without values nothing is commanded
-    yet."""
+    """Read a command's bytes into a sample: stamp, frame and a pose's seven numbers; values None: no command yet."""
 
     def stamp(self, data: bytes) -> int:
-        """Return the stamp of a command, ns; 0 if it has none."""
+        """Return the stamp of a command's bytes, ns; 0 if it has none or the command cannot be read."""
         sample = Sample(0.0)
         try:
             self.read(data, sample)
@@ -60,23 +58,23 @@ class PoseInput:
 
 
 class StrutInput(PoseInput):
-    """Nominal strut lengths on ``strut_setpoints``, m, by name: what a controller that plans struts itself commands a
-    machine without errors.
+    """The input of commands as nominal strut lengths, m, on ``strut_setpoints``, from a controller that plans struts.
 
-    They become the tool pose of that machine at once: limits, stamps, journal and replay only use poses. The strut
-    readings that such a controller receives are nominal too.
+    Nominal lengths are those of a machine without errors. They are converted into its tool pose, since limits, stamps,
+    journal and replay use poses only. The strut readings that this controller receives are nominal too.
     """
 
     topic, kind = "strut_setpoints", JointState
 
     def __init__(self, compensator: Compensator, names: list[str], frame_id: str) -> None:
-        # the search for the pose starts from its last command
         self._compensator, self._frame_id = compensator, frame_id
         self._structure, self._reader = Structure.of(compensator.geometry), StrutReader(names)
 
     def read(self, data: bytes, sample: Sample) -> None:  # type: ignore[override]
-        """As for poses; no values while all lengths are NaN: ros2_control publishes NaN until one of its controllers is
-        active. A KinematicsError: no pose near the last command, nor near home, has these lengths."""
+        """Read a command's bytes into a sample; set no values if all lengths are NaN, as before ros2_control is active.
+
+        Raises a KinematicsError if no pose near the last command, nor near home, has these lengths.
+        """
         message = read_message(data, JointState)
         sample.stamp, sample.frame_id = command_stamp(message.header.stamp), self._frame_id
         lengths = self._reader.pick(message)
@@ -84,7 +82,7 @@ class StrutInput(PoseInput):
             return
         self._reader.check(lengths.tolist())
         guesses = [self._compensator.geometry.home]
-        if np.isfinite(self._compensator.nominal).all():  # else there was no command yet
+        if np.isfinite(self._compensator.nominal).all():  # NaN before the first command
             guesses.insert(0, self._compensator.platform)
         for guess in guesses:
             solved = solve_poses(self._structure, lengths[None], guess, threads=1)
@@ -96,7 +94,7 @@ class StrutInput(PoseInput):
 
 
 def command_input(node: CompensatorState) -> PoseInput:
-    """Return the input selected by a node's parameters."""
+    """Return the input of commands that the parameter `command_input` selects."""
     if node.options["command_input"] == STRUTS:
         return StrutInput(node.compensator, node.options["joint_names"], node.options["base_frame"])
     return PoseInput()
@@ -108,9 +106,9 @@ def command_input(node: CompensatorState) -> PoseInput:
 class SensorTopic:
     """The subscription of one topic of readings.
 
-    `handle` is called with each message and its time of arrival, monotonic, s; it raises a HexapodError to reject it.
-    `reject` is called with that error; None: it is bad feedback. Messages within `period`, s, of the last good one are
-    ignored.
+    `handle` is called with each message and its monotonic time of arrival, s; it raises a HexapodError to reject the
+    message. `reject` is called with this error; None: the error is counted as bad feedback. Messages that arrive within
+    `period`, s, after the last accepted one are ignored.
     """
 
     def __init__(
@@ -121,21 +119,21 @@ class SensorTopic:
         handle: Callable[[Any, float], None],
         reject: Callable[[HexapodError], None] | None = None,
         period: float = 0.0,
-        several: str = "allow_several_publishers",  # name of the parameter that allows a second publisher
+        several: str = "allow_several_publishers",  # name of the parameter that allows more than one publisher
     ) -> None:
         self._node, self._topic, self._kind, self._period = node, topic, kind, period
         self._handle, self._reject = handle, reject or self._bad_feedback
-        self.last = math.nan  # time of the last good message, s; NaN before the first
+        self.last = math.nan  # monotonic time of the last accepted message, s; NaN before the first
         allowed = bool(node.options["allow_several_publishers"] or node.options[several])
         self._sender = node.sensing[topic] = node.subscribe_exclusive(kind, topic, self._receive, allowed, SENSOR_QOS)
 
     def stale(self, now: float, timeout: float) -> bool:
-        """Return whether it was published before, but not for longer than a timeout, s (0: off)."""
+        """Return whether the last accepted message is older than `timeout`, s (0: off); False before the first."""
         return 0.0 < timeout < now - self.last
 
     def _receive(self, data: bytes, sample: Sample) -> None:
-        # Dated by arrival: sensors need no stamp, clocks may be set, and a drift is slow compared with transport
-        # delays.
+        # A reading's time is its arrival: sensors need not stamp, clocks may be set, and transport delays are short
+        # compared with the changes of these quantities.
         try:
             self._sender.check(sample)
             if sample.now - self.last < self._period:
@@ -151,14 +149,14 @@ class SensorTopic:
 
 
 class Loads:
-    """Passes gravity, wrench and outside numbers from their single publishers to the compensator."""
+    """Subscriptions of gravity, wrench and external quantities, which it passes to the compensator."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._compensator = node, node.compensator
-        self._gravity: tuple[float, ...] | None = None  # as published; None: the parameter's, or the model's
+        self._gravity: tuple[float, ...] | None = None  # as published; None: use the parameter's, or else the model's
         self._wrench = Loading().wrench
-        self._numbers: dict[str, float] = {}  # as published; the compensator has those that count
-        self._table = Guard()  # of a table that refuses numbers outside
+        self._numbers: dict[str, float] = {}  # newest published external quantities; those in use: compensator.outside
+        self._table = Guard()  # refuses commands while a quantity is outside a table that refuses to extrapolate
         self._table.reason = OutsideTableError.reason
         node.standing = (*node.standing, self._table)
         self._topics = {
@@ -169,7 +167,7 @@ class Loads:
         self.apply()
 
     def apply(self) -> None:
-        """Pass the present gravity and wrench to the compensator, unless ``outside_hold`` holds the previous ones."""
+        """Pass gravity and wrench to the compensator, unless ``outside_hold`` is true."""
         if self._node.options["outside_hold"]:
             return
         stated = self._node.options["gravity"]
@@ -177,9 +175,9 @@ class Loads:
         self._compensator.set_load(Loading.of(gravity, self._wrench))
 
     def update(self) -> None:
-        """Pass the newest outside numbers to the compensator if they move the tool by more than ``outside_dead_band``.
+        """Pass the external quantities to the compensator if they move the tool by more than ``outside_dead_band``.
 
-        It is called periodically, not by each message, since each change builds a new model.
+        This is called every 50 ms, not for each message, since each change builds a new model.
         """
         compensator, options = self._compensator, self._node.options
         if options["outside_hold"] or self._table.problem or self._numbers.items() <= compensator.outside.items():
@@ -194,7 +192,7 @@ class Loads:
                 self._node.ignore("outside", error, self._node.bad_feedback, "outside")
 
     def stale(self, now: float) -> str:
-        """Return the published value, but not for longer than ``outside_timeout``."""
+        """Return the names of the topics that were published before, but not for ``outside_timeout``, joined."""
         timeout = self._node.options["outside_timeout"]
         return ", ".join(name for name, topic in self._topics.items() if topic.stale(now, timeout))
 
@@ -207,7 +205,7 @@ class Loads:
         size = math.hypot(*vector)
         if not EARTH[0] <= size <= EARTH[1]:
             allowed = "{:g}…{:g} m/s²".format(*EARTH)
-            raise CommandError("gravity", f"gravity: must be {allowed} in all, not {size:.4g}")
+            raise CommandError("gravity", f"gravity: its magnitude must be {allowed}, not {size:.4g}")
         moved = np.inf if self._gravity is None else math.dist(vector, self._gravity)
         if moved > self._node.options["gravity_dead_band"]:
             self._gravity = vector
@@ -224,28 +222,29 @@ class Loads:
         if len(message.name) != len(message.position):
             problem = f"has {len(message.name)} names for {len(message.position)} positions"
             raise CommandError("outside", f"outside: {problem}")
-        told = read_numbers({n: v for n, v in zip(message.name, message.position, strict=True) if n in table.names})
-        if table.names and not told:
+        values = dict(zip(message.name, message.position, strict=True))
+        numbers = read_numbers({name: values[name] for name in values if name in table.names})
+        if table.names and not numbers:
             found = shorten(", ".join(message.name))
             raise CommandError("outside", f"outside: must name {' or '.join(table.names)}, not {found}")
         try:
-            table.validate(told)
+            table.validate(numbers)
         except OutsideTableError as error:
             self._table.problem = str(error)
             raise
-        self._numbers |= told
+        self._numbers |= numbers
         self._table.problem = ""
 
     def findings(self) -> Iterator[str]:
-        """Yield warnings about the model's table of outside numbers."""
+        """Yield warnings about the model's table of external quantities."""
         table, numbers = self._compensator.model.outside, self._compensator.outside
         if missing := table.missing(numbers):
-            yield f"the model's table does not count: not known is {missing}"
+            yield f"the model's table is not applied: {missing} not received"
         elif held := table.held(numbers):
-            yield f"running, outside the model's table, whose edge holds: {held}"
+            yield f"running, outside the model's table, whose boundary value is used: {held}"
 
     def values(self) -> dict[str, str]:
-        """Return the loads in use, as key and value of diagnostics, as far as the model uses them."""
+        """Return the loads and external quantities that the model uses, as key-value pairs of the diagnostics."""
         compensator, model = self._compensator, self._compensator.model
         values = {}
         if model.load.bends or model.outside.names:
@@ -274,7 +273,7 @@ def fusion_rules(options: dict[str, Any]) -> FusionRules:
 
 
 class PoseInstrument:
-    """Receives the instrument's readings in a configured node; made only with ``fusion.enabled``."""
+    """Subscription of an instrument's tool poses, which feeds the fusion filter; exists with ``fusion.enabled``."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._kind = node, POSE_MESSAGES[node.options["fusion.message"]]
@@ -284,11 +283,11 @@ class PoseInstrument:
         self.fusion, self._fed = Fusion(node.compensator, fusion_rules(node.options)), -math.inf
 
     def follow(self) -> None:
-        """Apply the present parameters, from the next reading on."""
+        """Apply the present `fusion.*` parameters to all further readings."""
         self.fusion.rules = self.fusion.filter.rules = fusion_rules(self._node.options)
 
     def reset(self) -> None:
-        """Forget the drift; its correction ramps out."""
+        """Forget the estimated drift; its correction ramps out."""
         self.fusion.reset()
         self._node.pose_stamps.reset()
         self._fed = -math.inf
@@ -305,16 +304,16 @@ class PoseInstrument:
             self._node.log_warning("drift", self._node.drift_problem)
 
     def add_struts(self, struts: Sequence[float], made: float) -> None:
-        """Store struts, m, of a monotonic time, s, for the readings about them."""
+        """Add strut lengths, m, at the monotonic time `made`, s, between which readings are interpolated."""
         for error in self.fusion.add_struts(struts, made):
             self._reject(error)
 
     def weighed(self, pose: np.ndarray) -> np.ndarray:
-        """Return the compensator's estimate, weighed with the readings."""
+        """Return the tool pose from struts, shape (12,), corrected by the estimated but not compensated drift."""
         return self.fusion.weighed(pose)
 
     def values(self, now: float) -> dict[str, str]:
-        """Return the filter's state, as key and value of diagnostics."""
+        """Return the filter's state as key-value pairs of the diagnostics."""
         node, fusion = self._node, self.fusion
 
         def micro(values: np.ndarray) -> str:

@@ -1,8 +1,8 @@
-"""The virtual instrument node: what a tracker, a laser or a ball bar would read of the simulated drive's machine.
+"""The virtual instrument node: simulates a tracker, a laser or a ball bar that measures the simulated drive's machine.
 
-It watches ``tool_pose_true`` and publishes as a real instrument's driver does, with noise, wild readings, a broken
-beam and silence by parameter: :class:`~hexapod_comp.virtual.instruments.LiveInstrument`. Run it with ``ros2 run
-hexapod_comp instrument`` or ``python -m hexapod_comp.ros.instrument``.
+It subscribes to ``tool_pose_true`` and publishes readings as a real instrument's driver does. Parameters set noise,
+outliers, a broken beam and silence. Run it with ``ros2 run hexapod_comp instrument`` or ``python -m
+hexapod_comp.ros.instrument``.
 """
 
 from __future__ import annotations
@@ -29,44 +29,47 @@ from .parameters import Program, read_table
 from .process import run
 
 SET_UP_TOPIC = "instrument_set_up"
-SEEN_WITHIN = 0.5  # A true pose that is older says no more where the tool is, s
+SEEN_WITHIN = 0.5  # A true tool pose older than this, s, is not used
 
 PARAMETERS = read_table(f"""
-autostart | true |  | start | configure and activate at the start
+autostart | true |  | start | configure and activate when the process starts
 geometry_file | paper.yaml |  | configure | geometry file: a path or the name of a shipped one
-kind | laser | {", ".join(LIVE)} | configure | what it is: a tracker publishes ~/pose, a laser and a ball bar ~/readings
-components | 5-D | 1-D, 5-D, 6-D | configure | what a laser reads of a line: its length; straightness, pitch and yaw
-    too; roll as well
+kind | laser | {", ".join(LIVE)} | configure | kind of instrument: a tracker publishes ~/pose, a laser or ball bar
+    ~/readings
+components | 5-D | 1-D, 5-D, 6-D | configure | channels of a laser on a line: 1-D displacement; 5-D also straightness,
+    pitch and yaw; 6-D also roll
 base_frame | base |  | configure | frame_id of the true tool pose
 frame_id | base |  | configure | frame_id of a tracker's poses
-stands_at | [0.0, 0.0, 0.0] | -100 to 100 m | configure | where a tracker stands in base
-stands_turned | [0.0, 0.0, 0.0] | -7 to 7 rad | configure | and how it is turned, the angles α, β, γ
-noise_seed | 0 | 0 to 2147483647 | configure | seed of all that is drawn
+stands_at | [0.0, 0.0, 0.0] | -100 to 100 m | configure | position of the tracker in base
+stands_turned | [0.0, 0.0, 0.0] | -7 to 7 rad | configure | orientation of the tracker in base: the angles α, β, γ
+noise_seed | 0 | 0 to 2147483647 | configure | seed of all random numbers
 rate | 100.0 | 1 to 1000 Hz | configure | readings published per second
-length_noise | 1.0e-6 | 0 to 0.01 m | always | standard deviation of a length or coordinate that is read
-angle_noise | 1.0e-6 | 0 to 0.01 rad | always | of an angle
-beam_slope | 1.0e-4 | 0 to 0.1 rad | always | 1 σ of how a laser's beam lies off its line, from the next run on
-centre_off | 3.0e-4 | 0 to 0.1 m | always | 1 σ of a ball bar's centre beside its place, from the next run on
-wild_share | 0.0 | 0 to 1 | always | share of readings that are wild
-wild_size | 0.001 | 0 to 1 | always | error of a wild reading, m or rad
-fault_break | 0.0 | 0 to 3600 s | always | each setting breaks the beam for this long: readings are NaN, and those after
-    it start from a new zero
-fault_silent | false |  | always | publishes nothing, and keeps its zero
-fault_scale | 1.0 | -1e9 to 1e9 | always | of all that it reads: -1 reverses the sign, 1000 has it read mm
-fault_exchanged | false |  | always | its first two channels, or coordinates, are exchanged
+length_noise | 1.0e-6 | 0 to 0.01 m | always | standard deviation of a length or coordinate reading
+angle_noise | 1.0e-6 | 0 to 0.01 rad | always | standard deviation of an angle reading
+beam_slope | 1.0e-4 | 0 to 0.1 rad | always | standard deviation of the angle between a laser's beam and its line; used
+    from the next run on
+centre_off | 3.0e-4 | 0 to 0.1 m | always | standard deviation of a ball bar's centre from its set-up position; used
+    from the next run on
+wild_share | 0.0 | 0 to 1 | always | share of readings that are outliers
+wild_size | 0.001 | 0 to 1 | always | error of an outlier, m or rad
+fault_break | 0.0 | 0 to 3600 s | always | each setting breaks the beam for this time: readings are NaN meanwhile, and
+    start from a new zero afterwards
+fault_silent | false |  | always | publish nothing, but keep the zero of the readings
+fault_scale | 1.0 | -1e9 to 1e9 | always | factor of all readings: -1 reverses their sign, 1000 gives mm instead of m
+fault_exchanged | false |  | always | exchange the first two channels, or a tracker's x and y
 """)
 
 TOPICS = f"""
-in   tool_pose_true      PoseStamped: where the tool really is, in base
-     {SET_UP_TOPIC}   PoseStamped, latched: a run's line begins there and goes along its x; or its centre
-out  ~/readings          JointState of a laser or ball bar: name is the channel, position what is read, m or rad
+in   tool_pose_true      PoseStamped: true pose of the tool, in base
+     {SET_UP_TOPIC}   PoseStamped, latched: start of a laser's line, along its x axis; or centre of a ball bar
+out  ~/readings          JointState of a laser or ball bar: name is the channel, position the reading, m or rad
      ~/pose              PoseStamped of a tracker: the tool in the tracker's frame
      /diagnostics
 """
 
 PROGRAM = Program(
     "instrument",
-    "Reads a simulated machine as a tracker, a laser or a ball bar would.",
+    "Simulates a tracker, a laser or a ball bar that measures a simulated machine.",
     PARAMETERS,
     TOPICS,
     "-p kind:=tracker -p length_noise:=1.0e-5",
@@ -74,7 +77,7 @@ PROGRAM = Program(
 
 
 class InstrumentNode(MachineNode):
-    """Lifecycle node around one :class:`LiveInstrument`; arguments are those of ``rclpy`` nodes."""
+    """Lifecycle node around one :class:`LiveInstrument`; `options` are those of rclpy's nodes."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("instrument", PARAMETERS, **options)
@@ -86,7 +89,7 @@ class InstrumentNode(MachineNode):
         what, self._tracker = (options["kind"], options["components"]), options["kind"] == TRACKER
         self._instrument = LiveInstrument(geometry, *what, self._flaws(), stands, options["noise_seed"])
         self.set_hardware_id(geometry.name)
-        self._seen: tuple[Pose, float] | None = None  # the tool's pose, and when it arrived, monotonic
+        self._seen: tuple[Pose, float] | None = None  # true tool pose and its monotonic time of arrival, s
         self._broken_until, self._published, self._problem = -math.inf, 0, ""
         kind, topic = (PoseStamped, "~/pose") if self._tracker else (JointState, "~/readings")
         self._out = self.publish_on(kind, topic, STATE_QOS)
@@ -95,7 +98,7 @@ class InstrumentNode(MachineNode):
         self.every(1.0 / options["rate"], self._publish)
 
     def on_parameters(self, names: set[str]) -> None:
-        """Apply errors that are set while the node runs; the beam breaks whenever ``fault_break`` is set."""
+        """Apply noise and faults that are set while the node runs; each setting of ``fault_break`` breaks the beam."""
         if self.configured:
             self._instrument.flaws = self._flaws()
             if "fault_break" in names:
@@ -107,7 +110,7 @@ class InstrumentNode(MachineNode):
         values = {name: options[name] for name in kept}
         return LiveFlaws(**values, scale=options["fault_scale"], exchanged=options["fault_exchanged"])
 
-    # ---- what it sees and reads ----
+    # ---- messages in and out ----
 
     def _on_tool(self, message: PoseStamped) -> None:
         if pose := self._pose_in_base(message, "tool_pose_true"):
@@ -116,10 +119,10 @@ class InstrumentNode(MachineNode):
     def _on_set_up(self, message: PoseStamped) -> None:
         if pose := self._pose_in_base(message, SET_UP_TOPIC):
             self._instrument.set_up(pose)
-            self.note("set up", f"set up for {', '.join(self._instrument.channels)}")
+            self.log_action("set up", f"set up for {', '.join(self._instrument.channels)}")
 
     def _pose_in_base(self, message: PoseStamped, topic: str) -> Pose | None:
-        """Return a message's pose; None, and a warning, where it is none in the base."""
+        """Return a message's pose; log a warning and return None if it is invalid or not in `base_frame`."""
         try:
             pose = message_pose(message)
         except HexapodError as error:
@@ -159,7 +162,7 @@ class InstrumentNode(MachineNode):
         if self._problem:
             yield WARN, self._problem
         elif self._seen is None or now - self._seen[1] > SEEN_WITHIN:
-            yield WARN, "nobody publishes tool_pose_true"
+            yield WARN, "no tool_pose_true is received"
         elif now < self._broken_until:
             yield WARN, "the beam is broken"
         yield OK, "reading" if self._tracker or self._instrument.channels else f"waiting for {SET_UP_TOPIC}"

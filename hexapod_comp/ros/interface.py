@@ -1,6 +1,6 @@
-"""The compensator's interface and state: its parameters, the files they name, what it knows, counts and reports.
+"""The compensator's parameters, its geometry and model files, and its state with counters and diagnostics.
 
-What it does with all that: :mod:`.compensator`. doc/states.md has every case.
+:mod:`.compensator` handles the messages. doc/states.md lists every case.
 """
 
 from __future__ import annotations
@@ -31,129 +31,130 @@ if TYPE_CHECKING:
     from .inputs import Loads, PoseInstrument
 
 POSES, STRUTS = "poses", "struts"  # Values of the parameter ``command_input``
-NEAR_SINGULAR = 0.9  # Share of the largest allowed condition number above which diagnostics warn
+NEAR_SINGULAR = 0.9  # Diagnostics warn if the condition number is above this share of its limit
 RULES = FusionRules()
 
 PARAMETERS = read_table(f"""
-autostart | true |  | start | configure and activate at the start
+autostart | true |  | start | configure and activate when the process starts
 geometry_file | paper.yaml |  | configure | geometry file: a path or the name of a shipped one
-model_file | ideal |  | reload | model file: a path or the name of a shipped one; `ideal` corrects nothing, and the
-    log says so
-model_folder | '' |  | start | folder from which geometry and model may be read, with all below it, beside the shipped
-    ones; empty: each file's own folder at the start. What leads out by `..` or a link is refused, as is what is no
-    regular file or larger than 8 MB
+model_file | ideal |  | reload | model file: a path or the name of a shipped one; `ideal` corrects nothing, which the
+    log mentions
+model_folder | '' |  | start | folder in or below which geometry and model files must be, unless they are shipped ones;
+    empty: the folder of each file at the start. A path that leaves it by `..` or a link, or names a file larger than
+    8 MB or no regular file, is refused
 base_frame | base |  | configure | frame_id of poses in the machine base
 work_frame | work | not base_frame | configure | frame_id of poses in the geometry file's work frame
-frame_prefix | '' |  | configure | in front of the names of its other work frames
-tool | {TOOL} |  | always | the tool in use, by its name in the geometry file; while the machine stands
-command_input | poses | poses, struts | configure | what commands: `poses` on `tool_pose_command`, or `struts`
+frame_prefix | '' |  | configure | prefix of the frame_ids of the geometry file's named work frames
+tool | {TOOL} |  | always | name of the tool in use, from the geometry file; may be changed while the machine stands
+command_input | poses | poses, struts | configure | form of the commands: `poses` on `tool_pose_command`, or `struts`
     (nominal lengths) on `strut_setpoints`; the other topic is ignored
 joint_names | [strut_1, strut_2, strut_3, strut_4, strut_5, strut_6] |  | configure | the struts' names in JointState
     messages, in strut order
-command_timeout | 0.1 | 0 to 3600 s | always | a command is valid for this long; without another one the state is then
-    stale; 0 = off. The deadline that the publishers offer is the one at configure
-max_command_age | 0.5 | 0 to 3600 s | always | older, or newer, stamps are refused; 0 = off; a zero stamp means now
-feedback_timeout | 0.1 | 0.001 to 3600 s | always | without measured struts for this long there is no feedback
-max_reading_age | 0.5 | 0 to 3600 s | always | measured struts stamped older, or newer, are refused; 0 = off; a zero
-    stamp means now
-require_feedback | false |  | always | refuse commands while there is no feedback
-start_without_feedback_after | 0.0 | 0 to 3600 s | configure | for a machine without feedback: when no struts have
-    been measured for this long after the start, the first command may be anywhere within the limits; 0 = never, a
-    start waits for `strut_states`
-following_error_limit | 0.002 | 0 to 1 m | configure | measured struts further than this from all that was commanded
-    in the last 0.1 s stop the machine until `~/reset`; 0 = off
-catch_up_within | 0.1 | 0 to 3600 s | always | commands that arrive sooner than the struts may move wait at most this
-    long, in their order; 0 = only the newest waits
+command_timeout | 0.1 | 0 to 3600 s | always | time for which a command is valid; without a new command diagnostics
+    then warn; 0 = off. The publishers offer the value at configure as their deadline
+max_command_age | 0.5 | 0 to 3600 s | always | commands whose stamps differ from the clock by more than this are
+    refused; 0 = off; a zero stamp means now
+feedback_timeout | 0.1 | 0.001 to 3600 s | always | without measured struts for this long, feedback counts as missing
+max_reading_age | 0.5 | 0 to 3600 s | always | measured struts whose stamps differ from the clock by more than this are
+    refused; 0 = off; a zero stamp means now
+require_feedback | false |  | always | refuse commands while feedback is missing
+start_without_feedback_after | 0.0 | 0 to 3600 s | configure | for a machine without feedback: if no struts were
+    measured for this long after activation, the first command may be anywhere within the limits; 0 = wait for
+    `strut_states`
+following_error_limit | 0.002 | 0 to 1 m | configure | a measured strut further than this from all its commands of the
+    last 0.1 s stops the machine until `~/reset`; 0 = off
+catch_up_within | 0.1 | 0 to 3600 s | always | longest time for which commands that arrive faster than the struts may
+    move wait, in their order; 0 = only the newest command waits
 allow_several_publishers | false |  | configure | accept commands although several nodes publish commands or
-    `strut_states`, or others `strut_commands`
-allow_several_thermometers | false |  | configure | accept temperatures and humidity from several publishers, one for
-    each part for instance
-enable_compensation | true |  | configure | compensate from the start; `~/enable_compensation` switches
-ramp_rate | {DEFAULT_RAMP_RATE} | 1e-06 to 1 m/s | always | largest speed at which a change of model or switch, or the
-    difference between the measured struts and the first command, moves a strut
-temperature_time_constant_s | {DEFAULT_TIME_CONSTANT} | 0 to 3600 s | always | low pass of each part's temperatures, and
-    of humidity; 0 = off
-temperature_rate_limit | 0.2 | 0 to 1000 K/s | always | a part's temperature that jumps by more than 1 K and this rate
-    is refused; 0 = off
-temperature_spread_limit | 40.0 | 0 to 1000 K | always | a temperature further than this from the median of the other
-    parts' is refused, from 20 °C while no other is known; 0 = off
-temperature_timeout | 60.0 | 0 to 86400 s | always | a part without a temperature for this long is stale: diagnostics
-    report it, and the last value stays; the same for humidity; 0 = off
-humidity_rate_limit | {HUMIDITY_RATE} | 0 to 1 1/s | always | a humidity that jumps by more than 0.05 and this rate is
-    refused; 0 = off
-gravity | [0.0, 0.0, 0.0] | -10.6 to 10.6 m/s² | always | gravity in `base_frame` while nobody publishes `gravity`;
-    zeros: the model's
-gravity_dead_band | 0.0 | 0 to 1 m/s² | always | ignore a published gravity that differs by less from the one in use
-outside_dead_band | 0.0 | 0 to 0.01 m | always | ignore published outside numbers at which the model's table differs by
-    less from the one in use: its displacement, and its rotation times the machine's characteristic length
-outside_hold | false |  | always | hold the correction for gravity, wrench and outside numbers as it is, while an
-    exposure or a cut lasts
-outside_timeout | 60.0 | 0 to 86400 s | always | gravity, wrench, or outside numbers, not published for this long after
-    the last message are stale: diagnostics report it, and the last value stays; 0 = off
+    `strut_states`, or other nodes publish `strut_commands`
+allow_several_thermometers | false |  | configure | accept temperatures and humidity from several publishers, for
+    example one for each part
+enable_compensation | true |  | configure | compensation is on after configure; `~/enable_compensation` switches it
+ramp_rate | {DEFAULT_RAMP_RATE} | 1e-06 to 1 m/s | always | largest strut speed with which a change of model or switch,
+    or a difference between the measured struts and the first command, ramps in
+temperature_time_constant_s | {DEFAULT_TIME_CONSTANT} | 0 to 3600 s | always | time constant of the low-pass filter of
+    each temperature and of humidity; 0 = off
+temperature_rate_limit | 0.2 | 0 to 1000 K/s | always | a temperature that has changed by more than 1 K plus this rate
+    times the time since the last one is refused; 0 = off
+temperature_spread_limit | 40.0 | 0 to 1000 K | always | a part's temperature further than this from the median of the
+    other parts (or from 20 °C if no other is known) is refused; 0 = off
+temperature_timeout | 60.0 | 0 to 86400 s | always | without a temperature for this long a part is stale: diagnostics
+    warn, and the last value stays in use; the same for humidity; 0 = off
+humidity_rate_limit | {HUMIDITY_RATE} | 0 to 1 1/s | always | a humidity that has changed by more than 0.05 plus this
+    rate times the time since the last one is refused; 0 = off
+gravity | [0.0, 0.0, 0.0] | -10.6 to 10.6 m/s² | always | gravity in `base_frame` if no node publishes `gravity`;
+    zeros: the gravity of the model file
+gravity_dead_band | 0.0 | 0 to 1 m/s² | always | ignore a published gravity that differs by less than this from the one
+    in use
+outside_dead_band | 0.0 | 0 to 0.01 m | always | ignore published external quantities (topic `outside`) if the model's
+    table gives less change than this: displacement plus rotation times the machine's characteristic length
+outside_hold | false |  | always | keep the present correction for gravity, wrench and external quantities, for
+    example during an exposure or a cut
+outside_timeout | 60.0 | 0 to 86400 s | always | gravity, wrench or external quantities not published for this long
+    after the last message are stale: diagnostics warn, and the last value stays in use; 0 = off
 heartbeat_rate | 50.0 | 0 to 1000 Hz | always | heartbeats per second; 0 = none
 marker_rate | 10.0 | 0 to 10 Hz | always | markers and joint states per second; 0 = none
-fusion.enabled | false |  | configure | weigh the tool's pose that an instrument measures, `tool_pose_measured`, with
-    that of the struts, and follow the machine's slow drift
-fusion.compensate | false |  | always | also correct that drift, with a ramp as for a change of model; false ramps it
-    out
-fusion.message | pose_with_covariance | pose_with_covariance, pose | configure | the instrument's message:
-    PoseWithCovarianceStamped, or PoseStamped
+fusion.enabled | false |  | configure | combine the tool's pose that an instrument measures, on `tool_pose_measured`,
+    with the pose from the struts, and estimate the machine's slow drift
+fusion.compensate | false |  | always | also correct the estimated drift, which ramps in; false: it ramps out
+fusion.message | pose_with_covariance | pose_with_covariance, pose | configure | type of the instrument's messages:
+    PoseWithCovarianceStamped or PoseStamped
 fusion.position_deviation | {RULES.position_deviation:.1e} | 1e-09 to 0.01 m | always | standard deviation of the
-    instrument's positions where its message states none
-fusion.rotation_deviation | {RULES.rotation_deviation:.1e} | 1e-09 to 0.1 rad | always | the same of its rotations
-fusion.strut_deviation | {RULES.strut_deviation:.1e} | 0 to 0.001 m | always | standard deviation of a strut: its
-    encoder, and the model's residual error
-fusion.time_deviation | {RULES.time_deviation:.1e} | 0 to 0.1 s | always | standard deviation between the clocks of
-    instrument and struts: reduces the weight of readings made in motion
-fusion.drift_rate | {RULES.drift_rate:.1e} | 0 to 0.001 m | always | by how much each of the base's displacements and
-    the struts may drift in a second (standard deviation; it grows with the root of time)
-fusion.initial_deviation | {RULES.initial_deviation:.1e} | 1e-09 to 0.001 m | always | standard deviation of both at the
-    start, and after `~/reset`
-fusion.limit | {RULES.limit:.1e} | 1e-06 to 0.005 m | always | largest drift: a reading that would exceed it is
-    rejected, and the drift stays
+    instrument's positions if its message states none
+fusion.rotation_deviation | {RULES.rotation_deviation:.1e} | 1e-09 to 0.1 rad | always | standard deviation of the
+    instrument's rotations if its message states none
+fusion.strut_deviation | {RULES.strut_deviation:.1e} | 0 to 0.001 m | always | standard deviation of a strut's length:
+    encoder and residual error of the model
+fusion.time_deviation | {RULES.time_deviation:.1e} | 0 to 0.1 s | always | standard deviation of the time difference
+    between the stamps of instrument and struts; it reduces the weight of readings made in motion
+fusion.drift_rate | {RULES.drift_rate:.1e} | 0 to 0.001 m | always | standard deviation of the drift of each base
+    displacement and strut in one second; it grows with the square root of time
+fusion.initial_deviation | {RULES.initial_deviation:.1e} | 1e-09 to 0.001 m | always | standard deviation of the drift
+    of base and struts at the start and after `~/reset`
+fusion.limit | {RULES.limit:.1e} | 1e-06 to 0.005 m | always | largest drift; a reading that would exceed it is rejected
 fusion.gate_probability | {RULES.gate_probability} | 0.5 to 0.999999 | always | a reading outside the region that holds
-    this share of correct readings is rejected as wild (chi-square with six degrees of freedom)
-fusion.timeout | 10.0 | 0 to 86400 s | always | without an accepted reading for this long, diagnostics warn; the last
-    drift stays; 0 = off
+    this share of correct readings is rejected as an outlier (chi-square with six degrees of freedom)
+fusion.timeout | 10.0 | 0 to 86400 s | always | without an accepted reading for this long diagnostics warn, and the last
+    drift stays in use; 0 = off
 publish_array | false |  | configure | also publish `strut_commands_array` for ros2_controllers, in the order of
     joint_names
-publish_description | true |  | configure | publish the machine for robot_state_publisher and RViz: its URDF on
-    `robot_description`, latched, and all its joints on `joint_states`; false where another node publishes these topics
+publish_description | true |  | configure | publish the machine's URDF on `robot_description` (latched) and all its
+    joints on `joint_states`, for robot_state_publisher and RViz; false if another node publishes these topics
 """)
 
 TOPICS = """
-in   tool_pose_command       PoseStamped: commanded tool pose, frame_id a work frame; or, by command_input,
-     strut_setpoints         JointState: nominal strut lengths, m; NaN while the controller is not active
+in   tool_pose_command       PoseStamped: commanded tool pose, in base or a work frame (command_input: poses)
+     strut_setpoints         JointState: nominal strut lengths, m (command_input: struts); NaN is ignored
      strut_states            JointState: measured strut lengths, m
-     select_tool             String: tool by its name, for controllers; as parameter tool
+     select_tool             String: name of the tool to use, for controllers; sets the parameter tool
      temperatures            Temperature: °C; frame_id names strut_1 to strut_6, base or platform
-     humidity                RelativeHumidity: 0 to 1; for struts that swell
+     humidity                RelativeHumidity: 0 to 1; for a model of struts that swell
      gravity                 Vector3Stamped: in base, m/s²; for a model with a load block
-     wrench                  WrenchStamped: on the platform beside weight; frame_id platform, or the tool in use
-     outside                 JointState: outside numbers by name, rad, m or °C; for a model with a table of them
-     tool_pose_measured      PoseWithCovarianceStamped: an instrument's, with fusion.enabled
+     wrench                  WrenchStamped: forces on the platform besides weight; frame_id platform or the tool in use
+     outside                 JointState: external quantities by name, rad, m or °C; for a model with an outside table
+     tool_pose_measured      PoseWithCovarianceStamped: tool pose of an instrument, with fusion.enabled
 out  strut_commands          JointState: compensated strut lengths, m
      strut_commands_array    Float64MultiArray: the commands in joint order, with publish_array
      strut_corrections       JointState: command − nominal, m
-     nominal_strut_states    JointState: with strut_setpoints, measured struts less the corrections, m
+     nominal_strut_states    JointState: with strut_setpoints: measured struts minus the corrections, m
      tool_pose_estimate      PoseStamped: from measured struts, in base
      ~/predicted_error       PoseWithCovarianceStamped: the tool's error without compensation, in work;
-     ~/predicted_error_aligned  the same with the datum aligned
-     ~/tool                  String, latched: the tool in use
-     ~/travel                DiagnosticStatus: how far the tool may go from here, 1 Hz
-     ~/stopped               Bool, latched: commands are refused
-     ~/heartbeat, ~/validity UInt64, TimeReference: until when the newest command is valid
+     ~/predicted_error_aligned  the same error with the datum aligned
+     ~/tool                  String, latched: name of the tool in use
+     ~/travel                DiagnosticStatus: the tool's travel from the present pose in each axis, 1 Hz
+     ~/stopped               Bool, latched: true while commands are refused
+     ~/heartbeat, ~/validity UInt64, TimeReference: counter; time until which the newest command is valid
      joint_states            JointState: all joints of the machine's URDF
-     robot_description       String, latched: that URDF, of the geometry in use
+     robot_description       String, latched: URDF of the geometry in use
      /diagnostics, ~/markers, ~/journal, ~/files
 ask  ~/enable_compensation   SetBool
      ~/reload_model, ~/reset Trigger
-     ~/get_travel            Trigger: how far the tool may go from here
+     ~/get_travel            Trigger: the tool's travel from the present pose, as a table
 """
 
 PROGRAM = Program(
     "compensator",
-    "Compensates a hexapod's errors: tool poses in, strut commands out.",
+    "Compensates a hexapod's errors: receives tool poses, publishes strut commands.",
     PARAMETERS,
     TOPICS,
     "-p geometry_file:=mine.yaml -p model_file:=model.yaml",
@@ -161,7 +162,7 @@ PROGRAM = Program(
 
 
 def temperature_rules(options: dict[str, Any]) -> tuple[Plausibility, float]:
-    """Return the limits for temperatures, and the time constant of their filter, s, from the parameters."""
+    """Return plausibility limits of temperatures and humidity, and their filter's time constant, s, from parameters."""
     rules = Plausibility(
         rate=options["temperature_rate_limit"],
         spread=options["temperature_spread_limit"],
@@ -172,20 +173,23 @@ def temperature_rules(options: dict[str, Any]) -> tuple[Plausibility, float]:
 
 
 def frame_ids(geometry: HexapodGeometry, options: dict[str, Any]) -> dict[str, str]:
-    """Return the ``frame_id`` of poses in each frame of a machine, by the machine's names; a ParameterError if another
-    work frame's is that of the base or the usual work frame."""
+    """Return the ``frame_id`` of `base`, `work` and each named work frame of a machine, by the frame's name.
+
+    Raises a ParameterError if a named work frame would have the frame_id of `base` or `work`.
+    """
     ids = {BASE: options["base_frame"], WORK: options["work_frame"]}
     for name in geometry.work_frames:
         frame_id = ids.setdefault(name, f"{options['frame_prefix']}{name}")
         if name not in (BASE, WORK) and frame_id in (ids[BASE], ids[WORK]):
-            raise ParameterError(f"parameter frame_prefix: with it work frame {name!r} has the frame_id of another")
+            problem = f"work frame {name!r} would have the frame_id {frame_id!r} of another frame"
+            raise ParameterError(f"parameter frame_prefix: {problem}")
     return ids
 
 
 class MachineFiles:
-    """Geometry and model, as the parameters name them, each from its folder at the start or from ``model_folder``.
+    """The geometry and model file named by the parameters, read only from the folders that ``model_folder`` allows.
 
-    `sources` holds the texts read last, unchanged: ``geometry`` and ``model``.
+    `sources` holds the file texts read last, under ``geometry`` and ``model``.
     """
 
     def __init__(self, options: dict[str, Any]) -> None:
@@ -201,14 +205,16 @@ class MachineFiles:
         """Whether the model is the ideal one, which has no file."""
         return bool(self._options["model_file"] == IDEAL)
 
-    def made_of(self) -> dict[str, Any]:
-        """Return what the worker's process needs to make geometry and model from the same texts."""
+    def worker_machine(self) -> dict[str, Any]:
+        """Return the file texts and the model folder, from which the worker process builds the same machine."""
         folder = self._folders["model"]
         return {**self.sources, "folder": None if folder is None else str(folder)}
 
     def model_place(self) -> tuple[str, str, str | None]:
-        """Return name, the folder that relative paths start from (where it was deleted, only absolute ones are found),
-        and the folder in which it must be: the file is not opened here."""
+        """Return the model file's name, the working directory for relative names, and the folder that it must be in.
+
+        The file is not opened here. If the working directory was deleted, "/" is returned for it.
+        """
         try:
             place = os.getcwd()
         except FileNotFoundError:
@@ -231,35 +237,36 @@ class MachineFiles:
 
 # ---- state ----
 
-# What the sender of a refused command should do, by reason
+# Advice for the sender of a refused command, by the reason of the refusal
 ADVICE = {
     "stamp_past": "send the pose again with a new stamp; never skip one that was not answered",
     "stamp_future": "set the clocks, or send a zero stamp, which means now",
     "stamp_order": "stamp commands in the order in which they are sent",
-    "step": "go on from the last answered command (last_answered), in steps that the limit allows",
-    "speed": "plan slower, and stamp each pose with the time for which it was computed, not that of sending",
-    "acceleration": "plan more gently, and stamp each pose with the time for which it was computed",
-    "tool_changed": "send where the struts are with the tool in use; the refusal says where that is",
+    "step": "continue from the last answered command (last_answered), in steps that the limit allows",
+    "speed": "plan slower, and stamp each pose with the time for which it was computed, not the time of sending",
+    "acceleration": "plan less acceleration, and stamp each pose with the time for which it was computed",
+    "tool_changed": "send the pose that the tool in use has at the struts' present position; the refusal gives it",
     "no_feedback": "wait for strut_states; a machine without feedback needs start_without_feedback_after",
     "following_error": "find out why the struts do not follow, then call ~/reset while the machine stands",
     "several_publishers": "leave one publisher on the topic",
-    "unknown_publisher": "leave one publisher on the topic, whose node's name can be read",
+    "unknown_publisher": "leave one publisher on the topic, whose node has a readable name",
 }
 
-# The same for all other reasons: a limit, a frame, an invalid message
-OTHERWISE = "mend what the refusal names, and go on from the last answered command (last_answered)"
+# Advice for all other reasons: a limit, a frame, an invalid message
+OTHERWISE = "correct what the refusal names, and continue from the last answered command (last_answered)"
 
 
 class CompensatorState(MachineNode):
-    """A compensator node as far as it knows, counts and reports; its parts read and write this.
+    """State, counters and diagnostics of a compensator node, which the objects that handle its topics read and write.
 
-    Counters, stamps and the track of the struts outlive a configuration; :meth:`use_machine` begins one.
+    Counters, stamps and the track of the struts are kept when the node is configured anew; :meth:`use_machine` renews
+    the machine's state.
     """
 
-    source: OneSender  # of commands,
-    own_topic: OneSender  # of strut commands beside this node,
-    measuring: OneSender  # and of measured struts
-    standing: tuple[Guard, ...]  # refuse commands while they have a problem
+    source: OneSender  # guard against a second publisher of commands
+    own_topic: OneSender  # guard against another publisher of strut commands
+    measuring: OneSender  # guard against a second publisher of measured struts
+    standing: tuple[Guard, ...]  # each refuses all commands while it has a problem
     loads: Loads
 
     def __init__(self, **options: Any) -> None:
@@ -269,16 +276,16 @@ class CompensatorState(MachineNode):
         self.reading_stamps = StampGate("reading", self.clock, capped=True)
         self.pose_stamps = StampGate("measured pose", self.clock, capped=True)
         self.track = StrutTrack()
-        # Senders of sensor readings and of the tool's choice: a second one is ignored, and stops nothing
+        # Guards of sensor topics and of select_tool: a second publisher is ignored, but commands are still accepted
         self.sensing: dict[str, OneSender] = {}
-        self.commands, self.feedback = Flow(), Flow()  # accepted commands, usable measured struts
+        self.commands, self.feedback = Flow(), Flow()  # counts of accepted commands and of accepted strut readings
         self.refusals, self.bad_feedback, self.bad_poses = Refusals(), Refusals(), Refusals()
         self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
-        self.waited = self.dropped = 0  # number of commands that have waited, and that a newer one has replaced
-        self.behind = EventWindow()  # commands were handled late, by more than jitter
-        self.frame_id = ""  # of the last command
-        self.last_answered = 0  # stamp, ns; 0 before the first
-        self.fresh_start = True  # no command is in force
+        self.waited = self.dropped = 0  # number of commands that have waited, and that were replaced while waiting
+        self.behind = EventWindow()  # a command was handled later than JITTER after its arrival
+        self.frame_id = ""  # frame of the last command
+        self.last_answered = 0  # stamp of the last answered command, ns; 0: none
+        self.fresh_start = True  # no command was answered since activation or reset
         self.apply_parameters()
 
     def use_machine(self, compensator: Compensator) -> None:
@@ -286,12 +293,12 @@ class CompensatorState(MachineNode):
         self.thermometers = Thermometers(*temperature_rules(self.options))
         self.sensing.clear()
         self.instrument: PoseInstrument | None = None  # present with ``fusion.enabled``
-        self.prediction_problem = self.drift_problem = ""  # why no error is predicted, and no drift compensated
+        self.prediction_problem = self.drift_problem = ""  # why the error is not predicted, or drift not compensated
         self.track.watch(compensator.geometry)
         self.set_hardware_id(compensator.geometry.name)
 
     def apply_parameters(self) -> None:
-        """Apply the parameters as they are now; others are read where they are used."""
+        """Apply the present values of ages and limits; all other parameters are read each time they are used."""
         self.command_stamps.max_age = self.options["max_command_age"]
         self.reading_stamps.max_age = self.pose_stamps.max_age = self.options["max_reading_age"]
         self.track.limit = self.options["following_error_limit"]
@@ -306,7 +313,7 @@ class CompensatorState(MachineNode):
         return next((guard for guard in self.standing if guard.problem), None)
 
     def stops(self, now: float) -> bool:
-        """Return whether an active node refuses commands: a guard acts, no readings came, or one was refused lately."""
+        """Return whether a guard or missing readings refuse commands, or one was refused within the last second."""
         return self.standing_problem() is not None or self.refusals.recent(now) or self.track.waits(now)
 
     def fed(self, now: float) -> bool:
@@ -320,8 +327,8 @@ class CompensatorState(MachineNode):
             yield ERROR, f"refusing commands: {reasons}"
         disputed = [(topic, sender) for topic, sender in self.sensing.items() if sender.problem]
         senders = (self.measuring, *(sender for _, sender in disputed))
-        said = next((sender.reason for sender in senders if sender.problem), "")
-        if reasons := self.bad_feedback.reasons(now, said):
+        reported = next((sender.reason for sender in senders if sender.problem), "")
+        if reasons := self.bad_feedback.reasons(now, reported):
             yield ERROR, f"bad feedback: {reasons}"
         for topic, sender in disputed:
             yield ERROR, f"{topic} ignored: {sender.reason}: {sender.problem}"
@@ -353,9 +360,9 @@ class CompensatorState(MachineNode):
         for problem in filter(None, (self.prediction_problem, self.drift_problem, held)):
             yield WARN, problem
         if fusion is not None and 0.0 < self.options["fusion.timeout"] < now - fusion.last:
-            yield WARN, "no measured pose counts" if fusion.count else "waiting for the first measured pose"
+            yield WARN, "no measured pose accepted" if fusion.count else "waiting for the first measured pose"
         if self.track.waits(now):
-            yield WARN, "waiting for strut_states: where the struts stand is not known"
+            yield WARN, "waiting for strut_states: the struts' positions are not known"
         if not self.commands.count:
             yield OK, "waiting for the first command"
         if compensator.condition > NEAR_SINGULAR * compensator.geometry.limits.condition:
@@ -423,7 +430,7 @@ class CompensatorState(MachineNode):
         if self.instrument is not None:
             values |= self.instrument.values(now)
         if (unknown := temperatures.unknown_for(model.late_growth, now)) > 0.0:
-            values["late_parts"] = f"not known for another {unknown:.0f} s: the readings began too short ago"
+            values["late_parts"] = f"not known for another {unknown:.0f} s, until the readings span enough time"
         return {**values, **self.refusals.values()}
 
     def stale(self, now: float) -> str:

@@ -1,9 +1,9 @@
-"""ROS messages to numbers and back.
+"""Conversion of ROS messages to numbers and back.
 
-rclpy makes a Python object for every part of a received message, and checks every element of a sent one; that takes
-longer than a compensation. So commands, struts and pose estimates are read and written as the bytes on the wire: CDR
-(OMG DDS-RTPS 9.4.2, 10.2), four bytes for the encoding, then the fields in order, each at a multiple of its size,
-counted from behind those four. rclpy reads messages with another layout.
+rclpy makes a Python object for every part of a received message and checks every element of a sent one, which takes
+longer than the compensation. So this module reads and writes commands, struts and pose estimates as serialised bytes:
+CDR (OMG DDS-RTPS 9.4.2, 10.2), four bytes for the encoding, then the fields in order, each aligned to a multiple of its
+size, counted from the end of the four bytes. Messages with an unexpected layout are read by rclpy.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from ..errors import CommandError, shorten
 from ..machine.geometry import STRUT_NAMES
 from ..pose import Pose
 
-# Longer messages are refused without parsing, byte: a thousand times ours. Parsed, they would fill many times their
-# size.
+# Messages longer than this, byte (a thousand times the package's own), are refused unparsed: parsing needs many times
+# their size in memory.
 LARGEST_MESSAGE = 1 << 18
 
-# The squares of larger numbers, m, overflow; limits check whether a strut can be so long
+# Larger strut lengths, m, are refused here, since their squares overflow; the stroke is checked later
 LARGEST_LENGTH = 1e150
 
-# Smallest difference of two stamps from which a speed is computed, s; for a difference above the other there is
-# no speed between them
+# A speed is computed from the difference of two stamps, s: a shorter one counts as SHORTEST_PERIOD, and for one longer
+# than LONGEST_PERIOD no speed is computed
 SHORTEST_PERIOD, LONGEST_PERIOD = 1e-4, 1.0
 
-LITTLE_ENDIAN = b"\x00\x01"  # First bytes of plain CDR, little endian
+LITTLE_ENDIAN = b"\x00\x01"  # First bytes of a message in plain CDR, little endian
 
 _ENCODING = LITTLE_ENDIAN + b"\0\0"
 _START, _STAMP, _COUNT = struct.Struct("<iII"), struct.Struct("<iI"), struct.Struct("<I")
@@ -70,27 +70,26 @@ def stamp_of(nanoseconds: int) -> Time:
 
 
 def period(since: int, until: int) -> float:
-    """Return the time between two stamps, ns, by which a strut's speed is computed, s; 0 if there is none.
+    """Return the time, s, between two stamps, ns, for computing a strut's speed; 0 if no speed shall be computed.
 
-    It depends on the stamps alone, so that a recorded run answers the same when it is replayed.
+    It depends only on the stamps, so that a replayed run gives the same speeds as the recorded one.
     """
     seconds = (until - since) * 1e-9
     return max(seconds, SHORTEST_PERIOD) if 0.0 < seconds <= LONGEST_PERIOD else 0.0
 
 
 def read_message(data: bytes, kind: type) -> Any:
-    """Return the message of a subscription's bytes; a CommandError, ``message``, if it is too long or of another
-    type."""
+    """Return a message of type `kind` from its bytes; a CommandError, ``message``, if it is too long or unreadable."""
     if len(data) > LARGEST_MESSAGE:
         raise CommandError("message", f"a message must not have more than {LARGEST_MESSAGE} bytes, not {len(data)}")
     try:
         return deserialize_message(data, kind)
-    except (RuntimeError, ValueError) as error:  # the middleware's, or a text that is not UTF-8
+    except (RuntimeError, ValueError) as error:  # from the middleware, or for a text that is not UTF-8
         raise CommandError("message", f"the message cannot be read: {error}") from error
 
 
 def check_frame(frame_id: str, frames: Iterable[str]) -> None:
-    """Raise a CommandError, ``frame_id``, if a message's frame is not among those allowed."""
+    """Raise a CommandError, ``frame_id``, if a message's frame is not one of the allowed `frames`."""
     if frame_id not in (allowed := tuple(frames)):
         raise CommandError("frame_id", f"frame_id must be one of {', '.join(allowed)}, not {shorten(frame_id)}")
 
@@ -110,7 +109,7 @@ def write_pose(message: PoseStamped, position: np.ndarray, rotation: np.ndarray)
 
 
 def pose_message(pose: Pose, frame_id: str) -> PoseStamped:
-    """Return a new message with a zero stamp."""
+    """Return a PoseStamped with a pose in a frame and a zero stamp."""
     message = PoseStamped()
     message.header.frame_id = frame_id
     write_pose(message, pose.position, pose.rotation)
@@ -118,22 +117,23 @@ def pose_message(pose: Pose, frame_id: str) -> PoseStamped:
 
 
 def message_pose(message: PoseStamped) -> Pose:
-    """Return a message's pose; a PoseError where it is not finite, or the quaternion's norm is not 1."""
+    """Return a message's pose; raise a PoseError if a number is not finite or the quaternion's norm is not 1."""
     numbers = pose_numbers(message)
     return Pose.from_quaternion(np.array(numbers[:3]), np.array(numbers[3:]))
 
 
 def command_stamp(stamp: Time) -> int:
-    """Return a command's stamp, ns; a CommandError, ``message``, if it is not a valid time: with the largest seconds it
-    would not fit into an answer's stamp."""
+    """Return a command's stamp, ns; raise a CommandError, ``message``, if its nanoseconds make a second or more."""
     if stamp.nanosec >= _SECOND:
         raise CommandError("message", f"nanosec of the stamp must be below {_SECOND}, not {stamp.nanosec}")
     return nanoseconds_of(stamp)
 
 
 def read_pose(data: bytes, sample: Sample) -> None:
-    """Read a serialised PoseStamped into a sample: stamp, frame, x, y, z (m) and the quaternion x, y, z, w; a
-    CommandError, ``message``, if it is invalid."""
+    """Read a serialised PoseStamped into a sample's stamp, frame and values: x, y, z (m), quaternion x, y, z, w.
+
+    Raises a CommandError, ``message``, if the message is invalid.
+    """
     if data[:2] == LITTLE_ENDIAN and _FRAME_AT + _SEVEN.size <= len(data) <= LARGEST_MESSAGE:
         seconds, nanoseconds, length = _START.unpack_from(data, _START_AT)
         end = _FRAME_AT + length
@@ -149,12 +149,14 @@ def read_pose(data: bytes, sample: Sample) -> None:
 
 
 class PoseBytes:
+    """A PoseStamped as bytes, to be published repeatedly."""
+
     def __init__(self, frame_id: str) -> None:
         self._bytes = bytearray(_aligned(_with_text(_HEAD, frame_id), 8) + bytes(_SEVEN.size))
         self._quaternion = ffi.new("double[4]")
 
     def made(self, pose: np.ndarray, stamp: int) -> bytes:
-        """Return the bytes to publish: position, m, and rotation matrix by rows, shape (12,), with a stamp in ns."""
+        """Return the bytes of a pose, shape (12,): position, m, and rotation matrix by rows; the stamp is in ns."""
         lib.hc_quaternion(ffi.from_buffer("double[9]", pose[3:]), self._quaternion)
         _STAMP.pack_into(self._bytes, _START_AT, *divmod(stamp, _SECOND))
         _SEVEN.pack_into(self._bytes, len(self._bytes) - _SEVEN.size, *pose[:3].tolist(), *self._quaternion)
@@ -165,7 +167,7 @@ class PoseBytes:
 
 
 def _before_positions(frame_id: str, names: Sequence[str]) -> bytes:
-    """Return a JointState of six positions as bytes, up to these, with a stamp of zero."""
+    """Return the first bytes of a JointState with zero stamp, up to its six positions."""
     data = _with_count(_with_text(_HEAD, frame_id), len(names))
     for name in names:
         data = _with_text(data, name)
@@ -175,21 +177,21 @@ def _before_positions(frame_id: str, names: Sequence[str]) -> bytes:
 class StrutBytes:
     """A JointState of the six struts as bytes, to be published repeatedly.
 
-    The velocity field is filled too: with an empty one some readers refuse bags.
+    Its velocities are always filled in, since some readers of recordings refuse an empty field.
     """
 
     def __init__(self, frame_id: str = "", names: Sequence[str] = STRUT_NAMES) -> None:
-        self.stamp = 0  # of the previous message, ns; 0 before
+        self.stamp = 0  # stamp of the last message, ns; 0 before the first
         self.position, self.velocity = np.zeros(6), np.zeros(6)  # m and m/s
         self._names = _before_positions(frame_id, names)[_START_AT + _STAMP.size :]
         self._at = ffi.from_buffer("double[6]", self.position), ffi.from_buffer("double[6]", self.velocity)
 
     def made(self, lengths: Any, stamp: int, period: float = 0.0, fastest: float = np.inf) -> bytes:
-        """Return the bytes to publish, with a stamp in ns.
+        """Return the bytes of a message with six `lengths`, m, and a stamp, ns.
 
-        `lengths`: six, m, a tuple, a list or the core's ``double[6]``; None: position and velocity unchanged.
-        Velocities are their change since the last ones over `period` s; 0: at rest. Stamps jitter, and no strut is
-        faster than `fastest`, m/s: where one would be, all velocities are smaller in proportion.
+        `lengths` is a tuple, a list or the core's ``double[6]``; None keeps positions and velocities. Velocities are
+        the change of the lengths since the last message, divided by `period`, s; 0: all are zero. If a velocity exceeds
+        `fastest`, m/s, since stamps jitter, all are reduced in proportion.
         """
         if lengths is not None:
             lib.hc_write_lengths(lengths, period, fastest, *self._at)
@@ -199,20 +201,20 @@ class StrutBytes:
 
 
 class StrutReader:
-    """Extracts the six struts, by their joint names, from JointState messages; other joints are ignored."""
+    """A reader of JointState messages that extracts the six struts by their names and ignores other joints."""
 
     def __init__(self, names: Sequence[str] = STRUT_NAMES) -> None:
         self._struts, self._names = names, list[str]()
         self._order: Sequence[int] = range(6)
-        # Layout of the last message: size, bytes before the positions except the stamp, offset of the positions, number
-        # of velocities after them, and the offset of the efforts, which are empty.
+        # Layout of the last message: its size, the bytes before the positions without the stamp, offset of the
+        # positions, serialised number of velocities, and offset of the (empty) efforts
         self._shape: tuple[int, bytes, int, bytes, int] = (0, b"", 0, b"", 0)
 
     def sample(self, data: bytes, sample: Sample) -> None:
-        """Read a message from bytes into a sample: stamp and lengths, a tuple in strut order.
+        """Read a message's bytes into a sample: its stamp, ns, and six lengths, m, in strut order.
 
-        A message that differs from the last one only in stamp and numbers is read by the same layout. Errors are
-        those of :func:`read_message` and :meth:`read`.
+        A message with the last message's layout is unpacked without rclpy. Raises the errors of :func:`read_message`
+        and :meth:`read`.
         """
         size, head, at, velocities, efforts = self._shape
         known = len(data) == size and data[:4] == head[:4] and data[12:at] == head[4:]
@@ -232,36 +234,35 @@ class StrutReader:
             self._shape = (len(data), data[:4] + data[12:at], at, _COUNT.pack(fast), efforts)
 
     def read(self, message: JointState) -> np.ndarray:
-        """Return a message's lengths in strut order, m; a CommandError: ``strut_names``, ``strut_count``,
-        ``not_finite``."""
+        """Return a message's lengths, m, in strut order; errors ``strut_names``, ``strut_count``, ``not_finite``."""
         lengths = self.pick(message)
         self.check(lengths.tolist())
         return lengths
 
     def pick(self, message: JointState) -> np.ndarray:
-        """Return a message's six lengths in strut order, whatever their values; errors ``strut_names`` and
-        ``strut_count``."""
+        """Return a message's lengths, m, in strut order, unchecked; errors ``strut_names``, ``strut_count``."""
         if not self._names or message.name != self._names:
             order = strut_order(message.name, self._struts).tolist()
             self._order = range(6) if order == [0, 1, 2, 3, 4, 5] else order
             self._names = list(message.name)
         joints, positions = len(message.name), len(message.position)
         if joints != positions:
-            raise CommandError("strut_count", f"each of {joints} names needs a position, there are {positions}")
+            raise CommandError(
+                "strut_count", f"{joints} joint names need {joints} positions, but there are {positions}"
+            )
         return np.frombuffer(message.position, dtype=float)[np.asarray(self._order)]
 
     def check(self, lengths: Sequence[float]) -> None:
-        """Refuse invalid lengths, m: ``not_finite``."""
+        """Raise a CommandError, ``not_finite``, if a length, m, is not finite or is above LARGEST_LENGTH."""
         if not sum(map(abs, lengths)) < LARGEST_LENGTH:
             allowed = f"finite and below {LARGEST_LENGTH:g} m"
             raise CommandError("not_finite", f"strut lengths must be {allowed}, not {list(lengths)}")
 
 
 def strut_order(names: Sequence[str], struts: Sequence[str] = STRUT_NAMES) -> np.ndarray:
-    """Return the index of each of the six struts in a list of names; a CommandError, ``strut_names``, if one is
-    missing, or there twice."""
+    """Return each strut's index in a list of names; a CommandError, ``strut_names``, if one is missing or repeated."""
     counts = [(name, list(names).count(name)) for name in struts]
-    wrong = [f"{name} {'twice' if count else 'missing'}" for name, count in counts if count != 1]
+    wrong = [f"{name} is {'repeated' if count else 'missing'}" for name, count in counts if count != 1]
     if wrong:
         raise CommandError("strut_names", f"each strut must be named once: {', '.join(wrong)}")
     return np.array([list(names).index(name) for name in struts])

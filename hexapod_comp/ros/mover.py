@@ -1,9 +1,9 @@
-"""The mover node: a target pose or a program in, a stream of tool poses for the compensator out.
+"""The mover node: receives target poses and programs, and sends a stream of tool poses to the compensator.
 
-A move is planned in the process beside the node, from the machine's present pose, in the least time that the struts'
-speed, acceleration and jerk allow; all limits of the machine are checked along it before it begins. It is sent at one
-rate, and the last pose is repeated: a machine at standstill keeps following its temperatures. ``~/state`` reports its
-progress. Run it with ``ros2 run hexapod_comp mover`` or ``python -m hexapod_comp.ros.mover``.
+The node's worker process plans each move from the machine's present pose, in the least time that the struts' speed,
+acceleration and jerk allow, and checks all limits of the machine along it before the move begins. The node sends poses
+at a constant rate and repeats the last one, so that a machine at standstill follows its temperatures. ``~/state``
+reports progress. Run it with ``ros2 run hexapod_comp mover`` or ``python -m hexapod_comp.ros.mover``.
 """
 
 from __future__ import annotations
@@ -49,50 +49,51 @@ from .parameters import Program, read_table
 from .process import run
 from .worker import Worker
 
-ANSWERED_WITHIN = 0.4  # A command that the compensator has not answered after this time was refused, s
-IN_FLIGHT = 0.15  # While a command has waited this long for its answer, the path waits too, s
-# The path waits also while the tool is further behind than its way of LAG, s, and BEHIND, m, half of what the
-# compensator allows, for CAUGHT_UP_WITHIN, s, at most: drives hardly faster than the path never make up for a stall.
+ANSWERED_WITHIN = 0.4  # A command that the compensator has not answered after this time, s, counts as refused
+IN_FLIGHT = 0.15  # The node sends no further pose while a command has waited longer than this, s, for its answer
+# The node also waits while the tool is behind the command by more than the path of the last LAG, s, plus BEHIND, m
+# (half of the compensator's limit), but at most CAUGHT_UP_WITHIN, s: drives hardly faster than the path never catch up.
 LAG, BEHIND, CAUGHT_UP_WITHIN = 0.1, 1e-3, 2.0
-RESUMED = 5  # Number of new plans of a delayed move, from the last answered pose, before it is given up
-# Reasons that refuse all commands until an operator acts; other refusals may be due to a busy computer
+RESUMED = 5  # A delayed move is planned anew from the last answered pose this many times, then stopped
+# Reasons for which the compensator refuses all commands until an operator acts
 STANDING = ("following_error", "several_publishers", "unknown_publisher", "no_feedback", "tool_changed")
-PLANNER_KEPT = 600.0  # After the last plan, s: a new process takes a second, and on a busy computer half a minute
-ESTIMATE_WITHIN = 1.0  # An older estimate does not give the machine's pose, s
-STATE_PERIOD, STANDING_PERIOD = 0.1, 1.0  # Periods of ~/state while the machine moves, and while it stands, s
+PLANNER_KEPT = 600.0  # The idle worker process is kept this long, s: starting takes 1 s, 30 s on a busy computer
+ESTIMATE_WITHIN = 1.0  # An estimate older than this, s, is not used as the machine's pose
+STATE_PERIOD, STANDING_PERIOD = 0.1, 1.0  # Periods of ~/state while the machine moves, and at standstill, s
 
 IDLE, PLANNING, MOVING, SETTLING, ARRIVED, STOPPED = "idle", "planning", "moving", "settling", "arrived", "stopped"
 UNDER_WAY = (PLANNING, MOVING, SETTLING)
 
 PARAMETERS = read_table(f"""
-autostart | true |  | start | configure and activate at the start
+autostart | true |  | start | configure and activate when the process starts
 compensator | compensator |  | configure | name of the compensator's node, in this node's namespace
 base_frame | base |  | configure | frame_id of poses in the machine base
 work_frame | work | not base_frame | configure | frame_id of poses in the geometry file's work frame
-frame_prefix | '' |  | configure | in front of the names of its other work frames
+frame_prefix | '' |  | configure | prefix of the frame_ids of the geometry file's named work frames
 tool_frame | {TOOL} |  | configure | frame_id of relative moves in the tool's own frame
 rate | 250.0 | 10 to 1000 Hz | configure | tool poses sent per second
-limit_share | 0.9 | 0.01 to 1 | always | share of the struts' speed, acceleration and jerk that a move may use; the
-    rest is left to the corrections
-position_tolerance | 5.0e-6 | 1e-9 to 0.01 m | always | the tool has arrived when its estimate is this close to the
-    target
-rotation_tolerance | 2.0e-5 | 1e-9 to 0.1 rad | always | and rotated from it by no more than this
-settling_time | 0.1 | 0 to 60 s | always | for this long without interruption
-settling_timeout | 5.0 | 0.1 to 3600 s | always | report the tool as stopped when it has not settled this long after the
-    last pose was sent
+limit_share | 0.9 | 0.01 to 1 | always | share of the struts' speed, acceleration and jerk limits that a move may use;
+    the remainder is for the corrections
+position_tolerance | 5.0e-6 | 1e-9 to 0.01 m | always | largest distance from the estimated tool to the target at
+    arrival
+rotation_tolerance | 2.0e-5 | 1e-9 to 0.1 rad | always | largest rotation between the estimated tool and the target at
+    arrival
+settling_time | 0.1 | 0 to 60 s | always | the tool has arrived when it stays within both tolerances for this time
+settling_timeout | 5.0 | 0.1 to 3600 s | always | report the move as stopped if the tool has not arrived this long after
+    the last pose was sent
 """)
 
 TOPICS = """
-in   move_to                 PoseStamped: target of the tool, frame_id a work frame; a new one replaces the present one
-     move_by                 PoseStamped: relative move, frame_id `tool`: in the tool's frame, or a work frame: along
-                             and about its axes
-     pivot                   PointStamped: point of the tool, in its frame, that moves go straight with, usually its tip
-     program                 MultiDOFJointTrajectory: poses of the tool with times, which it never passes earlier
-     tool_pose_estimate      PoseStamped: from the compensator, as its ~/files, ~/tool and strut_commands
+in   move_to                 PoseStamped: target of the tool, in `base` or a work frame; a new target replaces it
+     move_by                 PoseStamped: relative move; frame_id `tool`: in the tool's frame; a work frame: along and
+                             about its axes
+     pivot                   PointStamped: point of the tool, in its frame, that moves in a straight line; first the tip
+     program                 MultiDOFJointTrajectory: tool poses, each with the earliest time at which it is reached
+     tool_pose_estimate      PoseStamped: from the compensator, as are its ~/files, ~/tool and strut_commands
 out  tool_pose_command       PoseStamped: to the compensator, in base
      ~/state                 DiagnosticStatus, latched: idle, planning, moving, settling, arrived, stopped
      /diagnostics
-ask  ~/stop                  Trigger: brake on the way, within the struts' limits, and stay there
+ask  ~/stop                  Trigger: brake on the path, within the struts' limits, and stay there
 """
 
 PROGRAM = Program(
@@ -102,16 +103,16 @@ PROGRAM = Program(
 
 @dataclass
 class Request:
-    """A request: poses of the tool in ``base``, with times if it is a program."""
+    """A requested move: tool poses in ``base``, with times if it is a program, or a relative displacement."""
 
-    stamp: int  # of the message, ns
+    stamp: int  # of the requesting message, ns
     poses: list[Pose]
-    times: list[float] = field(default_factory=list)  # of a program, s
-    relative: Pose | None = None  # of a relative move: the turn and the way, in the frame of `axes`
-    axes: np.ndarray | None = None  # (3, 3) the frame's axes in ``base``; None: the tool's own
+    times: list[float] = field(default_factory=list)  # earliest times of a program's poses, s
+    relative: Pose | None = None  # displacement and rotation of a relative move, in the frame of `axes`
+    axes: np.ndarray | None = None  # shape (3, 3), axes of a relative move in ``base``; None: the tool's own axes
 
     def from_pose(self, start: Pose) -> list[Pose]:
-        """Return the poses; those of a relative move relative to its start."""
+        """Return the target poses in ``base`` for a move that begins at the tool pose `start`."""
         if self.relative is None:
             return self.poses
         if self.axes is None:
@@ -121,45 +122,44 @@ class Request:
 
 
 class MoverNode(MachineNode):
-    """Lifecycle node that moves the tool of one compensator; arguments are those of ``rclpy`` nodes."""
+    """Lifecycle node that moves the tool of one compensator's machine; `options` are those of rclpy's nodes."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("mover", PARAMETERS, **options)
         self._state, self._text, self._by = IDLE, "no move yet", ""
         self._request = self._refused_request = 0  # stamps, ns
         self._refusal, self._ready_shown = "", False
-        self._resumed = 0  # number of new plans of the present move
-        # of the present move; None: a program, which cannot be resumed in its middle
-        self._target: Request | None = None
-        self._moves = 0  # that were begun
-        self._forget()
+        self._resumed = 0  # how often the present move was planned anew after a delay
+        self._target: Request | None = None  # of the present move; None for a program, which cannot be planned anew
+        self._moves = 0  # number of moves for which planning has begun
+        self._clear()
 
-    def _forget(self) -> None:
+    def _clear(self) -> None:
         """Forget machine, motion and all messages received."""
         self._sources: dict[str, Source] = {}
         self._geometry: HexapodGeometry | None = None
         self._tool = TOOL
         self._pivot: np.ndarray = np.zeros(3)
-        self._estimate: tuple[Pose, float] | None = None  # and when it came, monotonic
-        self._compensator_says: dict[str, str] = {}
+        self._estimate: tuple[Pose, float] | None = None  # estimated tool pose and its monotonic time of receipt, s
+        self._compensator_status: dict[str, str] = {}  # values and message of its newest diagnostics
         self._halt()
 
     def _halt(self) -> None:
-        """Send nothing more, and forget the last command's pose."""
-        self._held: Pose | None = None  # the pose that is sent at standstill
+        """Stop sending poses, and forget the last command's pose."""
+        self._held: Pose | None = None  # last commanded tool pose, which is repeated at standstill
         self._queue: deque[Motion] = deque()
         self._motion: Motion | None = None
-        self._path_is_motion = False  # else the stop itself ends there
+        self._path_is_motion = False  # True: `_path` samples `_motion`; False: it is the braking path out of it
         self._path: Path | None = None
         self._index = 0
-        self._pending: Request | None = None  # planned when the machine stands
+        self._pending: Request | None = None  # request that is planned as soon as the machine stands
         self._stamp = 0  # of the last command, ns
-        self._sent: deque[np.ndarray] = deque()  # positions of the last LAG
-        self._with_it = 0.0  # when the tool was last seen not to be behind
-        self._unanswered: deque[tuple[int, float, Pose]] = deque()  # stamps, when they were sent, and poses
-        self._answered: Pose | None = None  # the last pose that the compensator has answered
-        self._ended = self._near_since = 0.0
-        self._braking = ""  # who asked for it
+        self._sent: deque[np.ndarray] = deque()  # tool positions commanded within the last LAG, m
+        self._near_at = 0.0  # monotonic time, s, when the tool was last close enough to the command (_is_behind)
+        self._unanswered: deque[tuple[int, float, Pose]] = deque()  # stamp, ns, monotonic time of sending, s, and pose
+        self._answered: Pose | None = None  # pose of the last command that the compensator has answered
+        self._ended = self._near_since = 0.0  # monotonic times, s: end of the path; begin of the stay at the target
+        self._braking = ""  # cause of the stop, for `stopped_by`; empty: a new request, or no stop
 
     # ---- lifecycle ----
 
@@ -172,22 +172,23 @@ class MoverNode(MachineNode):
         return done
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Send nothing more, so that others may command."""
+        """Stop sending poses and close the publisher, so that another node may command."""
         if self._state in UNDER_WAY:
-            self._stopped("deactivated", "the node was deactivated on the way")
+            self._stopped("deactivated", "the node was deactivated during the move")
         self._halt()
-        self.close_ends(self._commands)
+        self.close_entities(self._commands)
         return super().on_deactivate(state)
 
     def unconfigure(self) -> None:
         self._worker.close()
-        self._forget()
+        self._clear()
 
     def publish_last_status(self) -> None:
-        """Publish the end of a move that the end of the node interrupts."""
+        """Publish that a move in progress stops because the node ends; then publish the last status."""
         if self._active and self._state in UNDER_WAY:
-            self._stopped("shut down", "the node ended on the way")
+            self._stopped("shut down", "the node ended during the move")
             self._states.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+        super().publish_last_status()
 
     def configure(self) -> None:
         name = self._options["compensator"]
@@ -208,7 +209,7 @@ class MoverNode(MachineNode):
         self._state_due = 0.0
         self._change(IDLE, "no move yet")
 
-    # ---- what the compensator says ----
+    # ---- topics of the compensator ----
 
     def _on_files(self, message: String) -> None:
         self._sources = read_sources(message.data)
@@ -219,12 +220,12 @@ class MoverNode(MachineNode):
         self._use_machine()
 
     def _use_machine(self) -> None:
-        """Use the compensator's geometry with its tool; another tool ends the hold with the previous one."""
+        """Use the compensator's geometry and tool; a change of tool stops a move and the sending of poses."""
         if not {"geometry", "model"} <= self._sources.keys():
             return
         geometry = self._sources["geometry"].geometry()
         if self._tool not in geometry.tools:
-            return  # of another file, which arrives next
+            return  # the tool belongs to another geometry file, which arrives next
         before, self._geometry = self._geometry, geometry.using(tool=self._tool, work=BASE)
         self._frames = {
             frame_id: geometry.work_frames[name] for name, frame_id in frame_ids(geometry, self._options).items()
@@ -232,7 +233,7 @@ class MoverNode(MachineNode):
         self.set_hardware_id(geometry.name)
         if before is not None and self._active and before.tool_name != self._tool:
             if self._state in UNDER_WAY:
-                self._stopped("refusal", f"the tool was changed to {self._tool!r} on the way")
+                self._stopped("refusal", f"the tool was changed to {self._tool!r} during the move")
             self._halt()
 
     def _on_estimate(self, message: PoseStamped) -> None:
@@ -247,10 +248,10 @@ class MoverNode(MachineNode):
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name.startswith(self._diagnosed):
-                self._compensator_says = {entry.key: entry.value for entry in status.values}
-                self._compensator_says["message"] = status.message
+                self._compensator_status = {entry.key: entry.value for entry in status.values}
+                self._compensator_status["message"] = status.message
 
-    # ---- what is asked for ----
+    # ---- requests ----
 
     def _on_move_to(self, message: PoseStamped) -> None:
         def request() -> Request:
@@ -306,8 +307,7 @@ class MoverNode(MachineNode):
         return self._frames[frame_id]
 
     def _ask(self, message: Any, read: Any) -> None:
-        """Plan a message's request, at once or when the present move has been braked; an invalid one changes
-        nothing."""
+        """Plan a requested move, now or once the present move has stopped; refuse an invalid request without effect."""
         try:
             if not self._active:
                 raise CommandError("not_active", "the mover is not active: ros2 lifecycle set /mover activate")
@@ -315,7 +315,7 @@ class MoverNode(MachineNode):
                 raise CommandError("not_ready", "the compensator has not yet published its machine on ~/files")
             request = read()
             if self._motion is None and self._held is None:
-                self._standing()  # raises where that is not known
+                self._standing()  # raises if the tool's present pose is not known
         except HexapodError as error:
             self._refused_request, self._refusal = nanoseconds_of(message.header.stamp), str(error)
             self.log_warning("request", f"move refused ({error.reason}): {error}")
@@ -328,23 +328,23 @@ class MoverNode(MachineNode):
             self._plan()
 
     def _ready(self) -> bool:
-        """Whether it knows the machine, and the pose of its tool."""
+        """Return whether the node is active and knows the machine and the present pose of its tool."""
         fresh = self._estimate is not None and time.monotonic() - self._estimate[1] <= ESTIMATE_WITHIN
         return self._active and self._geometry is not None and (fresh or self._held is not None)
 
     def _standing(self) -> Pose:
-        """Return the tool's pose, in ``base``: as it was sent, or before that as it is estimated."""
+        """Return the tool's pose in ``base``: the last one commanded, or before the first command the estimate."""
         if self._held is not None:
             return self._held
         if self._estimate is None or time.monotonic() - self._estimate[1] > ESTIMATE_WITHIN:
-            raise CommandError("no_estimate", f"no tool_pose_estimate for {ESTIMATE_WITHIN:g} s: where does it stand?")
+            problem = f"no tool_pose_estimate for {ESTIMATE_WITHIN:g} s"
+            raise CommandError("no_estimate", f"the tool's pose is not known: {problem}")
         return self._estimate[0]
 
     # ---- planning ----
 
     def _plan(self, anew: bool = False) -> None:
-        """Have the pending request planned, from the machine's present pose; `anew`: also one that has begun
-        already."""
+        """Have the worker plan the pending request from the tool's present pose; `anew`: the move was delayed."""
         request, self._pending = self._pending, None
         if request is None or self._geometry is None:
             return
@@ -374,10 +374,10 @@ class MoverNode(MachineNode):
     def _cannot(self, number: int, error: HexapodError) -> None:
         if number == self._moves and self._state == PLANNING:
             self._stopped("limit", str(error))
-            self._plan()  # the next request
+            self._plan()  # a newer request, if there is one
 
     def _begin(self, number: int, start: Pose, motions: list[Motion]) -> None:
-        """Begin a planned move, unless it was given up meanwhile."""
+        """Begin a planned move, unless it was stopped or replaced while it was planned."""
         if number != self._moves or self._state != PLANNING:
             return
         if self._pending is not None:
@@ -390,7 +390,7 @@ class MoverNode(MachineNode):
         self._next()
 
     def _next(self) -> None:
-        """Continue with the next motion, or settle."""
+        """Begin the next motion of the move; after the last motion, plan a newer request, or wait for settling."""
         if self._queue:
             self._motion, self._path_is_motion = self._queue.popleft(), True
             self._follow(self._motion.sample(self._options["rate"]))
@@ -401,16 +401,16 @@ class MoverNode(MachineNode):
         if self._pending is not None:
             self._plan()
         elif self._braking:
-            self._stopped(self._braking, "stopped on the way")
+            self._stopped(self._braking, "stopped during the move")
         else:
             self._change(SETTLING, "settling")
         self._braking = ""
 
     def _follow(self, path: Path) -> None:
-        self._path, self._index = path, 1  # the first pose is the present one
+        self._path, self._index = path, 1  # index 0 is the present pose, which has been sent
 
     def _brake(self, why: str) -> None:
-        """Leave the present motion by its earliest stop; why: the reported cause of the end."""
+        """Brake the present motion within the struts' limits; `why`: later `stopped_by`, empty for a new request."""
         self._braking = self._braking or why
         if self._motion is None or self._path is None or not self._path_is_motion:
             return
@@ -427,21 +427,22 @@ class MoverNode(MachineNode):
             self._brake("person")
             response.message = "braking"
         elif self._state in UNDER_WAY:
-            self._stopped("person", "stopped before it moved" if self._state == PLANNING else "stopped at its end")
-            response.message = "nothing was moving any more"
+            text = "stopped before the tool moved" if self._state == PLANNING else "stopped while the tool was settling"
+            self._stopped("person", text)
+            response.message = "the tool was not moving any more"
         else:
-            response.message = "nothing was moving"
+            response.message = "the tool was not moving"
         return response
 
     # ---- moving ----
 
     def _tick(self) -> None:
-        """Send the next pose, or the same again."""
+        """Send the next pose of the path, or at standstill the last pose again."""
         if not self._active or self._held is None:
             return
         period = round(1e9 / self._options["rate"])
         now = int(self.get_clock().now().nanoseconds)
-        # Stamped with the times for which they were computed; after a pause the path continues from there
+        # Stamps, one period apart, are the times for which poses were computed; after a pause they continue at `now`.
         stamp = max(self._stamp + period, now - period) if self._stamp else now
         held_up = self._unanswered and time.monotonic() - self._unanswered[0][1] > IN_FLIGHT
         if stamp > now + period or held_up or self._is_behind():
@@ -460,23 +461,25 @@ class MoverNode(MachineNode):
             self._next()
 
     def _is_behind(self) -> bool:
-        """Return whether the path shall wait for the tool to catch up."""
+        """Return whether the path must wait for the tool to catch up (see LAG, BEHIND and CAUGHT_UP_WITHIN)."""
         now = time.monotonic()
         if self._path is not None and self._held is not None and self._sent and self._estimate is not None:
             pose, came = self._estimate
             behind = np.linalg.norm(self._held.position - pose.position)
             way = np.linalg.norm(self._held.position - self._sent[0])
             if now - came < ESTIMATE_WITHIN and behind > way + BEHIND:
-                return now - self._with_it < CAUGHT_UP_WITHIN
-        self._with_it = now
+                return now - self._near_at < CAUGHT_UP_WITHIN
+        self._near_at = now
         return False
 
     def _settle(self, now: float) -> None:
-        """Report the arrival of a tool that stays at its target, or that it does not reach it."""
-        options, pose = self._options, self._estimate[0] if self._estimate else None
-        if pose is not None and self._held is not None and self._estimate and self._estimate[1] > self._ended:
+        """Report that the tool has arrived, or that it has not settled at its target within `settling_timeout`."""
+        options, where = self._options, ""
+        if self._held is not None and self._estimate is not None and self._estimate[1] > self._ended:
+            pose = self._estimate[0]
             away = float(np.linalg.norm(pose.position - self._held.position))
             turned = rotation_angle(pose.rotation.T @ self._held.rotation)
+            where = f"{away * 1e6:.2f} µm, {turned * 1e6:.2f} µrad"
             if away > options["position_tolerance"] or turned > options["rotation_tolerance"]:
                 self._near_since = np.inf
             elif now - (since := min(self._near_since, now)) >= options["settling_time"]:
@@ -485,13 +488,10 @@ class MoverNode(MachineNode):
             else:
                 self._near_since = since
         if now - self._ended > options["settling_timeout"]:
-            where = (
-                "no estimate" if pose is None or self._held is None else f"{away * 1e6:.2f} µm, {turned * 1e6:.2f} µrad"
-            )
             allowed = f"{options['position_tolerance'] * 1e6:g} µm, {options['rotation_tolerance'] * 1e6:g} µrad"
-            self._stopped(
-                "settling", f"{where} from the target after {options['settling_timeout']:g} s, allowed {allowed}"
-            )
+            after = f"{options['settling_timeout']:g} s"
+            text = f"{where} from the target after {after}, allowed {allowed}" if where else f"no estimate for {after}"
+            self._stopped("settling", text)
 
     # ---- state ----
 
@@ -548,10 +548,10 @@ class MoverNode(MachineNode):
         return {"state": self._state, "moves": str(self._moves), "tool": self._tool}
 
     def _refused(self) -> None:
-        """Continue from the last answered pose if a busy computer has delayed commands; else stop sending."""
-        said = self._compensator_says
-        message, alive = said.get("message", ""), self.count_publishers(self.resolve_topic_name("strut_commands"))
-        under_way, answered, target, request = self._state in UNDER_WAY, self._answered, self._target, self._request
+        """After an unanswered command, resume from the last answered pose; stop if that cannot succeed or was tried."""
+        status = self._compensator_status
+        message, alive = status.get("message", ""), self.count_publishers(self.resolve_topic_name("strut_commands"))
+        under_way, answered, target = self._state in UNDER_WAY, self._answered, self._target
         stands = any(reason in message for reason in STANDING)
         may_resume = alive and answered is not None and not stands and self._resumed < RESUMED
         if may_resume and not under_way:
@@ -563,13 +563,12 @@ class MoverNode(MachineNode):
             self._halt()
             self._held, self._answered, self._pending = answered, answered, pending
             self._resumed += 1
-            self.note("resume", "commands were held up: planned anew from the last one that was answered")
+            self.log_action("resume", "commands were delayed: the move is planned anew from the last answered pose")
             self._plan(anew=True)
             return
-        reason = said.get("last_refusal") or message or "no answer" if alive else "the compensator is not there"
+        reason = status.get("last_refusal") or message or "no answer" if alive else "no node publishes strut_commands"
         by = "following error" if "following_error" in message else "refusal"
         self._halt()
-        self._request = request
         self._stopped(by, reason if under_way else f"at standstill: {reason}")
 
 

@@ -1,4 +1,4 @@
-"""What a compensator publishes beside its answers: estimates, the machine's picture, safety outputs, the journal."""
+"""Topics of a compensator besides strut commands: pose estimate, markers, heartbeat, validity, stop, journal."""
 
 from __future__ import annotations
 
@@ -23,23 +23,22 @@ from .base import ACKNOWLEDGED_WITHIN, EVENT_QOS, LATCHED_QOS, STATE_QOS, profil
 from .interface import STRUTS, CompensatorState
 from .messages import PoseBytes, StrutBytes, period, stamp_of
 
-# Whether the node stops the machine is published again after this time, s: late subscribers receive what is latched,
-# but on a busy computer the middleware loses that now and then
+# Period of ~/stopped, s. The topic is latched for late subscribers, but a busy computer's middleware may lose a message
 REPEATED_AFTER = 1.0
 
-# Largest time of a message, ns: later validities are limited to it
+# Largest stamp of a ROS message, ns: ~/validity gives no later time
 LAST_STAMP = 2**31 * 10**9 - 1
 
-# Pages: each counts, and late subscribers need the last snapshot; a recorder's own queue is no longer than this
+# Of the journal: none of its pages may be lost, and late subscribers need the last snapshot
 JOURNAL_QOS = profile(10, latched=True)
 
 
 def nominal_lengths(compensator: Compensator, measured: np.ndarray) -> np.ndarray:
     """Return measured struts minus the correction, shape (6,), m, for a controller of nominal lengths.
 
-    With the measured ones it would count the corrections as a distance to go, and at each start from the struts'
-    positions they would be corrected once more. Before the first command the model's correction is used, where it
-    corrects.
+    With measured lengths the controller would treat the corrections as a position error, and a start from the struts'
+    positions would apply the corrections a second time. Before the first command the correction is computed from the
+    model, if compensation is on.
     """
     if np.isfinite(compensator.correction).all():
         return measured - compensator.correction
@@ -51,14 +50,14 @@ def nominal_lengths(compensator: Compensator, measured: np.ndarray) -> np.ndarra
 
 
 class Outputs:
-    """What a configured compensator publishes beside its answers: estimates, markers of the machine, its description,
-    and what a machine's own safety watches: a heartbeat, how long a command holds, whether commands are refused."""
+    """Publishers of a configured compensator besides its strut commands: pose estimates, markers, joints and URDF of
+    the machine; for its safety system, heartbeat, validity of the newest command, and whether commands are refused."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._compensator = node, node.compensator
         self._options = options = node.options
         self._frame, self._names = options["base_frame"], options["joint_names"]
-        self.answered = 0  # stamp of the newest command, ns; 0: there is none
+        self.answered = 0  # stamp of the newest answered command, ns; 0: none
         self._estimates = node.publish_on(PoseStamped, "tool_pose_estimate", STATE_QOS)
         self._markers = node.create_publisher(MarkerArray, "~/markers", EVENT_QOS)
         self._heartbeats = node.create_publisher(UInt64, "~/heartbeat", EVENT_QOS)
@@ -75,19 +74,18 @@ class Outputs:
         self._nominal_out, self._estimate_out = StrutBytes(names=self._names), PoseBytes(self._frame)
         self._beat, self._validity = UInt64(), TimeReference(source=node.resolve_topic_name("strut_commands"))
         self._stopped: bool | None = None
-        self._stop_said = 0.0
+        self._stop_published = 0.0  # monotonic time, s
         self.stop(True)
         node.at_rate("heartbeat_rate", self._beats)
         node.at_rate("marker_rate", self._show)
 
     def estimate(self, pose: np.ndarray, stamp: int) -> None:
-        """Publish a tool pose, shape (12,), position, m, and rotation matrix by rows, where somebody subscribes."""
+        """Publish a tool pose, shape (12,): position, m, and rotation matrix by rows; only if there are subscribers."""
         if self._estimates.get_subscription_count():
             self._estimates.publish(self._estimate_out.made(pose, stamp))
 
     def nominal(self, stamp: int, mean: Callable[[], np.ndarray]) -> None:
-        """Publish nominal lengths of the measured struts, from which a controller starts and which it holds: the
-        average for struts at rest."""
+        """Publish `mean()`, the measured struts (averaged while they stand), minus the corrections."""
         if self._nominal is not None:
             out, fastest = self._nominal_out, self._compensator.geometry.limits.speed
             lengths = np.ascontiguousarray(nominal_lengths(self._compensator, mean()))
@@ -95,14 +93,14 @@ class Outputs:
             self._nominal.publish(out.made(at, stamp, period(out.stamp, stamp), fastest))
 
     def stop(self, stopped: bool) -> None:
-        """Publish whether the node stops the machine, when that has changed and every :data:`REPEATED_AFTER`."""
+        """Publish on ~/stopped whether commands are refused, at each change and every :data:`REPEATED_AFTER`."""
         now = time.monotonic()
-        if stopped != self._stopped or now - self._stop_said > REPEATED_AFTER:
-            self._stopped, self._stop_said = stopped, now
+        if stopped != self._stopped or now - self._stop_published > REPEATED_AFTER:
+            self._stopped, self._stop_published = stopped, now
             self._stops.publish(Bool(data=stopped))
 
     def wait(self) -> None:
-        """Wait until the last ~/stopped has arrived."""
+        """Wait up to 0.4 s until the last message of ~/stopped has arrived."""
         self._stops.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
     def _beats(self) -> None:
@@ -116,8 +114,7 @@ class Outputs:
             self._validities.publish(self._validity)
 
     def _show(self) -> None:
-        """Publish the machine as markers and as the joints of its URDF, where somebody subscribes; before the first
-        command its struts have no corrections."""
+        """Publish markers and URDF joints of the machine, if there are subscribers; without corrections at first."""
         if not self._node.active:
             return
         now, pose = self._node.get_clock().now().to_msg(), self._compensator.platform_estimate
@@ -133,11 +130,11 @@ class Outputs:
 
 
 class JournalTopics:
-    """``~/journal`` and ``~/files``, which make a recording of a run replayable: the pages of
-    :mod:`hexapod_comp.compensation.journal`, and geometry and model in use, unchanged.
+    """Publishers of ``~/journal`` and ``~/files``, with which a recorded run can be replayed.
 
-    Both are reliable and kept for late subscribers, so that a recorder that starts during a motion gets what it needs.
-    Nothing is published while a command is handled: events are stored, and published with :meth:`tick`.
+    They carry the pages of :mod:`hexapod_comp.compensation.journal`, and the texts of the geometry and model file in
+    use. Both are reliable and latched, for a recorder that starts during a motion. Events are stored while a command is
+    handled, and published by :meth:`tick`.
     """
 
     def __init__(self, node: CompensatorState) -> None:
@@ -146,10 +143,10 @@ class JournalTopics:
         self._files = node.create_publisher(String, "~/files", JOURNAL_QOS)
         self._journal = Journal(node.compensator, self._sources, node.ids, node.options["joint_names"])
         self.answered, self.refused = self._journal.answered, self._journal.refused
-        self.tick(time.monotonic())  # so that no command comes before the first page
+        self.tick(time.monotonic())  # the first page must precede the first command
 
     def tick(self, now: float) -> None:
-        """Publish what is due: new files, then a page."""
+        """Publish changed files and a page of the journal, if a page is due."""
         if not self._journal.due(now):
             return
         if self._sources != self._published:
@@ -158,7 +155,7 @@ class JournalTopics:
         self._pages.publish(String(data=self._journal.page(now)))
 
     def finish(self, now: float) -> None:
-        """Publish a last page, with the answers since the previous one, and wait for its arrival."""
+        """Publish the last page, with the answers since the previous page, and wait up to 0.4 s for its arrival."""
         self._pages.publish(String(data=self._journal.page(now)))
         self._pages.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
@@ -167,7 +164,7 @@ class JournalTopics:
 
 STRUT_DIAMETER = 0.02
 JOINT_DIAMETER = 0.035
-LIFETIME = Duration(sec=1)  # Lifetime of markers: a machine that is not updated disappears instead of seeming alive
+LIFETIME = Duration(sec=1)  # Lifetime of markers: a machine that is not updated disappears from the picture
 
 GREY = ColorRGBA(r=0.5, g=0.5, b=0.55, a=1.0)
 STEEL = ColorRGBA(r=0.3, g=0.35, b=0.45, a=0.9)
@@ -181,7 +178,7 @@ def machine_markers(
     frame_id: str,
     stamp: Time,
 ) -> MarkerArray:
-    """Return the machine at a platform pose."""
+    """Return markers of the machine at a platform pose in base, its struts coloured by their corrections, m."""
     base = geometry.base_joints
     platform = position + geometry.platform_joints @ rotation.T
     tip = position + rotation @ geometry.tool.position + 0.1 * rotation[:, 2]
@@ -208,7 +205,7 @@ def machine_markers(
 
 
 def correction_colour(correction: float) -> ColorRGBA:
-    """Return blue for −100 µm, white for 0, red for +100 µm and beyond."""
+    """Return the colour of a correction, m: blue for −100 µm and below, white for 0, red for +100 µm and above."""
     share = max(-1.0, min(1.0, correction / 100e-6))
     rest = 1.0 - abs(share)
     return ColorRGBA(r=1.0 if share > 0 else rest, g=rest, b=1.0 if share < 0 else rest, a=1.0)

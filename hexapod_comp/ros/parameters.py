@@ -1,4 +1,4 @@
-"""Parameters of a node: its table, from which declaration, checks, help and pages are made, and the values in force."""
+"""Parameters of a node: their table, which declaration, checks, help and pages use, and their present values."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ USE_SIM_TIME = "use_sim_time"
 
 
 class ParameterError(HexapodError):
-    """A parameter's value is not allowed, or not now."""
+    """A parameter's value is not allowed, or cannot be set in the node's present state."""
 
     reason = "bad_parameter"
 
 
 class Taken(Enum):
-    """When a node applies a parameter's value, with its description."""
+    """The time at which a node applies a parameter's new value."""
 
     ALWAYS = "at any time"
     RELOAD = "at configure and at ~/reload_model"
@@ -49,13 +49,13 @@ RANGE = re.compile(r"(\S+) to (\S+) ?(\S*)")
 class Parameter:
     """One parameter of a node: a row of its table."""
 
-    name: str  # its name
+    name: str
     default: bool | int | float | str | list[str] | list[float]
-    # a number's range and unit, ``0 to 1 m``; choices, ``zero, hold``; ``not`` and the name of the parameter
-    # from which it must differ; empty: any value of the type
+    # range and unit of a number, ``0 to 1 m``; choices, ``zero, hold``; ``not`` and the name of a parameter from which
+    # it must differ; empty: any value of the default's type
     allowed: str
     taken: Taken
-    meaning: str  # what it means
+    meaning: str  # description for help and pages
 
     @property
     def range(self) -> tuple[float, float] | None:
@@ -64,7 +64,7 @@ class Parameter:
 
     @property
     def differs_from(self) -> str:
-        """Name of the parameter from which it must differ; empty: there is none."""
+        """Name of the parameter whose value this one must not have; empty: none."""
         return self.allowed.removeprefix("not ") if self.allowed.startswith("not ") else ""
 
     @property
@@ -78,7 +78,7 @@ class Parameter:
     def descriptor(self) -> ParameterDescriptor:
         result = ParameterDescriptor(
             description=self.meaning.replace("`", ""),
-            additional_constraints="; ".join(filter(None, (self.allowed, f"taken {self.taken.value}"))),
+            additional_constraints="; ".join(filter(None, (self.allowed, f"applied {self.taken.value}"))),
             read_only=self.taken is Taken.START,
             dynamic_typing=True,
         )
@@ -89,7 +89,7 @@ class Parameter:
         return result
 
     def checked(self, value: Any) -> Any:
-        """Return `value` as the parameter's type, or raise."""
+        """Return `value` in the parameter's type, or raise a ParameterError."""
         if isinstance(self.default, list) and isinstance(self.default[0], float):
             return self._checked_numbers(value)
         if isinstance(self.default, list):
@@ -132,7 +132,7 @@ def read_table(text: str) -> tuple[Parameter, ...]:
 
 
 def shown(value: bool | int | float | str | list[str] | list[float]) -> str:
-    """Return a default as a parameter's value is written."""
+    """Return a default as text, in the form in which a user writes a parameter's value."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list):
@@ -141,7 +141,7 @@ def shown(value: bool | int | float | str | list[str] | list[float]) -> str:
 
 
 class Parameters(dict[str, Any]):
-    """The values of a node's parameters, by name, validated; those that may change are always the ones in force."""
+    """The validated present values of a node's parameters, by name; it follows changes while the node runs."""
 
     def __init__(
         self,
@@ -160,13 +160,13 @@ class Parameters(dict[str, Any]):
             self[name] = parameter.checked(value)
         self._check_differences(self)
         declared = set(node.get_parameters_by_prefix(""))
-        for name in overrides(node):  # names that match no declared parameter are most likely misspelt
+        for name in overrides(node):  # a name that the node has not declared is most likely misspelt
             if name not in declared and not name.startswith("qos_overrides."):
                 near = difflib.get_close_matches(name, declared, 1)
                 hint = f"; did you mean {near[0]}?" if near else ""
                 node.get_logger().warning(f"there is no parameter {name}, it is ignored{hint}")
-        node.add_on_set_parameters_callback(self._judge)  # asked before rclpy's own, which switches the clock at once
-        node.add_post_set_parameters_callback(self._use)
+        node.add_on_set_parameters_callback(self._validate)  # called before rclpy's own callback, which sets the clock
+        node.add_post_set_parameters_callback(self._apply)
 
     def _check_differences(self, values: dict[str, Any]) -> None:
         for parameter in self._table.values():
@@ -177,29 +177,29 @@ class Parameters(dict[str, Any]):
     def _known(self, parameters: Iterable[RosParameter]) -> dict[str, Any]:
         return {p.name: self._table[p.name].checked(p.value) for p in parameters if p.name in self._table}
 
-    def _judge(self, parameters: list[RosParameter]) -> SetParametersResult:
-        """Refuse values that are not allowed, or have no effect before the node is configured or started again.
+    def _validate(self, parameters: list[RosParameter]) -> SetParametersResult:
+        """Refuse values that are not allowed, or that have no effect until the node is configured or started again.
 
-        Another clock is refused: stamps, ramps and the order of commands depend on the initial one.
+        A change of `use_sim_time` is refused: stamps, ramps and the order of commands depend on the clock at the start.
         """
         try:
             wanted, state = self._known(parameters), lifecycle_state(self._node)[1]
             for name, value in wanted.items():
                 at_configure = self._table[name].taken is Taken.CONFIGURE and state != "unconfigured"
                 if at_configure and value != self[name]:
-                    problem = f"is taken at configure, and the node is {state}; set it after a cleanup"
+                    problem = f"is applied at configure, and the node is {state}; set it after a cleanup"
                     raise self._table[name].refusal(problem)
             self._check_differences({**self, **wanted})
             clock = self._node.get_parameter(USE_SIM_TIME).value
             if any(parameter.name == USE_SIM_TIME and parameter.value is not clock for parameter in parameters):
-                problem = f"is {str(clock).lower()} for as long as the node runs; set it at the start"
+                problem = f"stays {str(clock).lower()} while the node runs; set it at the start"
                 raise ParameterError(f"parameter {USE_SIM_TIME}: {problem}")
             self._check(wanted)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def _use(self, parameters: list[RosParameter]) -> None:
+    def _apply(self, parameters: list[RosParameter]) -> None:
         if known := self._known(parameters):  # ROS also declares parameters of its own
             self.update(known)
             self._changed(set(known))
@@ -212,29 +212,29 @@ ROS_ARGUMENTS = "--ros-args"
 
 USAGE_ERROR = 2
 
-WIDTH = 118  # Of the help, characters
+WIDTH = 118  # Width of the help text, characters
 
 
 @dataclass(frozen=True)
 class Program:
-    """A node as a program."""
+    """A node's executable with its help text."""
 
     name: str  # of the executable
     summary: str
-    parameters: Sequence[Parameter]  # its ROS parameters
+    parameters: Sequence[Parameter]
     topics: str = ""
-    example: str = "-p autostart:=false"  # text after ``--ros-args`` in the example
+    example: str = "-p autostart:=false"  # arguments that follow ``--ros-args`` in the help's example
 
     def refusal(self, arguments: Sequence[str]) -> int | None:
-        """Return the exit code of a program that must not start with these arguments, after printing why; else None.
+        """Return None if the program may start with these arguments; else print help or error, return the exit code.
 
-        0 after ``--help``, 2 where an argument is not understood. ROS reads what follows ``--ros-args``. rcl itself
-        would read a stray ``name:=value`` as a rename, and ignore everything else.
+        The exit code is 0 after ``--help``, and 2 if an argument outside ``--ros-args`` is not understood. rcl itself
+        would read ``name:=value`` there as a remapping and ignore everything else.
         """
         return run_with_plain_streams(lambda: self._refusal(arguments))
 
     def _refusal(self, arguments: Sequence[str]) -> int | None:
-        lines = ["parameters (-p NAME:=VALUE behind --ros-args; default in brackets):"]
+        lines = ["parameters (-p NAME:=VALUE after --ros-args; default in brackets):"]
         for parameter in self.parameters:
             text = f"{parameter.name}  [{shown(parameter.default)}]  {parameter.described()}"
             lines += textwrap.wrap(text, WIDTH, initial_indent="  ", subsequent_indent="      ")
@@ -254,7 +254,7 @@ class Program:
             if strange:
                 listed = printable(" ".join(strange), LONGEST_TEXT)
                 parser.error(f"arguments not understood: {listed}. Parameters follow --ros-args: {example}")
-        except (RuntimeError, ValueError) as error:  # a ValueError: bytes that are no text
+        except (RuntimeError, ValueError) as error:  # a ValueError: bytes that are not UTF-8
             parser.print_usage(sys.stderr)
             text = f"{self.name}: error: ROS arguments not understood: {error}"
             print(printable(text, LONGEST_TEXT), file=sys.stderr)

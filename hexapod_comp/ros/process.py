@@ -1,4 +1,4 @@
-"""A node's process: its spin loop, signals, end, and a log that never blocks it; and a session for other programs."""
+"""A node's process: spin loop, signals, shutdown and a log that never blocks; and a ROS session for other programs."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from . import keep_discovery_local, open_streams, received_signals
 from .base import MachineNode
 from .parameters import Program
 
-# Longest wait of one spin, s: how soon a signal is noticed (EventsExecutor.spin itself never returns)
+# Longest wait of one call of spin_once, s, after which signals are checked (EventsExecutor.spin itself never returns)
 SPIN_PERIOD = 0.1
 
 ENDED_WITHIN = 4.0  # Longest time from a signal to the end of the process, s; usually it is a fraction of a second
-STREAMS = (1, 2)  # stdout and stderr: RCUTILS_LOGGING_USE_STDOUT decides where ROS writes
-BUFFER_SIZE = 1 << 20  # Of the log's pipe, byte: some thousands of lines. Linux allows everybody this much.
-LEAVING_WITHIN = 0.5  # Longest wait for the last lines of the log to be read, s
+STREAMS = (1, 2)  # stdout and stderr: RCUTILS_LOGGING_USE_STDOUT selects the one to which ROS writes its log
+BUFFER_SIZE = 1 << 20  # Size of the log's pipe, byte: thousands of lines; the largest size for unprivileged users
+LEAVING_WITHIN = 0.5  # Longest wait at the end for the last log lines to be read, s
 
-# Options of a node that publishes nothing and offers nothing
+# Options of a node that offers no services and publishes no log
 QUIET: dict[str, Any] = {
     "start_parameter_services": False,
     "enable_rosout": False,
@@ -54,6 +54,7 @@ def autostart(node: LifecycleNode, signals: Sequence[int] = ()) -> bool:
 
 
 def discovery() -> str:
+    """Return the ROS domain and the range of discovery as text, for the log."""
     reach, peers = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", ""), os.environ.get("ROS_STATIC_PEERS", "")
     hint = " (SUBNET finds other computers)" if reach == "LOCALHOST" else ""
     also = f" and of {printable(peers)}" if peers else ""
@@ -62,10 +63,10 @@ def discovery() -> str:
 
 
 def run(make_node: Callable[[], MachineNode], program: Program) -> int:
-    """Run a node until SIGINT, SIGTERM or SIGHUP, and end this process; return the exit code if it cannot start.
+    """Run a node until SIGINT, SIGTERM or SIGHUP, then end this process; return an exit code if arguments are refused.
 
-    Signals are only stored, since rclpy's own handling loses the last message and exits non-zero on a second Ctrl-C,
-    which ``ros2 launch`` sends.
+    rclpy's own signal handling is not used: it loses the last message, and exits non-zero on a second Ctrl-C, which
+    ``ros2 launch`` sends.
     """
     keep_discovery_local()
     arguments = sys.argv[1:]
@@ -73,14 +74,14 @@ def run(make_node: Callable[[], MachineNode], program: Program) -> int:
         return refusal
     open_streams()
     signals = received_signals()
-    try:  # the present stream, even if another replaces it
+    try:  # a copy of the real stderr, before LogRelay replaces it
         stderr = os.fdopen(os.dup(sys.stderr.fileno()), "w")
-    except (AttributeError, OSError):  # closed
+    except (AttributeError, OSError):  # stderr is closed
         stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
     with LogRelay():
         code = _run_until(signals, make_node, arguments, stderr)
-    # Python's own exit waits for threads of DDS, which sometimes never end, though all has been closed.
-    for stream in filter(None, (sys.stdout, sys.stderr)):  # None: it was closed from the beginning
+    # Python's own exit would wait for threads of DDS, which sometimes never end.
+    for stream in filter(None, (sys.stdout, sys.stderr)):  # None: the stream was closed from the beginning
         with suppress(OSError):
             stream.flush()
     os._exit(code)
@@ -104,15 +105,14 @@ def _run_until(
     executor = EventsExecutor()
     executor.add_node(node)
     spin = node.guard.around("spinning", functools.partial(executor.spin_once, timeout_sec=SPIN_PERIOD))
-    with ExitStack() as ending:  # the last is called first
+    with ExitStack() as ending:  # calls its callbacks in reverse order
         for end in (rclpy.try_shutdown, node.destroy_node, executor.shutdown, node.publish_last_status):
             ending.callback(end)
         ending.callback(_end_within, ENDED_WITHIN, stderr)
         if node.wants_autostart and node.unconfigured and not autostart(node, signals):
             return 1
-        # Modules loaded by now stay, and the collector need not examine them while the machine moves: for 45,000
-        # objects a full collection takes 17 ms, the time of eight commands. The allocator is left alone: told to give
-        # large blocks back it held 2 to 11 MB less after sixty messages of up to 6 MB, not worth a call into glibc.
+        # Exclude the objects that exist now from garbage collection: a full collection of 45,000 objects takes 17 ms,
+        # in which eight commands arrive.
         gc.collect()
         gc.freeze()
         while not signals and rclpy.ok():
@@ -121,10 +121,10 @@ def _run_until(
 
 
 def _end_within(seconds: float, stderr: TextIO) -> None:
-    """End this process by force in this many seconds, printing where every thread is: DDS may wait for ever.
+    """End this process by force after a time, printing the stacks of all threads: DDS may block the shutdown for ever.
 
-    Neither needs Python's lock, which a hanging thread may hold. If the output is not read, the system's alarm ends the
-    process a second later.
+    faulthandler and the system's alarm need no lock of Python, which a blocked thread may hold. The alarm ends the
+    process a second later if printing blocks.
     """
     faulthandler.dump_traceback_later(seconds, exit=True, file=stderr)
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
@@ -135,11 +135,11 @@ def _end_within(seconds: float, stderr: TextIO) -> None:
 
 
 class LogRelay:
-    """Context manager: writing to stdout and stderr never blocks; output that is not read in time is lost.
+    """Context manager in which writing to stdout and stderr never blocks; output that is not read in time is lost.
 
-    ROS writes its log to stderr from within the call, with Python's lock held. A terminal stopped with Ctrl-S, or a
-    pipe without a reader, would then block the machine's loop. So the loop writes into a pipe of this process, which a
-    thread empties; output that does not fit is lost.
+    ROS writes its log to stderr while it holds Python's lock. A terminal stopped with Ctrl-S, or a pipe that is not
+    read, would block the machine's loop. So the loop writes into a pipe, which a thread forwards; output that does not
+    fit into the pipe is lost.
     """
 
     def __enter__(self) -> LogRelay:
@@ -148,7 +148,7 @@ class LogRelay:
             try:
                 if stat.S_ISREG(os.fstat(stream).st_mode):
                     continue  # a file never blocks
-            except OSError:  # closed
+            except OSError:  # the stream is closed
                 continue
             real, (source, sink) = os.dup(stream), os.pipe()
             with suppress(OSError):  # a system with a lower limit keeps its own size
@@ -164,11 +164,11 @@ class LogRelay:
     def __exit__(self, *_: object) -> None:
         for stream, real, thread in self._relays:
             os.dup2(real, stream)
-            thread.join(LEAVING_WITHIN)  # for messages still in the pipe
+            thread.join(LEAVING_WITHIN)  # it forwards what is still in the pipe
 
 
 def _forward(source: int, real: int) -> None:
-    """Pass on the written bytes until the last writer has closed; keep emptying when the reader has gone."""
+    """Copy bytes from a pipe to the real stream until all writers have closed; discard them if nobody reads them."""
     while data := os.read(source, 1 << 16):
         with suppress(OSError):
             while data:
@@ -182,7 +182,7 @@ AnySession = TypeVar("AnySession", bound="RosSession")
 
 
 class RosSession:
-    """A private context of ROS with an executor and one node: for programs that talk to nodes; signals are theirs."""
+    """One node with its own ROS context and executor, for programs other than nodes; it handles no signals."""
 
     def __init__(self, name: str, namespace: str = "", arguments: Sequence[str] = (), **options: Any) -> None:
         open_streams()
@@ -200,18 +200,17 @@ class RosSession:
         self.close()
 
     def spin_once(self, timeout: float) -> None:
-        """Handle received messages, or the first to arrive within this time, s."""
+        """Handle messages that have arrived; if there are none, wait for one up to `timeout`, s."""
         self._executor.spin_once(timeout_sec=timeout)
 
     def catch_up(self) -> None:
-        """Handle all messages received so far, in their order: while a program computes for minutes, a hundred thousand
-        may arrive, and an answer behind them would come too late."""
+        """Handle all messages received so far, for example during a long computation, before new ones are awaited."""
         last = self._executor.create_task(lambda: None)
         while not last.done():
             self.spin_once(0.02)
 
     def wait(self, condition: Callable[[], object], timeout: float, what: str) -> None:
-        """Handle messages until a condition holds; a NoAnswerError if it does not within this time, s."""
+        """Handle messages until a condition holds; raise a NoAnswerError naming `what` after `timeout`, s."""
         end = time.monotonic() + timeout
         while not condition():
             if (left := end - time.monotonic()) <= 0.0:

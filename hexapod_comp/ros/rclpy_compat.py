@@ -1,6 +1,6 @@
-"""All workarounds for rclpy, and uses of its private parts, each with the version and the reason.
+"""All workarounds for rclpy and all uses of its private attributes, each with the version and the reason.
 
-rclpy 7.1 is that of Jazzy. When a later version is better, code here can be removed without other changes.
+ROS 2 Jazzy has rclpy 7.1. When a later version mends a problem, its workaround can be removed from this file alone.
 """
 
 from __future__ import annotations
@@ -29,11 +29,12 @@ def sampled(
     second: Callable[[], None],
     failed: Callable[[Exception], None],
 ) -> Callable[..., None]:
-    """Return a callback for rclpy that never raises, and passes on a message with its sample; `second` is called when
-    the message's sequence number shows a second sender.
+    """Return a subscription's callback that never raises: it calls `callback` with the message and a new Sample.
 
-    rclpy inspects a callback's signature for the message info, and then calls it with two arguments; the EventsExecutor
-    of rclpy 7.1 calls it with a tuple of the two instead.
+    It calls `second` when the message's sequence number shows a second sender, and `failed` with any exception.
+
+    rclpy passes the message info if the callback's signature has two arguments, but the EventsExecutor of rclpy 7.1
+    passes message and info as one tuple.
     """
 
     def called(*arguments: Any) -> None:
@@ -51,11 +52,10 @@ def sampled(
 
 
 class Alarm:
-    """Calls back in the node's executor: once, a while after it was `set`, or at a `rate`; both may change at any time.
+    """A timer that calls back in the node's executor: once after a time given to `set`, or at a rate that may change.
 
-    A timer may not be reset while a node runs: at each reset the EventsExecutor of rclpy 7.1 calls every due timer once
-    more, and postpones its next call by a period: a check every 50 ms did not run for seconds. A rate that changes
-    neither shifts a due tick nor makes it tick more often than the fastest.
+    It replaces rclpy's timers where a period changes. At each reset of a timer the EventsExecutor of rclpy 7.1 calls
+    every due timer once more and postpones its next call by a period: a check every 50 ms did not run for seconds.
     """
 
     def __init__(self, node: Node, callback: Callable[[], None], rate: float = 0.0) -> None:
@@ -67,13 +67,13 @@ class Alarm:
         self.set_rate(rate)
 
     def set(self, seconds: float) -> None:
-        """Call back after this time, s, instead of the previous one; never, if infinite."""
+        """Call back once, this time, s, from now, instead of at the time set before; infinity: never."""
         with self._change:
             self._due = time.monotonic() + seconds
             self._change.notify()
 
     def set_rate(self, rate: float) -> None:
-        """Tick on at another rate, Hz, counted from the last tick; 0: rest."""
+        """Call back at this rate, Hz, counted from the last call; 0: never."""
         if rate != self._rate:
             self._rate = rate
             self._set_next(time.monotonic())
@@ -89,10 +89,10 @@ class Alarm:
 
     def _tick(self) -> None:
         if not self._rate:
-            return  # it was closed or stopped while this tick was pending
+            return  # the alarm was closed or stopped while this call was pending
         now, period = time.monotonic(), 1.0 / self._rate
         due = self._last + period
-        self._last = due if now - due < period else now  # in step; missed ticks are not repeated
+        self._last = due if now - due < period else now  # keep the phase; missed calls are not repeated
         self._set_next(now)
         self._callback()
 
@@ -103,7 +103,7 @@ class Alarm:
                 if left > 0.0:
                     self._change.wait(None if left == float("inf") else left)
                     continue
-                executor = self._node.executor  # that of Jazzy knows no guard conditions
+                executor = self._node.executor  # Jazzy's EventsExecutor supports no guard conditions, but tasks
                 if executor is None or self._node not in executor.get_nodes():
                     self._due = time.monotonic() + 0.1
                 else:
@@ -112,8 +112,10 @@ class Alarm:
 
 
 class LateAnswer:
-    """Lets a service's callback return None: its answer then follows later, and the node continues in between. rclpy
-    7.1 lacks this: executors send what the callback returns. Only one request at a time may be pending."""
+    """A service whose callback may return None: its answer is then sent later by `answer`, and the node keeps running.
+
+    Executors of rclpy 7.1 always send the callback's return value. Only one request at a time may be pending.
+    """
 
     def __init__(self, service: Service) -> None:
         self.service, self._send, self._header = service, service.send_response, cast(Any, None)
@@ -136,7 +138,7 @@ class LateAnswer:
 
 
 def possible_only(node: LifecycleNode, change: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """Return the callback of ``change_state`` for possible transitions alone: of others rcl 9.2 logs each request."""
+    """Return a callback of ``change_state`` that refuses impossible transitions, each of which rcl 9.2 would log."""
 
     def checked(request: Any, response: Any) -> Any:
         wanted, machine = request.transition, node._state_machine
@@ -150,19 +152,21 @@ def possible_only(node: LifecycleNode, change: Callable[[Any, Any], Any]) -> Cal
 
 
 def lifecycle_state(node: LifecycleNode) -> tuple[int, str]:
-    """Return id and name of a node's state; a node of rclpy 7.1 offers it by a service, but not to itself."""
+    """Return id and name of a node's lifecycle state, which rclpy 7.1 offers by a service but not by a method."""
     number, name = node._state_machine.current_state
     return int(number), str(name)
 
 
 def end_lifecycle(node: LifecycleNode) -> None:
-    """Destroy the lifecycle's services with the node: rclpy 7.1 leaves them to the garbage collector, and a node that
-    is still referenced would continue to offer services that are never answered."""
+    """Destroy a node's lifecycle services, which rclpy 7.1 keeps until the node object is garbage-collected.
+
+    Until then the node would continue to offer services that are never answered.
+    """
     node._state_machine.destroy_when_not_in_use()
 
 
 def overrides(node: Node) -> Iterable[str]:
-    """Return the names of all parameters that a user has set, whether declared or not: rclpy 7.1 keeps them."""
+    """Return the names of all parameters that a user has set at the start, including names that the node lacks."""
     return getattr(node, "_parameter_overrides", {})
 
 
@@ -175,33 +179,34 @@ def full_name(info: Any) -> str:
 
 
 def publishers(node: Node, topic: str) -> tuple[tuple[str, ...], str]:
-    """Return the nodes that publish a topic, each once, and why they cannot be named: a node's name may be any bytes,
-    which rclpy 7.1 cannot return."""
+    """Return the sorted full names of the nodes that publish a topic, and why they cannot be read ('' if they can).
+
+    Another program may give its node a name of any bytes; rclpy 7.1 then raises an exception.
+    """
     try:
         return tuple(sorted({full_name(info) for info in node.get_publishers_info_by_topic(topic)})), ""
     except UnicodeDecodeError as error:
         return (), f"a node's name is not UTF-8: {shorten(error.object)}"
-    except Exception as error:  # of many kinds: others control the content of the graph
+    except Exception as error:  # of any kind: other programs control the content of the graph
         return (), described(error)
 
 
 def callers(node: Node, service: Service) -> str:
-    """Return the nodes that have a client of a service, for the log: one of them has called.
+    """Return, for the log, the names of the nodes that have a client of a service, joined by "or": one of them called.
 
-    rclpy 7.1 gives a callback only the number of the request, not its caller; requests are a topic of DDS, and the
-    graph lists its publishers. After an accident the first question is who has reset the machine; only the log can
-    answer it.
+    After an accident the first question is which node has reset the machine. rclpy 7.1 does not tell a callback who has
+    called, but requests travel on a DDS topic, whose publishers the graph lists.
     """
     try:
         infos = node.get_publishers_info_by_topic(f"rq{service.service_name}Request", no_mangle=True)
         names = sorted({full_name(info) for info in infos})
-    except Exception as error:  # of many kinds, as above
-        return f"somebody unknown ({described(error)})"
+    except Exception as error:  # of any kind, as in publishers()
+        return f"an unknown node ({described(error)})"
     return " or ".join(names) or "a node that has left"
 
 
 def described(error: BaseException) -> str:
-    """Return an error with its kind and the line that raised it."""
+    """Return an exception as text: its type, its message, and file and line that raised it."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
@@ -213,14 +218,14 @@ def described(error: BaseException) -> str:
 
 
 class Throttle:
-    """Lets one message per cause and second through, and counts what it held back."""
+    """Limit of the log to one message per cause and second, with the number of suppressed messages."""
 
     def __init__(self) -> None:
         self._last: dict[str, float] = {}
         self._held: dict[str, int] = {}
 
     def allow(self, cause: str, text: str) -> str | None:
-        """Return the text to be logged, with the number of suppressed ones, or None to suppress this one."""
+        """Return the text to log, with the number of messages suppressed before it; None to suppress this message."""
         now = time.monotonic()
         if now - self._last.get(cause, -1e9) < 1.0:
             self._held[cause] = self._held.get(cause, 0) + 1
@@ -231,10 +236,10 @@ class Throttle:
 
 
 class PlainLogger(rcutils_logger.RcutilsLogger):
-    """A node's logger that writes one printable line for each message, whatever text it quotes.
+    """A node's logger that writes each message as one printable line, whatever text the message quotes.
 
-    Anyone may send requests at any rate. So log messages during a request, ours or rclpy's, are throttled: one line a
-    second from each line of source.
+    Any node may send requests at any rate. So messages that are logged while a request is answered, by this package or
+    rclpy, are limited to one per second from each line of source.
     """
 
     def __init__(self, name: str, answering: Callable[[], bool]) -> None:
@@ -242,7 +247,7 @@ class PlainLogger(rcutils_logger.RcutilsLogger):
         self._answering, self._throttle = answering, Throttle()
 
     def log(self, message: str, severity: Any, throttled: bool = False, **keywords: Any) -> bool:
-        """Log a message, which the caller may have throttled; other arguments are those of rclpy's logger."""
+        """Log a message; `throttled`: the caller has limited its rate. Other arguments are those of rclpy's logger."""
         text: str | None = printable(str(message), LONGEST_TEXT)
         if self._answering() and not throttled:
             caller = rcutils_logger._find_caller(inspect.currentframe())
@@ -250,5 +255,5 @@ class PlainLogger(rcutils_logger.RcutilsLogger):
         return text is not None and bool(super().log(text, severity, **keywords))
 
 
-# rclpy 7.1 keeps one severity for each line of source that logs; those above call for others.
+# rclpy 7.1 allows one severity for each line of source that logs: let it take the line that called this file.
 rcutils_logger._internal_callers.append(os.path.realpath(__file__))

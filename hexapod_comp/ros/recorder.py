@@ -1,4 +1,4 @@
-"""Recording a machine's topics for replay, without ROS 2's own tools: messages as they travel, into an MCAP file."""
+"""Recording of a machine's topics for replay, without ROS 2's own tools: serialised messages into an MCAP file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ..errors import HexapodError, InputFileError
 from .base import profile
 from .process import QUIET, SPIN_PERIOD, RosSession
 
-# Recorded topics, their types, and whether they are offered reliably
+# Recorded topics with their types, and whether to subscribe reliably
 TOPICS = {
     "tool_pose_command": (PoseStamped, True),
     "strut_setpoints": (JointState, True),
@@ -36,33 +36,33 @@ TOPICS = {
 }
 
 JOURNAL = "compensator/journal"
-KEPT = (JOURNAL, "compensator/files")  # Topics that late subscribers receive too
-DEPTH = 1000  # Messages that may wait while the disk is slow: a second of commands
+LATCHED = (JOURNAL, "compensator/files")  # Topics whose last messages late subscribers receive too
+DEPTH = 1000  # Messages of a topic that may wait while the disk is slow: one second of commands at 1 kHz
 
-# With less free space than this on its disk, byte, a recording ends: closing it takes pending chunks of 1 MB,
-# an index of 300 bytes for each chunk, and others may write to the disk between two checks
+# A recording ends when its disk has less free space than this, byte: closing it writes pending chunks of 1 MB and an
+# index of 300 bytes for each chunk, and other programs may write to the disk between two checks
 RESERVE = 64_000_000
 
-# The disk, and whether the bag is still at its place, are checked at this period, s, and after this many bytes
-LOOK_PERIOD, LOOK_AFTER = 1.0, 16_000_000
+# Free disk space and existence of the bag's folder are checked with this period, s, and after this many bytes
+CHECK_PERIOD, CHECK_AFTER = 1.0, 16_000_000
 
 
 class BagWriter:
-    """Writes messages into a bag, which is closed while its disk still has room to close it."""
+    """A bag into which messages are written; it stops before its disk is too full to close the bag."""
 
     def __init__(self, folder: str | Path) -> None:
         self.counts: dict[str, int] = {}
         self.problem = ""
         self._folder = Path(folder)
         self._connections: dict[str, Any] = {}
-        self._looked, self._since_look = time.monotonic(), 0
+        self._checked, self._bytes_since_check = time.monotonic(), 0
         try:
             from rosbags.rosbag2 import StoragePlugin, Writer
             from rosbags.typesys import Stores, get_typestore
         except ImportError as error:
             raise HexapodError("recording needs rosbags, which is not installed: pip install rosbags") from error
         if self._folder.exists():
-            raise InputFileError(self._folder, "", "is there already; a recording makes a folder of its own")
+            raise InputFileError(self._folder, "", "exists already; a recording creates a new folder")
         self._store = get_typestore(Stores.ROS2_JAZZY)
         try:
             self._writer = Writer(self._folder, version=9, storage_plugin=StoragePlugin.MCAP)
@@ -76,7 +76,7 @@ class BagWriter:
             raise InputFileError(self._folder, "", f"cannot be made: {self.problem.partition(';')[0]}")
 
     def write(self, topic: str, kind: str, data: bytes) -> None:
-        """Write a message that arrived now; nothing once there is a :attr:`problem`."""
+        """Write the bytes of a message with the present time; do nothing once there is a :attr:`problem`."""
         if self.problem:
             return
         try:
@@ -84,20 +84,20 @@ class BagWriter:
                 self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
             self._writer.write(self._connections[topic], time.time_ns(), data)
         except OSError as error:
-            self.problem = f"{error.strerror}: what came before may be damaged"
+            self.problem = f"{error.strerror}: the messages written before may be damaged"
             return
         self.counts[topic] = self.counts.get(topic, 0) + 1
-        self._since_look += len(data)
-        if self._since_look > LOOK_AFTER:
+        self._bytes_since_check += len(data)
+        if self._bytes_since_check > CHECK_AFTER:
             self._check()
 
     def check_disk(self) -> None:
-        """Detect, periodically, that the bag was removed or its disk gets full."""
-        if not self.problem and time.monotonic() - self._looked >= LOOK_PERIOD:
+        """Check every :data:`CHECK_PERIOD` that the bag's folder exists and its disk is not full."""
+        if not self.problem and time.monotonic() - self._checked >= CHECK_PERIOD:
             self._check()
 
     def _check(self) -> None:
-        self._looked, self._since_look = time.monotonic(), 0
+        self._checked, self._bytes_since_check = time.monotonic(), 0
         try:
             free = shutil.disk_usage(self._folder).free
         except OSError:
@@ -105,10 +105,10 @@ class BagWriter:
             return
         if free < RESERVE:
             full = f"less than {RESERVE // 1_000_000} MB are free on its disk"
-            self.problem = f"{full}; what was received until then is whole and can be replayed"
+            self.problem = f"{full}; all messages received before are recorded and can be replayed"
 
     def close(self) -> None:
-        """Close the bag; an error is the :attr:`problem`."""
+        """Close the bag; store an error in :attr:`problem`."""
         try:
             self._writer.close()
         except OSError as error:
@@ -118,15 +118,15 @@ class BagWriter:
 
 
 class BagRecorder(RosSession):
-    """Subscribes to a machine's topics and writes them."""
+    """A node that subscribes to a machine's topics and writes their messages into a bag."""
 
     def __init__(self, folder: str | Path, namespace: str = "") -> None:
         self._bag = BagWriter(folder)
-        self.counts = self._bag.counts  # messages of each topic
+        self.counts = self._bag.counts  # number of messages of each topic
         super().__init__("hexapod_comp_recorder", namespace, **QUIET)
         for topic, (kind, reliable) in TOPICS.items():
             self._subscribe(topic, kind, profile(DEPTH, reliable))
-        for topic in KEPT:
+        for topic in LATCHED:
             self._subscribe(topic, String, profile(DEPTH, latched=True))
 
     def close(self) -> None:
@@ -134,7 +134,7 @@ class BagRecorder(RosSession):
         self._bag.close()
 
     def run(self, going_on: Callable[[], bool], progress: Callable[[int], object] = lambda messages: None) -> None:
-        """Record while a condition, checked at least every 0.1 s, holds, and while the bag can be written."""
+        """Record until `going_on()`, called at least every 0.1 s, is false or the bag can no longer be written."""
         reported = 0
         while going_on() and not self.problem:
             self.spin_once(SPIN_PERIOD)

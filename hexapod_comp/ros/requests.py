@@ -1,4 +1,4 @@
-"""Requests to a compensator beside commands: reset, switch, another model or tool, travel, predicted error."""
+"""Services and on-demand topics of a compensator: reset, switch, change of model or tool, travel, predicted error."""
 
 from __future__ import annotations
 
@@ -27,21 +27,23 @@ from .parameters import ParameterError
 from .rclpy_compat import LateAnswer
 from .worker import Worker, WorkerError
 
-# Reading a model file is abandoned after this time, s; the shipped ones take one second, nearly all of it imports
-LOADED_WITHIN = 30.0
+LOADED_WITHIN = 30.0  # Longest time for reading a model file, s; a shipped one takes 1 s, mostly for imports
 
-PREDICTION_PERIOD = 0.2  # Period at which a predicted error is requested and published, s
+PREDICTION_PERIOD = 0.2  # Period of ~/predicted_error, s
 TRY_AGAIN_AFTER = 10.0  # A failed prediction is repeated after this time, s
 
-TRAVEL_PERIOD = 1.0  # Between two messages of ``~/travel``, s
-LONGEST_REASON = 200  # Longest text of the limits that end the travel, characters
+TRAVEL_PERIOD = 1.0  # Period of ~/travel, s
+LONGEST_REASON = 200  # Longest text of each limit that ends the travel, characters
 
 
 class Requests:
-    """Services and topics for requests to a configured compensator."""
+    """The services of a configured compensator, and the topics that its worker process computes.
 
-    def __init__(self, node: CompensatorState, forget: Callable[[], None]) -> None:
-        self._node, self._forget = node, forget
+    `forget_commands` is the node's method that a reset calls.
+    """
+
+    def __init__(self, node: CompensatorState, forget_commands: Callable[[], None]) -> None:
+        self._node, self._forget_commands = node, forget_commands
         self._worker = Worker()
         node.create_logged_service(SetBool, "~/enable_compensation", self._on_enable)
         node.create_logged_service(Trigger, "~/reset", self._on_reset)
@@ -56,7 +58,7 @@ class Requests:
         self._predicted.update(now)
 
     def close(self) -> None:
-        """Answer pending requests, and end the worker."""
+        """Answer pending requests with a refusal, and end the worker process."""
         self._reload.answer(Trigger.Response(message="the old model stays: the node was cleaned up"))
         self._travel.close()
         self._worker.close()
@@ -66,23 +68,23 @@ class Requests:
         return SetBool.Response(success=True, message=f"compensation ramps {'in' if request.data else 'out'}")
 
     def _on_reset(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response:
-        """Forget the last command and a following error, if the machine stands."""
+        """Forget the last command and a latched following error; refuse while the machine moves."""
         node, now = self._node, time.monotonic()
         if moving := node.track.moving(now):
             refusal = f"refused while the machine moves: {moving}"
             node.refused_resets.add("moving", refusal, now)
             node.log_warning("reset", f"reset {refusal}")
             return Trigger.Response(message=refusal)
-        self._forget()
+        self._forget_commands()
         node.track.release()
-        known = "the next command may be one allowed step from where the struts were known to be last"
+        known = "the next command may be one allowed step from the struts' last known positions"
         return Trigger.Response(success=True, message=known)
 
     # ---- the model ----
 
     def _on_reload(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response | None:
         if self._worker.busy("load_model"):
-            return Trigger.Response(message="the model is being loaded already")
+            return Trigger.Response(message="refused: a model is already being loaded")
         machine, files = self._node.compensator.geometry.name, self._node.files
         if files.ideal:
             return self._use_model((MachineModel(machine), IDEAL_SOURCE))
@@ -93,14 +95,14 @@ class Requests:
             lambda found: self._reload.answer(self._use_model(found)),
             lambda error: self._reload.answer(self._keep_model(error)),
             within=LOADED_WITHIN,
-            late=f"{name}: could not be read within {LOADED_WITHIN:g} s; is the disk or the network behind it there?",
+            late=f"{name}: could not be read within {LOADED_WITHIN:g} s; check its disk or network",
         )
         return None
 
     def _use_model(self, found: tuple[MachineModel, Any]) -> Trigger.Response:
         sources = self._node.files.sources
         before = sources["model"]
-        model, sources["model"] = found  # the source first: the journal records it with the change
+        model, sources["model"] = found  # set before set_model: the journal records the source with the change
         try:
             self._node.compensator.set_model(model)
         except HexapodError as error:
@@ -115,10 +117,10 @@ class Requests:
 
 
 class ToolChoice:
-    """The tool in use: selected by the parameter ``tool`` and the topic ``select_tool``, published on ``~/tool``.
+    """The choice of the tool by the parameter ``tool`` or the topic ``select_tool``, published on ``~/tool``.
 
-    The topic is for controllers: it sets the parameter. Only one node may publish on it, and the tool changes only
-    while the machine stands.
+    A message on the topic, which is for controllers, sets the parameter. Only one node may publish the topic. The tool
+    can be changed only while the machine stands.
     """
 
     def __init__(self, node: CompensatorState) -> None:
@@ -130,7 +132,7 @@ class ToolChoice:
         self._publish()
 
     def check(self, name: str) -> None:
-        """Refuse an unknown tool, and any other while the machine moves."""
+        """Raise a ParameterError for an unknown tool, and for a change of tool while the machine moves."""
         geometry = self._compensator.geometry
         try:
             geometry.using(tool=name)
@@ -141,18 +143,21 @@ class ToolChoice:
             raise ParameterError(f"parameter tool: stays {geometry.tool_name!r} while the machine moves: {moving}")
 
     def apply(self) -> None:
-        """Use the tool that the parameter names now."""
+        """Use the tool named by the parameter, and publish its name, if it has changed."""
         if (name := self._node.options["tool"]) != self._compensator.geometry.tool_name:
             self._compensator.set_tool(name)
-            self._node.note("tool", f"tool {name!r}: the next command must be at the struts' present position")
+            self._node.log_action("tool", f"tool {name!r}: the next command must be at the struts' present position")
             self._publish()
 
     def _on_message(self, data: bytes, sample: Sample) -> None:
-        """Set the parameter. If the commander's choice is refused, its next command must be at the struts' present
-        position: commands for the tool that it did not get may follow. A refused choice by another node stops
-        nothing."""
+        """Set the parameter `tool` to a message's tool.
+
+        If the choice of the node that commands poses is refused, its next command must be at the struts' present
+        position, since further commands may be meant for the refused tool. A refused choice of any other node has no
+        effect on commands.
+        """
         node, now = self._node, sample.now
-        node.update_publishers()  # a new publisher may have sent already, and the commander's name may be outdated
+        node.update_publishers()  # to know the present publishers of select_tool and of commands
         try:
             self._sender.check(sample)
             name = read_message(data, String).data
@@ -170,15 +175,17 @@ class ToolChoice:
 
 
 def situation(node: CompensatorState) -> dict[str, Any]:
-    """Return what the worker's process needs beside geometry and model: tool, temperatures, load, outside numbers."""
+    """Return the worker's arguments for the present tool, temperatures, load and external quantities."""
     compensator = node.compensator
     present = compensator.geometry.tool_name, compensator.temperatures, compensator.loading, dict(compensator.outside)
     return {"now": present}
 
 
 class TravelReports:
-    """``~/travel``, once a second while there are subscribers, and ``~/get_travel``: the tool's travel from the last
-    commanded pose, or before the first command from the last measured one."""
+    """Topic ``~/travel``, once a second while there are subscribers, and service ``~/get_travel``.
+
+    They give the tool's travel from the last commanded pose, or before the first command from the last measured pose.
+    """
 
     def __init__(self, node: CompensatorState, worker: Worker) -> None:
         self._node, self._worker = node, worker
@@ -199,7 +206,7 @@ class TravelReports:
 
     def _on_request(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response | None:
         if self._asked:
-            raise CommandError("busy", "it is being worked out already")
+            raise CommandError("busy", "the travel is already being computed")
         if not self._worker.busy("travel"):
             self._begin()
         self._asked = True
@@ -208,13 +215,13 @@ class TravelReports:
     def _begin(self) -> None:
         node, compensator = self._node, self._node.compensator
         names = {frame_id: name for name, frame_id in node.ids.items()}
-        work = names.get(node.frame_id, WORK)  # before the first command the usual one
+        work = names.get(node.frame_id, WORK)  # before the first command the frame `work`
         if np.isfinite(compensator.nominal).all():
             platform = compensator.platform
         elif node.feedback.count:
             platform = Pose(*compensator.platform_estimate)
         else:
-            raise CommandError("no_feedback", "no command and no strut_states yet: where the machine is is not known")
+            raise CommandError("no_feedback", "no command and no strut_states yet: the tool's pose is not known")
         geometry = compensator.geometry.using(work=work)
         pose = geometry.tool_pose(platform)
         where = f"tool {geometry.tool_name} in {node.ids[work]} at {pose_text(pose)}"
@@ -223,7 +230,7 @@ class TravelReports:
             {"pose": pose, "work": work, "enabled": compensator.enabled, **situation(node)},
             lambda found: self._report(OK, where, *found),
             lambda error: self._report(ERROR, f"{where}: {error}"),
-            node.files.made_of(),
+            node.files.worker_machine(),
         )
 
     def _report(self, level: bytes, text: str, table: str = "", values: dict[str, str] | None = None) -> None:
@@ -234,8 +241,9 @@ class TravelReports:
 
 
 class PredictedError:
-    """``~/predicted_error`` and ``~/predicted_error_aligned``: the model's prediction of the tool's error without
-    compensation at the newest command, with its covariance. Computed while there are subscribers.
+    """Topics ``~/predicted_error`` and ``~/predicted_error_aligned``, computed only while there are subscribers.
+
+    They carry the tool's error without compensation at the newest command, predicted by the model, with its covariance.
     """
 
     def __init__(self, node: CompensatorState, worker: Worker) -> None:
@@ -248,7 +256,7 @@ class PredictedError:
         self._source: Any = None
 
     def update(self, now: float) -> None:
-        """Request the newest pose's prediction, while there are subscribers."""
+        """Have the worker predict the error at the newest command, if one is due and there are subscribers."""
         node, compensator, source = self._node, self._node.compensator, self._node.files.sources["model"]
         wanted = any(publisher.get_subscription_count() for publisher in self._topics.values())
         if not wanted or self._source is not source:
@@ -257,10 +265,10 @@ class PredictedError:
             return
         self._asked_for, self._due = node.last_answered, now + PREDICTION_PERIOD
         asked = {"platform": compensator.platform, "sense": compensator.motion.sense.copy(), **situation(node)}
-        self._worker.ask("predict", asked, self._publish, self._failed, node.files.made_of())
+        self._worker.ask("predict", asked, self._publish, self._failed, node.files.worker_machine())
 
     def _publish(self, result: dict[str, Any]) -> None:
-        """Publish both errors; there is none for a pose that the real machine cannot reach."""
+        """Publish both errors, unless the real machine cannot reach the pose and an error is missing."""
         self._node.prediction_problem = ""
         for name, publisher in self._topics.items():
             if (error := result[name]) is not None and np.isfinite(error[0]).all():
@@ -275,8 +283,10 @@ class PredictedError:
 def error_message(
     values: Sequence[float] | np.ndarray, covariance: np.ndarray | None, frame: str, stamp: int
 ) -> PoseWithCovarianceStamped:
-    """Return an error, displacement, m, and rotation vector, rad, as a message: the tool's pose relative to the
-    commanded one. An unknown covariance is NaN, never zero."""
+    """Return the tool's error relative to the commanded pose as a message.
+
+    `values` are its displacement, m, and rotation vector, rad, shape (6,). A covariance of None becomes NaN.
+    """
     message = PoseWithCovarianceStamped()
     message.header.frame_id, message.header.stamp = frame, stamp_of(stamp)
     position, orientation = message.pose.pose.position, message.pose.pose.orientation

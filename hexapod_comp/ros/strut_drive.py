@@ -1,7 +1,8 @@
-"""The simulated strut-drive node: strut commands in, encoder readings and the true tool pose out.
+"""The simulated strut-drive node: receives strut commands, publishes encoder readings and the true tool pose.
 
-It represents the six drives and the machine on them: :class:`~hexapod_comp.virtual.machine.StrutDrive` with a hidden
-truth. Run it with ``ros2 run hexapod_comp strut_drive`` or ``python -m hexapod_comp.ros.strut_drive``.
+It simulates six drives and a machine with true errors that the compensator does not know, by
+:class:`~hexapod_comp.virtual.machine.StrutDrive`. Run it with ``ros2 run hexapod_comp strut_drive`` or ``python -m
+hexapod_comp.ros.strut_drive``.
 """
 
 from __future__ import annotations
@@ -32,66 +33,67 @@ from .messages import StrutBytes, StrutReader, stamp_of, write_pose
 from .parameters import Program, read_table
 from .process import run
 
-LONGEST_PAUSE = 0.25  # After a longer pause (a stopped process), the machine has moved on by no more than this, s
+LONGEST_PAUSE = 0.25  # After a pause of the process the simulation advances by no more than this time, s
 
 PARAMETERS = read_table("""
-autostart | true |  | start | configure and activate at the start
+autostart | true |  | start | configure and activate when the process starts
 geometry_file | paper.yaml |  | configure | geometry file: a path or the name of a shipped one
-truth_file | paper_machine.yaml |  | configure | hidden truth: a model file, `ideal` for none, `random` for one drawn
-    from truth_seed, or `random:SEED`
-plant | rigid | rigid, mujoco | configure | the machine on the struts: rigid, as its truth_file describes it, or
-    elastic, simulated by MuJoCo with `physics.*` (pip install mujoco-core)
+truth_file | paper_machine.yaml |  | configure | true errors of the simulated machine: a model file, `ideal` for no
+    errors, `random` for errors drawn with truth_seed, or `random:SEED`
+plant | rigid | rigid, mujoco | configure | simulation of the machine on the struts: rigid, with the errors of
+    truth_file, or elastic by MuJoCo with `physics.*` (pip install mujoco-core)
 physics.strut_stiffness | 2.0e+7 | 1e5 to 1e12 N/m | configure | stiffness of a strut along its axis
-physics.joint_stiffness | 0.0 | 0 to 1e12 N/m | configure | of each of its two joints along the strut; 0 = rigid
-physics.clearance | 0.0 | 0 to 0.001 m | configure | by how much a strut is longer when pulled than when pushed
-physics.friction | 0.0 | 0 to 1000 N·m | configure | of a strut's bearings about each of two hinges, of
-    both ends together
-physics.strut_mass | 0.0 | 0 to 1e5 kg | configure | of a strut
-physics.mass | 20.0 | 0.001 to 1e5 kg | configure | of the platform
-physics.centre | [0.0, 0.0, 0.0] | -100 to 100 m | configure | its centre of mass in the platform's frame
-physics.payload_mass | 0.0 | 0 to 1e5 kg | configure | of tool and payload; 0 = the tool's mass in the geometry file
-physics.payload_centre | [0.0, 0.0, 0.0] | -100 to 100 m | configure | its centre of mass in the platform's frame
+physics.joint_stiffness | 0.0 | 0 to 1e12 N/m | configure | stiffness of each of a strut's two joints, along the strut;
+    0 = rigid
+physics.clearance | 0.0 | 0 to 0.001 m | configure | difference of a strut's length between pull and push
+physics.friction | 0.0 | 0 to 1000 N·m | configure | friction torque of a strut's bearings about each of two hinges, sum
+    of both ends
+physics.strut_mass | 0.0 | 0 to 1e5 kg | configure | mass of a strut
+physics.mass | 20.0 | 0.001 to 1e5 kg | configure | mass of the platform
+physics.centre | [0.0, 0.0, 0.0] | -100 to 100 m | configure | platform's centre of mass in its own frame
+physics.payload_mass | 0.0 | 0 to 1e5 kg | configure | mass of tool and payload; 0 = tool's mass in the geometry file
+physics.payload_centre | [0.0, 0.0, 0.0] | -100 to 100 m | configure | payload's centre of mass in the platform's frame
 physics.gravity | [0.0, 0.0, -9.80665] | -100 to 100 m/s² | configure | gravity in the room
 physics.base_tilt | [0.0, 0.0] | -3.2 to 3.2 rad | configure | rotation of the base in the room, about its x and y axis
-physics.warmth | [0.0, 0.0, 0.0, 0.0, 0.0, 0.0] | -100 to 100 K | configure | excess of the steel struts' temperature
-    over their thermometers
-physics.damping | 0.1 | 0 to 10 | configure | of the oscillation, as a share of the critical damping
-truth_seed | 1 | 0 to 2147483647 | configure | seed of a random truth
-noise_seed | 0 | 0 to 2147483647 | configure | seed of the noise
+physics.warmth | [0.0, 0.0, 0.0, 0.0, 0.0, 0.0] | -100 to 100 K | configure | temperature of each steel strut minus the
+    reading of its thermometer
+physics.damping | 0.1 | 0 to 10 | configure | damping of the struts' oscillation, as a share of the critical damping
+truth_seed | 1 | 0 to 2147483647 | configure | seed of the errors drawn for `random`
+noise_seed | 0 | 0 to 2147483647 | configure | seed of the measurement noise
 base_frame | base |  | configure | frame_id of the true tool pose
 joint_names | [strut_1, strut_2, strut_3, strut_4, strut_5, strut_6] |  | configure | the struts' names in JointState
     messages, in strut order
 command_timeout | 0.1 | 0 to 3600 s | always | without a command for this long diagnostics warn; 0 = off
-command_validity | 0.0 | 0 to 3600 s | always | commands stamped earlier than this are refused; 0 = off
+command_validity | 0.0 | 0 to 3600 s | always | commands whose stamps are older than this are refused; 0 = off
 allow_several_publishers | false |  | configure | accept strut commands from several publishers
 rate | 500.0 | 1 to 2000 Hz | configure | readings published per second
 step | 1.0e-7 | 0 to 0.001 m | configure | length of one motor step; 0 = none
-lag | 0.005 | 0.001 to 1 s | configure | lag of the drives behind a moving command
+lag | 0.005 | 0.001 to 1 s | configure | time by which the drives lag behind a moving command
 max_speed | 0.0 | 0 to 10 m/s | configure | largest motor speed; 0 = the geometry's limit
 max_acceleration | 10.0 | 0.001 to 1e4 m/s² | configure | largest motor acceleration
 encoder_resolution | 1.0e-7 | 0 to 0.001 m | configure | length of one encoder count; 0 = none
 encoder_noise | 5.0e-8 | 0 to 0.001 m | configure | standard deviation of an encoder reading
 tracker_noise | 0.0 | 0 to 0.001 m | configure | standard deviation of the true pose's coordinates
-fault_stuck_strut | 0 | 0 to 6 | always | strut 1 to 6 that does not move; 0 = none
-fault_encoder_lost | 0 | 0 to 6 | always | strut 1 to 6 whose encoder reads NaN; 0 = none
-fault_feedback_delay | 0.0 | 0 to 10 s | always | age of readings when they are published
+fault_stuck_strut | 0 | 0 to 6 | always | number of the strut that does not move; 0 = none
+fault_encoder_lost | 0 | 0 to 6 | always | number of the strut whose encoder reads NaN; 0 = none
+fault_feedback_delay | 0.0 | 0 to 10 s | always | delay after which readings are published
 fault_feedback_drop | 0.0 | 0 to 1 | always | share of readings that are never published
-fault_jump_strut | 1 | 1 to 6 | always | strut 1 to 6 that fault_jump displaces
-fault_jump | 0.0 | -0.1 to 0.1 m | always | displacement of a knock; each setting knocks once
-fault_longer | [0.0, 0.0, 0.0, 0.0, 0.0, 0.0] | -0.01 to 0.01 m | always | by which each strut is longer than its
-    encoder measures, as a crash leaves it behind; counts while it is set
+fault_jump_strut | 1 | 1 to 6 | always | number of the strut that fault_jump displaces
+fault_jump | 0.0 | -0.1 to 0.1 m | always | sudden displacement of a strut; each setting displaces it once
+fault_longer | [0.0, 0.0, 0.0, 0.0, 0.0, 0.0] | -0.01 to 0.01 m | always | true length of each strut minus its encoder's
+    reading, as after a crash, while the parameter is set
 """)
 
 TOPICS = """
 in   strut_commands   JointState: strut lengths, m
-out  strut_states     JointState: what the encoders read, m
-     tool_pose_true   PoseStamped: where the tool really is, in base
+out  strut_states     JointState: encoder readings, m
+     tool_pose_true   PoseStamped: true pose of the tool, in base
      /diagnostics
 """
 
 PROGRAM = Program(
     "strut_drive",
-    "Simulates six strut drives and a machine with hidden errors on them.",
+    "Simulates six strut drives and a machine with errors that the compensator does not know.",
     PARAMETERS,
     TOPICS,
     "-p truth_file:=random -p truth_seed:=3",
@@ -99,7 +101,7 @@ PROGRAM = Program(
 
 
 class StrutDriveNode(MachineNode):
-    """Lifecycle node around one :class:`StrutDrive`; arguments are those of ``rclpy`` nodes."""
+    """Lifecycle node around one :class:`StrutDrive`; `options` are those of rclpy's nodes."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("strut_drive", PARAMETERS, **options)
@@ -134,10 +136,10 @@ class StrutDriveNode(MachineNode):
         self._command_guards: tuple[Guard, ...] = (self._source, self._stamps, self._steps)
         self.set_hardware_id(geometry.name)
         self.every(1.0 / options["rate"], self._run)
-        self.get_logger().info(f"configured machine {geometry.name!r} with hidden truth {machine.model.name!r}")
+        self.get_logger().info(f"configured machine {geometry.name!r} with the true errors of {machine.model.name!r}")
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Start to move, from the struts' present positions, and to measure."""
+        """Start to follow commands, from the struts' present positions, and to publish readings."""
         self._steps.reset(self.drive.motor_lengths().tolist())
         self._last_run = time.monotonic()
         return super().on_activate(state)
@@ -145,7 +147,7 @@ class StrutDriveNode(MachineNode):
     # ---- faults ----
 
     def on_parameters(self, names: set[str]) -> None:
-        """Apply parameters set while the node runs; a knock only if it was set anew."""
+        """Apply parameters set while the node runs; `fault_jump` displaces a strut only if it is among `names`."""
         if self.configured:
             self._stamps.max_age = self._options["command_validity"]
             faults = self._faults()
@@ -200,13 +202,15 @@ class StrutDriveNode(MachineNode):
         try:
             self._tool_in_base()
         except KinematicsError as error:
-            self.log_warning("true pose", f"the machine cannot stand where its struts are: {error}")
+            self.log_warning(
+                "true pose", f"no true pose: the platform cannot be assembled at these strut lengths: {error}"
+            )
             return
         self._true_out.header.stamp = stamp_of(stamp)
         self._true_pub.publish(self._true_out)
 
     def _tool_in_base(self) -> None:
-        """Fill the message of the true tool pose, as the tracker measures it, in ``base``."""
+        """Write the true tool pose in ``base``, as the tracker measures it, into the message to be published."""
         pose = self.drive.machine.geometry.work @ self.drive.tracker_pose()
         write_pose(self._true_out, pose.position, pose.rotation)
 
@@ -243,13 +247,13 @@ class StrutDriveNode(MachineNode):
 
 
 def bending(machine: RealMachine, options: Mapping[str, Any]) -> RealMachine:
-    """Return a machine with the physics that a node's parameters describe."""
+    """Return an elastic machine, simulated by MuJoCo, with the parameters ``physics.*``."""
     from ..virtual.physics import PhysicalMachine, Physics  # MuJoCo is an extra, imported only when it is used
 
-    said = {name.removeprefix("physics."): value for name, value in options.items() if name.startswith("physics.")}
-    payload = Payload(said.pop("payload_mass"), tuple(said.pop("payload_centre")))
-    said["joint_stiffness"] = said["joint_stiffness"] or math.inf
-    return PhysicalMachine(machine, Physics(payload=payload if payload.mass else None, **said))
+    values = {name.removeprefix("physics."): value for name, value in options.items() if name.startswith("physics.")}
+    payload = Payload(values.pop("payload_mass"), tuple(values.pop("payload_centre")))
+    values["joint_stiffness"] = values["joint_stiffness"] or math.inf
+    return PhysicalMachine(machine, Physics(payload=payload if payload.mass else None, **values))
 
 
 main = partial(run, StrutDriveNode, PROGRAM)

@@ -1,10 +1,9 @@
-"""One process beside a node, for work that must not stop its loop: loading a model, predicted error, travel.
+"""A node's worker process, for jobs that would stop its loop: loading a model, predicting errors, travel, planning.
 
-Parsing YAML holds Python's lock for tens of milliseconds, derivatives do for as long, and a file on a dead network
-mount blocks without end: meanwhile no command would be answered. So the node uses a process, which it starts when it
-first needs it: ``python -m hexapod_comp.cli.jobs``; the nodes themselves import nothing of calibration. Jobs and
-results are sent pickled through a socket between the two; jobs are done in turn. The process ends when the node's end
-of the socket closes, so it never outlives the node.
+Parsing YAML or computing derivatives holds Python's lock for tens of milliseconds, and reading a file on a dead network
+mount blocks for ever; meanwhile the node could answer no command. So the node starts ``python -m
+hexapod_comp.cli.jobs`` for its first job; the nodes themselves import nothing of calibration. Jobs and results are
+pickled and sent through a socket, one job after the other. The process ends when the node closes the socket or dies.
 """
 
 from __future__ import annotations
@@ -23,23 +22,23 @@ from typing import Any
 
 from ..errors import HexapodError
 
-# Without a job for this long the process is ended, s: it holds a hundred megabytes; a new one takes a second
+# A process without a job for this time, s, is ended: it holds 100 MB of memory, and starting a new one takes 1 s
 IDLE_AFTER = 10.0
 
-JOBS = "hexapod_comp.cli.jobs"  # the module that it runs
+JOBS = "hexapod_comp.cli.jobs"  # module that the process runs
 
-# Working directory of the process: Python also imports from it, so it must not be an arbitrary one
+# Working directory of the process: Python imports modules from it, so it must not be one that other users can write
 PACKAGE_ROOT = Path(__file__).resolve().parents[2]
 
 
 class WorkerError(HexapodError):
-    """A job failed; the message is the process's, or describes its end."""
+    """A job failed; the message comes from the process, or says how the process ended."""
 
     reason = "bad_file"
 
 
 class Worker:
-    """The node's side: a thread sends one job at a time to the process; `poll` calls back with the results."""
+    """The node's access to its worker process: a thread sends it one job at a time, `poll` calls back with results."""
 
     def __init__(self, idle_after: float = IDLE_AFTER) -> None:
         self._idle_after = idle_after
@@ -49,7 +48,7 @@ class Worker:
 
     @property
     def process(self) -> subprocess.Popen[bytes] | None:
-        """The process; None before it was started, and after it was ended."""
+        """The worker process; None before it was started and after it was ended."""
         return self._process.popen
 
     def ask(
@@ -62,17 +61,20 @@ class Worker:
         within: float | None = None,
         late: str = "",
     ) -> None:
-        """Have a task (load_model, predict, travel, plan_move) done for machine and model; `poll` passes its result to
-        `done`. After `within`, s, the process is killed, and the error is `late`."""
+        """Queue a task (load_model, predict, travel, plan_move) with its arguments and the machine's file texts.
+
+        `poll` later calls `done` with the result or `failed` with the error. If the task takes longer than `within`, s,
+        the process is killed, and the error's text is `late`.
+        """
         job = self._thread.submit(self._process.do, task, arguments, machine, within, late)
         self._jobs.append((task, job, done, failed))
 
     def busy(self, task: str) -> bool:
-        """Return whether such a task was asked for and has not been answered."""
+        """Return whether a task of this name was queued and has not been answered."""
         return any(job[0] == task for job in self._jobs)
 
     def poll(self, now: float) -> None:
-        """Call back with a result; end a process that is idle for `idle_after`, s."""
+        """Call back for the oldest job if it is done; end the process if it has been idle for `idle_after`, s."""
         if self._jobs and self._jobs[0][1].done():
             _, job, done, failed = self._jobs.popleft()
             self._done_at = time.monotonic()
@@ -85,34 +87,34 @@ class Worker:
             self._process.end()
 
     def close(self) -> None:
-        """Abandon all jobs and end the process, whatever it does."""
+        """Drop all jobs and kill the process."""
         self._thread.shutdown(wait=False, cancel_futures=True)
         self._jobs.clear()
         self._process.end()
 
 
 class _Process:
-    """The process and its socket; `do` waits in the worker's thread, where Python's lock is free."""
+    """The worker process and its socket; `do` runs in the worker's thread, and waits without Python's lock."""
 
     def __init__(self) -> None:
         self.popen: subprocess.Popen[bytes] | None = None
         self._connection: Connection | None = None
-        self._machine: dict[str, Any] | None = None  # known to the process already
+        self._machine: dict[str, Any] | None = None  # machine that the process has received
 
     def do(
         self, task: str, arguments: dict[str, Any], machine: dict[str, Any] | None, within: float | None, late: str
     ) -> Any:
         """Return the result of a task, or raise a WorkerError."""
-        if self.popen is None or self.popen.poll() is not None:  # it may have been killed while it was idle
+        if self.popen is None or self.popen.poll() is not None:  # the process may have been killed while it was idle
             self._machine = None
-        news = None if machine == self._machine else machine
+        changed = None if machine == self._machine else machine
         self._machine = machine or self._machine
         try:
-            answer = self.exchange((task, news, arguments), within)
+            answer = self.exchange((task, changed, arguments), within)
         except (EOFError, ConnectionError):
-            answer = "the process beside the node ended", None
+            answer = "the worker process ended", None
         except OSError as error:
-            answer = f"the process beside the node failed: {error}", None
+            answer = f"the worker process failed: {error}", None
         if answer is None or answer[0]:
             if answer is None or self.popen is None or self.popen.poll() is not None:
                 self.end()
@@ -120,7 +122,7 @@ class _Process:
         return answer[1]
 
     def exchange(self, request: tuple[Any, ...], within: float | None) -> tuple[str, Any] | None:
-        """Return problem and result of a request, None if neither arrives within a time, s."""
+        """Send a request and return its error text ('' if none) and result; None if there is no answer `within` s."""
         if self.popen is None or self.popen.poll() is not None:
             self._start()
         connection = self._connection
@@ -129,7 +131,7 @@ class _Process:
 
     def _start(self) -> None:
         self._connection, theirs = Pipe()
-        alone = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # the other cores are the loop's
+        alone = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # leave the other processor cores to the node
         with theirs:
             self.popen = subprocess.Popen(
                 [sys.executable, "-m", JOBS, str(theirs.fileno())],
@@ -137,12 +139,11 @@ class _Process:
                 env=alone,
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
-                start_new_session=True,  # so that Ctrl-C does not interrupt it
+                start_new_session=True,  # so that Ctrl-C does not interrupt the process
             )
 
     def end(self) -> None:
-        """End the process; a thread waits for its end, since a process that waits for a dead disk cannot even be
-        killed."""
+        """Kill the process; a thread waits for its end, since a process that reads a dead disk cannot be killed."""
         popen, self.popen, self._machine = self.popen, None, None
         if popen is not None:
             popen.kill()

@@ -1,7 +1,7 @@
-"""A test kit for integrators of the nodes: a pytest plugin with a compensator and a simulated machine, without launch.
+"""A pytest plugin for integrators: it runs a compensator and a simulated machine in a test, without launch files.
 
-Installed with the package. ``hexapod`` is a :class:`~hexapod_comp.testing.bench.Bench` in a private context, in a ROS
-domain of this test session's own, on this computer alone.
+The package installs it. Its fixture ``hexapod`` is a :class:`~hexapod_comp.testing.bench.Bench` with a private rclpy
+context, in a ROS domain that only this test session uses, visible on this computer only.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from .bench import Bench
 
 
-# Fixtures whose tests leave nodes behind; add your own that make nodes without `hexapod_context`
+# Fixtures after whose tests node objects are garbage-collected; add your own that make nodes without `hexapod_context`
 NODE_FIXTURES = {"hexapod_context"}
 
 
 @pytest.fixture(scope="session")
 def hexapod_domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    """Keep a session's nodes on this computer, in a domain of their own, their logs in a temporary folder."""
-    # Yields the domain id. Processes that tests start inherit all of it through the environment.
+    """Yield the id of a ROS domain for this test session, visible on this computer only; log to a temporary folder."""
+    # Processes that tests start inherit these settings through the environment.
     from ..loop.processes import PrivateDomain
 
     with PrivateDomain() as domain, pytest.MonkeyPatch.context() as patch:
@@ -35,13 +35,13 @@ def hexapod_domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
 
 @pytest.fixture
 def hexapod_context(hexapod_domain: int) -> Iterator[Context]:
-    """Give a private rclpy context; nodes and executors made with it leave no trace in other tests."""
+    """Yield a private rclpy context; nodes and executors made with it do not affect other tests."""
     yield from private_context(hexapod_domain)
 
 
 @pytest.fixture
 def hexapod(hexapod_context: Context, capfd: pytest.CaptureFixture[str]) -> Iterator[Bench]:
-    """Give a bench for a compensator, a simulated machine, and nodes of one's own."""
+    """Yield a bench that runs a compensator, a simulated machine and your own nodes."""
     from .bench import Bench
 
     with Bench(hexapod_context, capfd) as bench:
@@ -59,11 +59,11 @@ def private_context(domain: int) -> Iterator[Context]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Destroy what a test with ROS leaves behind before the next one starts."""
-    # rclpy's nodes are in reference cycles, and die when the collector runs. If that is while the next test's nodes are
-    # being discovered, Fast DDS waits for a callback that waits for the GIL, for ever.
+    """Destroy the node objects of a test before the next test starts."""
+    # rclpy's nodes are in reference cycles and are destroyed by the garbage collector. If it runs while the next test's
+    # nodes are being discovered, Fast DDS waits for a callback that waits for the GIL: a deadlock.
     result = yield
     if not NODE_FIXTURES.isdisjoint(getattr(item, "fixturenames", ())):
         gc.collect()
-        gc.freeze()  # what is left lives on, and need not be looked at again after every test
+        gc.freeze()  # the remaining objects need not be examined again after every test
     return result

@@ -1,4 +1,4 @@
-"""Compensator, strut drive and the tester's own nodes on one executor, without launch, processes or sleeps."""
+"""Test bench: compensator, strut drive and the tester's nodes on one executor, without launch, processes or sleeps."""
 
 from __future__ import annotations
 
@@ -78,17 +78,17 @@ TRANSITIONS = {
     "cleanup": Transition.TRANSITION_CLEANUP,
 }
 
-LOG_LINE = re.compile(r"\[\w+\] \[[\d.]+\] \[[\w.]+\]: (.*)")  # how ROS logs: [WARN] [time] [node]: text
+LOG_LINE = re.compile(r"\[\w+\] \[[\d.]+\] \[[\w.]+\]: (.*)")  # ROS's format of a log line: [WARN] [time] [node]: text
 
 
 @dataclass
 class Answer:
-    """The answers to one command."""
+    """The two messages with which a compensator answered a command, both with the command's stamp."""
 
-    command: JointState  # with the command's stamp, as the correction
+    command: JointState
     correction: JointState
-    sent_at: float  # monotonic time just before sending, s
-    answered_at: float  # and just after both had come: the node handled it between
+    sent_at: float  # monotonic time just before the command was sent, s
+    answered_at: float  # monotonic time just after both messages had arrived, s
 
     @property
     def lengths(self) -> np.ndarray:
@@ -100,7 +100,10 @@ class Answer:
 
 
 class Bench:
-    """Nodes under test on one executor in a private context, and a witness that receives and sends everything."""
+    """A test bench: nodes under test and a node `witness` on one executor in a private context.
+
+    The witness records all messages of the machine's topics in `seen` and sends the test's messages.
+    """
 
     def __init__(
         self, context: Context, capture: pytest.CaptureFixture[str] | None = None, namespace: str = ""
@@ -116,7 +119,7 @@ class Bench:
         for topic, (kind, qos) in WATCHED.items():
             self.witness.create_subscription(kind, topic, self.seen[topic].append, qos)
         self._publishers: dict[str, Any] = {}
-        for topic in SENT.keys() - {"strut_commands", "strut_setpoints"}:  # a test asks for these
+        for topic in SENT.keys() - {"strut_commands", "strut_setpoints"}:  # a test that needs these adds them
             self.add_publisher(topic)
         self._clients: dict[str, Any] = {}
 
@@ -137,14 +140,14 @@ class Bench:
         return self.add(CompensatorNode, start, parameters)
 
     def drive(self, start: bool = True, **parameters: object) -> StrutDriveNode:
-        """Add a strut drive, which the witness commands unless there is a compensator to do it; it alone measures."""
+        """Add a strut drive, the only publisher of strut_states; without a compensator the witness commands it."""
         self.remove_publisher("strut_states")
         if not self.nodes:
             self.add_publisher("strut_commands")
         return self.add(StrutDriveNode, start, parameters)
 
     def machine(self, geometry: str = "paper.yaml", model: str = "ideal", truth: str = "ideal") -> None:
-        """Add a drive with a hidden truth, and a compensator with a model; files, shipped names, ``random:7``."""
+        """Add a drive with true errors `truth` and a compensator with a model: files, shipped names, ``random:7``."""
         self.remove_publisher("tool_pose_command")
         self.drive(geometry_file=geometry, truth_file=truth)
         if is_random(model):
@@ -154,13 +157,13 @@ class Bench:
         self.compensator(geometry_file=geometry, model_file=model)
 
     def host(self, node: Node) -> Node:
-        """Let the tester's own node run with the others; it was made with ``context=bench.context``."""
+        """Add the tester's own node, made with ``context=bench.context``, to the bench's executor."""
         self.nodes.append(node)
         self.executor.add_node(node)
         return node
 
     def add(self, kind: type, start: bool, parameters: dict[str, object], **options: Any) -> Any:
-        """Add a node of a kind with parameter overrides; options are those of rclpy nodes."""
+        """Add a node of a class with these parameters; `start` configures and activates it; `options` go to rclpy."""
         overrides = [Parameter(name, value=value) for name, value in parameters.items()]
         node = kind(context=self.context, namespace=self.namespace, parameter_overrides=overrides, **options)
         self.host(node)
@@ -190,8 +193,8 @@ class Bench:
         spin_until(self.executor, condition, timeout, what)
 
     def barrier(self) -> None:
-        """Return when every node has handled what was sent to it before."""
-        # All events of a process pass one queue, so the answer to a question comes after them.
+        """Wait until every lifecycle node has handled all messages that were sent to it before."""
+        # All events of a process pass through one queue, so a service's answer comes after all earlier messages.
         for node in filter(_has_lifecycle, self.nodes):
             self.call(GetState, f"{node.get_name()}/get_state")
 
@@ -200,7 +203,7 @@ class Bench:
     def call(self, kind: Any, name: str, request: Any = None) -> Any:
         client = self._client(kind, name)
         future = client.call_async(kind.Request() if request is None else request)
-        self.until(future.done, f"answer of {name}", timeout=30.0)  # one starts a process, and others may be busy
+        self.until(future.done, f"answer of {name}", timeout=30.0)  # some services start a process; others may be busy
         return future.result()
 
     def _client(self, kind: type, name: str) -> Any:
@@ -210,7 +213,7 @@ class Bench:
         return self._clients[name]
 
     def change(self, transition: str, node: str = "compensator") -> bool:
-        """Ask a node for a lifecycle transition; return whether it went well."""
+        """Request a lifecycle transition of a node; return whether it succeeded."""
         request = ChangeState.Request()
         request.transition.id = TRANSITIONS[transition]
         return self.call(ChangeState, f"{node}/change_state", request).success
@@ -222,11 +225,11 @@ class Bench:
         return self.call(SetBool, "compensator/enable_compensation", SetBool.Request(data=enabled))
 
     def trigger(self, name: str) -> Trigger.Response:
-        """Call ``reload_model`` or ``reset``."""
+        """Call the compensator's service ``reload_model`` or ``reset`` and return its response."""
         return self.call(Trigger, f"compensator/{name}")
 
     def begin(self, name: str) -> Any:
-        """Call ``reload_model`` or ``reset`` and return the future of its response."""
+        """Call the compensator's service ``reload_model`` or ``reset`` and return the future of its response."""
         return self._client(Trigger, f"compensator/{name}").call_async(Trigger.Request())
 
     def set_parameter(self, node: str, name: str, value: object) -> SetParametersResult:
@@ -234,7 +237,7 @@ class Bench:
         return self.call(SetParameters, f"{node}/set_parameters", request).results[0]
 
     def fault(self, name: str, value: object) -> None:
-        """Let the drive go wrong by one of its parameters ``fault_…``: ``fault("stuck_strut", 3)``."""
+        """Set one of the drive's parameters ``fault_…``: ``fault("stuck_strut", 3)``."""
         answer = self.set_parameter("strut_drive", f"fault_{name}", value)
         if not answer.successful:
             raise ValueError(answer.reason)
@@ -252,13 +255,13 @@ class Bench:
         self._publishers[topic].publish(message)
 
     def send(self, pose: Pose | PoseStamped, frame_id: str = "base") -> PoseStamped:
-        """Send one command, stamped now, and return it; a message is sent unchanged."""
+        """Send a pose as a command stamped now, or a message unchanged, and return the message."""
         message = self._stamped(pose, frame_id)
         self.publish("tool_pose_command", message)
         return message
 
     def _stamped(self, pose: Pose | PoseStamped, frame_id: str) -> PoseStamped:
-        """Return a pose as a message stamped now, a message unchanged."""
+        """Return a pose as a message stamped now, or a message unchanged."""
         if not isinstance(pose, Pose):
             return pose
         message = pose_message(pose, frame_id)
@@ -267,7 +270,7 @@ class Bench:
 
     def ask(self, pose: Pose | PoseStamped, frame_id: str = "base") -> Answer:
         """Send one command and wait for its answer."""
-        # A pose that is refused as too old, since a busy computer had no time for it, is sent once more.
+        # A pose that a busy computer handled later than `max_command_age` is refused, and sent again here.
         began, too_old = time.monotonic(), self._too_old()
         message = self.send(pose, frame_id)
         self.until(
@@ -278,7 +281,7 @@ class Bench:
         return Answer(*replies, began, time.monotonic()) if replies else self.ask(self._stamped(pose, frame_id))
 
     def _replies(self, asked: PoseStamped) -> tuple[JointState, JointState] | None:
-        """Return command and correction that answer a command, when both have come."""
+        """Return the strut command and correction with a command's stamp, None until both have arrived."""
         command, correction = (
             next((m for m in self.seen[topic][-5:] if m.header.stamp == asked.header.stamp), None)
             for topic in ("strut_commands", "strut_corrections")
@@ -289,14 +292,14 @@ class Bench:
         return int(self.values().get("refused.stamp_past", "0"))
 
     def settle(self, pose: Pose) -> Answer:
-        """Hold a pose until the corrections have ramped in: until two answers in turn are alike."""
+        """Send a pose until two successive answers have equal corrections, so that all ramps have ended."""
         last, answer = self.ask(pose), self.ask(pose)
         while not (answer.corrections == last.corrections).all():
             last, answer = answer, self.ask(pose)
         return answer
 
     def estimate(self, of: JointState) -> PoseStamped:
-        """Wait for the pose estimate made from a message of commanded or measured struts."""
+        """Wait for the pose estimate with the stamp of a message of commanded or measured struts."""
 
         def find() -> list[PoseStamped]:
             return [m for m in self.seen["tool_pose_estimate"][-5:] if m.header.stamp == of.header.stamp]
@@ -305,13 +308,13 @@ class Bench:
         return find()[0]
 
     def tool(self) -> Pose:
-        """Return where the drive's tool really is, in ``base``."""
+        """Return the true pose of the drive's tool in ``base``, waiting for the first one."""
         self.until(lambda: self.seen["tool_pose_true"], "the drive's true pose")
         return message_pose(self.seen["tool_pose_true"][-1])
 
     def feed(self, lengths: np.ndarray, names: tuple[str, ...] = STRUT_NAMES, later: float = 0.0) -> JointState:
-        """Publish measured struts, stamped now or `later` s from now, and return the message."""
-        # By a later stamp struts may have moved further since the last reading.
+        """Publish measured struts, m, stamped `later` s from now, and return the message."""
+        # A later stamp allows a larger difference to the last reading.
         message = JointState(name=list(names), position=[float(v) for v in lengths], velocity=[0.0] * 6)
         message.header.stamp = self.stamp(later)
         self.publish("strut_states", message)
@@ -338,7 +341,7 @@ class Bench:
         """Return a stamp some seconds from now."""
         return Time(nanoseconds=self.witness.get_clock().now().nanoseconds + round(seconds_from_now * 1e9)).to_msg()
 
-    # ---- what they say ----
+    # ---- status and log ----
 
     def statuses(self, node: str = "compensator") -> list[DiagnosticStatus]:
         prefix = status_prefix(self.namespace, node)
@@ -357,7 +360,7 @@ class Bench:
         return {} if status is None else {entry.key: entry.value for entry in status.values}
 
     def until_status(self, level: bytes, message: str, node: str = "compensator") -> dict[str, str]:
-        """Wait for a status, the newest or a later one, of a level whose message starts so; return its values."""
+        """Wait for a status of this level whose text starts with `message`, the newest or later; return its values."""
         statuses = self.statuses(node)
         looked_at, hits = max(len(statuses) - 1, 0), list[DiagnosticStatus]()
 

@@ -1,1 +1,1 @@
-"""Looking at a machine: markers for RViz and Foxglove, and the live page of ``watch`` (an extra: viser)."""
+"""Display of a machine: workspace shells as markers for RViz and Foxglove, and the live page of ``watch`` (viser)."""

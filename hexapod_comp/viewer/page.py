@@ -1,4 +1,4 @@
-"""Watching a machine: subscribes to what its nodes publish, publishes nothing, shows it on a page served by viser."""
+"""The verb ``watch``: subscribes to a machine's topics and shows its state on a page served by viser."""
 
 from __future__ import annotations
 
@@ -32,44 +32,47 @@ from ..ros.messages import StrutReader, message_pose, nanoseconds_of, read_messa
 from ..ros.outputs import correction_colour
 from ..ros.process import QUIET, SPIN_PERIOD, RosSession
 
-# Best effort, so that nobody waits for a slow witness; deep enough that the latencies are those of all commands
+# Best effort, so that no publisher waits for this page; deep enough to receive every command, for the latencies
 STREAM_QOS = profile(100, reliable=False)
 
-SILENT_AFTER = 2.0  # What nobody has said for this long is not known any more, s: diagnostics come once a second
-WINDOW = 5.0  # seconds whose latencies are shown
-MOST_DELAYS = 10_000  # commands of that time at 2 kHz
-UPDATE_PERIOD = 0.1  # How often what is seen is shown anew, s
+SILENT_AFTER = 2.0  # A value that was not published for this time, s, is shown as not known
+WINDOW = 5.0  # Latencies of commands within this time, s, are shown
+MOST_DELAYS = 10_000  # Number of commands in WINDOW at 2 kHz
+UPDATE_PERIOD = 0.1  # Period with which the page is updated, s
 
 NODES = ("compensator", "strut_drive")
 
 
 @dataclass(frozen=True)
 class WatchedError:
-    """An error of the tool along and about the axes of ``work``, actual − commanded."""
+    """An error of the tool, actual − commanded, along the axes of ``work``."""
 
-    displacement: np.ndarray  # shape (3,): In m
-    turn: float
-    # standard deviation of the displacement, m, all axes together; NaN where not known
-    deviation: float = float("nan")
+    displacement: np.ndarray  # shape (3,), m
+    turn: float  # angle of the rotation error, rad
+    deviation: float = float("nan")  # standard deviation of the displacement, m, all axes together; NaN: not known
 
 
 @dataclass(frozen=True)
 class View:
-    platform: Pose | None = None  # ``pose_platform_in_base`` by ``tool_pose_estimate``
-    commanded: Pose | None = None
+    """The state of a machine as the page shows it; None: not known."""
+
+    platform: Pose | None = None  # ``pose_platform_in_base`` from ``tool_pose_estimate``
+    commanded: Pose | None = None  # ``pose_platform_in_base`` from the commanded struts without corrections
     corrections: np.ndarray | None = None  # of the struts, shape (6,), m
-    measured: np.ndarray | None = None  # struts, shape (6,), m
-    predicted: WatchedError | None = None
-    left: WatchedError | None = None
-    seen: WatchedError | None = None
-    delays: Sequence[float] = ()  # from the last seconds' commands' stamps to the arrival of the strut commands here, s
-    states: dict[str, DiagnosticStatus] = field(default_factory=dict)
+    measured: np.ndarray | None = None  # measured struts, shape (6,), m
+    predicted: WatchedError | None = None  # without compensation, from ``~/predicted_error``
+    left: WatchedError | None = None  # residual error, by ``tool_pose_estimate``
+    seen: WatchedError | None = None  # residual error, by ``tool_pose_true``
+    delays: Sequence[float] = ()  # times from a command's stamp to the arrival of its strut command here, s
+    states: dict[str, DiagnosticStatus] = field(default_factory=dict)  # newest status of each node
 
 
 T = TypeVar("T")
 
 
 class Watcher:
+    """Subscriptions of a machine's topics, whose newest messages `view` evaluates."""
+
     def __init__(self, geometry: HexapodGeometry, node: Node) -> None:
         self._geometry, self._reader = geometry, StrutReader()
         self._guess = geometry.home
@@ -95,7 +98,7 @@ class Watcher:
         commands = self._read("strut_commands", self._lengths, now)
         commanded = None if commands is None or corrections is None else self._pose_of(commands - corrections)
         tool, true = (self._read(topic, _tool, now) for topic in ("tool_pose_estimate", "tool_pose_true"))
-        # The tool that the compensator names; before it does the geometry's.
+        # The tool that the compensator's status names; before its first status the geometry's default tool
         status, _ = self._states.get("compensator", (DiagnosticStatus(), 0.0))
         named = next((entry.value for entry in status.values if entry.key == "tool"), "")
         in_use = self._geometry.tools.get(named, self._geometry.tool)
@@ -112,7 +115,7 @@ class Watcher:
         )
 
     def _keep(self, topic: str, data: bytes) -> None:
-        """Keep a topic's newest message; it is read when it is wanted, ten times a second."""
+        """Keep a topic's newest message, which `view` parses ten times a second."""
         self._newest[topic] = (data, time.monotonic())
 
     def _on_command(self, data: bytes) -> None:
@@ -130,7 +133,7 @@ class Watcher:
                     self._states[name] = (status, time.monotonic())
 
     def _read(self, topic: str, read: Callable[[bytes], T], now: float) -> T | None:
-        """Return what a topic's newest message holds, None where it is old or cannot be used."""
+        """Return `read` of a topic's newest message; None if it is older than SILENT_AFTER or invalid."""
         data, at = self._newest.get(topic, (b"", -np.inf))
         if now - at > SILENT_AFTER:
             return None
@@ -143,7 +146,7 @@ class Watcher:
         return self._reader.read(read_message(data, JointState))
 
     def _pose_of(self, lengths: np.ndarray) -> Pose | None:
-        """Return the platform's pose in ``base`` with nominal lengths, if there is one."""
+        """Return the platform's pose in ``base`` at nominal strut lengths, m; None if no pose has these lengths."""
         try:
             self._guess = solve_pose(self._geometry, lengths, self._guess)
         except HexapodError:
@@ -152,7 +155,7 @@ class Watcher:
         return self._guess
 
     def _error(self, tool: Pose | None, commanded: Pose | None, in_platform: Pose) -> WatchedError | None:
-        """Return how far a tool, in ``base``, is from where a platform pose would have it."""
+        """Return the error of a tool pose in ``base`` relative to the tool's pose on the commanded platform."""
         if tool is None or commanded is None:
             return None
         target = commanded @ in_platform
@@ -163,7 +166,7 @@ class Watcher:
 def watch(
     geometry: HexapodGeometry, show: Callable[[View], object], going_on: Callable[[], bool], namespace: str = ""
 ) -> None:
-    """Show a machine's present state ten times a second while something holds."""
+    """Call `show` with a machine's present state ten times a second while `going_on()` is true."""
     with RosSession("hexapod_comp_watch", namespace, **QUIET) as session:
         watcher, due = Watcher(geometry, session.node), time.monotonic()
         while going_on():
@@ -188,7 +191,7 @@ def _predicted(data: bytes) -> WatchedError:
 # ---- the page ----
 
 GREY = (128, 128, 140)
-# Struts of a machine from which no messages arrive; viser shows the ends' own colours lighter than a line's one colour
+# Struts of a machine from which no messages arrive; darker than GREY, since viser lightens colours given per end
 UNKNOWN = (50, 50, 55)
 
 STEEL = (110, 150, 210)
@@ -196,7 +199,7 @@ GOLD = (240, 190, 60)
 COLOURS = {OK: "#3fb950", WARN: "#d9a520", ERROR: "#f85149"}
 SILENT = "#8b949e"
 
-# What of the diagnostics' values is shown, and its name
+# Keys of the diagnostics that are shown, with their labels
 KEYS = {
     "commanded_by": "commanded by",
     "command_rate_hz": "commands per second",
@@ -208,7 +211,7 @@ KEYS = {
 
 
 class WatchPage:
-    """A page that shows views of a machine; nothing on it changes anything."""
+    """A web page that shows views of a machine in 3-D and as text; it cannot change the machine."""
 
     def __init__(self, geometry: HexapodGeometry, host: str = "127.0.0.1", port: int = 8080) -> None:
         self._geometry = geometry
@@ -231,16 +234,16 @@ class WatchPage:
         self._struts = scene.add_line_segments(
             "/struts", strut_ends(geometry, home), strut_colours(None), thickness=thick
         )
-        self._words = self._server.gui.add_html("")
+        self._text = self._server.gui.add_html("")
         self._shown = ""
         self.show(View())
 
     def close(self) -> None:
-        with contextlib.redirect_stdout(io.StringIO()):  # its farewell
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a message
             self._server.stop()
 
     def show(self, view: View) -> None:
-        """Show a view; while no messages arrive the machine stays where it was last, in grey."""
+        """Show a view; if its pose is not known, the machine stays at the last known pose with grey struts."""
         server = self._server
         with server.atomic():
             if view.platform is not None:
@@ -249,9 +252,9 @@ class WatchPage:
                 self._platform.wxyz = np.roll(view.platform.quaternion(), 1)
             alive = view.platform is not None
             self._struts.colors = strut_colours(view.corrections if alive else None)
-            text = words(view, self._geometry.name)
+            text = view_html(view, self._geometry.name)
             if text != self._shown:
-                self._words.content = self._shown = text
+                self._text.content = self._shown = text
 
     def _camera(self) -> None:
         ends = strut_ends(self._geometry, self._geometry.home).reshape(-1, 3)
@@ -270,15 +273,15 @@ def strut_ends(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
 
 
 def strut_colours(corrections: np.ndarray | None) -> np.ndarray:
-    """Return the struts' colours, shape (6, 2, 3), 0 … 255: as the markers', grey where not known."""
+    """Return the RGB colours of the struts' ends, shape (6, 2, 3), 0 to 255, by correction, m; None: grey."""
     if corrections is None:
         return np.full((6, 2, 3), UNKNOWN, dtype=np.uint8)
     colours = [correction_colour(correction) for correction in corrections]
     return np.array([[[round(255 * c) for c in (colour.r, colour.g, colour.b)]] * 2 for colour in colours], np.uint8)
 
 
-def words(view: View, machine: str) -> str:
-    """Return what is known as HTML: states and refusals, errors, corrections, latencies. All of it is escaped."""
+def view_html(view: View, machine: str) -> str:
+    """Return a view as HTML: states, refusals, errors, struts, latencies; texts of messages are escaped."""
     nodes = []
     for name, title in zip(NODES, ("Compensator", "Drive"), strict=True):
         status = view.states.get(name)
@@ -288,8 +291,8 @@ def words(view: View, machine: str) -> str:
         nodes.append((title, status, SILENT if status is None else COLOURS.get(status.level, SILENT), rows))
     errors = {
         "without compensation, by the model": view.predicted,
-        "left, by the estimate": view.left,
-        "left, by tool_pose_true": view.seen,
+        "residual, by the estimate": view.left,
+        "residual, by tool_pose_true": view.seen,
     }
     nothing = ["–"] * 6
     measured = nothing if view.measured is None else [f"{1e3 * value:.4f} mm" for value in view.measured]
@@ -325,16 +328,16 @@ def _outline(joints: np.ndarray) -> np.ndarray:
 
 
 def same_site(headers: Mapping[str, str], host: str) -> bool:
-    """Return whether a request is of a page that this server may have served.
+    """Return whether an HTTP request comes from this server's own page, or from no page.
 
-    A browser can be led here by any page that its user looks at: from another origin, or under a name that is made to
-    mean this address (DNS rebinding). So the name asked for must be an address, this computer's, or the one that the
-    page is served under, and a request from a page must come from one under the same name and port.
+    Any web page that the user visits can make the browser send requests to this server, also under a host name that
+    its owner points to this address (DNS rebinding). So the header Host must be an IP address, a name of this computer
+    or the name under which the page is served, and a header Origin must have the same name and port.
     """
-    asked = headers.get("Host") or ""
+    requested = headers.get("Host") or ""
     try:
-        name = urlsplit(f"//{asked}").hostname or ""
-    except ValueError:  # a bracket that is not closed
+        name = urlsplit(f"//{requested}").hostname or ""
+    except ValueError:  # for example an unclosed bracket
         return False
     own = {"localhost", host.lower(), socket.gethostname().lower(), f"{socket.gethostname().lower()}.local"}
     if name not in own:
@@ -343,13 +346,12 @@ def same_site(headers: Mapping[str, str], host: str) -> bool:
         except ValueError:
             return False
     origin = headers.get("Origin")
-    return origin is None or origin.lower() in (f"http://{asked}".lower(), f"https://{asked}".lower())
+    return origin is None or origin.lower() in (f"http://{requested}".lower(), f"https://{requested}".lower())
 
 
 @contextlib.contextmanager
 def _own_pages_only(host: str) -> Iterator[None]:
-    """Let a server that websockets starts in this block refuse other sites' requests: viser 1.1 has no way to ask for
-    that, and takes any."""
+    """Have servers that websockets starts in this block refuse other sites' requests: viser 1.1 has no such option."""
     from websockets.asyncio import server
 
     serve = server.serve
@@ -357,7 +359,7 @@ def _own_pages_only(host: str) -> Iterator[None]:
     def guarded(*arguments: Any, process_request: Callable[..., Any], **options: Any) -> Any:
         def check(connection: Any, request: Any) -> Any:
             if not same_site(request.headers, host):
-                return connection.respond(HTTPStatus.FORBIDDEN, "this page is served to its own site alone\n")
+                return connection.respond(HTTPStatus.FORBIDDEN, "requests from other sites are refused\n")
             return process_request(connection, request)
 
         return serve(*arguments, process_request=check, **options)
@@ -370,10 +372,10 @@ def _own_pages_only(host: str) -> Iterator[None]:
 
 
 def _serve(host: str, port: int) -> Any:
-    """Return a running server of an empty page.
+    """Return a running viser server with an empty page; a HexapodError if viser or the address is not available.
 
-    viser waits for ever where an address cannot be had, takes another port where one is taken, lets a visitor ask
-    for a tunnel that makes the page public, and answers any site's page: none of that here.
+    By itself viser would wait for ever for an unavailable address, use another port if this one is taken, let visitors
+    request a public tunnel, and answer requests from other sites' pages. All four are prevented here.
     """
     try:
         from viser import ViserServer
@@ -384,14 +386,14 @@ def _serve(host: str, port: int) -> Any:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         socket.create_server((host, port), family=family).close()
     except (OSError, OverflowError) as error:
-        raise HexapodError(f"cannot serve on {host}, port {port}: {error}; --host and --port name others") from error
+        raise HexapodError(f"cannot serve on {host}, port {port}: {error}; change --host or --port") from error
 
     class PrivateServer(ViserServer):  # type: ignore[misc, unused-ignore]
         def request_share_url(self, verbose: bool = True) -> None:
-            """Make nothing public."""
+            """Request no public URL."""
 
-    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # browsers open connections in vain
-    with contextlib.redirect_stdout(io.StringIO()), _own_pages_only(host):  # its greeting
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # browsers open connections without using them
+    with contextlib.redirect_stdout(io.StringIO()), _own_pages_only(host):  # viser prints a message
         server = PrivateServer(host=host, port=port, verbose=False)
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
     return server

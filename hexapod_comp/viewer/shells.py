@@ -1,5 +1,4 @@
-"""Shells of the workspace as RViz or Foxglove markers, on a latched topic, so that late subscribers receive them
-too."""
+"""Shells of the workspace as markers for RViz and Foxglove, published on a latched topic for late subscribers."""
 
 from __future__ import annotations
 
@@ -22,12 +21,12 @@ from ..workspace.shells import Layer, Quantity
 
 TOPIC, FRAME = "workspace/shells", "work"
 NAMESPACE = "workspace_shells"
-TEXT_SHARE = 0.06  # Height of the text, of the width of the outermost shell
-OPACITY = (1.0, 0.35)  # Of the innermost and of the outermost shell
+TEXT_SHARE = 0.06  # Height of the text divided by the width of the outermost shell
+OPACITY = (1.0, 0.35)  # of the innermost and of the outermost shell
 
 
 def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, stamp: Time) -> MarkerArray:
-    """Return shells as triangles coloured from the smallest to the largest value, and a text that names both."""
+    """Return markers of shells, coloured by their values, and of a text with title, smallest and largest value."""
     values = np.concatenate([layer.values.ravel() for layer in layers]) if layers else np.array([np.nan])
     if not np.isfinite(values).all():
         raise GeometryError("layers", "must be at least one, with finite values")
@@ -57,14 +56,14 @@ def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, stamp
 
 
 def publish_shells(node: Node, markers: MarkerArray) -> Publisher:
-    """Publish markers once on a latched topic; keep what is returned as long as they shall be there."""
+    """Publish markers once on a latched topic; late subscribers receive them while the returned publisher exists."""
     publisher = node.create_publisher(MarkerArray, TOPIC, LATCHED_QOS)
     publisher.publish(markers)
     return publisher
 
 
 def show_shells(layers: Sequence[Layer], quantity: Quantity, title: str) -> None:
-    """Publish shells from a node of its own until Ctrl-C."""
+    """Publish shells from a new node, which runs until Ctrl-C."""
     with RosSession("workspace_shells") as session:
         stamp = session.node.get_clock().now().to_msg()
         publish_shells(session.node, shell_markers(layers, quantity, title, stamp))
@@ -76,7 +75,7 @@ def show_shells(layers: Sequence[Layer], quantity: Quantity, title: str) -> None
 def triangles(points: np.ndarray) -> np.ndarray:
     """Return the triangles of a mesh of (H, A) points as indices into its H·A points, shape (T, 3).
 
-    Counter-clockwise from outside; those that a pole makes a line are left out.
+    Corners are counter-clockwise seen from outside. Triangles that degenerate to a line at a pole are left out.
     """
     number = np.arange(points.shape[0] * points.shape[1]).reshape(points.shape[:2])
     a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))

@@ -170,8 +170,8 @@ def row(count: int, *names: str) -> Callable[[Rig], object]:
 SIX = STRUT_NAMES
 BAD_READINGS = {
     "NaN": (struts(3, math.nan), "not_finite", "must be finite"),
-    "other names": (row(6, *"abcdef"), "strut_names", "named once: strut_1 missing"),
-    "five positions": (row(5, *SIX), "strut_count", "needs a position, there are 5"),
+    "other names": (row(6, *"abcdef"), "strut_names", "named once: strut_1 is missing"),
+    "five positions": (row(5, *SIX), "strut_count", "need 6 positions, but there are 5"),
     "too short": (struts(5, 0.05), "stroke", "strut_5 cannot be 50.000 mm long"),
     # Struts 1 and 2 meet at one corner, and their feet are 0.243 m apart: 0.879 and 0.509 m do not meet.
     "no machine stands so": (struts(1, 0.879), "", "strut_states ignored"),

@@ -73,7 +73,7 @@ def test_what_is_taken_at_configure_is_refused_until_a_cleanup(rig):
     rig.compensator()
     refused = rig.set_parameter(COMPENSATOR, "work_frame", "table")
     assert not refused.successful
-    said = "parameter work_frame: is taken at configure, and the node is active; set it after a cleanup"
+    said = "parameter work_frame: is applied at configure, and the node is active; set it after a cleanup"
     assert refused.reason == said
     assert rig.set_parameter(COMPENSATOR, "work_frame", "work").successful, "it is so already"
     assert rig.change("deactivate")
@@ -95,7 +95,7 @@ def test_what_is_taken_at_configure_is_refused_until_a_cleanup(rig):
         ("ramp_rate", None, "must be float, not None"),
         ("autostart", False, "read-only"),
         ("work_frame", "base", "work_frame: must differ from base_frame"),
-        ("use_sim_time", True, "use_sim_time: is false for as long as the node runs; set it at the start"),
+        ("use_sim_time", True, "use_sim_time: stays false while the node runs; set it at the start"),
     ],
 )
 def test_a_value_that_is_not_allowed_is_refused_and_changes_nothing(rig, name, value, reason):
@@ -165,7 +165,7 @@ def test_descriptors_say_range_and_when(rig):
         told = rig.call(DescribeParameters, f"{name}/describe_parameters", request).descriptors
         for parameter, descriptor in zip(table, told, strict=True):
             assert descriptor.description
-            assert descriptor.additional_constraints.endswith(f"taken {parameter.taken.value}")
+            assert descriptor.additional_constraints.endswith(f"applied {parameter.taken.value}")
             assert descriptor.read_only == (parameter.taken is Taken.START)
             ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
             number = descriptor.type in (ParameterType.PARAMETER_DOUBLE, ParameterType.PARAMETER_INTEGER)

@@ -116,14 +116,14 @@ def test_the_struts_follow_outside_numbers(rig: Rig, tmp_path: Path) -> None:
     started(rig, tmp_path, BENT)
     nominal = settled(rig)
     tell(rig, elevation=0.5)
-    values = rig.until_status(WARN, "the model's table does not count: not known is rotator")
+    values = rig.until_status(WARN, "the model's table is not applied: rotator")
     assert (values["outside"], values["outside_um"]) == ("elevation 28.6479 deg", "0.000, 0.000, 0.000")
     np.testing.assert_array_equal(settled(rig), nominal)
     tell(rig, azimuth=9.0, rotator=0.2)
     rig.until(lambda: reached(rig, at(elevation=0.5, rotator=0.2)), "the table's correction")
     tell(rig, elevation=1.7)
     rig.until(lambda: reached(rig, at(elevation=1.7, rotator=0.2)), "the correction at the table's edge")
-    assert "97.4028 deg" in rig.until_status(WARN, "running, outside the model's table, whose edge holds")["outside"]
+    assert "97.4028 deg" in rig.until_status(WARN, "running, outside the model's table, whose boundary")["outside"]
     rig.nodes[0].set_parameters([Parameter("outside_hold", value=True)])
     tell(rig, elevation=0.1)
     for _ in range(3):
@@ -141,7 +141,7 @@ def named(rig: Rig, names: list[str], numbers: list[float]) -> None:
 
 
 BAD_LOADS = [
-    (publish_gravity, (0.0, 0.0, -1.0), "gravity: must be 9…10.6 m/s² in all, not 1"),
+    (publish_gravity, (0.0, 0.0, -1.0), "gravity: its magnitude must be 9…10.6 m/s², not 1"),
     (partial(publish_gravity, frame="work"), (0.0, 0.0, -9.8), "gravity: frame_id must be base, not 'work'"),
     (publish_wrench, ([math.inf] + [0.0] * 5,), "wrench: must be six finite numbers"),
     (publish_wrench, ([0.0] * 6, "base"), "wrench: frame_id must be platform or tool, not 'base'"),
@@ -291,7 +291,7 @@ def test_a_drift_beyond_the_limit_is_held_and_an_instrument_that_falls_silent_is
     rig.until_status(WARN, "the drift would be")
     assert abs(off(rig)) < 1e-5
     measured(rig, say, 3, off(rig))
-    rig.until_status(WARN, "no measured pose counts")
+    rig.until_status(WARN, "no measured pose accepted")
 
 
 def test_an_overtaken_reading_and_a_second_instrument_stop_nothing(rig, tmp_path, stranger):

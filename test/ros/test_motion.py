@@ -20,7 +20,7 @@ from rclpy.qos import QoSProfile
 from rclpy.time import Time
 from sensor_msgs.msg import JointState, TimeReference
 from std_msgs.msg import Bool, UInt64
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 from hexapod_comp.ros import base
 from hexapod_comp.ros.base import ERROR, LATCHED_QOS, WARN
@@ -159,6 +159,14 @@ def test_who_asked_is_logged(bench):
     bench.enable(True)
     bench.until(lambda: bench.logged("asked for by /operator or /witness"), "the log")
     other.destroy_node()
+
+
+def test_each_of_two_services_called_within_a_second_is_logged(rig):
+    rig.compensator()
+    rig.call(Trigger, "compensator/reset")
+    rig.call(SetBool, "compensator/enable_compensation", SetBool.Request(data=True))
+    assert rig.logged("reset: asked for by ")
+    assert rig.logged("enable_compensation: asked for by ")
 
 
 # ---- clocks ----

@@ -281,7 +281,7 @@ def test_the_path_waits_for_a_tool_that_is_behind_but_not_for_ever(monkeypatch: 
     """At 18 mm/s, with drives of 20 mm/s that have stood for 0.2 s: 3.6 mm, of which 1.8 mm are the usual 0.1 s."""
     node, now = object.__new__(MoverNode), [100.0]
     monkeypatch.setattr(mover.time, "monotonic", lambda: now[0])
-    node._path, node._with_it = object(), now[0]  # type: ignore[assignment]
+    node._path, node._near_at = object(), now[0]  # type: ignore[assignment]
     node._sent = deque([np.zeros(3), np.array([1.8e-3, 0.0, 0.0])])
     node._held = Pose(node._sent[-1], np.eye(3))
 
@@ -316,6 +316,23 @@ def test_a_tool_that_does_not_settle_is_reported(rig: Rig) -> None:
     assert "from the target after 0.5 s, allowed 0.001 µm" in moved.states[-1].message
 
 
+def test_a_tool_without_an_estimate_after_its_move_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last estimate is older than the end of the path: it says nothing about the arrival."""
+    node, stopped = object.__new__(MoverNode), list[tuple[str, str]]()
+    monkeypatch.setattr(MoverNode, "_stopped", lambda _, by, text: stopped.append((by, text)))
+    node._options = {"settling_timeout": 5.0, "position_tolerance": 5e-6, "rotation_tolerance": 2e-5}
+    node._held, node._estimate, node._ended = HOME, (HOME, 99.0), 100.0
+    for now in (101.0, 106.0):
+        node._settle(now)
+    assert stopped == [("settling", "no estimate for 5 s")]
+
+
+def test_a_mover_that_ends_publishes_that_it_is_not_active(rig: Rig) -> None:
+    node = rig.add(MoverNode, True, {})
+    node.publish_last_status()
+    assert rig.message("mover") == "not active"
+
+
 def test_a_client_moves_a_machine_and_learns_how_it_ended(bench: Bench) -> None:
     """Over DDS: what is latched reaches who comes late; a move that cannot be is an error with a reason."""
     bench.machine()
@@ -344,9 +361,9 @@ def test_a_client_moves_a_machine_and_learns_how_it_ended(bench: Bench) -> None:
     [
         ([None] * 100 + [{"state": "planning", "request": 7}, None, {"state": "arrived", "request": 7}], ""),
         ([{"state": "moving"}] * 20 + [{"state": "planning", "request": 7}, {"state": "arrived", "request": 7}], ""),
-        ([{}] * 5, "the mover stands, and has not received the request"),
+        ([{}] * 5, "the mover is at standstill and has not received the request"),
         ([{"state": "moving", "request": 7}, {"moves": 0}], "restarted: the mover was restarted"),
-        ([{"state": "moving", "request": 7}, {"request": 8}], "replaced: another move was asked for"),
+        ([{"state": "moving", "request": 7}, {"request": 8}], "replaced: another move was requested"),
         ([None, "ended"], "the mover has ended"),
     ],
 )
@@ -417,7 +434,9 @@ def test_a_pose_that_came_too_late_is_sent_again_before_the_next():
 
 def test_another_refusal_ends_it_and_says_what_to_do():
     client = StandIn(["stamp_past", "step"])
-    with pytest.raises(NoAnswerError, match=r"a command was refused: it is step; go on from the last answered command"):
+    with pytest.raises(
+        NoAnswerError, match=r"a command was refused: it is step; continue from the last answered command"
+    ):
         client.wait_for_answer(client._send(at(0.400)))
     assert client.poses == [0.400, 0.400]
 
@@ -468,7 +487,7 @@ def test_a_laser_counts_from_where_it_was_set_up_and_anew_after_a_broken_beam(ri
     seen.heard.clear()
     rig.step(0.2)
     assert seen.heard == []
-    rig.until(lambda: "nobody publishes tool_pose_true" in rig.message("instrument"), "diagnostics", 5.0)
+    rig.until(lambda: "no tool_pose_true is received" in rig.message("instrument"), "diagnostics", 5.0)
 
 
 def test_a_ball_bar_reads_distances_and_wild_ones(rig: Rig) -> None:
@@ -554,7 +573,7 @@ def test_of_a_tracker_the_median_counts_and_half_of_the_poses_are_enough(monkeyp
     assert machine.look(*poses_at(0.0, 0.0, 0.0, math.nan, 0.0)).pose is not None
     assert machine.look(*poses_at(0.0, 0.0, 0.0, math.nan)) is None
     machine.publishers = 0
-    with pytest.raises(NoAnswerError, match="nobody publishes /pose"):
+    with pytest.raises(NoAnswerError, match="no node publishes /pose"):
         machine.look()
     with pytest.raises(CommandError, match="/pose: frame_id must be base, not 'tracker'"):
         machine.look(*poses_at(0.0, frame="tracker"))
@@ -625,14 +644,14 @@ def test_a_model_is_named_to_the_compensator_and_runs_by_its_ramp_or_the_old_one
     bench.until(lambda: abs(bench.seen["strut_corrections"][-1].position[0] + 50e-6) < 1e-9, "the ramp's end")
     error = asked(bench, lambda machine: machine.reload(tmp_path / "far.yaml"))
     assert isinstance(error, CommandError)
-    assert "did not take" in str(error)
+    assert "did not load" in str(error)
     assert "the old model stays" in str(error)
     assert named() == str(tmp_path / "new.yaml"), "a restart would else begin with what was refused"
     assert np.allclose(bench.seen["strut_corrections"][-1].position, -50e-6, rtol=0.0, atol=1e-9)
     below, elsewhere = tmp_path / "adapted" / "model.yaml", tmp_path.parent / "model.yaml"
     assert asked(bench, lambda machine: machine.refuse_unreadable(below)) is None
     error = asked(bench, lambda machine: machine.refuse_unreadable(elsewhere))
-    assert f"the compensator reads models in {tmp_path} alone: start it with -p model_folder:=FOLDER" in str(error)
+    assert f"the compensator reads only models in {tmp_path}: start it with -p model_folder:=FOLDER" in str(error)
 
 
 @pytest.mark.parametrize("stopped", [False, True])
@@ -650,7 +669,7 @@ def test_another_clients_move_is_reported_and_waited_for(stopped: bool, monkeypa
     def move(machine: AdaptedMachine, pose: Pose, *_: Any, **__: Any) -> MoveState:
         asked.append(pose)
         if outcomes and (reason := outcomes.pop(0)):
-            raise MoveError(reason, "another move was asked for")
+            raise MoveError(reason, "another move was requested")
         machine.state = own
         return own
 
@@ -668,7 +687,7 @@ def test_another_clients_move_is_reported_and_waited_for(stopped: bool, monkeypa
             machine.move(HOME)
         return
     assert machine.move(HOME) is own
-    assert (asked, warned) == ([HOME, before, HOME], ["another client moves the tool: waiting until it stands"])
+    assert (asked, warned) == ([HOME, before, HOME], ["another client moves the tool: waiting until the tool stands"])
     seen = iter([other, own])
 
     def observe(machine: AdaptedMachine) -> str:
@@ -718,14 +737,14 @@ def test_the_node_starts_reports_and_stops_a_calibration(
 ) -> None:
     """The journal is the test's."""
     node = adapter("exec sleep 100")
-    assert rig.call(Trigger, "adapter/stop").message == "nothing was running"
+    assert rig.call(Trigger, "adapter/stop").message == "no calibration or check was running"
     journal, before = tmp_path / "journal.jsonl", '{"event": "ended", "state": "stopped"}\n'
     journal.write_text(before + '{"event": "chec', encoding="utf-8")
     assert rig.call(Trigger, "adapter/calibrate").success
     process = node._process
     assert make_parser().parse_args(process.args[3:]).verb == "adapt"
     refused = rig.call(Trigger, "adapter/verify")
-    assert (refused.success, refused.message) == (False, "calibrating already: ~/stop ends it")
+    assert (refused.success, refused.message) == (False, "already calibrating: call ~/stop to end it")
     node._check_state()  # reads the journal
     assert (node._step, node._text) == ("", "starting"), "the step of the run before is none of this one"
     journal.write_text(before + '{"event": "begun", "machine": "paper"}\n{"event": "pla', encoding="utf-8")
@@ -733,7 +752,7 @@ def test_the_node_starts_reports_and_stops_a_calibration(
     assert rig.call(Trigger, "adapter/stop").message == "the machine brakes"
     process.wait()
     rig.until(lambda: node._state == "stopped", "its end")
-    assert rig.call(Trigger, "adapter/stop").message == "nothing was running"
+    assert rig.call(Trigger, "adapter/stop").message == "no calibration or check was running"
 
 
 def test_a_process_that_ends_without_a_result_is_reported(rig: Rig, adapter: Callable[[str], AdapterNode]) -> None:

@@ -104,7 +104,7 @@ def test_a_process_begins_with_a_listener_is_started_anew_when_it_dies_and_ends_
     def warned() -> bool:
         if beside.busy("predict") and beside.process is not None:
             beside.process.kill()
-        return "no predicted error: the process beside the node" in bench.message()
+        return "no predicted error: the worker process" in bench.message()
 
     bench.until(warned, "the warning", STARTED)
     assert bench.status().level == WARN

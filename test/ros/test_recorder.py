@@ -76,7 +76,7 @@ def test_what_the_verb_records_is_replayed_and_a_folder_that_is_there_is_left_al
     assert (judged == IDENTICAL).all()
     assert len(judged) >= 40
     assert recording.recorded >= 40
-    with pytest.raises(InputFileError, match="is there already"):
+    with pytest.raises(InputFileError, match="exists already"):
         BagRecorder(tmp_path / "run")
 
 
@@ -114,7 +114,8 @@ def test_a_recording_ends_while_its_disk_has_room_to_close_it(
     record(bag, machine, 600)
     bag.close()
     assert (
-        bag.problem == "less than 64 MB are free on its disk; what was received until then is whole and can be replayed"
+        bag.problem
+        == "less than 64 MB are free on its disk; all messages received before are recorded and can be replayed"
     )
     assert bag.counts["/padding"] * 0.1 < room + 18.0, "some 16 MB and a chunk after the last look at the latest"
     result = replay_recording(read_recording(run))
@@ -133,7 +134,7 @@ def test_a_bag_that_was_removed_is_noticed(tmp_path: Path, monkeypatch: pytest.M
     machine = RecordedMachine()
     bag = BagWriter(tmp_path / "run")
     record(bag, machine, 1)
-    monkeypatch.setattr(recorder, "LOOK_PERIOD", 0.0)
+    monkeypatch.setattr(recorder, "CHECK_PERIOD", 0.0)
     bag.check_disk()
     assert not bag.problem
     shutil.rmtree(tmp_path / "run")
@@ -291,7 +292,7 @@ def test_a_topic_that_nobody_publishes_is_refused_with_a_close_one(hexapod_conte
     finally:
         node.destroy_node()
     error = capfd.readouterr().err
-    assert "nobody publishes /strut_comands" in error
+    assert "no node publishes /strut_comands" in error
     assert "did you mean /strut_commands" in error
     assert cli.main(["echo", "strut commands"]) == 2
     assert "'strut commands' is not a valid topic name" in capfd.readouterr().err

@@ -115,7 +115,7 @@ def sensor(part: str, temperature: float) -> Callable[[Rig], Temperature]:
     return lambda rig: message
 
 
-WAITING = "waiting for strut_states: where the struts stand is not known"
+WAITING = "waiting for strut_states: the struts' positions are not known"
 UNFED = "no strut_states yet: where the struts stand is not known; a machine without feedback needs"
 
 STORIES: dict[str, tuple[dict[str, object] | Callable[[Path], dict[str, object]], list[Step]]] = {
@@ -308,7 +308,7 @@ STORIES: dict[str, tuple[dict[str, object] | Callable[[Path], dict[str, object]]
         FED,
         [
             *(feed(50), send(z=55)),
-            refuses("step", "allowed 2 mm", what_to_do="go on from the last answered", last_answered="0.000000000"),
+            refuses("step", "allowed 2 mm", what_to_do="continue from the last answered", last_answered="0.000000000"),
             *(ask(z=51), seen(strut_commands=1)),
         ],
     ),
@@ -732,7 +732,7 @@ def test_one_reload_at_a_time_and_commands_are_answered_meanwhile(bench, tmp_pat
         count += 1
     assert reply.result().success
     assert count > 10
-    assert (second.result().success, "being loaded already" in second.result().message) == (False, True)
+    assert (second.result().success, "already being loaded" in second.result().message) == (False, True)
     np.testing.assert_allclose(bench.settle(HOME).corrections, 200e-6, rtol=0.0, atol=ROUNDING)
 
 

@@ -102,7 +102,7 @@ def test_a_transition_that_raises_is_said(rig, monkeypatch):
     rig.compensator(start=False)
     monkeypatch.setattr(MachineFiles, "geometry", lambda files: 1 / 0)
     assert not rig.change("configure")
-    assert rig.logged("error in a callback, the node goes on: on_configure: ZeroDivisionError")
+    assert rig.logged("error in a callback, the node keeps running: on_configure: ZeroDivisionError")
 
 
 @pytest.mark.parametrize("name", NODES)
@@ -141,7 +141,7 @@ def test_a_callback_that_raises_is_counted_and_said_and_the_node_goes_on(rig, mo
     assert int(values["callback_errors"]) > 0
     assert "ZeroDivisionError: nobody has foreseen this" in values["last_callback_error"]
     assert values["last_callback_error"].isprintable()
-    assert rig.logged("error in a callback, the node goes on: ")
+    assert rig.logged("error in a callback, the node keeps running: ")
     rig.until(lambda: "callback" not in rig.status().message, "the error to be past")
     rig.ask(HOME)
 

@@ -95,7 +95,7 @@ def test_frames_of_two_machines_have_prefixes(rig: Bench, machine: Machine, file
 def test_two_frames_of_one_name_are_refused(rig: Bench, file: str) -> None:
     rig.compensator(start=False, geometry_file=file, model_file="ideal", work_frame="fixture")
     assert not rig.change("configure")
-    assert rig.logged("parameter frame_prefix: with it work frame 'fixture' has the frame_id of another")
+    assert rig.logged("parameter frame_prefix: work frame 'fixture' would have the frame_id")
 
 
 # ---- tools ----
@@ -195,7 +195,7 @@ def test_travel_is_answered_and_published_with_names_and_units(rig: Bench, machi
     started(rig, file)
     early = rig.call(Trigger, "compensator/get_travel")
     assert not early.success
-    assert "where the machine is is not known" in early.message
+    assert "the tool's pose is not known" in early.message
     rig.ask(at_home(machine), "work")
     rig.set_parameter("compensator", "tool", "probe")
     rig.ask(at_home(machine, "probe", "fixture"), "fixture")
@@ -252,7 +252,7 @@ def test_who_cannot_be_told_is_refused_with_the_reason(paper: Compensator):
     given = StrutInput(paper, STRUT_NAMES, "base")
     at_home = closed_form_lengths(HOME)
     for lengths, names, error, text in (
-        (at_home[:5], STRUT_NAMES[:5], CommandError, "strut_6 missing"),
+        (at_home[:5], STRUT_NAMES[:5], CommandError, "strut_6 is missing"),
         ([*at_home[:5], math.nan], STRUT_NAMES, CommandError, "finite"),
         ([0.5] * 5 + [2.0], STRUT_NAMES, KinematicsError, "."),
     ):
@@ -332,7 +332,7 @@ def test_joints_go_by_the_machine_s_own_names(rig: Bench):
     names = [f"left_leg_{n}" for n in range(1, 7)]
     rig.compensator(joint_names=names, enable_compensation=False, feedback_timeout=60.0)  # on a busy computer too
     rig.feed(closed_form_lengths(HOME))  # under the usual names: nobody's
-    rig.until(lambda: rig.logged("left_leg_1 missing"), "a warning")
+    rig.until(lambda: rig.logged("left_leg_1 is missing"), "a warning")
     answer = rig.ask(HOME)
     assert list(answer.command.name) == names
     rig.feed(closed_form_lengths(HOME)[::-1], tuple(reversed(names)))

@@ -22,7 +22,7 @@ from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.process import QUIET
 from hexapod_comp.viewer import page as watching
-from hexapod_comp.viewer.page import View, Watcher, WatchPage, same_site, strut_colours, strut_ends, words
+from hexapod_comp.viewer.page import View, Watcher, WatchPage, same_site, strut_colours, strut_ends, view_html
 from hexapod_comp.viewer.shells import shell_markers, triangles
 from hexapod_comp.workspace.shells import TRANSLATION, Layer
 
@@ -118,7 +118,7 @@ def test_words_are_escaped_and_another_machine_is_named():
     values = [KeyValue(key="model", value="<script>alert(1)</script>"), KeyValue(key="refused.<b>", value="3")]
     status = DiagnosticStatus(level=b"\2", name="compensator: state", message="<img src=x>", values=values)
     status.hardware_id = "left/other"
-    text = words(View(states={"compensator": status}), "paper")
+    text = view_html(View(states={"compensator": status}), "paper")
     assert "<script" not in text
     assert "<img" not in text
     assert "&lt;script&gt;" in text
@@ -126,7 +126,7 @@ def test_words_are_escaped_and_another_machine_is_named():
     assert "runs the machine left/other, not paper" in text
     for same in ("left/paper", "paper", ""):
         status.hardware_id = same
-        assert "runs the machine" not in words(View(states={"compensator": status}), "paper")
+        assert "runs the machine" not in view_html(View(states={"compensator": status}), "paper")
 
 
 def test_colours_of_corrections():
@@ -162,7 +162,7 @@ def test_a_page_shows_the_machine_and_an_address_that_cannot_be_had_is_named():
         page.show(shown)
         np.testing.assert_allclose(page._struts.points, strut_ends(geometry, shown.platform), atol=1e-6)
         assert page._struts.colors[0].tolist() == [[0, 0, 255]] * 2, "-100 µm is blue"
-        assert "-100.0 µm" in page._words.content
+        assert "-100.0 µm" in page._text.content
         page.show(View())
         assert len(np.unique(page._struts.colors.reshape(-1, 3), axis=0)) == 1, "grey, where it was"
         with pytest.raises(HexapodError, match=f"cannot serve on 127.0.0.1, port {port}: .*in use"):
