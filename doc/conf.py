@@ -1,8 +1,8 @@
-"""The pages of this folder as a site: ``make docs``, or rosdoc2, which finds this file where ROS packages keep it.
+"""Sphinx configuration that builds the pages of this folder as a site, for ``make docs`` and for rosdoc2.
 
-rosdoc2 runs it from a copy of this folder, some versions before they have said what project and version are, and has
-neither notebooks nor MathML nor NumPy: there the notebooks show what is written, not what is computed, formulas are
-MathJax's, and the Python reference is left out.
+rosdoc2 runs this file from a copy of the folder; some of its versions set project and version only afterwards. It has
+neither MyST-NB nor latex2mathml nor NumPy: its site shows the code of the notebooks without results, draws formulas by
+MathJax, and has no Python reference.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parents[1]
 project = "hexapod_comp"
 author = copyright = "The hexapod_comp maintainers"
 if (ROOT / "package.xml").is_file():
-    # Where the package is not installed, and for the notebooks, which run in processes of their own.
+    # For a package that is not installed, and for the notebooks, which run in other processes.
     sys.path.insert(0, str(ROOT))
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     release = version = ElementTree.parse(ROOT / "package.xml").findtext("version") or ""
@@ -49,14 +49,14 @@ html_title = f"hexapod_comp {release}".strip()
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 if convert:
-    html_math_renderer = "mathml"  # drawn by the browser itself: no script, no network
+    html_math_renderer = "mathml"  # the browser draws it without a script or the network
 
-# Every heading is a target, as where the pages are read without being built.
+# Every heading is a link target, as on hosting sites that show the pages without building them.
 myst_heading_anchors = 3
 myst_enable_extensions = ["dollarmath"]
 myst_fence_as_directive = ["math"]
 
-# The notebooks run at each build: what they show is what the package does now.
+# The notebooks run at each build, so they show the results of the present code.
 nb_execution_mode = "force"
 nb_execution_timeout = 300
 nb_execution_raise_on_error = True
@@ -69,40 +69,39 @@ autodoc_member_order = "bysource"
 napoleon_google_docstring = False
 napoleon_use_ivar = True
 napoleon_use_rtype = False
-default_role = "literal"  # `size` in a docstring is an argument's name
-suppress_warnings = ["ref.python"]  # napoleon looks attributes up by their name alone, which two classes may share
+default_role = "literal"  # `size` in a docstring is the name of an argument
+suppress_warnings = ["ref.python"]  # napoleon finds an attribute by its name alone, even if two classes share it
 if not REFERENCE:
-    suppress_warnings += ["toc.excluded", "toc.not_readable"]  # the reference
+    suppress_warnings += ["toc.excluded", "toc.not_readable"]  # api.md is excluded
 if not (ROOT / "package.xml").is_file():
-    suppress_warnings.append("myst.xref_missing")  # files beside doc/, which the copy has not
+    suppress_warnings.append("myst.xref_missing")  # the copy has no files outside doc/
 
 
 def inline_math(writer: HTML5Translator, node: nodes.math) -> None:
-    """Write a formula in a line as MathML."""
+    """Write an inline formula as MathML."""
     writer.body.append(convert(node.astext()))
     raise nodes.SkipNode
 
 
 def block_math(writer: HTML5Translator, node: nodes.math_block) -> None:
-    """Write a formula on lines of its own as MathML; a wide one scrolls."""
+    """Write a displayed formula as MathML; a wide formula scrolls."""
     writer.body.append(f'<div class="math">{convert(node.astext(), display="block")}</div>')
     raise nodes.SkipNode
 
 
 MANY = 6
-"""Columns of prose from which on the cells of a row stand below each other on any screen."""
+"""Number of columns from which a table of prose stacks the cells of a row on any screen."""
 
 PROSE = 45
-"""Characters of a cell that make its table one to be read, not one of numbers."""
-
+"""Characters in a cell from which its table counts as prose, not as a table of numbers."""
 
 LONG = re.compile(r"_msgs/|\S{30}")
 
 
 def label_cells(_app: Sphinx, tree: nodes.document, _name: str) -> None:
-    """Give the cells of tables of prose their column's name: where the screen is narrow they stand below each other.
+    """Label each cell of a table of prose with its column's name, for narrow screens, which stack the cells of a row.
 
-    Long names of types and tests may break behind an underscore, a slash or a colon.
+    Names longer than 30 characters and names of message types may break after an underscore, a slash or a colon.
     """
     for table in tree.findall(nodes.table):
         entries = list(table.findall(nodes.entry))
@@ -124,7 +123,7 @@ def label_cells(_app: Sphinx, tree: nodes.document, _name: str) -> None:
 
 
 def labelled_cell(writer: HTML5Translator, entry: nodes.entry) -> None:
-    """Write a cell of a table with its label, which the style sheet shows."""
+    """Write a table cell with its label as an attribute, which the style sheet shows."""
     HTML5Translator.visit_entry(writer, entry)
     if entry.get("label"):
         opened = next(n for n in reversed(range(len(writer.body))) if writer.body[n].startswith(("<td", "<th")))
@@ -132,18 +131,18 @@ def labelled_cell(writer: HTML5Translator, entry: nodes.entry) -> None:
 
 
 def keep_bars(_app: Sphinx, _what: str, _name: str, _thing: object, _options: object, lines: list[str]) -> None:
-    """Keep |x| in a docstring what it is there, a magnitude; reStructuredText would look for a substitution."""
+    """Escape the bars of a magnitude |x| in a docstring, which reStructuredText would take for a substitution."""
     lines[:] = [re.sub(r"(``.*?``)|\|", lambda match: match[1] or r"\|", line) for line in lines]
 
 
 class CodeCell(CodeBlock):
-    """A notebook's cell where there are no notebooks: its code, without a run."""
+    """Directive that shows the code of a notebook's cell without running it, if MyST-NB is not installed."""
 
     option_spec = CodeBlock.option_spec | {"tags": lambda text: text}
 
 
 def setup(app: Sphinx) -> None:
-    """Let formulas be written as MathML, and docstrings be read as they are meant."""
+    """Register the writers of formulas and table cells, and the handler of docstrings."""
     if not NOTEBOOKS:
         app.add_directive("code-cell", CodeCell)
     if convert:

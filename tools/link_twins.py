@@ -1,6 +1,6 @@
-"""Let equal files of a folder share their place on the disk: ``link_twins.py .venv``.
+"""Replace equal files of a folder by hard links, which saves disk space: ``link_twins.py .venv``.
 
-ROS's wheels hold each library under three names, since wheels have no links, and OpenSSL once in each of eight.
+ROS's wheels hold each library under three names, since wheels have no links, and eight of the wheels hold OpenSSL.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import sys
 from collections import defaultdict
 from pathlib import Path
 
-SMALLEST = 65536  # bytes; what is smaller saves nothing
+SMALLEST = 65536  # bytes; smaller files save nothing
 
 
 def main(folder: str) -> None:
-    """Replace each file that equals an earlier one by a hard link to that one."""
+    """Replace each file that equals an earlier file by a hard link to it."""
     by_size: dict[tuple[int, int], list[Path]] = defaultdict(list)
     for directory, _, names in os.walk(folder):
         for path in (Path(directory, name) for name in sorted(names)):

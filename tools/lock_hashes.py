@@ -1,7 +1,7 @@
 """Write locked/*.txt: every package of constraints.txt with the SHA-256 of each file that make may install of it.
 
-Run by ``make constraints``, with Python 3.11 or newer and uv beside it. A file of ``ros`` comes first, and the
-others hold what they add to it, so that pip takes them together.
+``make constraints`` runs it, with Python 3.11 or newer and uv beside that Python. locked/ros.txt is complete; any other
+file holds only the packages that it adds to ros.txt, and pip installs both together.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ FILES = {
     "compiler": ["ros", "compiler"],
     "wheel": ["ros", "wheel"],
 }
-"""What each file holds: the package's own requirements, and these extras."""
+"""The extras of each file, by its name; the package's own requirements are in every file."""
 
 WHEEL = re.compile(
     r"-(?:cp3(?:10|11|12|13|14)-cp3\d+|cp3\d+-abi3|(?:py2\.)?py3\d*(?:\.py2)?-none|cp3\d+-none)-(\S+)\.whl$"
 )
-"""Interpreters of make's environments, without the free-threaded ones; the rest of a name says the platform."""
+"""Wheels for Python 3.10 to 3.14 without free threading, by the end of their names; group 1 is the platform."""
 
 EVERYWHERE = ("platform_machine == 'x86_64'", "platform_python_implementation == 'CPython'", "sys_platform == 'linux'")
-"""What make asks of a machine anyway, and markers need not say."""
+"""Conditions that make requires of every machine, and that are therefore omitted from the markers."""
 
 
 def compiled(extras: list[str]) -> list[dict[str, Any]]:
-    """Return the packages that uv picks for extras, at the versions of constraints.txt."""
+    """Return the packages that uv resolves for some extras, at the versions of constraints.txt."""
     command = [str(Path(sys.executable).parent / "uv"), "pip", "compile", "setup.py", "--universal", "--quiet"]
     command += ["--python-version", "3.10", "--constraint", "constraints.txt", "--format", "pylock.toml"]
     for extra in extras:
@@ -46,7 +46,7 @@ def compiled(extras: list[str]) -> list[dict[str, Any]]:
 
 
 def hashes(package: dict[str, Any]) -> Iterator[str]:
-    """Yield the hashes of the wheels that fit, of the source archive where none does."""
+    """Yield the SHA-256 of each wheel for make's Pythons, or of the source archive if there is no such wheel."""
     fitting = []
     for wheel in package.get("wheels", []):
         match = WHEEL.search(wheel["url"])
@@ -57,7 +57,7 @@ def hashes(package: dict[str, Any]) -> Iterator[str]:
 
 
 def entry(package: dict[str, Any]) -> str:
-    """Return a package as pip reads it: version, marker, hashes."""
+    """Return a package's entry in a requirements file: name, version, marker, hashes."""
     parts = [part for part in package.get("marker", "").split(" and ") if part and part not in EVERYWHERE]
     marker = f" ; {' and '.join(parts)}" if parts else ""
     lines = [f"{package['name']}=={package['version']}{marker}"]
@@ -65,7 +65,7 @@ def entry(package: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Write all files."""
+    """Write all files of locked/."""
     before: set[str] = set()
     folder = ROOT / "locked"
     folder.mkdir(exist_ok=True)

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""Make the pictures of doc/, all of them from the code and the files that the pages are about.
+"""Draw the pictures of doc/ by the code and from the files that the pages describe.
 
-Run from the project's root: ``python -m tools.make_doc_pictures [--out FOLDER]``; the two of calibrations take a
-minute. Two runs with the same libraries on the same number of threads give identical files.
+Run it in the project's root: ``python -m tools.make_doc_pictures [--out FOLDER]``; it takes a minute, for two
+calibrations. Two runs with the same libraries on the same number of threads give identical files.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ ROOT = Path(__file__).resolve().parents[1]
 
 EXAMPLE_TOOL = Pose.from_angles([0.0, 0.0, 0.12], np.zeros(3))
 EXAMPLE_WORK = Pose.from_angles([0.15, -0.12, 0.0], np.deg2rad([0.0, 0.0, 20.0]))
-"""Frames that the paper's machine does not have; drawn to show what the names mean."""
+"""Example tool and work frames, drawn to explain the names; the paper's machine has neither."""
 
 SEED, LEAD = 1, 0.01
-"""Of the calibrations shown, as doc/calibration.md has them: the virtual instruments' seed; the screws' lead, m."""
+"""The virtual instruments' seed and the screws' lead, m, of the calibrations in doc/calibration.md."""
 
 
 def direction_figure() -> Figure:
-    """Show the direction of motion that the code gives a noisy axis: there, at rest, and back."""
+    """Return the direction of motion that the code gives a noisy axis while it moves forward, rests, and moves back."""
     threshold = 2.0
     there = np.concatenate([np.linspace(0.0, 12.0, 60), np.full(60, 12.0), np.linspace(12.0, 3.0, 60)])
     values = there + 0.3 * np.random.default_rng(1).standard_normal(len(there))
@@ -64,41 +64,41 @@ def direction_figure() -> Figure:
 
 
 def machine_picture(geometry: HexapodGeometry) -> Figure:
-    """Return the paper's machine with its three dimensions and the four frames."""
+    """Return a picture of the paper's machine with its three dimensions and the four frames."""
     return configuration_figure(replace(geometry, tool=EXAMPLE_TOOL, work=EXAMPLE_WORK))
 
 
 def measured(geometry: HexapodGeometry, name: str) -> MeasurementSet:
-    """Return what ``hexapod_comp simulate --campaign NAME --seed 1`` reads."""
+    """Return the readings that ``hexapod_comp simulate --campaign NAME --seed 1`` writes."""
     campaign = load_campaign(ROOT / "config" / f"{name}.yaml")
     truth = RealMachine(geometry, load_model(ROOT / "config" / "paper_machine.yaml", geometry))
     return measure(template(campaign, geometry, SEED), campaign, truth, SEED)
 
 
 def strut_error_picture(fit: ModelFit, one_d: MeasurementSet) -> Figure:
-    """Return Mou & King's Figures 3 and 4, from 1-D and from 5-D lines, and the same as the joint fit has it."""
+    """Return Mou & King's Figures 3 and 4 by scheme lines from 1-D and from 5-D lines, and by the joint fit."""
     models = {
         "lines, 1-D": fit_lines(one_d).model,
         "lines, 5-D": fit_lines(fit.measurements).model,
         "joint, 5-D": fit.model,
     }
-    # Off the middle, where displacements along x alone give mirrored struts the same curve.
+    # In the middle, mirrored struts would have the same curve in the 1-D model.
     return strut_error_figure(one_d.geometry, models, y=LINE_Y)
 
 
 def shells_picture() -> Figure:
-    """Show what an error of the first screw's pitch does to the unit's tool (v. Daake et al., Figure 2)."""
+    """Return shells of the workspace coloured by the effect of screw 1's pitch error (v. Daake et al., Figure 2)."""
     (figure,) = daake.shells(load_geometry(daake.MACHINE)).figures.values()
     return figure
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Make all pictures."""
+    """Draw and write all pictures."""
     parser = argparse.ArgumentParser(description="make the pictures of doc/")
     parser.add_argument("--out", type=Path, default=ROOT / "doc" / "pictures", help="folder")
     out = parser.parse_args(arguments).out
     out.mkdir(parents=True, exist_ok=True)
-    # Without these two every run writes other identifiers and another date.
+    # A fixed salt here and no date below: otherwise every run writes other identifiers and another date.
     matplotlib.rcParams["svg.hashsalt"] = "hexapod_comp"
     geometry = load_geometry(ROOT / "config" / "paper.yaml")
     fit = fit_model(measured(geometry, "campaign_5d"), FitSettings(lead=LEAD))
@@ -108,8 +108,10 @@ def main(arguments: list[str] | None = None) -> int:
         "direction.svg": direction_figure(),
         "joint_fit.svg": fit_figure(fit),
         "strut_errors.svg": strut_error_picture(fit, measured(geometry, "campaign_1d")),
-        "example_6_6.png": overview_figure(overview(load_geometry("example_6_6"))),  # a point for every face
-        "shells_screw_pitch.png": shells_picture(),  # thousands of faces: a large file as SVG
+        "example_6_6.png": overview_figure(
+            overview(load_geometry("example_6_6"))
+        ),  # PNG: an SVG has a point for every face
+        "shells_screw_pitch.png": shells_picture(),  # PNG: thousands of faces are a large SVG file
     }
     for name, figure in pictures.items():
         figure.savefig(out / name, metadata={"Date": None})

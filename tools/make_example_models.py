@@ -1,16 +1,15 @@
 #!/usr/bin/env python3
-"""Make the two example models in config/: a virtual machine's truth, and the paper's 1-D model of it.
+"""Make the two example models in config/: the true errors of a virtual machine, and Mou & King's 1-D model of it.
 
-``paper_machine.yaml`` is the hidden truth of the shipped virtual machine, drawn from a fixed seed: the
-paper's geometry with ±100 µm on every joint coordinate and strut, ±100 ppm of pitch, a 4 µm screw wave of
-10 mm period, 3–5 µm of backlash and a smooth six-component field.
+``paper_machine.yaml`` holds the true errors of the shipped virtual machine, drawn from a fixed seed: the paper's
+geometry with ±100 µm on every joint coordinate and strut, ±100 ppm of pitch, a 4 µm screw wave of 10 mm period, 3–5 µm
+of backlash and a smooth six-component field.
 
-``paper_lines_model.yaml`` is what Mou & King would make of that machine: scheme ``lines`` of
-:mod:`hexapod_comp.calibration.lines` on the readings of a 1-D laser, taken on the uncompensated machine along
-the lines of a 4-inch grid, every inch, forward and backward, three times.
+``paper_lines_model.yaml`` is a model of that machine by Mou & King's method: scheme ``lines`` of
+:mod:`hexapod_comp.calibration.lines` on the readings of a 1-D laser, taken on the uncompensated machine along the lines
+of a 4-inch grid, every inch, forward and backward, three times.
 
-Run from the project's root: ``python -m tools.make_example_models [--out FOLDER]``. Two runs give identical
-files.
+Run it in the project's root: ``python -m tools.make_example_models [--out FOLDER]``. Two runs give identical files.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 SEED = 3
 DATE = "2025-01-01"
-"""Fixed, so that the files do not change with the day on which they are made."""
+"""Fixed, so that the files do not depend on the day of the run."""
 
 BOX = np.array([[-8.0 * INCH, -8.0 * INCH, 0.350], [8.0 * INCH, 8.0 * INCH, 0.350 + 8.0 * INCH]]).round(6)
 """The paper's measured box: ±203.2 mm, ±203.2 mm, 203.2 mm upwards from 350 mm."""
@@ -55,11 +54,11 @@ BOUNDS = ImperfectionBounds(
 )
 
 CAMPAIGN = Campaign(BOX, cell=4 * INCH, step=INCH, instrument="1-D", diagonals=0, cycles=3)
-"""The paper's lines, read by a laser of 1 µm noise."""
+"""The paper's lines, read by a 1-D laser with 1 µm of noise."""
 
 
 def make_machine(geometry: HexapodGeometry) -> MachineModel:
-    """Return the virtual machine's truth, rounded to what people can read (field: 0.1 nm, else 1 nm)."""
+    """Return the virtual machine's true errors, rounded to be readable in a file (field: 0.1 nm, all others: 1 nm)."""
     drawn = draw_model(geometry, BOUNDS, SEED, "virtual machine")
     s = drawn.struts
     struts = replace(
@@ -88,12 +87,12 @@ def make_machine(geometry: HexapodGeometry) -> MachineModel:
 
 
 def tidy(values: np.ndarray, decimals: int) -> np.ndarray:
-    """Return values rounded to decimals of a millionth: they then stand in a file as µm, µrad or ppm."""
+    """Return values rounded to some decimals of a millionth, the decimals of µm, µrad or ppm in a file."""
     return np.round(values * 1e6, decimals) / 1e6
 
 
 def make_lines_model(truth: RealMachine, truth_hash: str) -> tuple[MachineModel, ModelEvaluation]:
-    """Return the paper's 1-D model of a machine, and the error that it leaves."""
+    """Return Mou & King's 1-D model of a machine, and the error that this model leaves."""
     measured = measure(template(CAMPAIGN, truth.geometry), CAMPAIGN, truth, SEED)
     model = fit_lines(measured, date=DATE, name="paper's 1-D lines").model
     x, y, z = (tidy(family, 4) for family in model.field.lines)
@@ -112,19 +111,19 @@ def make_lines_model(truth: RealMachine, truth_hash: str) -> tuple[MachineModel,
 
 
 def micrometres(before: float, after: float) -> str:
-    """Return two lengths as text."""
+    """Return two lengths as text, in µm."""
     return f"{before * 1e6:.1f} and {after * 1e6:.1f}"
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Make both files and print what the lines model is worth."""
+    """Write both files, and print the error that the lines model leaves."""
     parser = argparse.ArgumentParser(description="make config/paper_machine.yaml and paper_lines_model.yaml")
-    parser.add_argument("--out", type=Path, default=ROOT / "config", help="folder; by default the project's")
+    parser.add_argument("--out", type=Path, default=ROOT / "config", help="folder for both files (default: config/)")
     out = parser.parse_args(arguments).out
     geometry = load_geometry(ROOT / "config" / "paper.yaml")
     machine_file = out / "paper_machine.yaml"
     save_model(make_machine(geometry), machine_file)
-    # What is measured is the machine in the file, not the one in memory: they may differ by a rounding.
+    # Measure the machine in the file: the machine in memory may differ from it by a rounding.
     truth = RealMachine(geometry, load_model(machine_file, geometry))
     digest = hashlib.sha256(machine_file.read_bytes()).hexdigest()
     model, found = make_lines_model(truth, digest)

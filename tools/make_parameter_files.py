@@ -1,6 +1,6 @@
-"""Write config/parameters.yaml and the tables of doc/parameters.md from the nodes' own tables of parameters.
+"""Write config/parameters.yaml and the tables of doc/parameters.md from the nodes' tables of parameters.
 
-Run it after a change of a table: ``python tools/make_parameter_files.py``. A test holds both against the tables.
+Run it after a change of such a table: ``python tools/make_parameter_files.py``. A test compares both files.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ HEAD = """\
 
 
 def table(parameters: tuple[Parameter, ...]) -> str:
-    """Return a table of parameters as Markdown."""
+    """Return a node's parameters as a Markdown table."""
     rows = [
         f"| `{p.name}` | `{shown(p.default)}` | {_allowed(p)} | {p.taken.name.lower()} | {p.meaning} |"
         for p in parameters
@@ -50,14 +50,14 @@ def _allowed(parameter: Parameter) -> str:
 
 
 def page(text: str) -> str:
-    """Return the page with the tables as they should be, each below the heading with its node's name."""
+    """Return the text of doc/parameters.md with renewed tables, each below the heading with its node's name."""
     for node, parameters in TABLES.items():
         text = re.sub(rf"(?<=\n## {node}\n)[^#]*", lambda _, p=parameters: f"\n{table(p)}\n\n", text)
     return text.rstrip() + "\n"
 
 
 def file() -> str:
-    """Return the file of parameters, for nodes in any namespace."""
+    """Return the text of config/parameters.yaml, for nodes in any namespace."""
     text = HEAD
     for node, parameters in TABLES.items():
         lines: list[str] = []
