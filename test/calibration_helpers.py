@@ -1,6 +1,6 @@
-"""Small virtual campaigns for the calibration tests, and what a model is worth on the machine itself.
+"""Small virtual campaigns for the calibration tests, and the tool error that a model leaves on the machine itself.
 
-The box is the paper's, but its lines stand 8 inches apart and are read every 2 inches: a fit takes a second.
+The box is the paper's, but lines are 8 inches apart and have a reading every 2 inches, so that a fit takes a second.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ INCH = 0.0254
 BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])
 LEAD = 0.01
 
-# Machine B of the calibration bars
+# Errors of machine B of benchmarks.calibration
 BOUNDS = ImperfectionBounds(joint=1e-4, strut_offset=1e-4, pitch=1e-4, wave=(4e-6, 4e-6), backlash=(3e-6, 5e-6))
 
-SETTINGS = FitSettings(lead=LEAD, field_degree=3)  # Everything that there is, the field kept small
+SETTINGS = FitSettings(lead=LEAD, field_degree=3)  # All blocks, with a small field
 
-FEW = replace(SETTINGS, blocks=("pitch", "wave", "backlash"))  # The blocks that machine B has
+FEW = replace(SETTINGS, blocks=("pitch", "wave", "backlash"))  # The blocks of machine B
 
-NEUTRAL = (20.0,) * 8  # Temperatures that change nothing, °C
+NEUTRAL = (20.0,) * 8  # Temperatures without growth, °C
 
 
 @cache
@@ -59,12 +59,12 @@ def virtual_machine(seed: int, bounds: ImperfectionBounds = BOUNDS) -> RealMachi
 
 
 def measured(truth: RealMachine, plan: Campaign, seed: int) -> MeasurementSet:
-    """Return what instruments read on a machine."""
+    """Return the readings of a plan's instruments on a machine."""
     return measure(template(plan, truth.geometry), plan, truth, seed)
 
 
 class Fitted(NamedTuple):
-    """A machine, its model, and what the fit knows."""
+    """A machine's true model, the fitted model, and the fitted parameters."""
 
     truth: MachineModel
     model: MachineModel
@@ -73,7 +73,7 @@ class Fitted(NamedTuple):
 
 @cache
 def fitted(poses: int = 0) -> Fitted:
-    """Return a machine measured by 5-D lines, four diagonals and so many of a tracker's poses, and fitted."""
+    """Return a machine and its fit to 5-D lines, four diagonals and a number of a tracker's poses."""
     truth = virtual_machine(5)
     fit = fit_model(measured(truth, campaign(poses=poses, tilt=np.radians(10.0)), 5), FEW)
     return Fitted(truth.model, fit.model, fit.parameters)
@@ -93,7 +93,7 @@ def true_parameters(space: ParameterSpace, truth: MachineModel) -> np.ndarray:
 
 
 def tool_error(truth: RealMachine, model: MachineModel | None) -> tuple[float, float]:
-    """Return the RMS tool error that a model's compensation leaves on the machine itself, m and rad, datum aligned."""
+    """Return the RMS tool error, m and rad, datum aligned, that a model's compensation leaves on the machine itself."""
     found = held_out(truth, model, BOX, 300, seed=5)
     return found.aligned.rms, found.rotation.rms
 
@@ -104,7 +104,7 @@ def scattered(
     temperatures: Sequence[tuple[float, ...]] | None = None,
     probe: np.ndarray | None = None,
 ) -> MeasurementSet:
-    """Return absolute readings, all zero, at poses that the machine took one after the other."""
+    """Return absolute readings, all zero, at poses that the machine took in this order."""
     temperatures = temperatures or [NEUTRAL] * len(poses)
     readings = [
         Reading("poses", 1, FROM_PREVIOUS, pose, f"{kind}_{axis}", 0.0, temperatures=warmth, source=FileLine("test", n))
@@ -116,7 +116,7 @@ def scattered(
 
 
 def fitted_model(folder: Path, offset: float = 30e-6) -> Path:
-    """Write a model with all struts too long by as much, every parameter known to 2 µm, and its posterior."""
+    """Write a model whose struts are all too long by `offset`, m, and its posterior with 2 µm of every parameter."""
     grid = np.stack(np.meshgrid([-0.1, 0.1], [-0.1, 0.1], [0.38, 0.45]), axis=-1).reshape(-1, 3)
     readings = scattered(paper(), [Pose(p, np.eye(3)) for p in grid])
     space = ParameterSpace(readings, FitSettings(blocks=()))

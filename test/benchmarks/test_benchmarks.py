@@ -1,4 +1,4 @@
-"""Benchmarks that cannot run say so and fail; short runs of those that take hours."""
+"""Benchmarks that lack a program or data report it and exit with 2; long benchmarks are run for a short time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from benchmarks.soak import soak
 
 
 def test_rubins_tables_are_fetched_by_who_runs_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Without them exit 2; with files of their form, here a cosine in five rows, the nodes are judged."""
+    """``benchmarks.rubin`` exits with 2 without the observatory's tables, and checks tables of their form."""
     assert rubin.main([str(tmp_path)]) == 2
     assert f"cannot run: there is no {tmp_path}/fitter/zd_m2.txt" in capsys.readouterr().err
     angles = np.arange(90.0, -1.0, -22.5)
@@ -32,14 +32,14 @@ def test_rubins_tables_are_fetched_by_who_runs_it(tmp_path: Path, capsys: pytest
     assert capsys.readouterr().out.count("PASSED") == 2
 
 
-# ---- two hosts and a cable ----
+# ---- benchmarks.network: two network name spaces, joined by a simulated cable ----
 
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def frame(kind: int, protocol: int, options: int, fragment: int, payload: bytes) -> bytes:
-    """Return an Ethernet frame with an IPv4 packet, made from RFC 791: version and length, …, protocol at byte 9."""
+    """Return an Ethernet frame with an IPv4 packet, written from RFC 791 (the protocol is byte 9 of the header)."""
     length = 20 + options + len(payload)
     version_and_length = 0x40 | (5 + options // 4)
     addresses = socket.inet_aton("10.99.0.1") + socket.inet_aton("10.99.0.2")
@@ -64,7 +64,7 @@ def test_the_cable_takes_udp_checksums_off_and_nothing_else():
 
 @long_test
 def test_two_hosts_and_a_cable_that_is_cut():
-    """The machine goes on, the loss is said, nothing is breached; the bars on time are the benchmark's."""
+    """A cut cable is reported, and no limit is broken; the benchmark's own bars on times are not checked here."""
     why_not = refusal()
     if why_not:
         pytest.skip(f"no network namespaces here: {why_not}")
@@ -79,7 +79,7 @@ def test_two_hosts_and_a_cable_that_is_cut():
         assert row[-1] == "0", "no breach"
 
 
-# ---- soak: no latency is judged here, other jobs decide it on a shared machine ----
+# ---- soak: latency is not checked, since on a shared machine other jobs determine it ----
 
 
 SECONDS = 5.0
@@ -91,7 +91,7 @@ def test_five_seconds_at_1_khz():
     counted = sum(int(found.diagnostics["compensator"][name]) for name in ("commands_missed", "refused"))
     assert len(found.latencies) > 100.0 * SECONDS, "a machine too busy for 100 Hz shows nothing"
     assert found.lost <= counted
-    assert len(found.beats) > 10.0 * SECONDS  # of 50 a second
+    assert len(found.beats) > 10.0 * SECONDS  # 50 beats a second are published
     memory = np.array(found.memory)[:, 1:]
     assert (memory[-1] - memory[len(memory) // 2]).max() < 1e6, "an hour of that would be more than 1.4 GB"
 
@@ -108,7 +108,7 @@ def genhexkins():
 
 
 def test_lengths_are_linuxcncs(genhexkins):
-    """Both add some ten products of lengths up to 1 m: 1e-15 m each."""
+    """genhexkins' lengths equal ours; each sums about ten products of lengths up to 1 m, with 1e-15 m of rounding."""
     poses = make_poses(200)
     lengths, codes = np.empty((200, 6)), np.empty(200, np.int32)
     genhexkins.inverse(emc_poses(poses.positions, poses.rotations), lengths, codes)
@@ -117,7 +117,7 @@ def test_lengths_are_linuxcncs(genhexkins):
 
 
 def test_poses_are_linuxcncs(genhexkins):
-    """It ends when the struts are right to 1e-12 m, and leaves about as much."""
+    """genhexkins' poses equal ours; its iteration ends when the struts are within 1e-12 m."""
     poses = make_poses(200, 1e-3, 1.0)
     home = emc_poses(poses.home.position[None], poses.home.rotation[None])
     codes, found = genhexkins.solved(poses.lengths, np.repeat(home, 200, axis=0))

@@ -1,6 +1,6 @@
-"""The fault campaign's judge, and a few of its episodes. The whole campaign: python -m benchmarks.faults.
+"""The judge of the fault campaign, and a few of its episodes. The whole campaign: python -m benchmarks.faults.
 
-The judge is judged with records made by hand, in which it is known what is wrong.
+The judge is tested with records of runs that these tests write, each with a known violation.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from hexapod_comp.ros.base import log_problem
 LIMITS = SimpleNamespace(stroke=np.tile([0.33, 0.88], (6, 1)), step=2e-3, correction=2e-3, speed=0.25)
 
 PERIOD = 0.004
-"""Of the commands in the records made here, s."""
+"""Period of the commands in these records, s."""
 
 
 def quiet(seconds: float = 6.0) -> Record:
-    """Return the record of a machine that moves at 40 mm/s and has no faults."""
+    """Return the record of a machine that moves at up to 40 mm/s and has no faults."""
     record = Record()
     record.ended = seconds
     for index in range(int(seconds / PERIOD)):
@@ -52,7 +52,7 @@ def quiet(seconds: float = 6.0) -> Record:
 
 
 def say(record: Record, time: float, message: str, node: str = "compensator", **values: str) -> None:
-    """Put a status into a record."""
+    """Add a diagnostic status of a node to a record."""
     record.statuses.append(Status(time, node, 2, message, values))
     record.statuses.sort(key=lambda status: status.time)
 
@@ -62,19 +62,19 @@ def of_strut(n: int, value: float) -> np.ndarray:
 
 
 def off(record: Record, since: int, by: float | np.ndarray) -> None:
-    """Move strut commands from one on, m."""
+    """Shift all strut commands from number `since` on by a length, m."""
     for struts in record.commands[since:]:
         struts.lengths[:] += by
 
 
 def told(record: Record, **lengths: Any) -> None:
-    """Let one of 1,500 messages be wrong."""
+    """Change the lengths of message 700 of 1,500 in one of the record's lists, by the function given for that list."""
     ((name, spoilt),) = lengths.items()
     getattr(record, name)[700].lengths[:] = spoilt(getattr(record, name)[700].lengths)
 
 
 def restarted(record: Record, further: float) -> None:
-    """A compensator that has been reset starts from where the struts stand, 5 mm from the last command, or not."""
+    """Restart the compensator at command 700 from the struts, 5 mm away; shift its first command by `further`, m."""
     off(record, 700, 5e-3)
     for struts in record.measured[680:]:
         struts.lengths[:] += 5e-3
@@ -83,7 +83,7 @@ def restarted(record: Record, further: float) -> None:
 
 
 def hurried(record: Record, speed: float) -> None:
-    """Eight commands 4 ms apart as they were sent, at so many m/s; 250 mm/s are allowed, and 5 % more."""
+    """Send commands 700 to 706 at a speed, m/s; the limit is 250 mm/s, and the judge allows 5 % more."""
     start = record.commands[699].lengths
     for n, struts in enumerate(record.commands[700:]):
         record.commands[700 + n] = replace(struts, lengths=start + speed * PERIOD * min(n + 1, 7))
@@ -99,7 +99,7 @@ def standing(record: Record) -> None:
 
 
 def lost(record: Record, *seconds: float) -> None:
-    """Commands without an answer, while a fault lasts from 2 to 2.5 s, which is reported."""
+    """Leave commands at some seconds without an answer; a corrupt message lasts from 2 to 2.5 s and is reported."""
     corrupt(record)
     say(record, 2.15, "refusing commands: not_finite")
     for second in seconds:
@@ -125,7 +125,7 @@ JUDGED: dict[str, tuple[Callable[[Record], object], str]] = {
     "one lost outside the fault": (lambda record: lost(record, 1.0, 2.2), "1 of"),
     "one lost inside the fault": (lambda record: lost(record, 2.2), ""),
 }
-"""What happens to the record of a good run, and what the judge says of it."""
+"""Change of a good record, and the violation that the judge must report (empty: none)."""
 
 
 @pytest.mark.parametrize("case", JUDGED)
@@ -170,7 +170,7 @@ def test_how_long_a_report_took(at, message, delay):
     ],
 )
 def test_silence_is_visible_after_the_nodes_timeout(kind, link, node, words):
-    """The last message came at 2.001 s and the timeouts are 0.1 s: visible at 2.101, said at 2.201."""
+    """The last message came at 2.001 s, the timeout is 0.1 s: due at 2.101 s, the report came at 2.201 s."""
     record = quiet()
     record.delivered[link] = [t for t in record.delivered[link] if not 2.002 < t < 3.0]
     record.faults = [Happened(kind, 2.002, 3.0)]
@@ -179,7 +179,7 @@ def test_silence_is_visible_after_the_nodes_timeout(kind, link, node, words):
 
 
 def test_who_is_dead_need_not_report_and_who_is_stopped_must_when_it_goes_on():
-    """Nor need the successor of a killed node report what its predecessor received."""
+    """A stopped node must report a fault once it runs again; the successor of a killed node need not."""
     record = quiet()
     corrupt(record)
     record.outages["compensator"] = [(1.9, 2.4)]
@@ -207,7 +207,7 @@ def test_recovery_ends_with_the_last_command_that_was_not_answered(last_bad, rec
 
 
 def test_a_full_log_disk_is_a_problem_and_so_is_a_folder_that_fails(monkeypatch, tmp_path):
-    """64 KiB are 16 blocks of 4,096 byte. A folder that is not there is no problem: nothing is logged to files."""
+    """The least free space is 16 blocks of 4,096 bytes. Without a log folder nodes log to no file: no problem."""
     full, broken = f"log disk full: {tmp_path}", OSError(5, "Input/output error")
     for blocks, problem in ((1000, ""), (16, ""), (15, full), (0, full)):
         monkeypatch.setattr(os, "statvfs", Mock(return_value=SimpleNamespace(f_bavail=blocks, f_frsize=4096)))
@@ -221,7 +221,7 @@ def test_a_full_log_disk_is_a_problem_and_so_is_a_folder_that_fails(monkeypatch,
 
 
 class Chosen:
-    """An episode told instead of drawn."""
+    """An episode with given faults instead of faults drawn at random."""
 
     number = -1
 
@@ -230,9 +230,10 @@ class Chosen:
 
 
 def test_a_few_episodes(isolated_ros):
-    """With two faults each, or under a stream that goes on; a report in time wants a processor: without one, again.
+    """Episodes with two faults each, or under a stream of commands, break no limit and report each fault in time.
 
-    Two of the nine, all with ALL_TESTS=1.
+    An episode that reports late is repeated if its processes had to wait for a processor. Two of the nine episodes run
+    by default, all with ALL_TESTS=1.
     """
     disk = () if refusal_to_mount() else ("log_disk_full",)
     kinds = [("corrupt_pose", *disk), ("encoder_nan", "drop_pose"), ("kill_compensator", "drop_feedback")]

@@ -1,4 +1,4 @@
-"""The certificate of one small fit: its figures are the report's, its names a stranger's, its files those written."""
+"""The certificate of a small fit: its figures equal the report's, it quotes any text, its hashes match the files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hexapod_comp.calibration.sensitivity import predict
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.measurements.readings import FileLine
 
-# What a stranger might call a run
+# Text that a user might give as a run's name, and that HTML or a template must not interpret
 HOSTILE = "</td><script>alert(1)</script><img src=https://example.org/x onerror=y>\u202e\n"
 
 
@@ -32,19 +32,19 @@ def fit() -> ModelFit:
 
 @pytest.fixture
 def model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(certificate, "_figures", lambda fit: [])  # pictures take most of the time
+    monkeypatch.setattr(certificate, "_figures", lambda fit: [])  # the pictures take most of the time
     (tmp_path / "model.yaml").write_text("the model")
     return tmp_path / "model.yaml"
 
 
 def cells(text: str) -> list[list[str]]:
-    """Return the cells of each table row."""
+    """Return the texts of the cells of each table row."""
     rows = re.findall(r"<tr>(.*?)</tr>", text, re.DOTALL)
     return [[re.sub("<.*?>", "", cell) for cell in re.findall(r"<t[hd].*?</t[hd]>", row, re.DOTALL)] for row in rows]
 
 
 def test_it_promises_what_the_report_promises(fit: ModelFit, model: Path) -> None:
-    """Before, after and interval are the fit's; U is twice the interval's upper end; hashes are the files'."""
+    """Before, after and interval equal the fit's; U is twice the upper end; the hashes are those of the files."""
     read = replace(fit, measurements=replace(fit.measurements, files=(("laser.csv", "ab" * 32),)))
     report = fit_report(fit)
     table = cells(certificate_text(read, "a model", [model], report))
@@ -66,7 +66,7 @@ def test_it_promises_what_the_report_promises(fit: ModelFit, model: Path) -> Non
 
 
 def test_strangers_names_are_text(fit: ModelFit, model: Path) -> None:
-    """Run, file, model, notes, outliers and details may hold anything; nothing of it is obeyed or loaded."""
+    """Markup in names of runs, files and models, in notes, outliers and details appears as text and loads nothing."""
     m = fit.measurements
     runs = tuple(replace(run, name=HOSTILE + run.name) for run in m.runs)
     sources = tuple(FileLine(HOSTILE, 1) for _ in m.sources)
@@ -81,9 +81,10 @@ def test_strangers_names_are_text(fit: ModelFit, model: Path) -> None:
 
 
 def test_figures_after_come_from_a_fit_without_the_line(fit: ModelFit) -> None:
-    """Truth: the fit repeated without the first line, and what that predicts there. Its own choice of noise and
-    tolerances differs a little: a fifth of what a target leaves. That is the laser's noise of 1 µm and where the
-    machine stops, 0.5 µm: 1.1 µm together, beside some 10 µm of the readings."""
+    """The truth is a fit repeated without the first line, and its prediction for that line.
+
+    That fit's own noise and tolerances differ, by a fifth of the residual of 1.1 µm (1 µm of laser noise, 0.5 µm of
+    scatter of the stops). The line's error is 10 µm."""
     m = fit.measurements
     own = np.flatnonzero(m.run == 0)
     others = fit_model(m.select(m.run != 0), replace(FEW, blocks=tuple(b.name for b in fit.space.blocks[1:])))

@@ -1,7 +1,7 @@
-"""Check readings against a fitted model: what has happened is known, because the test has done it to the machine.
+"""Check readings against a fitted model, after a change of the machine that the test itself has made.
 
-The readings come from the virtual instruments, which never see the fit. Sizes are allowed four of the standard
-deviations that the check itself states.
+The readings come from the virtual instruments, which never see the fit. Sizes may differ by four of the standard
+deviations that the check states.
 """
 
 from __future__ import annotations
@@ -65,21 +65,21 @@ def check(truth: MachineModel, seed: int = 9, places: str = "ends") -> Measureme
 
 
 def crashed(strut: int, size: float) -> MachineModel:
-    """Return the machine with one strut's offset changed, m."""
+    """Return the true machine with the offset of one strut changed by a size, m."""
     offset = fitted().truth.struts.offset.copy()
     offset[strut] += size
     return replace(fitted().truth, struts=replace(fitted().truth.struts, offset=offset))
 
 
 def left(truth: MachineModel, model: MachineModel) -> float:
-    """Return what a model leaves of the tool's error at points nobody measured, the datum aligned, m."""
+    """Return the RMS tool error that a model leaves at points that were not measured, datum aligned, m."""
     return held_out(RealMachine(paper(), truth), model, BOX, 100).aligned.rms
 
 
 def test_twelve_proposed_readings_name_the_strut() -> None:
-    """Strut 3 by 20 µm, read by the virtual instruments where the package proposes; two or more share a zero.
+    """Strut 3, moved by 20 µm and read at the proposed places, is named; at least two readings share each zero.
 
-    Straightnesses come by threes, for their slope is unknown, and a machine that has not changed is valid.
+    Proposed straightness readings come in threes, because a slope is unknown as well. An unchanged machine is valid.
     """
     straight = propose_check(fitted().known, 15, ("straightness",))
     assert set(straight.kind) == {KINDS.index("straightness")}
@@ -100,7 +100,7 @@ def test_twelve_proposed_readings_name_the_strut() -> None:
 
 
 def test_evidence_is_the_ratio_of_two_normal_densities() -> None:
-    """scipy's densities are the truth; rounding of their logarithms, some 100, is 1e-9."""
+    """The truth is scipy's densities; their logarithms are about 100, with 1e-9 of rounding."""
     rng = np.random.default_rng(1)
     root, effect, z = rng.standard_normal((5, 5)), rng.standard_normal((5, 2)), rng.standard_normal(5)
     covariance = root @ root.T + np.eye(5)
@@ -116,7 +116,7 @@ def test_evidence_is_the_ratio_of_two_normal_densities() -> None:
 
 
 def test_densities_of_readings_are_those_of_a_normal_distribution() -> None:
-    """scipy's is the truth. Its numbers are the readings less an unknown zero of each channel of a run."""
+    """The truth is scipy's density of the readings after the unknown zero of each channel of a run is projected out."""
     known, readings = widened(fitted().known), check(fitted().truth)
     found = CheckReadings.of(known, readings)
     covariance = found.noise + found.rows @ known.covariance @ found.rows.T
@@ -126,13 +126,13 @@ def test_densities_of_readings_are_those_of_a_normal_distribution() -> None:
     kinds = [CHANNELS[channel].partition("_")[0] for channel in zeros]
     places = [int((readings.kind == k).sum()) - kinds.count(name) for k, name in enumerate(KINDS)]
     np.testing.assert_allclose(found.freedom, places, atol=1e-9)
-    # Other values are as linear in the numbers as readings taken anew.
+    # Changing the values must give the same residuals as new readings with these values.
     anew = CheckReadings.of(known, readings.with_values(-readings.value)).residuals
     np.testing.assert_allclose(found.changed_by(-2.0 * readings.value).residuals, anew, rtol=0.0, atol=1e-8)
 
 
 def test_the_cut_of_outliers_does_not_make_the_noise_smaller() -> None:
-    """What is left of a normal variance that is cut at 2.5 σ, by the integral of its density: 0.978."""
+    """Clipping a normal variable at 2.5 σ leaves 0.978 of its variance, by the integral of its density."""
     cut = 2.5
     inside = quad(lambda z: z * z * norm.pdf(z), -cut, cut)[0]
     assert consistency(cut) == pytest.approx(inside + 2.0 * cut**2 * norm.sf(cut), rel=1e-9)
@@ -140,7 +140,7 @@ def test_the_cut_of_outliers_does_not_make_the_noise_smaller() -> None:
 
 
 def test_a_moved_datum_moves_the_tool_as_a_rigid_body_does() -> None:
-    """Shift and turn about the box's centre, by the closed form; 10 µm make second-order terms below a nanometre."""
+    """The truth is a shift and a turn about the box's centre in closed form; second order is below 1 nm."""
     space = widened(fitted().known).space
     columns = next(c for c in possible_changes(space, ()) if c.family == DATUM).columns
     size = 0.5 * np.linalg.norm(np.ptp(space.work_box, axis=0))
@@ -156,9 +156,9 @@ def test_a_moved_datum_moves_the_tool_as_a_rigid_body_does() -> None:
 
 @pytest.mark.parametrize(("strut", "size"), [(0, 20e-6), pytest.param(3, -20e-6, marks=long_test)])
 def test_a_crashed_strut_is_named_measured_and_repaired(strut: int, size: float) -> None:
-    """The test has moved it; the renewed model leaves no more than half as much again as the fit had left.
+    """The moved strut is named; the updated model leaves at most 1.5 times the error of the first fit.
 
-    At home the tool is moved by nothing, before and after: lines do not show where the machine stands.
+    At home neither model moves the tool: lines do not show where the machine stands.
     """
     truth = crashed(strut, size)
     readings = check(truth)
@@ -178,7 +178,7 @@ def test_a_crashed_strut_is_named_measured_and_repaired(strut: int, size: float)
 
 
 def test_growth_of_all_struts_is_a_temperature() -> None:
-    """40 ppm on every strut: steel by three kelvin."""
+    """40 ppm on every strut, the growth of steel by three kelvin, is named as a temperature."""
     struts = fitted().truth.struts
     grown = replace(struts, offset=struts.offset + 40e-6 * struts.reference_length, pitch=struts.pitch + 40e-6)
     result = verify_model(fitted().model, fitted().known, check(replace(fitted().truth, struts=grown)))
@@ -189,7 +189,7 @@ def test_growth_of_all_struts_is_a_temperature() -> None:
 
 
 def with_one_wrong(number: int) -> Verification:
-    """Return a check of the machine as it was, one reading 50 µm or µrad off."""
+    """Return the check of an unchanged machine with one reading wrong by 50 µm or 50 µrad."""
     readings = check(fitted().truth)
     value = readings.value.copy()
     value[number] += 50e-6
@@ -197,8 +197,8 @@ def with_one_wrong(number: int) -> Verification:
 
 
 def test_what_readings_cannot_tell_stays_open_and_says_what_would_settle_it() -> None:
-    """A reading that is off is told from the machine. A wrong pitch at one end of the only line with one is not: a
-    joint that has moved explains it as well."""
+    """A wrong reading is named if others contradict it. A wrong pitch at one end of the only line with pitch stays
+    undecided: a moved joint explains it as well."""
     result = with_one_wrong(8)
     assert (result.verdict, result.candidates[0].family) == (NAMED, READING)
     assert "take this reading again" in refusal(result)
@@ -210,7 +210,7 @@ def test_what_readings_cannot_tell_stays_open_and_says_what_would_settle_it() ->
 
 
 def test_readings_of_an_unchanged_machine_taken_for_something_else_are_recognised() -> None:
-    """Each mistake by the name of what the test has done; arcseconds are 4.848 µrad. Nothing is renewed from them."""
+    """Each mistake made in reading an unchanged machine is named, and stops an update. 1 arcsec is 4.848 µrad."""
     readings, known = check(fitted().truth), fitted().known
     angular = np.isin(readings.channel, [CHANNELS.index(name) for name in ("rotation_x", "rotation_y", "rotation_z")])
     arcseconds = readings.with_values(np.where(angular, readings.value / 4.848137, readings.value))
@@ -219,7 +219,7 @@ def test_readings_of_an_unchanged_machine_taken_for_something_else_are_recognise
         "all readings: sign reversed": readings.with_values(-readings.value),
         "taken with the compensation off": compensated(readings, fitted().model),
     }
-    # Larger than any change that is expected: that is no mistake of whoever read it.
+    # A strut moved by 2 mm, more than any expected change, is not taken for a mistake in reading.
     assert not verify_model(fitted().model, known, check(crashed(1, 2e-3))).doubts
     for name, taken in mistaken.items():
         result = verify_model(fitted().model, known, taken)
@@ -228,7 +228,7 @@ def test_readings_of_an_unchanged_machine_taken_for_something_else_are_recognise
 
 
 def test_what_is_in_no_hypothesis_is_not_named() -> None:
-    """A platform joint that has moved by 60 µm across its struts is no strut, no datum and no temperature."""
+    """A platform joint moved by 60 µm across its struts is not named as a strut, the datum or a temperature."""
     moved = fitted().truth.platform_deviation.copy()
     moved[2:4] += [30e-6, -40e-6, 30e-6]
     result = verify_model(fitted().model, fitted().known, check(replace(fitted().truth, platform_deviation=moved)))
@@ -240,6 +240,6 @@ def test_what_is_in_no_hypothesis_is_not_named() -> None:
 
 
 def test_readings_that_tell_nothing_are_refused() -> None:
-    """One place of each run: its unknown zero takes it."""
+    """A check with one place per run is refused: the run's unknown zero explains any value."""
     with pytest.raises(CalibrationError, match="determine nothing"):
         verify_model(fitted().model, fitted().known, check(fitted().truth, places="start"))

@@ -1,7 +1,7 @@
-"""A calibration leaves the tool where it is at the datum, as far as readings do not show where the machine stands.
+"""A calibration does not move the tool at the datum, unless the readings show where the machine stands.
 
-Truth: the foreign machines' own kinematics (:mod:`foreign_machines`), and what a rigid motion of everything does to an
-instrument, by hand.
+The truth is the foreign machines' own kinematics (:mod:`foreign_machines`), and the effect of a rigid motion of the
+whole machine on an instrument, written out by hand.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from hexapod_comp.measurements.readings import KINDS
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.instruments import measure
 
-STILL = 1e-9  # m and rad: the bar; a model file keeps a hundredth of a nanometre
+STILL = 1e-9  # largest motion at the datum, m and rad; a model file is rounded to 0.01 nm
 
 
 @pytest.mark.parametrize("name", machine_names())
 def test_switching_compensation_on_does_not_move_the_tool_at_home(name: str, tmp_path: Path) -> None:
-    """After a fit of laser lines; by the tests' own kinematics the model wants the nominal lengths there."""
+    """After a fit to laser lines, the tests' own kinematics of the model give the nominal lengths at home."""
     machine = machines()[name]
     geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
     truth = Errors.drawn(machine, 5)
@@ -61,7 +61,7 @@ def laser_fit() -> ModelFit:
 
 
 def projection(readings, tracker_frame: str = "known") -> np.ndarray:
-    """Return what readings do not show at home, by the fit's own weights at a tolerance of 0.1 mm."""
+    """Return the projection on motions at home that readings do not show, at a tolerance of 0.1 mm."""
     space = laser_fit().space
     space = ParameterSpace((space.geometry, space.region), replace(space.settings, tracker_frame=tracker_frame))
     estimation = Estimation(readings, space, alone=False)
@@ -79,7 +79,7 @@ def test_a_tracker_is_believed_and_one_pose_of_it_shows_no_more_than_its_place()
     one = positions.select(positions.station == 0)
     part = projection(one)
     assert np.trace(part) == pytest.approx(3.0)
-    # Whatever is taken off turns everything about the one place that was seen.
+    # Each motion in the projection is a rotation about the one place that was measured.
     for taken in part.T:
         shift, turn = taken[:3], taken[3:]
         arm = far.position - small.paper().home.position

@@ -1,4 +1,4 @@
-"""What a model leaves of errors: figures known beforehand, for machines simple enough to know them."""
+"""Error figures of models, for machines so simple that the figures are known in closed form."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ def geometry() -> HexapodGeometry:
 
 @pytest.fixture(scope="module")
 def framed(geometry) -> HexapodGeometry:
-    """The same machine with a tool and a work frame, both turned and shifted."""
+    """Return the paper's machine with a turned and shifted tool frame and work frame."""
     tool = Pose.from_angles([0.01, -0.02, 0.08], np.deg2rad([10.0, -5.0, 30.0]))
     return replace(geometry, tool=tool, work=Pose.from_angles([0.02, 0.01, 0.05], np.deg2rad([1.0, 2.0, 40.0])))
 
@@ -37,14 +37,14 @@ def truth(geometry) -> RealMachine:
 
 
 def moved(geometry: HexapodGeometry, turn: np.ndarray, shift: np.ndarray) -> RealMachine:
-    """Return a machine whose base stands elsewhere: every pose is turned and shifted, nothing else."""
+    """Return a machine whose only error is a rigid motion of its base."""
     joints = geometry.base_joints.copy()
     deviation = Rotation.from_rotvec(turn).apply(joints) + shift - joints
     return RealMachine(geometry, MachineModel(geometry.name, base_deviation=deviation))
 
 
 def field_machine(geometry: HexapodGeometry, forward: list[float], backward: list[float]) -> MachineModel:
-    """Return a machine whose only error is dx along x, the same polynomials of u on every line."""
+    """Return a machine whose only error is dx along x, by the same polynomials of u on every line."""
     nodes = tuple(BOX[:, axis] for axis in range(3))
     family = np.zeros((2, 2, 2, 6, len(forward)))
     family[0, :, :, 0], family[1, :, :, 0] = forward, backward
@@ -53,9 +53,9 @@ def field_machine(geometry: HexapodGeometry, forward: list[float], backward: lis
 
 
 def test_a_turned_machine_has_no_error_once_aligned(geometry, framed):
-    """A rigid motion of everything: alignment takes out all of it, and the rotation its whole angle.
+    """Alignment removes a rigid motion of the machine, and the rotation error completely.
 
-    Closed form of a shift alone: every point is off by the same vector, 50 µm long, whatever tool and work frame.
+    A shift alone moves every point by the same vector, 50 µm long, with any tool and work frame.
     """
     turn = np.array([1e-4, -2e-4, 3e-4])
     for machine in (geometry, framed):
@@ -69,7 +69,7 @@ def test_a_turned_machine_has_no_error_once_aligned(geometry, framed):
 
 
 def test_repeatability_alone(geometry):
-    """√3 times the figure per axis; 6000 draws scatter by 1/√12000 ≈ 1 %, four times that is allowed."""
+    """The error is √3 times the repeatability per axis; 6000 draws scatter by 1/√12000 ≈ 1 %, and 4 % is allowed."""
     perfect = RealMachine(geometry, MachineModel(geometry.name))
     found = held_out(perfect, None, BOX, 1000, repeatability=1e-6)
     assert found.raw.rms == pytest.approx(np.sqrt(3.0) * 1e-6, rel=0.04)
@@ -77,7 +77,7 @@ def test_repeatability_alone(geometry):
 
 
 def test_temperatures_seen_and_not_seen(geometry):
-    """A machine 1 K warm, by its own model: nothing is left when the sensors say so, much when they do not."""
+    """A machine 1 K warm: its own model leaves nothing with the sensors' readings, and over 4 µm without them."""
     model = MachineModel(geometry.name, struts=StrutErrors(expansion=np.full(6, 11e-6)))
     warm = Temperatures(dict.fromkeys(Temperatures.NAMES, 21.0))
     truth = RealMachine(geometry, model, warm)
@@ -87,7 +87,7 @@ def test_temperatures_seen_and_not_seen(geometry):
 
 
 def test_all_passes_at_once_are_the_machine_one_by_one(framed):
-    """The objects' way, pose by pose; a strut's direction is that of its last 2 mm of way, by distances of joints."""
+    """The truth is the machine pose by pose; a strut's direction is that of its length over the last 2 mm."""
     truth = RealMachine(framed, draw_model(framed, BOUNDS, 5))
     model = draw_model(framed, BOUNDS, 6)
     passes = random_passes(framed, BOX * 0.5 + np.array([0.0, 0.0, 0.1]), 20, 0.1, np.random.default_rng(0))
@@ -110,7 +110,7 @@ def test_all_passes_at_once_are_the_machine_one_by_one(framed):
 
 
 def test_paper_metric_of_a_scale_error(geometry):
-    """dx = a·u grows from 0 at a line's start to 2a at its end: a in the mean, on 16 of 16 + 16 + 8 readings."""
+    """dx = a·u grows from 0 to 2a along an x-line, with mean a; of 16 + 16 + 8 readings 16 are on x-lines."""
     truth = RealMachine(geometry, field_machine(geometry, [0.0, 10e-6], [0.0, 10e-6]))
     found = paper_metric(truth, truth.model, BOX)
     assert found.before == pytest.approx(10e-6 * 16 / 40, rel=1e-6)
@@ -120,7 +120,7 @@ def test_paper_metric_of_a_scale_error(geometry):
 
 
 def test_paper_metric_of_backlash(geometry):
-    """∓b/2 forward and backward: an interferometer zeroed on the way out reads 0 there and b on the way back."""
+    """dx is ∓b/2 forward and backward: an interferometer zeroed at the start reads 0 forward and b backward."""
     truth = RealMachine(geometry, field_machine(geometry, [-4e-6], [4e-6]))
     found = paper_metric(truth, MachineModel(geometry.name), BOX)
     assert found.before == pytest.approx(8e-6 / 2 * 16 / 40, rel=1e-6)

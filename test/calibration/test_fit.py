@@ -1,4 +1,4 @@
-"""The joint fit: rows, nuisances, evidence, solver, the screws' lead by the textbook, whole fits against the truth."""
+"""The joint fit: design matrix, nuisance parameters, evidence, solver, the screws' lead, and fits of known machines."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SHAPE = (40, 12)
 
 @pytest.fixture
 def rows() -> DesignMatrix:
-    """Three parts of cells that are mixed up, moved by parameters of which some are common."""
+    """Return a design matrix in three parts, with shuffled rows and with columns that some parts share."""
     rng = np.random.default_rng(1)
     cells = np.split(rng.permutation(SHAPE[0]), [15, 27])
     columns = (np.arange(7), np.array([0, 1, 5, 9]), np.array([2, 10, 11]))
@@ -47,7 +47,7 @@ def rows() -> DesignMatrix:
 
 
 def close(ours: np.ndarray, wanted: np.ndarray) -> None:
-    """Compare sums of forty products of numbers near one."""
+    """Compare arrays of sums of forty products of numbers near one."""
     np.testing.assert_allclose(ours, wanted, rtol=0.0, atol=1e-12)
 
 
@@ -65,7 +65,7 @@ def test_rows_in_parts_are_the_whole_matrix(rows: DesignMatrix):
     close(rows.using(used, factors, factors[:5]).dense(), factors[:, None] * whole[:, used] * factors[:5])
     close(rows.select(cells).using(used, factors[cells]).dense(), (factors[:, None] * whole)[np.ix_(cells, used)])
     close(rows.beside(v).dense(), np.hstack([whole, v]))
-    # A zero is taken off the cells of its part alone: what is left of cells of equal noise is what their mean leaves
+    # Projecting out a zero changes only the rows of its part: for equal noise it subtracts their mean.
     members = np.sort(rows.parts[1].cells[3:9])
     rows.project_out(Zeros([members], np.full(40, np.nan)).unknowns(np.ones(40)))
     whole[members] -= whole[members].mean(axis=0)
@@ -73,7 +73,7 @@ def test_rows_in_parts_are_the_whole_matrix(rows: DesignMatrix):
 
 
 FEW = small.FEW
-pytestmark = pytest.mark.usefixtures("unsuspected")  # what else readings might be: test_mixed_up
+pytestmark = pytest.mark.usefixtures("unsuspected")  # the search for mix-ups is tested in test_mixed_up
 SOME = replace(FEW, blocks=(*FEW.blocks, "field displacement", "field rotation"), field_degree=2)
 LINEAR, STRAIGHTNESS, ROTATION, POSITION, ATTITUDE = range(5)
 ONES = np.ones(len(KINDS))
@@ -97,7 +97,9 @@ def linearised(measurements: MeasurementSet, settings: FitSettings = FEW) -> tup
 
 
 def test_what_instruments_do_not_know_changes_nothing():
-    """Zeros of ±1 mm and beam slopes of ±1 mrad on every channel of every run: 1e-16 · 1 mm / 1 µm is left."""
+    """Unknown zeros of ±1 mm and beam slopes of ±1 mrad in every channel of every run do not change the answer.
+
+    Rounding leaves 1e-16 · 1 mm / 1 µm."""
     ours, rng = readings(), np.random.default_rng(1)
     group = ours.run * len(CHANNELS) + ours.channel
     zeros, slopes = rng.uniform(-1e-3, 1e-3, (2, group.max() + 1))
@@ -110,15 +112,15 @@ def test_what_instruments_do_not_know_changes_nothing():
     answers = [solve(space, p, space.start_tolerances(), noise, 0) for p in (problem, other)]
     deviations = np.sqrt(np.diag(answers[0].covariance))
     np.testing.assert_allclose((answers[1].y - answers[0].y) / deviations, 0.0, atol=1e-6)
-    # A laser's wavelength is known: only straightness beams may lie askew.
+    # A laser's wavelength is known, so a slope of a linear channel must change the residuals.
     tilted = ours.with_values(ours.value + np.where(ours.kind == LINEAR, 1e-4 * ours.along(), 0.0))
     assert np.abs(linearised(tilted)[1].target - problem.target).max() > 1.0
 
 
 def test_repeated_readings_count_as_their_weighted_mean():
-    """Three passes of unlike uncertainty, against one pass of their mean x̄ = Σx/σ² / Σ1/σ² with 1/σ̄² = Σ1/σ².
+    """Three passes of different uncertainty equal one pass of their mean x̄ = Σx/σ² / Σ1/σ² with 1/σ̄² = Σ1/σ².
 
-    Covariances are compared as correlations: one that is near zero has no digits of its own. The normal equations'
+    Covariances are compared as correlations: a covariance near zero has no digits of its own. The normal equations'
     condition is 1e7, so that rounding, which differs between versions of NumPy, leaves 2e-9.
     """
     thrice, rng = readings(cycles=3), np.random.default_rng(2)
@@ -141,7 +143,7 @@ def test_repeated_readings_count_as_their_weighted_mean():
 
 @cache
 def random_problem(seed: int = 3, count: int = 240) -> tuple[ParameterSpace, LinearProblem, np.ndarray]:
-    """Return a problem with random rows and three kinds of readings, and the noise factors that it was made with."""
+    """Return a linear problem with random rows and three kinds of readings, and the noise factors of its values."""
     space, rng = ParameterSpace(readings(), FEW), np.random.default_rng(seed)
     spread = space.spread(space.start_tolerances())
     rows = rng.standard_normal((count, space.size)) / spread * rng.uniform(0.02, 3.0, space.size)
@@ -171,7 +173,7 @@ def problem_of(rows: np.ndarray, target: np.ndarray, kind: np.ndarray, fold: np.
 def dense(
     space: ParameterSpace, problem: LinearProblem, tolerances: np.ndarray, noise: np.ndarray, keep: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the textbook's answer and covariance: least squares with the priors as further rows."""
+    """Return answer and covariance by the textbook: least squares with the priors as additional rows."""
     spread = space.spread(tolerances)
     scale = 1.0 / noise[problem.kind[keep]]
     rows = np.vstack([scale[:, None] * problem.rows.dense()[keep], np.diag(1.0 / spread)])
@@ -195,9 +197,9 @@ def test_solver_is_least_squares_with_prior_rows():
 
 
 def test_held_out_errors_are_those_of_fits_that_left_a_fold_out():
-    """Twenty folds of some twelve cells, and one of half of them, each really left out and fitted again.
+    """Each of twenty folds of about twelve cells, and one fold of half the cells, is left out and the fit repeated.
 
-    What a fold moves, and the covariance of that, are those of the two fits: of the lesser fit's, less the whole one's.
+    The change of the parameters and its covariance equal the difference of the two fits' answers and covariances.
     """
     space, problem, noise = random_problem()
     problem = replace(problem, fold=np.where(np.arange(240) < 120, 0, problem.fold))
@@ -226,8 +228,9 @@ def dense_evidence(space: ParameterSpace, problem: LinearProblem, tolerances: np
 
 
 def test_evidence_is_that_of_the_readings_distribution():
-    """Differences, since the density's constant is left out. With and without waves its ratio is what Savage and
-    Dickey take from the posterior alone."""
+    """Differences of the evidence equal those of the readings' log density, whose constant is omitted.
+
+    With and without waves, the difference is the Savage–Dickey ratio, which needs only the posterior."""
     space, problem, noise = random_problem()
     start, of_waves = space.start_tolerances(), [block.name for block in space.blocks].index("wave")
     without = np.where(np.arange(len(start)) == of_waves, 0.0, start)
@@ -239,7 +242,7 @@ def test_evidence_is_that_of_the_readings_distribution():
 
 
 def test_evidence_of_ill_conditioned_readings_is_not_above_that_of_readings_met_exactly():
-    """Readings of 10⁵ times their noise, as in another unit, of a machine that five directions nearly describe."""
+    """Readings are 10⁵ times their noise, as in a wrong unit, of a machine that five directions nearly describe."""
     space, problem, noise = random_problem()
     rng, start = np.random.default_rng(0), space.start_tolerances()
     rows = rng.standard_normal((240, 5)) @ rng.standard_normal((5, space.size))
@@ -252,13 +255,12 @@ def test_evidence_of_ill_conditioned_readings_is_not_above_that_of_readings_met_
 
 
 def test_tolerances_and_noise_are_the_most_probable_ones(monkeypatch: pytest.MonkeyPatch):
-    """At the fixed point the evidence has no slope along any log tolerance or log noise factor.
+    """At the fixed point the evidence has zero slope along every log tolerance and log noise factor.
 
-    Each tolerance t has the prior t^−h · exp(−h·(t₀/t)²/2), h = ASSUMED.hyperprior, written from the rule
-    that the first guess counts as h of a parameter. Slopes by central differences; the largest one away
-    from the optimum is about 60.
+    Each tolerance t has the prior t^−h · exp(−h·(t₀/t)²/2), h = ASSUMED.hyperprior: the first guess counts as h of a
+    parameter. Slopes are central differences; away from the optimum the largest is about 60.
     """
-    monkeypatch.setattr("hexapod_comp.calibration.estimator.ROUNDS_SETTLED", 1e-6)  # on to the fixed point
+    monkeypatch.setattr("hexapod_comp.calibration.estimator.ROUNDS_SETTLED", 1e-6)  # iterate until the fixed point
     space, problem, _ = random_problem()
     answer = solve(space, problem, space.start_tolerances(), ONES, 400)
     start, kinds = space.start_tolerances(), np.array([LINEAR, STRAIGHTNESS, ROTATION])
@@ -277,7 +279,7 @@ def test_tolerances_and_noise_are_the_most_probable_ones(monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize(("seed", "instrument"), [(1, "5-D"), (3, "5-D"), (1, "6-D"), (3, "6-D")])
 def test_tool_error_falls_as_predicted(seed: int, instrument: str):
-    """The bound is 95 %; four cases were looked at, eight of eight machines lay within it."""
+    """The tool error lies in the interval of 95 % for two machines and two instruments."""
     fit, truth = fitted(seed, instrument), small.virtual_machine(seed)
     before, _ = small.tool_error(truth, None)
     after, turned = small.tool_error(truth, fit.model)
@@ -289,7 +291,7 @@ def test_tool_error_falls_as_predicted(seed: int, instrument: str):
 
 
 def test_blocks_that_the_machine_has_are_kept_and_no_others():
-    """All blocks on offer; then a machine of joints alone."""
+    """With all blocks allowed, the fit keeps those that the machine has; for wrong joints alone it keeps none."""
     fit = fit_model(readings(), replace(small.SETTINGS, field_degree=1))
     assert [d.block for d in fit.decisions] == [
         b for b in BLOCKS[1:] if b not in ("expansion", "moisture", "late", "compliance", "lost motion", "friction")
@@ -302,7 +304,7 @@ def test_blocks_that_the_machine_has_are_kept_and_no_others():
 
 
 def test_worn_screws_are_told_from_others():
-    """Wear of up to 8 µm is kept and leaves what a fit without it leaves three times over; others have none (above)."""
+    """The block of wear up to 8 µm is kept, and leaves a third of the error of a fit without it, or less."""
     truth = small.virtual_machine(2, replace(small.BOUNDS, wear=8e-6))
     ours = small.measured(truth, small.campaign("5-D", 16), 2)
     fit = fit_model(ours, replace(SOME, blocks=(*SOME.blocks, "backlash map")))
@@ -313,7 +315,7 @@ def test_worn_screws_are_told_from_others():
 
 
 def test_a_field_is_found():
-    """A field of 30 µm and 60 µrad, with terms up to degree six, is kept and takes a good part of it away."""
+    """Of a field of 30 µm and 60 µrad with terms up to degree six, a fit with a field leaves at most 0.7."""
     bounds = replace(small.BOUNDS, field_displacement=30e-6, field_rotation=60e-6, field_box=small.BOX,
                      field_reversal=0.0)  # fmt: skip
     truth = small.virtual_machine(2, bounds)
@@ -325,7 +327,7 @@ def test_a_field_is_found():
 
 
 def test_noise_twice_and_three_times_as_stated_is_found():
-    """2 µm and 3 µrad under a stated 1: known from some 360 to 600 free readings, 4 % each; four of these."""
+    """Stated 1 µm and 1 µrad, true 2 µm and 3 µrad: 360 to 600 free readings find that to 4 %; 16 % is allowed."""
     plan = small.campaign(noise=(2e-6, 1e-6, 3e-6, 1e-5, 1e-5, 1e-6, 1e-6))
     ours = small.measured(small.virtual_machine(1), plan, 1)
     fit = fit_model(replace(ours, uncertainty=np.full(len(ours), 1e-6)), FEW)
@@ -335,16 +337,16 @@ def test_noise_twice_and_three_times_as_stated_is_found():
     assert sum(c.readings for c in fit.channels) == len(ours)
 
 
-# Machine A: so good that Gauss–Newton settles in two steps, before any reading has been doubted
+# Errors of machine A are so small that Gauss–Newton converges in two steps, before it downweights any reading
 SMALL_ERRORS = replace(small.BOUNDS, joint=1e-5, strut_offset=1e-5, pitch=5e-5)
 
 
 @pytest.mark.parametrize("gross", [2e-5, pytest.param(1e-3, marks=long_test)])
 def test_gross_errors_are_named_and_do_no_harm(gross: float):
-    """Three readings that are 20 standard deviations off, or a millimetre: listed, and the tool error stays.
+    """Three readings wrong by 20 standard deviations or 1 mm are listed; the tool error grows by at most a fifth.
 
-    Dropping them outright would be best; downweighted readings pull with 2.5 standard deviations each, which
-    moves 57 parameters from 1,600 readings by a fraction of their standard error.
+    A downweighted reading still pulls with 2.5 standard deviations, which moves 57 parameters from 1,600 readings by a
+    fraction of their standard error.
     """
     truth, where = small.virtual_machine(2, SMALL_ERRORS), [100, 700, 1300]
     ours = small.measured(truth, small.campaign(), 2)
@@ -362,7 +364,7 @@ def test_gross_errors_are_named_and_do_no_harm(gross: float):
 
 
 def test_a_fit_that_does_not_settle_says_what_still_moves(monkeypatch):
-    """One step from the nominal machine, with nothing but the struts' pitch: only that can have moved."""
+    """The fit gets one step from the nominal machine, with the pitch as the only free block: the error must name it."""
     monkeypatch.setattr("hexapod_comp.calibration.estimator.STEPS", 1)
     settings = replace(FEW, blocks=("pitch",), tolerances=(("structure", 1e-12), ("pitch", 100e-6)))
     space = ParameterSpace(readings(), settings)
@@ -380,14 +382,14 @@ def test_too_few_readings_are_refused_with_their_numbers():
 
 
 def test_wrong_units_are_a_calibration_error():
-    """38 µm read as 38 mm: no machine is like that."""
+    """38 µm read as 38 mm is refused as a wrong unit."""
     ours = readings()
     with pytest.raises(CalibrationError, match=r"units|does the unit fit\?"):
         fit_model(ours.with_values(1e3 * ours.value), FEW)
 
 
 def test_readings_without_noise_are_welcome():
-    """What a virtual campaign with perfect lasers gives: nanometres are left, of which rounding makes none."""
+    """A virtual campaign with perfect lasers is fitted; less than 10 nm of tool error is left."""
     plan = small.campaign("6-D", noise=(0.0,) * len(KINDS))
     truth = small.virtual_machine(1)
     fit = fit_model(small.measured(truth, plan, 1), FEW)
@@ -395,7 +397,7 @@ def test_readings_without_noise_are_welcome():
 
 
 def test_a_channel_that_never_changes_is_refused():
-    """A constant is an unknown zero, so nothing is left: one dead channel among others that live is enough."""
+    """A channel whose readings are all equal shows only its unknown zero; one such channel among others is refused."""
     ours = readings()
     straightness = ours.kind == KINDS.index("straightness")
     stuck = ours.with_values(np.where(straightness, 3e-6, ours.value))
@@ -404,13 +406,13 @@ def test_a_channel_that_never_changes_is_refused():
 
 
 MM = 1e-3
-# What machine B has, and its waves' harmonics
+# The blocks of machine B, and harmonics of its waves
 HARMONICS = replace(small.SETTINGS, lead=None, blocks=("pitch", "wave", "wave 2", "wave 3", "wave 4", "backlash"))
 
 
 @cache
 def of_waves(seed: int, **changes: object) -> MeasurementSet:
-    """Return a small campaign's readings of machine B, changed."""
+    """Return a small campaign's readings of machine B with changed error bounds."""
     return small.measured(small.virtual_machine(seed, replace(small.BOUNDS, **changes)), small.campaign(), seed)
 
 
@@ -422,7 +424,7 @@ def lead_of(measured: MeasurementSet, settings: FitSettings = HARMONICS) -> Scre
 
 @pytest.mark.parametrize(("seed", "true"), [(1, 2.0), (2, 3.7), (5, 19.3)])
 def test_leads_of_all_sizes_are_read_off(seed: int, true: float):
-    """Six standard errors, six decades of odds beyond the threshold's; readings stand 2 inches apart."""
+    """Leads of 2 to 19.3 mm are found within six standard errors, from readings 2 inches apart."""
     lead = lead_of(of_waves(seed, wave_period=true * MM))
     assert lead.shown == pytest.approx(true * MM, abs=6.0 * lead.error)
     assert lead.error < 1e-3 * lead.shown
@@ -430,8 +432,8 @@ def test_leads_of_all_sizes_are_read_off(seed: int, true: float):
 
 
 def test_waves_far_above_the_noise_do_not_bias_the_lead():
-    """30 µm at 0.2 µm noise, beside a length map: residuals clipped about a fit without waves had lost their peaks, and
-    the lead was 190 standard errors off."""
+    """Waves of 30 µm at 0.2 µm of noise, beside a length map. When residuals of a fit without waves were clipped, the
+    waves lost their peaks and the lead was wrong by 190 standard errors."""
     measured = of_waves(3, wave=(30e-6, 45e-6), wave_period=10.0 * MM, length_map=2e-6)
     lead = lead_of(measured, replace(HARMONICS, blocks=BLOCKS))
     assert lead.shown == pytest.approx(10.0 * MM, abs=4.0 * lead.error)
@@ -439,7 +441,7 @@ def test_waves_far_above_the_noise_do_not_bias_the_lead():
 
 
 def test_round_leads_are_taken_as_such():
-    """10 mm, and 0.5 in: leads are made so. 3.7 mm is taken as it is shown, as is what is not known well enough."""
+    """A lead found near 10 mm or 0.5 in is rounded to it; 3.7 mm, and a lead known badly, stay as found."""
     shown = [ScrewLead(None, value * MM, 2e-6, 100.0).used for value in (10.0031, 12.6985, 3.7)]
     assert shown == [pytest.approx(10.0 * MM), pytest.approx(12.7 * MM), 3.7 * MM]
     assert ScrewLead(None, 10.03 * MM, 20e-6, 100.0).used == 10.03 * MM
@@ -447,13 +449,13 @@ def test_round_leads_are_taken_as_such():
 
 @pytest.mark.parametrize("bounds", [{"wave": (1e-9, 2e-9)}, {"wave": (0.0, 0.0), "length_map": 5e-6}])
 def test_what_is_not_there_is_not_shown(bounds: dict):
-    """With waves far below the noise, and with smooth errors of length that the space does not have."""
+    """No lead is reported for waves far below the noise, nor for smooth length errors without a period."""
     lead = lead_of(of_waves(6, **bounds))
     assert (lead.shown, lead.used) == (None, None)
 
 
 def test_a_wave_twice_a_turn_alone_agrees_with_the_lead():
-    """A cardan joint turns its screw unevenly twice a turn: 5 mm are shown, and 10 mm given explain it."""
+    """A cardan joint turns its screw unevenly, twice per turn: a period of 5 mm agrees with a given lead of 10 mm."""
     lead = lead_of(of_waves(3, wave_period=5.0 * MM), replace(HARMONICS, lead=10.0 * MM))
     assert lead.shown == pytest.approx(5.0 * MM, rel=1e-3)
     assert lead.agrees
@@ -461,7 +463,7 @@ def test_a_wave_twice_a_turn_alone_agrees_with_the_lead():
 
 
 def test_the_lead_is_the_fundamental_though_a_harmonic_be_larger():
-    """Waves of 1 µm once, 3 to 4 µm two to four times a turn."""
+    """The lead of waves of 1 µm once per turn, and of 3 to 4 µm two to four times, is found as 10 mm."""
     lead = lead_of(of_waves(7, wave=(1e-6, 1e-6), harmonics=(3e-6, 4e-6)))
     assert lead.shown == pytest.approx(10.0 * MM, rel=1e-3)
 
@@ -474,7 +476,7 @@ def test_a_given_lead_that_disagrees_is_remarked_on():
 
 
 def test_harmonics_are_fitted_and_only_those_that_are_there():
-    """Second and third of 1 to 2 µm: left are some hundredths of a micrometre, the fourth is left out."""
+    """Of a second and third harmonic of 1 to 2 µm and no fourth, the fit keeps the first two, and leaves 0.5 µm."""
     truth = small.virtual_machine(8, replace(small.BOUNDS, harmonics=(1e-6, 2e-6)))
     struts = replace(truth.model.struts, cosine=truth.model.struts.cosine[:, :3], sine=truth.model.struts.sine[:, :3])
     truth = type(truth)(truth.geometry, replace(truth.model, struts=struts))

@@ -1,6 +1,7 @@
-"""Ball bars, stations, touched balls, R-tests, squares: what their unknowns explain, what fits make of them.
+"""Ball bars, stations, spheres, R-tests and squares: what their nuisance parameters explain, and fits to their
+readings.
 
-Truth: distances between points that the tests place themselves; machines and kinematics of :mod:`foreign_machines`.
+The truth is distances between points that the tests choose; machines and kinematics are of :mod:`foreign_machines`.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ UM, MM = 1e-6, 1e-3
 
 
 def ball(points: int, radius: float, centre: np.ndarray) -> np.ndarray:
-    """Return points on a sphere."""
+    """Return random points on a sphere."""
     n = np.random.default_rng(1).standard_normal((points, 3))
     return centre + radius * n / np.linalg.norm(n, axis=1)[:, None]
 
 
 def left_of(lengths: Lengths, displacement: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Return what is left of lengths, m, once their unknowns have explained what they can."""
+    """Return the residuals of lengths, m, after their nuisance parameters are projected out."""
     scale = np.full(len(value), 1.0 / UM)
     expected, _, unknowns = lengths.linearise(displacement, value, scale)
     left = scale * (value - expected)
@@ -53,8 +54,8 @@ def left_of(lengths: Lengths, displacement: np.ndarray, value: np.ndarray) -> np
 
 @pytest.mark.parametrize("known", [False, True])
 def test_a_centre_millimetres_off_explains_all_of_its_lengths(known: bool) -> None:
-    """From a point 3 mm off, of a bar of 100 mm: 45 µm are of second order. The prior, 5 mm, pulls by a thousandth of
-    a micrometre at most: 1 µm² / (5 mm)² of 3 mm."""
+    """A centre 3 mm off explains the lengths of a bar of 100 mm. Second order is 45 µm; the centre's prior of 5 mm adds
+    at most 1 µm² / (5 mm)² of 3 mm, 0.001 µm."""
     centre, off = np.array([0.1, -0.2, 0.5]), np.array([2.0, -1.0, 2.0]) * MM
     points, moved = ball(40, 0.1, centre), 50.0 * UM * np.random.default_rng(2).standard_normal((40, 3))
     read = np.linalg.norm(points + moved - centre - off, axis=1) + (0.0 if known else 17.0 * MM)
@@ -64,7 +65,7 @@ def test_a_centre_millimetres_off_explains_all_of_its_lengths(known: bool) -> No
 
 
 def test_the_balls_of_a_plate_move_together() -> None:
-    """A plate turned by 5 mrad and shifted by millimetres explains its lengths; a ball that moved alone does not."""
+    """A plate turned by 5 mrad and shifted by millimetres explains its lengths; one ball that moved alone does not."""
     balls = np.array([[0.0, 0.0, 0.4], [0.1, 0.0, 0.4], [0.0, 0.1, 0.42]])
     points = np.vstack([ball(15, 0.02, centre) for centre in balls])
     of_each = np.repeat(balls, 15, axis=0)
@@ -78,7 +79,7 @@ def test_the_balls_of_a_plate_move_together() -> None:
 
 
 def test_a_centre_at_another_place_is_refused() -> None:
-    """50 mm off: a coordinate is wrong, and no instrument."""
+    """A centre 50 mm off is refused: a coordinate in the file must be wrong."""
     centre = np.array([0.0, 0.0, 0.5])
     points = ball(30, 0.2, centre)
     lengths = Lengths("bar 3", np.arange(30), points, np.tile(centre, (30, 1)), False)
@@ -88,14 +89,14 @@ def test_a_centre_at_another_place_is_refused() -> None:
 
 
 def lengths_from(machine: Machine, name: str, tips: np.ndarray, tools: np.ndarray, centre: np.ndarray) -> list[Reading]:
-    """Return a run of lengths from a place of work, values of zero."""
+    """Return a run of lengths, with values of zero, from a centre in the work frame."""
     at = tuple(centre.round(9).tolist())
     poses = [Pose(*pose) for pose in zip(tips.round(9), tools, strict=True)]
     return [Reading(name, 1, UNKNOWN, pose, "length", 0.0, UM, centre=at) for pose in poses]
 
 
 def planned(machine: Machine, what: str) -> list[Reading]:
-    """Return lengths from four stations, or circles and R-tests; tools stand up to 6° off level."""
+    """Return lengths from four stations, or circles and R-tests, with tools up to 6° off level."""
     rng, half = np.random.default_rng(5), np.array(machine.half)
     tools = np.stack([rotation(*rng.uniform(-6.0, 6.0, 3)) for _ in range(45)])
     if what == "stations":
@@ -116,7 +117,7 @@ def planned(machine: Machine, what: str) -> list[Reading]:
 
 
 def measured(machine: Machine, truth: Errors, path: Path, what: str) -> MeasurementSet:
-    """Return what instruments read of 0.5 µm on a machine told nominal lengths; their centres are off by 0.2 mm."""
+    """Return readings with 0.5 µm of noise, and centres 0.2 mm off, of a machine commanded with nominal lengths."""
     m = assemble(load_geometry(machine.write(path)), planned(machine, what))
     rng = np.random.default_rng(8)
     poses = m.stations.positions, m.stations.rotations
@@ -134,25 +135,25 @@ def measured(machine: Machine, truth: Errors, path: Path, what: str) -> Measurem
 @pytest.mark.parametrize("what", ["stations", "circles and R-tests"])
 @pytest.mark.parametrize("name", foreign_machines.machine_names())
 def test_instruments_mend_machines_of_all_kinds(name: str, what: str, tmp_path: Path) -> None:
-    """Errors of 50 µm, readings of 0.5 µm: a quarter is left at most at tips that nobody measured, the datum aligned.
+    """Of errors of 50 µm, readings of 0.5 µm leave at most a quarter at tips that were not measured, datum aligned.
 
-    Circles that all are about as large do not show how large: what they leave besides is that.
+    Circles of about the same size do not show the machine's size; most of their residual error is this size.
     """
     machine = foreign_machines.machines()[name]
     truth = Errors.drawn(machine, 3)
     readings = measured(machine, truth, tmp_path / "machine.yaml", what)
-    fit = fit_model(readings, FitSettings(blocks=("pitch",)))  # all that these machines err by, with structure
+    fit = fit_model(readings, FitSettings(blocks=("pitch",)))  # the only errors of these machines beside structure
     save_model(fit.model, tmp_path / "model.yaml")
     tips = machine.middle + np.random.default_rng(9).uniform(-0.8, 0.8, (100, 3)) * np.array(machine.half)
     error = partial(tool_errors, machine, truth)
     before = aligned_rms(tips, error(None, tips))
     after = aligned_rms(tips, error(Errors.read(tmp_path / "model.yaml"), tips))
-    assert after < 0.25 * before  # some forty poses, for speed; what whole campaigns leave: benchmarks.calibration
+    assert after < 0.25 * before  # 45 poses, for speed; benchmarks.calibration evaluates whole campaigns
     assert all(0.7 < c.chi_square < 1.3 or c.stated == UM for c in fit.channels)
 
 
 def test_what_circles_and_lengths_cannot_see() -> None:
-    """Circles of one unknown radius do not change when the machine is a little too large; known lengths do."""
+    """Circles of one unknown radius do not show the machine's size; lengths with a known zero do."""
     machine = foreign_machines.machines()["paper"]
     readings = [r for r in planned(machine, "circles") if r.channel == "length"]
     seen = {}
@@ -164,14 +165,14 @@ def test_what_circles_and_lengths_cannot_see() -> None:
     assert {"roll of x", "roll of y", "roll of z"} <= set(seen[True])
 
 
-FRAMES = ((0.5 * MM, 1e-3), (1.0, 0.3))  # How far a tracker's frame is off, m and rad
+FRAMES = ((0.5 * MM, 1e-3), (1.0, 0.3))  # shift and rotation of a tracker's frame, m and rad
 
 
 def in_frame(m: MeasurementSet, shift: np.ndarray, turn: Rotation) -> MeasurementSet:
-    """Return a tracker's poses as it shows them in a frame that stands elsewhere: p′ = Rᵀ·(p − d), A′ = Rᵀ·A."""
+    """Return a tracker's poses in a frame that is shifted by d and rotated by R: p′ = Rᵀ·(p − d), A′ = Rᵀ·A."""
     work, points = m.geometry.work.rotation, m.points()
     read = np.zeros((len(m.stations), 6))
-    place = m.channel - CHANNELS.index("position_x")  # position x, y, z, attitude x, y, z
+    place = m.channel - CHANNELS.index("position_x")  # columns: position x, y, z, attitude x, y, z
     read[m.station, place] = m.value
     actual = points + read[:, :3] @ work.T
     attitude = turn.inv() * Rotation.from_rotvec(read[:, 3:] @ work.T)
@@ -181,10 +182,10 @@ def in_frame(m: MeasurementSet, shift: np.ndarray, turn: Rotation) -> Measuremen
 
 @pytest.mark.parametrize("attitudes", [pytest.param(True, marks=long_test), False])
 def test_a_trackers_frame_may_stand_anywhere(attitudes: bool) -> None:
-    """The same tool error is left as with a right frame, within 2 %, and little more than if it were known.
+    """A tracker's wrong frame leaves the same tool error as the right frame, to 2 %, if the fit estimates the frame.
 
-    Six unknowns of 480 or 240 numbers cost 1 % of accuracy if they fell on all directions alike; told to be known, a
-    frame that is 0.5 mm off leaves a datum that is.
+    Estimating it leaves at most 15 % more than knowing it: its six unknowns, of 480 or 240 numbers, would cost 1 % if
+    they affected all directions alike.
     """
     truth = small.virtual_machine(3)
     poses = small.measured(truth, small.campaign(None, 0, poses=80, tilt=0.14), 3)
@@ -210,7 +211,7 @@ ENDS = {"x": [[-0.1, 0.0, 0.45], [0.1, 0.0, 0.45]], "y": [[0.0, -0.1, 0.45], [0.
 
 
 def faces(slope: str) -> Campaign:
-    """Return straightness along x and along y, from one square where it is named."""
+    """Return straightness along x and y, read with one square (`slope`: its name) or with separate slopes ("")."""
     runs = [line_run(f"face {a}", "straightness", np.array(ends), 9, np.eye(3)) for a, ends in ENDS.items()]
     for run in runs:
         object.__setattr__(run, "slope", slope)
@@ -218,7 +219,7 @@ def faces(slope: str) -> Campaign:
 
 
 def left_beside(m: MeasurementSet, values: np.ndarray) -> float:
-    """Return how much of a straightness is left beside the instruments' unknowns, in m."""
+    """Return the largest residual of a straightness, m, after the nuisance parameters are projected out."""
     estimation = Estimation(m, ParameterSpace(m, FEW), alone=False)
     cells = estimation.cells
     mean = np.bincount(cells.of_reading, values) / np.bincount(cells.of_reading)
@@ -228,9 +229,10 @@ def left_beside(m: MeasurementSet, values: np.ndarray) -> float:
 
 @pytest.mark.parametrize(("slope", "seen"), [("square", True), ("", False)])
 def test_squareness_shows_where_two_faces_share_a_slope(slope, seen):
-    """The square turned by 1 mrad adds x to dy and −y to dx, and leaves nothing.
+    """A square turned by 1 mrad adds x to dy and −y to dx, and leaves no residual.
 
-    Axes that are 1 mrad off square add +x and +y: half of it on either face is the square's, ±0.1 mm at the ends.
+    Axes that are 1 mrad off square add +x and +y: the square explains half of it on each face, ±0.1 mm is left at the
+    ends.
     """
     m = template(faces(slope), virtual_machine(3).geometry)
     point = m.points()[m.station]

@@ -1,4 +1,4 @@
-"""Scheme `lines`: polynomials come back, unknown zeros and slopes stay out, families do not count twice."""
+"""Scheme `lines`: polynomials are recovered, unknown zeros and slopes removed, families of lines not added twice."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ from hexapod_comp.virtual.imperfections import draw_model
 from hexapod_comp.virtual.instruments import compensated, measure
 
 GRID = tuple(np.round(np.linspace(low, high, n), 9) for low, high, n in zip(*BOX, (5, 5, 3), strict=True))
-POWERS = (5, 5, 3)  # A third of 17, 17 and 9 points
+POWERS = (5, 5, 3)  # orders by the rule: a third of 17, 17 and 9 points
 
 QUIET = Campaign(BOX, 4 * INCH, INCH, instrument="1-D", diagonals=0, noise=(0.0,) * 7, beam_slope=1e-3)
 LASER = replace(QUIET, noise=(1e-6,) * 7)
@@ -40,13 +40,13 @@ def machine_of(geometry: HexapodGeometry, lines) -> RealMachine:
 
 
 def parameter(axis: int, coordinate):
-    """Return u of a coordinate, from the definition: −1 at the first node, 1 at the last."""
+    """Return u of a coordinate by its definition: −1 at the first node, 1 at the last."""
     low, high = BOX[:, axis]
     return 2.0 * (coordinate - low) / (high - low) - 1.0
 
 
 def random_family(rng: np.random.Generator, axis: int, components, datum: float) -> np.ndarray:
-    """Return a family of lines, ±10 µm or µrad, each zero at a coordinate in the mean of its directions."""
+    """Return a family of lines, ±10 µm or µrad; the mean of both directions of each line is zero at a coordinate."""
     first, second = CROSS_AXES[axis]
     family = np.zeros((2, len(GRID[first]), len(GRID[second]), 6, POWERS[axis]))
     family[:, :, :, components] = rng.uniform(-1e-5, 1e-5, (*family.shape[:3], len(components), POWERS[axis]))
@@ -57,7 +57,7 @@ def random_family(rng: np.random.Generator, axis: int, components, datum: float)
 
 @pytest.fixture(scope="module")
 def linear_truth(geometry) -> RealMachine:
-    """A machine that is nothing but 001's 1-D field."""
+    """Return a machine whose only error is Mou & King's 1-D field."""
     rng = np.random.default_rng(1)
     home = geometry.home.position
     return machine_of(geometry, tuple(random_family(rng, axis, [axis], home[axis]) for axis in range(3)))
@@ -70,7 +70,7 @@ def quiet(geometry, linear_truth) -> MeasurementSet:
 
 @pytest.fixture(scope="module")
 def five(geometry) -> MeasurementSet:
-    """A 5-D campaign to be filled in."""
+    """Return the rows of a 5-D campaign without values."""
     return template(replace(QUIET, instrument="5-D"), geometry)
 
 
@@ -86,9 +86,9 @@ def real_fit(geometry, real) -> LinesFit:
 
 
 def test_a_machine_of_the_papers_form_is_found_again(quiet, linear_truth):
-    """Truth: the machine's own coefficients, zero where the fit's lines are; 1e-12 m is the solver's rounding.
+    """The fit recovers the coefficients of a machine whose field has the fit's own form, to 1e-12 m of rounding.
 
-    Without noise adjusted R² must take the whole order.
+    Without noise adjusted R² must choose the full order.
     """
     fit = fit_lines(quiet)
     for found, true in zip(fit.model.field.lines, linear_truth.model.field.lines, strict=True):
@@ -99,9 +99,9 @@ def test_a_machine_of_the_papers_form_is_found_again(quiet, linear_truth):
 
 @pytest.mark.parametrize("instrument", ["1-D", "5-D"])
 def test_what_the_screws_turning_does_is_not_counted_twice(tmp_path, instrument):
-    """A machine without errors has none, though its screws turn: 1e-12 m and rad are the solver's rounding.
+    """A machine without errors gets a field of zero although its screws turn, to 1e-12 m and rad of rounding.
 
-    Told nominal lengths it errs by micrometres, and whoever applies the model takes that from the geometry.
+    Commanded with nominal lengths it errs by micrometres, which the compensator computes from the geometry.
     """
     machine = machines()["unit"]
     geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
@@ -114,7 +114,7 @@ def test_what_the_screws_turning_does_is_not_counted_twice(tmp_path, instrument)
 
 
 def noisy_lines(geometry: HexapodGeometry, seed: int = 0) -> MeasurementSet:
-    """Return 1-D readings of 20 µm·u² on every line with noise of 0.5 µm."""
+    """Return 1-D readings of 20 µm·u² with 0.5 µm of noise on every line."""
     rng = np.random.default_rng(seed)
     blank = template(QUIET, geometry)
     axis = np.array([run.base_axis for run in blank.runs])[blank.run]
@@ -124,14 +124,14 @@ def noisy_lines(geometry: HexapodGeometry, seed: int = 0) -> MeasurementSet:
 
 
 def test_adjusted_r2_finds_a_parabola(geometry):
-    """Never less. It takes a term when its F is above 1: by chance on about half of the lines that could have more."""
+    """No line has an order below 2. A higher term with F > 1 is taken by chance, on fewer than half of the lines."""
     orders = np.array([line.order for line in fit_lines(noisy_lines(geometry)).lines])
     assert orders.min() == 2
     assert np.mean(orders == 2) > 0.5
 
 
 def test_the_figures_of_a_polynomial_are_those_of_a_regression(geometry):
-    """Truth: scipy.stats.linregress on NumPy's polynomial of the same order; adjusted R² by variances."""
+    """The truth is scipy.stats.linregress on NumPy's polynomial of the same order; adjusted R² from variances."""
     for line in fit_lines(noisy_lines(geometry)).lines[::7]:
         fitted = np.polynomial.Polynomial.fit(line.coordinates, line.values, line.order)(line.coordinates)
         variance = ((line.values - fitted) ** 2).sum() / (len(fitted) - line.order - 1)
@@ -141,12 +141,12 @@ def test_the_figures_of_a_polynomial_are_those_of_a_regression(geometry):
 
 
 def test_families_do_not_count_twice(geometry, five):
-    """A machine of the scheme's own form, read in 5-D without noise, comes back but for what 5-D lines cannot see.
+    """5-D lines without noise recover the field of a machine of the scheme's own form, except for its unseen terms.
 
-    Truth: the machine's field at random points. Its dx is any polynomials on the x-lines, zero at home, and a
-    bow that all y-lines share; so for dy and dz. Unseen, by the unknown zeros and slopes, are a
-    constant, the two slopes across and their product, in each displacement: they are projected out. Families
-    that were added as read would be off by as much as the machine's error, 10 µm.
+    The truth is the machine's field at random points. Its dx has any polynomials on the x-lines, zero at home, and a
+    curve that all y-lines share; dy and dz likewise. The unknown zeros and slopes hide a constant, the two slopes
+    across and their product in each displacement; the test projects them out. Families added as they are read would be
+    wrong by 10 µm.
     """
     rng = np.random.default_rng(5)
     home = geometry.home.position
@@ -173,15 +173,15 @@ def test_one_direction_serves_for_both_with_a_note(quiet, linear_truth):
     fit = fit_lines(forward)
     for family, true in zip(fit.model.field.lines, linear_truth.model.field.lines, strict=True):
         assert (family[0] == family[1]).all()
-        # Its own zero now stands for both: the shape is the forward one's.
+        # The zero is now that of the forward readings alone, so only the shapes are compared.
         assert family[0][..., 1:] == pytest.approx(true[0][..., 1:], abs=1e-12)
     assert any("not read in both directions" in note for note in fit.notes)
 
 
 def test_the_work_frame_may_be_turned_by_right_angles(geometry, linear_truth, quiet):
-    """The same machine, its program written in a frame turned by 90°: the same field in ``base``."""
+    """The same machine, with its program in a frame turned by 90°, gets the same field in ``base``."""
     turn = Pose.from_angles([0.0, 0.0, 0.0], np.deg2rad([0.0, 0.0, 90.0]))
-    turned = replace(geometry, work=turn, tool=turn)  # so the platform stays as it was
+    turned = replace(geometry, work=turn, tool=turn)  # the tool is turned too, so the platform's poses stay the same
     campaign = replace(QUIET, instrument="5-D")
     fits = []
     for machine in (geometry, turned):
@@ -196,7 +196,9 @@ def reduction(found: PaperMetric) -> float:
 
 
 def test_the_papers_claim_on_virtual_machines(geometry):
-    """001: 70 % on its own metric. Mean of five machines of ±100 µm, 3–5 µm of backlash and 4 µm of screw wave."""
+    """The mean over five machines is above the paper's 70 %, in its own measure.
+
+    The machines have ±100 µm on joints and struts, 3–5 µm of backlash and a screw wave of 4 µm."""
     blank = template(LASER, geometry)
     found = []
     for seed in range(5):
@@ -206,7 +208,7 @@ def test_the_papers_claim_on_virtual_machines(geometry):
 
 
 def test_strut_errors_of_a_lifted_machine(geometry):
-    """A field of dz = 10 µm: each strut is longer by its Jacobian's z column, but for ΔL²/2L ≈ 1e-10 m."""
+    """For dz = 10 µm each strut is longer by the z column of its Jacobian, but for ΔL²/2L ≈ 1e-10 m."""
     family = np.zeros((2, 2, 2, 6, 1))
     family[:, :, :, 2] = 10e-6
     empty = np.zeros((2, 2, 2, 6, 0))
@@ -219,7 +221,7 @@ def test_strut_errors_of_a_lifted_machine(geometry):
 
 
 def test_pictures(geometry, real_fit):
-    """Twice two panels of six struts; one panel a line, or one for lines that share a polynomial."""
+    """Pictures have the expected numbers of panels and curves; a model without a box or a missing fit is refused."""
     figure = strut_error_figure(geometry, {"1-D": real_fit.model, "5-D": real_fit.model})
     assert len(figure.axes) == 4
     assert all(len(axes.lines) == 6 for axes in figure.axes)
@@ -232,19 +234,19 @@ def test_pictures(geometry, real_fit):
 
 
 def line_of(measured: MeasurementSet, start: str) -> np.ndarray:
-    """Return which readings are of runs whose names begin so."""
+    """Return which readings belong to runs whose names begin with `start`."""
     return np.array([run.name.startswith(start) for run in measured.runs])[measured.run]
 
 
 def with_a_tilted_line(m: MeasurementSet) -> MeasurementSet:
-    """Return readings of which the first run's are taken with a tilted tool."""
+    """Return readings whose first run has a tilted tool."""
     rotations = m.stations.rotations.copy()
     rotations[m.station[m.run == 0]] = Pose.from_angles(np.zeros(3), [0.01, 0.0, 0.0]).rotation
     return replace(m, stations=replace(m.stations, rotations=rotations))
 
 
 def skewed(geometry: HexapodGeometry) -> MeasurementSet:
-    """Return lines of a work frame that is turned by 30° about z: z lines alone stay parallel to an axis."""
+    """Return lines of a work frame turned by 30° about z: only its z-lines are parallel to an axis of base."""
     turn = Pose.from_angles([0.0, 0.0, 0.0], np.deg2rad([0.0, 0.0, 30.0]))
     campaign = replace(QUIET, box=BOX * [0.5, 0.5, 1.0], instrument="5-D")
     return template(campaign, replace(geometry, work=turn, tool=turn))

@@ -1,7 +1,7 @@
-"""Calibration under weight: a stated stiffness holds for other tools, and readings at two loads refine it.
+"""Calibration under weight: a stated stiffness predicts the error with other tools; readings at two loads refine it.
 
-Truth: the same virtual machine with struts of 18 to 22 N/µm, a platform of 20 kg and a spindle of 10 kg, driven under
-tools that no reading has seen.
+The truth is one virtual machine with struts of 18 to 22 N/µm, a platform of 20 kg and a spindle of 10 kg, driven with
+tools that were not mounted during the readings.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def truth() -> RealMachine:
 
 
 def under(payload: Payload, seed: int, gravity: tuple[float, ...] = (np.nan,) * 3) -> MeasurementSet:
-    """Return what a 5-D laser reads on the machine that carries a payload."""
+    """Return the readings of a 5-D laser on the machine with a payload."""
     plan = campaign()
     laid = template(plan, truth().geometry)
     row = payload.mass, *payload.centre, *gravity
@@ -73,15 +73,16 @@ def fit(settings: FitSettings, two: bool = False) -> ModelFit:
 
 
 def left(fitted: ModelFit, payload: Payload) -> float:
-    """Return what compensation leaves of the tool error with a payload, m; the model is told what it is."""
+    """Return the RMS tool error, m, that compensation leaves with a payload that the model is given."""
     geometry = truth().geometry.carrying(payload)
     return tool_error(RealMachine(geometry, truth().model), fitted.model)[0]
 
 
 def test_a_stated_stiffness_holds_for_tools_that_no_reading_has_seen() -> None:
-    """The bar: at most 1.3 times what it leaves with the tool as calibrated, and within the promise for that tool.
+    """With other tools the error is at most 1.3 times that with the calibrated tool, and below the predicted upper end.
 
-    Blind, the same machine leaves more. One load shows something of a stiffness by the places where it is read.
+    Without a stated stiffness it is at least three times as large. Readings at one load refine a stiffness, since the
+    forces differ from place to place.
     """
     told, blind = fit(TOLD), fit(BLIND)
     as_calibrated = left(told, SPINDLE)
@@ -99,7 +100,7 @@ def test_a_stated_stiffness_holds_for_tools_that_no_reading_has_seen() -> None:
 
 
 def test_a_fit_promises_for_another_load_what_the_machines_of_its_posterior_err_there() -> None:
-    """Forty machines drawn, driven by the core with 20 kg; the mean of as many squares is known to a tenth."""
+    """The truth is forty machines drawn from the posterior, driven with 20 kg; their mean square is known to 10 %."""
     space, x, covariance = fit(TOLD).space, fit(TOLD).solution.x, fit(TOLD).covariance
     load = HEAVY.mass, *HEAVY.centre, *DOWN
     stations, rng, squares = box_stations(space, load=load), np.random.default_rng(1), []
@@ -117,7 +118,7 @@ def test_a_fit_promises_for_another_load_what_the_machines_of_its_posterior_err_
 
 
 def test_readings_at_two_loads_refine_the_stiffness() -> None:
-    """Six numbers, stated to ±10 %, come nearer to the truth in the mean, within what the fit says of each."""
+    """Six compliances, stated to ±10 %, come nearer to the true ones in the mean, and within their standard errors."""
     fitted = fit(TOLD, two=True)
     block = fitted.space.block("compliance")
     assert block is not None
@@ -130,9 +131,9 @@ def test_readings_at_two_loads_refine_the_stiffness() -> None:
 
 @pytest.mark.parametrize("axes", [None, np.roll(np.eye(3), 1, 0)[[0, 1, 0, 1, 0, 1]]], ids=["ball", "cardan"])
 def test_the_blocks_of_load_have_the_slopes_that_the_core_has(axes: np.ndarray | None) -> None:
-    """Finite differences of the prediction, which the core makes; tilted gravity, a payload off the middle, friction.
+    """The truth is finite differences of the core's prediction, with tilted gravity and a payload off the middle.
 
-    A lost motion is taken up within 30 N, so that many readings are on its slope, and few at its ends.
+    A lost motion is taken up within 30 N, so many readings are on its slope, and few at its ends.
     """
     readings = joined([under(SPINDLE, 1), under(HEAVY, 2, (1.0, -2.0, -9.5))])
     readings = replace(readings, geometry=replace(readings.geometry, base_axes=axes))
@@ -154,7 +155,7 @@ def test_the_blocks_of_load_have_the_slopes_that_the_core_has(axes: np.ndarray |
 
 
 def test_the_model_says_for_which_loads_and_the_compensator_warns_outside(tmp_path: Path) -> None:
-    """Both go through their files; verify and update need the posterior's settings."""
+    """Model file and posterior file keep the loads, and the compensator warns of a load outside them."""
     fitted = fit(TOLD, two=True)
     assert fitted.model.origin.loads == (
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -9.807),
@@ -177,9 +178,10 @@ def test_the_model_says_for_which_loads_and_the_compensator_warns_outside(tmp_pa
 @long_test
 @pytest.mark.parametrize("settings", [BLIND, TOLD], ids=["no stiffness", "stiffness stated"])
 def test_verify_names_the_payload_and_no_temperature(settings: FitSettings) -> None:
-    """Ten kilograms more that nobody tells of; then the same readings with what they carry, where stiffness is known.
+    """``verify`` names 10 kg more on the tool as a payload; readings that state this payload are valid.
 
-    The readings are the outward ones of the campaign's own lines. A machine that has grown is not taken for a load.
+    The readings are the forward ones of the campaign's own lines. A machine whose struts have grown is not called a
+    payload.
     """
     fitted = fit(settings)
     known = fitted.parameters
@@ -208,14 +210,14 @@ def test_verify_names_the_payload_and_no_temperature(settings: FitSettings) -> N
 
 
 def test_a_payload_moves_the_tool_as_the_core_says() -> None:
-    """The parameters that stand for 3 kg more, at poses of the readings, against the core with and without them."""
+    """The parameters that represent 3 kg more move the tool at the readings' poses as the core does with 3 kg more."""
     fitted = fit(TOLD)
     readings, space = under(SPINDLE, 1), widened(fitted.parameters).space
     heavier = replace(
         readings.stations, loads=np.tile([13.0, *SPINDLE.centre, *[np.nan] * 3], (len(readings.stations), 1))
     )
     x = np.zeros(space.size)
-    # In the tool's own centre, 10 mm aside: a mass in the platform's middle and a moment
+    # The added mass is 10 mm from the platform's axis: a mass at its centre and a moment
     moved = predict(space, x, heavier).errors - predict(space, x, readings.stations).errors
     change = payload_changes(space)[1]
     assert change.columns is not None
@@ -227,7 +229,7 @@ def test_a_payload_moves_the_tool_as_the_core_says() -> None:
 
 
 def test_fit_takes_the_stated_load_by_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The verb's report names loads, its model has the block; a stiffness in another unit is refused."""
+    """The verb's report names the loads, and its model has the load block; a stiffness in another unit is refused."""
     write_measurements(under(SPINDLE, 1), tmp_path / "one.csv")
     (tmp_path / "load.yaml").write_text("format: hexapod_comp/load\nversion: 1\nstiffness_N_per_um: 20\nmass_kg: 20\n")
     words = ["fit", tmp_path / "one.csv", "--load", tmp_path / "load.yaml", "--out", tmp_path / "model.yaml"]
@@ -241,7 +243,7 @@ def test_fit_takes_the_stated_load_by_a_file(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_readings_of_which_half_state_a_payload_are_refused() -> None:
-    """What the others carried nobody knows: taken for none, the stiffness would be fitted to it. A tool's mass says."""
+    """If only some readings state a payload they are refused, unless the geometry file gives the tool's mass."""
     half = joined([under(SPINDLE, 1), replace(under(Payload(), 2), stations=template(campaign(), paper()).stations)])
     with pytest.raises(
         CalibrationError, match="has no payload_kg where others do, and the geometry file gives tool no mass"
@@ -252,9 +254,9 @@ def test_readings_of_which_half_state_a_payload_are_refused() -> None:
 
 
 def test_lost_motion_and_friction_are_fitted_where_forces_change_their_sign() -> None:
-    """Truth: six clearances and frictions. At the box's sides struts pull that push in its middle.
+    """The truth is six clearances and frictions. Struts pull at the sides of the box that push in its middle.
 
-    Without the blocks they look like a field; where all struts push nothing shows a clearance, and it is left out.
+    Without these blocks the fit explains them by a field. If all struts push everywhere, the block is omitted.
     """
     clearance, friction = 1e-6 * np.array([3.0, 5.0, 2.0, 6.0, 4.0, 1.0]), np.array([0.4, 1.0, 0.6, 0.8, 0.3, 0.7])
     loose = RealMachine(paper(), replace(truth().model, load=replace(TRUE, lost_motion=clearance, friction=friction)))
@@ -279,8 +281,8 @@ def test_lost_motion_and_friction_are_fitted_where_forces_change_their_sign() ->
     assert "lost motion" in undetermined_load_blocks(told, paper(), template(high, paper()).stations)
     assert "lost motion" not in undetermined_load_blocks(told, paper(), readings.stations)
 
-    # Clearances that go to their ends at once, where the model is on its line between them, are no change: the same
-    # machine with a take-up of 1 mN, whose clearances exceed the noise. Without their variance χ² is 5 per number.
+    # The same machine with a take-up of 1 mN: its clearances are at their ends where the model is between them. A
+    # check must not call it changed; without the clearances' variance χ² is 5 per number.
     lost_motion = fitted.space.block("lost motion")
     assert lost_motion is not None
     known, x = fitted.parameters, fitted.solution.x.copy()

@@ -1,7 +1,7 @@
-"""What readings show that no parameter describes, and how it widens the promise.
+"""Errors in readings that no parameter describes, and how they widen the predicted interval.
 
-Each misfit is put into the readings of a machine of the model's own class, so its size is known; the machine itself
-takes part with a tool error of 0.3 µm after the fit, and a reading's noise is 1 µm and 1 µrad.
+The test adds each misfit, of known size, to the readings of a machine of the model's class. The machine itself has 0.3
+µm of tool error after the fit; a reading has 1 µm or 1 µrad of noise.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from hexapod_comp.machine.trial import Trial
 from hexapod_comp.measurements.readings import CHANNELS, KINDS, MeasurementSet, Stations
 from hexapod_comp.virtual.instruments import station_errors
 
-pytestmark = pytest.mark.usefixtures("unsuspected")  # what else readings might be: test_mixed_up
+pytestmark = pytest.mark.usefixtures("unsuspected")  # the search for mix-ups is tested in test_mixed_up
 
 LINEAR, STRAIGHTNESS, ROTATION = (KINDS.index(kind) for kind in ("linear", "straightness", "rotation"))
 
@@ -41,9 +41,9 @@ def readings() -> MeasurementSet:
 
 
 def test_what_is_described_is_promised_as_before(readings):
-    """The promise grows by the laser's stated scale alone, 0.5 ppm over some 0.2 m: priors hold next to nothing.
+    """Without a misfit the laser's stated scale, 0.5 ppm over 0.2 m, widens the interval; priors add below 0.001.
 
-    And by how far any covariance is believed; were it without doubt, by 1.3 at most.
+    The finite number of degrees of freedom of the covariance widens it as well; both together by at most 1.6 times.
     """
     fit = fit_model(readings, FEW)
     beyond = fit.unexplained
@@ -60,11 +60,11 @@ def test_what_is_described_is_promised_as_before(readings):
 
 
 def test_the_upper_end_holds_what_a_variance_may_be():
-    """Closed forms: χ² with 2 degrees of freedom is exponential; what is believed without end is not widened.
+    """Closed forms: χ² with 2 degrees of freedom is exponential; with infinite belief the interval is not widened.
 
-    And draws that are normal along one axis become Student's t, whose square is Fisher's F.
+    Draws that are normal along one axis become Student's t, whose square is Fisher's F.
     """
-    places, one, tail = np.zeros((2, 3)), np.full(100_001, 1e-6), -2.0 * np.log(0.975)  # exceeded with 97.5 %
+    places, one, tail = np.zeros((2, 3)), np.full(100_001, 1e-6), -2.0 * np.log(0.975)  # P(χ² > tail) = 0.975
 
     def high(left: np.ndarray = one, **of: float) -> float:
         return 1e6 * Unexplained(**of).promised(left, places).high
@@ -79,7 +79,7 @@ def test_the_upper_end_holds_what_a_variance_may_be():
 
 
 def test_an_interval_is_widened_by_each_cause_in_its_way():
-    """Of draws that are all 1 µm; two places 2 m apart are 1 m from their middle."""
+    """All draws are 1 µm; each cause widens the interval by its closed form. Two places 2 m apart have arms of 1 m."""
     one, places = np.full(9, 1e-6), np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     assert Unexplained().promised(one, places) == pytest.approx((1e-6, 1e-6, 1e-6))
     assert Unexplained(factor=3.0, averaged=4.0).promised(one, places) == pytest.approx((3e-6, 1e-6, 4e-6))
@@ -97,10 +97,10 @@ def test_an_interval_is_widened_by_each_cause_in_its_way():
 
 
 def test_noise_beyond_the_stated_is_promised(readings):
-    """Four times the stated noise: in doubt, above three times, but written, below ten.
+    """Four times the stated noise puts a fit in doubt (from 3), but it is written (below 10).
 
-    Whether instrument or machine scatters so nobody can tell without repeats: it is a discrepancy, which the upper end
-    has and the lower end has not.
+    Without repeats it is not known whether instrument or machine scatters: the upper end contains the discrepancy, the
+    lower end does not.
     """
     noise = 4e-6 * np.random.default_rng(2).standard_normal(len(readings))
     fit = fit_model(readings.with_values(readings.value + noise), FEW)
@@ -114,15 +114,15 @@ def test_noise_beyond_the_stated_is_promised(readings):
 
 
 def with_stops(cycles: int, seed: int) -> MeasurementSet:
-    """Return the readings of a machine that stops within ±1 µm of where it should, along each axis."""
+    """Return the readings of a machine that stops within ±1 µm of its commands along each axis."""
     return measured(virtual_machine(seed), campaign(cycles=cycles, repeatability=1e-6), seed)
 
 
 @pytest.mark.parametrize(("cycles", "widest"), [(1, 1.6), (2, 1.3)])
 def test_the_machine_s_repeatability_stays_in_use(cycles: int, widest: float):
-    """The tool stops √3 µm off, RMS, whatever the model says; 600 readings, or as many repeats, tell that to 10 %.
+    """The tool stops √3 µm RMS off its commands, with any model; 600 readings or as many repeats show it to 10 %.
 
-    It is called repeatability where repeats show it; without repeats it may be an error that is not in the model.
+    With repeats it is called repeatability; without repeats it may also be a lack of fit.
     """
     fit = fit_model(with_stops(cycles, 3), FEW)
     scatter, found = fit.unexplained.displacement, pytest.approx(1e-6 * np.sqrt(3.0), rel=0.1)
@@ -133,16 +133,16 @@ def test_the_machine_s_repeatability_stays_in_use(cycles: int, widest: float):
 
 
 def lost_motion(stations: Stations, structure: Structure) -> np.ndarray:
-    """Return what friction adds to each strut's length, (N, 6), m: by the sign of its speed, and unlike along it."""
+    """Return each strut's lost motion by friction, (N, 6), m: by the sign of its speed, varying along it."""
     lengths = strut_lengths_batch(structure, stations.positions, stations.rotations)
     return 4e-6 * stations.sense[:, 3:] * np.cos(2.0 * np.pi * lengths / 0.06 + np.arange(6))
 
 
 @pytest.mark.parametrize("cycles", [1, 3])
 def test_friction_in_the_struts_is_no_repeatability(cycles: int):
-    """A lost motion that is different all along the struts is in no block; passes repeat it, but for 1 µm of stops.
+    """A lost motion that varies along the struts is in no block: it is a lack of fit, and repeats except for 1 µm.
 
-    The truth is the machine itself, moved through random points both ways.
+    The truth is the machine itself, moved through random points in both directions.
     """
     truth, plan = virtual_machine(3), campaign(cycles=cycles, repeatability=1e-6)
     structure, ours = Structure.of(truth.geometry), measured(truth, plan, 3)
@@ -169,7 +169,7 @@ def test_friction_in_the_struts_is_no_repeatability(cycles: int):
 
 
 def test_a_scale_that_drifts_is_measured(readings):
-    """30 ppm from the first to the last reading; the standard error is some 2 ppm."""
+    """A scale that drifts by 30 ppm from the first to the last reading is measured; its standard error is 2 ppm."""
     time = np.linspace(-0.5, 0.5, len(readings))
     growth = 30e-6 * time * readings.along() * (readings.kind == LINEAR)
     fit = fit_model(readings.with_values(readings.value + growth), FEW)
@@ -178,7 +178,7 @@ def test_a_scale_that_drifts_is_measured(readings):
 
 
 def test_lines_that_differ_from_each_other_widen_the_promise(readings):
-    """Each run's laser has a scale of its own, ±30 ppm: 6 µm over a line that is read to 1 µm."""
+    """Each run's laser has a scale error of its own, ±30 ppm, which is 6 µm on lines read to 1 µm."""
     scale = 30e-6 * np.random.default_rng(4).standard_normal(len(readings.runs))
     spoilt = readings.value + scale[readings.run] * readings.along() * (readings.kind == LINEAR)
     fit = fit_model(readings.with_values(spoilt), FEW)
@@ -189,7 +189,7 @@ def test_lines_that_differ_from_each_other_widen_the_promise(readings):
 
 
 def test_chi_square_is_told_by_lines_and_direction(readings):
-    """Five times the noise on the y lines' straightness is a χ² of 25 there, less what the fit takes up."""
+    """Noise of 5 µm on the y-lines' straightness gives this part alone a χ² of 25, minus what the fit absorbs."""
     spoilt = (family_of_run(readings)[readings.run] == 1) & (readings.kind == STRAIGHTNESS)
     noise = 5e-6 * np.random.default_rng(5).standard_normal(len(readings)) * spoilt
     fit = fit_model(readings.with_values(readings.value + noise), replace(FEW, robust=False))
@@ -208,7 +208,7 @@ def test_one_run_is_held_by_the_priors(readings):
 
 
 def test_a_fit_that_does_not_settle_names_the_runs_that_pull(readings, monkeypatch):
-    """It does not settle with run 3, then with nothing left out either: that is refused, but can be forced."""
+    """A fit that does not converge with run 3 omits it; if it does not converge without it either, it is refused."""
     always = False
 
     def unsettled(estimation, *start):
@@ -219,7 +219,7 @@ def test_a_fit_that_does_not_settle_names_the_runs_that_pull(readings, monkeypat
 
     monkeypatch.setattr("hexapod_comp.calibration.fit.iterate", unsettled)
     along, name = readings.along() / np.abs(readings.along()).max(), readings.runs[3].name
-    pull = np.where(readings.run == 3, 50e-6 * along + 20e-6 * along**2, 0.0)  # of another state of the machine
+    pull = np.where(readings.run == 3, 50e-6 * along + 20e-6 * along**2, 0.0)  # as from another state of the machine
     pulled = readings.with_values(readings.value + pull)
     fit = fit_model(pulled, FEW)
     assert fit.doubts[0].startswith(f"with run {name} the fit does not converge: left out")
@@ -229,7 +229,7 @@ def test_a_fit_that_does_not_settle_names_the_runs_that_pull(readings, monkeypat
 
 
 def test_influence_is_what_leaving_a_run_out_does(readings):
-    """Against normal equations without the run's rows."""
+    """The truth is the normal equations without the run's rows."""
     space = ParameterSpace(readings, FEW)
     estimation = Estimation(readings, space)
     start = np.zeros(space.size), space.start_tolerances(), np.ones(len(KINDS))
@@ -246,7 +246,7 @@ def test_influence_is_what_leaving_a_run_out_does(readings):
 
 
 def test_stated_scale(readings):
-    """A laser: 0.5 ppm, and 0.5 mrad that shorten by half their square, 0.125 ppm; 2 ppm and 2 mrad: 2 ppm twice."""
+    """A laser has 0.5 ppm, and 0.5 mrad, whose half square is 0.125 ppm; 2 ppm and 2 mrad are 2 ppm twice."""
     assert stated_scale(readings, FEW) == pytest.approx(np.hypot(0.5e-6, 0.125e-6), rel=1e-12)
     assert stated_scale(readings, replace(FEW, scale=2e-6, alignment=2e-3)) == pytest.approx(np.sqrt(8.0) * 1e-6)
     with pytest.raises(ModelError, match="alignment"):
@@ -257,7 +257,7 @@ def test_stated_scale(readings):
 
 @pytest.mark.parametrize("value", [1e308, np.nan])
 def test_a_set_changed_in_python_names_a_value_that_no_reading_has(readings, value):
-    """Files are refused where they are read; a set may be changed afterwards."""
+    """A value that no file may hold is refused by the fit, too, if it was set in Python."""
     spoilt = readings.value.copy()
     spoilt[5] = value
     with pytest.raises(CalibrationError, match=r"campaign, .*the value is"):

@@ -1,6 +1,6 @@
-"""What readings might be but what they are called, and how it is named.
+"""Mix-ups in the readings, and the cause that the fit names.
 
-Each mistake is made by the test in the readings of a machine that the model describes.
+The tests make each mistake in the readings of a machine that the model describes.
 """
 
 from __future__ import annotations
@@ -62,14 +62,14 @@ CAUSES = {
 
 @pytest.mark.parametrize("cause", CAUSES)
 def test_the_cause_is_named(readings, cause):
-    """The first that is named is what was done; of half the runs, which half is reversed is anybody's guess."""
+    """The first cause named is the one that was made; if half of the runs are reversed, either half may be named."""
     named = mixed_up(CAUSES[cause](readings), FEW)
     assert named
     assert named[0].startswith(cause) or ("of 25 runs" in cause and "12 of 25 runs" in named[0])
 
 
 def test_exchanged_channels_are_named_where_the_plain_model_lacks_much(tmp_path):
-    """Length maps leave rotations off by 54 times their noise: an exchange adds a quarter of that."""
+    """Exchanged channels are named although length maps, not in the model, leave rotations at 54 times the noise."""
     settings = FitSettings(blocks=("pitch", "map", "field displacement", "field rotation"))
     machine = machines()["framed"]
     geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
@@ -85,7 +85,7 @@ def test_exchanged_channels_are_named_where_the_plain_model_lacks_much(tmp_path)
 
 
 def with_measured_struts(m: MeasurementSet) -> MeasurementSet:
-    """Return what is read where struts stop 5 µm off, as their encoders tell."""
+    """Return readings of a machine whose struts stop 5 µm off, with the stops measured by the encoders."""
     off = 5e-6 * np.random.default_rng(1).standard_normal(m.stations.commands.shape)
     stopped = replace(m, stations=replace(m.stations, commands=m.stations.commands + off))
     moved = station_errors(stopped, virtual_machine(3)) - station_errors(m, virtual_machine(3))
@@ -100,13 +100,13 @@ def with_measured_struts(m: MeasurementSet) -> MeasurementSet:
     ],
 )
 def test_another_frame_is_named(readings, frame, name):
-    """What undoes a turn is the turn back, and a mirror undoes itself; measured lengths know of no frame."""
+    """A wrong frame is named by the change that corrects it; measured strut lengths do not depend on the frame."""
     named = mixed_up(in_frame(with_measured_struts(readings), frame), FEW)
     assert [text.rpartition(" fits")[0] for text in named] == [name]
 
 
 def test_a_fit_that_fails_names_the_cause(readings, monkeypatch):
-    """Large errors and a reversed sign end in no machine at all: whoever reads that must learn why."""
+    """If the fit fails, the error message names the reversed sign that explains the failure."""
 
     def fail(*_):
         raise CalibrationError("fit", "did not settle")
@@ -119,13 +119,13 @@ def test_a_fit_that_fails_names_the_cause(readings, monkeypatch):
 
 
 def test_the_sign_of_everything_shows_in_the_backlash_alone(readings):
-    """To first order the machine with all errors reversed reads so, but its screws would lead their nuts."""
+    """With all signs reversed the readings fit a machine with negative backlash, which is refused."""
     with pytest.raises(CalibrationError, match=SWAPPED):
         fit_model(readings.with_values(-readings.value), FEW)
 
 
 def test_what_fits_better_otherwise_is_not_written(readings):
-    """Straightness of the x lines is small here: exchanged, it scatters by 2.5 µm, and nothing else makes that 1 µm."""
+    """Exchanged straightness of the x-lines, which adds 2.5 µm of scatter, is a reason not to write the model."""
     exchanged = np.arange(len(CHANNELS))
     y, z = (CHANNELS.index(f"straightness_{axis}") for axis in "yz")
     exchanged[[y, z]] = z, y
@@ -141,13 +141,13 @@ def tilted_set() -> MeasurementSet:
 
 
 def longer_probe(m: MeasurementSet) -> MeasurementSet:
-    """Return what is read 1 mm further out along the tool."""
+    """Return the readings of a measured point 1 mm further out along the tool."""
     out = 1e-3 * (m.stations.rotations @ m.geometry.tool.rotation)[:, :, 2]
     return m.with_values(m.value + (m.directions()[:, :3] * out[m.station]).sum(axis=1))
 
 
 def half_backward(m: MeasurementSet) -> MeasurementSet:
-    """Return a set in which every second place that was passed forward was passed backward, but is labelled forward."""
+    """Return readings in which every second place labelled forward was in fact passed backward."""
     there = np.where(m.direction == FORWARD, m.station, -1)
     wrong = np.unique(there[there >= 0])[::2]
     truth = virtual_machine(3)
@@ -168,13 +168,13 @@ SHARED = {
 
 @pytest.mark.parametrize("cause", SHARED)
 def test_what_all_readings_share_is_named(cause):
-    """A probe 1 mm longer, 270 ppm (a laser in air that counts vacuum wavelengths), half the forward labels wrong."""
+    """A probe 1 mm longer, a scale of 270 ppm (vacuum wavelengths in air), half the labels wrong: each is named."""
     named = mixed_up(SHARED[cause](tilted_set()), FEW)
     assert any(text.startswith(cause) for text in named) if cause else not named
 
 
 def test_the_evidence_of_a_common_mode_is_that_of_a_normal_distribution(readings):
-    """With K + σ²·d·dᵀ as covariance of few readings, by SciPy's density."""
+    """The truth is SciPy's normal density of few readings with the covariance K + σ²·d·dᵀ."""
     m = readings.select(np.arange(len(readings)) % 9 == 0)
     space = ParameterSpace(m, FEW)
     estimation = Estimation(m, space, alone=False)

@@ -1,6 +1,7 @@
-"""Errors of the tool as fits predict them, what campaigns see and what more would: drawn machines and the textbook.
+"""Predicted errors of the tool, the information of campaigns, and the gain of further measurements.
 
-Where drawn machines go is computed by :mod:`foreign_machines`, whose kinematics are not the package's.
+The truth is machines drawn at random, moved by :mod:`foreign_machines`, whose kinematics are not the package's, and
+textbook formulas.
 """
 
 from __future__ import annotations
@@ -48,11 +49,11 @@ DRAWS = 1500
 
 
 def known(machine: Machine, folder: Path) -> FittedParameters:
-    """Return parameters of structure and pitch, known to about 5 µm and 5 ppm, with correlations."""
+    """Return parameters of structure and pitch with correlated standard deviations of about 5 µm and 5 ppm."""
     geometry = load_geometry(machine.write(folder / "machine.yaml"))
     tips = np.random.default_rng(1).uniform(*machine.box, (12, 3))
     commanded = [Pose(p, geometry.work.rotation.T @ machine.level() @ geometry.tool.rotation) for p in tips]
-    probe = geometry.tool.position + np.array([0.01, -0.02, 0.03])  # the laser's target is not the tool
+    probe = geometry.tool.position + np.array([0.01, -0.02, 0.03])  # the laser's target is beside the tool
     space = ParameterSpace(small.scattered(geometry, commanded, None, probe), FitSettings(blocks=("pitch",)))
     rng = np.random.default_rng(2)
     mixing = np.eye(space.size) + 0.3 * rng.standard_normal((space.size, space.size)) / np.sqrt(space.size)
@@ -61,7 +62,7 @@ def known(machine: Machine, folder: Path) -> FittedParameters:
 
 
 def errors_of(space: ParameterSpace, x: np.ndarray) -> Errors:
-    """Return what parameter vectors (size,) or (N, size) mean, in the words of the tests' own machines."""
+    """Return parameter vectors, (size,) or (N, size), as errors of the tests' own machines."""
     shape, groups = x.shape[:-1], space.platform_groups
     end = 18 + 3 * (groups.max() + 1)
     base, joints, offset, pitch = np.split(x, [18, end, end + 6], axis=-1)
@@ -70,14 +71,14 @@ def errors_of(space: ParameterSpace, x: np.ndarray) -> Errors:
 
 
 def motions(machine: Machine, space: ParameterSpace, drawn: np.ndarray, poses: tuple) -> np.ndarray:
-    """Return what :func:`tool_motion` does for each of D parameter vectors at each of N poses, (D, N, 6)."""
+    """Return :func:`tool_motion` of each of D parameter vectors at each of N poses, (D, N, 6)."""
     count = len(poses[0])
     each = errors_of(space, np.repeat(drawn, count, axis=0))
     return tool_motion(machine, each, *(np.concatenate([part] * len(drawn)) for part in poses)).reshape(-1, count, 6)
 
 
 def tool_motion(machine: Machine, errors: Errors, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Return how tips move and turn, (N, 6) in work, when the struts are told the nominal machine's lengths."""
+    """Return how tips move and turn, (N, 6) in work, when the struts are commanded to the nominal machine's lengths."""
     ends = positions[:, None] + machine.platform @ np.swapaxes(rotations, 1, 2)
     told = np.linalg.norm(ends - machine.base, axis=2)
     went = goes_to(machine, errors, told, positions, rotations)
@@ -87,9 +88,9 @@ def tool_motion(machine: Machine, errors: Errors, positions: np.ndarray, rotatio
 
 @pytest.mark.parametrize("name", ["hanging", "inches"])
 def test_errors_spread_as_those_of_machines_that_are_drawn(name: str, tmp_path: Path) -> None:
-    """1500 machines: a standard deviation is known to 1/√3000, 1.8 %; 8 % is beyond four of these.
+    """1500 drawn machines give a standard deviation to 1/√3000 = 1.8 %; 8 % is over four times that.
 
-    First order is off by the spread over the machine's size, 1e-5. Poses are tilted and beside the box, too.
+    First order is wrong by the spread over the machine's size, 1e-5. Some poses are tilted or outside the box.
     """
     machine = machines()[name]
     fitted = known(machine, tmp_path)
@@ -109,7 +110,7 @@ def test_errors_spread_as_those_of_machines_that_are_drawn(name: str, tmp_path: 
     for n, found in enumerate(standing.covariance):
         sigma = standing.deviations[n]
         ours, theirs = found / np.outer(sigma, sigma), np.corrcoef(spread[:, n].T)
-        np.testing.assert_allclose(ours, theirs, atol=0.11)  # 1/√1500, four times
+        np.testing.assert_allclose(ours, theirs, atol=0.11)  # four times 1/√1500
 
     assert aligned is not None
     told = np.stack(np.meshgrid(*(np.linspace(*side, 3) for side in space.work_box.T)), -1).reshape(-1, 3)
@@ -118,21 +119,21 @@ def test_errors_spread_as_those_of_machines_that_are_drawn(name: str, tmp_path: 
     reference = machine.tips(told, level), motions(machine, space, drawn[:1000], (told, level))
     sets = aligned_by_kabsch(*reference, machine.tips(positions, rotations), spread[:1000])
     assert aligned.deviations is not None
-    np.testing.assert_allclose(aligned.deviations, np.std(sets, axis=0), rtol=0.17)  # 300 machines, four times 4.1 %
+    np.testing.assert_allclose(aligned.deviations, np.std(sets, axis=0), rtol=0.17)  # 4 · 4.1 % (300 machines)
     (at_x,) = aligned_by_kabsch(
         reference[0],
         motions(machine, space, fitted.x[None], (told, level)),
         machine.tips(positions, rotations),
         expected[None],
     )
-    np.testing.assert_allclose(aligned.values, at_x, rtol=0.0, atol=0.1 * UM)  # 100 µm squared over 0.1 m
+    np.testing.assert_allclose(aligned.values, at_x, rtol=0.0, atol=0.1 * UM)  # second order: 100 µm squared over 0.1 m
     assert aligned.deviations[:, :3].mean() < 0.5 * standing.deviations[:, :3].mean()
 
 
 def aligned_by_kabsch(before: np.ndarray, moved: np.ndarray, tips: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Return motions `found` (D, N, 6) at `tips` (N, 3), less the rigid motion that best maps the reference tips.
+    """Return motions `found` (D, N, 6) at `tips` (N, 3) minus the rigid motion that best maps the reference tips.
 
-    These stood at `before` (R, 3), and went by `moved` (D, R, 6).
+    The reference tips were at `before` (R, 3), and moved by `moved` (D, R, 6).
     """
     aligned = []
     for motion, way in zip(found, moved, strict=True):
@@ -148,7 +149,7 @@ def test_a_pose_that_the_machine_cannot_take_has_no_error_and_spoils_no_other(tm
     fitted = known(machines()["hanging"], tmp_path)
     geometry = fitted.space.geometry
     predictor = ErrorPredictor(RealMachine(geometry, fitted.space.model(fitted.x)), fitted)
-    positions = geometry.home.position + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.04]])  # mirrored: assembled otherwise
+    positions = geometry.home.position + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.04]])  # the second is mirrored
     found = predictor.predict((positions, np.tile(geometry.home.rotation, (2, 1, 1))))
     for errors in found:
         assert errors is not None
@@ -160,7 +161,7 @@ def test_a_pose_that_the_machine_cannot_take_has_no_error_and_spoils_no_other(tm
 
 
 def saved(folder: Path) -> tuple[FittedParameters, Path]:
-    """Write a model and what its fit knows."""
+    """Write a model and its posterior; return the parameters and the model's path."""
     fitted, path = known(machines()["framed"], folder), folder / "after the crash.yaml"
     model = fitted.space.model(fitted.x)
     model = dataclasses.replace(model, origin=dataclasses.replace(model.origin, date="2026-01-31"))
@@ -169,7 +170,7 @@ def saved(folder: Path) -> tuple[FittedParameters, Path]:
 
 
 def test_what_a_fit_knows_comes_back_from_its_file(tmp_path: Path) -> None:
-    """All of it, to the last bit: new readings are to be added to it some day."""
+    """A posterior file returns every number to the last bit, so that new readings can be added to it later."""
     fitted, path = saved(tmp_path)
     geometry = fitted.space.geometry
     model = load_model(path, geometry)
@@ -183,7 +184,7 @@ def test_what_a_fit_knows_comes_back_from_its_file(tmp_path: Path) -> None:
 
 
 def rewritten(path: Path, **head: object) -> None:
-    """Replace entries of the head, None: without it, in the file beside a model, which has its hash."""
+    """Replace entries in the head of the posterior file (None removes one), and its hash in the model file."""
     beside = path.with_name("after the crash.posterior.npz")
     with np.load(beside) as archive:
         arrays = dict(archive)
@@ -195,9 +196,9 @@ def rewritten(path: Path, **head: object) -> None:
 
 
 def test_what_is_not_the_models_own_is_not_known(tmp_path: Path) -> None:
-    """Moved away, of another fit, of another geometry, altered, no archive: a reason, never another machine's figures.
+    """A posterior that is missing, altered, of another fit or geometry, or no archive is not used; the reason is given.
 
-    A model names no file elsewhere.
+    A model file cannot name a posterior in another folder.
     """
     fitted, path = saved(tmp_path)
     geometry, beside = fitted.space.geometry, tmp_path / "after the crash.posterior.npz"
@@ -225,7 +226,7 @@ ANYTHING = [[], {}, None, [["x", 1]], 10**400]
 
 
 def test_any_value_in_a_posteriors_head_is_read_or_refused_in_words(tmp_path: Path) -> None:
-    """Never a traceback; what is read can be used."""
+    """Any value in a posterior's head either gives usable parameters or a reason, and never an exception."""
     fitted, path = saved(tmp_path)
     geometry, text = fitted.space.geometry, path.read_text()
     beside = path.with_name("after the crash.posterior.npz")
@@ -254,7 +255,7 @@ def tilted() -> Poses:
 
 
 def fitted(poses: int = 0) -> tuple[RealMachine, FittedParameters]:
-    """Return a machine fitted to a 5-D laser's lines, with so many of a tracker's poses."""
+    """Return a machine fitted to a 5-D laser's lines and to a number of a tracker's poses."""
     of_lines = small.fitted(poses)
     return RealMachine(small.paper(), of_lines.model), of_lines.known
 
@@ -265,9 +266,9 @@ def left_by_lines() -> dict[str, Any]:
 
 
 def test_the_measurement_that_is_recommended_does_what_is_foretold() -> None:
-    """Lines of a level tool leave its tilting open; a tracker sees it. Fitted with its poses, that much is left.
+    """A tracker's poses are recommended to reduce the tilt error; a fit with such poses has the predicted error.
 
-    Noise and tolerances are found anew, and other poses of the same number are drawn: a quarter is allowed.
+    The fit estimates noise and tolerances anew, and from other poses: 25 % is allowed.
     """
     result = left_by_lines()
     shares = {share["name"]: share["left_workspace_m"] for share in result["if_measured"]}
@@ -279,7 +280,7 @@ def test_the_measurement_that_is_recommended_does_what_is_foretold() -> None:
 
 
 def test_known_and_measured_are_the_textbooks() -> None:
-    """Known: the conditional covariance. Measured: the inverse of the sum of both informations. In SI units."""
+    """The truth: conditional covariance for a known block, inverse of the summed information for a measurement."""
     result, (machine, parameters) = left_by_lines(), fitted()
     sigma = parameters.covariance
     _, _, slopes, _ = ErrorPredictor(machine, parameters).slopes(tilted())
@@ -310,12 +311,12 @@ FIELD = FitSettings(blocks=("field displacement", "field rotation"), field_degre
 
 @cache
 def linearised(instrument: str, diagonals: int, settings: FitSettings) -> tuple[ParameterSpace, LinearProblem]:
-    """Return space and linear problem of a campaign on the nominal machine: what it sees needs no readings."""
+    """Return parameter space and linear problem of a campaign on the nominal machine, which needs no readings."""
     return problem_of(template(small.campaign(instrument, diagonals), small.paper()), settings)
 
 
 def read(instrument: str, diagonals: int, settings: FitSettings) -> Estimation:
-    """Return a campaign's readings against parameters."""
+    """Return the estimation problem of a campaign."""
     plan = template(small.campaign(instrument, diagonals), small.paper())
     return Estimation(plan, ParameterSpace(plan, settings))
 
@@ -327,13 +328,13 @@ def problem_of(measurements: MeasurementSet, settings: FitSettings) -> tuple[Par
 
 
 def rank(space: ParameterSpace, problem: LinearProblem) -> int:
-    """Return how many structure parameters readings of 1 µm tell from ±100 µm, by NumPy's singular values."""
+    """Return how many structure parameters of ±100 µm are seen by readings of 1 µm, by NumPy's singular values."""
     singular = np.linalg.svd(problem.rows.dense()[:, space.blocks[0].part] * 100e-6, compute_uv=False)
     return int((singular > 1.0).sum())
 
 
 def test_level_lines_see_14_of_33_structure_parameters():
-    """The issue's count, on the shipped campaign without its diagonals: 33 parameters, 14 of them seen."""
+    """The shipped campaign without diagonals sees 14 of the 33 structure parameters, as an independent count gives."""
     plan = replace(load_campaign(config_file("campaign_5d.yaml")), diagonals=0)
     space, problem = problem_of(template(plan, small.paper()), STRUCTURE)
     seen = observe(space, problem, solve(space, problem, space.start_tolerances(), ONES, 0))
@@ -350,8 +351,8 @@ def test_level_lines_see_14_of_33_structure_parameters():
     ],
 )
 def test_machine_errors_that_leave_no_trace(instrument: str, diagonals: int, unseen: set[str]):
-    """By hand: a shear or a bilinear twist is constant along its own line and linear across, which zeros and beam
-    slopes swallow; on a body diagonal it is not. Roll needs a roll channel."""
+    """By hand: shear and bilinear twist are constant along their own line and linear across it, so zeros and slopes
+    hide them. Body diagonals show them. Roll needs a roll channel."""
     errors = without_trace(read(instrument, diagonals, FIELD))
     assert {error.name for error in errors} == unseen
 
@@ -383,15 +384,15 @@ def test_indices_are_the_published_ones():
     assert seen.condition == pytest.approx(200.0, rel=1e-6)
     wanted = {"O1": gmean(kept) / 10.0, "O2": 2.0 / 400.0, "O3": 2.0, "O4": 4.0 / 400.0}
     assert seen.indices == pytest.approx(wanted, rel=1e-6)
-    # Data give s²/(1 + s²) of each direction; the rest is the prior's
+    # The data determine s²/(1 + s²) of each direction
     assert seen.blocks[0].determined == pytest.approx((singular**2 / (1.0 + singular**2)).sum(), rel=1e-9)
 
 
 def test_expected_error_of_one_known_parameter():
-    """One uncertain strut offset: the error is its sensitivity times its standard deviation, the datum aligned.
+    """With one uncertain strut offset, the error is the sensitivity times the standard deviation, datum aligned.
 
-    Moved by finite difference and aligned by least squares over shift and rotation here. The mean square over 300
-    draws of a squared normal number is within 3 · √(2/300) = 25 % of its expectation, its root within 13 %.
+    The truth is a finite difference, aligned here by least squares over shift and rotation. The mean square over 300
+    draws is within 3 · √(2/300) = 25 % of its expectation, its root within 13 %.
     """
     space, _ = linearised("5-D", 4, STRUCTURE)
     offset, sigma = list(space.blocks[0].labels).index("strut_3 offset"), 2e-6

@@ -1,4 +1,4 @@
-"""Proposed campaigns: gains by plain linear algebra, expectations by another way, the limits of each machine."""
+"""Proposed campaigns: gains against dense matrices, expected errors against ``plan``, limits of each machine."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -33,14 +33,14 @@ UM = 1e-6
 def proposed(
     error: float, tilt_deg: float, instruments: tuple[str, ...], hours: float, base: Campaign | None = None
 ) -> Proposal:
-    """Return a plan for the paper's machine in the paper's box; structure, pitch, wave and backlash are fitted."""
+    """Return a plan in the paper's box whose fit has structure, pitch, wave and backlash."""
     tilt = float(np.radians(tilt_deg))
     place = MeasuringBox(small.paper(), small.BOX, np.eye(3), tilt)
     return propose(place, Goal(error, tilt, instruments, hours * HOUR), small.FEW, base)
 
 
 def test_gains_are_those_of_the_whole_matrices() -> None:
-    """Each gain is by how much tr(M·C) falls when C is inverted anew with the candidate's rows, to rounding."""
+    """Each gain equals the decrease of tr(M·C) when C is inverted again with the candidate's rows, to rounding."""
     rng = np.random.default_rng(1)
     seen = [rng.standard_normal((k, 9)) for k in (1, 3, 4, 2)]
     root = rng.standard_normal((9, 5))
@@ -62,7 +62,7 @@ def test_gains_are_those_of_the_whole_matrices() -> None:
 
 
 def test_what_limits_a_goal() -> None:
-    """Lines have unknown zeros: no linear laser shows where a tilted tool is beside a level one."""
+    """A linear laser cannot show the error of a tilted tool beside a level one, since its zeros are unknown."""
     blind = proposed(1.0 * UM, 10.0, ("linear",), 3.0)
     assert not blind.met
     assert blind.unseen > blind.goal.error
@@ -72,7 +72,7 @@ def test_what_limits_a_goal() -> None:
     assert not short.met
     assert short.needed is not None
     assert short.needed > HOUR
-    # What is proposed fits into the hour, also where the choice went on to find the time that the goal needs
+    # The proposed runs fit into the hour, although the search went on to find the time that the goal needs.
     runs = short.campaign.runs
     spent = sum(TIMES[run.instrument].of(run, short.campaign.cycles) for run in runs) + TIMES["linear"].first
     assert spent == pytest.approx(short.seconds, abs=1e-6)
@@ -81,7 +81,7 @@ def test_what_limits_a_goal() -> None:
 
 
 def test_the_machine_s_repeatability_counts() -> None:
-    """As in ``plan`` for the same campaign. A goal that the stops alone miss is out of reach whatever is measured."""
+    """The expected error agrees with ``plan``; a goal below the scatter of the stops is out of reach."""
     loose = small.campaign(repeatability=1.0 * UM)
     result = proposed(2.2 * UM, 0.0, ("linear",), 6.0, loose)
     assert result.met
@@ -96,10 +96,10 @@ def test_the_machine_s_repeatability_counts() -> None:
 
 
 def test_no_time_at_all_and_tilts_beyond_the_limits(tmp_path: Path) -> None:
-    """The laser takes 20 min to put up, 8 min for a run; four points, each read once, at 4 s are 0.3 min: 0.47 h."""
+    """The shortest run takes 0.47 h: 20 min to set the laser up, 8 min for the run, 4 points of 4 s each."""
     with pytest.raises(CalibrationError, match=r"hours: are too few: the shortest run takes 0\.47 h"):
         proposed(1.0 * UM, 0.0, ("linear",), 0.2)
-    geometry = load_geometry(machines()["unit"].write(tmp_path / "machine.yaml"))  # its base joints end at 18°
+    geometry = load_geometry(machines()["unit"].write(tmp_path / "machine.yaml"))  # its base joints tilt by at most 18°
     place = MeasuringBox(geometry, machines()["unit"].box, np.eye(3), np.radians(30.0))
     with pytest.raises(CalibrationError, match="tilt: 30° is within the limits in only 0 % of the box"):
         propose(place, Goal(1.0 * UM, np.radians(30.0)), FitSettings(blocks=()))
@@ -107,7 +107,7 @@ def test_no_time_at_all_and_tilts_beyond_the_limits(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", machine_names())
 def test_every_machine_of_the_zoo(name: str, tmp_path: Path) -> None:
-    """All candidates are within the limits, as the reader of campaigns judges them, before a file and after it."""
+    """On every machine of the zoo all candidates are within the limits, and the proposed file reads back."""
     machine = machines()[name]
     geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
     tilt = float(np.radians(3.0))
@@ -127,7 +127,7 @@ def test_every_machine_of_the_zoo(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("instrument", ["ball_bar", "station", "r_test"])
 def test_instruments_that_shops_own(instrument: str, tmp_path: Path) -> None:
-    """On a 6-6 machine with turned frames each lowers what is to be expected, and its file reads back."""
+    """On a 6-6 machine with turned frames each instrument lowers the expected error, and its file reads back."""
     machine = machines()["framed"]
     geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
     tilt = float(np.radians(5.0))
@@ -157,10 +157,10 @@ def test_wrong_goals(change: dict, complaint: str) -> None:
 
 
 def test_a_goal_under_other_loads_says_under_how_many_to_read() -> None:
-    """Two loads where the readings of one leave more than the goal under the other; one where they do not.
+    """The plan asks for readings under two loads only if readings under one do not reach the goal under the other.
 
-    Struts of 5 N/µm under 60 kg, stated to 10 %: the machine lies on its side. Truth: the fewer loads, by the planner's
-    own expectation for the campaign of the wider goal.
+    The struts have 5 N/µm, stated to 10 %, under 60 kg; the other load is the machine on its side. The truth for one
+    load is the planner's own expectation for the easier goal.
     """
     load = Load(stiffness=np.full(6, 5e6), mass=60.0).numbers()
     settings = replace(small.FEW, blocks=("pitch", "wave", "compliance"), load=load)

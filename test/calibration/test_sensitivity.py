@@ -1,4 +1,4 @@
-"""Parameters, blocks, predictions: NumPy's polynomials, the priors' formulas, the machine itself, differences."""
+"""Parameters, blocks and predictions, against NumPy's polynomials, the priors' formulas, and finite differences."""
 
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -41,21 +41,21 @@ def unit_box(points: np.ndarray, box: np.ndarray) -> np.ndarray:
 
 
 def series(powers: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return coefficients as NumPy's three-dimensional Legendre series takes them, shape (5, 5, 5)."""
+    """Return coefficients in the form of NumPy's three-dimensional Legendre series, shape (5, 5, 5)."""
     result = np.zeros((5, 5, 5))
     result[tuple(powers.T)] = values
     return result
 
 
 def random_field(field: SmoothField, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return a field of 5 µm and 20 µrad as its prior expects it, forward and backward 1 µm and 1 µrad apart."""
+    """Return coefficients of a field of 5 µm and 20 µrad, drawn from its prior; its reversal has 1 µm and 1 µrad."""
     size = np.repeat([5e-6, 20e-6], 3)[:, None] * field.prior
     reversal = 1e-6 * field.reversal_prior * rng.standard_normal((3, 6, len(field.reversal_powers)))
     return size * rng.standard_normal((6, len(field.powers))), reversal
 
 
 def test_smooth_field_is_the_legendre_series():
-    """NumPy's legval3d sums the same series; both round some fifty products of values below 1e-5."""
+    """NumPy's legval3d gives the same sum; both round about fifty products of values below 1e-5."""
     rng = np.random.default_rng(1)
     field = SmoothField(BOX, 4)
     mean, reversal = random_field(field, rng)
@@ -71,7 +71,7 @@ def test_smooth_field_is_the_legendre_series():
 
 
 def test_degrees_count_for_more_along_short_sides():
-    """A cube takes all terms up to the total degree: C(n + 3, 3). Half a side counts √2 times per degree."""
+    """A cube has all terms up to the total degree, C(n + 3, 3); a side of half the length costs √2 per degree."""
     cube = SmoothField(np.array([[0.0, 0.0, 0.0], [0.3, 0.3, 0.3]]), 5)
     assert len(cube.powers) == 56
     assert cube.powers.sum(axis=1).max() == 5
@@ -86,7 +86,7 @@ def test_degrees_count_for_more_along_short_sides():
 def grid_difference(field: SmoothField, coefficients: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Return the largest difference between a field and its grid at random points and directions, shape (6,).
 
-    Some points lie beside the box, where both hold.
+    Some points are outside the box, where both hold the value at the boundary.
     """
     rng = np.random.default_rng(3)
     points = field.box.mean(axis=0) + 1.1 * (rng.uniform(*field.box, (400, 3)) - field.box.mean(axis=0))
@@ -101,10 +101,10 @@ def grid_difference(field: SmoothField, coefficients: tuple[np.ndarray, np.ndarr
     [(3, [], GRID_TOLERANCE), (6, [], 100e-9), (3, [2], GRID_TOLERANCE), (3, [0, 1, 2], GRID_TOLERANCE)],
 )
 def test_grid_field_is_the_same_field(degree: int, flat: list[int], allowed: float):
-    """Stated: 30 nm and 30 nrad at points of its own; twice that elsewhere. Across a plane or a point nothing varies.
+    """The grid equals the field to 30 nm and 30 nrad at its own check points, and to twice that elsewhere.
 
-    A field of degree 6 would need more lines than a model file should carry. A tenth of what lasers resolve is
-    allowed there: 0.1 µm, and twice as many µrad.
+    A field of degree 6 is limited by the number of lines in a model file: 0.1 µm and 0.2 µrad are allowed, a tenth of a
+    laser's resolution. A flat box has no terms across it.
     """
     box = BOX.copy()
     box[1, flat] = box[0, flat]
@@ -115,9 +115,9 @@ def test_grid_field_is_the_same_field(degree: int, flat: list[int], allowed: flo
 
 
 def test_vector_names_and_sizes(space: ParameterSpace, readings: MeasurementSet):
-    """Twelve joints (three shared ones on the platform) and six offsets are 33; every parameter has a name.
+    """Twelve joints, of which platform joints coincide in pairs, and six offsets are 33 named parameters.
 
-    A general machine has 42. Knots cover all commands, close enough.
+    A machine with separate joints has 42. The knots of the map cover all commands.
     """
     geometry = general_machine()
     poses = [Pose(p, r) for p, r in zip(*poses_about(geometry.home, 3, seed=1), strict=True)]
@@ -140,7 +140,7 @@ def test_without_a_lead_there_are_no_waves(readings: MeasurementSet):
 
 
 def test_prior_of_the_map_is_matern(space: ParameterSpace):
-    """Matérn 5/2 as in Rasmussen and Williams, eq. 4.17; 1e-9 of independent variance keep it regular."""
+    """The prior is Matérn 5/2 (Rasmussen and Williams, eq. 4.17), with 1e-9 of independent variance for regularity."""
     root, knots = space.block("map").root, space.block("map").knots
     distance = np.sqrt(5.0) * cdist(knots[:, None], knots[:, None]) / ASSUMED.map_correlation
     wanted = (1.0 + distance + distance**2 / 3.0) * np.exp(-distance)
@@ -150,7 +150,7 @@ def test_prior_of_the_map_is_matern(space: ParameterSpace):
 
 
 def test_model_says_what_the_vector_says(readings: MeasurementSet):
-    """A drawn machine goes into the vector by its own attributes and comes back."""
+    """A drawn machine, written into the parameter vector attribute by attribute, is read back from it."""
     few = ParameterSpace(readings, replace(small.SETTINGS, blocks=("pitch", "wave", "backlash")))
     truth = small.virtual_machine(3).model
     model = few.model(small.true_parameters(few, truth))
@@ -206,7 +206,7 @@ def led() -> HexapodGeometry:
 
 
 def case(geometry: HexapodGeometry, settings: FitSettings) -> tuple[ParameterSpace, Stations, np.ndarray]:
-    """Return a space, tilted poses with a probe, temperatures and humidity, and a machine as its priors expect one."""
+    """Return a parameter space, tilted stations with temperatures and humidity, and a machine drawn from the priors."""
     rng = np.random.default_rng(11)
     positions, rotations = poses_about(geometry.home, 12, seed=12, reach=0.04, tilt_deg=8.0)
     poses = [Pose(p, r) for p, r in zip(positions, rotations, strict=True)]
@@ -222,24 +222,24 @@ def case(geometry: HexapodGeometry, settings: FitSettings) -> tuple[ParameterSpa
 
 
 def differences(space: ParameterSpace, stations: Stations, x: np.ndarray, ways: np.ndarray) -> np.ndarray:
-    """Return the derivatives of e in some directions (size, n) by central differences, shape (M, 6, n)."""
+    """Return the derivatives of e along some directions (size, n) by central differences, shape (M, 6, n)."""
 
     def errors(steps: np.ndarray) -> np.ndarray:
         return predict(space, x + ways @ steps, stations).errors.ravel()
 
-    # 0.5 µm (or µm/m, µrad): rounding of some 1e-15 m over it is 2e-9, the third derivative even less.
+    # Steps of 0.5 µm (µm/m, µrad): rounding of 1e-15 m is 2e-9 of a step, and the third derivative is smaller.
     return central_difference(errors, np.zeros(ways.shape[1]), 5e-7).reshape(len(stations), 6, -1)
 
 
 def some_ways(space: ParameterSpace, part: slice) -> np.ndarray:
-    """Return two random directions within a block, shape (size, 2): every parameter has a part in both."""
+    """Return two random directions within a block, shape (size, 2), that contain every parameter."""
     ways = np.zeros((space.size, 2))
     ways[part] = np.random.default_rng(13).choice([-1.0, 1.0], ways[part].shape)
     return ways
 
 
 def worst(found: np.ndarray, wanted: np.ndarray) -> float:
-    """Return the largest difference, displacement and rotation each relative to its largest derivative."""
+    """Return the largest difference of displacement or rotation, relative to the largest derivative of each."""
     parts = (slice(0, 3), slice(3, 6))
     return max(float(np.abs(found[:, p] - wanted[:, p]).max() / max(np.abs(wanted[:, p]).max(), 1e-9)) for p in parts)
 
@@ -247,14 +247,14 @@ def worst(found: np.ndarray, wanted: np.ndarray) -> float:
 @pytest.mark.parametrize(
     ("make", "settings", "tolerance"),
     [
-        # Left out on purpose: thermal growth of the deviations, 2e-4; the slope of the field, 1e-3 at most; half
-        # the rotation error, 1e-3 rad, in which rotation vectors do not add up.
+        # The derivatives omit the growth of the deviations, 2e-4, the slope of the field, 1e-3 at most, and half the
+        # rotation error, 1e-3 rad, by which rotation vectors do not add up.
         (small.paper, WARM, 2e-3),
         (small.paper, SPLIT, 2e-3),
         (general_machine, WARM, 2e-3),
         (small.paper, LATE, 2e-3),
         (general_machine, BY_ONE, 2e-3),
-        # A screw that the platform's turning turns: lead/2π times 10 rad per metre of strut.
+        # A screw turned by the platform's rotation: lead/2π times 10 rad per metre of strut
         (led, STRUTS_ONLY, 3e-2),
     ],
     ids=["shared joints", "separate joints", "twelve joints", "late parts", "one thermometer", "turning screws"],
@@ -270,9 +270,10 @@ def test_every_block_against_finite_differences(
 
 
 def test_displacements_are_exact_without_heat_and_field():
-    """Nothing is left out of them: only the rounding of the differences, some 1e-15 m / 5e-7, is in the way.
+    """Without growth and field, displacements omit nothing: they are exact to 1e-15 m / 5e-7 of rounding.
 
-    An estimate of backlash may go below zero by noise; a prediction that stops there lets the fit run away.
+    Backlash may be negative here, as an estimate may be by noise; a prediction clipped at zero would make the fit
+    diverge.
     """
     space, stations, x = case(small.paper(), STRUTS_ONLY)
     x[space.block("backlash").part] = [-2e-6, 1e-6, -1e-6, 3e-6, -3e-6, 2e-6]
@@ -285,9 +286,9 @@ def test_displacements_are_exact_without_heat_and_field():
 
 @pytest.mark.parametrize("settings", [WARM, SPLIT, STRUTS_ONLY], ids=["warm", "separate joints", "no field"])
 def test_prediction_is_the_machine_that_the_compensator_runs(settings: FitSettings):
-    """Errors of the measured point of RealMachine with the whole model, field as a grid.
+    """The prediction equals the error of the measured point of RealMachine with the same model, its field as a grid.
 
-    The grid may differ by its tolerance; rotations of 1 mrad and 50 µrad do not commute: half their product.
+    The grid may differ by its tolerance. Rotations of 1 mrad and 50 µrad do not commute, by half their product.
     """
     space, stations, x = case(small.paper(), settings)
     model = space.model(x)

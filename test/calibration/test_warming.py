@@ -1,4 +1,4 @@
-"""What fits tell of heat and humidity, on machines whose growth is known, and the courses behind what sensors read."""
+"""Heat and humidity: fits of machines with known growth, and the smoothed courses of noisy sensors."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ COUNT = len(PLAN.stations)
 
 
 def course(times: np.ndarray, temperatures: np.ndarray) -> np.ndarray:
-    """Return the courses behind what all parts' sensors read (COUNT, 8), °C, at times of the plan's stations, s."""
+    """Return the smoothed courses of all parts' sensors, (COUNT, 8), °C, read at times of the plan's stations, s."""
     return with_courses(
         replace(PLAN, stations=replace(PLAN.stations, times=times, temperatures=temperatures))
     ).stations.temperatures
 
 
 def test_what_sensors_add_within_a_burst_is_taken_off() -> None:
-    """Fifty stations every ten minutes, one in four seconds, warm by 3 K; a filter of 30 s leaves 6.5 mK of noise.
+    """Noise within a burst is smoothed: fifty stations every ten minutes, 4 s apart, on parts that warm by 3 K.
 
-    Of fifty readings of which eight are alike, six are independent; a level and a slope are two of them. What is left
-    changes from reading to reading by no more than a slope that is known from half of the noise over a minute.
+    A filter of 30 s makes eight readings alike: six of fifty are independent, and level and slope are two of these.
+    From reading to reading the course changes by no more than a slope known from half of the noise over a minute.
     """
     left, times = 0.0065, 600.0 * (np.arange(COUNT) // 50) + 4.0 * (np.arange(COUNT) % 50)
     true = np.tile(20.0 - 3.0 * np.expm1(-times / 1500.0)[:, None], 8)
@@ -49,7 +49,7 @@ def test_what_sensors_add_within_a_burst_is_taken_off() -> None:
 
 
 def test_without_times_each_run_has_a_course() -> None:
-    """A step from run to run, as of one temperature written beside each, is no slope within them."""
+    """Without times, a temperature that changes from run to run stays constant within each run."""
     run = np.zeros(COUNT, dtype=int)
     run[PLAN.station] = PLAN.run
     steps = np.tile(20.0 + 0.5 * (run[:, None] % 3), 8)
@@ -62,7 +62,7 @@ SETTINGS = FitSettings(blocks=("expansion", "late"))
 
 
 def rounds(box: np.ndarray, count: int) -> Campaign:
-    """Return x, y and z lines of five points through a box's middle, read again in each round."""
+    """Return lines of five points along x, y and z through a box's middle, read again in each round."""
     runs = []
     for number in range(count):
         for axis in range(3):
@@ -74,7 +74,7 @@ def rounds(box: np.ndarray, count: int) -> Campaign:
 
 
 def truth(thermometer: str = "base") -> RealMachine:
-    """Return a machine without errors but growth; struts run ahead of their thermometer, the platform lags."""
+    """Return a machine whose only error is growth: struts lead the base's thermometer, the platform lags behind it."""
     expansion = np.array([[-20e-6]] * 6 + [[0.0], [8e-6]])
     model = MachineModel(
         "paper", "warm", struts=StrutErrors(expansion=np.full(6, 15e-6)), base_expansion=11e-6,
@@ -85,7 +85,7 @@ def truth(thermometer: str = "base") -> RealMachine:
 
 @cache
 def measured(rise: float = 3.0, timed: bool = True, parts: tuple[int, ...] = (6,)) -> MeasurementSet:
-    """Return lines read in eight rounds, a quarter of an hour apart, while thermometers rise."""
+    """Return lines read in eight rounds over two hours, while the thermometers of some parts rise."""
     plan = rounds(small.BOX, 8)
     planned = template(plan, small.paper())
     times = 30.0 * np.arange(len(planned.stations))
@@ -104,7 +104,7 @@ def fit() -> ModelFit:
 
 
 def test_expansions_and_time_constant_come_back():
-    """Within three of the standard deviations that the fit states; the struts' mean to 1 ppm/K besides."""
+    """Expansions and time constant are within three stated deviations; the struts' mean is within 1 ppm/K."""
     warming = fit().warming
     wanted = {"struts": (15e-6, -20e-6), "base": (11e-6, 0.0), "platform": (14e-6, 8e-6)}
     assert [growth.part for growth in warming.growths] == list(wanted)
@@ -120,8 +120,9 @@ def test_expansions_and_time_constant_come_back():
 
 
 def test_the_noise_of_sensors_is_not_taken_for_growth():
-    """Struts with sensors of their own that read 0.02 K beside, one kelvin in 150: within three of the deviations that
-    the same readings have without that noise. Fitted to what is read, 19.7 ± 0.3 ppm/K would be 1.4 ± 0.2."""
+    """Sensors on the struts have 0.02 K of noise, and every strut's growth stays within three stated deviations.
+
+    A fit to the raw readings would find 1.4 ± 0.2 in place of 19.7 ± 0.3 ppm/K."""
     quiet = measured(parts=tuple(range(8)))
     noise = 0.02 * np.random.default_rng(5).standard_normal(quiet.stations.temperatures.shape)
     stations = replace(quiet.stations, temperatures=quiet.stations.temperatures + noise)
@@ -133,9 +134,9 @@ def test_the_noise_of_sensors_is_not_taken_for_growth():
 
 
 def test_thermometers_that_are_rounded_do_not_override_what_is_stated():
-    """Struts of 15 ppm/K, so stated, with displays of 0.1 K, while they warm by 1 K: they keep that to a tenth.
+    """A stated 15 ppm/K changes by at most a tenth if the displays have steps of 0.1 K and the struts warm by 1 K.
 
-    Taken as read, a stair of 0.1 K is 0.9 µm on a strut that does not move: that is said to grow by 1 ppm/K.
+    Taken as exact, a step of 0.1 K would move a strut by 0.9 µm although it does not move, and give 1 ppm/K.
     """
     exact = measured(rise=1.0, parts=tuple(range(8)))
     expansion = np.array([15e-6] * 6 + [11e-6, 14e-6])
@@ -151,7 +152,7 @@ def test_thermometers_that_are_rounded_do_not_override_what_is_stated():
 
 
 def test_expansions_are_known_no_better_than_the_time_constant():
-    """Truth: fits with the time constant a tenth up and down; sizes of priors follow it too, by a little."""
+    """The truth is fits with a time constant 10 % smaller and larger; the sizes of priors change a little, too."""
     ((constant, deviation),) = fit().warming.time_constants
     ends = [
         fit_model(measured(), replace(SETTINGS, time_constants=(constant * np.exp(way),))).warming.growths
@@ -164,7 +165,7 @@ def test_expansions_are_known_no_better_than_the_time_constant():
 
 
 def test_without_a_warm_up_nothing_is_invented():
-    """0.3 K are below what a sensor's drift may be: stated expansions stay, and the report says so."""
+    """A warm-up of 0.35 K may be a sensor's drift: stated expansions stay, and the report says so."""
     cold = fit_model(measured(rise=0.35), replace(SETTINGS, strut_expansion=12e-6))
     assert cold.warming.growths == ()
     assert cold.model.late_growth.time_constants == ()
@@ -172,7 +173,7 @@ def test_without_a_warm_up_nothing_is_invented():
     assert "expansion is not determined" in warming_text(cold.warming)
 
 
-MOISTURE = 3e-4  # 3 ppm per %, m/m
+MOISTURE = 3e-4  # 3 ppm of length per % of humidity
 DAMP = FitSettings(blocks=("moisture",), strut_moisture=1e-4)
 
 
@@ -182,7 +183,7 @@ def geometry(tmp_path_factory: pytest.TempPathFactory) -> HexapodGeometry:
 
 
 def damp(geometry: HexapodGeometry) -> MeasurementSet:
-    """Return lines of a 6-6 machine with turned frames, read in four rounds, while the air goes from 40 % to 65 %."""
+    """Return lines of a 6-6 machine with turned frames, read in four rounds while humidity rises from 40 % to 65 %."""
     plan = rounds(machines()["framed"].box, 4)
     planned = template(plan, geometry)
     humidity = 0.4 + 0.25 * np.linspace(0.0, 1.0, len(planned.stations))
@@ -197,7 +198,7 @@ def test_what_humidity_does_to_struts_comes_back(geometry: HexapodGeometry) -> N
     assert change == ("humidity", pytest.approx(0.25), "1")
     assert abs(growth.found - MOISTURE) < 3.0 * growth.deviation < 0.3 * MOISTURE
     assert growth.determined > 0.9
-    np.testing.assert_allclose(fitted.model.struts.moisture, growth.found, atol=1e-11)  # files have 11 digits
+    np.testing.assert_allclose(fitted.model.struts.moisture, growth.found, atol=1e-11)  # rounding in a file is 1e-11
 
 
 def test_missing_humidity_is_said_and_counts_as_50_percent(geometry: HexapodGeometry) -> None:

@@ -1,4 +1,4 @@
-"""``classify`` in-process, from file to file: what it prints, writes and refuses."""
+"""The verb ``classify``, called in this process: what it prints, writes and refuses."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def table(path: Path) -> list[dict[str, str]]:
 
 
 def test_everything_is_written_printed_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The shipped machine and budget: four orientations tilted about x and y, allowed error; JSON of the same study."""
+    """The shipped machine and budget, in four tilted orientations: report, table, pictures, page and JSON agree."""
     options = ("--cells", "6", "--tilt-deg", "-4,4", "--allow-um", "50")
     studies: list[study.Study] = []
     real = study.classify
@@ -54,7 +54,7 @@ def test_everything_is_written_printed_and_told(tmp_path: Path, monkeypatch: pyt
     assert (content["machine"], len(content["reach"])) == ("positioning_unit", 4)
     largest = np.array([float(row["translation_max_um"]) for row in rows])
     assert rows[0]["error_type"] == "screw pitch"
-    # 004, Table 1: 34.4 µm to 13.68 µm, and its size is 2 to 2.86 times the others' sizes
+    # v. Daake et al., Table 1: from 34.4 to 13.68 µm; the pitch's size is 2 to 2.86 times the other sizes
     assert largest[0] >= 2.0 * largest[1]
     assert (np.diff(largest) < 0.0).all()
     assert [record["error_type"] for record in content["ranking"]] == [row["error_type"] for row in rows]
@@ -81,7 +81,7 @@ def test_without_plotly_the_rest_is_there(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_options_reach_the_survey(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What they do there is test_runner's; of the paper's machine 18 coordinates of six platform joints, or 9."""
+    """Options arrive in the survey; coinciding platform joints of the paper's machine give 9 errors, or 18."""
     given: list[tuple[object, ...]] = []
     original = study.survey
 
@@ -103,8 +103,8 @@ def test_options_reach_the_survey(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_a_model_in_place_of_a_budget_says_what_is_left_and_what_to_measure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Six known numbers of 2 µm each leave about as much; the work frame is named, units are in the keys."""
-    found: list[object] = []  # text, JSON, table and picture are of one calculation
+    """A model with six strut offsets known to 2 µm leaves an error of that size; frame and units are named."""
+    found: list[object] = []  # text, JSON, table and picture show one calculation
     real = remaining.remaining
     monkeypatch.setattr(remaining, "remaining", lambda *a: (found or (found.append(real(*a)) or found))[0])
     monkeypatch.setattr(verb, "COMBINED_POSES", 60)
@@ -138,11 +138,8 @@ def test_a_model_of_which_nobody_knows_how_good_it_is_leaves_nobody_knows_what()
     assert "what the calibration of paper_machine leaves is not known: model 'virtual machine' carries no" in err
 
 
-# What is refused: nothing is written, one line says what and where.
-
-
 def test_a_tilt_that_no_pose_allows_is_refused_with_the_limits() -> None:
-    """At 60° about both axes nothing is reached; the message names every limit that stops it."""
+    """At 60° about both axes no pose is reached; the message names every limit that excludes poses."""
     code, out, err = classify(*QUICK, "--tilt-deg", 60)
     assert (code, out) == (2, "")
     parts = ("empty at the orientation (60, 60, 0)°", "stroke, shortest at", "base joint cone at")

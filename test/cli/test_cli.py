@@ -1,4 +1,4 @@
-"""The command line in-process: what it prints, what it refuses and how, and what ``check`` finds."""
+"""The command line, called in this process: what it prints and refuses, and what ``check`` finds."""
 
 from __future__ import annotations
 
@@ -53,11 +53,8 @@ def file_of(folder: Path, rows: Sequence[Sequence[object]], header: str = POSE_H
     return str(path)
 
 
-# The program itself.
-
-
 def test_verbs_explain_themselves_and_rules_name_their_options() -> None:
-    """A rule about an option that a verb has not would never be broken."""
+    """Each verb's help has an example, and its rules mention only its own options."""
     for name, verb in VERBS.items():
         assert f"$ hexapod_comp {name} " in hexapod(name, "--help")[1].partition("example:\n")[2] + " "
         options = {option.name for option in verb.options}
@@ -66,7 +63,7 @@ def test_verbs_explain_themselves_and_rules_name_their_options() -> None:
 
 
 def test_json_is_printed_and_out_stays_csv(tmp_path: Path) -> None:
-    """Both at once: the file is the one that is written without --json."""
+    """--json prints JSON and leaves the CSV file of --out unchanged; --out refuses a name that ends in .json."""
     one, two = str(tmp_path / "one.csv"), str(tmp_path / "two.csv")
     for verb, given in (("ik", TABLE_1), ("check", TABLE_1), ("assess", TABLE_1)):
         hexapod(verb, given, "--out", one)
@@ -90,7 +87,7 @@ def test_json_is_printed_and_out_stays_csv(tmp_path: Path) -> None:
     ],
 )
 def test_the_shell_completes(tmp_path: Path, typed: str, offered: set[str]) -> None:
-    """As bash asks, by argcomplete's protocol: a line, a cursor, a file for the answers. Nothing heavy is loaded."""
+    """Completion answers by argcomplete's protocol (line, cursor, file for the answers), without loading NumPy."""
     pytest.importorskip("argcomplete")
     (tmp_path / "mine.csv").touch()
     (tmp_path / "deep").mkdir()
@@ -107,7 +104,7 @@ def test_the_shell_completes(tmp_path: Path, typed: str, offered: set[str]) -> N
 
 
 def test_the_marks_by_which_the_shell_finds_out_are_at_the_top() -> None:
-    """argcomplete's global completion reads the first 1,024 bytes of what a command imports."""
+    """argcomplete searches the first 1,024 bytes of the files that a command imports for its mark."""
     for name in ("cli/__init__.py", "__main__.py"):
         assert "PYTHON_ARGCOMPLETE_OK" in (ROOT / "hexapod_comp" / name).read_text(encoding="utf-8")[:1024]
 
@@ -126,11 +123,8 @@ def test_control_c_and_a_closed_pipe(monkeypatch: pytest.MonkeyPatch) -> None:
     assert hexapod("ik", "--pose", "0,0,400") == (130, "", "")
 
 
-# ik and fk.
-
-
 def test_one_pose_as_text_and_as_json() -> None:
-    """Table 2, row 2. Negative numbers need no equals sign."""
+    """The lengths are row 2 of the paper's Table 2. A negative pose needs no equals sign."""
     by_list = hexapod("ik", "--pose", "0,0,400,5,0,0")
     printed = re.findall(r"strut_\d +([\d.]+)", by_list[1])
     assert [f"{float(value):.3f}" for value in printed] == [f"{length * 1e3:.3f}" for length in table_lengths()[1]]
@@ -141,7 +135,7 @@ def test_one_pose_as_text_and_as_json() -> None:
 
 
 def only_backlash(folder: Path, lost: list[float], machine: str = "paper") -> str:
-    """A model with a backlash, µm, and nothing else."""
+    """Write a model whose only error is backlash, µm; return its path."""
     path = folder / "backlash.yaml"
     struts, origin = StrutErrors(backlash=np.array(lost) * 1e-6), ModelOrigin("2026-01-31")
     path.write_text(model_text(MachineModel(machine, "lost motion", struts=struts, origin=origin)))
@@ -149,7 +143,7 @@ def only_backlash(folder: Path, lost: list[float], machine: str = "paper") -> st
 
 
 def test_forward_and_backward_differ_by_the_backlash_and_midway_is_between(tmp_path: Path) -> None:
-    """A backlash is what a command must go further after a reversal: forward − backward = b, by definition."""
+    """By definition of the backlash b, command forward − command backward = b for each strut."""
     lost = [1.0, 2.0, 3.0, 4.0, 5.0, 8.0]
     given = ("ik", "--pose", "70,-30,420,3,-2,5", "--model", only_backlash(tmp_path, lost))
     found = {}
@@ -159,7 +153,7 @@ def test_forward_and_backward_differ_by_the_backlash_and_midway_is_between(tmp_p
         (row,) = content["rows"]
         assert row["direction"] == direction
         found[direction] = np.array([row[f"L{i}_mm"] for i in range(1, 7)]) * 1e3
-        if told:  # fk, moved the same way, finds the pose again; its text and that of ik say which way
+        if told:  # fk with the same direction finds the pose again; both texts state the direction
             lengths = ",".join(repr(float(length) * 1e-3) for length in found[direction])
             back = ("fk", "--lengths", lengths, *given[3:], *told)
             (pose,) = json.loads(hexapod(*back, "--json")[1])["rows"]
@@ -173,7 +167,7 @@ def test_forward_and_backward_differ_by_the_backlash_and_midway_is_between(tmp_p
 
 
 def test_a_line_has_both_ways_of_every_strut(tmp_path: Path) -> None:
-    """Commands differ by +b where the nominal length, by finite differences, rises on the way, by −b where it falls."""
+    """Commands differ by +b where the nominal length rises along the line, by −b where it falls."""
     geometry = load_geometry("example_6_6")
     x, y, z = geometry.tool_pose(geometry.home).position * 1e3
     lost, out = [1.0, 2.0, 3.0, 4.0, 5.0, 8.0], tmp_path / "line.csv"
@@ -194,17 +188,17 @@ def test_a_line_has_both_ways_of_every_strut(tmp_path: Path) -> None:
         for name in ("nominal_L{}_mm", "correction_L{}_um")
     )
     rates = np.diff(nominal[:half], axis=0)
-    steady = np.sign(rates[1:]) == np.sign(rates[:-1])  # no turning point between a row's neighbours
+    steady = np.sign(rates[1:]) == np.sign(rates[:-1])  # no turning point between this row's neighbours
     assert steady.mean() > 0.8
     assert (rates > 0.0).any()
     assert (rates < 0.0).any()
     both = (corrections[:half] - corrections[half:])[1:-1]
     np.testing.assert_allclose(both[steady], (np.sign(rates[1:]) * lost)[steady], atol=1e-5)
-    assert len(read_lengths(str(out))[1]) == 2 * half  # fk reads it
+    assert len(read_lengths(str(out))[1]) == 2 * half  # fk accepts the file
 
 
 def test_ik_predicts_the_error_without_compensation_in_the_work_frame() -> None:
-    """Told nominal lengths, the machine is where ``fk`` says. The shipped model carries no covariance: never a zero."""
+    """The predicted error is where ``fk`` finds the machine with nominal lengths; without covariance no deviations."""
     pose = "10,20,420,2,-3,4"
     lengths = json.loads(hexapod("ik", "--pose", pose, "--json")[1])["rows"][0]
     told = ",".join(repr(lengths[f"L{n}_mm"]) for n in range(1, 7))
@@ -218,9 +212,9 @@ def test_ik_predicts_the_error_without_compensation_in_the_work_frame() -> None:
     for axis, commanded in zip("xyz", (10.0, 20.0, 420.0), strict=True):
         assert row[f"error_{axis}_um"] == pytest.approx((went[f"{axis}_mm"] - commanded) * 1e3, abs=1e-6)
     assert all(row[name] is None for name in row if "_sd_" in name)
-    assert abs(row["error_aligned_x_um"]) < abs(row["error_x_um"])  # 80 µm of the datum
+    assert abs(row["error_aligned_x_um"]) < abs(row["error_x_um"])  # the datum alone is 80 µm
     text = hexapod("ik", "--pose", pose, "--model", "paper_machine")[1]
-    assert text.count("not known") == 1 + 1 + 12  # the direction, the reason, six components twice
+    assert text.count("not known") == 1 + 1 + 12  # direction, reason, two times six components
     assert "error_z_um" not in hexapod("ik", "--pose", pose, "--json")[1]
 
 
@@ -232,11 +226,8 @@ def test_fk_names_the_row_without_a_pose(tmp_path: Path) -> None:
     assert err.startswith("hexapod_comp: error: line 3 (row 2): no pose has these strut lengths")
 
 
-# check.
-
-
 def test_lists_of_broken_limits_are_capped(tmp_path: Path) -> None:
-    """However many targets are out of reach: twenty lines in check, ten notes of ik, and how many more there are."""
+    """``check`` prints 20 broken limits and ``ik`` 10 notes; both print how many more there are."""
     path = file_of(tmp_path, [(n, 0, 0, 950, 0, 0, 0) for n in range(30)])
     code, out, _ = hexapod("check", path, "--stream", "--rate-hz", "1")
     broken = int(re.search(r"broken limits \((\d+)\)", out).group(1))
@@ -268,7 +259,7 @@ def test_check_names_row_and_limit(tmp_path: Path, options: tuple, limit: str, h
     assert not report["within_limits"]
     assert {(entry["limit"], entry["line"]) for entry in report["broken"]} >= {(limit, 3)}
     smallest = next(entry for entry in report["smallest_margins"] if entry["limit"] == limit)
-    length = np.hypot(np.sqrt(509.192**2 - 400.0**2), height)  # 000, Table 2: 509.192 mm long at a height of 400 mm
+    length = np.hypot(np.sqrt(509.192**2 - 400.0**2), height)  # Table 2: 509.192 mm at a height of 400 mm
     value = {"stroke": length, "step": length - 509.192, "speed": 250.0 * (length - 509.192)}[limit]
     assert smallest["value"] == pytest.approx(value, rel=1e-3)
     assert smallest["margin"] == pytest.approx(smallest["allowed"] - smallest["value"])
@@ -276,7 +267,7 @@ def test_check_names_row_and_limit(tmp_path: Path, options: tuple, limit: str, h
 
 
 def test_check_finds_what_happens_on_the_way() -> None:
-    """Both ends within the stroke of strut 1, the middle not: a straight line past its base joint's foot."""
+    """Both ends of a move are within the stroke of strut 1, its middle, nearest to a base joint, is not."""
     joint = PAPER.base_joints[0]
     there = PAPER.platform_joints[0]
     middle = np.array([joint[0] - there[0], joint[1] - there[1], 0.4])
@@ -300,7 +291,7 @@ def test_check_finds_what_happens_on_the_way() -> None:
 
 
 def test_check_follows_a_stream_like_the_compensator(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Directions, backlash and steps along a stream, three pieces long: as the compensator makes them."""
+    """Over a stream of three pieces ``check`` computes the directions, backlash and steps of the compensator."""
     done: list[int] = []
     monkeypatch.setattr("hexapod_comp.compensation.checks.CHUNK", 256)
     model = random_model(np.random.default_rng(22), "paper")
@@ -330,7 +321,7 @@ def test_check_follows_a_stream_like_the_compensator(monkeypatch: pytest.MonkeyP
 
 
 def test_check_says_where_a_field_cannot_be_undone() -> None:
-    """A displacement that grows by 1.5 m per m has no inverse by iteration; a field that refuses has none outside."""
+    """``check`` names a field of 1.5 m per m, which iteration cannot invert, and poses outside a field that refuses."""
     grid = tuple(np.array(axis) for axis in ([-0.2, 0.2], [-0.2, 0.2], [0.3, 0.5]))
     lines = [np.zeros((2, 2, 2, 6, 2)) for _ in range(3)]
     lines[0][:, :, :, 0, 1] = 0.3  # u runs from −1 to 1 over 0.4 m
@@ -348,11 +339,8 @@ def test_check_refuses_what_makes_no_sense() -> None:
             check(PAPER, IDEAL, table_poses(), mode=mode, rate=rate)
 
 
-# assess.
-
-
 def test_assess_prints_the_papers_tables() -> None:
-    """Table 2 to the printed digits; Table 4 − Table 2 is what it says."""
+    """The lengths equal Table 2 to its printed digits; the third table is the difference of the first two."""
     code, out, err = hexapod("assess", "--seed", "3")
     assert (code, err) == (0, "")
     blocks = out.split("\n\n")
@@ -364,7 +352,7 @@ def test_assess_prints_the_papers_tables() -> None:
         for block in blocks[2:5]
     )
     np.testing.assert_allclose(ideal * 1e-3, table_lengths(), atol=0.5001e-6)
-    np.testing.assert_allclose((real - ideal) * 1e3, change, atol=1.6e-3)  # three roundings: 0.5 nm, 0.5 nm, 0.5 nm
+    np.testing.assert_allclose((real - ideal) * 1e3, change, atol=1.6e-3)  # rounding of three printed numbers
     assert "round trip of the real structure" in blocks[-1]
     told = json.loads(hexapod("assess", "--machines", 5, "--seed", 5, "--json")[1])
     assert told["seeds"] == list(range(5, 10))
@@ -376,7 +364,7 @@ def test_assess_prints_the_papers_tables() -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_signals_end_a_session_in_order(number: signal.Signals) -> None:
-    """What was started inside is ended, as contexts do; 128 + signal, as shells count."""
+    """A signal ends what the session has started; the exit code is 128 + the signal's number, as in shells."""
     ended = []
     before = signal.getsignal(number)
 
@@ -393,7 +381,7 @@ def test_signals_end_a_session_in_order(number: signal.Signals) -> None:
 
 
 def test_tool_and_work_frame_of_ik_fk_check_and_travel(tmp_path: Path) -> None:
-    """Truth: the zoo's frames and kinematics for the probe in the fixture with the platform at home."""
+    """The truth is the zoo's frames and kinematics, for its probe in its fixture with the platform at home."""
     machine = with_frames("inches")
     used, home = machine.using("probe", "fixture"), np.array([machine.home])
     pose = Pose(used.tips(home, np.eye(3)[None])[0], used.work.matrix.T @ used.tool.matrix)
@@ -414,12 +402,12 @@ def test_tool_and_work_frame_of_ik_fk_check_and_travel(tmp_path: Path) -> None:
         (way.way, way.unit, way.error and way.error.reason) for way in ways
     ]
     assert [row["travel"] for row in told] == pytest.approx([way.shown for way in ways], abs=1e-6)
-    lines = hexapod("travel", *names)[1].splitlines()  # from home
+    lines = hexapod("travel", *names)[1].splitlines()  # starts at home
     assert lines[0].startswith(f"machine {machine.name}: how far the probe in fixture may go from x, y, z ")
     assert [line.split()[:3] for line in lines[2:]] == [[w.way, f"{w.shown:.3f}", w.unit] for w in ways]
 
 
-# A table over outside numbers: a sag of 10 µm at 0° and of 40 µm at 90°.
+# A table over elevation: the tool sags by 10 µm at 0° and by 40 µm at 90°
 
 SAG = """elevation_deg,x_um,y_um,z_um,rx_urad,ry_urad,rz_urad
 0,0,0,-10,0,0,0
@@ -428,14 +416,14 @@ SAG = """elevation_deg,x_um,y_um,z_um,rx_urad,ry_urad,rz_urad
 
 
 def raised_um(model: Path, *options: str) -> float:
-    """Return by how much the tool is commanded higher at home."""
+    """Return by how much, µm, a model's command at home is higher than the nominal command."""
     row = json.loads(hexapod("ik", "--pose", "0,0,400", "--model", model, "--json", *options)[1])["rows"][0]
     lengths = np.array([row[f"L{n}_mm"] for n in range(1, 7)]) * 1e-3
     return float(RealMachine(PAPER, IDEAL).pose_for(lengths)[0].position[2] - PAPER.home.position[2]) * 1e6
 
 
 def test_a_table_moves_the_tool_where_it_is_looked_up(tmp_path: Path) -> None:
-    """Corrections have the other sign; of what a calibration has seen only the difference counts."""
+    """The tool is raised by the table's error, or by minus its correction; after --calibrated-at by the difference."""
     (tmp_path / "sag.csv").write_text(SAG)
     bent = tmp_path / "bent.yaml"
     table = ("outside", tmp_path / "sag.csv", "--out", bent)
@@ -466,7 +454,7 @@ def test_a_table_moves_the_tool_where_it_is_looked_up(tmp_path: Path) -> None:
 
 
 def test_a_table_leaves_what_a_fit_knows_of_a_model(tmp_path: Path) -> None:
-    """The hash that the posterior's file names is that of the model with a table and without."""
+    """The hash of a model's text is the same with a table and without, so its posterior stays valid."""
     (tmp_path / "sag.csv").write_text(SAG)
     out = ("--model", "paper_machine", "--out", tmp_path / "both.yaml")
     assert hexapod("outside", tmp_path / "sag.csv", "--holds", "errors", *out)[0] == 0

@@ -1,7 +1,7 @@
-"""``simulate``, ``fit``, ``plan``, ``iso230`` and ``verify`` in-process, from file to file.
+"""The verbs ``simulate``, ``fit``, ``plan``, ``iso230`` and ``verify``, called in this process with files.
 
-One campaign of a 1-D laser is measured and fitted once for the whole module; tests of options that only change
-what is written get that fit again instead of a new one. A model whose parameters are known to 2 µm is verified.
+One campaign of a 1-D laser is measured and fitted once for the whole module; tests of options that change only the
+output use this fit. ``verify`` checks a model whose parameters are known to 2 µm.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from hexapod_comp.measurements.tidy import write_measurements
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.instruments import compensated, measure
 
-# Six readings on the shortest lines, the fewest that scheme lines takes; two cycles, the fewest for ISO 230-2
+# Six readings on the shortest line, the minimum of scheme lines; two cycles, the minimum of ISO 230-2
 CAMPAIGN = """format: hexapod_comp/campaign
 version: 1
 box_mm: [[-203.2, -203.2, 350], [203.2, 203.2, 553.2]]
@@ -43,7 +43,7 @@ diagonals: 4
 cycles: 2
 """
 
-BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])  # the same box, m
+BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])  # the campaign's box, m
 
 JOINT = ("--lead-mm", "10", "--blocks", "pitch,wave,backlash")
 
@@ -52,7 +52,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 @dataclass(frozen=True)
 class Calibration:
-    """The folder with all files, the fit, and what was said of it."""
+    """The folder with all files, the fit, and what ``fit`` printed as text and as JSON."""
 
     folder: Path
     campaign: Path
@@ -64,7 +64,7 @@ class Calibration:
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
-    """Measure the shipped machine and fit it, with every file that fit can write."""
+    """Measure and fit the shipped machine with all output files of ``fit``."""
     folder = tmp_path_factory.mktemp("calibration")
     campaign, measured = folder / "campaign.yaml", folder / "measured.csv"
     campaign.write_text(CAMPAIGN)
@@ -84,7 +84,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
 
 @pytest.fixture
 def fitted(done: Calibration, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calibration:
-    """Give the fit to whoever asks for one, and an empty folder to write into."""
+    """Return the module's fit, which every further ``fit`` gives as well, and change into an empty folder."""
     monkeypatch.setattr(fit_module, "fit_model", lambda *arguments: done.fit)
     monkeypatch.chdir(tmp_path)
     return done
@@ -94,9 +94,6 @@ def said_by(*words: object) -> str:
     code, out, err = hexapod(*words)
     assert code == 0, err
     return out
-
-
-# measure, then fit.
 
 
 def test_fit_reports_all_its_sections(done: Calibration) -> None:
@@ -120,7 +117,7 @@ def test_fit_reports_all_its_sections(done: Calibration) -> None:
 
 
 def test_what_is_printed_was_fitted(done: Calibration) -> None:
-    """The two figures that decide whether anyone uses the model, from the text and from the fit."""
+    """The printed errors before and after equal those of the fit."""
     level = done.fit.level
     assert level is not None
     found = re.search(r"level tool: +([\d.]+) → ([\d.]+) µm RMS \(([\d.]+)…([\d.]+) with 95 %\)", done.said)
@@ -129,11 +126,11 @@ def test_what_is_printed_was_fitted(done: Calibration) -> None:
     np.testing.assert_allclose([float(v) for v in found.groups()], wanted, atol=0.006)
     removed = re.search(r"error vector in space, RMS, datum aligned: .*\(([\d.]+) % less\)", done.said)
     assert removed
-    assert float(removed.group(1)) > 90.0  # the shipped machine has a field of 3 µm, which no block here can be
+    assert float(removed.group(1)) > 90.0  # the shipped machine has a field of 3 µm, and the fit has no field
 
 
 def test_model_file_holds_the_fit_and_where_it_comes_from(done: Calibration) -> None:
-    """To the last digit of the file: what the nodes load is what was judged."""
+    """The model file holds the fitted numbers to the last digit, its sources and date."""
     geometry = load_geometry("paper")
     model = load_model((done.folder / "model.yaml"), geometry)
     stored, _ = load_posterior(model, geometry, (done.folder / "model.yaml"))
@@ -155,14 +152,14 @@ def test_model_file_holds_the_fit_and_where_it_comes_from(done: Calibration) -> 
     np.testing.assert_allclose(model.region.box, BOX, atol=1e-12)
     residual = model.origin.held_out_residual
     assert residual is not None
-    assert 0.5e-6 < residual < 5e-6  # cells of two readings of 1 µm, and the shipped machine's field of 3 µm
+    assert 0.5e-6 < residual < 5e-6  # two readings of 1 µm per cell, and the machine's field of 3 µm
     np.testing.assert_allclose(model.base_deviation, done.fit.model.base_deviation, rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(model.struts.backlash, done.fit.model.struts.backlash, rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(model.struts.period, 0.01, rtol=1e-12)
 
 
 def test_options_reach_the_fit(done: Calibration, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """In SI, and the field's three blocks under one word."""
+    """Options arrive in the settings in SI units; the word `field` stands for three blocks."""
     given: list[FitSettings] = []
 
     def spy(measured: object, settings: FitSettings, *_: object) -> ModelFit:
@@ -183,11 +180,8 @@ def test_options_reach_the_fit(done: Calibration, monkeypatch: pytest.MonkeyPatc
     assert expansions == pytest.approx((11.7e-6, 11e-6, 23e-6))
 
 
-# Certificate.
-
-
 def test_certificate(fitted: Calibration) -> None:
-    """After the model: its hash is that of the file as it was written, details are in it, and the whole report."""
+    """The certificate has the hash of the written model file, the given details and the whole report."""
     Path("details.yaml").write_text("format: hexapod_comp/certificate\nversion: 1\noperator: <Jo>\n")
     options = ("--certificate", "out.html", "--details", "details.yaml", "--name", "Tuesday's")
     with quick_pictures():
@@ -202,11 +196,8 @@ def test_certificate(fitted: Calibration) -> None:
     assert "class=warning" not in text
 
 
-# Scheme lines.
-
-
 def test_scheme_lines(done: Calibration, tmp_path: Path) -> None:
-    """Polynomials, a model whose field is the measured box, no covariance; JSON alone on stdout."""
+    """Scheme lines writes a model with a field over the measured box and no posterior; stdout has only JSON."""
     written = ("--out", tmp_path / "lines.yaml", "--pictures", tmp_path / "pictures")
     with quick_pictures():
         code, out, err = hexapod("fit", done.measured, "--scheme", "lines", "--json", *written)
@@ -223,7 +214,7 @@ def test_scheme_lines(done: Calibration, tmp_path: Path) -> None:
     assert all(0.0 < line["residual_std_m"] < 1e-4 for line in content["lines"])
 
 
-# Readings that do not bear the model out.
+# Readings that contradict the model
 
 ALL = ("--out", "m.yaml", "--report", "r.txt", "--certificate", "c.html", "--pictures", "p")
 
@@ -231,7 +222,9 @@ ALL = ("--out", "m.yaml", "--report", "r.txt", "--certificate", "c.html", "--pic
 def test_noise_far_above_the_stated_writes_nothing_unless_it_is_forced(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Exit code 1, what is wrong at the top of the report, no file; a forced model says so wherever it is."""
+    """Noise of 30 times the stated gives exit code 1, the reason first in the report, and no file.
+
+    With --force the report, the model's note and the certificate begin with a warning."""
     monkeypatch.chdir(tmp_path)
     Path("campaign.yaml").write_text(CAMPAIGN + "noise: {linear_um: 30}\n")
     said_by("simulate", "--campaign", "campaign.yaml", "--seed", 1, "--out", "readings.csv")
@@ -262,8 +255,8 @@ def test_noise_far_above_the_stated_writes_nothing_unless_it_is_forced(
 
 
 def test_micrometres_called_millimetres_write_nothing(done: Calibration, tmp_path: Path) -> None:
-    """By either scheme, whether the file states no noise, or noise that is in millimetres then, too."""
-    # Scheme lines leaves the screws' waves, a few micrometres, which now are millimetres.
+    """Readings in a wrong unit write no model by either scheme, with noise stated in that unit or not stated."""
+    # Scheme lines leaves the screws' waves of a few micrometres, here read as millimetres.
     wrong, text = tmp_path / "mm.csv", done.measured.read_text().replace(",um,", ",mm,")
     wrong.write_text("".join(line.rsplit(",", 1)[0] + "\n" for line in text.splitlines()))
     code, out, _ = hexapod("fit", wrong, "--scheme", "lines", "--out", tmp_path / "m.yaml")
@@ -280,7 +273,7 @@ def test_micrometres_called_millimetres_write_nothing(done: Calibration, tmp_pat
 
 
 def test_a_dead_instrument_is_refused(done: Calibration, tmp_path: Path) -> None:
-    """Every value 0; the run's name may hold commas, so that cells are counted from the end."""
+    """A laser that reads 0 everywhere is refused. A run's name may hold commas, so cells are counted from the end."""
     dead, lines = tmp_path / "dead.csv", done.measured.read_text().splitlines()
     last = len(lines[0].split(",")) - lines[0].split(",").index("value")
     cells = [line.split(",") for line in lines[1:]]
@@ -292,11 +285,8 @@ def test_a_dead_instrument_is_refused(done: Calibration, tmp_path: Path) -> None
         assert list(tmp_path.iterdir()) == [dead]
 
 
-# plan.
-
-
 def test_plan_says_what_will_be_determined(done: Calibration, tmp_path: Path) -> None:
-    """Level 5-D lines show 14 of 33 structure parameters, says issue 3, and no roll; a 1-D laser shows less."""
+    """Level 5-D lines show 14 of 33 structure parameters (an independent count) and no roll; 1-D lines show less."""
     five = tmp_path / "five.yaml"
     five.write_text(CAMPAIGN.replace("1-D", "5-D"))
     code, out, err = hexapod("plan", five, *JOINT)
@@ -316,7 +306,7 @@ def test_plan_says_what_will_be_determined(done: Calibration, tmp_path: Path) ->
 
 
 def test_plan_proposes_a_campaign(done: Calibration, tmp_path: Path) -> None:
-    """The proposed file is one that plan judges; what it says beforehand is what plan says of it, draws aside."""
+    """``plan`` of the proposed file gives the proposal's expected error, except for random draws."""
     path = tmp_path / "mine.yaml"
     goal = ("--goal-um", "2", "--instruments", "linear", "--hours", "3", "--time", "linear=5,2,1")
     code, out, err = hexapod("plan", done.campaign, *JOINT, *goal, "--out", path, "--json")
@@ -332,7 +322,7 @@ def test_plan_proposes_a_campaign(done: Calibration, tmp_path: Path) -> None:
 
 
 def test_a_mistyped_coordinate_stands_on_the_first_line(tmp_path: Path) -> None:
-    """306 for 30.6: with file and line, before all else."""
+    """A position of 306 in place of 30.6 is named with its file and line, first in the report."""
     folder, path = Path(__file__).resolve().parents[2] / "examples" / "tracker", tmp_path / "points.csv"
     path.write_bytes(re.sub(rb"(?m)^P07;[-0-9]+,", b"P07;306,", (folder / "points.csv").read_bytes()))
     columns = ("--columns", folder / "columns.yaml", "--blocks", "structure")
@@ -341,7 +331,7 @@ def test_a_mistyped_coordinate_stands_on_the_first_line(tmp_path: Path) -> None:
 
 
 def test_a_model_that_the_compensator_would_refuse_is_named_before_it_is_written() -> None:
-    """All struts too long by 1.5 times what may be corrected, and by a tenth of that."""
+    """A model is refused in words if struts are wrong by 1.5 times the correction limit, not at 0.1 times."""
     poses = [Pose(np.array([x, 0.0, 0.42]), np.eye(3)) for x in (-0.1, 0.0, 0.1)]
     measured = scattered(paper(), poses)
     limit = paper().limits.correction
@@ -354,12 +344,12 @@ def test_a_model_that_the_compensator_would_refuse_is_named_before_it_is_written
 
 
 MICRON = (1e-6,) * len(KINDS)
-STRUT = 1  # which strut is moved, by 50 µm
+STRUT = 1  # index of the strut that is moved by 50 µm
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a model, and checks of the machine as it is, with a strut moved, and compensated."""
+    """Return a folder with a model and check readings: unchanged, with a moved strut, with compensation running."""
     folder = tmp_path_factory.mktemp("verify")
     model = load_model(fitted_model(folder), paper())
     box = np.array([[-0.1, -0.1, 0.38], [0.1, 0.1, 0.45]])
@@ -379,12 +369,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def model_in(folder: Path) -> Path:
-    """Return the model file."""
+    """Return the path of the model file."""
     return next(folder.glob("*.yaml"))
 
 
 def test_verdicts_are_exit_codes_and_a_moved_strut_is_named(folder: Path) -> None:
-    """All struts are 30 µm too long: without --compensated the readings of a compensated machine differ."""
+    """VALID gives exit code 0, a moved strut 1. Struts are 30 µm too long, so --compensated makes a difference."""
     model = model_in(folder)
     code, out, _ = hexapod("verify", model, folder / "same.csv")
     assert code == 0
@@ -400,7 +390,7 @@ def test_verdicts_are_exit_codes_and_a_moved_strut_is_named(folder: Path) -> Non
 
 
 def test_proposed_readings_are_written_to_be_filled_in(folder: Path) -> None:
-    """They are of the model that is named; what is measured has its own files."""
+    """--propose writes readings without values; wrong combinations of arguments are refused."""
     proposed = folder / "check.csv"
     code, out, _ = hexapod("verify", model_in(folder), "--propose", proposed, "--readings", 8)
     assert code == 0

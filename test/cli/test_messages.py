@@ -1,8 +1,8 @@
-"""The wording of what is refused, in one file: messages.txt has what is typed, or a file's text, and the answer.
+"""The wording of refusals: messages.txt holds commands, or files' texts, each followed by its expected message.
 
-A line ``file NAME "its text"`` gives every command below it that names the file this file to read.
+A line ``file NAME "its text"`` sets the content of file NAME for all commands below it.
 
-``RENEW_MESSAGES=1 pytest test/cli/test_messages.py`` writes the answers anew; ``git diff`` then shows every new word.
+``RENEW_MESSAGES=1 pytest test/cli/test_messages.py`` rewrites the messages; ``git diff`` then shows every new word.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def read_length(text: str) -> None:
 
 
 def answer(asked: str, capsys: pytest.CaptureFixture[str]) -> str:
-    """Return what is said of a command (in braces: the errors of its b.yaml), or of a YAML file with a length ``a``."""
+    """Return the message of a command (in braces: the errors of its b.yaml), or of a YAML file with a length ``a``."""
     if asked.startswith("yaml "):
         with pytest.raises(InputFileError) as caught:
             read_length(YAML + json.loads(asked.removeprefix("yaml ")))
@@ -53,7 +53,9 @@ def answer(asked: str, capsys: pytest.CaptureFixture[str]) -> str:
     assert sorted(Path().rglob("*")) == before, "nothing is written"
     *usage, last = err.splitlines()
     assert usage[0].startswith("usage: hexapod_comp") if usage else last.startswith("hexapod_comp: error: "), err
-    return last.replace(f"{config_folder()}", "config").partition(" (choose from")[0]  # Python's own, by version
+    return last.replace(f"{config_folder()}", "config").partition(" (choose from")[
+        0
+    ]  # Python's list of choices differs by version
 
 
 @pytest.mark.parametrize(("line", "asked"), CASES, ids=[asked for _, asked in CASES])

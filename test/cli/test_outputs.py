@@ -1,4 +1,4 @@
-"""No verb replaces what it reads: every option that names a file is either read or written, and the two never meet."""
+"""No verb overwrites its input: every option that names a file is declared as read or written, and never both."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from hexapod_comp.formats import outputs
 ROOT = Path(__file__).resolve().parents[2]
 WORDS = {"name", "namespace", "blocks", "instruments", "order", "scheme", "method", "scheduler", "thermometer", "host"}
 WORDS |= {"tool", "work", "topic", "frame", "readings"}
-"""Options whose text is no file's name."""
+"""Options whose text is not a file name."""
 
 
 def test_every_option_that_names_a_file_is_declared_as_read_or_written():
-    """Other options take a number, a word that is no file's name, or nothing."""
+    """All other options take a number, a word of :data:`WORDS`, or nothing."""
     for name, verb in VERBS.items():
         for option in verb.options:
             text = option.keywords.get("type") in (None, csv_file, html_file) and "choices" not in option.keywords
@@ -60,7 +60,7 @@ def test_output_that_is_an_input_is_refused_at_once(command: str, name: str, fol
 
 
 def test_other_names_of_an_input_are_refused_too(folder: Path, capsys):
-    """A link, and standard input."""
+    """The input is recognised through a symbolic link, and as standard input."""
     given, out = folder / "table1.csv", folder / "out.csv"
     out.symlink_to(given)
     assert cli.main(["ik", str(given), "--out", str(out)]) == 2
@@ -78,19 +78,19 @@ def test_other_names_of_an_input_are_refused_too(folder: Path, capsys):
 
 
 def test_a_file_in_an_output_folder_that_is_read_is_not_replaced(folder: Path):
-    """Which files a folder will get only their writers know: they ask too."""
+    """Writers of files in an output folder check each file, since only they know its name."""
     from hexapod_comp.formats.outputs import write_text
 
     with outputs.protected({"budget": str(folder / "c.yaml")}, {}, {"pictures": str(folder)}):
         with pytest.raises(InputFileError, match="is read by this command"):
             write_text(folder / "c.yaml", "new")
         write_text(folder / "other.csv", "new")
-    write_text(folder / "c.yaml", "new")  # a program that uses the package may
+    write_text(folder / "c.yaml", "new")  # outside of a command a program may overwrite the file
     assert (folder / "c.yaml").read_text() == (folder / "other.csv").read_text() == "new"
 
 
 def test_two_outputs_in_one_file_are_refused_at_once(folder: Path, capsys):
-    """One would replace the other without a word."""
+    """Otherwise one output would replace the other without a message."""
     shutil.copy(ROOT / "config" / "table1.csv", folder / "r.csv")
     (folder / "link.html").symlink_to(folder / "a.html")
     command = f"fit {folder}/r.csv --out {folder}/a.html --certificate {folder}/link.html"
