@@ -1,6 +1,6 @@
-"""What tests with ROS need: nothing of them is seen outside, nothing outside disturbs them.
+"""Fixtures of tests with ROS: their nodes are isolated from other nodes on the computer and network.
 
-rclpy is imported inside the fixtures only, so that the core's tests run where there is no ROS.
+rclpy is imported inside the fixtures only, so that the core's tests run without ROS.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from node_helpers import Bench, Rig, Stranger
     from rclpy.context import Context
 
-pytest_plugins = ("hexapod_comp.testing",)  # where the package is not installed
+pytest_plugins = ("hexapod_comp.testing",)  # if the package is not installed
 
 OWN_NODE_FIXTURES = {"module_context", "client"}
 
-# Folders of tests that wait for nodes more than they compute, those of the longest tests first
+# Folders whose tests wait for nodes more than they compute; the folder with the longest tests is first
 WAITING = ("test/loop/", "test/benchmarks/", "test/linuxcnc/", "test/ros/")
 
 
 def pytest_configure() -> None:
-    """Let the kit clear up behind our own fixtures too."""
+    """Make the test kit clean up after this project's own node fixtures, too."""
     from hexapod_comp.testing import NODE_FIXTURES
 
     NODE_FIXTURES.update(OWN_NODE_FIXTURES)
@@ -31,9 +31,9 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
-    """Keep a file's tests in one process, as ``--dist loadfile`` does, but those of the zoo machine by machine.
+    """Run a file's tests in one process, as ``--dist loadfile`` does, but split test_zoo.py by machine.
 
-    The first process takes the files whose tests wait for nodes, the others those that compute, as long as there are.
+    The first process takes the files whose tests wait for nodes first, the other processes those that compute.
     """
     if config.getvalue("dist") != "loadfile":
         return None
@@ -56,19 +56,19 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
 
 @pytest.fixture(scope="session", autouse=True)
 def isolated_ros(hexapod_domain: int) -> int:
-    """Keep all tests' nodes in this session's domain: also those that do not ask for one start processes."""
+    """Use this session's ROS domain in every test, since some tests start processes with nodes."""
     return hexapod_domain
 
 
 @pytest.fixture
 def unsuspected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave out of fits what else their readings might be: where that is not asked, it takes longest."""
+    """Switch off the fit's search for mix-ups, which takes most of its time, in tests of other things."""
     monkeypatch.setattr("hexapod_comp.calibration.fit.mixups", lambda *_: [])
 
 
 @pytest.fixture(scope="module")
 def module_context(hexapod_domain: int) -> Iterator[Context]:
-    """Give a context that the tests of a module share, for nodes that are never spun."""
+    """Provide one context for the tests of a module whose nodes are never spun."""
     from hexapod_comp.testing import private_context
 
     yield from private_context(hexapod_domain)
@@ -76,7 +76,7 @@ def module_context(hexapod_domain: int) -> Iterator[Context]:
 
 @pytest.fixture
 def bench(hexapod_context: Context, capfd: pytest.CaptureFixture[str]) -> Iterator[Bench]:
-    """Give a bench with this project's usual machine."""
+    """Provide a bench with this project's usual machine."""
     from node_helpers import Bench
 
     with Bench(hexapod_context, capfd) as made:
@@ -90,7 +90,7 @@ def rig(
     monkeypatch: pytest.MonkeyPatch,
     request: pytest.FixtureRequest,
 ) -> Iterator[Rig]:
-    """Give a bench without DDS, on a clock of its own, which is the test module's ``time`` too."""
+    """Provide a bench without DDS whose clock also replaces ``time`` in the test module."""
     from node_helpers import Rig
 
     with Rig(module_context, capfd, monkeypatch) as made:
@@ -101,7 +101,7 @@ def rig(
 
 @pytest.fixture
 def stranger(rig: Rig) -> Stranger:
-    """Give another node beside the rig's."""
+    """Provide a second node beside the rig's."""
     from node_helpers import Stranger
 
     return Stranger(rig, "stranger")

@@ -1,4 +1,4 @@
-"""Virtual machines, instruments and warm-up against errors known in closed form; ``simulate`` and ``imagine``."""
+"""Virtual machines, instruments and warm-up against closed forms; the verbs ``simulate`` and ``imagine``."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def filled(campaign: Campaign, truth: RealMachine, seed: int = 3) -> Measurement
 
 
 def test_a_shifted_base_shows_in_absolute_positions_only() -> None:
-    """All base joints moved by d: the platform moves by d, exactly. Lines are zeroed at their first reading."""
+    """Moving all base joints by d moves the platform by exactly d; lines, zeroed at their start, do not show it."""
     d = np.array([20e-6, -30e-6, 50e-6])
     truth = RealMachine(paper_geometry(), MachineModel("paper", base_deviation=np.tile(d, (6, 1))))
     found = filled(QUIET, truth)
@@ -50,8 +50,8 @@ def test_a_shifted_base_shows_in_absolute_positions_only() -> None:
 
 
 def test_backlash_separates_the_directions() -> None:
-    """Every strut lags half its backlash of 4 µm behind. On vertical lines all struts move alike: going up the
-    platform is too low by 2 µm and more (struts lean), going down as much too high; second order: 1e-11."""
+    """Every strut lags by half its backlash of 4 µm. On vertical lines all struts move alike: upwards the platform is
+    too low by 2 µm or more (the struts are oblique), downwards as much too high. Second order is 1e-11 m."""
     struts = StrutErrors(backlash=np.full(6, 4e-6))
     truth = RealMachine(paper_geometry(), MachineModel("paper", struts=struts))
     plan = template(Campaign(BOX, 0.1, 0.05, "1-D", 0), paper_geometry())
@@ -66,7 +66,7 @@ def test_backlash_separates_the_directions() -> None:
 
 
 def test_noise_is_as_the_campaign_says() -> None:
-    """Standard deviations of a few hundred draws: within 15 % (four standard errors at 400)."""
+    """Standard deviations of about 400 draws are within 15 %, four standard errors."""
     campaign = replace(QUIET, noise=(1e-6, 2e-6, 3e-6, 4e-6, 5e-6, 6e-6, 7e-6), poses=200)
     truth = RealMachine(paper_geometry(), MachineModel("paper"))
     found = filled(campaign, truth)
@@ -76,7 +76,7 @@ def test_noise_is_as_the_campaign_says() -> None:
             assert set(found.uncertainty[of_kind(found, kind)]) == {sigma}
     np.testing.assert_array_equal(filled(campaign, truth).value, found.value)
     assert not np.array_equal(filled(campaign, truth, seed=4).value, found.value)
-    assert np.isnan(filled(QUIET, truth).uncertainty).all()  # nobody reads without noise: nothing is stated
+    assert np.isnan(filled(QUIET, truth).uncertainty).all()  # without noise the readings state no uncertainty
 
 
 def test_beam_slopes_bend_straightness_only_and_one_slope_holds_for_a_run() -> None:
@@ -90,7 +90,7 @@ def test_beam_slopes_bend_straightness_only_and_one_slope_holds_for_a_run() -> N
         each = found.value[rows] / along[rows]
         np.testing.assert_allclose(each, each[0], atol=1e-11)
         slopes.append(each[0])
-    assert np.std(slopes) == pytest.approx(100e-6, rel=0.4)  # 54 draws
+    assert np.std(slopes) == pytest.approx(100e-6, rel=0.4)  # of 54 draws
 
 
 def test_the_machine_stops_elsewhere_at_every_visit_for_all_channels_alike() -> None:
@@ -105,7 +105,7 @@ def test_the_machine_stops_elsewhere_at_every_visit_for_all_channels_alike() -> 
 
 
 def test_the_truths_own_compensation_leaves_nothing() -> None:
-    """Running the truth backwards, then forwards: rounding of lengths below a metre, 1e-15; measured 1.2e-15."""
+    """The true model, run backwards and then forwards, leaves rounding of lengths below a metre: 1.2e-15 m."""
     geometry = paper_geometry()
     model = load_model(config_file("paper_machine"), geometry)
     plan = compensated(template(QUIET, geometry), model)
@@ -148,14 +148,14 @@ def test_verb_writes_what_it_says(tmp_path: Path) -> None:
     truth = RealMachine(geometry, load_model(config_file("paper_machine"), geometry))
     expected = measure(template(campaign, geometry, 1), campaign, truth, 1)
     assert f"{len(expected)} readings of 21 runs" in said[1]  # 16 lines, 4 diagonals, the poses
-    # The file has what instruments show, a tenth of a nanometre, and states their noise, to rounding in its unit.
+    # The file is rounded to 0.1 nm, the instruments' resolution; its stated noise is exact in its unit.
     found = read_measurements(str(paths[0]), geometry)
     np.testing.assert_allclose(found.value, expected.value, rtol=0.0, atol=0.51e-10)
     np.testing.assert_allclose(found.uncertainty, expected.uncertainty, rtol=1e-15)
     stated = {kind: found.uncertainty[of_kind(found, kind)][0] for kind in ("linear", "rotation", "position")}
     assert stated == pytest.approx({"linear": 0.5e-6, "rotation": np.radians(0.2 / 3600.0), "position": 10e-6})
     assert np.isnan(found.uncertainty[of_kind(found, "straightness")]).all()
-    # A machine that warms: times, temperatures and humidity of the shipped sensors.
+    # With --warm-up the file has times, and temperatures and humidity of the shipped sensors.
     options = ("--warm-up", "warm_up", "--model", "paper_machine", "--out", tmp_path / "warm.csv")
     said = hexapod("simulate", "--campaign", tmp_path / "small.yaml", *options)
     assert "\nwarms while it is measured: strut_1 " in said[1]
@@ -172,7 +172,7 @@ STEEL = 11.5e-6
 
 
 def test_parts_follow_the_power_by_a_first_order_lag() -> None:
-    """On for 1000 s, off for another thousand: closed form on both ways; rounding of two thousand steps."""
+    """The power is on for 1000 s, then off for 1000 s; the truth is the closed form of a first-order lag."""
     t = np.arange(1001.0)
     course = ALIKE.course(2000, off=(1000, 2000))
     reached = 1.0 - np.exp(-1000.0 / 600.0)
@@ -183,8 +183,9 @@ def test_parts_follow_the_power_by_a_first_order_lag() -> None:
 
 @pytest.mark.parametrize("name", ["framed", "inches"])
 def test_a_machine_that_grows_evenly_shows_it_on_every_round(name: str, tmp_path: Path) -> None:
-    """Struts, base and platform alike: the platform's place is the commanded one, grown; the tool's offset does not.
-    What acts is the temperature, not what the filter makes of it 30 s later. Second order: 1e-9 of a metre's 1e-5."""
+    """If all parts grow alike, the platform's position grows with them; the tool's offset does not grow.
+
+    The growth follows the temperature, not the sensor's filter, which is 30 s late. Second order: 1e-9 of 1e-5 m."""
     geometry, box = load_geometry(machines()[name].write(tmp_path / "machine.yaml")), machines()[name].box
     side = float(np.ptp(box, axis=0).min())
     campaign = ALIKE.campaign(Campaign(box, side, side, None, 4, noise=(0.0,) * len(KINDS), beam_slope=0.0))
@@ -196,7 +197,7 @@ def test_a_machine_that_grows_evenly_shows_it_on_every_round(name: str, tmp_path
     warmth = 3.0 * (1.0 - np.exp(-np.maximum(times, 0.0) / 600.0))
     assert (read.stations.temperatures[read.station][times < 0.0] == 20.0).all()
     linear = read.channel == 0
-    # From each run's first reading on, which has a warmth of its own.
+    # Relative to each run's first reading, at which the laser was zeroed
     for run in range(len(read.runs)):
         rows = np.flatnonzero(linear & (read.run == run) & (read.direction == 1))
         grown = read.stations.positions[read.station[rows]] * (STEEL * warmth[rows])[:, None]
@@ -242,15 +243,15 @@ def test_the_shipped_file_and_one_with_a_slip(tmp_path: Path) -> None:
             load_warm_up(path)
 
 
-# Leaves what the tests' own reader and kinematics have: structure, offsets and pitch
+# Only errors that the tests' own kinematics have stay: structure, offsets and pitch
 PLAIN = ("--wave-um", "0", "--map-um", "0", "--backlash-um", "0")
 
 
 @pytest.mark.parametrize("name", machine_names())
 def test_any_machine(name: str, tmp_path: Path) -> None:
-    """The figures of the report are those of the file, at random places of the box that the report names."""
-    # Of 1,000 places each. Aligned errors grow towards the corners, so that squares scatter by one and a half times
-    # their size: a mean square good to 4.5/√1000 = 14 %, its root to 7 %, two such 10 %.
+    """The errors in the report of ``imagine`` are those of the written file, at random places of the box it names."""
+    # Both figures are over 1,000 places. Aligned errors grow towards the corners: squares scatter by 1.5 times their
+    # size, a mean square by 4.5/√1000 = 14 %, its root by 7 %, the difference of two roots by 10 %.
     machine = machines()[name]
     geometry, out = machine.write(tmp_path / "machine.yaml"), tmp_path / "truth.yaml"
     bounds = ("--joints-um", "30", "--struts-um", "20", "--pitch-ppm", "100")
@@ -269,7 +270,7 @@ def test_any_machine(name: str, tmp_path: Path) -> None:
 
 
 def test_every_bound_ends_where_it_belongs(tmp_path: Path) -> None:
-    """The file's keys carry the units; each value lies within its option's bound, and only then."""
+    """Each value in the file lies within the bounds of its option, in the unit of its key."""
     out = tmp_path / "truth.yaml"
     options = "--joints-um 0 --struts-um 0 --pitch-ppm 0 --wave-um 2,3 --wave-period-mm 4 --map-um 1.5 --wear-um 3"
     options += " --backlash-um 5,6 --strut-expansion-ppm-per-k 10,11 --body-expansion-ppm-per-k 12,13 --field-um 7"
@@ -286,7 +287,7 @@ def test_every_bound_ends_where_it_belongs(tmp_path: Path) -> None:
     assert model.struts.period.tolist() == [0.004] * 6
     assert np.sqrt((model.struts.map_values**2).mean(axis=1)) / UM == pytest.approx([1.5] * 6)
     wear = model.struts.map_backlash.max(axis=1) / UM
-    assert ((wear > 1.4) & (wear <= 3.0)).all()  # at least half of it, between knots
+    assert ((wear > 1.4) & (wear <= 3.0)).all()  # wear is at its bound between knots, at them at least half
     for values, low, high in (
         (struts["backlash_um"], 5.0, 6.0),
         (model.struts.expansion * 1e6, 10.0, 11.0),
@@ -298,7 +299,7 @@ def test_every_bound_ends_where_it_belongs(tmp_path: Path) -> None:
     places = np.random.default_rng(1).uniform(model.field.box[0], model.field.box[1], (300, 3))
     seen = np.array([model.field.evaluate(place, np.ones(3))[0] for place in places])
     back = np.array([model.field.evaluate(place, -np.ones(3))[0] for place in places])
-    assert 0.2 * 7 * UM < np.abs(seen[:, :3]).max() <= 7.1 * UM  # scaled on a grid of nine places a side
+    assert 0.2 * 7 * UM < np.abs(seen[:, :3]).max() <= 7.1 * UM  # the field is scaled on a grid of nine places per side
     assert 0.2 * 9e-6 < np.abs(seen[:, 3:]).max() <= 9.1e-6
     assert np.abs(seen - back).max() > 0.1 * UM
     assert told["tool_error"]["frame"] == "work"
@@ -313,7 +314,7 @@ def test_every_bound_ends_where_it_belongs(tmp_path: Path) -> None:
     ],
 )
 def test_random_is_the_same_machine_in_every_verb(command: str, tmp_path: Path) -> None:
-    """By its name and by the file of ``imagine`` with that seed: the same numbers, printed and in files."""
+    """``random:SEED`` and the file of ``imagine --seed SEED`` give the same numbers, printed and in files."""
     (tmp_path / "campaign.yaml").write_text(SMALL)
     file = tmp_path / "truth.yaml"
     assert hexapod("imagine", "--seed", 4, "--out", file)[0] == 0

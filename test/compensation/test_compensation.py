@@ -1,5 +1,4 @@
-"""The compensator: commands that close the loop, refusals that leave no trace, changes that ramp; its phases, and its
-limits of speed and acceleration by stamps, by receipt and by publication."""
+"""The compensator: its commands reach the pose, refusals change nothing, changes ramp; phases and limits of speed."""
 
 from __future__ import annotations
 
@@ -50,12 +49,12 @@ RAMP = 1e-3
 
 
 def model_of(geometry: HexapodGeometry, seed: int) -> MachineModel:
-    """Return a model with every block on."""
+    """Return a model in which every block has errors."""
     return random_model(np.random.default_rng(seed), geometry.name)
 
 
 def tool_poses(geometry: HexapodGeometry, count: int, seed: int) -> list[Pose]:
-    """Return tool poses in the work frame whose platform poses lie about home."""
+    """Return tool poses in the work frame whose platform poses are near home."""
     rng = np.random.default_rng(seed)
     return [geometry.work.inverse() @ random_pose(rng, geometry.home) @ geometry.tool for _ in range(count)]
 
@@ -71,7 +70,7 @@ def nominal_lengths(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
 
 
 def numbers_of(pose: Pose) -> tuple[float, ...]:
-    """Return a pose as the loop's entry takes it: position, then quaternion x, y, z, w by scipy."""
+    """Return a pose in the form that ``step`` takes: position, then quaternion x, y, z, w by scipy."""
     return (*pose.position.tolist(), *Rotation.from_matrix(pose.rotation).as_quat().tolist())
 
 
@@ -85,7 +84,7 @@ def composed(*poses: Pose) -> tuple[Rotation, np.ndarray]:
 
 
 def assert_same_records(one: Correction, other: Correction) -> None:
-    """Compare every field bit by bit."""
+    """Compare every field of two records bit by bit."""
     for entry in fields(Correction):
         a, b = getattr(one, entry.name), getattr(other, entry.name)
         if isinstance(a, Pose):
@@ -97,12 +96,9 @@ def assert_same_records(one: Correction, other: Correction) -> None:
             assert a == b, entry.name
 
 
-# The command is right.
-
-
 @pytest.mark.parametrize("geometry", [FREE, OFFSET, SKEWED], ids=["paper", "tool and work", "6-6 with lead"])
 def test_the_commands_bring_the_real_machine_to_the_pose(geometry: HexapodGeometry) -> None:
-    """Closure: the forward model, by Newton from home, finds the commanded pose again: 1e-13 m, 1e-12 rad."""
+    """The forward model, by Newton from home, finds the commanded pose again: to 1e-13 m and 1e-12 rad."""
     compensator = Compensator(geometry, model_of(geometry, 1))
     for n, pose in enumerate(tool_poses(geometry, 50, 2)):
         record = compensator.correct(pose, n / RATE)
@@ -112,15 +108,15 @@ def test_the_commands_bring_the_real_machine_to_the_pose(geometry: HexapodGeomet
         assert Rotation.from_matrix(tool.rotation @ pose.rotation.T).magnitude() <= 1e-12
         np.testing.assert_allclose(model_pose.position, record.model_pose.position, atol=1e-13)
         np.testing.assert_allclose(record.command, record.nominal + record.correction, atol=1e-16)
-        assert np.abs(record.correction).max() > 50e-6  # there was something to correct
+        assert np.abs(record.correction).max() > 50e-6  # the model has errors of this size
         estimate, (rotation, position) = compensator.estimate(record.command), composed(geometry.work, pose)
-        np.testing.assert_allclose(estimate[:3], position, atol=2e-13)  # read back from the encoders, seen from base
+        np.testing.assert_allclose(estimate[:3], position, atol=2e-13)  # from the encoders, in base
         np.testing.assert_allclose(estimate[3:].reshape(3, 3), rotation.as_matrix(), atol=1e-12)
         assert not record.ramping
 
 
 def test_both_entries_give_the_same_commands() -> None:
-    """Quaternion in, rotation matrix in: the same to rounding, also with a norm that is off by what is allowed."""
+    """``step`` with quaternions and ``correct`` with matrices give the same commands, also for a norm of 1.0009."""
     model = model_of(OFFSET, 6)
     by_pose, by_numbers, unnormalised = (Compensator(OFFSET, model) for _ in range(3))
     for n, pose in enumerate(tool_poses(OFFSET, 20, 6)):
@@ -133,7 +129,7 @@ def test_both_entries_give_the_same_commands() -> None:
 
 @pytest.mark.parametrize("geometry", [FREE, OFFSET], ids=["paper", "tool and work"])
 def test_the_predicted_error_is_right_to_first_order(geometry: HexapodGeometry) -> None:
-    """Against the exact forward run under nominal lengths: the difference falls by four when errors halve."""
+    """The difference to the exact forward run with nominal lengths falls by four when the errors are halved."""
     rng = np.random.default_rng(8)
     deviations, offsets = rng.uniform(-1.0, 1.0, (2, 6, 3)), rng.uniform(-1.0, 1.0, 6)
     whole = random_field(np.random.default_rng(9), size=0.2)
@@ -157,13 +153,13 @@ def test_the_predicted_error_is_right_to_first_order(geometry: HexapodGeometry) 
 
     full, error = difference(1e-3)
     half, _ = difference(5e-4)
-    assert error > 5e-4  # a large error on purpose, so that its square stands clear of rounding
+    assert error > 5e-4  # so large that its square is well above rounding
     assert 3.6 < full / half < 4.4
     assert full < 0.05 * error
 
 
 def test_the_first_command_takes_the_mean_of_both_directions() -> None:
-    """Backlash alone: told L, a strut is L − s·b/2 long, so it must be told L + s·b/2; s is 0 at first."""
+    """A strut with backlash b alone and command L is L − s·b/2 long, so the command is L + s·b/2; at first s = 0."""
     backlash = np.linspace(10e-6, 60e-6, 6)
     compensator = Compensator(FREE, MachineModel("paper", struts=StrutErrors(backlash=backlash)))
     first = compensator.correct(FREE.home)
@@ -176,7 +172,7 @@ def test_the_first_command_takes_the_mean_of_both_directions() -> None:
 
 
 def test_temperatures_in_closed_form() -> None:
-    """Struts told c are (1 + a·ΔT)·c long; joints move away from their body's origin by a·ΔT of their distance."""
+    """Struts with command c are (1 + a·ΔT)·c long; joints move outwards by a·ΔT of their radius."""
     expansion = np.linspace(5e-6, 20e-6, 6)
     struts = StrutErrors(expansion=expansion)
     model = MachineModel("paper", struts=struts, base_expansion=11e-6, platform_expansion=23e-6)
@@ -193,7 +189,7 @@ def test_temperatures_in_closed_form() -> None:
     np.testing.assert_allclose(record.command, lengths / (1.0 + expansion * warmer), atol=1e-15)
 
 
-# What is outside.
+# Outside the field's box
 
 
 def boxed(outside: str) -> MachineModel:
@@ -222,11 +218,11 @@ def test_another_machines_model_is_refused() -> None:
     assert not compensator.ramping
 
 
-# A refusal leaves no trace.
+# A refused command changes nothing
 
 
 def standing(limits: Limits = PAPER.limits, outside: str = "hold") -> Compensator:
-    """Return a compensator in motion, with a model of everything and a ramp under way."""
+    """Return a compensator in motion, with all blocks of a model and a ramp in progress."""
     rng = np.random.default_rng(13)
     model = replace(
         random_model(rng, "paper"),
@@ -260,7 +256,7 @@ REFUSED: dict[str, tuple[Limits, Pose | tuple[float, ...]]] = {
 
 
 def assert_no_trace(make: Callable[[], Compensator], refuse: Callable[[Compensator], None]) -> None:
-    """Compare with a twin that never saw the refused command, over the ramp that follows."""
+    """Compare with a compensator that did not get the refused command, also over the ramp that follows."""
     tried, twin = make(), make()
     refuse(tried)
     np.testing.assert_array_equal(tried.command, twin.command)
@@ -283,7 +279,7 @@ def test_a_refused_command_leaves_no_trace(reason: str) -> None:
     assert_no_trace(lambda: standing(limits, "refuse" if reason == "outside_field" else "hold"), refuse)
 
 
-# The first command after a reset.
+# The first command after a reset
 
 
 def test_the_first_command_is_at_most_a_step_from_the_measured_struts() -> None:
@@ -296,7 +292,7 @@ def test_the_first_command_is_at_most_a_step_from_the_measured_struts() -> None:
     compensator.reset(lengths + 1.999e-3)
     compensator.correct(PAPER.home)
     compensator.reset()
-    compensator.correct(shifted(PAPER.home, 0.0, 0.0, 0.1))  # nothing known, nothing to compare with
+    compensator.correct(shifted(PAPER.home, 0.0, 0.0, 0.1))  # without measured lengths there is no limit of the step
 
 
 @pytest.mark.parametrize("measured", [np.full(6, np.nan), np.zeros(5), np.full(6, np.inf)], ids=["NaN", "five", "∞"])
@@ -311,9 +307,9 @@ def test_measured_lengths_that_are_none_are_refused(measured: np.ndarray) -> Non
 
 @pytest.mark.parametrize("backlash", [0.0, 20e-6], ids=["none", "backlash"])
 def test_a_restarted_compensator_starts_from_the_measured_struts(backlash: float) -> None:
-    """Its first command is what was measured, the way from there no faster than the ramp, its end a fresh start's.
+    """At rest, the first command equals the measured lengths, and the following ones ramp to those of a fresh start.
 
-    At rest, after a motion that has left every strut at the forward side of its backlash.
+    Before the restart a motion has left every strut at the forward side of its backlash.
     """
     model = MachineModel("paper", struts=StrutErrors(offset=np.full(6, 70e-6), backlash=np.full(6, backlash)))
     before = Compensator(PAPER, model, RAMP)
@@ -330,7 +326,7 @@ def test_a_restarted_compensator_starts_from_the_measured_struts(backlash: float
 
 
 def test_a_refused_first_command_leaves_the_start_from_the_measured_struts() -> None:
-    """Struts on their commands, an impossible command, then a good one: that starts from the struts all the same."""
+    """After impossible first commands, a valid command still starts from the measured lengths."""
     compensator = standing()
     measured = compensator.command + 5e-6
     compensator.reset(measured)
@@ -342,7 +338,7 @@ def test_a_refused_first_command_leaves_the_start_from_the_measured_struts() -> 
     np.testing.assert_allclose(compensator.correct(PAPER.home, 1.0).command, measured, rtol=0.0, atol=1e-15)
 
 
-# Changes ramp.
+# Changes ramp
 
 
 def changed_model(compensator: Compensator) -> None:
@@ -355,8 +351,8 @@ CHANGES = {
     "warmer": lambda c: c.set_temperature("base", 45.0),
     "colder": lambda c: c.set_temperature("base", 5.0),
 }
-"""The new model and the cold base make the model's struts shorter at once while they really lengthen: a
-jump that must not pass for a reversal."""
+"""The new model and the cold base shorten the model's struts at once while in fact they lengthen: this jump must not
+count as a reversal."""
 
 
 def running(seed: int = 14) -> Compensator:
@@ -368,7 +364,7 @@ def running(seed: int = 14) -> Compensator:
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
 def test_a_change_at_rest_ramps_at_its_rate_and_arrives(change: Callable[[Compensator], None]) -> None:
-    """No command moves a strut by more than rate · time; the largest change takes just as long as that says."""
+    """No command moves a strut by more than rate · time, and the largest change takes its size over the rate."""
     compensator = running()
     start = compensator.command.copy()
     change(compensator)
@@ -396,10 +392,10 @@ def test_a_change_at_rest_ramps_at_its_rate_and_arrives(change: Callable[[Compen
 
 @pytest.mark.parametrize("change", [CHANGES["model"], CHANGES["colder"]], ids=["model", "colder"])
 def test_a_change_in_motion_adds_no_step(change: Callable[[Compensator], None]) -> None:
-    """While the pose moves, a command moves by no more than pose and ramp together ask for.
+    """While the pose moves, a command moves by no more than the pose's own motion plus the ramp.
 
-    The pose's own part is what a compensator without the change does, ± 1 % for the slope of the models'
-    corrections (their pitch errors are below 0.1 %, their fields below that).
+    The pose's own motion is that of a compensator without the change, ± 1 % for the slope of the models' corrections
+    (pitch errors are below 0.1 %, fields below that).
     """
     compensator, undisturbed = running(), running()
     last, plain_last = compensator.command.copy(), undisturbed.command.copy()
@@ -424,14 +420,12 @@ def test_a_late_command_does_not_step(late: float) -> None:
     assert np.abs(command - last).max() <= RAMP * LONGEST_RAMP_STEP * (1.0 + 1e-9)
 
 
-# ---- phases ----
-
 STATES = Path(__file__).resolve().parents[2] / "doc" / "states.md"
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_core_keeps_to_the_table(seed):
-    """Two hundred events in any order; every accepted and refused command, too."""
+    """Two hundred events in random order change the phase as the table has it; refused commands do not change it."""
     geometry = load_geometry(config_file("paper.yaml"))
     rng, seen = np.random.default_rng(seed), set()
     ideal, random = (find_model(name, geometry) for name in ("ideal", f"random:{seed}"))
@@ -482,14 +476,12 @@ def test_the_page_shows_the_table():
     assert shown == {phase: (phase.value, TRANSITIONS[phase]) for phase in Phase}
 
 
-# ---- speed and acceleration ----
-
 SPEED = 0.25
-"""Its largest strut speed, m/s."""
+"""Limit of the paper machine's strut speed, m/s."""
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 RISE = 1e-3 / 0.789
-"""So far, m, the tool rises from home while a strut lengthens by about 1 mm; lengths are 507 mm, height 400 mm."""
+"""Rise of the tool from home, m, that lengthens struts by 1 mm; they are 507 mm long at a height of 400 mm."""
 
 
 def ideal(**limits: float) -> Compensator:
@@ -501,7 +493,7 @@ def at(rise: float) -> tuple[float, ...]:
 
 
 def test_a_stream_at_the_limit_passes_by_its_stamps():
-    """4 ms apart and 1 ms apart, at 0.999 of the limit; at 1.02 it ends when 5 ms of motion are used up."""
+    """Streams of 4 ms and 1 ms pass at 0.999 of the limit; at 1.02 they end once they are 5 ms of motion ahead."""
     for period, count in ((4e-3, 300), (1e-3, 600)):
         for share, ends in ((0.999, False), (1.02, True)):
             compensator, told = ideal(), list[float]()
@@ -514,14 +506,14 @@ def test_a_stream_at_the_limit_passes_by_its_stamps():
 
 
 def rise_of(lengthening: float) -> float:
-    """Return how far the tool rises from home while the struts lengthen: Pythagoras."""
+    """Return the rise of the tool from home, m, for a lengthening of the struts, m (Pythagoras)."""
     start = float(np.linalg.norm(PAPER.base_joints[0] - (PAPER.platform_joints[0] + [0.0, 0.0, 0.4])))
     flat = start**2 - 0.4**2
     return math.sqrt((start + lengthening) ** 2 - flat) - 0.4
 
 
 def test_a_clock_that_is_set_back_or_stands_tells_no_speed():
-    """A stamp earlier than the last one's, or none at all: the time of receipt is left."""
+    """If a stamp is earlier than the last one, or missing, the time of receipt limits the speed."""
     compensator = ideal()
     compensator.step(at(0.0), 100.0, None, 7.0)
     compensator.step(at(RISE), 50.0, None, 7.01)
@@ -546,9 +538,9 @@ def test_too_early_a_command_says_how_long_it_must_wait_and_nothing_has_changed(
 
 @pytest.mark.parametrize("seed", range(6))
 def test_nothing_that_comes_makes_the_struts_faster_than_the_limit(seed):
-    """Commands at random times, in bunches, with resets, some published late: over 20 ms never above 1.05.
+    """Over 20 ms the struts never move faster than 1.05 of the limit, with commands at random times and in bunches.
 
-    Publications are at random up to 30 ms late, as by a processor that was away; resets go to measured struts.
+    Some publications are up to 30 ms late, as with a busy processor, and resets go to measured struts.
     """
     rng = np.random.default_rng(seed)
     compensator, published = ideal(), list[tuple[float, np.ndarray]]()
@@ -577,7 +569,7 @@ def test_nothing_that_comes_makes_the_struts_faster_than_the_limit(seed):
 
 
 def test_a_constant_acceleration_passes_as_what_it_is():
-    """2 m/s² are allowed: 1.99 pass at 1 kHz and at 250 Hz, 2.05 do not, and a jump of the speed by 50 mm/s neither."""
+    """With a limit of 2 m/s², 1.99 passes at 1 kHz and 250 Hz; 2.05 and a jump of the speed by 50 mm/s do not."""
     for period in (1e-3, 4e-3):
         for acceleration, ends in ((1.99, False), (2.05, True)):
             compensator = ideal(acceleration=2.0)
@@ -592,7 +584,7 @@ def test_a_constant_acceleration_passes_as_what_it_is():
 
 
 def test_compensation_is_switched_on_and_a_model_is_taken_while_struts_move():
-    """What they move with is no acceleration of the correction; the C core had refused both."""
+    """The struts' own acceleration does not count as one of the correction (the C core refused both changes before)."""
     compensator = ideal(acceleration=2.0)
     for n in range(40):
         compensator.step(at(rise_of(0.5 * 1.9 * (1e-3 * n) ** 2)), 1e-3 * n)

@@ -1,7 +1,7 @@
-"""The drift that a pose instrument shows: a Kalman filter, and what the compensator makes of it.
+"""Drift measured by a pose instrument: the Kalman filter, and how the compensator applies its result.
 
-Truth: the Gaussian posterior of all readings at once, by dense matrices; chi-square intervals over seeds; rigid motion
-of the whole machine; finite differences of the core's forward kinematics; a machine of its own that has drifted.
+The truth is the Gaussian posterior of all readings at once, by dense matrices; rigid motion of the whole machine;
+finite differences of the core's forward kinematics; and a second machine that has drifted.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def paper() -> HexapodGeometry:
 
 
 def poses(geometry: HexapodGeometry, count: int, seed: int = 0, reach: float = 0.03) -> list[Pose]:
-    """Return platform poses about home."""
+    """Return platform poses near home."""
     rng, home = np.random.default_rng(seed), geometry.home
     turns = Rotation.from_rotvec(0.05 * rng.standard_normal((count, 3))).as_matrix()
     shifts = reach * rng.uniform(-1.0, 1.0, (count, 3))
@@ -67,7 +67,7 @@ def lengths(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
 
 
 def test_the_filter_is_the_posterior_of_all_readings_at_once():
-    """Random walk and readings are jointly Gaussian: conditioned by dense matrices, without a recursion."""
+    """The truth is the joint Gaussian of random walk and readings, conditioned by dense matrices at once."""
     rng, count, states = np.random.default_rng(1), 12, 5
     rules = FusionRules(drift_rate=0.7, initial_deviation=1.3, limit=1e9, gate_probability=1.0 - 1e-12)
     times = np.sort(rng.uniform(0.0, 20.0, count))
@@ -113,13 +113,15 @@ def test_a_drift_beyond_the_limit_is_held(paper):
     assert not ours.state.any()
 
 
-# ---- the machine ----
+# ---- filter and machine ----
 
 
 def test_what_is_observed_is_how_the_tool_moves(geometry):
-    """Finite differences of the core's forward kinematics; a rigid drift moves the tool with the whole machine."""
+    """The truth is finite differences of the core's forward kinematics with the drift applied."""
     compensator = Compensator(geometry, MachineModel(geometry.name))
-    close = 0.05 if geometry.name == "example_6_6" else 1e-3  # its screws turn in their nuts as the platform turns
+    close = (
+        0.05 if geometry.name == "example_6_6" else 1e-3
+    )  # screws that turn with the platform are not in the linear observation
     for place in poses(geometry, 3, 2):
         struts, tool = lengths(geometry, place), place @ geometry.tool
         expected, step = observation(geometry, place, tool), 1e-4
@@ -144,7 +146,7 @@ def test_what_is_observed_is_how_the_tool_moves(geometry):
 
 
 def followed(geometry: HexapodGeometry, drift: np.ndarray, wild: float = 0.0) -> tuple[Compensator, Fusion]:
-    """Return a compensator whose fusion has heard 300 readings of a machine that has drifted so."""
+    """Return a compensator and its fusion after 300 readings of a machine with a drift and a share of outliers."""
     compensator, rng = Compensator(geometry, MachineModel(geometry.name)), np.random.default_rng(11)
     truth = Compensator(geometry, drifted(geometry, MachineModel(geometry.name), drift))
     fusion = Fusion(compensator, FusionRules(initial_deviation=3e-5))
@@ -166,7 +168,7 @@ def followed(geometry: HexapodGeometry, drift: np.ndarray, wild: float = 0.0) ->
 
 @pytest.mark.parametrize("wild", [0.0, 0.05])
 def test_the_compensator_follows_the_drift(geometry, wild):
-    """Commands for poses that it has not visited bring the drifted machine's tool there within its noise."""
+    """At poses without a reading, the commands leave a tenth of the drifted machine's tool error."""
     drift = np.array([20, -15, 10, 8, -5, 12, 20, -10, 15, -20, 5, 10]) * 1e-6
     compensator, fusion = followed(geometry, drift, wild)
     truth = Compensator(geometry, drifted(geometry, MachineModel(geometry.name), drift))
@@ -174,7 +176,7 @@ def test_the_compensator_follows_the_drift(geometry, wild):
     compensator.set_ramp_rate(1.0)
     for place in poses(geometry, 20, 9):
         compensator.reset()
-        for n in range(3):  # the first begins where the struts stand, the next take the drift up
+        for n in range(3):  # the first command starts from the struts, the next apply the drift
             commands = compensator.correct(geometry.tool_pose(place), 0.02 * n).command
         wanted = (place @ geometry.tool).position
         left.append(truth.estimate(commands)[:3] - wanted)
@@ -221,7 +223,7 @@ def test_a_reading_needs_struts_of_its_moment(paper, before):
 
 
 def test_a_machine_that_moves_makes_its_own_reading_uncertain(paper):
-    """A millisecond between the clocks is 0.1 mm at 100 mm/s: no wild reading, and hardly a weight."""
+    """Clocks 1 ms apart make 0.1 mm at 100 mm/s: the reading is accepted, with almost no weight."""
     fusion = Fusion(Compensator(paper, MachineModel(paper.name)), RULES)
 
     def moved(way: float) -> Pose:

@@ -1,6 +1,6 @@
-"""Stamps while clocks are set: what is fresh passes, what was overtaken does not, and no stream is shut out.
+"""Stamps while clocks are set: new messages pass, overtaken ones are refused, and no stream is blocked for good.
 
-Truth: the time at which each message was made by a clock that nobody sets; a simulation knows it, the gate does not.
+The truth is the time of each message by a clock that nobody sets, which the simulation knows and the gate does not.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from hexapod_comp.errors import CommandError
 SECOND, MS = 1_000_000_000, 1_000_000
 
 STEPS = [sign * step for step in (0.01, 0.03, 0.1, 0.2, 0.3, 0.45, 0.6, 0.9, 1.2, 2.0) for sign in (-1.0, 1.0)]
-"""By how much the clock is set, s."""
+"""Steps by which the clock is set, s."""
 
 
 class TestClock:
-    """A system clock that can be set beside a monotonic one."""
+    """A system clock that can be set, beside a monotonic clock."""
 
     __test__ = False
 
@@ -35,7 +35,7 @@ class TestClock:
 
 
 def checked(gate: StampGate, stamp: int, now: float) -> float:
-    """Let a gate check a stamp; return how old it says the message is, s."""
+    """Return the age of a message, s, by the gate that checks its stamp."""
     sample = Sample(now, stamp)
     gate.check(sample)
     return sample.age
@@ -46,11 +46,11 @@ def checked(gate: StampGate, stamp: int, now: float) -> float:
     ("lead", "rate", "shared"), [(0.0, 1000.0, True), (0.05, 1000.0, True), (0.0, 50.0, True), (0.0, 1000.0, False)]
 )
 def test_a_shared_clock_that_is_set_shuts_nothing_out(step, lead, rate, shared):
-    """Of 0.8 s of messages none is refused, though the clock is set after a quarter; no late copy is obeyed.
+    """No message in order is refused during 0.8 s, although the clock is set after 0.2 s, and no late copy is accepted.
 
-    Each is on its way for 0.2 ms and an exponential jitter of 0.1 ms, in order, so that around the step some were
-    stamped before it and arrive after; `lead`: stamped so long ahead, as scheduled commands are. Now and then one comes
-    once more, 37 ms later. A sender with a clock of its own goes on when ours is set.
+    A message takes 0.2 ms plus an exponential jitter of 0.1 ms, so some are stamped before the step and arrive after
+    it. With `lead` messages are stamped in advance, as scheduled commands are. Some arrive a second time, 37 ms later.
+    A sender with a clock of its own is not affected when ours is set.
     """
     rng, clock, count = np.random.default_rng(1), TestClock(), round(0.8 * rate)
     gate, began, step_at = StampGate("command", clock.watch, 0.5 * shared), clock.steady, 0.25 * count / rate
@@ -91,7 +91,7 @@ def test_a_sender_whose_clock_alone_is_set_back_is_heard_after_a_run_of_20_ms(st
 
 
 def test_what_was_held_up_and_comes_at_once_is_no_clock_that_was_set():
-    """Fifty commands of 50 ms ago, in order, within a millisecond: none is obeyed."""
+    """Fifty commands, delayed by 50 ms, arrive in order within a millisecond: all are refused."""
     clock = TestClock()
     gate = StampGate("command", clock.watch)
     checked(gate, clock.system(), clock.now)
@@ -105,7 +105,7 @@ def test_what_was_held_up_and_comes_at_once_is_no_clock_that_was_set():
 
 @pytest.mark.parametrize("step", [-2.0, -0.3, 0.3, 2.0])
 def test_a_step_while_the_node_stands_still_splits_what_waits_where_it_was_made(step):
-    """0.4 s of commands wait, the clock is set in their middle: all come in their order."""
+    """0.4 s of commands wait while the clock is set in their middle: all are accepted, in order."""
     clock = TestClock()
     gate = StampGate("command", clock.watch, 0.5)
     for _ in range(100):
@@ -124,7 +124,7 @@ def test_a_step_while_the_node_stands_still_splits_what_waits_where_it_was_made(
 
 @pytest.mark.parametrize("step", [-3600.0, -0.3, 0.3, 3600.0])
 def test_a_command_that_is_faster_than_the_only_one_before_is_read_by_the_new_setting(step):
-    """The first was on its way for 20 ms on a busy computer, the next for 1 ms, and the clock was set between."""
+    """The first command took 20 ms on a busy computer, the next 1 ms, and the clock was set between them."""
     clock = TestClock()
     gate = StampGate("command", clock.watch, 0.5)
     for late in (20 * MS, MS):
@@ -138,7 +138,7 @@ def test_a_command_that_is_faster_than_the_only_one_before_is_read_by_the_new_se
 
 def test_a_step_in_a_pause_counts_too_and_slewing_and_a_slow_read_do_not():
     clock = TestClock()
-    for _ in range(3000):  # an hour at NTP's largest rate, 500 ppm
+    for _ in range(3000):  # one hour at NTP's largest rate, 500 ppm
         clock.steady += int(1.2 * SECOND)
         clock.ahead += int(1.2 * SECOND * 500e-6)
         clock.watch.read()
@@ -146,7 +146,7 @@ def test_a_step_in_a_pause_counts_too_and_slewing_and_a_slow_read_do_not():
     plain = clock.watch.system
 
     def slow() -> int:
-        clock.steady += 30 * MS  # the processor is elsewhere between the two clocks
+        clock.steady += 30 * MS  # a pause between reading the two clocks
         return plain()
 
     clock.watch.system = slow
@@ -172,11 +172,11 @@ def test_simulated_time_is_set_only_when_it_falls():
 @pytest.mark.parametrize(
     ("later", "pause", "passes"),
     [
-        (0, 4, True),  # the same once more
+        (0, 4, True),  # the same stamp again
         (1, 4, True),
         (-60 * MS, 4, False),
         (-1, 4, False),
-        (-1, round(FORGET_ORDER_AFTER * 1000), True),  # a sender that was restarted
+        (-1, round(FORGET_ORDER_AFTER * 1000), True),  # long enough for a restarted sender
     ],
 )
 def test_what_is_in_order(later, pause, passes):
@@ -185,7 +185,7 @@ def test_what_is_in_order(later, pause, passes):
     stamp = clock.system()
     checked(gate, stamp, clock.now)
     gate.accept(Sample(clock.now, stamp))
-    checked(gate, 0, clock.now)  # says nothing
+    checked(gate, 0, clock.now)  # without a stamp
     gate.accept(Sample(clock.now, 0))
     clock.steady += pause * MS
     if passes:
@@ -197,7 +197,7 @@ def test_what_is_in_order(later, pause, passes):
 
 
 def test_the_drive_refuses_old_commands_only_and_by_the_clock_in_force():
-    """`future=False`; and a clock set forward by 2 s makes no command on its way too old."""
+    """With `future=False` stamps ahead pass; setting the clock forward by 2 s makes no command on its way too old."""
     clock = TestClock()
     gate = StampGate("command", clock.watch, 0.1, future=False)
     checked(gate, clock.system() + 3600 * SECOND, clock.now)
@@ -212,7 +212,7 @@ def test_the_drive_refuses_old_commands_only_and_by_the_clock_in_force():
 
 @pytest.mark.parametrize("capped", [True, False])
 def test_a_stamp_ahead_counts_as_now_where_it_must_not_shut_out(capped):
-    """Of readings, not of commands: there the order matters more."""
+    """A reading stamped ahead counts as stamped now; a command keeps its stamp, since its order matters more."""
     gate = StampGate("reading", StampClock(lambda: 100 * SECOND), 0.5, capped=capped)
     gate.check(ahead := Sample(1.0, 100 * SECOND + 400 * MS))
     gate.accept(ahead)

@@ -1,8 +1,7 @@
-"""Temperatures and humidity: the filter against its weights written out; which readings count; parts that follow late;
-struts that swell.
+"""Temperatures and humidity: the filter, plausible readings, late parts, and struts that swell.
 
-Sums of a few readings of some 20 °C are rounded to about 1e-12 °C; nothing physical is below 1e-6. A strut that has
-grown by g makes L = (1 + g)·c of its command, so c = L/(1 + g)."""
+Sums of a few readings of about 20 °C are rounded to 1e-12 °C; nothing physical is below 1e-6. A strut that has grown by
+g is L = (1 + g)·c long at command c, so c = L/(1 + g)."""
 
 from __future__ import annotations
 
@@ -26,7 +25,7 @@ from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.temperatures import LateGrowth
 
 ROUNDING = 1e-10
-"""°C."""
+"""Rounding of temperatures, °C."""
 
 
 def taken(low_pass: TemperatureFilter, values: np.ndarray, times: np.ndarray, name: str = "base") -> np.ndarray:
@@ -35,7 +34,7 @@ def taken(low_pass: TemperatureFilter, values: np.ndarray, times: np.ndarray, na
 
 @given(st.lists(st.tuples(st.floats(-40.0, 120.0), st.floats(0.0, 300.0)), min_size=1, max_size=30))
 def test_it_is_the_mean_weighted_by_age(readings: list[tuple[float, float]]) -> None:
-    """NumPy's, at any times and in any order of arrival. On regular readings that is one pole's low pass."""
+    """The truth is NumPy's weighted mean, at any times in any order: a one-pole low pass."""
     values, times = np.array(readings).T
     expected = np.average(values, weights=np.exp((times - times.max()) / 30.0))
     assert taken(TemperatureFilter(30.0), values, times)[-1] == pytest.approx(expected, abs=ROUNDING)
@@ -62,7 +61,7 @@ def test_what_is_refused_leaves_no_trace(name: str, value: float, time: float, t
     assert low_pass.update("base", 21.0, 0.0) == 20.5
 
 
-# ---- which readings count ----
+# ---- plausible readings ----
 
 
 def thermometers(rate: float = 0.2, spread: float = 40.0, timeout: float = 60.0) -> Thermometers:
@@ -81,7 +80,7 @@ def thermometers(rate: float = 0.2, spread: float = 40.0, timeout: float = 60.0)
     ],
 )
 def test_a_part_warms_no_faster_than_its_rate(value: float, seconds: float, taken: bool) -> None:
-    """From 20.9 °C: 1 K at once, and 0.2 K/s."""
+    """After 20.9 °C a change of 1 K is allowed at once, and 0.2 K more per second."""
     made = thermometers()
     made.update("base", 20.9, 100.0)
     if taken:
@@ -93,7 +92,7 @@ def test_a_part_warms_no_faster_than_its_rate(value: float, seconds: float, take
 
 
 def test_a_part_is_judged_by_the_median_of_the_others() -> None:
-    """23 °C is the middle of 70, 22 and 23, 46.5 °C that of 70, 22, 23 and 82."""
+    """The median of 70, 22 and 23 °C is 23 °C, with 82 °C besides it is 46.5 °C."""
     made = thermometers(rate=0.0, spread=60.0)
     for part, value in (("base", 70.0), ("strut_1", 22.0), ("strut_2", 23.0)):
         made.update(part, value, 0.0)
@@ -103,7 +102,7 @@ def test_a_part_is_judged_by_the_median_of_the_others() -> None:
 
 
 def test_what_is_stale_is_no_measure_for_others() -> None:
-    """Yesterday's 0 °C in the yard: after 60 s the reference of 20 °C counts again."""
+    """A reading of 0 °C is the reference for other parts for 60 s; after that the reference of 20 °C counts again."""
     made = thermometers(rate=0.0)
     made.update("base", 0.0, 0.0)
     with pytest.raises(ModelError, match=r"the other parts' 0\.00 °C"):
@@ -117,14 +116,14 @@ def test_what_is_stale_is_no_measure_for_others() -> None:
 
 
 def late_model() -> MachineModel:
-    """Return a model whose struts follow the base's thermometer with 600 s."""
+    """Return a model whose struts follow the base's thermometer with a time constant of 600 s."""
     struts = StrutErrors(expansion=np.full(6, 12e-6))
     late_growth = LateGrowth((600.0,), np.array([[12e-6]] * 6 + [[0.0]] * 2), "base")
     return MachineModel("paper", "late", struts=struts, late_growth=late_growth)
 
 
 def test_a_compensator_follows_late_and_a_restored_one_goes_on_bit_for_bit():
-    """Struts of 12 ppm/K follow a step of 3 K: after one time constant by 1 − 1/e, whatever was read in between."""
+    """Struts of 12 ppm/K follow a step of 3 K: after one time constant by 1 − 1/e, for any times of the readings."""
     geometry = load_geometry("paper.yaml")
     one, other = (Compensator(geometry, late_model()) for _ in range(2))
     one.set_temperature("base", 20.0, 100.0)
@@ -155,7 +154,7 @@ def test_lags_begin_anew_with_a_model_of_other_time_constants():
     compensator.set_temperature("base", 22.0, 60.0)
     compensator.set_model(replace(model, late_growth=replace(model.late_growth, time_constants=(900.0,))))
     assert compensator.snapshot()["lags"] == {}
-    np.testing.assert_allclose(compensator.machine.growth, 24e-6)  # at rest
+    np.testing.assert_allclose(compensator.machine.growth, 24e-6)  # 2 K · 12 ppm/K, without delay
     with pytest.raises(ModelError, match=r"snapshot\.lags\.base"):
         compensator.restore(compensator.snapshot() | {"lags": {"base": [0.0, 1.0]}})
 
@@ -164,7 +163,7 @@ def test_lags_begin_anew_with_a_model_of_other_time_constants():
 
 
 PPM_PER_PERCENT = 1e-4
-"""One ppm per % of relative humidity is 1e-6 / 0.01."""
+"""1 ppm per % of relative humidity as a number: 1e-6 / 0.01."""
 
 EPSILON = 2e-16
 
@@ -200,7 +199,7 @@ def test_percent_for_a_fraction_and_other_nonsense_are_refused(value: float) -> 
 
 
 def test_a_jump_is_refused_until_it_may_have_come() -> None:
-    """0.45 to 0.80: 0.35, of which 0.05 at once and 0.02 a second."""
+    """A change by 0.35 is allowed after 15 s: 0.05 at once, and 0.02 more per second."""
     rules = Plausibility(rate=0.2, spread=40.0, timeout=60.0)
     sensors = Thermometers(rules, time_constant=0.0)
     assert sensors.update("humidity", 0.45, 0.0) == 0.45
@@ -210,7 +209,7 @@ def test_a_jump_is_refused_until_it_may_have_come() -> None:
 
 
 def test_humidity_is_smoothed_goes_stale_and_judges_no_temperature() -> None:
-    """Two readings at one moment count alike. 60 °C is 40 K from 20 °C, and of no concern to the air's 0.5."""
+    """Two readings at one time are averaged; humidity is not among the temperatures that are compared."""
     sensors = Thermometers(Plausibility(rate=0.0, spread=41.0, timeout=60.0, humidity_rate=0.0))
     sensors.update("humidity", 0.4, 0.0)
     assert sensors.update("humidity", 0.6, 0.0) == pytest.approx(0.5, abs=1e-15)

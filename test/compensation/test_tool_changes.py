@@ -1,8 +1,7 @@
-"""A change of tool: the struts stay, and the next command must be where they are.
+"""A change of tool leaves the struts in place, and the next command must be where they are. How far a tool may go.
 
-Truth: the zoo's own frames say which pose of the new tool is where the struts stand. How far a tool may go: the public
-check, pose by pose, bisected here. Both stop within a billionth of a step; 1e-9 is far above that and far below any
-limit's meaning.
+The truth is the zoo's own frames for the pose of the new tool, and for the travel the public check, pose by pose,
+bisected here. Both stop within a billionth of a step; 1e-9 is far above it.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.pose import Pose
 
 ROUNDING = 1e-12
-"""m; commands are found to that."""
+"""Tolerance of commands, m."""
 
 
 @pytest.fixture(params=["framed", "hanging", "inches", "mirror"])
@@ -43,7 +42,7 @@ def compensator(machine: Machine, tmp_path: Path) -> Compensator:
 
 
 def numbers(machine: Machine, tool: str | None, shift: float = 0.0) -> tuple[float, ...]:
-    """Return the numbers of the tool's pose in work with the platform at home, but for a shift along z."""
+    """Return the tool's pose in work, as numbers, with the platform at home, shifted along z by `shift`, m."""
     used = machine.using(tool)
     tip = np.array(machine.home) + np.array(used.tool.position) + [0.0, 0.0, shift]
     position = used.work.matrix.T @ (tip - np.array(used.work.position))
@@ -58,12 +57,12 @@ def test_the_struts_stay_and_go_on_from_there(machine: Machine, compensator: Com
     np.testing.assert_allclose(after, before, rtol=0.0, atol=ROUNDING)
     assert not compensator.ramping
     further = compensator.step(numbers(machine, "probe", 1e-4), 1.02)
-    assert 5e-5 < np.abs(further - before).max() < 1.1e-4  # less than the tip: the struts stand askew
+    assert 5e-5 < np.abs(further - before).max() < 1.1e-4  # less than the tip moves, since the struts are oblique
 
 
 @pytest.mark.parametrize("way", [2e-5, 4e-4, 3e-2])
 def test_a_command_for_another_place_is_refused(way: float, machine: Machine, compensator: Compensator) -> None:
-    """Also one that a single step would allow: it was on its way for the old tool."""
+    """A command elsewhere is refused, even within one step: it was sent for the old tool."""
     before = compensator.step(numbers(machine, None), 1.0).copy()
     compensator.set_tool("probe")
     state = compensator.snapshot()
@@ -76,7 +75,9 @@ def test_a_command_for_another_place_is_refused(way: float, machine: Machine, co
     named = re.search(r"in work the tool is at x, y, z (.*), (.*), (.*) mm, alpha", str(caught.value))
     assert named is not None
     at = 1e3 * np.array(numbers(machine, "probe")[:3])
-    np.testing.assert_allclose([float(part) for part in named.groups()], at, rtol=0.0, atol=5.1e-4)  # as many digits
+    np.testing.assert_allclose(
+        [float(part) for part in named.groups()], at, rtol=0.0, atol=5.1e-4
+    )  # the message has three decimals
     with pytest.raises(LimitError, match="since the change"):
         compensator.step(numbers(machine, None), 1.01)
     with pytest.raises(PoseError):
@@ -106,14 +107,14 @@ def test_estimates_and_records_are_those_of_the_tool(machine: Machine, compensat
         compensator.set_tool(name)
         tip = np.array(machine.home) + np.array(machine.using(name).tool.position)
         pose = compensator.estimate(command)
-        np.testing.assert_allclose(pose[:3], tip, rtol=0.0, atol=1e-10)  # Newton's method ends there
+        np.testing.assert_allclose(pose[:3], tip, rtol=0.0, atol=1e-10)  # tolerance of Newton's method
         np.testing.assert_allclose(pose[3:].reshape(3, 3), machine.using(name).tool.matrix, rtol=0.0, atol=1e-10)
         used = compensator.geometry
         assert compensator.correct(used.tool_pose(compensator.platform)).tool == name
 
 
 def test_a_snapshot_knows_its_tool(machine: Machine, compensator: Compensator) -> None:
-    """Also that no command was where the struts are yet."""
+    """A restored compensator has the snapshot's tool, and still needs a command where the struts are."""
     compensator.step(numbers(machine, None), 1.0)
     compensator.set_tool("probe")
     other = Compensator(compensator.geometry.using("tool"), compensator.model)
@@ -141,23 +142,21 @@ def test_an_unknown_tool_changes_nothing(machine: Machine, compensator: Compensa
     assert changes == [("tool", "stub")]
 
 
-# ---- travel: how far a tool may go ----
-
 CLOSE = 1e-9
-"""m and rad."""
+"""Tolerance of travels, m and rad."""
 
 WAYS = [(axis, sign) for axis in range(6) for sign in (1, -1)]
 
 
 def poses(start: np.ndarray, axis: int, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return x, y, z, m, and rotations where one of six coordinates (m, degrees) has gone on by some ways, SI."""
+    """Return positions, m, and rotations after one of six coordinates (m, degrees) has changed by `ways`, SI."""
     at = np.tile(start, (len(ways), 1))
     at[:, axis] += ways if axis < 3 else np.degrees(ways)
     return at[:, :3], np.array([rotation(*angles) for angles in at[:, 3:]])
 
 
 def allowed(geometry: HexapodGeometry, model: MachineModel, start: np.ndarray, ways: np.ndarray) -> np.ndarray:
-    """Return which poses the check allows; `ways`, (12, n), SI, go from a pose (m, degrees) as in WAYS."""
+    """Return which poses the check allows at distances `ways`, (12, n), SI, from a pose (m, degrees), along WAYS."""
     listed = [poses(start, axis, sign * row) for (axis, sign), row in zip(WAYS, ways, strict=True)]
     result = check(geometry, model, tuple(np.concatenate(part) for part in zip(*listed, strict=True)), "poses")
     good = np.ones(ways.size, dtype=bool)
@@ -166,9 +165,9 @@ def allowed(geometry: HexapodGeometry, model: MachineModel, start: np.ndarray, w
 
 
 def by_check(geometry: HexapodGeometry, model: MachineModel, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each way the last pose that the check allows and the first that it does not, shape (12,), SI.
+    """Return the largest allowed distance and the first not allowed along each of WAYS, shape (12,), SI.
 
-    Steps of 4 mm and 1° find them, until half a turn; halving them does the rest.
+    Steps of 4 mm and 1°, up to half a turn, bracket it; bisection refines it.
     """
     step = np.array([4e-3 if axis < 3 else np.radians(1.0) for axis, _ in WAYS])
     low, ended, ahead = np.zeros(12), np.zeros(12, dtype=bool), 8
@@ -186,7 +185,7 @@ def by_check(geometry: HexapodGeometry, model: MachineModel, start: np.ndarray) 
 
 
 def compare(geometry: HexapodGeometry, model: MachineModel, start: np.ndarray) -> set[str]:
-    """Hold every way from a pose (m, degrees) against the check; return the limits met."""
+    """Compare each travel from a pose (m, degrees) with the check; return the limits that end the travels."""
     found = travel(RealMachine(geometry, model), Pose(start[:3], rotation(*start[3:])))
     names = ("x", "y", "z", "alpha", "beta", "gamma")
     assert [one.way for one in found] == [f"{sign}{name}" for name in names for sign in "+-"]
@@ -200,7 +199,7 @@ def compare(geometry: HexapodGeometry, model: MachineModel, start: np.ndarray) -
 
 
 def somewhere(machine: Machine) -> np.ndarray:
-    """Return a tool pose in work, m and degrees, a little off home: the tool's attitude there is some turned one."""
+    """Return a tool pose in work, m and degrees, near home and with a turned attitude."""
     level = machine.work.matrix.T @ rotation(1.0, -2.0, 3.0) @ machine.tool.matrix
     alpha = np.arcsin(-level[1, 2])
     beta, gamma = np.arctan2(level[0, 2], level[2, 2]), np.arctan2(level[1, 0], level[1, 1])
@@ -218,7 +217,7 @@ def test_every_way_ends_where_the_check_says(name: str, tmp_path: Path) -> None:
 
 
 def test_every_limit_is_met() -> None:
-    """The example has all limits of single poses; tightened one at a time each of them stands first somewhere."""
+    """The example machine has every limit of single poses; each of them, tightened, ends some travel."""
     geometry = load_geometry("example_6_6.yaml")
     model, start = MachineModel(geometry.name), np.array([0.01, 0.02, 0.38, 1.0, 2.0, 15.0])
     met = set()
@@ -230,7 +229,7 @@ def test_every_limit_is_met() -> None:
 
 @pytest.mark.parametrize("outside", ["refuse", "hold"])
 def test_the_end_of_a_field_counts_where_the_model_refuses_it(outside: str) -> None:
-    """A field of no error in a box of ±30 mm about the measured point at home, which is the platform's origin."""
+    """A field of zero error in a box of ±30 mm about home ends travels only if it refuses poses outside."""
     geometry = load_geometry("paper.yaml")
     nodes = tuple(np.array([-0.03, 0.03]) + middle for middle in geometry.home.position)
     field = GridField(nodes, tuple(np.zeros((2, 2, 2, 6, 1)) for _ in "xyz"), outside=outside)
@@ -244,7 +243,7 @@ def test_the_end_of_a_field_counts_where_the_model_refuses_it(outside: str) -> N
 
 
 def test_a_turn_without_limit_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No limit of the paper's machine stands within 5° of home."""
+    """Within 5° of home, here the longest turn, no limit of the paper's machine ends a travel."""
     monkeypatch.setattr(module, "LONGEST_TURN", np.radians(5.0))
     geometry = load_geometry("paper.yaml")
     found = travel(RealMachine(geometry, MachineModel("paper")), geometry.tool_pose(geometry.home))
@@ -253,7 +252,7 @@ def test_a_turn_without_limit_ends(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_with_compensation_off_the_model_does_not_count(tmp_path: Path) -> None:
-    """Truth: the machine without a model. Where the model's screws have no lead, its corrections are all there is."""
+    """With compensation off, travels that end at a nominal limit equal those of a machine without a model."""
     machine = with_frames("framed")
     geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
     model = load_model(Errors.drawn(machine, 5).write(tmp_path / "model.yaml", machine), geometry)

@@ -1,5 +1,6 @@
-"""What the track of the struts answers: can they stand so, do they follow, do they stand, where does a start begin;
-and what each guard refuses, on a clock of the test's own. Stamps: test_stamps.py, temperatures: test_thermal.py."""
+"""The track of the struts: plausible readings, following errors, motion, the start of a run; what each guard refuses.
+
+The clock is the test's own. Stamps: test_stamps.py, temperatures: test_thermal.py."""
 
 from __future__ import annotations
 
@@ -39,24 +40,24 @@ def read(track: StrutTrack, struts, at: float, age: float = 0.0) -> None:
     track.accept(sample)
 
 
-# ---- readings that cannot be ----
+# ---- implausible readings ----
 
 
 @pytest.mark.parametrize(
     ("jump", "by_stamp", "by_arrival", "passes"),
     [
-        (2.9e-3, 0.0, 0.002, True),  # 2 mm + 2 ms · 500 mm/s = 3 mm
+        (2.9e-3, 0.0, 0.002, True),  # allowed: 2 mm + 2 ms · 500 mm/s = 3 mm
         (3.1e-3, 0.0, 0.002, False),
-        (10e-3, 0.020, 0.0, True),  # delivered at once after a pause: 12 mm in the 20 ms between their stamps
+        (10e-3, 0.020, 0.0, True),  # delivered at once after a pause: 12 mm in the 20 ms between the stamps
         (13e-3, 0.020, 0.0, False),
-        (50e-3, 0.002, 0.1, True),  # 52 mm
+        (50e-3, 0.002, 0.1, True),  # allowed: 52 mm
         (1e30, 0.1, 0.1, False),
     ],
 )
 def test_struts_move_no_faster_than_they_can(jump, by_stamp, by_arrival, passes):
-    """The paper's machine: 2 mm per command, 250 mm/s, and twice that by hand."""
+    """A reading may jump by the paper machine's step of 2 mm plus twice its speed of 250 mm/s, for motion by hand."""
     track = StrutTrack(load_geometry(config_file("paper.yaml")))
-    track.check_jump(Sample(0.0, 0, six(7.0)))  # nothing is known yet
+    track.check_jump(Sample(0.0, 0, six(7.0)))  # without an earlier reading nothing is compared
     track.accept(Sample(1.0, 5 * SECOND, six(0.5)))
     sample = Sample(1.0 + by_arrival, round((5 + by_stamp) * 1e9), six(0.5, -jump, 4))
     if passes:
@@ -82,11 +83,8 @@ def test_no_strut_is_longer_or_shorter_than_it_can_be():
         assert caught.value.reason == "stroke"
 
 
-# ---- following ----
-
-
 def test_lag_is_no_following_error():
-    """At 0.1 m/s a strut is 5 mm behind after 50 ms: right, since that was commanded in the last 0.1 s."""
+    """At 0.1 m/s a strut is 5 mm behind after 50 ms, no error: it was commanded there in the last 0.1 s."""
     track = StrutTrack(limit=1e-3)
     for n in range(200):
         track.add_command(six(0.5 + 1e-4 * n), 1e-3 * n)
@@ -113,7 +111,7 @@ def test_lag_is_no_following_error():
 
 
 def test_what_counts_as_moving():
-    """More than 50 µm in 0.1 s, told or measured; what was long ago does not count."""
+    """Motion is more than 50 µm within the last 0.1 s, commanded or measured."""
     track = StrutTrack()
     assert track.moving(1.0) == ""
     for n in range(100):
@@ -127,11 +125,8 @@ def test_what_counts_as_moving():
     assert track.moving(2.06) == "strut_1 went 0.051 mm in the last 0.1 s"
 
 
-# ---- where a start begins ----
-
-
 def test_a_wait_for_feedback_has_an_end_where_a_parameter_says_so():
-    """By a clock of its own: 2 s after the start, not before it; a single reading ends it for good."""
+    """The wait ends 2 s after the start, by the track's clock; after one reading there is no wait any more."""
     track = StrutTrack(anywhere_after=2.0)
     with pytest.raises(CommandError, match="from 2 s after the start on") as caught:
         track.start(100.0, fresh=False)
@@ -151,7 +146,7 @@ def test_a_wait_for_feedback_has_an_end_where_a_parameter_says_so():
 
 
 def test_a_start_from_struts_at_rest_is_from_the_mean_of_their_readings():
-    """Truth: 0.5 m, read 200 times with a noise of 0.1 µm; then a strut goes 10 µm away, and the newest counts."""
+    """The start is the mean of 200 readings with 0.1 µm of noise; after a motion of 10 µm, the newest one."""
     rng, track = np.random.default_rng(3), StrutTrack()
     for n in range(200):
         read(track, 0.5 + rng.normal(0.0, 1e-7, 6), 7.0 + 0.002 * n)
@@ -159,22 +154,22 @@ def test_a_start_from_struts_at_rest_is_from_the_mean_of_their_readings():
     away = six(0.5, 1e-5)
     read(track, away, 7.4)
     np.testing.assert_array_equal(track.start(8.0, fresh=True), away)
-    read(track, away, 9.0)  # what came before is past
+    read(track, away, 9.0)  # older readings are forgotten
     np.testing.assert_array_equal(track.start(9.0, fresh=True), away)
 
 
 @pytest.mark.parametrize(
     ("measured_at", "fresh", "wanted"),
     [
-        (9.89, True, "told"),  # readings of a minute may count as fresh, but the struts have been sent elsewhere since
+        (9.89, True, "told"),  # the reading is fresh, but a command was sent after it
         (9.91, True, "measured"),
-        (10.05, False, "told"),  # the drive may have lagged still when it was last heard
-        (10.11, False, "measured"),  # it was there, or somebody has moved it since
+        (10.05, False, "told"),  # the drive may still have lagged
+        (10.11, False, "measured"),  # the strut has arrived, or has been moved since
     ],
 )
 @pytest.mark.parametrize("late", [0.0, 0.3])
 def test_what_is_known_last_counts(measured_at, fresh, wanted, late):
-    """A drive follows and tells within 0.1 s; the last command was at 10 s. A reading counts from when it was made."""
+    """A drive follows within 0.1 s, and the last command was at 10 s; a reading counts from the time of measurement."""
     track = StrutTrack()
     track.add_command(six(0.4), 10.0)
     track.reset()
@@ -186,7 +181,7 @@ def test_what_is_known_last_counts(measured_at, fresh, wanted, late):
 # ---- guards ----
 
 STEP, SPEED = 2e-3, 0.25
-"""Of the paper's machine: m and m/s."""
+"""Step, m, and speed, m/s, of the paper's machine."""
 
 AT = (0.5,) * 6
 
@@ -196,7 +191,7 @@ def moved(way: float, strut: int = 4) -> tuple[float, ...]:
 
 
 def reason(guard: Guard, sample: Sample) -> str:
-    """Return why a guard refuses a sample; empty where it lets it pass."""
+    """Return the reason for which a guard refuses a sample; empty if the guard accepts it."""
     try:
         guard.check(sample)
     except HexapodError as error:
@@ -204,14 +199,11 @@ def reason(guard: Guard, sample: Sample) -> str:
     return ""
 
 
-# ---- speed ----
-
-
 @pytest.mark.parametrize(("way", "pause", "passes"), [(2.9e-3, 0.004, True), (3.1e-3, 0.004, False), (0.03, 0.2, True)])
 def test_steps_beyond_the_limits_of_step_and_speed_are_refused(way, pause, passes):
-    """2 mm per command and 250 mm/s: 3 mm after 4 ms, 52 mm after 0.2 s."""
+    """With 2 mm per command and 250 mm/s, 3 mm are allowed after 4 ms and 52 mm after 0.2 s."""
     guard = StrutSteps(STEP, SPEED)
-    guard.check(Sample(0.0, 0, (7.0,) * 6))  # nothing is known yet
+    guard.check(Sample(0.0, 0, (7.0,) * 6))  # without an earlier command nothing is compared
     guard.accept(Sample(1.0, 0, AT))
     sample = Sample(1.0 + pause, 0, moved(way))
     if passes:
@@ -238,8 +230,7 @@ def test_the_first_command_is_held_against_where_the_struts_stand_however_long()
 
 
 def test_many_in_turn_are_no_faster_than_the_struts_but_for_a_bunch():
-    """1.9 mm each millisecond is within a step each time; 2 mm and 0.1 s at 250 mm/s, 27 mm, may be ahead: fourteen of
-    them, less what 1 ms of motion takes off each."""
+    """Commands of 1.9 mm each millisecond pass as steps until they are 27 mm ahead of 250 mm/s (2 mm and 0.1 s)."""
     guard = StrutSteps(STEP, SPEED)
     guard.reset(list(AT))
     for n in range(1, 40):
@@ -247,7 +238,7 @@ def test_many_in_turn_are_no_faster_than_the_struts_but_for_a_bunch():
         if found := reason(guard, sample):
             break
         guard.accept(sample)
-    assert (found, n) == ("speed", 17)  # the first gives no right to a way: 1.9 + 16 · 1.65 = 28.3 mm, 15 are 26.65 mm
+    assert (found, n) == ("speed", 17)  # 15 commands are 1.9 + 15 · 1.65 = 26.65 mm ahead, 16 are 28.3 mm
 
 
 @fixed
@@ -255,7 +246,7 @@ def test_many_in_turn_are_no_faster_than_the_struts_but_for_a_bunch():
     st.lists(st.tuples(st.floats(-1, 1), st.floats(0, 2)), min_size=1, max_size=40), st.floats(1e-3, 1), st.floats(0, 5)
 )
 def test_what_passes_a_rate_limit_moves_no_faster(moves, at_once, rate):
-    """A property: between any two accepted values in turn there is no more than at_once + rate · time."""
+    """Consecutive accepted values differ by at most at_once + rate · time."""
     limit, accepted, now = RateLimit(at_once, rate), [], 0.0
     for value, pause in moves:
         now += pause
@@ -271,7 +262,7 @@ def test_what_passes_a_rate_limit_moves_no_faster(moves, at_once, rate):
 
 
 class Graph:
-    """Stands for the ROS graph: DDS would have to be stopped between two of its messages to see this over topics."""
+    """A stand-in for the ROS graph, since DDS cannot be stopped between two of its messages."""
 
     def __init__(self, *names: str, count: int | None = None, unknown: str = "", own: str = "", allowed: bool = False):
         self.names, self.unknown, self.fixed_count, self.asked = names, unknown, count, 0
@@ -286,7 +277,7 @@ class Graph:
 
 
 def test_unnamed_counts_as_another():
-    """What DDS has found but not yet named, or never will: not a ROS node."""
+    """A publisher that DDS has found but not named, or that is no ROS node, counts as another sender."""
     graph = Graph("/left/controller", UNKNOWN_NAME)
     sender = graph.sender
     sender.update(0.0)
@@ -313,7 +304,7 @@ def test_another_on_an_own_topic_is_a_problem_and_one_of_the_same_name_is_not():
     graph.names = ("/me", "/stranger")
     graph.sender.update(0.2)
     assert graph.sender.problem == "/commands is also published by /stranger"
-    graph.names, graph.fixed_count = ("/stranger",), 1  # its own has not been found yet
+    graph.names, graph.fixed_count = ("/stranger",), 1  # its own publisher is not discovered yet
     graph.sender.update(0.3)
     assert graph.sender.problem
 
@@ -333,7 +324,7 @@ NUMBERS = {
 
 @pytest.mark.parametrize("case", NUMBERS)
 def test_sequence_numbers_tell(case):
-    """Counted by hand; two of one name stand in the graph, one of which may be a ghost."""
+    """Sequence numbers, counted by hand, distinguish two senders of one name from one sender and its stale entry."""
     numbers, missed, two = NUMBERS[case]
     graph = Graph("/a", "/a")
     graph.sender.update(0.0)
@@ -345,7 +336,7 @@ def test_sequence_numbers_tell(case):
 
 
 def test_two_of_one_name_are_refused_where_the_middleware_does_not_count():
-    """As rmw_cyclonedds: whether one is the other's ghost cannot be told; one alone is obeyed."""
+    """Without sequence numbers (rmw_cyclonedds) two publishers of one name are refused, a single one is accepted."""
     for publishers, number, refused in ((1, None, False), (2, None, True), (2, 1, False)):
         sender = Graph(*["/controller"] * publishers).sender
         sender.update(0.0)
@@ -356,9 +347,6 @@ def test_two_of_one_name_are_refused_where_the_middleware_does_not_count():
         assert bool(sender.problem) is refused
         assert not sender.receive(number, 10.1)
         assert sender.missed == 0
-
-
-# ---- what all have in common ----
 
 
 def test_what_happened_while_nobody_asked_holds_once():

@@ -1,7 +1,7 @@
-"""The core is never wrong silently, whatever it is given, and compiles without a warning.
+"""The core returns a correct answer or an error for any input, and compiles without a warning.
 
-Every answer is judged by NumPy's linear algebra on the joints, not by the core. ``benchmarks.c_core`` compiles it
-for more compilers, instruction sets and processors.
+NumPy's linear algebra on the joints checks every answer. ``benchmarks.c_core`` covers more compilers, instruction sets
+and processors.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.pose import Pose
 
 MACHINES = [paper_geometry(), general_machine(), three_two_one_machine()]
-fewer = settings(fixed, max_examples=40)  # For those that mostly end in the slow search for the closest pose
+fewer = settings(fixed, max_examples=40)  # for tests whose cases mostly end in the slow search for the closest pose
 
 machines = st.sampled_from(MACHINES)
 any_float = st.floats(allow_nan=True, allow_infinity=True)
-far = st.floats(-2.0, 2.0) | st.floats(-1e6, 1e6)  # Coordinates of poses, m
+far = st.floats(-2.0, 2.0) | st.floats(-1e6, 1e6)  # coordinates of poses, m
 
 quaternions = st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: math.hypot(*q) > 1e-3)
 
 
 @st.composite
 def any_poses(draw) -> Pose:
-    """Give poses within 1000 km, turned anyhow."""
+    """Draw poses within 1000 km, with any rotation."""
     quaternion = np.array(draw(quaternions))
     return Pose.from_quaternion(draw(st.tuples(far, far, far)), quaternion / np.linalg.norm(quaternion))
 
@@ -56,8 +56,8 @@ def any_poses(draw) -> Pose:
 def judge(machine: HexapodGeometry, structure: Structure, lengths: np.ndarray, pose: Pose) -> None:
     """Fail unless a pose closes the loops, is regular and belongs to the working assembly mode.
 
-    Loops: the solver promises 1e-13 m on such machines and this sum rounds once more. Condition and sign:
-    NumPy's inverse and determinant of (u_i, R·t_i × u_i), the sign being that at home.
+    Loops: the solver promises 1e-13 m on such machines, and the sum here rounds once more. Condition and sign: NumPy's
+    inverse and determinant of (u_i, R·t_i × u_i), compared with home's sign.
     """
     matrix, found = jacobian_by_numpy(structure, pose)
     np.testing.assert_allclose(found, lengths, rtol=1e-15, atol=3e-13)
@@ -70,7 +70,7 @@ def judge(machine: HexapodGeometry, structure: Structure, lengths: np.ndarray, p
 
 
 def jacobian_by_numpy(structure: Structure, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Jacobian, its rotation part per characteristic length, and the lengths."""
+    """Return the Jacobian, with rotations times the characteristic length, and the lengths."""
     arms = structure.platform_joints @ pose.rotation.T
     struts = pose.position + arms - structure.base_joints
     lengths = np.linalg.norm(struts, axis=1)
@@ -79,7 +79,7 @@ def jacobian_by_numpy(structure: Structure, pose: Pose) -> tuple[np.ndarray, np.
 
 
 def solve_and_judge(machine: HexapodGeometry, lengths: np.ndarray, guess: Pose) -> Pose | None:
-    """Return the solver's answer once it is found right, None when it raised one of its errors."""
+    """Return the solver's answer after judging it, or None if the solver raised a KinematicsError."""
     structure = Structure.of(machine)
     try:
         pose = solve_pose(structure, lengths, guess)
@@ -92,7 +92,7 @@ def solve_and_judge(machine: HexapodGeometry, lengths: np.ndarray, guess: Pose) 
 @fixed
 @given(machines, st.lists(any_float, min_size=6, max_size=6))
 def test_any_six_floats(machine: HexapodGeometry, lengths: list[float]) -> None:
-    """Also denormal, huge, negative and not numbers; what is not a length must be called that."""
+    """Any six floats, also denormal, huge, negative and NaN, give a correct pose or an error."""
     lengths = np.array(lengths)
     if not (np.isfinite(lengths) & (lengths > 0.0)).all():
         with pytest.raises(NotFiniteError):
@@ -104,7 +104,7 @@ def test_any_six_floats(machine: HexapodGeometry, lengths: list[float]) -> None:
 @fixed
 @given(machines, st.lists(any_float, min_size=18, max_size=18))
 def test_anything_at_all_in_the_core(machine: HexapodGeometry, numbers: list[float]) -> None:
-    """No check stands before the core here: lengths, position and rotation are any 18 floats."""
+    """Any 18 floats as lengths, position and rotation, given to the C core directly, without Python's checks."""
     structure = Structure.of(machine)
     lengths, position, rotation = np.split(np.array(numbers), [6, 9])
     rotation = rotation.reshape(3, 3)
@@ -120,7 +120,7 @@ def test_anything_at_all_in_the_core(machine: HexapodGeometry, numbers: list[flo
 @fewer
 @given(machines, any_poses(), st.sampled_from(["home", "target", "guess"]))
 def test_any_target_and_any_guess(machine: HexapodGeometry, pose: Pose, start: str) -> None:
-    """The lengths of some pose, possibly a singular one or of another mode, from home or itself; home from anywhere."""
+    """The lengths are those of any pose, also a singular one; the guess is home, the pose, or any other."""
     target, guess = {"home": (pose, machine.home), "target": (pose, pose), "guess": (machine.home, pose)}[start]
     lengths = strut_lengths(Structure.of(machine), target)
     if np.isfinite(lengths).all():
@@ -133,7 +133,7 @@ def pose_in_box(machine: HexapodGeometry, seed: int) -> Pose:
 
 
 def test_the_target_itself_between_100000_pairs_in_the_box() -> None:
-    """±50 mm, ±30°: the target to 1e-12, or once in 10⁴ another mode, which must be said; guesses by hundreds."""
+    """Within ±50 mm and ±30° the solver finds the true pose to 1e-12, or reports another mode once in 10⁴."""
     machine = MACHINES[0]
     structure = Structure.of(machine)
     answers = 0
@@ -149,7 +149,7 @@ def test_the_target_itself_between_100000_pairs_in_the_box() -> None:
 
 
 def test_a_window_follows_with_play():
-    """As a nut in its thread: 2 wide, pushed up to 5, the way back shows after 2."""
+    """A window of width 2 is pushed up to 5, and reports the way back after 2, as a nut with backlash."""
     low, sense = batch.follow(2.0, np.array([0.0, 5.0, 3.5, 3.0, 2.5, 5.5]))
     assert low.tolist() == [-1.0, 3.0, 3.0, 3.0, 2.5, 3.5]
     assert sense.tolist() == [0.0, 1.0, 1.0, 1.0, -1.0, 1.0]
@@ -161,11 +161,11 @@ WRONG = {"shape": lambda a: a[:-1], "type": lambda a: a.astype(np.float32), "lay
 @pytest.mark.parametrize("wrong", WRONG)
 @pytest.mark.parametrize("place", range(5))
 def test_what_does_not_fit_is_refused_where_it_crosses(place, wrong):
-    """Nothing is read or written beyond an array: each argument's shape, type and layout is checked."""
+    """Shape, type and layout of each array are checked, so that the C code stays within it."""
     names = "base", "platform", "positions", "rotations", "lengths"
     arrays = [np.zeros((6, 3)), np.ones((6, 3)), np.zeros((4, 3)), np.tile(np.eye(3), (4, 1, 1)), np.zeros((4, 6))]
     arrays[place] = WRONG[wrong](arrays[place])
-    # A batch of another length is one: it is the next array that does not fit.
+    # A batch of another length is valid by itself; the next array then does not match it.
     blamed = "rotations" if (names[place], wrong) == ("positions", "shape") else names[place]
     with pytest.raises(ValueError, match=f"^{blamed}: must be"):
         batch.strut_lengths(*arrays)
@@ -188,18 +188,18 @@ def test_no_compiler_warns(compiler, tmp_path):
 
 @long_test
 def test_sanitizers_have_nothing_to_say_and_the_numbers_are_the_same(tmp_path):
-    """Commands, estimates, temperatures, batches, checks, travel, assembly modes and drives; undefined is an error."""
+    """Sanitizers find no undefined behaviour in any function of the core, and do not change its numbers."""
     if missing(BUILDS["gcc -O0"]):
         pytest.skip("no gcc here")
     geometry = load_geometry("paper")
     write_c(tmp_path, geometry, load_model("paper_machine", geometry), ("", ""))
     plain, sanitized = (printed(build, tmp_path, 500) for build in (BUILDS["gcc -O0"], QUICK))
     assert plain == sanitized
-    assert plain.count("\ntool ") > 500  # most of the commands and estimates were answered
+    assert plain.count("\ntool ") > 500  # most commands and estimates succeeded
 
 
 def test_elementary_functions_are_right_to_one_unit_in_the_last_place(tmp_path):
-    """Of five million arguments, beside the C library in long double."""
+    """For five million arguments the truth is the C library in long double."""
     if missing(BUILDS["gcc -O3"]) or np.finfo(np.longdouble).nmant < 63:
         pytest.skip("no gcc, or no long double here")
     words = ["gcc", *FLAGS, *STRICT, f"-I{SOURCE.parent}", str(ULPS), "-o", str(tmp_path / "ulps"), "-lm"]
@@ -213,7 +213,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_the_core_was_built_of_these_very_sources():
-    """Where it fails: python setup.py build_ext --inplace."""
+    """If this fails: python setup.py build_ext --inplace."""
     assert core.ffi.string(core.lib.hc_sources()).decode() == sources_hash(Path(core.__file__).parent)
 
 
@@ -223,7 +223,7 @@ WITHOUT_CFFI = (
 
 
 def test_a_build_without_cffi_fails_and_says_what_is_missing(tmp_path):
-    """As colcon and setup.py run it; pip brings cffi. setuptools alone would end well, with no core."""
+    """``setup.py build``, as colcon runs it, fails without cffi; setuptools alone would build no core and succeed."""
     copied = ("setup.py", "package.xml", "README.md", "LICENSE", "tools", "hexapod_comp")
     for name in copied:
         (tmp_path / name).symlink_to(ROOT / name)
