@@ -1,8 +1,8 @@
-"""The estimator: a whitened, chunked, robust Gauss–Newton with evidence for the parameters given the readings.
+"""The estimator: robust Gauss–Newton iterations that estimate parameters, priors and noise from readings.
 
-Each linear problem is Bayesian: every block of parameters has a prior whose size (a hyperparameter) is estimated from
-the readings, as is the noise of every kind of channel: empirical Bayes, by MacKay's fixed point. Nuisance parameters of
-the instruments are projected out of the design matrix beforehand, so they add no unknowns.
+Each step solves a linear Bayesian problem. The size of each block's prior (its tolerance) and the noise of each kind of
+channel are hyperparameters that are estimated from the readings, by MacKay's fixed point of the evidence (empirical
+Bayes). Nuisance parameters of the instruments are projected out of the design matrix before, so they add no unknowns.
 """
 
 from __future__ import annotations
@@ -29,19 +29,16 @@ from .sensitivity import Prediction, Slopes, predict
 Given = TypeVar("Given")
 Result = TypeVar("Result")
 
-STEPS, SETTLED = 20, 1e-2  # most Gauss-Newton steps; largest change of a parameter in the last one, σ
-ROUNDS, FEW_ROUNDS = 12, 2  # rounds of hyperparameters at one step, and at the start from an answer
-ROUNDS_SETTLED = 1e-3  # relative change after which rounds stop: hyperparameters are known to 1/√(2n)
-LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # longest extrapolation, in rounds, and largest change by it, logarithm
-LEAST_FREEDOM = 10.0  # fewest readings beyond the parameters for a noise: its own error is then 22 %
-CHUNK, THREADED = 512, 500  # cells of a processor's cache; rows from which on threads share the work
+STEPS, SETTLED = 20, 1e-2  # largest number of Gauss–Newton steps; change of a parameter, σ, below which they end
+ROUNDS, FEW_ROUNDS = 12, 2  # updates of the hyperparameters in one step; the same if they start near their solution
+ROUNDS_SETTLED = 1e-3  # relative change of the hyperparameters below which updates end; their own error is 1/√(2n)
+LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # largest extrapolation, in updates; largest change by it, logarithm
+LEAST_FREEDOM = 10.0  # degrees of freedom needed to estimate a noise, whose relative error is then 22 %
+CHUNK, THREADED = 512, 500  # cells that fit into a processor's cache; rows from which threads share the work
 
 
-def at_once(work: Callable[[Given], Result], items: Iterable[Given], rows: int) -> list[Result]:
-    """Return the results of independent work with matrices of this number of rows, done in parallel if these are many.
-
-    NumPy uses as many threads as there are processors; work on few rows ends before a thread would have started.
-    """
+def in_parallel(work: Callable[[Given], Result], items: Iterable[Given], rows: int) -> list[Result]:
+    """Return work(item) of each item, computed by threads if the matrices have at least THREADED rows."""
     if rows < THREADED:
         return list(map(work, items))
     return list(_workers(os.getpid()).map(work, items))
@@ -49,22 +46,22 @@ def at_once(work: Callable[[Given], Result], items: Iterable[Given], rows: int) 
 
 @cache
 def _workers(process: int) -> ThreadPoolExecutor:
-    """Return the threads of a process; one that was forked has its own."""
+    """Return the thread pool of a process; a forked process gets its own pool."""
     return ThreadPoolExecutor(len(os.sched_getaffinity(process)))
 
 
-class Alike(NamedTuple):
-    """Cells whose readings depend on the same parameters."""
+class SparsePart(NamedTuple):
+    """Rows of a design matrix that have their nonzero values in the same columns."""
 
-    cells: np.ndarray  # (n,): Which
-    columns: np.ndarray  # (m,): These parameters, ascending
-    values: np.ndarray  # (n, m): Derivatives
+    cells: np.ndarray  # (n,): indices of the rows, which are cells
+    columns: np.ndarray  # (m,): ascending indices of the columns, which are parameters
+    values: np.ndarray  # (n, m): derivatives of the cells by the parameters
 
 
 class DesignMatrix:
-    """A matrix of a row for each cell and a column for each parameter."""
+    """A matrix with a row for each cell and a column for each parameter, stored in parts without zero columns."""
 
-    def __init__(self, shape: tuple[int, int], parts: Sequence[Alike]) -> None:
+    def __init__(self, shape: tuple[int, int], parts: Sequence[SparsePart]) -> None:
         self.shape, self.parts = shape, tuple(parts)
         self._part, self._place = np.zeros(shape[0], dtype=int), np.zeros(shape[0], dtype=int)
         for n, part in enumerate(self.parts):
@@ -72,11 +69,11 @@ class DesignMatrix:
 
     @staticmethod
     def of(matrix: np.ndarray) -> DesignMatrix:
-        """Return a dense matrix in this form."""
-        return DesignMatrix(matrix.shape, [Alike(np.arange(len(matrix)), np.arange(matrix.shape[1]), matrix)])
+        """Return a dense matrix as a design matrix of one part."""
+        return DesignMatrix(matrix.shape, [SparsePart(np.arange(len(matrix)), np.arange(matrix.shape[1]), matrix)])
 
     def dense(self) -> np.ndarray:
-        """Return the whole matrix."""
+        """Return the matrix as one array."""
         result = np.zeros(self.shape)
         for part in self.parts:
             result[np.ix_(part.cells, part.columns)] = part.values
@@ -97,25 +94,25 @@ class DesignMatrix:
         return result
 
     def between(self, matrix: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return aᵀ·M·b for the rows a and b of pairs of cells, shape (pairs,)."""
+        """Return aᵀ·M·b for each pair of cells, whose rows are a (of `first`) and b (of `second`), shape (pairs,)."""
         result = np.empty(len(first))
-        for (p, q), pairs in _alike(self._part[first], self._part[second]):
+        for (p, q), pairs in _equal_pairs(self._part[first], self._part[second]):
             a, b = self.parts[p], self.parts[q]
             reached = a.values[self._place[first[pairs]]] @ matrix[np.ix_(a.columns, b.columns)]
             result[pairs] = np.einsum("ci,ci->c", reached, b.values[self._place[second[pairs]]])
         return result
 
     def select(self, cells: np.ndarray) -> DesignMatrix:
-        """Return the rows of some cells, in their order; without copying if they are consecutive."""
+        """Return the rows of these cells in the given order; consecutive rows are not copied."""
         owner, parts = self._part[cells], []
         for n in np.unique(owner):
             at = np.flatnonzero(owner == n)
             part = self.parts[n]
-            parts.append(Alike(at, part.columns, part.values[as_slice(self._place[cells[at]])]))
+            parts.append(SparsePart(at, part.columns, part.values[as_slice(self._place[cells[at]])]))
         return DesignMatrix((len(cells), self.shape[1]), parts)
 
     def using(self, used: np.ndarray, factors: np.ndarray, spread: np.ndarray | None = None) -> DesignMatrix:
-        """Return the rows times a factor each, (C,), with some parameters' columns only, times their spread."""
+        """Return the columns `used`, with each row times its factor, (C,), and each column times its `spread`."""
         place = np.full(self.shape[1], -1)
         place[used] = np.arange(len(used))
         parts = []
@@ -125,22 +122,23 @@ class DesignMatrix:
             values = factors[part.cells, None] * part.values[:, as_slice(kept)]
             if spread is not None:
                 values *= spread[columns]
-            parts.append(Alike(part.cells, columns, values))
+            parts.append(SparsePart(part.cells, columns, values))
         return DesignMatrix((self.shape[0], len(used)), parts)
 
     def beside(self, columns: np.ndarray) -> DesignMatrix:
-        """Return the matrix with further columns (C, k)."""
+        """Return the matrix with `columns`, (C, k), appended."""
         size, further = self.shape[1], np.arange(columns.shape[1])
         parts = [
-            Alike(p.cells, np.append(p.columns, size + further), np.hstack([p.values, columns[p.cells]]))
+            SparsePart(p.cells, np.append(p.columns, size + further), np.hstack([p.values, columns[p.cells]]))
             for p in self.parts
         ]
         return DesignMatrix((self.shape[0], size + len(further)), parts)
 
     def project_out(self, unknowns: Sequence[Nuisance]) -> None:
-        """Project out, in place, the components that unknowns of instruments may explain.
+        """Project the instruments' unknowns out of the matrix, in place.
 
-        The cells of each are in one part, or in parts of the same parameters, as a tracker's positions and attitudes.
+        The cells of one unknown must be in one part, or in parts with the same columns, as a tracker's positions and
+        attitudes are.
         """
         owner = np.array([self._part[unknown.members[0]] for unknown in unknowns])
         for n, unknown in enumerate(unknowns):
@@ -161,18 +159,18 @@ class DesignMatrix:
             for n in np.flatnonzero(owner == part).tolist():
                 unknowns[n].project_out(self.parts[part].values, as_slice(self._place[unknowns[n].members]))
 
-        at_once(clear, range(len(self.parts)), self.shape[0])
+        in_parallel(clear, range(len(self.parts)), self.shape[0])
 
 
 def as_slice(indices: np.ndarray) -> np.ndarray | slice:
-    """Return indices as a slice where they follow each other: then indexing copies nothing."""
+    """Return consecutive indices as a slice, so that indexing copies nothing; return other indices unchanged."""
     if len(indices) and indices[-1] - indices[0] == len(indices) - 1 and (np.diff(indices) == 1).all():
         return slice(int(indices[0]), int(indices[-1]) + 1)
     return indices
 
 
-def _alike(first: np.ndarray, second: np.ndarray) -> Iterator[tuple[tuple[int, int], np.ndarray]]:
-    """Yield each pair of numbers that occurs, and where."""
+def _equal_pairs(first: np.ndarray, second: np.ndarray) -> Iterator[tuple[tuple[int, int], np.ndarray]]:
+    """Yield each distinct pair (first[i], second[i]), and the indices i at which it occurs."""
     many = int(second.max(initial=0)) + 1
     pairs, group = np.unique(first * many + second, return_inverse=True)
     for n, pair in enumerate(pairs.tolist()):
@@ -181,40 +179,39 @@ def _alike(first: np.ndarray, second: np.ndarray) -> Iterator[tuple[tuple[int, i
 
 @dataclass(frozen=True)
 class LinearProblem:
-    """The fit linearised at one parameter vector x = root·y, free of the instruments' unknowns."""
+    """The fit linearised at one parameter vector x = root·y: target ≈ rows·y, free of the instruments' unknowns."""
 
-    # (C,): Cells' values that the parameters explain, over their standard deviation at unit noise factors
-    target: np.ndarray
-    rows: DesignMatrix  # (C, size): Their derivatives by y, alike
-    kind: np.ndarray  # (C,): As in :class:`Cells`
-    fold: np.ndarray  # (C,): As in :class:`Cells`
+    target: np.ndarray  # (C,): cells' values as far as y explains them, over their standard deviation at noise factor 1
+    rows: DesignMatrix  # (C, size): derivatives of the cells' values by y, over the same standard deviation
+    kind: np.ndarray  # (C,): kind of channel, as in :class:`Cells`
+    fold: np.ndarray  # (C,): fold of cross-validation, as in :class:`Cells`
     normal: np.ndarray  # (kinds, size, size): rowsᵀ·rows of each kind
     moment: np.ndarray  # (kinds, size): rowsᵀ·target of each kind
-    square: np.ndarray  # (kinds,): Sum of squared targets, the scatter of readings about their cell's mean included
-    freedom: np.ndarray  # (kinds,): Readings minus unknowns projected out
-    least_noise: np.ndarray  # (kinds,): Smallest noise factors that an instrument can have
-    # (C, 6): Derivatives by the struts' lengths, scaled as the rows, with the instruments' unknowns still in them
+    square: np.ndarray  # (kinds,): sum of squared targets and of squared deviations of readings from their cell's mean
+    freedom: np.ndarray  # (kinds,): number of readings minus unknowns projected out
+    least_noise: np.ndarray  # (kinds,): smallest noise factors that an instrument can have
+    # (C, 6): derivatives by strut lengths over the same standard deviation, before unknowns are projected out
     per_length: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
-    unknowns: tuple[Nuisance, ...] = ()  # What that is
-    # (C,): One over the standard deviation of the cells' values at unit noise factors
+    unknowns: tuple[Nuisance, ...] = ()  # the unknowns of instruments that were projected out
+    # (C,): one over the standard deviation of the cells' values at noise factor 1
     scale: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """The posterior of a linear problem for the parameters y in use."""
+    """The posterior of a linear problem for the n parameters y whose blocks are in use."""
 
-    used: np.ndarray  # (n,): Which parameters; the others' blocks are out
-    y: np.ndarray  # (n,): The most probable ones
-    covariance: np.ndarray  # (n, n): Theirs
-    tolerances: np.ndarray  # (blocks,): Size of each block's prior; zero: the block is out
-    noise: np.ndarray  # (kinds,): Factor on the standard deviation of each kind's readings
-    determined: np.ndarray  # (n,): Share of each parameter that comes from the data; the rest comes from the prior
-    spread: np.ndarray  # (n,): The prior's standard deviation of each y
-    log_determinant: float  # Logarithm of the determinant of the precision of y over that
+    used: np.ndarray  # (n,): indices of the parameters in use
+    y: np.ndarray  # (n,): their most probable values
+    covariance: np.ndarray  # (n, n): covariance of y
+    tolerances: np.ndarray  # (blocks,): standard deviation of each block's prior; zero: the block is not in use
+    noise: np.ndarray  # (kinds,): factor on the stated standard deviation of each kind's readings
+    determined: np.ndarray  # (n,): share of each parameter's information that comes from readings, not from the prior
+    spread: np.ndarray  # (n,): the prior's standard deviation of each y
+    log_determinant: float  # log determinant of the precision of y / spread
 
     def every(self, size: int) -> np.ndarray:
-        """Return all parameters y, (size,): zero for those not in use."""
+        """Return all parameters y, (size,), with zeros for parameters that are not in use."""
         y = np.zeros(size)
         y[self.used] = self.y
         return y
@@ -228,7 +225,10 @@ def solve(
     rounds: int = ROUNDS,
     silent: np.ndarray | None = None,
 ) -> Posterior:
-    """Return the posterior of a linear problem; tolerances and noise factors are estimated with it."""
+    """Return the posterior of a linear problem after up to `rounds` updates of tolerances and noise factors.
+
+    Parameters whose tolerance is zero, and those with indices `silent`, are not used.
+    """
     used = np.setdiff1d(np.flatnonzero(space.spread(tolerances)), [] if silent is None else silent)
     kinds = np.unique(problem.kind)
     normal, moment = problem.normal[np.ix_(kinds, used, used)], problem.moment[np.ix_(kinds, used)]
@@ -253,30 +253,30 @@ def solve(
 
 
 def _extrapolated(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> np.ndarray:
-    """Return the extrapolation of three rounds of a fixed point that converges slowly, in logarithms (SQUAREM).
+    """Return the extrapolation of three iterates of a slow fixed point, in logarithms (SQUAREM).
 
-    Varadhan, Roland (2008), Scandinavian Journal of Statistics 35, 335: first − 2·a·r + a²·v, with r and v first and
-    second differences and a = −|r|/|v|, no shorter than a round and at most ``longest_stride`` of them.
+    Varadhan, Roland (2008), Scandinavian Journal of Statistics 35, 335: first − 2·a·r + a²·v, with r and v the first
+    and second differences and a = −|r|/|v|, where |a| is limited to 1 … LONGEST_STRIDE.
     """
-    live = third > 0.0
-    logs = np.log(np.stack([first[live], second[live], third[live]]))
+    positive = third > 0.0
+    logs = np.log(np.stack([first[positive], second[positive], third[positive]]))
     step, bend = logs[1] - logs[0], logs[2] - 2.0 * logs[1] + logs[0]
     stride = float(np.clip(np.linalg.norm(step) / max(float(np.linalg.norm(bend)), 1e-12), 1.0, LONGEST_STRIDE))
     result = third.copy()
-    led = logs[0] + 2.0 * stride * step + stride**2 * bend
-    result[live] = np.exp(np.clip(led, logs[2] - LEAP, logs[2] + LEAP))
+    extrapolated = logs[0] + 2.0 * stride * step + stride**2 * bend
+    result[positive] = np.exp(np.clip(extrapolated, logs[2] - LEAP, logs[2] + LEAP))
     return result
 
 
 def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the inverse of a positive definite matrix, which is overwritten, and the logarithm of its determinant."""
+    """Return the inverse of a positive definite matrix, and its log determinant; overwrite the matrix."""
     factor, failed = dpotrf(matrix.T, lower=1, overwrite_a=1)
     if failed:
-        problem = "are too few to tell noise from the machine's errors, or their uncertainty is below any instrument's"
+        problem = "are too few to distinguish noise from machine errors, or their stated uncertainty is too small"
         raise CalibrationError("measurements", problem)
     log_determinant = 2.0 * float(np.log(np.diag(factor)).sum())
     lower, _ = dpotri(factor, lower=1, overwrite_c=1)
-    inverse = lower.T + lower  # dpotrf has left zeros above
+    inverse = lower.T + lower  # dpotrf has written zeros above the diagonal
     inverse[np.diag_indices_from(inverse)] *= 0.5
     return inverse, log_determinant
 
@@ -284,20 +284,21 @@ def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
 def _noise(
     problem: LinearProblem, kinds: np.ndarray, normal: np.ndarray, moment: np.ndarray, posterior: Posterior
 ) -> np.ndarray:
-    """Return new noise factors: squared residuals over the remaining degrees of freedom; sums of some kinds."""
+    """Return new noise factors: √(squared residuals / remaining degrees of freedom) of each kind in `kinds`."""
     result = posterior.noise.copy()
-    for k, information, rest in zip(kinds, normal, _unmet(problem, kinds, normal, moment, posterior.y), strict=True):
+    squares = _squared_residuals(problem, kinds, normal, moment, posterior.y)
+    for k, information, square in zip(kinds, normal, squares, strict=True):
         freedom = problem.freedom[k] - np.vdot(posterior.covariance, information) / result[k] ** 2
-        if freedom > LEAST_FREEDOM and rest > 0.0:
-            result[k] = np.sqrt(rest / freedom)
+        if freedom > LEAST_FREEDOM and square > 0.0:
+            result[k] = np.sqrt(square / freedom)
     return np.maximum(result, problem.least_noise)
 
 
 def _tolerances(space: ParameterSpace | Components, posterior: Posterior, z: np.ndarray) -> np.ndarray:
-    """Return new tolerances: MacKay's fixed point, squared parameters over how many are determined.
+    """Return new tolerances by MacKay's fixed point: tolerance² = sum of y² / number of determined parameters.
 
-    The first guess counts as a tenth of a parameter, which keeps an empty block from collapsing; a stated tolerance is
-    not estimated.
+    The first guess counts as ASSUMED.hyperprior parameters, so that the tolerance of an unused block does not become
+    zero. A stated tolerance is not changed.
     """
     result, start = posterior.tolerances.copy(), space.start_tolerances()
     for n, part in enumerate(space.parts):
@@ -312,36 +313,34 @@ def _tolerances(space: ParameterSpace | Components, posterior: Posterior, z: np.
 
 
 def log_evidence(problem: LinearProblem, posterior: Posterior) -> float:
-    """Return the logarithm of the readings' probability under a posterior's tolerances and noise, up to a constant.
+    """Return the log probability of the readings, given a posterior's tolerances and noise, up to a constant.
 
-    MacKay (1992), Neural Computation 4, 415: the likelihood of the best parameters, times the Occam factor of their
-    priors.
+    MacKay (1992), Neural Computation 4, 415: the likelihood of the most probable parameters times their Occam factor.
     """
     kinds, used, y = np.unique(problem.kind), posterior.used, posterior.y
     normal, moment = problem.normal[np.ix_(kinds, used, used)], problem.moment[np.ix_(kinds, used)]
     weights = posterior.noise[kinds] ** -2
-    # A sum of squares: where the equations are ill-conditioned, y is not their solution, and makes it larger
-    unmet = weights @ _unmet(problem, kinds, normal, moment, y) + ((y / posterior.spread) ** 2).sum()
-    return float(-0.5 * (unmet + posterior.log_determinant - problem.freedom[kinds] @ np.log(weights)))
+    # Computed as a sum of squares, which does not assume that y solves ill-conditioned equations exactly
+    squares = weights @ _squared_residuals(problem, kinds, normal, moment, y) + ((y / posterior.spread) ** 2).sum()
+    return float(-0.5 * (squares + posterior.log_determinant - problem.freedom[kinds] @ np.log(weights)))
 
 
-def _unmet(
+def _squared_residuals(
     problem: LinearProblem, kinds: np.ndarray, normal: np.ndarray, moment: np.ndarray, y: np.ndarray
 ) -> np.ndarray:
-    """Return the squared residuals of each kind for parameters y, (kinds,), over the stated noise."""
+    """Return the sum of squared residuals over the stated noise, for parameters y, of each kind in `kinds`."""
     return np.maximum(problem.square[kinds] - 2.0 * moment @ y + normal @ y @ y, 0.0)
 
 
 def whitened_precision(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
-    """Return the precision of y over the prior's spread, shape (n, n)."""
+    """Return the precision matrix of y / spread, shape (n, n)."""
     kinds = np.unique(problem.kind)
     information = problem.normal[np.ix_(kinds, posterior.used, posterior.used)]
     return _whitened(posterior.noise[kinds], information, posterior.spread)
 
 
 def _whitened(noise: np.ndarray, information: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Return :func:`whitened_precision` of the noise (kinds,) and the information (kinds, n, n) of each kind, and the
-    spread (n,)."""
+    """Return the precision matrix of y / spread from noise (kinds,), information (kinds, n, n) and spread (n,)."""
     precision = np.tensordot(noise**-2, information, 1)
     precision *= spread[:, None] * spread
     precision[np.diag_indices_from(precision)] += 1.0
@@ -354,22 +353,22 @@ def physical_covariance(space: ParameterSpace, posterior: Posterior) -> np.ndarr
 
 
 MEDIAN_TO_SIGMA = 1.4826
-"""Standard deviation of a normal distribution over the median of its absolute values."""
+"""Standard deviation of a normal distribution divided by the median of its absolute values."""
 
 ROUNDING = 1e-12
-"""A smaller component of a direction counts as zero: frames turned by right angles are exact to rounding."""
+"""Component of a direction below which it counts as zero, since frames turned by right angles have rounding errors."""
 
 
 class _Group(NamedTuple):
-    """Cells of one kind whose errors have the same components; those of a run, and of an unknown, are consecutive."""
+    """Cells of one kind whose directions have the same nonzero components, ordered by run and by unknown."""
 
     kind: int
-    components: np.ndarray
-    cells: np.ndarray
+    components: np.ndarray  # indices of the nonzero components
+    cells: np.ndarray  # indices of the cells
 
 
 class Estimation:
-    """Readings against parameters."""
+    """The estimation of a space's parameters from measurements; `alone`: no earlier fit supplements the readings."""
 
     def __init__(self, measurements: MeasurementSet, space: ParameterSpace, alone: bool = True) -> None:
         refuse_impossible(measurements)
@@ -380,26 +379,27 @@ class Estimation:
         self._squares = self.cells.squares()
         self._frames = [] if space.settings.tracker_frame == "known" else self.cells.frames(measurements)
         self._components = np.abs(self.cells.directions) > ROUNDING
-        for frame in self._frames:  # turning the frame turns them
+        for frame in self._frames:  # the directions turn with the tracker's unknown frame
             self._components[frame.members] = np.repeat(
                 [self._components[frame.members, k : k + 3].any() for k in (0, 3)], 3
             )
         for lengths in self._lengths:
-            self._components[lengths.members, :3] = True  # their directions change with the answer
-        self._groups = self._group_alike()
+            self._components[lengths.members, :3] = True  # the directions of lengths change with their unknown centre
+        self._groups = self._group_cells()
         needed = len(space.blocks[0].labels)
         free = len(self.cells.station) - len(self._zeros.groups) - int(self._zeros.sloping.sum())
         free -= len(self._squares) + sum(lengths.count for lengths in self._lengths) + 6 * len(self._frames)
         if alone and free < needed:
-            problem = f"{len(measurements)} readings at {len(self.cells.station)} distinct places leave {free} "
-            raise CalibrationError("measurements", problem + f"numbers for the structure's {needed} parameters")
+            places = f"{len(measurements)} readings at {len(self.cells.station)} distinct places"
+            problem = f"{places} give {max(free, 0)} independent values for the structure's {needed} parameters"
+            raise CalibrationError("measurements", problem)
 
     def linearise(
         self, x: np.ndarray, reading_weights: np.ndarray, unsettled: bool = True
     ) -> tuple[LinearProblem, np.ndarray]:
-        """Return the linear problem at a parameter vector, and each reading's residual there, m or rad.
+        """Return the linear problem at a parameter vector x, and the residual of each reading, m or rad.
 
-        The cells' variance includes that of `unsettled` lost motions.
+        If `unsettled`, the variance of a cell includes that of lost motions that may be at either end.
         """
         c, m = self.cells, self.measurements
         weights = reading_weights / self.uncertainty**2
@@ -422,8 +422,8 @@ class Estimation:
         rows.project_out(unknowns)
         residuals = misfit - unknown[c.of_reading]
         scatter = np.bincount(m.kind, weights * (misfit - mean[c.of_reading]) ** 2, len(KINDS))
-        # Huber's proposal 2: noise is estimated from clipped residuals, weight² · residual², since outliers would
-        # enlarge it.
+        # Huber's proposal 2: noise is estimated from clipped residuals, weight² · residual², because outliers would
+        # otherwise enlarge it.
         clipped = weights * (1.0 - reading_weights) / allowed[c.of_reading]
         beyond = np.bincount(m.kind, clipped * residuals**2, len(KINDS))
         problem = self._problem(target + moved, rows, scatter - beyond, unknowns)
@@ -432,34 +432,28 @@ class Estimation:
         return problem, residuals
 
     def _rows(self, x: np.ndarray, prediction: Prediction, directions: np.ndarray) -> tuple[DesignMatrix, np.ndarray]:
-        """Return each cell's derivatives by y, and the effect of all parameters together, (C,).
-
-        Along directions (C, 6), over the standard deviations of the cells' values.
-        """
+        """Return the derivatives of errors along `directions`, (C, 6), by y, and their product with y at x, (C,)."""
         c, space, moved = self.cells, self.space, np.empty(len(self.cells.station))
         slopes, y = Slopes(space, prediction, self.measurements.stations, whitened=True), space.whitened_parameters(x)
 
-        def rows_of(group: _Group) -> Alike:
+        def rows_of(group: _Group) -> SparsePart:
             columns = slopes.columns(group.components)
             rows = np.empty((len(group.cells), len(columns)))
             for first in range(0, len(rows), CHUNK):
                 part, cells = rows[first : first + CHUNK], group.cells[first : first + CHUNK]
                 slopes.write(part, c.station[cells], directions[cells], group.components)
                 moved[cells] = part @ y[columns]
-            return Alike(group.cells, columns, rows)
+            return SparsePart(group.cells, columns, rows)
 
-        return DesignMatrix((len(moved), space.size), at_once(rows_of, self._groups, len(moved))), moved
+        return DesignMatrix((len(moved), space.size), in_parallel(rows_of, self._groups, len(moved))), moved
 
     @property
     def fixed_unknowns(self) -> bool:
-        """Whether the instruments' unknowns move the same cells whatever was read: no lengths, no tracker's frame."""
+        """Whether the effect of the instruments' unknowns is independent of the values: no lengths, no free frames."""
         return not self._lengths and not self._frames
 
     def free_of_nuisance(self, rows: np.ndarray) -> np.ndarray:
-        """Return cells' derivatives (C, K) free of the instruments' unknowns, over their noise.
-
-        The noise is the stated one.
-        """
+        """Return derivatives of cells (C, K) over their stated noise, with the instruments' unknowns projected out."""
         scale, unknowns = self._stated_unknowns()
         rows = scale[:, None] * rows
         for part in unknowns:
@@ -467,32 +461,30 @@ class Estimation:
         return rows
 
     def shares_of_nuisance(self) -> np.ndarray:
-        """Return the share of each cell's value that the instruments' unknowns explain, shape (C,), 0…1."""
+        """Return the share, 0…1, of each cell's variance that the instruments' unknowns explain, shape (C,)."""
         shares = np.zeros(len(self.cells.station))
         for part in self._stated_unknowns()[1]:
             shares[part.members] += part.basis**2 @ part.share
         return shares
 
     def _stated_unknowns(self) -> tuple[np.ndarray, list[Nuisance]]:
-        """Return 1/σ of each cell by its stated noise, (C,), and the instruments' unknowns, for the nominal machine."""
+        """Return 1/σ of each cell, (C,), σ its stated noise, and the instruments' unknowns for the nominal machine."""
         scale = np.sqrt(np.bincount(self.cells.of_reading, self.uncertainty**-2))
         values = np.zeros(len(scale))
         return scale, self.unknowns(self.cells.directions.copy(), np.zeros((len(scale), 6)), values, scale)[1]
 
     def _predicted(self, x: np.ndarray) -> Prediction:
-        """Return the machine of a parameter vector at the stations."""
+        """Return the prediction for the machine of a parameter vector at the stations."""
         try:
             return predict(self.space, x, self.measurements.stations)
         except (ModelError, KinematicsError) as error:
-            hint = "do units, directions and commanded poses fit, and are all blocks allowed?"
-            problem = f"left the machines that can be ({error}); {hint}"
-            raise CalibrationError("fit", problem) from error
+            hint = "check units, directions and commanded poses, and allow all blocks"
+            raise CalibrationError("fit", f"reached a machine that is not possible ({error}); {hint}") from error
 
     def unknowns(
         self, directions: np.ndarray, errors: np.ndarray, values: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, list[Nuisance]]:
-        """Return the predicted values of cells with errors (C, 6), and the unknowns; updates `directions` that depend
-        on them."""
+        """Return predicted values of cells with errors (C, 6), and the instruments' unknowns; update `directions`."""
         expected = np.einsum("ci,ci->c", directions, errors)
         unknowns = self._zeros.unknowns(scale)
         unknowns += [of_square(n, scale[n], self.cells.lever[n], self.cells.group[n]) for n in self._squares]
@@ -507,10 +499,10 @@ class Estimation:
         return expected, unknowns
 
     def _variances_of_unsettled(self, prediction: Prediction) -> np.ndarray:
-        """Return variances of cells' values by lost motions that may be at either end, (2, C): allowed, and expected.
+        """Return variances of cells' values by lost motions that may be at either end, (2, C): enlarged, and expected.
 
-        An error of the forces is common to all n cells of a strut's unsettled stations: each is allowed n times its
-        own variance, so that together they count as one.
+        An error of the forces is common to all n cells at a strut's unsettled stations. The enlarged variance is n
+        times the expected one, so that the n cells together count as one.
         """
         c = self.cells
         if not prediction.load.lost_motion.any():
@@ -520,21 +512,20 @@ class Estimation:
         return np.stack([squares @ np.count_nonzero(deviations, axis=0), squares.sum(axis=1)])
 
     def of_unsettled(self, prediction: Prediction) -> tuple[np.ndarray, np.ndarray]:
-        """Return cells' derivatives by the struts' lengths, and these lengths' deviations by unsettled lost motions, m,
-        both (C, 6)."""
+        """Return derivatives of cells by strut lengths, and :func:`unsettled_lengths` at the cells, m, both (C, 6)."""
         c, linkage = self.cells, Linkage(prediction, self.space.probe, self.measurements.stations)
         return linkage.errors(c.station, c.directions, np.arange(6)).gains, unsettled_lengths(linkage)[c.station]
 
     def _problem(
         self, target: np.ndarray, rows: DesignMatrix, scatter: np.ndarray, unknowns: list[Nuisance]
     ) -> LinearProblem:
-        """Compute the sums that later steps need."""
+        """Return the linear problem with its sums of products for each kind of channel."""
         kind, size, kinds = self.cells.kind, self.space.size, len(KINDS)
         normal, moment, square = np.zeros((kinds, size, size)), np.zeros((kinds, size)), scatter.copy()
         freedom = np.bincount(self.measurements.kind, minlength=kinds).astype(float)
         for part in unknowns:
             freedom -= np.bincount(kind[part.members], part.basis**2 @ part.share, kinds)
-        products = at_once(lambda part: part.values.T @ part.values, rows.parts, len(target))
+        products = in_parallel(lambda part: part.values.T @ part.values, rows.parts, len(target))
         for group, (_, columns, values), product in zip(self._groups, rows.parts, products, strict=True):
             normal[group.kind][np.ix_(columns, columns)] += product
             moment[group.kind][columns] += target[group.cells] @ values
@@ -542,8 +533,8 @@ class Estimation:
         least_noise = LEAST_NOISE / np.array([self.measurements.stated_of(k) for k in range(kinds)])
         return LinearProblem(target, rows, kind, self.cells.fold, normal, moment, square, freedom, least_noise)
 
-    def _group_alike(self) -> list[_Group]:
-        """Return the cells in groups of one kind whose errors have the same components."""
+    def _group_cells(self) -> list[_Group]:
+        """Return groups of cells of one kind whose directions have the same nonzero components."""
         c = self.cells
         for members in (*self._zeros.groups, *self._squares, *(lengths.members for lengths in self._lengths)):
             self._components[members] |= self._components[members].any(axis=0)
@@ -555,9 +546,9 @@ class Estimation:
         ]
 
     def robust_weights(self, residuals: np.ndarray) -> np.ndarray:
-        """Return Huber's weights of residuals (N,), 1 for all below the threshold.
+        """Return Huber's weights of residuals (N,): 1 up to the threshold, threshold / |residual| beyond.
 
-        The threshold is in units of the median of each kind's residuals, which gross errors do not move.
+        The threshold is ASSUMED.huber σ of each kind, with σ from the median, which outliers hardly change.
         """
         size = np.abs(residuals) / self.uncertainty
         weights = np.ones(len(size))
@@ -570,7 +561,7 @@ class Estimation:
 
 
 class NotSettled(CalibrationError):
-    """A fit whose parameters still change after the last step, with its state then."""
+    """A fit has not converged: its parameters still change in the last step. `solution` is the last iterate."""
 
     def __init__(self, problem: str, solution: Solution) -> None:
         super().__init__("fit", problem)
@@ -579,15 +570,15 @@ class NotSettled(CalibrationError):
 
 @dataclass(frozen=True)
 class Solution:
-    """A settled fit."""
+    """The result of Gauss–Newton steps."""
 
-    problem: LinearProblem  # Linearised at the answer
-    posterior: Posterior  # The answer
-    x: np.ndarray  # (size,): Its parameters, SI
-    residuals: np.ndarray  # (N,): Of each reading, m or rad
-    weights: np.ndarray  # (N,): Robust weight of each reading, 0…1
-    steps: int  # Gauss–Newton steps
-    change: float  # Largest change of a parameter in the last one, in its standard deviation
+    problem: LinearProblem  # linearised at the start of the last step
+    posterior: Posterior  # posterior of that problem
+    x: np.ndarray  # (size,): estimated parameters, SI
+    residuals: np.ndarray  # (N,): residual of each reading, m or rad
+    weights: np.ndarray  # (N,): robust weight of each reading, 0…1
+    steps: int  # number of Gauss–Newton steps
+    change: float  # largest change of a parameter in the last step, in its standard deviation
 
 
 def iterate(
@@ -597,11 +588,14 @@ def iterate(
     noise: np.ndarray,
     progress: Callable[[str], object],
 ) -> Solution:
-    """Run Gauss–Newton steps until the parameters converge, from the nominal machine or from an answer."""
+    """Return the solution after Gauss–Newton steps from parameters x (zero: the nominal machine) until they converge.
+
+    Raise NotSettled if a parameter still changes by more than its standard deviation after STEPS steps.
+    """
     space, weights = estimation.space, np.ones(len(estimation.measurements))
     robust = space.settings.robust
-    share, before = 1.0, np.inf  # of a step that is made: less where steps grow, as where a force changes its sign
-    all_alike = 0 if x.any() else 1  # steps whose residuals are the machine's errors: no reading is downweighted
+    share, before = 1.0, np.inf  # share of a step that is made; halved if steps grow, as when a force changes its sign
+    unweighted = 0 if x.any() else 1  # first steps without robust weights, while residuals are the machine's errors
     for step in range(1, STEPS + 1):
         problem, residuals = estimation.linearise(x, weights)
         posterior = solve(space, problem, tolerances, noise)
@@ -612,36 +606,35 @@ def iterate(
         share *= 0.5 if step > 3 and change > before else 1.0
         x, before = space.physical(posterior.y) - (1.0 - share) * moved, change
         progress(f"step {step}: largest change {change:.2g} standard deviations")
-        if (change < SETTLED and (step > all_alike + 1 or not robust)) or step == STEPS:
+        if (change < SETTLED and (step > unweighted + 1 or not robust)) or step == STEPS:
             break
-        if robust and step > all_alike:
+        if robust and step > unweighted:
             weights = estimation.robust_weights(residuals)
     solution = Solution(problem, posterior, x, residuals, weights, step, change)
     if change > 1.0:
         block = max(space.blocks, key=lambda block: sizes[block.part].max())
-        moving = f"did not settle within {STEPS} steps: {block.name} still changes by {change:.2g} standard deviations"
-        raise NotSettled(f"{moving}; are all blocks allowed, and is it measured in enough places?", solution)
+        moving = f"did not converge in {STEPS} steps: {block.name} still changes by {change:.2g} standard deviations"
+        raise NotSettled(f"{moving}; are all blocks allowed, and are there readings at enough places?", solution)
     return solution
 
 
 class Omitted(NamedTuple):
     """Effect of leaving one group of cells out of a fit."""
 
-    cells: np.ndarray  # (n,): the group
-    errors: np.ndarray  # (n,): leave-one-out residuals, in standard deviations
-    moved: np.ndarray  # (k,): change of the effects of the parameters
-    covariance: np.ndarray  # (k, k): covariance of that change, if the model is right
+    cells: np.ndarray  # (n,): cells of the group
+    errors: np.ndarray  # (n,): residuals of the cells without them in the fit, in standard deviations
+    moved: np.ndarray  # (k,): change of k functions of the parameters
+    covariance: np.ndarray  # (k, k): covariance of this change if the model is right
 
 
 def jackknife(
     rows: DesignMatrix, residual: np.ndarray, precision: np.ndarray, groups: np.ndarray, effects: np.ndarray
 ) -> list[Omitted]:
-    """Return the effect of leaving out each group of cells, in the linear problem: exact, and no fit is repeated.
+    """Return the effect of leaving each group of cells out of a linear problem, exactly and without another fit.
 
-    Without a group's rows R and residuals r, parameters z whose precision is P = C⁻¹ change by
-    (P − Rᵀ·R)⁻¹·Rᵀ·r = C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r, a matrix of the parameters' size or of the group's; the covariance of
-    that is (P − Rᵀ·R)⁻¹ − C if the model is right. `effects`, (n, k), are the functions of the parameters whose change
-    is computed.
+    Without a group's rows R and residuals r, parameters z of precision P = C⁻¹ change by −(P − Rᵀ·R)⁻¹·Rᵀ·r =
+    −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r; the smaller of the two matrices is factored. If the model is right, the covariance of this
+    change is (P − Rᵀ·R)⁻¹ − C. The results are the changes, up to sign, of the linear functions effectsᵀ·z, (k,).
     """
     covariance = np.linalg.inv(precision)
     reached = covariance @ effects
@@ -661,13 +654,13 @@ def jackknife(
 
     order = np.argsort(groups, kind="stable")
     members = np.split(order, np.flatnonzero(np.diff(groups[order])) + 1)
-    return at_once(without, members, len(groups))
+    return in_parallel(without, members, len(groups))
 
 
 def influence(run: np.ndarray, solution: Solution) -> np.ndarray:
-    """Return the change of the parameters without each run, in their standard deviations: Cook's distance, (runs,).
+    """Return Cook's distance of each run, (runs,): the change of the parameters without it, in standard deviations.
 
-    `run` (C,) is that of each cell.
+    `run`, (C,), is the index of each cell's run.
     """
     problem, p = solution.problem, solution.posterior
     scale = 1.0 / p.noise[problem.kind]

@@ -15,7 +15,7 @@ import numpy as np
 from ..core import MOST_HARMONICS
 from .assumptions import ASSUMED
 from .blocks import WAVES
-from .estimator import MEDIAN_TO_SIGMA, Estimation, LinearProblem, Posterior, at_once, solve
+from .estimator import MEDIAN_TO_SIGMA, Estimation, LinearProblem, Posterior, in_parallel, solve
 
 LEAST_FREEDOM = 200.0  # with fewer degrees of freedom no period is searched for
 MOST_STEPS = 8  # Newton steps to the best frequency: they converge quadratically, the clipping of outliers linearly
@@ -113,7 +113,7 @@ def _strongest(estimation: Estimation, problem: LinearProblem) -> tuple[float, L
     spectrum = residuals.spectrum()
     best = _fundamental(residuals, spectrum)
     rivals = _rivals(residuals.frequencies, spectrum, best.frequency, residuals.span)
-    lines = at_once(lambda f: residuals.line(f, 1), rivals, len(problem.target))
+    lines = in_parallel(lambda f: residuals.line(f, 1), rivals, len(problem.target))
     return min([best.odds, *(best.odds - rival.odds for rival in lines)]), best, posterior
 
 

@@ -13,10 +13,10 @@ from scipy.stats import multivariate_normal
 
 from hexapod_comp.calibration.assumptions import ASSUMED
 from hexapod_comp.calibration.estimator import (
-    Alike,
     DesignMatrix,
     Estimation,
     LinearProblem,
+    SparsePart,
     iterate,
     jackknife,
     log_evidence,
@@ -42,7 +42,7 @@ def rows() -> DesignMatrix:
     cells = np.split(rng.permutation(SHAPE[0]), [15, 27])
     columns = (np.arange(7), np.array([0, 1, 5, 9]), np.array([2, 10, 11]))
     return DesignMatrix(
-        SHAPE, [Alike(c, k, rng.standard_normal((len(c), len(k)))) for c, k in zip(cells, columns, strict=True)]
+        SHAPE, [SparsePart(c, k, rng.standard_normal((len(c), len(k)))) for c, k in zip(cells, columns, strict=True)]
     )
 
 
@@ -369,7 +369,7 @@ def test_a_fit_that_does_not_settle_says_what_still_moves(monkeypatch):
     settings = replace(FEW, blocks=("pitch",), tolerances=(("structure", 1e-12), ("pitch", 100e-6)))
     space = ParameterSpace(readings(), settings)
     start = np.zeros(space.size), space.start_tolerances(), ONES
-    text = r"did not settle within 1 steps: pitch still changes by \d.* standard deviations; .* enough places\?$"
+    text = r"did not converge in 1 steps: pitch still changes by \d.* standard deviations; .* enough places\?$"
     with pytest.raises(CalibrationError, match=text):
         iterate(Estimation(readings(), space), *start, lambda _: None)
 
