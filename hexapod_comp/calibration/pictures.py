@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from ..core.batch import strut_errors
 from ..errors import CalibrationError, ModelError
-from ..formats.figures import NOTHING, SIX_COLOURS, WITH, WITHOUT, picture_text
+from ..formats.figures import LEAST_SHOWN, SIX_COLOURS, WITH, WITHOUT, picture_text
 from ..machine.field import COMPONENTS, CROSS_AXES
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths_batch
@@ -168,7 +168,7 @@ def before_after_figure(fit: ModelFit) -> Figure:
     maps = before, np.sqrt(left**2 + max(beside, 0.0))
     figure = Figure(figsize=(11, 7.2), layout="constrained")
     rows = figure.subplots(2, 3, sharex=True, sharey=True)
-    sizes = np.maximum(np.array(maps), NOTHING)
+    sizes = np.maximum(np.array(maps), LEAST_SHOWN)
     scale = LogNorm(float(np.nanmin(sizes)), float(np.nanmax(sizes)))
     for panels, name, values in zip(rows, ("before", "after"), sizes, strict=True):
         for axes, height, layer in zip(panels, heights, values, strict=True):

@@ -1,7 +1,7 @@
-"""CSV files: units in the column names, errors that name row and column.
+"""CSV files with units in the column names; errors name the line and the column.
 
-The header determines the separator of columns: commas, else semicolons, else tabs. With other separators numbers may
-have decimal commas, as spreadsheets of many countries write them.
+The first of comma, semicolon and tab that occurs in the header separates the columns. In a file with semicolons or tabs
+numbers may have decimal commas, as spreadsheets of many countries write them.
 """
 
 from __future__ import annotations
@@ -29,30 +29,31 @@ from .texts import DECIMAL_COMMA, MICRO_ERRORS, THOUSANDS, number_hint, plain_nu
 
 LABEL_COLUMNS = ("sequence", "name")
 
-SAME_NODE = 1e-9  # of an axis' span: coordinates of a grid that differ by less are one node
-MAX_ROWS = 2_000_000  # longer files are refused: an hour's path at 500 Hz fits, an endless device does not
-MAX_COLUMNS = 1000  # wider files are refused: other laboratories' have some dozen columns
-MAX_CELLS = 40_000_000  # larger tables are refused: each cell takes some 60 bytes
+SAME_NODE = 1e-9  # coordinates of a grid that differ by less than this fraction of the axis' span are one node
+MAX_ROWS = 2_000_000  # largest number of rows: one hour's path at 500 Hz has 1,800,000; an endless device is refused
+MAX_COLUMNS = 1000  # largest number of columns; files of other laboratories have a few dozen
+MAX_CELLS = 40_000_000  # largest number of cells; each cell takes about 60 bytes of memory
 
-# Longer lines are refused, in characters: a file without line ends would be read into memory completely
+# Longest line, in characters: a file without line ends would otherwise be read into memory completely
 MAX_LINE = 1_000_000
 
-# Encodings of a file. If none is given it is UTF-16 if its byte order mark says so, else UTF-8; a file that is neither
-# is read as Windows-1252, of which Latin-1 is a part: only letters of names differ.
+# Encodings that a columns file may state. Without a stated encoding a file with the byte order mark of UTF-16 is read
+# as UTF-16, and every other file as UTF-8. If it is not valid UTF-8 it is read as Windows-1252, which contains Latin-1;
+# a wrong guess changes only letters of names.
 ENCODINGS = ("utf-8", "utf-16", "windows-1252", "latin-1")
 
-MOST_SKIPPED = 1000  # rows above or below the header that may be skipped
+MOST_SKIPPED = 1000  # largest number of rows above the header, and below the header, that may be skipped
 
-# Separators of columns; the first of them that is in the header is used
+# Separators of columns in order of preference; the first one that occurs in the header is used
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 
-QUOTED = re.compile(r'"[^"]*"')  # separators in quotes do not count
-FORMULA = ("=", "+", "-", "@", "\t", "\r")  # a spreadsheet runs a cell that begins so as a formula
-MARK = "'"  # set before such a cell when it is written: spreadsheets show the text, and `unmarked` removes it
+QUOTED = re.compile(r'"[^"]*"')  # text in quotes, in which separators do not separate columns
+FORMULA = ("=", "+", "-", "@", "\t", "\r")  # first characters of a cell that a spreadsheet executes as a formula
+MARK = "'"  # written before such a cell, so that a spreadsheet shows it as text; `unmarked` removes the mark
 
 
 def csv_text(rows: Iterable[Sequence[Any]]) -> str:
-    """Return rows of numbers and texts as CSV, with line feeds; mark texts that a spreadsheet would run."""
+    """Return rows of numbers and texts as CSV with line feeds; mark texts that a spreadsheet would execute."""
     stream = io.StringIO()
     csv.writer(stream, lineterminator="\n").writerows([_marked(cell) for cell in row] for row in rows)
     return stream.getvalue()
@@ -64,36 +65,37 @@ def _marked(cell: Any) -> Any:
 
 
 def unmarked(cell: str) -> str:
-    """Return a cell of a file as it was before :func:`csv_text` marked it."""
+    """Return a cell without the mark that :func:`csv_text` wrote before it."""
     return cell[1:] if cell.startswith(MARK) and _marked(cell[1:]) == cell else cell
 
 
 @dataclass(frozen=True)
 class Row:
-    line: int  # line in the file, the header being line 1
-    label: str  # the row's ``sequence`` or ``name``, or its number
+    """Place of a row in a file, for messages."""
+
+    line: int  # number of the row's line in the file, from 1
+    label: str  # the row's cell in the column ``sequence`` or ``name``; without these columns the number of the row
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Format of a CSV file, where its header does not show it."""
+    """Properties of a CSV file that cannot be detected from its header."""
 
-    encoding: Annotated[str, Choice(*ENCODINGS)] = ""  # empty: detected
-    # Rows to skip above the header, empty ones and comments too, and below it: titles, a row of units
-    rows_above_header: Annotated[int, Integer(0, MOST_SKIPPED)] = 0
-    rows_below_header: Annotated[int, Integer(0, MOST_SKIPPED)] = 0
+    encoding: Annotated[str, Choice(*ENCODINGS)] = ""  # empty: detect the encoding
+    rows_above_header: Annotated[int, Integer(0, MOST_SKIPPED)] = 0  # rows to skip, with empty ones and comments
+    rows_below_header: Annotated[int, Integer(0, MOST_SKIPPED)] = 0  # rows to skip, for example a row of units
 
 
-AS_USUAL = Layout()
+DEFAULT_LAYOUT = Layout()
 
 
 class Table:
-    """A CSV file with a parsed header, without empty rows and comments."""
+    """The content of a CSV file: its header and its rows, without empty rows and comments."""
 
-    def __init__(self, path: str | Path, layout: Layout = AS_USUAL) -> None:
+    def __init__(self, path: str | Path, layout: Layout = DEFAULT_LAYOUT) -> None:
         self.path = path
         self.header: list[str] = []
-        self.rows: list[tuple[int, list[str]]] = []  # line in the file, and cells
+        self.rows: list[tuple[int, list[str]]] = []  # number of the line in the file, and the row's cells
         self.sha256, self._separator = "", ","
         self.notes: list[str] = []
         self._read(layout)
@@ -106,7 +108,7 @@ class Table:
     # ---- reading ----
 
     def _read(self, layout: Layout) -> None:
-        """Read the file; again as Windows-1252 where it is not UTF-8 and no encoding was given."""
+        """Read the file. If no encoding is given and it is not valid UTF-8, read it again as Windows-1252."""
         with open_input(self.path, MAX_CSV_BYTES) as file:
             again = not layout.encoding and file.seekable()
             start = file.read(2) if again else b""
@@ -121,7 +123,7 @@ class Table:
                     if attempt != "utf-8" or not again:
                         problem = f"is not {attempt.upper()} text"
                         if not layout.encoding:
-                            problem += "; spreadsheets have 'CSV UTF-8' among the formats in which they save"
+                            problem += "; in a spreadsheet choose 'CSV UTF-8' when saving"
                         raise InputFileError(self.path, "", problem) from error
 
     def _decode(self, file: io.FileIO, layout: Layout, encoding: str) -> None:
@@ -132,7 +134,7 @@ class Table:
         text, lines = self._bounded_lines(stream), None
         before = sum(1 for _ in itertools.islice(text, layout.rows_above_header))
         try:
-            header = ""  # the first line, below the skipped ones, that is neither empty nor a comment
+            header = ""  # the first line below the skipped rows that is neither empty nor a comment
             for line in text:
                 if line.strip() and not line.lstrip().startswith(("#", '"#')):
                     header = line
@@ -152,11 +154,11 @@ class Table:
         except OSError as error:
             raise InputFileError(self.path, "", f"cannot be read: {error.strerror}") from error
         if encoding == "windows-1252" and not layout.encoding:
-            self.notes = [f"{self.path}: is not UTF-8; its names were read as Windows-1252"]
+            self.notes = [f"{self.path}: is not UTF-8; it was read as Windows-1252"]
         self.sha256 = source.sha256.hexdigest()
 
     def _bounded_lines(self, stream: io.TextIOWrapper) -> Iterator[str]:
-        """Yield the lines of a stream; refuse one too long, and the zero bytes that spreadsheets never write."""
+        """Yield the lines of a stream; refuse a line longer than `MAX_LINE`, and a line with a zero byte."""
         for number, line in enumerate(iter(partial(stream.readline, MAX_LINE + 1), ""), start=1):
             if len(line) > MAX_LINE:
                 problem = f"is longer than the allowed {MAX_LINE} characters"
@@ -178,11 +180,11 @@ class Table:
             hint, own = "", SEPARATORS[self._separator]
             others = [name for mark, name in SEPARATORS.items() if name != own and any(mark in cell for cell in cells)]
             if len(self.header) == 1:
-                hint = "; is that the header? A columns file skips titles above it: table: rows_above_header"
+                hint = "; is this the header? To skip titles above it, set table: rows_above_header in a columns file"
             elif others:
-                hint = f"; {own} separate columns here, as in the header, and this line has {others[0]} too"
+                hint = f"; {own} separate the columns, as in the header, but this line also contains {others[0]}"
             elif own == "commas":
-                hint = "; are its decimal points commas? Then separate columns by semicolons"
+                hint = "; are commas used as decimal points? Then separate the columns by semicolons"
             problem = f"has {len(cells)} columns, the header has {len(self.header)}{hint}"
             raise InputFileError(self.path, f"line {line}", problem)
         if len(self.rows) >= MAX_ROWS:
@@ -192,7 +194,7 @@ class Table:
         self.rows.append((line, cells))
 
     def _point_decimals(self) -> None:
-        """Replace decimal commas by points; refuse a file in which a comma is ambiguous."""
+        """Replace decimal commas by decimal points; refuse a file in which a comma is ambiguous."""
         commas = [
             (line, row, k)
             for line, row in self.rows
@@ -205,10 +207,10 @@ class Table:
         where, cell = f"line {first}, column {self.header[k]}", row[k]
         for line, row in self.rows:
             if any("." in cell and not math.isnan(plain_number(cell)) for cell in row):
-                problem = f"has a decimal comma, but line {line} has a decimal point; write points everywhere"
+                problem = f"has a decimal comma, but line {line} has a decimal point; write decimal points only"
                 raise InputFileError(self.path, where, problem, cell)
         if all(THOUSANDS.fullmatch(row[k].strip()) for _, row, k in commas):
-            problem = "has a comma that may be a decimal one or stand between thousands; write a decimal point"
+            problem = "has a comma that may be a decimal comma or a thousands separator; write a decimal point"
             raise InputFileError(self.path, where, problem, cell)
         for _, row, k in commas:
             row[k] = row[k].replace(",", ".")
@@ -216,7 +218,7 @@ class Table:
     # ---- columns ----
 
     def column(self, name: str, dimension: str | None) -> tuple[int, float] | None:
-        """Return index and unit of a column, or None if it is absent."""
+        """Return the index of a column and the size of its unit in SI; None if the file does not have the column."""
         wanted = {name: 1.0} if dimension is None else {f"{name}_{u}": s for u, s in spellings(dimension).items()}
         keys = [key for key in wanted if key in self.header]
         if len(keys) > 1:
@@ -227,7 +229,7 @@ class Table:
         return self.header.index(keys[0]), wanted[keys[0]]
 
     def columns(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]] | None:
-        """Return all columns of a group, None when the whole group is absent."""
+        """Return index and unit of each column of a group; None if the file has no column of the group."""
         columns = [self.column(name, dimension) for name in names]
         if all(entry is None for entry in columns):
             return None
@@ -237,7 +239,7 @@ class Table:
         return [entry for entry in columns if entry is not None]
 
     def required(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]]:
-        """Return all columns of a required group."""
+        """Return index and unit of each column of a required group; InputFileError if a column is missing."""
         columns = self.columns(names, dimension)
         if columns is None:
             raise self._missing(names[0], dimension)
@@ -248,12 +250,12 @@ class Table:
         problem = f"column {named} is missing"
         if len(self.header) > 1:
             return InputFileError(self.path, "header", problem)
-        problem += f"; columns are separated by {', '.join(SEPARATORS.values())}, and this is one column"
+        problem += f"; columns must be separated by {' or '.join(SEPARATORS.values())}, but only one column was found"
         return InputFileError(self.path, "header", problem, self.header[0])
 
     @property
     def unknown(self) -> list[str]:
-        """Names of the columns for which nobody has asked."""
+        """Names of the columns that no call of this table has read so far."""
         return [name for name in self.header if name and name not in self._known]
 
     def refuse_unknown(self) -> None:
@@ -266,8 +268,8 @@ class Table:
         return np.stack([self.values(index, unit) for index, unit in columns], axis=1)
 
     def values(self, index: int, unit: float, blank: bool = False) -> np.ndarray:
-        """Return the finite numbers of a column in SI, shape (rows,); NaN for blank cells where there may be some."""
-        known: dict[str, float] = {}  # numbers repeat
+        """Return the finite numbers of a column in SI, shape (rows,); NaN for blank cells if `blank` allows them."""
+        known: dict[str, float] = {}  # each text is converted once, since numbers repeat
         for line, row in self.rows:
             text = row[index]
             if text not in known:
@@ -276,7 +278,7 @@ class Table:
         return np.array([known[row[index]] for _, row in self.rows])
 
     def texts(self, name: str) -> list[str]:
-        """Return the cells of a required column, without spaces around them."""
+        """Return the cells of a required column without leading and trailing spaces."""
         index = self.required((name,), None)[0][0]
         cells = [row[index] for _, row in self.rows]
         known = {cell: unmarked(cell.strip()) for cell in set(cells)}
@@ -286,7 +288,7 @@ class Table:
         return number_in(self.path, f"line {line}, column {self.header[index]}", text)
 
     def labels(self) -> list[Row]:
-        """Return line and label of every row."""
+        """Return the line number and the label of each row."""
         columns = [self.header.index(name) for name in LABEL_COLUMNS if name in self.header]
         return [
             Row(line, unmarked(row[columns[0]].strip()) if columns else str(n + 1))
@@ -294,10 +296,10 @@ class Table:
         ]
 
 
-def grid_order(table: Table, coordinates: np.ndarray, what: str) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return the nodes along each axis of a grid, and its nodes' rows in their order: each node must have one row.
+def grid_order(table: Table, coordinates: np.ndarray, names: str) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return the nodes along each axis of a grid, and the indices of the table's rows in the order of the grid's nodes.
 
-    `coordinates`, shape (axes, rows); those of one axis are the same where they differ by less than 1e-9 of its span.
+    `coordinates` has shape (axes, rows); `names` names them in messages. Each node of the grid must have one row.
     """
     nodes, places = [], []
     for values in coordinates:
@@ -309,9 +311,9 @@ def grid_order(table: Table, coordinates: np.ndarray, what: str) -> tuple[list[n
     given, first, repeats = np.unique(where, return_index=True, return_counts=True)
     if (repeats > 1).any():
         again = np.flatnonzero(where == given[repeats > 1][0])[1]
-        raise InputFileError(table.path, f"line {table.rows[again][0]}", f"{what} are given twice")
+        raise InputFileError(table.path, f"line {table.rows[again][0]}", f"{names} are given twice")
     if len(given) != (count := math.prod(len(axis) for axis in nodes)):
-        problem = f"has {len(given)} rows, its grid needs {count}: one for every {what}"
+        problem = f"has {len(given)} rows, its grid needs {count}: one for every {names}"
         raise InputFileError(table.path, f"lines {table.rows[first.min()][0]}…{table.rows[-1][0]}", problem)
     return nodes, np.argsort(where)
 
@@ -326,7 +328,7 @@ def number_in(path: str | Path, where: str, text: str) -> float:
 
 
 class _Hashed(io.RawIOBase):
-    """The bytes of a file, counted and hashed while they are read, also from a pipe."""
+    """A stream of the bytes of a file or pipe, which counts and hashes the bytes while they are read."""
 
     def __init__(self, file: io.FileIO, path: str | Path, most: int) -> None:
         self._file, self._path, self._left, self._most = file, path, most, most
@@ -344,13 +346,13 @@ class _Hashed(io.RawIOBase):
         return count
 
 
-# Digits by which each unit moves the decimal point
+# Number of digits by which each power of ten moves the decimal point
 SHIFTS = {10.0**digits: digits for digits in range(-9, 10)}
 
 
 def si_from_text(text: str, number: float, unit: float) -> float:
-    """Return a number in SI: where the unit only moves the decimal point, the float nearest to the text."""
-    # So 203.2 mm is the float 0.2032 of source code, and numbers written with all digits are restored.
+    """Return a number in SI. If the unit is a power of ten, the result is the float nearest to the decimal text."""
+    # So 203.2 mm becomes the float 0.2032, and numbers that were written with all digits are restored exactly.
     digits = SHIFTS.get(unit)
     if digits is None:
         return unit * number
@@ -360,5 +362,5 @@ def si_from_text(text: str, number: float, unit: float) -> float:
 
 
 def exact(text: str, number: float) -> Decimal:
-    """Return a number that stands in a file as a decimal, without rounding it first."""
+    """Return the number in a file's text as a Decimal without rounding; `number` is the text's float."""
     return Decimal(repr(number)) if "e" in text.lower() else Decimal(text)

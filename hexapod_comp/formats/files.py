@@ -1,8 +1,8 @@
-"""Reading files from outside: type and size are checked before anything is read.
+"""Reading of files: the type and the size of a file are checked before it is read.
 
-Every reader of the package opens its files here. A FIFO without a writer would block for ever, a device or a growing
-file never ends, and a parser may need a hundred times a file's size; so the bounds are here together, each far above
-what a hexapod needs.
+Every reader of the package opens its files here. Reading a FIFO without a writer would block for ever, a device or a
+growing file has no end, and a parser may need a hundred times the size of a file in memory. Therefore sizes are
+limited; each limit is far above what a hexapod needs.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from pathlib import Path
 from ..errors import InputFileError, printable
 from .texts import MICRO_ERRORS
 
-# Opens a path with flags and returns a descriptor, or refuses it, for Python's `open`
+# An opener for Python's `open`: a function of path and flags that returns a file descriptor, or raises an error
 Opener = Callable[[str, int], int]
 
 MEGABYTE = 1_000_000
 
-MAX_FILE_BYTES = 8 * MEGABYTE  # YAML files, HAL files, pages of a journal; the largest model has some 100 kB
-MAX_CSV_BYTES = 500 * MEGABYTE  # an hour's path at 500 Hz has some 270 MB
-MAX_ARCHIVE_BYTES = 200 * MEGABYTE  # a fit's posterior: the covariance of some 5000 parameters
+MAX_FILE_BYTES = 8 * MEGABYTE  # limit for YAML files, HAL files and pages of a journal; a large model has 100 kB
+MAX_CSV_BYTES = 500 * MEGABYTE  # limit for CSV files; one hour's path at 500 Hz has about 270 MB
+MAX_ARCHIVE_BYTES = 200 * MEGABYTE  # limit for a fit's posterior: the covariance of about 5000 parameters
 
-# Names of files that the caller has opened already (`-`, `<(command)`): these may be pipes
+# Names of files that the shell has opened for this process (`-`, `<(command)`); only these may be pipes
 OPEN_STREAMS = re.compile(r"/dev/(stdin|fd/\d+)|/proc/(self|\d+)/fd/\d+")
 
 KINDS = {stat.S_IFIFO: "FIFO", stat.S_IFCHR: "device", stat.S_IFBLK: "device", stat.S_IFSOCK: "socket"}
 
 
 def open_input(path: str | Path, most: int, opener: Opener | None = None) -> io.FileIO:
-    """Open a regular file of at most `most` bytes, or one that the caller has opened already, for reading."""
+    """Open a regular file of at most `most` bytes, or a stream that the shell has opened (`-`), for reading."""
     try:
         file = open(path, "rb", buffering=0, opener=opener or _open_at_once)  # noqa: SIM115 - the caller closes it
         try:
@@ -67,7 +67,7 @@ def too_large(path: str | Path, most: int) -> InputFileError:
 
 
 def read_bytes(path: str | Path, most: int = MAX_FILE_BYTES, opener: Opener | None = None) -> bytes:
-    """Return the bytes of a file of bounded size; errors as :func:`open_input`."""
+    """Return the bytes of a file of at most `most` bytes; InputFileError as in :func:`open_input`."""
     with open_input(path, most, opener) as file, parsing(path, "cannot be read", OSError):
         content = io.BufferedReader(file).read(most + 1)
     if len(content) > most:
@@ -76,7 +76,7 @@ def read_bytes(path: str | Path, most: int = MAX_FILE_BYTES, opener: Opener | No
 
 
 def read_text(path: str | Path, opener: Opener | None = None, most: int = MAX_FILE_BYTES) -> str:
-    """Return the text of a UTF-8 file of bounded size, with line feeds."""
+    """Return the text of a UTF-8 file of at most `most` bytes; lines end in line feeds."""
     content = read_bytes(path, most, opener)
     try:
         text = content.decode("utf-8-sig", MICRO_ERRORS).replace("\r\n", "\n").replace("\r", "\n")
@@ -91,10 +91,10 @@ def read_text(path: str | Path, opener: Opener | None = None, most: int = MAX_FI
 def parsing(
     path: str | Path, problem: str, kinds: type[Exception] | tuple[type[Exception], ...] = Exception
 ) -> Iterator[None]:
-    """Convert the exceptions of a parser on hostile bytes into an InputFileError with a problem."""
-    # Libraries raise many types: struct.error, KeyError, AssertionError, zlib.error,
-    # RecursionError. So by default every exception is caught here; around calls of a library only, never around this
-    # package's code.
+    """Convert exceptions of a library that parses a file into an InputFileError with the text `problem`."""
+    # Libraries raise many types on damaged files: struct.error, KeyError, AssertionError, zlib.error, RecursionError.
+    # So by default every exception is converted. Use it only around calls of a library, never around this package's
+    # code, whose mistakes it would hide.
     try:
         yield
     except InputFileError:

@@ -1,4 +1,4 @@
-"""Results as JSON: the one conversion from computed results to what other programs read."""
+"""Conversion of results to JSON, and reading of JSON."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from .texts import CODES
 
 
 def json_content(text: str, most: int = MAX_FILE_BYTES) -> Any:
+    """Return the content of a JSON text; ValueError if it is longer than `most`, too deeply nested, or has a NaN."""
     if len(text) > most:
         raise ValueError(f"has {len(text)} characters, at most {most} are allowed")
     try:
         return json.loads(text, parse_constant=_refuse_constant)
     except RecursionError as error:
-        raise ValueError("is nested too deep") from error
+        raise ValueError("is nested too deeply") from error
 
 
 def _refuse_constant(name: str) -> None:
@@ -31,13 +32,13 @@ def _refuse_constant(name: str) -> None:
 
 
 def json_text(result: Any, indent: int | None = 1) -> str:
-    """Return a result as JSON text that ends with a line break; see :func:`plain`."""
+    """Return a result as JSON text that ends with a line break; :func:`plain` converts the result."""
     text = json.dumps(plain(result), indent=indent, ensure_ascii=False, allow_nan=False)
     return CODES.sub(lambda code: f"\\u{ord(code[0]):04x}", text) + "\n"
 
 
 def plain(value: Any) -> Any:
-    """Return a result as JSON types; its numbers are restored as the same floats."""
+    """Return a result as JSON types; NaN and infinity become null, all other numbers are restored exactly."""
     if isinstance(value, str | int | None):
         return value
     if isinstance(value, float):
@@ -68,4 +69,4 @@ def _parts(value: Any) -> Any:
         return value.isoformat()
     if isinstance(value, PathLike):
         return fspath(value)
-    raise TypeError(f"{type(value).__name__} has no place in JSON")
+    raise TypeError(f"{type(value).__name__} cannot be converted to JSON")

@@ -1,4 +1,4 @@
-"""Writing files: completely or not at all, and never over one that the same command reads."""
+"""Writing of files: a file is written completely or not at all, and never replaces an input of the same command."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ from typing import IO, Any
 
 from ..errors import InputFileError
 
-# Files that this command reads, by device and inode, with their names; empty outside of a command
+# Names of the files that the running command reads, by device and inode; empty if no command runs
 _protected: dict[tuple[int, int], str] = {}
 
 
 @contextmanager
 def protected(read: Mapping[str, Any], written: Mapping[str, Any], folders: Mapping[str, Any]) -> Iterator[None]:
-    """Refuse, while this context is open, to write a file that the command reads; check its outputs at once."""
-    # Each option gives a name, a list of names, or a value that is not a file. Refused are
-    # outputs that are inputs, or another output, or cannot be written there: better now than after a long
-    # calculation.
+    """Refuse to write a file that the command reads while this context is open; check all outputs at its start."""
+    # An option's value is a name, a list of names, or not a file. An output is refused if it is an input or another
+    # output, or if it cannot be written. The check is made before the calculation, which may take long.
     try:
         for given in read.values():
             for value in given if isinstance(given, list) else [given]:
@@ -36,41 +35,41 @@ def protected(read: Mapping[str, Any], written: Mapping[str, Any], folders: Mapp
             while path and not os.path.exists(path):
                 path = os.path.dirname(path)
             if path and not os.path.isdir(path):
-                raise InputFileError(path, "", "cannot be made a folder: it is a file")
+                raise InputFileError(path, "", "cannot be created as a folder: it is a file")
         yield
     finally:
         _protected.clear()
 
 
 def _refuse_unwritable(files: Mapping[str, str]) -> None:
-    """Raise where a file cannot be written, or is named by two options; these may share a pipe or a device."""
-    taken: dict[str, str] = {}
+    """Raise if a file cannot be written, or if two options name the same regular file."""
+    option_of: dict[str, str] = {}
     for name, path in files.items():
         if os.path.isdir(path):
-            raise InputFileError(path, "", "cannot be written: it is a folder, and a file is wanted")
+            raise InputFileError(path, "", "cannot be written: it is a folder, not a file")
         if not os.path.isdir(os.path.dirname(path) or "."):
             raise InputFileError(path, "", "cannot be written: its folder does not exist")
         if os.path.exists(path) and not os.path.isfile(path):
             continue
-        other = taken.setdefault(os.path.realpath(path), name)
+        other = option_of.setdefault(os.path.realpath(path), name)
         if other != name:
-            raise InputFileError(path, "", f"cannot hold both what {other} and what {name} write")
+            raise InputFileError(path, "", f"is given for both {other} and {name}; give two files")
 
 
 def refuse_replacing_input(path: str | Path) -> None:
-    """Raise InputFileError when a file that is about to be written is one that this command reads."""
+    """Raise an InputFileError if a file to be written is an input of the running command."""
     identity = _identity(path)
     if identity is not None and identity in _protected:
-        problem = f"is read by this command, as {_protected[identity]}, and would be replaced; write to another file"
+        problem = f"is an input of this command ({_protected[identity]}) and would be replaced; write to another file"
         raise InputFileError(path, "", problem)
 
 
 @contextmanager
 def new_file(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
-    """Give a stream that writes a file completely or not at all, also when the process crashes; text is UTF-8.
+    """Open a stream that writes a file completely or not at all, even if the process crashes; text is UTF-8.
 
-    It replaces an existing file, with that one's mode and, if this user may give files away, its owner.
-    Pipes, devices and other special files are written directly.
+    An existing file is replaced; the new file gets its mode and, if the user is permitted to set it, its owner. Pipes,
+    devices and other special files are written directly.
     """
     refuse_replacing_input(path)
     encoding = None if "b" in mode else "utf-8"
@@ -89,10 +88,10 @@ def new_file(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
 
 @contextmanager
 def _replacement(target: str, mode: str, encoding: str | None) -> Iterator[IO[Any]]:
-    """Give a stream whose file replaces `target` when all of it is on the disk."""
+    """Open a stream to a temporary file, which replaces `target` after it is completely on the disk."""
     before = os.stat(target) if os.path.exists(target) else None
-    if before is not None and not os.access(target, os.W_OK):  # renaming alone would not check this
-        raise PermissionError(errno.EACCES, "it is protected against writing")
+    if before is not None and not os.access(target, os.W_OK):  # os.replace would replace a write-protected file
+        raise PermissionError(errno.EACCES, "it is write-protected")
     folder, name = os.path.split(target)
     temporary = os.path.join(folder, f".{name[:50]}.{secrets.token_hex(6)}")
     try:
@@ -113,7 +112,7 @@ def _replacement(target: str, mode: str, encoding: str | None) -> Iterator[IO[An
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file as :func:`new_file` does."""
+    """Write a text to a file, completely or not at all, as with :func:`new_file`."""
     with new_file(path) as stream:
         stream.write(text)
 
@@ -122,23 +121,23 @@ def make_folder(path: str | Path) -> None:
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputFileError(path, "", f"this folder cannot be made: {error.strerror}") from error
+        raise InputFileError(path, "", f"this folder cannot be created: {error.strerror}") from error
 
 
 def _identities(name: str) -> list[tuple[int, int]]:
-    """Return device and inode of an argument's file, or of all files of a folder."""
+    """Return device and inode of the file that an argument names, or of each file in the folder that it names."""
     from .paths import config_file
 
     try:
         path = Path("/dev/stdin") if name == "-" else Path(name) if os.path.isdir(name) else config_file(name)
-    except InputFileError:  # not a file's name (ideal, random), or a missing one: checked by the verb
+    except InputFileError:  # the name is no file (ideal, random), or the file is missing: the verb checks it
         return []
     files = path.iterdir() if path.is_dir() else [path]
     return [identity for file in files if (identity := _identity(file)) is not None]
 
 
 def _identity(path: str | Path) -> tuple[int, int] | None:
-    """Return device and inode of a regular file, links followed; None for anything else."""
+    """Return device and inode of a regular file after following links; None for any other path."""
     try:
         status = os.stat(os.path.expanduser(path))
     except (OSError, ValueError):

@@ -1,7 +1,7 @@
-"""HTML pages that load nothing: one file that opens offline in any browser, and prints. Texts from outside are escaped.
+"""HTML pages in one file, without references to other files: they open offline in any browser and can be printed.
 
-A page is a template in hexapod_comp/templates that extends page.html. :func:`render` fills it in: every displayed value
-is put on one line, cut if it is very long, and escaped, unless it is :class:`markupsafe.Markup`.
+A page is a template in hexapod_comp/templates that extends page.html. :func:`render` fills it in. Every displayed value
+is put on one line, cut at `LONGEST_TEXT` characters and escaped, unless it is :class:`markupsafe.Markup`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 TEMPLATES = Path(__file__).resolve().parents[1] / "templates"
 
-RESOLUTION = 110  # of embedded pictures, dots per inch
-LONGEST_CELL, LONGEST_TEXT = 300, 2000  # of a text in a table, and of any other; longer ones end in …
+RESOLUTION = 110  # resolution of embedded pictures, dots per inch
+LONGEST_CELL, LONGEST_TEXT = 300, 2000  # longest text in a table's cell and elsewhere, characters; then it ends in …
 
 
 def render(template: str | Path, **values: Any) -> str:
-    """Return a page, or a part of one, from a template in hexapod_comp/templates, or from a file that extends one."""
+    """Return the HTML of a template (its name in hexapod_comp/templates, or a Path) filled in with values."""
     environment = _environment()
     if isinstance(template, Path):
         return environment.from_string(template.read_text(encoding="utf-8")).render(values)
@@ -39,7 +39,7 @@ def _environment() -> Environment:
     from markupsafe import Markup
 
     def one_line(value: Any) -> Any:
-        """Return a displayed value before it is escaped: our own HTML unchanged, texts without line breaks."""
+        """Return a value to be displayed, before it is escaped: Markup unchanged, texts without line breaks."""
         return value if isinstance(value, Markup | int) or value is None else printable(str(value), LONGEST_TEXT)
 
     environment = Environment(
@@ -53,7 +53,7 @@ def _environment() -> Environment:
 
 
 def png(figure: Figure) -> Markup:
-    """Return a figure as a data address, which puts the picture into the page itself."""
+    """Return a figure as a data URL, which embeds the picture in the page."""
     from markupsafe import Markup
 
     stream = io.BytesIO()

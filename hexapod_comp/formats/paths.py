@@ -1,4 +1,4 @@
-"""Finding the shipped configuration files, in a source tree and in an installation."""
+"""Search for configuration files: the user's own, and the shipped ones in a source tree or an installation."""
 
 from __future__ import annotations
 
@@ -17,18 +17,21 @@ PACKAGE = "hexapod_comp"
 
 FORMAT = re.compile(r"^format: hexapod_comp/(\w+)", re.MULTILINE)  # the `format` line of a YAML file
 
-# Kinds of files with their suffixes; all others are YAML files with a `format` line
+# Suffixes of the kinds of file that are CSV files; files of all other kinds are YAML files with a `format` line
 SUFFIXES = {"poses": (".csv",), "lengths": (".csv",), "readings": (".csv",)}
 
-# Texts in the header of CSV files of a kind
+# Text by which the header of a CSV file shows its kind
 COLUMNS = {"poses": re.compile(r'(?:^|[",;\t])\s*x_'), "lengths": re.compile(r'(?:^|[",;\t])\s*L1_')}
 
-MOST_LISTED = 12  # names in a message about a file that is missing
-MOST_LOOKED_AT = 500  # files of a folder that are opened to find those of a kind
+MOST_LISTED = 12  # largest number of names in a message about a missing file
+MOST_OPENED = 500  # largest number of files of a folder that are opened to find files of one kind
 
 
 def config_file(name: str | os.PathLike[str], kind: str = "", beside: bool = False) -> Path:
-    """Find a configuration file: the user's own where `name` is a path to one, else a shipped one."""
+    """Return the path of a configuration file: `name` if it is the path of a file, else the shipped file of that name.
+
+    If there is no file, the InputFileError lists files of this `kind`: shipped ones and, with `beside`, in its folder.
+    """
     own = os.path.expanduser(name)
     if os.path.isfile(own):
         return Path(own)
@@ -40,7 +43,7 @@ def config_file(name: str | os.PathLike[str], kind: str = "", beside: bool = Fal
 
 
 def input_file(name: str | os.PathLike[str], kind: str = "") -> Path:
-    """Find a file to read: anything but a folder at a path, pipes too; else a shipped file."""
+    """Return the path of an input: `name` if it is the path of a file or pipe (- is stdin), else the shipped file."""
     own = os.path.expanduser(name)
     if own == "-":
         return Path("/dev/stdin")
@@ -48,7 +51,7 @@ def input_file(name: str | os.PathLike[str], kind: str = "") -> Path:
 
 
 def confined_file(name: str | os.PathLike[str], folder: Path | None, kind: str = "") -> Path:
-    """Find a configuration file as :func:`config_file` does, but only in one folder or among the shipped ones."""
+    """Return the path of a configuration file that is in `folder`, below `folder`, or shipped; refuse other files."""
     own = os.path.expanduser(os.fspath(name))
     if own and folder is not None and os.path.exists(folder / own):
         own = os.path.join(folder, own)
@@ -60,9 +63,9 @@ def confined_file(name: str | os.PathLike[str], folder: Path | None, kind: str =
 
 
 def confined_opener(folder: Path | None) -> Callable[[str, int], int]:
-    """Return what opens a file for Python's ``open`` only where :func:`confined_file` finds it."""
-    # A file may be replaced between the check of its name and its opening, by a pipe or by a link that leads elsewhere.
-    # So opening does not block, and the open file is checked.
+    """Return an opener for Python's ``open`` that refuses files outside `folder` and the shipped configurations."""
+    # Between the check of its name and its opening a file may be replaced by a pipe or by a link to another folder.
+    # Therefore the file is opened without blocking, and the opened file is checked.
 
     def opened(path: str, flags: int) -> int:
         descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_NOCTTY)
@@ -79,16 +82,16 @@ def confined_opener(folder: Path | None) -> Callable[[str, int], int]:
 
 
 def _refuse_elsewhere(name: str | os.PathLike[str], path: Path, folder: Path | None) -> None:
-    """Raise if a file, its links resolved, is neither in `folder` nor in the folder of the shipped configurations."""
+    """Raise if a file, after resolving its links, is outside `folder` and the folder of shipped configurations."""
     folders = [place.resolve() for place in (folder, config_folder()) if place is not None]
     if not any(path.is_relative_to(place) for place in folders):
         places = " and ".join(str(place) for place in folders)
-        problem = f"leads to {path}, but files are only read from {places}; see model_folder"
+        problem = f"leads to {path}, but files are read only from {places}; see the parameter model_folder"
         raise InputFileError(os.fspath(name), "", problem)
 
 
 def folder_of(name: str | os.PathLike[str]) -> Path | None:
-    """Return the folder of a file given by its path, without links; None for the name of a shipped one."""
+    """Return the folder, with links resolved, of a file that is given by its path; None for a shipped file's name."""
     own = os.path.expanduser(name)
     if os.path.dirname(own) or os.path.isfile(own):
         return Path(os.path.dirname(own) or ".").resolve()
@@ -96,15 +99,15 @@ def folder_of(name: str | os.PathLike[str]) -> Path | None:
 
 
 def shipped_names(kind: str = "") -> list[str]:
-    """Return the names of all shipped configuration files, or of those of a kind, relative to their folder, sorted."""
+    """Return the sorted names of the shipped configuration files relative to their folder; `kind` restricts them."""
     folder = config_folder()
     files = [path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".")]
-    chosen = [path for path in files if path.parent == folder and _is_a(path, kind)] if kind else files
+    chosen = [path for path in files if path.parent == folder and _has_kind(path, kind)] if kind else files
     return sorted(path.relative_to(folder).as_posix() for path in chosen)
 
 
-def _is_a(path: Path, kind: str) -> bool:
-    """Return whether a file is of a kind, by its suffix or by its first lines."""
+def _has_kind(path: Path, kind: str) -> bool:
+    """Return whether a file is of a kind, judged by its suffix and its first 4096 characters."""
     if path.suffix.lower() not in SUFFIXES.get(kind, (".yaml", ".yml")):
         return False
     try:
@@ -122,9 +125,9 @@ def _is_a(path: Path, kind: str) -> bool:
 @cache
 def config_folder() -> Path:
     """Return the folder of the shipped configuration files."""
-    # It is searched from this file upwards, so it always belongs to the running code: `config` beside the package in a
-    # source tree (also with an editable or symlinked installation), else `share/hexapod_comp/config` in the prefix into
-    # which pip or colcon installed both.
+    # The search starts at this file, so the folder always belongs to the running code. In a source tree (and with an
+    # editable or symlinked installation) it is `config` beside the package. Otherwise it is `share/hexapod_comp/config`
+    # in the prefix into which pip or colcon installed the package.
     package = Path(__file__).resolve().parents[1]
     if (package.parent / "package.xml").is_file():
         return package.parent / "config"
@@ -132,29 +135,28 @@ def config_folder() -> Path:
         folder = prefix / "share" / PACKAGE / "config"
         if folder.is_dir():
             return folder
-    raise InputFileError(package, "", f"no share/{PACKAGE}/config in any folder above it; install it anew")
+    raise InputFileError(package, "", f"no folder above it has share/{PACKAGE}/config; install the package again")
 
 
 def version() -> str:
-    """Return the version of the running code: package.xml is installed beside the configuration."""
+    """Return the version of the running code, from the package.xml beside the folder of the configurations."""
     path = config_folder().parent / "package.xml"
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
-        raise InputFileError(path, "", f"cannot be read: {error.strerror}; install it anew") from error
+        raise InputFileError(path, "", f"cannot be read: {error.strerror}; install the package again") from error
     match = re.search(r"<version>\s*(.*?)\s*</version>", text)
     return match.group(1) if match else "unknown"
 
 
 def _no_such_file(name: str, kind: str, beside: bool) -> str:
-    """Return the message that `name` is neither a file nor shipped, with the files of its kind in its folder, and the
-    shipped ones."""
+    """Return the message that there is no file `name`; list the files of its kind in its folder and shipped ones."""
     own = os.path.expanduser(name)
     folder = os.path.dirname(own)
     if folder and not os.path.isdir(folder):
-        return "there is no such file, nor its folder"
+        return "there is no such file, and its folder does not exist"
     shipped = shipped_names(kind) if kind != "readings" else []
-    present = sorted(path.name for path in _files_in(Path(folder or ".")) if _is_a(path, kind)) if beside else []
+    present = sorted(path.name for path in _files_in(Path(folder or ".")) if _has_kind(path, kind)) if beside else []
     near = difflib.get_close_matches(os.path.basename(own), present + shipped, 1)
     parts = ["is a folder" if os.path.isdir(own) else "there is no such file"]
     what = ", ".join(SUFFIXES[kind]) if kind in SUFFIXES else kind.replace("_", " ")
@@ -165,9 +167,9 @@ def _no_such_file(name: str, kind: str, beside: bool) -> str:
 
 
 def _files_in(folder: Path) -> list[Path]:
-    """Return the files of a folder, not too many; none where it cannot be read."""
+    """Return at most `MOST_OPENED` files of a folder; no file if the folder cannot be read."""
     try:
-        return [path for path in itertools.islice(folder.iterdir(), MOST_LOOKED_AT) if path.is_file()]
+        return [path for path in itertools.islice(folder.iterdir(), MOST_OPENED) if path.is_file()]
     except OSError:
         return []
 

@@ -1,19 +1,19 @@
-"""Schemas of YAML files: keys that end in their unit, read strictly into SI, and written back to the same numbers.
+"""Schemas of YAML files: keys that end in their unit are read strictly into SI, and written back exactly.
 
-A file's schema is a dataclass. The annotation of a field defines its key; a field with a default is optional::
+The schema of a file is a dataclass. The annotation of a field defines its key; a field with a default is optional::
 
     @dataclass(frozen=True)
     class Struts:
         stroke: Annotated[np.ndarray, Numbers("mm", (2,))]         # stroke_mm, stroke_in, …; required
         offset: Annotated[np.ndarray, Numbers("um", PER_STRUT)] = field(default_factory=lambda: np.zeros(6))
         outside: Annotated[str, Choice("hold", "refuse")] = "hold"
-        wave: Wave | None = None               # a section with a schema of its own
+        wave: Wave | None = None               # a section; Wave is its schema
 
-    struts = read(Struts, section) # unknown, missing, not finite values and those of another shape are refused
+    struts = read_whole(Struts, section)       # refuses unknown and missing keys, NaN, infinity, wrong shapes
 
-Fields without an annotation of this module are not keys: ``read(Campaign, top, level=...)`` gives them, and may give
-others in place of the file. :class:`Section` is the mapping that is read: values are taken out, and a remaining key is
-an error.
+A field without an annotation of this module is not a key of the file: ``read(Campaign, top, level=...)`` sets such a
+field, and may set a field in place of its key. A :class:`Section` is the mapping that is read: a value that is read is
+removed, and a key that remains at the end is an error.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ import numpy as np
 from ..errors import GeometryError, InputFileError
 from .texts import number_hint
 
-# Keys compared with a misspelt key: in a hostile file more would take minutes
+# Largest number of keys that are compared with a misspelt key: the comparison with more keys would take minutes
 MOST_NEIGHBOURS = 1000
 
-# Unit suffixes per kind of quantity, and their size in SI (temperatures stay in degrees Celsius)
+# Unit suffixes of each kind of quantity, with their size in SI (temperatures remain in degrees Celsius)
 UNITS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "in": 0.0254},
     "angle": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": np.pi / 180.0, "arcsec": np.pi / 648000.0},
@@ -59,26 +59,26 @@ UNITS: dict[str, dict[str, float]] = {
 }
 
 DIMENSIONS = {unit: dimension for dimension, units in UNITS.items() for unit in units}  # kind of quantity of each unit
-LARGEST = 1e12  # bound of the numbers in a file, in any unit: products of several stay finite
+LARGEST = 1e12  # largest magnitude of a number in a file, in any unit: products of several numbers remain finite
 
-# They look alike, and either may be on a keyboard: both replace the u of um and urad
+# Two characters that look alike; a file may have either of them in place of the u of um and urad
 MICROS = "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"
 
-PER_STRUT = "per strut"  # shape of six numbers that may be given as one for all
-PAIRS_PER_STRUT = "pairs per strut"  # and of six pairs that may be given as one
-Shape = tuple[int | None, ...]  # lengths of an array's axes; None leaves one free
+PER_STRUT = "per strut"  # shape of six numbers; a file may give one number for all struts
+PAIRS_PER_STRUT = "pairs per strut"  # shape of six pairs of numbers; a file may give one pair for all struts
+Shape = tuple[int | None, ...]  # lengths of an array's axes; None allows any length
 
 
 @cache
 def spellings(dimension: str) -> dict[str, float]:
-    """Return a quantity's units with their sizes in SI: those with the prefix u also with both characters µ."""
+    """Return the units of a kind of quantity with their sizes in SI; units with the prefix u also with µ."""
     units = UNITS[dimension]
     return units | {micro + unit[1:]: size for unit, size in units.items() if unit[0] == "u" for micro in MICROS}
 
 
 def in_si(values: Any, factor: float) -> Any:
-    """Return numbers in SI from their unit's size, by moving the decimal point where that suffices."""
-    # So 12.3 µm in a file is the float 12.3e-6 of source code, not its neighbour.
+    """Return numbers times their unit's size `factor`; if it is a power of ten, only the decimal point is moved."""
+    # So 12.3 µm in a file becomes exactly the float 12.3e-6.
     digits = round(math.log10(factor))
     if digits == 0 or 10.0**digits != factor:
         return values * factor
@@ -101,7 +101,7 @@ def in_unit(values: Any, unit: str) -> Any:
         if isinstance(value, list):
             return [converted(item) for item in value]
         result = exact(value)
-        if result is None:  # no float reads back as this one: the neighbour that will be read instead
+        if result is None:  # no float in this unit reads back as exactly this value: use the nearest one that does
             result = exact(float(in_si(value / factor, factor)))
         return value / factor if result is None else result
 
@@ -109,37 +109,37 @@ def in_unit(values: Any, unit: str) -> Any:
 
 
 class Section:
-    """One mapping of a file: values are taken out by key, and a remaining key is an error."""
+    """One mapping of a file. Each method that reads a value removes its key; :meth:`finish` refuses remaining keys."""
 
     def __init__(self, path: str | Path, key: str, content: Any):
-        self.path, self.key = path, key  # file and place in it, for messages; no place at its top
+        self.path, self.key = path, key  # file, and the mapping's key in it ("" for the whole file), for messages
         if not isinstance(content, dict):
             raise InputFileError(path, key, "must be a mapping of keys to values", content)
-        self._left = dict(content)
+        self._remaining = dict(content)
         self._known: set[str] = set()
 
     def __contains__(self, key: str) -> bool:
         self._known.add(key)
-        return key in self._left
+        return key in self._remaining
 
     def where(self, key: str) -> str:
         return f"{self.key}.{key}" if self.key else key
 
     def error(self, key: str, problem: str, value: Any = None) -> InputFileError:
-        """Return (not raise) an error about `key`."""
+        """Return (do not raise) an error about `key`."""
         return InputFileError(self.path, self.where(key), problem, value)
 
     def require(self, key: str) -> Any:
-        """Take a required value of any kind."""
+        """Return the value of a required key, of any kind."""
         if key not in self:
-            raise self.error(key, f"is missing{self._meant([key], 0.6)}")
-        return self._left.pop(key)
+            raise self.error(key, f"is missing{self._misspelt([key], 0.6)}")
+        return self._remaining.pop(key)
 
-    def _meant(self, keys: list[str], likeness: float) -> str:
-        """Return the missing key that was probably meant, to append to a message."""
-        left = list(islice(self._left, MOST_NEIGHBOURS))
-        near = [result for key in keys for result in difflib.get_close_matches(key, left, 1, likeness)]
-        return f"; did you mean it by {near[0]!r}?" if near else ""
+    def _misspelt(self, keys: list[str], likeness: float) -> str:
+        """Return a hint to append to a message: a remaining key that is similar to one of the missing `keys`."""
+        remaining = list(islice(self._remaining, MOST_NEIGHBOURS))
+        near = [result for key in keys for result in difflib.get_close_matches(key, remaining, 1, likeness)]
+        return f"; is {near[0]!r} a misspelling of it?" if near else ""
 
     def text(self, key: str) -> str:
         value = self.require(key)
@@ -178,9 +178,9 @@ class Section:
             yield Section(self.path, f"{self.where(key)}[{index}]", item)
 
     def array(self, key: str, shape: Shape = ()) -> np.ndarray:
-        """Take finite numbers of a given shape."""
+        """Return the finite numbers of a required key, of a given shape."""
         value = self.require(key)
-        stack = [(key, value)]  # text, booleans or mappings anywhere inside nested lists are refused
+        stack = [(key, value)]  # items of the nested lists that are still to be checked for being numbers
         while stack:
             where, item = stack.pop()
             if isinstance(item, list):
@@ -203,51 +203,51 @@ class Section:
         return array
 
     def quantity_key(self, name: str, dimension: str) -> str | None:
-        """Return the key that carries `name` with a unit of `dimension`, or None when there is none."""
+        """Return the key that consists of `name` and a unit of `dimension`; None if the file has no such key."""
         usual = [f"{name}_{unit}" for unit in UNITS[dimension]]
         self._known.update(usual)
-        keys = [f"{name}_{unit}" for unit in spellings(dimension) if f"{name}_{unit}" in self._left]
-        if name in self._left:
-            raise self.error(name, f"has no unit; write one of {', '.join(usual)}", self._left[name])
+        keys = [f"{name}_{unit}" for unit in spellings(dimension) if f"{name}_{unit}" in self._remaining]
+        if name in self._remaining:
+            raise self.error(name, f"has no unit; write one of {', '.join(usual)}", self._remaining[name])
         if len(keys) > 1:
             raise self.error(keys[0], f"is given twice, also as {keys[1]}")
         return keys[0] if keys else None
 
     def quantity(self, name: str, dimension: str, shape: Shape = (), default: Any = None) -> np.ndarray:
-        """Take numbers with a unit: ``stroke`` finds ``stroke_mm``, …; in SI; the default if they are absent."""
+        """Return numbers in SI: the name ``stroke`` finds the key ``stroke_mm``, …; `default` without such a key."""
         key = self.quantity_key(name, dimension)
         if key is None:
             if default is not None:
                 return np.array(default, dtype=float)
             usual = [f"{name}_{unit}" for unit in UNITS[dimension]]
-            raise self.error(name, f"is missing; write one of {', '.join(usual)}{self._meant(usual, 0.8)}")
+            raise self.error(name, f"is missing; write one of {', '.join(usual)}{self._misspelt(usual, 0.8)}")
         return in_si(self.array(key, shape), spellings(dimension)[key[len(name) + 1 :]])
 
     def per_strut(self, name: str, dimension: str, default: float | None = None) -> np.ndarray:
-        """Take a quantity given once for all struts or as a list of six; return shape (6,), SI."""
+        """Return a quantity of each strut, shape (6,), SI; the file has one number for all struts, or six numbers."""
         key = self.quantity_key(name, dimension)
-        if key is not None and isinstance(self._left[key], list):
+        if key is not None and isinstance(self._remaining[key], list):
             return self.quantity(name, dimension, (6,))
         return np.full(6, self.quantity(name, dimension, (), default))
 
     def pairs_per_strut(self, name: str, dimension: str) -> np.ndarray:
-        """Take one pair for all struts or six pairs; return shape (6, 2), SI."""
+        """Return a pair of each strut, shape (6, 2), SI; the file has one pair for all struts, or six pairs."""
         key = self.quantity_key(name, dimension)
-        given = None if key is None else self._left[key]
+        given = None if key is None else self._remaining[key]
         if isinstance(given, list) and any(isinstance(item, list) for item in given):
             return self.quantity(name, dimension, (6, 2))
         return np.tile(self.quantity(name, dimension, (2,)), (6, 1))
 
-    def left(self) -> list[str]:
-        return list(self._left)
+    def remaining(self) -> list[str]:
+        return list(self._remaining)
 
     def finish(self) -> None:
-        """Raise if keys remain: a misspelt key must not be ignored silently."""
-        if self._left:
-            key = next(iter(self._left))
+        """Raise an InputFileError if a key has not been read: a misspelt key must not be ignored silently."""
+        if self._remaining:
+            key = next(iter(self._remaining))
             near = difflib.get_close_matches(key, sorted(self._known), 1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise self.error(key, f"is not a known key here{hint}", self._left[key])
+            raise self.error(key, f"is not a known key here{hint}", self._remaining[key])
 
 
 def _shape_text(shape: Shape) -> str:
@@ -256,34 +256,34 @@ def _shape_text(shape: Shape) -> str:
 
 @contextmanager
 def file_errors(path: str | Path) -> Iterator[None]:
-    """Convert a dataclass's error about its values (GeometryError, ModelError) into one that names the file."""
+    """Convert an error about a value (GeometryError, ModelError) into an InputFileError that names the file."""
     try:
         yield
     except GeometryError as error:
         raise InputFileError(path, error.key, error.problem, error.value) from error
 
 
-# What a key holds.
+# Kinds of values.
 
 
 class Kind:
-    """How a key's value is taken from a section; `take` gets the section and the key's name."""
+    """Kind of a key's value. `read_value`, called with a section and the key's name, checks and returns the value."""
 
-    def __init__(self, take: Callable[[Section, str], Any]) -> None:
-        self.take = take
+    def __init__(self, read_value: Callable[[Section, str], Any]) -> None:
+        self.read_value = read_value
 
     def read(self, section: Section, name: str, default: Any) -> Any:
-        """Return the value of a key; the default if it is absent, unless that is MISSING."""
-        return default if default is not MISSING and name not in section else self.take(section, name)
+        """Return the value of a key; the default if the key is absent. With the default MISSING the key is required."""
+        return default if default is not MISSING and name not in section else self.read_value(section, name)
 
 
 @dataclass(frozen=True)
 class Numbers(Kind):
-    """Finite numbers: in SI where they have a unit, and read in any unit of its kind; plain ones with unit ""."""
+    """Kind: finite numbers. A file may have them in any unit of the same quantity; they are returned in SI."""
 
-    unit: str  # in which it is written
-    shape: Shape | str = ()  # or PER_STRUT, PAIRS_PER_STRUT
-    key: str = ""  # key in the file, where it is not the field's name
+    unit: str  # unit in which the numbers are written to a file; "": numbers without a unit
+    shape: Shape | str = ()  # lengths of the axes, PER_STRUT or PAIRS_PER_STRUT
+    key: str = ""  # name of the key in the file; empty: the name of the field
 
     def read(self, section: Section, name: str, default: Any) -> Any:
         name = self.key or name
@@ -291,7 +291,7 @@ class Numbers(Kind):
             return default
         return super().read(section, name, MISSING if self.unit else default)
 
-    def take(self, section: Section, name: str) -> Any:  # type: ignore[override]
+    def read_value(self, section: Section, name: str) -> Any:  # type: ignore[override]
         if isinstance(self.shape, str):
             read_in = section.per_strut if self.shape == PER_STRUT else section.pairs_per_strut
             return read_in(name, DIMENSIONS[self.unit])
@@ -307,31 +307,31 @@ class Numbers(Kind):
 
 
 def Integer(low: int, high: int) -> Kind:
-    """Return the kind of whole numbers within bounds."""
+    """Return the kind: a whole number from `low` to `high`."""
 
-    def take(section: Section, name: str) -> int:
+    def read_value(section: Section, name: str) -> int:
         value = section.integer(name)
         if not low <= value <= high:
             raise section.error(name, f"must be {low} to {high}", value)
         return value
 
-    return Kind(take)
+    return Kind(read_value)
 
 
 def Choice(*words: Any) -> Kind:
-    """Return the kind of what must be one of the listed words or numbers."""
+    """Return the kind: one of the given words or numbers."""
     return Kind(lambda section, name: section.choice(name, words))
 
 
 def Text() -> Kind:
-    """Return the kind of texts that are not empty."""
+    """Return the kind: a text that is not empty."""
     return Kind(Section.text)
 
 
 def Names(*counts: int, what: str = "column names") -> Kind:
-    """Return the kind of lists of names, as of columns; where counts are given, of one of these lengths."""
+    """Return the kind: a list of names, for example of columns; `counts` are the allowed lengths of the list."""
 
-    def take(section: Section, name: str) -> tuple[str, ...]:
+    def read_value(section: Section, name: str) -> tuple[str, ...]:
         given = section.require(name)
         well = isinstance(given, list) and given and all(isinstance(text, str) and text.strip() for text in given)
         if not well or (counts and len(given) not in counts):
@@ -339,11 +339,11 @@ def Names(*counts: int, what: str = "column names") -> Kind:
             raise section.error(name, f"must be a list of {count}{what}", given)
         return tuple(given)
 
-    return Kind(take)
+    return Kind(read_value)
 
 
 def Unit(dimension: str) -> Kind:
-    """Return the kind of names of units; a unit's size in SI is stored."""
+    """Return the kind: the name of a unit; its value is the unit's size in SI."""
     return Kind(lambda section, name: section.unit(name, dimension))
 
 
@@ -353,7 +353,7 @@ def _nested(schema: Any) -> Kind:
 
 @cache
 def keys_of(schema: type) -> dict[str, tuple[Any, Any]]:
-    """Return the kind of each field of a schema, by its annotation, and its default (MISSING: the key is required)."""
+    """Return the kind and the default of each field that is a key; the default MISSING means a required key."""
     hints, keys = get_type_hints(schema, include_extras=True), {}
     for one in fields(schema):
         if (kind := _kind(hints[one.name])) is not None:
@@ -362,7 +362,7 @@ def keys_of(schema: type) -> dict[str, tuple[Any, Any]]:
 
 
 def _kind(hint: Any) -> Any:
-    """Return the meaning of an annotation: a kind, a schema, or None or one of these; else None."""
+    """Return the kind that an annotation, or a part of a union, defines; None for an annotation that defines no key."""
     if get_origin(hint) is Annotated:
         return next((kind for kind in get_args(hint)[1:] if isinstance(kind, Kind)), None)
     if get_origin(hint) in (Union, UnionType):
@@ -374,7 +374,7 @@ T = TypeVar("T")
 
 
 def read(schema: Callable[..., T], section: Section, **given: Any) -> T:
-    """Return the content of a section; fields that are `given` are not read from it."""
+    """Return the content of a section as an instance of `schema`; fields that are `given` are not read."""
     keys: dict[str, tuple[Any, Any]] = keys_of(schema)  # type: ignore[arg-type]
     values = {name: kind.read(section, name, default) for name, (kind, default) in keys.items() if name not in given}
     with file_errors(section.path):
@@ -382,7 +382,7 @@ def read(schema: Callable[..., T], section: Section, **given: Any) -> T:
 
 
 def read_whole(schema: Callable[..., T], section: Section, **given: Any) -> T:
-    """Return the content of a section, as :func:`read`; unknown keys are refused."""
+    """Return the content of a section as :func:`read` does, and refuse unknown keys."""
     result = read(schema, section, **given)
     section.finish()
     return result

@@ -1,4 +1,4 @@
-"""Numbers and tables as text, for reports, and streams that accept any text."""
+"""Numbers and tables as text for reports, and an output stream that is safe for a terminal."""
 
 from __future__ import annotations
 
@@ -14,21 +14,20 @@ from typing import Any, TextIO
 
 from ..errors import InputFileError
 
-# Characters that a terminal executes instead of showing: all control characters but tab and line break, changes of
-# direction
+# Characters that a terminal executes: control characters except tab and line feed, and changes of writing direction
 CODES = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 
-# Exit codes when output cannot be written, and when its reader has closed it: 128 + signal, as in shells
+# Exit codes if output cannot be written, and if the reader has closed the pipe (128 + signal number, as in shells)
 UNWRITABLE, BROKEN_PIPE = 2, 141
 
 
 def number(value: float, digits: int) -> str:
-    """Return a number with these digits after its point, never −0."""
+    """Return a number as text with `digits` digits after the decimal point; −0 becomes 0."""
     return f"{round(value, digits) + 0.0:.{digits}f}"
 
 
 def plain_number(text: str) -> float:
-    """Return the finite number of a text in plain notation, else NaN: Python also reads 1_0 and １０ as ten."""
+    """Return the finite number of a text; NaN for other texts and for 1_0 or １０, which Python's float accepts."""
     try:
         value = float(text)
     except ValueError:
@@ -36,39 +35,37 @@ def plain_number(text: str) -> float:
     return value if math.isfinite(value) and text.isascii() and "_" not in text else math.nan
 
 
-DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")  # a number in the notation of many countries
-
-
-# A number whose comma may be a decimal one, or a thousands separator
+DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")  # a number with a decimal comma
+# A number whose comma may be a decimal comma or a thousands separator
 THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
 
 
 def number_hint(text: str) -> str:
-    """Return why a text is not a number, to append to a message, where that is obvious."""
+    """Return a hint to append to a message: how to write the number that a text probably means; "" without a guess."""
     text = text.strip()
     if THOUSANDS.fullmatch(text):
         meant = f"{text.replace(',', '.')} or {text.replace(',', '')}"
-        return f"; its comma may be a decimal one or stand between thousands: write {meant}"
+        return f"; its comma may be a decimal comma or a thousands separator: write {meant}"
     if DECIMAL_COMMA.fullmatch(text):
         return f", with a decimal point: {text.replace(',', '.')}"
     return ", without semicolons" if ";" in text else ""
 
 
 def _micro(error: UnicodeError) -> tuple[str, int]:
-    """Read the byte B5, which is not valid UTF-8 alone, as µ, as spreadsheets under Windows write it."""
+    """Decode the single byte B5, which is invalid UTF-8, as µ: spreadsheets under Windows write µ so."""
     if isinstance(error, UnicodeDecodeError) and error.object[error.start] == 0xB5:
         return "µ", error.start + 1
     raise error
 
 
-# Handler of decoding errors: UTF-8 in which a micro sign may be that of Windows-1252
+# Name of a handler of decoding errors, for UTF-8 text in which µ may be encoded as in Windows-1252
 MICRO_ERRORS = "hexapod_comp_micro"
 
 codecs.register_error(MICRO_ERRORS, _micro)
 
 
 def aligned(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table with its columns aligned to the right, a last one without header to the left."""
+    """Return a table as text with columns aligned to the right; a last column without header is aligned to the left."""
     lines = [list(header), *(list(row) for row in rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     if not header[-1]:
@@ -78,10 +75,10 @@ def aligned(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 class PlainStream:
-    """A text stream that shows codes for the terminal instead of executing them, in any encoding."""
+    """A text stream that writes control characters as visible escapes, so that a terminal does not execute them."""
 
-    # Printed text may quote files and arguments: names of machines, of runs, labels. When it cannot be written, it
-    # is discarded from then on, so that no further error appears at the program's end.
+    # Printed text may quote files and arguments, for example names of machines and runs. After a failed write all
+    # further text is discarded, so that no second error appears at the end of the program.
 
     def __init__(self, stream: TextIO | None, needed: bool) -> None:
         self.terminal = stream or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - as long as the process
@@ -99,7 +96,7 @@ class PlainStream:
             return self._fail(error)
 
     def flush(self) -> None:
-        """Write what is still to be written; errors are those of :meth:`write`."""
+        """Write the buffered text; errors are handled as in :meth:`write`."""
         try:
             self.terminal.flush()
         except OSError as error:
@@ -115,12 +112,12 @@ class PlainStream:
 
 
 def own_terminal() -> TextIO:
-    """Return stderr for our own codes, as those of a progress bar."""
+    """Return stderr without the escaping of :class:`PlainStream`, for the control codes of a progress bar."""
     return getattr(sys.stderr, "terminal", sys.stderr)
 
 
 def run_with_plain_streams(run: Callable[[], int | None]) -> int | None:
-    """Run a program that prints to a :class:`PlainStream`; return its exit code, or the code of failed output."""
+    """Run a program with stdout and stderr as :class:`PlainStream`; return its exit code, or that of failed output."""
     with redirect_stdout(PlainStream(sys.stdout, True)), redirect_stderr(PlainStream(sys.stderr, False)):  # type: ignore[type-var]
         try:
             code = run()

@@ -1,4 +1,4 @@
-"""YAML files, read strictly and written to be readable; :mod:`.schema` reads the keys."""
+"""Strict reading and readable writing of YAML files; :mod:`.schema` interprets the keys."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from ..errors import InputFileError, shorten
 from .files import read_text
 from .schema import Section
 
-# Deeper nested YAML is refused: a model needs five levels, and the parser's own stack ends at some thousand
+# Deepest nesting of a YAML file: a model needs five levels, and the parser's stack overflows at some thousand
 MAX_DEPTH = 32
 
-# YAML of more values, keys and lists is refused: each takes 10 µs and 600 bytes. A field of 20 × 20 lines along each
-# axis, forward and backward, with six polynomials of the fifth order, has 120,000.
+# Largest number of values, keys and lists in a YAML file; each takes 10 µs and 600 bytes. A field of 20 × 20 lines
+# along each axis, forward and backward, with six polynomials of the fifth order, has 120,000.
 MAX_NODES = 200_000
 
-# Numbers that YAML 1.1 reads otherwise than people do: 0400 is 256, 1:30 is 90, 0x10 is 16
+# Numbers that YAML 1.1 reads in an unexpected way: 0400 as 256, 1:30 as 90, 0x10 as 16
 AMBIGUOUS_NUMBER = re.compile(r"[-+]?0[0-9A-Za-z]|.*[:_]")
 
 
 class _StrictLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Safe loader that refuses a key given twice, and numbers that mislead."""
+    """YAML loader for plain values that refuses a key given twice and numbers in an ambiguous notation."""
 
 
 def _mapping_without_duplicates(loader: Any, node: yaml.MappingNode) -> dict:
@@ -40,7 +40,7 @@ def _mapping_without_duplicates(loader: Any, node: yaml.MappingNode) -> dict:
 
 
 def _complaint(problem: str, node: yaml.Node | yaml.Event) -> yaml.YAMLError:
-    """Return (not raise) an error that says where in the text it is."""
+    """Return (do not raise) a YAML error that holds the position of a node in the text."""
     return yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
 
 
@@ -50,7 +50,7 @@ def _plain_number(loader: Any, node: yaml.ScalarNode) -> int | float:
         raise _complaint(f"{shorten(text)} is not a plain decimal number", node)
     try:
         return int(text) if node.tag.endswith(":int") else loader.construct_yaml_float(node)
-    except ValueError as error:  # Python reads no whole number of more than 4300 digits
+    except ValueError as error:  # Python converts no whole number of more than 4300 digits
         raise _complaint(f"{shorten(text)} is too long for a number", node) from error
 
 
@@ -68,12 +68,12 @@ for _tag in ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float"):
 
 
 def read_yaml(path: str | Path, file_format: str, version: int) -> Section:
-    """Read a YAML file as :func:`parse_yaml` does its text."""
+    """Read a YAML file, check its `format` and `version`, and return its content as a Section."""
     return parse_yaml(read_text(path), path, file_format, version)
 
 
 def parse_yaml(text: str, name: str | Path, file_format: str, version: int) -> Section:
-    """Parse YAML with the safe loader and check its `format` and `version` lines."""
+    """Parse a YAML text, check its `format` and `version`, and return its content as a Section."""
     content = yaml_content(text, name)
     if not isinstance(content, dict):
         raise InputFileError(name, "", "must hold keys and values at its top level", content)
@@ -83,12 +83,12 @@ def parse_yaml(text: str, name: str | Path, file_format: str, version: int) -> S
         raise section.error("format", f"must be {file_format!r}", given)
     given_version = section.require("version")
     if type(given_version) is not int or given_version != version:
-        raise section.error("version", f"only version {version} is understood", given_version)
+        raise section.error("version", f"must be {version}, the only version that this program reads", given_version)
     return section
 
 
 def yaml_content(text: str, name: str | Path, most_nodes: int = MAX_NODES) -> Any:
-    """Return the content of YAML: plain values, lists and mappings, of bounded number and depth."""
+    """Return the content of a YAML text as plain values, lists and mappings; refuse one too large or too deep."""
     try:
         _reject_aliases_and_tags(text, most_nodes)
         return yaml.load(text, Loader=_StrictLoader)
@@ -102,9 +102,9 @@ def yaml_content(text: str, name: str | Path, most_nodes: int = MAX_NODES) -> An
 
 
 def _reject_aliases_and_tags(text: str, most_nodes: int) -> None:
-    """Raise on aliases and tags, by which a short file could expand or make objects, before anything is made of it."""
-    # Nested references (`*name`) can stand for more values than memory holds, and so can short lists; nesting overflows
-    # the parser's stack and ends the process, a tag (`!!float`) makes the loader read a value as another type.
+    """Raise a YAML error on an alias, a tag, too many values or too deep nesting, before the text is loaded."""
+    # Nested aliases (`*name`) of a short file can expand to more values than memory holds. Deep nesting overflows the
+    # parser's stack and ends the process. A tag (`!!float`) makes the loader read a value as another type.
     depth = nodes = 0
     for event in yaml.parse(text, Loader=_StrictLoader):
         if isinstance(event, yaml.AliasEvent):
@@ -119,11 +119,11 @@ def _reject_aliases_and_tags(text: str, most_nodes: int) -> None:
             raise _complaint(f"is nested more than {MAX_DEPTH} deep", event)
 
 
-LONGEST_LINE = 2**30  # characters: LibYAML, unlike PyYAML's own writer, accepts no infinity
+LONGEST_LINE = 2**30  # longest written line, characters: no line is wrapped; LibYAML does not accept infinity
 
 
 class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
-    """Rows of numbers on one line, everything else in blocks, nothing by reference."""
+    """YAML writer that puts a list of numbers on one line, all other content into blocks, and writes no aliases."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -138,5 +138,5 @@ _Dumper.add_representer(list, _represent_list)
 
 
 def block_text(content: dict[str, Any]) -> str:
-    """Return content as YAML, in its order, each row of numbers on one line."""
+    """Return content as YAML text in the content's order, each list of numbers on one line."""
     return str(yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=LONGEST_LINE))

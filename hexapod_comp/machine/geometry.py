@@ -63,12 +63,12 @@ def read_named_poses(top: Section, key: str, read: Callable[[Section, str], Pose
     if key not in top:
         return {}
     section = top.section(key)
-    if len(section.left()) > MOST:  # before each is read
-        raise top.error(key, f"must be no more than {MOST}", len(section.left()))
+    if len(section.remaining()) > MOST:  # before each is read
+        raise top.error(key, f"must be no more than {MOST}", len(section.remaining()))
     for name in (BASE, WORK, TOOL):
         if name in section:
             raise section.error(name, f"is what the machine's own {name} frame is called")
-    return {name: read(section, name) for name in section.left()}
+    return {name: read(section, name) for name in section.remaining()}
 
 
 def pose_text(pose: Pose) -> str:

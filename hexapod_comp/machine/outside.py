@@ -224,7 +224,7 @@ def read_outside(section: Section) -> dict[str, Any]:
     names, units, nodes = [], [], []
     for axis in section.sections("axes"):
         names.append(axis.text("name"))
-        key = next((key for key in axis.left() if key.startswith("nodes_")), "nodes")
+        key = next((key for key in axis.remaining() if key.startswith("nodes_")), "nodes")
         name, unit = unit_of(key)
         if name != "nodes" or not unit:
             raise axis.error(key, f"must be nodes_UNIT with one of {', '.join(DIMENSIONS)}")

@@ -1,1 +1,1 @@
-"""Readings of every instrument, and every reader of measured files."""
+"""Measurements: the readings of all instruments, the readers of measured files, campaigns, and ISO 230 evaluation."""

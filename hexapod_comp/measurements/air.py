@@ -1,4 +1,4 @@
-"""The effect of air on a laser's length."""
+"""Refractive index of air (Ciddor), and the correction of a laser's displacement by it."""
 
 from __future__ import annotations
 
@@ -6,32 +6,32 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-Values: TypeAlias = "float | np.ndarray"  # one number, or one a reading
+Values: TypeAlias = "float | np.ndarray"  # one number for all readings, or an array with one number for each reading
 
-# Vacuum wavelength of a helium-neon laser, m. The index changes by 1·10⁻¹² per 0.1 pm: any He-Ne laser has it.
+# Vacuum wavelength, m, used for every helium-neon laser: a wavelength 0.1 pm longer changes the index by only 1·10⁻¹²
 VACUUM_WAVELENGTH = 632.9908e-9
-USUAL_CO2_PPM = 450.0  # CO₂ in the air of a workshop, 10⁻⁶; 100 more raise n by 1.5·10⁻⁸
+USUAL_CO2_PPM = 450.0  # CO₂ in the air of a workshop, 10⁻⁶; 100·10⁻⁶ more CO₂ raises the index by 1.5·10⁻⁸
 ZERO_CELSIUS = 273.15  # 0 °C in K
-# Lowest and highest values of the air of a workshop: the range of Ciddor's equation, above ice
+# Lowest value, highest value and their text: the range in which Ciddor's equation is valid, without ice
 AIR_RANGES = {
     "temperature": (0.0, 60.0, "0…60 °C"),
     "pressure": (50e3, 120e3, "50…120 kPa, given in Pa"),
     "humidity": (0.0, 1.0, "0…1, as a fraction"),
 }
 
-LARGEST_INDEX = 1.001  # no air of :data:`AIR_RANGES` comes near it: an index above is a mistake
+LARGEST_INDEX = 1.001  # largest index accepted from a file; air within :data:`AIR_RANGES` stays below 1.0004
 
 
 class Air(NamedTuple):
-    """State of the air along a laser's beam, for one reading or for many, within :data:`AIR_RANGES`."""
+    """State of the air along a laser's beam, for one reading or for an array of readings, within :data:`AIR_RANGES`."""
 
     temperature: Values  # °C
-    pressure: Values  # pressure at the place, not reduced to sea level, Pa
-    humidity: Values  # relative, as a fraction 0…1
+    pressure: Values  # pressure at the machine, not reduced to sea level, Pa
+    humidity: Values  # relative humidity, as a fraction 0…1
 
 
 def ciddor_index(air: Air, vacuum_wavelength: float = VACUUM_WAVELENGTH, co2_ppm: float = USUAL_CO2_PPM) -> np.ndarray:
-    """Return the phase refractive index of air after Ciddor."""
+    """Return the phase refractive index of air by Ciddor's equation; `vacuum_wavelength` in m."""
     vapour = _vapour_fraction(air)
     density = _molar_density(air.pressure, air.temperature, vapour)
     of_dry_air = density * (1.0 - vapour) / _molar_density(101_325.0, 15.0, 0.0)
@@ -43,18 +43,18 @@ def ciddor_index(air: Air, vacuum_wavelength: float = VACUUM_WAVELENGTH, co2_ppm
 
 
 def _dry_air_refractivity(wavenumber_squared: float, co2_ppm: float) -> float:
-    """Return n − 1 of dry air at 15 °C and 101 325 Pa (Ciddor, eqs. 1 and 2); wavenumber in 1/µm."""
+    """Return n − 1 of dry air at 15 °C and 101 325 Pa (Ciddor, eqs. 1 and 2); the squared wavenumber is in 1/µm²."""
     of_450_ppm = 5_792_105.0 / (238.0185 - wavenumber_squared) + 167_917.0 / (57.362 - wavenumber_squared)
     return 1e-8 * of_450_ppm * (1.0 + 0.534e-6 * (co2_ppm - 450.0))
 
 
 def _vapour_refractivity(wavenumber_squared: float) -> float:
-    """Return n − 1 of water vapour at 20 °C and 1333 Pa (Ciddor, eq. 3); wavenumber in 1/µm."""
+    """Return n − 1 of water vapour at 20 °C and 1333 Pa (Ciddor, eq. 3); the squared wavenumber is in 1/µm²."""
     return 1.022e-8 * float(np.polyval([0.004028, -0.032380, 2.6422, 295.235], wavenumber_squared))
 
 
 def _vapour_fraction(air: Air) -> Values:
-    """Return the share of water among the molecules (Ciddor, appendix A)."""
+    """Return the mole fraction of water vapour in moist air (Ciddor, appendix A)."""
     kelvin = air.temperature + ZERO_CELSIUS
     saturation = np.exp(1.2378847e-5 * kelvin**2 - 1.9121316e-2 * kelvin + 33.93711047 - 6343.1645 / kelvin)
     enhancement = 1.00062 + 3.14e-8 * air.pressure + 5.6e-7 * air.temperature**2
@@ -62,7 +62,7 @@ def _vapour_fraction(air: Air) -> Values:
 
 
 def _molar_density(pressure: Values, temperature: Values, vapour: Values) -> Values:
-    """Return p/(Z·T), the molar density times the gas constant, Pa/K (Ciddor, eq. 4 and appendix A)."""
+    """Return p/(Z·T), Pa/K: the molar density multiplied by the gas constant (Ciddor, eq. 4 and appendix A)."""
     t, ratio = temperature, pressure / (temperature + ZERO_CELSIUS)
     first = 1.58123e-6 - 2.9331e-8 * t + 1.1043e-10 * t**2
     first = first + (5.707e-6 - 2.051e-8 * t) * vapour + (1.9898e-4 - 2.376e-6 * t) * vapour**2
@@ -71,5 +71,5 @@ def _molar_density(pressure: Values, temperature: Values, vapour: Values) -> Val
 
 
 def correct_displacement(raw: Values, air: Air, assumed_index: Values = 1.0) -> np.ndarray:
-    """Return the displacement L that an interferometer measured, from its displayed value."""
+    """Return the true displacement from the `raw` one that an interferometer displayed with `assumed_index`."""
     return np.asarray(raw) * (assumed_index / ciddor_index(air))

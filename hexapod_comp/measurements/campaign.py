@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -37,82 +37,83 @@ from .runs import assemble
 
 CAMPAIGN_FORMAT = "hexapod_comp/campaign"
 CAMPAIGN_VERSION = 1
-# Lasers on grid lines: linear only; with two straightnesses, pitch and yaw; with roll as well
+# Lasers for the lines of a grid. 1-D: displacement only. 5-D: also two straightnesses, pitch and yaw. 6-D: also roll.
 INSTRUMENTS = ("1-D", "5-D", "6-D")
-# Instruments for a line: a linear laser; straightness, or pitch and yaw, with their optics; all of these; and roll.
-# Along a line that is not parallel to an axis of the work frame the last two read its length alone.
+# Instruments for a line: a linear laser, straightness optics, optics for pitch and yaw, a 5-D laser and a 6-D laser.
+# Along a line that is not parallel to an axis of the work frame the 5-D and the 6-D laser read displacement only.
 LINE_INSTRUMENTS = ("linear", "straightness", "rotation", "5-D", "6-D")
-# Instruments for scattered poses: a tracker's position alone, and with the attitude
+# Instruments for scattered poses: a tracker that reads position only, and a tracker that also reads attitude
 POSE_INSTRUMENTS = ("tracker", "tracker_6d")
-# Instruments for a length from a centre: a telescoping ball bar, in both directions; a tracking interferometer; a probe
-# that touches spheres
+# Instruments for a length from a centre: a telescoping ball bar (run in both senses), a tracking interferometer, and a
+# probe that touches spheres
 LENGTH_INSTRUMENTS = ("ball_bar", "station", "probe")
-# Instrument for the place of the tool's ball beside three sensors, while the tool tilts about it
+# R-test: three sensors read the displacement of a ball at the tool's tip while the tool tilts about the ball's centre
 BALL_INSTRUMENTS = ("r_test",)
 LISTED_INSTRUMENTS = (*LINE_INSTRUMENTS, *POSE_INSTRUMENTS, *LENGTH_INSTRUMENTS, *BALL_INSTRUMENTS)
-# Planes of circles, in the work frame: a circle goes from the first axis to the second
+# Planes of circles in the work frame: a counter-clockwise circle turns from the first axis to the second
 PLANES = {"xy": (0, 1), "yz": (1, 2), "zx": (2, 0)}
-MOST_POINTS = 10_000  # of one run
-# Larger campaigns are refused: at one reading a second this one takes six days, and a unit may be wrong
+MOST_POINTS = 10_000  # largest number of points of one run
+# Largest number of readings of a campaign. At one reading a second they take six days: more suggest a wrong unit.
 MOST_READINGS = 500_000
-DIAGONALS = (0, 4, 16)  # none, the box's four body diagonals, or these and the two diagonals of each of its six faces
-# Number of cells of the longest edge of a machine's own box, and of steps a cell, if a file does not give them
+DIAGONALS = (0, 4, 16)  # numbers of diagonals: none, a box's 4 body diagonals, or also the 12 diagonals of its faces
+# If a campaign file gives neither cell nor step: cells along the longest edge of the machine's own box; steps per cell
 CELLS_OF_A_BOX, STEPS_OF_A_CELL = 4, 4
-GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # points that turn by it are spread evenly: neighbours are never alike
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad; points of which each is turned by it from the last spread evenly
 
-# Returns a machine's own box, (2, 3), m in the work frame, and the tool's attitude there, (3, 3)
+# A function that returns a machine's own box, (2, 3), m in the work frame, and the tool's attitude in it, (3, 3)
 OwnBox = Callable[[], tuple[np.ndarray, np.ndarray]]
 
 
-# Runs that a campaign lists.
+# Runs of a campaign.
 
 
 @dataclass(frozen=True)
 class CampaignRun:
-    """One run: the poses of the tool, and the instrument that reads them; ModelError where it cannot."""
+    """One run: the poses of the tool and the instrument. ModelError if the instrument cannot measure at these poses."""
 
     name: str
     instrument: str  # one of LISTED_INSTRUMENTS
-    # pose_tool_in_work, (n, 3), m, and (n, 3, 3). Those of a line lie on it, with the same attitude, from its start to
-    # its end; they are passed there and back, and so are those of a ball bar.
+    # pose_tool_in_work, (n, 3), m, and (n, 3, 3). The poses of a line go from its start to its end with one attitude.
+    # The poses of a line or of a ball bar's circle are visited forward and backward.
     positions: np.ndarray
     rotations: np.ndarray
     centres: np.ndarray | None = None  # points from which lengths are read, (n, 3), in the work frame, m
-    known_zero: bool = False  # the lengths are calibrated
-    alternate: bool = False  # a line's places are read once, in alternating directions
-    slope: str = ""  # the square whose slope its straightness shares with other runs
+    known_zero: bool = False  # whether the lengths are calibrated
+    alternate: bool = False  # whether every second point of a line is read forward only, and the others backward only
+    slope: str = ""  # name of a square: runs that name the same square share one unknown slope of straightness
 
     def __post_init__(self) -> None:
         where = f"run {self.name}"
         if not 1 <= len(self.positions) <= MOST_POINTS:
             raise ModelError(where, f"must have 1 to {MOST_POINTS} points", len(self.positions))
         if (self.instrument in LENGTH_INSTRUMENTS) != (self.centres is not None):
-            raise ModelError(where, "must be with a centre for lengths, and without for all else", self.instrument)
-        if self.is_line and np.linalg.norm(self.way) < LEAST_TRAVEL:
+            problem = "needs a centre if its instrument reads lengths, and must not have one otherwise"
+            raise ModelError(where, problem, self.instrument)
+        if self.is_line and np.linalg.norm(self.travel) < LEAST_TRAVEL:
             raise ModelError(where, "starts and ends at the same place")
         if self.axis is None and self.instrument in ("straightness", "rotation"):
-            problem = "is not parallel to an axis of the work frame: only a linear laser reads it"
+            problem = "is not parallel to an axis of the work frame: only a linear laser can measure along it"
             raise ModelError(where, problem, self.instrument)
 
     @property
     def is_line(self) -> bool:
-        """Whether it is read along a line."""
+        """Whether the run's instrument reads along a line."""
         return self.instrument in LINE_INSTRUMENTS
 
     @property
-    def way(self) -> np.ndarray:
-        """From the first position to the last, shape (3,), m."""
+    def travel(self) -> np.ndarray:
+        """Vector from the first position to the last in the work frame, shape (3,), m."""
         return np.asarray(self.positions[-1] - self.positions[0])
 
     @property
     def axis(self) -> int | None:
-        """0, 1 or 2 for a line parallel to x, y or z of the work frame, None for any other."""
-        moving = np.flatnonzero(np.abs(self.way) > LEAST_TRAVEL)
+        """0, 1 or 2 for a line parallel to x, y or z of the work frame; None for a line in another direction."""
+        moving = np.flatnonzero(np.abs(self.travel) > LEAST_TRAVEL)
         return int(moving[0]) if len(moving) == 1 else None
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Channels read at each point."""
+        """Channels that the instrument reads at each point."""
         if self.instrument in LENGTH_INSTRUMENTS:
             return ("length",)
         if self.instrument in BALL_INSTRUMENTS:
@@ -123,33 +124,33 @@ class CampaignRun:
         return line_channels(self.instrument, self.axis)
 
     def count(self, cycles: int) -> int:
-        """Return how many readings :meth:`readings` yields."""
+        """Return the number of readings that :meth:`readings` yields."""
         return len(self.positions) * len(self.channels) * self._passes(cycles) // (1 + self.alternate)
 
     def _passes(self, cycles: int) -> int:
-        """Return how often the poses are passed: a tracker's once, a line and a circle in both directions."""
+        """Return how often each pose is visited: once by a tracker; per cycle twice on a line or circle, else once."""
         if self.instrument in POSE_INSTRUMENTS:
             return 1
         return (2 if self.is_line or self.instrument == "ball_bar" else 1) * cycles
 
     def readings(self, cycles: int) -> Iterator[Reading]:
-        """Yield the readings, values of zero: of a line in `cycles` passes forward and backward, of a pose once."""
+        """Yield the run's readings with value zero, in the order in which the machine visits the poses."""
         poses = [Pose(*pose) for pose in zip(self.positions, self.rotations, strict=True)]
         if self.is_line:
             for reading in line_readings(self.name, poses, self.channels, cycles, self.alternate):
                 yield reading._replace(slope=self.slope)
             return
-        way_of = UNKNOWN if self.instrument in POSE_INSTRUMENTS else FROM_PREVIOUS
-        of_file = [None] * len(poses) if self.centres is None else [tuple(c) for c in self.centres.tolist()]
+        direction = UNKNOWN if self.instrument in POSE_INSTRUMENTS else FROM_PREVIOUS
+        centres = [None] * len(poses) if self.centres is None else [tuple(c) for c in self.centres.tolist()]
         for number in range(self._passes(cycles)):
             order = -1 if self.instrument == "ball_bar" and number % 2 else 1
-            for pose, centre in list(zip(poses, of_file, strict=True))[::order]:
+            for pose, centre in list(zip(poses, centres, strict=True))[::order]:
                 for channel in self.channels:
-                    reading = Reading(self.name, number + 1, way_of, pose, channel, 0.0)
+                    reading = Reading(self.name, number + 1, direction, pose, channel, 0.0)
                     yield reading._replace(centre=centre, known_zero=self.known_zero)
 
     def content(self) -> dict[str, Any]:
-        """Return the entry of a campaign file."""
+        """Return the run as an entry of a campaign file, in mm and degrees."""
         head: dict[str, Any] = {"name": self.name, "instrument": self.instrument}
         angles = (np.degrees(angles_from_rotation(self.rotations)).round(9) + 0.0).tolist()
         positions = in_unit(self.positions + 0.0, "mm")
@@ -166,7 +167,7 @@ class CampaignRun:
 
 
 def line_channels(instrument: str, axis: int | None) -> tuple[str, ...]:
-    """Return the channels of an instrument on a line along an axis of the work frame (None: along none of them)."""
+    """Return the channels of an instrument on a line parallel to axis 0, 1 or 2 of the work frame (None: to none)."""
     if axis is None or instrument in ("1-D", "linear"):
         return ("linear",)
     straight, turning = (tuple(f"{kind}_{AXES[a]}" for a in CROSS_AXES[axis]) for kind in ("straightness", "rotation"))
@@ -176,7 +177,7 @@ def line_channels(instrument: str, axis: int | None) -> tuple[str, ...]:
 
 
 def line_run(name: str, instrument: str, ends: np.ndarray, points: int, rotation: np.ndarray) -> CampaignRun:
-    """Return a run between two places of the work frame, shape (2, 3), m, at one attitude of the tool."""
+    """Return a line run between two points `ends` of the work frame, shape (2, 3), m, at one attitude of the tool."""
     positions = np.linspace(ends[0], ends[1], points).round(12)
     return CampaignRun(name, instrument, positions, np.tile(rotation, (points, 1, 1)))
 
@@ -190,7 +191,7 @@ def circle_run(
     rotation: np.ndarray,
     known_zero: bool = False,
 ) -> CampaignRun:
-    """Return a ball bar's run, `count` readings each way, on a full circle about its fixed ball, m in work."""
+    """Return a ball bar's run on a full circle about its fixed ball (m in work), with `points` points in each sense."""
     angles = np.linspace(0.0, 2.0 * np.pi, points)
     places = centre + radius * (np.cos(angles)[:, None] * axes[0] + np.sin(angles)[:, None] * axes[1])
     centres = np.tile(np.asarray(centre, dtype=float), (points, 1))
@@ -198,7 +199,7 @@ def circle_run(
 
 
 def tilts(points: int, largest: float) -> np.ndarray:
-    """Return attitudes of a tool that tilts outwards in a spiral up to an angle, rad, level first, (points, 3, 3)."""
+    """Return attitudes whose tilt grows along a spiral from level to `largest`, rad; shape (points, 3, 3)."""
     share = np.sqrt(np.arange(points) / max(points - 1, 1))
     turns = np.arange(points) * GOLDEN_ANGLE
     angles = np.stack([share * np.cos(turns), share * np.sin(turns), np.zeros(points)], axis=1)
@@ -208,9 +209,9 @@ def tilts(points: int, largest: float) -> np.ndarray:
 def line_readings(
     name: str, poses: Sequence[Pose], channels: Iterable[str], cycles: int, alternate: bool = False
 ) -> Iterator[Reading]:
-    """Yield the readings of passes forward and backward over a line, values of zero."""
-    way = poses[-1].position - poses[0].position
-    if way[np.flatnonzero(np.abs(way) > LEAST_TRAVEL)[0]] < 0.0:
+    """Yield the readings, with value zero, of `cycles` passes forward and backward over a line."""
+    travel = poses[-1].position - poses[0].position
+    if travel[np.flatnonzero(np.abs(travel) > LEAST_TRAVEL)[0]] < 0.0:
         poses = poses[::-1]
     channels, stops = tuple(channels), (poses[::2], poses[1::2]) if alternate else (poses, poses)
     for cycle in range(1, cycles + 1):
@@ -220,7 +221,7 @@ def line_readings(
                     yield Reading(name, cycle, direction, pose, channel, 0.0)
 
 
-# The entries of a campaign file, each of which makes a run.
+# Entries of a campaign file. Each entry makes one run.
 
 Angles = Annotated[np.ndarray, Numbers("deg", (3,))]
 Zero = Annotated[str, Choice("known", "unknown")]
@@ -232,7 +233,7 @@ def _level() -> np.ndarray:
 
 @dataclass(frozen=True)
 class LineEntry:
-    """A line between two places."""
+    """Entry of a campaign file for a line between two points of the work frame."""
 
     line: Annotated[np.ndarray, Numbers("mm", (2, 3))]
     points: Annotated[int, Integer(2, MOST_POINTS)] = 2
@@ -241,17 +242,14 @@ class LineEntry:
     slope: Annotated[str, Text()] = ""
 
     def run(self, name: str, instrument: str) -> CampaignRun:
-        """Return the run."""
-        positions = np.linspace(self.line[0], self.line[1], self.points).round(12)
-        rotations = np.tile(rotation_from_angles(self.angles), (self.points, 1, 1))
-        return CampaignRun(
-            name, instrument, positions, rotations, alternate=self.stops == "alternate", slope=self.slope
-        )
+        """Return the line as a run."""
+        run = line_run(name, instrument, self.line, self.points, rotation_from_angles(self.angles))
+        return replace(run, alternate=self.stops == "alternate", slope=self.slope)
 
 
 @dataclass(frozen=True)
 class CircleEntry:
-    """A ball bar's circle."""
+    """Entry of a campaign file for a circle of a ball bar."""
 
     plane: Annotated[str, Choice(*PLANES)]
     centre: Annotated[np.ndarray, Numbers("mm", (3,))]
@@ -261,14 +259,14 @@ class CircleEntry:
     zero: Zero = "unknown"
 
     def run(self, name: str, instrument: str) -> CampaignRun:
-        """Return the run."""
+        """Return the circle as a run."""
         axes, rotation = np.eye(3)[list(PLANES[self.plane])], rotation_from_angles(self.angles)
         return circle_run(name, self.centre, self.radius, self.points, axes, rotation, self.zero == "known")
 
 
 @dataclass(frozen=True)
 class SphereEntry:
-    """Touches spread over the upper half of a sphere, or of each sphere of a plate."""
+    """Entry of a campaign file for touches spread evenly over the upper half of each of one or more spheres."""
 
     centres: Annotated[np.ndarray, Numbers("mm", (None, 3))]
     radius: Annotated[float, Numbers("mm")]
@@ -277,7 +275,7 @@ class SphereEntry:
     zero: Zero = "unknown"
 
     def run(self, name: str, instrument: str) -> CampaignRun:
-        """Return the run."""
+        """Return the touches as a run."""
         up, turns = (np.arange(self.points) + 0.5) / self.points, np.arange(self.points) * GOLDEN_ANGLE
         level = np.sqrt(1.0 - up**2)
         outwards = np.stack([level * np.cos(turns), level * np.sin(turns), up], axis=1)
@@ -289,20 +287,20 @@ class SphereEntry:
 
 @dataclass(frozen=True)
 class TiltsEntry:
-    """An R-test at one place."""
+    """Entry of a campaign file for an R-test: a ball that keeps its place while the tool tilts by up to `tilt`."""
 
     position: Annotated[np.ndarray, Numbers("mm", (3,))]
     points: Annotated[int, Integer(4, MOST_POINTS)]
     tilt: Annotated[float, Numbers("deg")]
 
     def run(self, name: str, instrument: str) -> CampaignRun:
-        """Return the run."""
+        """Return the tilts as a run."""
         return CampaignRun(name, instrument, np.tile(self.position, (self.points, 1)), tilts(self.points, self.tilt))
 
 
 @dataclass(frozen=True)
 class PosesEntry:
-    """Listed poses; lengths have one centre, or one each."""
+    """Entry of a campaign file that lists poses; lengths have one centre for all poses or a centre for each pose."""
 
     poses: Annotated[np.ndarray, Numbers("mm", (None, 3))]
     angles: Annotated[np.ndarray | None, Numbers("deg", (None, 3))] = None
@@ -311,17 +309,17 @@ class PosesEntry:
     zero: Zero = "unknown"
 
     def run(self, name: str, instrument: str) -> CampaignRun:
-        """Return the run."""
+        """Return the poses as a run."""
         count = len(self.poses)
         for key, given in (("angles_deg", self.angles), ("centres_mm", self.centres)):
             if given is not None and len(given) != count:
-                raise ModelError(f"run {name}: {key}", f"must be as many as poses: {count}", len(given))
+                raise ModelError(f"run {name}: {key}", f"must have one row for each of the {count} poses", len(given))
         centres = self.centres if self.centre is None else np.tile(self.centre, (count, 1))
         angles = np.zeros_like(self.poses) if self.angles is None else self.angles
         return CampaignRun(name, instrument, self.poses, rotation_from_angles(angles), centres, self.zero == "known")
 
 
-# Short forms of an instrument's entry, if it lists no poses
+# Entry of each instrument that has a short form. An entry with the key poses is a PosesEntry instead.
 SHORT_FORMS: dict[str, Any] = {"ball_bar": CircleEntry, "probe": SphereEntry, "r_test": TiltsEntry}
 
 
@@ -331,7 +329,7 @@ def read_runs(top: Section) -> tuple[CampaignRun, ...]:
     for entry in top.sections("runs"):
         name = entry.text("name")
         if name in {run.name for run in runs}:
-            raise entry.error("name", "is given to two runs: readings of one run share their unknown zeros", name)
+            raise entry.error("name", "is given to two runs: readings of one run share one unknown zero", name)
         instrument = entry.choice("instrument", LISTED_INSTRUMENTS)
         schema = LineEntry if instrument in LINE_INSTRUMENTS else SHORT_FORMS.get(instrument, PosesEntry)
         if instrument not in LINE_INSTRUMENTS and entry.quantity_key("poses", "length") is not None:
@@ -344,39 +342,36 @@ def read_runs(top: Section) -> tuple[CampaignRun, ...]:
     return tuple(runs)
 
 
-# The campaign.
-
-
 @dataclass(frozen=True)
 class Campaign:
-    """A calibration campaign on a box of commanded tool positions; ModelError if it is impossible."""
+    """A calibration campaign in a box of commanded tool positions. ModelError if a value is out of its range."""
 
     box: Annotated[np.ndarray, Numbers("mm", (2, 3))]  # lowest and highest corner in the work frame, m
-    cell: Annotated[float, Numbers("mm")]  # distance of the grid's lines, m
-    step: Annotated[float, Numbers("mm")]  # distance of the readings along a line, m
-    instrument: str | None = "5-D"  # one of INSTRUMENTS on every grid line; None for no lines
-    diagonals: int = 4  # one of DIAGONALS, read by a 1-D laser
+    cell: Annotated[float, Numbers("mm")]  # distance between neighbouring grid lines, m
+    step: Annotated[float, Numbers("mm")]  # distance between neighbouring readings along a line, m
+    instrument: str | None = "5-D"  # one of INSTRUMENTS, used on every grid line; None: grid lines are not measured
+    diagonals: int = 4  # number of diagonals, one of DIAGONALS, measured with a 1-D laser
     cycles: Annotated[int, Integer(1, MOST_READINGS)] = 1  # passes forward and backward over each line
-    poses: Annotated[int, Integer(0, MOST_READINGS)] = 0  # scattered in the box, read in position and attitude
-    tilt: Annotated[float, Numbers("deg")] = 0.0  # largest tilt about x and y of the scattered poses, rad
-    noise: tuple[float, ...] = tuple(DEFAULT_UNCERTAINTY.values())  # 1 σ of a reading by kind (KINDS), m or rad
+    poses: Annotated[int, Integer(0, MOST_READINGS)] = 0  # number of random poses, read in position and attitude
+    tilt: Annotated[float, Numbers("deg")] = 0.0  # largest tilt about x and about y of the random poses, rad
+    noise: tuple[float, ...] = tuple(DEFAULT_UNCERTAINTY.values())  # 1 σ of a reading of each of KINDS, m or rad
     beam_slope: Annotated[float, Numbers("urad")] = 100e-6  # 1 σ of a straightness beam's unknown slope, rad
-    centre_off: Annotated[float, Numbers("mm")] = 0.3e-3  # 1 σ of a centre of lengths beside its place, each axis, m
-    repeatability: Annotated[float, Numbers("um")] = 0.0  # 1 σ of where the machine really stops, each axis, m
-    level: np.ndarray = field(default_factory=lambda: np.eye(3))  # tool in the work frame; scattered poses tilt from it
-    runs: tuple[CampaignRun, ...] = ()  # listed one by one, in measuring order, after all others
+    centre_off: Annotated[float, Numbers("mm")] = 0.3e-3  # 1 σ of the error of a length's stated centre, each axis, m
+    repeatability: Annotated[float, Numbers("um")] = 0.0  # 1 σ of the scatter of the machine's stops, each axis, m
+    level: np.ndarray = field(default_factory=lambda: np.eye(3))  # untilted attitude of the tool in the work frame
+    runs: tuple[CampaignRun, ...] = ()  # listed runs, measured in this order after lines, diagonals and random poses
 
     def __post_init__(self) -> None:
         box = np.array(self.box, dtype=float)
         object.__setattr__(self, "box", box)
         if box.shape != (2, 3) or not (np.isfinite(box).all() and (box[0] < box[1]).all()):
-            raise ModelError("box", "must be its lowest and its highest corner", box.tolist())
+            raise ModelError("box", "must be the box's lowest corner and its highest corner", box.tolist())
         for name in ("cell", "step"):
             if not 0.0 < getattr(self, name) <= np.ptp(box, axis=0).min() + 1e-9:
-                problem = "must be above zero and no longer than the box's shortest side, m"
+                problem = "must be above zero and at most the length of the box's shortest side, m"
                 raise ModelError(name, problem, getattr(self, name))
         if not (self.instrument or self.diagonals or self.poses or self.runs):
-            raise ModelError("instrument", "or diagonals, poses or runs: nothing is measured")
+            raise ModelError("instrument", "is missing, and so are diagonals, poses and runs: nothing is measured")
         if not 0.0 <= self.tilt < math.inf:
             raise ModelError("tilt", "must be finite and not negative", self.tilt)
         sizes = {name: getattr(self, name) for name in ("beam_slope", "centre_off", "repeatability")}
@@ -385,12 +380,12 @@ class Campaign:
                 raise ModelError(name, f"must be 0…{LARGEST_READING:g} m or rad", size)
         if len(self.noise) != len(KINDS):
             raise ModelError("noise", f"must be one number for each of {', '.join(KINDS)}", list(self.noise))
-        if not self._roughly() <= MOST_READINGS:
-            problem = f"would be some {self._roughly():.3g} readings, at most {MOST_READINGS} are allowed"
+        if not self._approximate_count() <= MOST_READINGS:
+            problem = f"give about {self._approximate_count():.3g} readings, allowed are {MOST_READINGS}"
             raise ModelError("cell, step, cycles, poses, runs", problem)
 
-    def _roughly(self) -> float:
-        """Return the approximate number of the campaign's readings, without making any."""
+    def _approximate_count(self) -> float:
+        """Return the approximate number of the campaign's readings without creating the readings."""
         sides = np.ptp(self.box, axis=0)
         cells, passes = sides / self.cell + 1.0, 2.0 * self.cycles * (sides / self.step + 1.0)
         of_lines = cells.prod() * (passes / cells).sum() * len(self.channels(0)) if self.instrument else 0.0
@@ -404,18 +399,18 @@ class Campaign:
         return math.sqrt(3.0) * self.repeatability
 
     def nodes(self, axis: int) -> np.ndarray:
-        """Return the coordinates of the grid's lines along an axis, m; the last cell may be narrower."""
+        """Return the grid's coordinates along an axis, m. The last cell may be narrower than `cell`."""
         low, high = self.box[:, axis]
         inner = np.arange(low, high - 1e-3 * self.cell, self.cell)
         return np.append(inner, high)
 
     def channels(self, axis: int) -> tuple[str, ...]:
-        """Return the channels on a grid line along an axis."""
+        """Return the channels that are read on a grid line parallel to axis 0, 1 or 2."""
         return line_channels(self.instrument or "1-D", axis)
 
 
 def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
-    """Read a campaign file (YAML, see config/campaign_5d.yaml), or a shipped one by its name."""
+    """Read a campaign file (YAML, see config/campaign_5d.yaml) by its path, or a shipped campaign by its name."""
     path = input_file(path, "campaign")
     top = read_yaml(path, CAMPAIGN_FORMAT, CAMPAIGN_VERSION)
     instrument = top.choice("instrument", (*INSTRUMENTS, "none"), "none")
@@ -434,7 +429,7 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
 
 
 def _grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> dict[str, Any]:
-    """Return box, the tool's attitude in it, and the distances of lines and of readings, if the file has none."""
+    """Return box, level, cell and step of a campaign. Take box and level from the machine if the file has no box."""
     mm, given = Numbers("mm"), dict[str, Any]()
     if own_box is None or top.quantity_key("box", "length") is not None:
         given["box"] = top.quantity("box", "length", (2, 3))
@@ -450,7 +445,7 @@ def _grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> dict[str, A
 
 
 def campaign_text(campaign: Campaign, remarks: Sequence[str] = ()) -> str:
-    """Return the file (YAML) of a campaign all of whose readings are its runs', with comments at the top."""
+    """Return a campaign that consists of listed runs only as YAML text, with `remarks` as comments at the top."""
     content = {"format": CAMPAIGN_FORMAT, "version": CAMPAIGN_VERSION, "box_mm": in_unit(campaign.box, "mm")}
     content["cycles"] = campaign.cycles
     units = ["urad" if kind in ANGULAR_KINDS else "um" for kind in KINDS]
@@ -464,13 +459,13 @@ def campaign_text(campaign: Campaign, remarks: Sequence[str] = ()) -> str:
 
 
 def template(campaign: Campaign, geometry: HexapodGeometry, seed: int = 0, name: str = "campaign") -> MeasurementSet:
-    """Return the readings of a campaign on a nominal machine with values of zero; a seed picks the scattered poses."""
+    """Return the readings, with value zero, of a campaign on a nominal machine; `seed` draws its random poses."""
     readings = campaign_readings(campaign, seed)
     return assemble(geometry, [reading._replace(source=FileLine(name, 0)) for reading in readings])
 
 
 def campaign_readings(campaign: Campaign, seed: int = 0) -> Iterator[Reading]:
-    """Yield a campaign's readings in measuring order, with values of zero."""
+    """Yield a campaign's readings, with value zero, in measuring order; `seed` draws its random poses."""
     for run in _grid_runs(campaign):
         yield from run.readings(campaign.cycles)
     yield from _scattered(campaign, seed)
@@ -479,7 +474,7 @@ def campaign_readings(campaign: Campaign, seed: int = 0) -> Iterator[Reading]:
 
 
 def _grid_runs(campaign: Campaign) -> Iterator[CampaignRun]:
-    """Yield the lines of the grid, and the diagonals."""
+    """Yield a run for each line of the campaign's grid, then a run for each diagonal."""
 
     def run(name: str, instrument: str, ends: np.ndarray) -> CampaignRun:
         points = max(2, round(float(np.linalg.norm(ends[1] - ends[0])) / campaign.step) + 1)
@@ -498,7 +493,7 @@ def _grid_runs(campaign: Campaign) -> Iterator[CampaignRun]:
 
 
 def diagonals(box: np.ndarray) -> list[np.ndarray]:
-    """Return the ends (2, 3) of a box's four body diagonals, and of the two diagonals of each of its six faces."""
+    """Return the ends, (2, 3) each, of a box's 4 body diagonals, then of the 2 diagonals of each of its 6 faces."""
     corners = [(np.array(c), 1 - np.array(c)) for c in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0))]
     for a, b in CROSS_AXES:
         for side, turned in np.ndindex(2, 2):
@@ -509,7 +504,7 @@ def diagonals(box: np.ndarray) -> list[np.ndarray]:
 
 
 def _scattered(campaign: Campaign, seed: int) -> Iterator[Reading]:
-    """Yield the tracker's readings at random poses."""
+    """Yield a tracker's readings, with value zero, at the campaign's random poses."""
     rng = np.random.default_rng(seed)
     channels = [f"{kind}_{a}" for kind in ("position", "attitude") for a in AXES]
     for number in range(campaign.poses):

@@ -1,10 +1,10 @@
-"""Collecting a campaign's readings on a running machine, from station to station, into a file that is always complete.
+"""Collecting of a campaign's readings on a running machine, station by station, into a tidy CSV file.
 
-The machine is whatever can be sent to a pose and watched there by an instrument: one that reads poses of the tool, a
-tracker or motion capture, or one that reads single channels, a laser on a line or a ball bar. What they read is written
-as the campaign's channels, so that ``fit`` takes the file. An interrupted run continues after the stations that its
-file has, or begins anew if the interruption has lost its unknown zero. First readings are compared with the commands:
-:mod:`.set_up` reports a mistake then, not when everything has been measured.
+The instrument reads either poses of the tool (a tracker, motion capture) or single channels (a laser on a line, a ball
+bar). The file holds the readings as the campaign's channels, so ``fit`` can read it, and it can be read at any time
+during the campaign. After an interruption `collect` continues behind the stations in the file; it repeats a run whose
+unknown zero the interruption has changed. :mod:`.set_up` compares the first readings with the commands, so that a
+mistake in the instrument's set-up is reported at the start of the campaign.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from ..core.batch import quaternion_of
-from ..errors import HexapodError, InputFileError
+from ..errors import HexapodError, InputFileError, PoseError
 from ..machine.geometry import HexapodGeometry
 from ..machine.passes import APPROACH
 from ..pose import Pose, attitude_error
@@ -45,7 +45,7 @@ from .set_up import (
     LARGEST_ERROR,
     PoseCheck,
     SetUpError,
-    WayCheck,
+    TravelCheck,
     check_nudges,
     dimension,
     nudge,
@@ -55,33 +55,36 @@ from .tidy import read_tidy, write_measurements
 
 __all__ = ["Collected", "InstrumentMachine", "MeasuredMachine", "Observation", "RunSetUp", "SetUpError", "collect"]
 
-SAVE_EVERY = 5.0  # Period at which the file is rewritten, s, also at the end of each run
+SAVE_EVERY = 5.0  # Time between two rewrites of the file, s; the file is also rewritten at the end of each run
 PASSES = (FORWARD, BACKWARD)  # Directions of a pass over a line
-MOVED = 2.0 * LARGEST_ERROR  # Frames from two sets of stations differ by less, m, if the tracker stood
-BROKEN = "a broken beam"
-FRAME_REMARK = "tracker frame in base, mm and quaternion: "  # of a file whose poses came from a tracker anywhere
-OPEN = "open"  # in place of the frame while too little was measured to know it
+# Largest distance, m, between places of the tool by two estimates of the tracker's frame: more means a moved tracker
+LARGEST_FRAME_SHIFT = 2.0 * LARGEST_ERROR
+BROKEN_BEAM = "a broken beam"
+FRAME_REMARK = "tracker frame in base, mm and quaternion: "  # first line of a file measured with a free tracker frame
+OPEN = "open"  # written in place of the frame while too few stations are measured to estimate it
 
 
 class Observation(NamedTuple):
-    """A reading of a machine at rest."""
+    """All readings of one stop of the machine."""
 
-    pose: Pose | None  # ``pose_tool_in_base``, or in the tracker's frame, averaged; None: no instrument of poses
-    uncertainty: np.ndarray  # (6,) its standard deviation along and about the axes of ``base``, m and rad; NaN: unknown
-    struts: tuple[float, ...] | None = None  # measured lengths, m
-    temperatures: tuple[float, ...] | None = None  # struts 1–6, base, platform, °C
-    time: float = math.nan  # s
-    channels: Mapping[str, tuple[float, float]] = {}  # what is read itself, from any zero, and its deviation, m or rad
-    zero_lost: bool = False  # the zeros of these are others than at the observation before: a beam was broken
-    gravity: tuple[float, ...] | None = None  # in ``base``, m/s²
+    pose: Pose | None  # averaged pose of the tool in ``base`` or in the tracker's frame; None: poses are not measured
+    # (6,): standard deviation of the pose along and about the axes of the frame of the pose, m and rad; NaN: unknown
+    uncertainty: np.ndarray
+    struts: tuple[float, ...] | None = None  # measured strut lengths, m
+    temperatures: tuple[float, ...] | None = None  # of struts 1–6, base and platform, °C
+    time: float = math.nan  # when the readings were taken, s
+    channels: Mapping[str, tuple[float, float]] = {}  # reading (zero arbitrary) and its standard deviation, m or rad
+    zero_lost: bool = False  # whether the channels' zeros have changed since the last observation: a broken beam
+    gravity: tuple[float, ...] | None = None  # direction and size of gravity in ``base``, m/s²
 
 
 class RunSetUp(NamedTuple):
-    """What an instrument is set up for: one run of a campaign."""
+    """One run of a campaign, as the instrument must be set up for it."""
 
     name: str
     channels: tuple[str, ...]
-    # In base: of a line its first point, and x along it, forward; of lengths the first centre; else the first pose
+    # In base. Line: its first point, with x along the line's forward direction. Lengths: the first centre. Other runs:
+    # the first commanded pose of the tool.
     place: Pose
 
 
@@ -89,34 +92,34 @@ class MeasuredMachine(Protocol):
     """A machine that moves to poses, with an instrument that measures its tool."""
 
     def move(self, pose: Pose) -> object:
-        """Move the tool to ``pose_tool_in_work`` and return when it has settled; a HexapodError where it cannot."""
+        """Move the tool to ``pose_tool_in_work`` and return when it has settled; HexapodError if that is impossible."""
 
     def observe(self) -> Observation | None:
-        """Return the instrument's reading; None if it reads nothing, as with a broken beam."""
+        """Return the readings at this stop; None if the instrument reads nothing, for example with a broken beam."""
 
 
 @runtime_checkable
 class InstrumentMachine(MeasuredMachine, Protocol):
-    """A machine whose instrument is set up for each run."""
+    """A machine whose instrument must be set up anew for each run."""
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
-        """Return, when it is set up, which of the run's channels it reads itself; the others come from poses."""
+        """Set up the instrument for a run; return the channels that it reads. The others are computed from poses."""
 
 
 class Visit(NamedTuple):
-    """One stop: all channels read at a station in one pass of a run."""
+    """One stop of the machine: all channels that are read at a station in one pass of a run."""
 
     run: str
     cycle: int
     direction: int
     pose: Pose  # ``pose_tool_in_work``
-    readings: tuple[int, ...]  # indices among the campaign's
+    readings: tuple[int, ...]  # indices into the campaign's readings
     first_of_pass: bool
-    approach: Pose | None  # from where it is reached in the direction of its pass
+    approach: Pose | None  # pose from which the stop is reached in the direction of its pass; None: from anywhere
 
     @property
     def where(self) -> str:
-        """Where it is, for people."""
+        """Run, cycle and position of the stop as text for messages."""
         return f"{self.run}, cycle {self.cycle}, at {(self.pose.position * 1e3).round(3).tolist()} mm"
 
 
@@ -125,8 +128,8 @@ class Collected:
     """Result of :func:`collect`."""
 
     measurements: MeasurementSet
-    resumed: int  # number of stops that the file had already
-    missing: tuple[str, ...]  # stops at which the instrument read nothing
+    resumed: int  # number of stops whose readings were in the file at the start
+    missing: tuple[str, ...]  # stops at which the instrument read nothing, and runs that lost their zero
 
 
 def collect(
@@ -140,14 +143,15 @@ def collect(
     going_on: Callable[[], bool] = lambda: True,
     tracker_frame: str = KNOWN,
 ) -> Collected:
-    """Visit a campaign's stations in its order and write what is read there as tidy CSV; `seed` draws scattered poses.
+    """Visit a campaign's stations in order and write the readings to `path` as tidy CSV; `seed` draws random poses.
 
-    A file that is there already must hold readings of this campaign, and is completed. An instrument that reads nothing
-    is asked `attempts` times, and a run whose zero is lost on the way is begun as often. `progress` is told, at each
-    stop, the number of those done, of all, and where it is; `going_on` ends the run before a stop. With
-    `tracker_frame` ``free`` poses are measured in a frame that is estimated from the first stations. A SetUpError is a
-    mistake in sign, unit, channel, frame or target, an InputFileError a file of another campaign; what was read is in
-    the file.
+    If the file exists, it must hold readings of this campaign; the missing readings are added. An instrument that reads
+    nothing is asked up to `attempts` times. A run whose zero is lost is measured up to `attempts` times. `progress` is
+    called before each stop with the number of finished stops, the number of all stops and a text that names the stop.
+    `going_on` is called before each stop; if it returns False, collecting ends there. With `tracker_frame` ``free``
+    poses are measured in a frame that is estimated from the first stations. A SetUpError reports a mistake in sign,
+    unit, channel, frame or target; an InputFileError reports a file of another campaign. Readings taken before an
+    error are in the file.
     """
     work = _Collecting(geometry, machine, list(campaign_readings(campaign, seed)), path, attempts, tracker_frame)
     work.progress, work.going_on = progress, going_on
@@ -168,7 +172,7 @@ def collect(
 
 
 class _Collecting:
-    """A campaign in progress: the readings taken so far, and the poses of the instruments as far as they are known."""
+    """A campaign in progress: the readings taken so far, and the tracker's frame once it is estimated."""
 
     def __init__(
         self,
@@ -184,9 +188,8 @@ class _Collecting:
         self._plan = assemble(geometry, [reading._replace(source=FileLine("campaign", 0)) for reading in listed])
         self._directions, points = self._plan.directions(), self._plan.points()
         away = np.linalg.norm(points[self._plan.station] - self._plan.centre, axis=1)
-        self._ways = np.where(
-            np.isnan(away), self._plan.along(), away
-        )  # along a line, or the distance from a length's centre
+        # Commanded coordinate along the line, or commanded distance from a length's centre, m
+        self._commanded = np.where(np.isnan(away), self._plan.along(), away)
         self.visits, self.missing, self.resumed = list(_visits(listed)), list[str](), 0
         angular = any(reading.channel.partition("_")[0] in ANGULAR_KINDS for reading in listed)
         self.poses = PoseCheck(geometry.characteristic_length, tracker_frame, angular)
@@ -195,16 +198,16 @@ class _Collecting:
         if Path(path).exists():
             self.found = _resumed(path, geometry, listed)
             self._frame = _stated_frame(path, tracker_frame)
-        self._unplaced: list[tuple[int, Observation, Pose]] = []  # in a frame that does not show yet
-        self._nudged: set[tuple[str, ...]] = set()  # channels that were checked
-        self._saved, self._here = time.monotonic(), -1  # when, and the stop at which the machine stands
+        self._unplaced: list[tuple[int, Observation, Pose]] = []  # readings taken before the frame is estimated
+        self._nudged: set[tuple[str, ...]] = set()  # channels that small moves of the tool have checked
+        self._saved, self._present_stop = time.monotonic(), -1  # time of the last save, s; stop at which the machine is
         self.progress: Callable[[int, int, str], object]
         self.going_on: Callable[[], bool]
 
     # ---- runs and stops ----
 
     def run(self, stops: Sequence[int]) -> None:
-        """Visit the stops of a run that have no reading yet; begin anew where the zero of its readings is lost."""
+        """Visit the stops of a run that have no reading yet. Repeat the run if the zero of its readings is lost."""
         if self._all_found(stops):
             self.resumed += len(stops)
             return
@@ -213,13 +216,13 @@ class _Collecting:
         run = self._plan.runs[self._plan.run[readings[0]]]
         own: Collection[str] = ()
         if isinstance(self._machine, InstrumentMachine):
-            place = self._place(run, self.visits[stops[0]])
+            place = self._instrument_pose(run, self.visits[stops[0]])
             own = [c for c in channels if c in self._machine.set_up(RunSetUp(run.name, channels, place))]
         counting = bool(own) and not run.known_zero
         missing, causes = list(self.missing), list[str]()
         for _ in range(self._attempts if counting else 1):
             self.missing = list(missing)
-            if counting:  # whoever was away does not know whether the zero is still the same
+            if counting:  # readings from before an interruption may have another zero: measure the whole run again
                 for n in readings:
                     self.found.pop(n, None)
             cause = self._pass_over(stops, own, counting)
@@ -227,7 +230,7 @@ class _Collecting:
                 break
             causes.append(cause)
         else:
-            if BROKEN not in causes:
+            if BROKEN_BEAM not in causes:
                 question = "is the centre or the target elsewhere, or is something in the beam"
                 raise SetUpError(f"{causes[-1]}, each of {self._attempts} times: {question}?")
             self.missing.append(f"{run.name}, whose zero was lost {self._attempts} times")
@@ -236,8 +239,8 @@ class _Collecting:
     def _all_found(self, stops: Sequence[int]) -> bool:
         return all(n in self.found for k in stops for n in self.visits[k].readings)
 
-    def _place(self, run: Run, first: Visit) -> Pose:
-        """Return where an instrument stands: see :class:`RunSetUp`."""
+    def _instrument_pose(self, run: Run, first: Visit) -> Pose:
+        """Return the pose at which the instrument is set up for a run: see `place` of :class:`RunSetUp`."""
         n = first.readings[0]
         if run.is_line:
             across = np.linalg.svd(run.axis[None])[2][1]
@@ -246,10 +249,10 @@ class _Collecting:
         return pose if self._listed[n].centre is None else Pose(self._plan.centre[n], np.eye(3))
 
     def _pass_over(self, stops: Sequence[int], own: Collection[str], counting: bool) -> str:
-        """Visit a run's stops that are not found yet; return the reason if the zero was lost, else an empty text."""
+        """Visit a run's stops that have no reading yet. Return why the zero was lost, or "" if it was not lost."""
         zeros: dict[str, float] = {}
         checked = not own or tuple(own) in self._nudged
-        ways = {channel: WayCheck(channel, checked) for channel in own}
+        checks = {channel: TravelCheck(channel, checked) for channel in own}
         for k in stops:
             visit = self.visits[k]
             if self._all_found([k]):
@@ -258,38 +261,38 @@ class _Collecting:
             if not self.going_on():
                 return ""
             self.progress(k, len(self.visits), visit.where)
-            self._go(k)
+            self._move_to_stop(k)
             if not checked:
                 if not self._check_channels(visit, own):
-                    return BROKEN
+                    return BROKEN_BEAM
                 checked = True
-                self._go(k)
+                self._move_to_stop(k)
             seen = self._observe()
             if seen is None:
                 self.missing.append(visit.where)
                 continue
             if seen.zero_lost and counting and zeros:
-                return BROKEN
-            if jumped := self._take_channels(visit, seen, ways, zeros):
+                return BROKEN_BEAM
+            if jumped := self._add_channels(visit, seen, checks, zeros):
                 if counting:
                     return jumped
                 self.missing.append(visit.where)
                 continue
-            self._take_pose(visit, seen, own)
+            self._add_pose(visit, seen, own)
             if time.monotonic() - self._saved > SAVE_EVERY:
                 self.save()
         return ""
 
-    def _go(self, k: int) -> None:
-        """Move to a stop, in the direction of its pass."""
+    def _move_to_stop(self, k: int) -> None:
+        """Move to stop number `k` in the direction of its pass."""
         visit = self.visits[k]
-        if visit.approach is not None and (visit.first_of_pass or self._here != k - 1):
+        if visit.approach is not None and (visit.first_of_pass or self._present_stop != k - 1):
             self._move(visit.approach)
         self._machine.move(visit.pose)
-        self._here = k
+        self._present_stop = k
 
     def _move(self, pose: Pose) -> bool:
-        """Move somewhere that need not be reached; return False where a limit forbids it."""
+        """Move to an auxiliary pose; return False if a limit of the machine forbids it."""
         try:
             self._machine.move(pose)
         except HexapodError as error:
@@ -299,12 +302,11 @@ class _Collecting:
         return True
 
     def _observe(self) -> Observation | None:
-        """Return the instrument's reading; ask again where it reads nothing."""
+        """Return the readings at this stop. Ask the instrument up to `attempts` times; None if it reads nothing."""
         return next((o for o in (self._machine.observe() for _ in range(self._attempts)) if o is not None), None)
 
     def _check_channels(self, visit: Visit, own: Collection[str]) -> bool:
-        """Move the tool a little along each channel's direction and hold what they read against it; False: their zero
-        was lost meanwhile."""
+        """Compare the channels' readings with small moves of the tool along their directions; False: a lost zero."""
         chosen = [n for n in visit.readings if self._listed[n].channel in own]
         directions, before = self._directions[chosen], self._observe()
         names = [self._listed[n].channel for n in chosen]
@@ -320,28 +322,27 @@ class _Collecting:
                     break
             else:
                 raise SetUpError(f"the limits leave no room to move along {name} at {visit.where}")
-        tolerances = [nudge_tolerance(self._listed[n].channel, float(self._ways[n])) for n in chosen]
+        tolerances = [nudge_tolerance(self._listed[n].channel, float(self._commanded[n])) for n in chosen]
         check_nudges(names, directions, seen, tolerances)
         self._nudged.add(tuple(own))
         return True
 
     # ---- readings ----
 
-    def _take_channels(
-        self, visit: Visit, seen: Observation, ways: Mapping[str, WayCheck], zeros: dict[str, float]
+    def _add_channels(
+        self, visit: Visit, seen: Observation, checks: Mapping[str, TravelCheck], zeros: dict[str, float]
     ) -> str:
-        """Add what an instrument read itself; return the jump that no machine makes, as text, empty if there is
-        none."""
+        """Add an instrument's readings. If a reading jumped by more than a machine can, add none and return a text."""
         added, jumped = {}, ""
         for n in visit.readings:
             reading = self._listed[n]
-            if reading.channel in ways:
-                (read, deviation), way = seen.channels[reading.channel], float(self._ways[n])
+            if reading.channel in checks:
+                (read, deviation), commanded = seen.channels[reading.channel], float(self._commanded[n])
                 follows = reading.channel in ("linear", "length")
-                if jump := ways[reading.channel].jump(way, read):
+                if jump := checks[reading.channel].jump(commanded, read):
                     unit = "mrad" if dimension(reading.channel) == "angle" else "mm"
                     jumped = f"{reading.channel} jumps by {jump * 1e3:.3g} {unit} on the way to {visit.where}"
-                value = read - (way if follows else 0.0)
+                value = read - (commanded if follows else 0.0)
                 if not reading.known_zero:
                     value -= zeros.setdefault(reading.channel, value)
                 added[n] = self._reading(reading, value, deviation, seen)
@@ -349,8 +350,8 @@ class _Collecting:
             self.found |= added
         return jumped
 
-    def _take_pose(self, visit: Visit, seen: Observation, own: Collection[str]) -> None:
-        """Add what a measured pose shows of the channels that no instrument read itself."""
+    def _add_pose(self, visit: Visit, seen: Observation, own: Collection[str]) -> None:
+        """Compute the channels that no instrument reads from the measured pose, and add them as readings."""
         wanted = [n for n in visit.readings if self._listed[n].channel not in own]
         if not wanted:
             return
@@ -358,24 +359,24 @@ class _Collecting:
             self.missing.append(visit.where)
             return
         if not self.poses.plausible(self._geometry.work @ visit.pose, seen.pose):
-            return  # not usable, and the next stops give the reason
+            return  # this pose cannot be right; the check at the next stops reports the reason
         self._unplaced += [(n, seen, seen.pose) for n in wanted]
-        shown = self.poses.frame()
+        estimated = self.poses.frame()
         if self._frame is None:
-            self._frame = shown
+            self._frame = estimated
         if self._frame is None:
             return
-        apart = (
-            0.0 if shown is None else np.linalg.norm((shown @ seen.pose).position - (self._frame @ seen.pose).position)
-        )
-        if apart > MOVED:
-            text = f"the tracker stands {apart * 1e3:.1f} mm from where it stood when the file was begun"
+        shift = 0.0
+        if estimated is not None:
+            shift = float(np.linalg.norm((estimated @ seen.pose).position - (self._frame @ seen.pose).position))
+        if shift > LARGEST_FRAME_SHIFT:
+            text = f"the tracker stands {shift * 1e3:.1f} mm from where it stood when the file was begun"
             raise SetUpError(f"{text}: give another file")
-        self.found |= {n: self._of_pose(n, then, self._frame, pose) for n, then, pose in self._unplaced}
+        self.found |= {n: self._reading_from_pose(n, then, self._frame, pose) for n, then, pose in self._unplaced}
         self._unplaced.clear()
 
-    def _of_pose(self, n: int, seen: Observation, frame: Pose, pose: Pose) -> Reading:
-        """Return a reading from a measured pose in an instrument's frame."""
+    def _reading_from_pose(self, n: int, seen: Observation, frame: Pose, pose: Pose) -> Reading:
+        """Return reading number `n` of the campaign, computed from a measured pose in the tracker's frame."""
         reading, w = self._listed[n], self._directions[n]
         commanded, measured = self._geometry.work @ reading.pose, frame @ pose
         off = measured.position - commanded.position
@@ -384,11 +385,11 @@ class _Collecting:
             value = float(np.linalg.norm(measured.position - centre) - np.linalg.norm(commanded.position - centre))
         else:
             value = float(w @ np.concatenate([off, attitude_error(measured.rotation, commanded.rotation)]))
-        along = np.concatenate([w[:3] @ frame.rotation, w[3:] @ frame.rotation])  # as the instrument's axes see it
+        along = np.concatenate([w[:3] @ frame.rotation, w[3:] @ frame.rotation])  # w in the tracker's frame
         return self._reading(reading, value, float(np.sqrt(along**2 @ seen.uncertainty**2)), seen)
 
     def _reading(self, reading: Reading, value: float, deviation: float, seen: Observation) -> Reading:
-        """Return a campaign's reading with its value, and the temperatures and load at that time."""
+        """Return a campaign's reading with its measured value, temperatures, time and load filled in."""
         payload = self._geometry.payload
         load = (payload.mass, *payload.centre) if payload.mass else NO_LOAD[:4]
         return reading._replace(
@@ -401,11 +402,11 @@ class _Collecting:
         )
 
     def save(self) -> MeasurementSet | None:
-        """Write the readings, without lines of one point; return them, None where there are none."""
+        """Write the readings to the file and return them; None if there are none. Leave out lines of one point."""
         places: dict[str, set[bytes]] = {}
         for reading in self.found.values():
             places.setdefault(reading.run, set()).add(reading.pose.position.tobytes())
-        self._tell_directions()
+        self._set_directions()
         kept = [
             self.found[n]
             for n in sorted(self.found)
@@ -418,8 +419,8 @@ class _Collecting:
         write_measurements(whole, self._path, self._frame_remark())
         return whole
 
-    def _tell_directions(self) -> None:
-        """Set the direction of poses outside of passes: reached from the pose before, or unknown after a gap."""
+    def _set_directions(self) -> None:
+        """Set the direction of poses that are not on a line: from the pose before, or unknown after a missing one."""
         for before, visit in zip([None, *self.visits], self.visits, strict=False):
             if visit.direction not in PASSES:
                 read = before is not None and before.run == visit.run and before.readings[0] in self.found
@@ -427,7 +428,7 @@ class _Collecting:
                     self.found[n] = self.found[n]._replace(direction=FROM_PREVIOUS if read else UNKNOWN)
 
     def _frame_remark(self) -> str:
-        """Return the note for the file about a tracker whose frame is unknown."""
+        """Return the remark for the file that states a free tracker frame; "" if the tracker's frame is the base."""
         if not self.poses.free:
             return ""
         if self._frame is None:
@@ -437,7 +438,7 @@ class _Collecting:
 
 
 def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
-    """Yield the stops of a campaign's readings, in their order."""
+    """Yield the stops at which a campaign's readings are taken, in measuring order."""
 
     def stop(n: int) -> tuple[str, int, int, bytes]:
         r = listed[n]
@@ -449,22 +450,22 @@ def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
         r = listed[members[0]]
         this = r.run, r.cycle, r.direction
         approach = None
-        if r.direction not in PASSES:  # poses one after the other, each reached from the one before
+        if r.direction not in PASSES:  # each pose of such a run is reached from the pose before
             approach = last.pose if k and (last := listed[stops[k - 1][0]]).run == r.run else None
             yield Visit(*this, r.pose, members, False, approach)
             continue
-        for other, sign in ((k + 1, -1.0), (k - 1, 1.0)):  # the way from here to the next stop, or from the last one
+        for other, sign in ((k + 1, -1.0), (k - 1, 1.0)):  # travel to the next stop of the pass, or from the last
             there = listed[stops[other][0]] if 0 <= other < len(stops) else None
             if approach is None and there and (there.run, there.cycle, there.direction) == this:
-                way = sign * (there.pose.position - r.pose.position)
-                if (length := float(np.linalg.norm(way))) > 0.0:
-                    approach = Pose(r.pose.position + way * (APPROACH / length), r.pose.rotation)
+                travel = sign * (there.pose.position - r.pose.position)
+                if (length := float(np.linalg.norm(travel))) > 0.0:
+                    approach = Pose(r.pose.position + travel * (APPROACH / length), r.pose.rotation)
         yield Visit(*this, r.pose, members, this != before, approach)
         before = this
 
 
 def _resumed(path: str | Path, geometry: HexapodGeometry, listed: Sequence[Reading]) -> dict[int, Reading]:
-    """Return the campaign's readings that a file has already, by their number."""
+    """Return the readings that the file at `path` already holds, by their number in the campaign."""
 
     def key(run: str, cycle: int, direction: int, pose: Pose, channel: str) -> tuple[object, ...]:
         place = np.concatenate([pose.position * 1e6, pose.rotation.ravel() * 1e6]).round().astype(int)
@@ -476,13 +477,13 @@ def _resumed(path: str | Path, geometry: HexapodGeometry, listed: Sequence[Readi
         n = number.get(key(reading.run, reading.cycle, reading.direction, reading.pose, reading.channel))
         if n is None:
             problem = f"run {reading.run}, {reading.channel} is no reading of this campaign; give another file"
-            raise InputFileError(path, str(reading.source.line), problem)
+            raise InputFileError(path, f"line {reading.source.line}", problem)
         found[n] = reading
     return found
 
 
 def _stated_frame(path: str | Path, tracker_frame: str) -> Pose | None:
-    """Return the tracker's frame that a file states, or the base; None where it is yet to be found."""
+    """Return the tracker's frame that a file states, or the base's frame; None if the file's frame is still open."""
     with Path(path).open(encoding="utf-8") as file:
         remarks = [line[2:] for line in file if line.startswith(f"# {FRAME_REMARK}")]
     if bool(remarks) != (tracker_frame == FREE):
@@ -493,5 +494,9 @@ def _stated_frame(path: str | Path, tracker_frame: str) -> Pose | None:
     text = remarks[0].removeprefix(FRAME_REMARK).strip()
     if text == OPEN:
         return None
-    numbers = np.array(text.split(","), dtype=float)
-    return Pose.from_quaternion(numbers[:3] * 1e-3, numbers[3:])
+    try:
+        numbers = np.array(text.split(","), dtype=float)
+        return Pose.from_quaternion(numbers[:3] * 1e-3, numbers[3:])
+    except (PoseError, ValueError) as error:
+        problem = "must be a position, mm, and a quaternion: seven numbers"
+        raise InputFileError(path, "tracker frame", problem, text) from error

@@ -1,4 +1,4 @@
-"""One reader for measured files of every kind."""
+"""Reading of measured files, tidy or wide, into one :class:`~.readings.MeasurementSet`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def read_measurements(
     probe: np.ndarray | None = None,
     in_reach: bool = True,
 ) -> MeasurementSet:
-    """Read measured files, whatever wrote them, as one set.
+    """Read measured files of any instrument into one set.
 
     Parameters
     ----------
@@ -34,17 +34,17 @@ def read_measurements(
     geometry : HexapodGeometry
         The machine that was measured.
     columns : path, optional
-        Columns file that explains them, or the name of a shipped one; without it they are tidy CSV, one
-        reading a row.
+        Columns file that explains wide CSV files, or the name of a shipped columns file. Without it the files
+        must be tidy CSV: one reading in each row.
     probe : array_like, shape (3,), optional
         The measured point in ``platform``, m; the tool's tip by default.
     in_reach : bool
-        Refuse commands that the nominal machine cannot take; the figures of a standard do not need that.
+        Refuse commanded poses that the nominal machine cannot reach. The figures of ISO 230 do not need this check.
 
     Raises
     ------
     InputFileError
-        Naming file and place.
+        If a file cannot be read; the error names the file, the line and the column.
     """
     paths = [paths] if isinstance(paths, str | Path) else paths
     if not paths:
@@ -53,7 +53,7 @@ def read_measurements(
     columns = None if columns is None else config_file(columns, "columns", beside=True)
     if columns is not None and probe is not None:
         raise InputFileError(files[0], "", "a wide file is of the tool's tip; leave the probe out")
-    with _kept_in_memory():
+    with _garbage_collector_disabled():
         if columns is None:
             read = [read_tidy(path, geometry, probe) for path in files]
         else:
@@ -62,9 +62,8 @@ def read_measurements(
 
 
 @contextmanager
-def _kept_in_memory() -> Iterator[None]:
-    """Disable the garbage collector: rows become a million small objects, and collection takes a quarter of the
-    time."""
+def _garbage_collector_disabled() -> Iterator[None]:
+    """Disable the garbage collector while rows become small objects: collection would take a quarter of the time."""
     enabled = gc.isenabled()
     gc.disable()
     try:

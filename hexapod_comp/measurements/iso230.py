@@ -1,4 +1,4 @@
-"""Figures of ISO 230-2:2014, 230-4:2005 and 230-6:2002, and which of measured runs each standard judges."""
+"""Figures of ISO 230-2:2014, ISO 230-4:2005 and ISO 230-6:2002, and the choice of the runs that fit each standard."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from ..formats.texts import aligned, number
 from .readings import BACKWARD, CHANNELS, FORWARD, LEAST_TRAVEL, LENGTH, MeasurementSet
 
 DIRECTIONS = ("up", "down")  # approach in the positive direction, and in the negative
-STANDARD_CYCLES = 5  # how often the standard has each target approached from each side
-TARGETS_PER_METRE = 5  # fewest targets per metre, and fewest at all, that the standard asks for
-LONGEST_TRAVEL = 2.0  # longest travel, m, for which the standard prescribes this test
+STANDARD_CYCLES = 5  # approaches of each target from each side that ISO 230-2 requires
+TARGETS_PER_METRE = 5  # smallest number of targets per metre that ISO 230-2 requires, and on a line shorter than 1 m
+LONGEST_TRAVEL = 2.0  # longest travel, m, for which ISO 230-2 prescribes this test
 EVEN_SPACING = 1e-6  # targets whose spacings differ by less than this, m, count as evenly spaced
-SURE_REVERSAL = 3.0  # standard errors above which a mean reversal is no chance
+SURE_REVERSAL = 3.0  # a mean reversal above this number of standard errors counts as significant
 
 
 @dataclass(frozen=True, eq=False)
 class PositioningTest:
-    """A positioning test with its figures, as :func:`evaluate` returns it; directions are up, then down."""
+    """Figures of a positioning test. Arrays with one row per direction hold up (positive direction), then down."""
 
     targets: np.ndarray  # (m,): commanded positions along the line, m
-    cycles: int  # n, approaches of each target from each side
+    cycles: int  # n, number of approaches of each target from each side
     mean: np.ndarray  # (2, m): mean unidirectional deviations x̄ᵢ, m
     standard_deviation: np.ndarray  # (2, m): estimators sᵢ of the repeatability, with n − 1, m
-    reversal: np.ndarray  # (m,): Bᵢ = x̄ᵢ↑ − x̄ᵢ↓, m; negative where the motion lags, as with play
+    reversal: np.ndarray  # (m,): Bᵢ = x̄ᵢ↑ − x̄ᵢ↓, m; negative if the motion lags behind the command, as with backlash
     repeatability: np.ndarray  # (3, m): Rᵢ↑, Rᵢ↓ and Rᵢ of both directions, m
-    figures: dict[str, float]  # the axis' figures by the standard's symbols, m: ``A``, ``A_up``, …, ``B_mean``, ``M``
-    notes: tuple[str, ...]  # where the test departs from the standard's, and what looks wrong: one sentence each
+    figures: dict[str, float]  # figures of the axis by the standard's symbols, m: ``A``, ``A_up``, …, ``B_mean``, ``M``
+    notes: tuple[str, ...]  # deviations of the test from the standard, and signs of a mistake: one sentence each
 
 
 def evaluate(positions: np.ndarray, readings: np.ndarray) -> PositioningTest:
-    """Return the figures of ISO 230-2:2014 for one line; readings (up and down, two or more cycles, targets), m."""
+    """Return the figures of ISO 230-2:2014 for one line; `readings` has shape (2: up, down; cycles ≥ 2; targets), m."""
     mean, s = readings.mean(axis=1), readings.std(axis=1, ddof=1)
     low, high = mean - 2.0 * s, mean + 2.0 * s
     reversal = mean[0] - mean[1]
@@ -53,8 +53,7 @@ def evaluate(positions: np.ndarray, readings: np.ndarray) -> PositioningTest:
 
 
 def _positioning_notes(targets: np.ndarray, cycles: int, reversal: np.ndarray, deviation: np.ndarray) -> list[str]:
-    """Return where a plan departs from the standard's, and whether the motion leads instead of lagging, beyond
-    chance."""
+    """Return notes on deviations from the standard, and on a significant reversal of the wrong sign."""
     notes = []
     travel = float(np.ptp(targets))
     needed = max(TARGETS_PER_METRE, math.ceil(TARGETS_PER_METRE * travel))
@@ -90,7 +89,7 @@ ROWS = {
 
 
 def report(test: PositioningTest, standard: str = "ISO 230-2:2014") -> str:
-    """Return a test as text, under the name of its standard: targets in mm, everything else in µm, notes below."""
+    """Return a test as text under the name of its standard: targets in mm, all other lengths in µm, then notes."""
 
     def cells(values: Iterable[float]) -> str:
         return "".join(f"{round(value * 1e6, 3) + 0.0:10.3f}" for value in values)  # never −0
@@ -109,42 +108,44 @@ def report(test: PositioningTest, standard: str = "ISO 230-2:2014") -> str:
     return "\n".join(lines)
 
 
-SENSES = {"ccw": FORWARD, "cw": BACKWARD}  # counter-clockwise and clockwise, seen against the circle's axis
-# Readings of one sense below which a circle of its own and a deviation from it cannot be told apart: it has three
-# unknowns
-FEWEST = 5
-FULL = np.radians(45.0)  # A circle without a larger gap between its readings is a full one
-SHORTEST = np.radians(90.0)  # A shorter arc tells no centre
-# Most times that a centre is moved, radii taken as linear in its shift; a shorter shift, m, ends it
-ROUNDS, SETTLED = 5, 1e-9
+SENSES = {"ccw": FORWARD, "cw": BACKWARD}  # counter-clockwise and clockwise, seen from the tip of the circle's axis
+FEWEST_READINGS = 5  # smallest number of readings of one sense: 3 determine a circle, 2 more check it
+LARGEST_GAP = np.radians(45.0)  # a circle is full if no gap between neighbouring readings is larger than this, rad
+SHORTEST_ARC = np.radians(90.0)  # a shorter arc, rad, does not determine a centre
+# Iterations for a circle's centre: largest number, and the shift, m, below which they stop
+ITERATIONS, CONVERGED = 5, 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class CircularTest:
-    """A circular test with its figures, as :func:`evaluate_circle` returns it."""
+    """Figures of a circular test."""
 
-    radius: float  # of the nominal path, m
-    readings: dict[str, int]  # how many in each sense that was run, by :data:`SENSES`
-    # by the standard's symbols, m: ``G_ccw`` and ``G_cw``, circular deviations; ``G_b``, the bidirectional one;
-    # ``F_max_ccw``, ``F_min_ccw`` and so on, radial deviations; ``D``, the mean bidirectional radial deviation. What
-    # the test cannot tell is left out.
+    radius: float  # radius of the nominal path, m
+    readings: dict[str, int]  # number of readings in each measured sense, a key of :data:`SENSES`
+    # Figures by the standard's symbols, m: circular deviations ``G_ccw`` and ``G_cw``, bidirectional circular deviation
+    # ``G_b``, radial deviations ``F_max_ccw``, ``F_min_ccw``, ``F_max_cw``, ``F_min_cw``, and mean bidirectional radial
+    # deviation ``D``. A figure that the test does not determine has no key.
     figures: dict[str, float]
-    notes: tuple[str, ...]  # where the test departs from the standard's: one sentence each
+    notes: tuple[str, ...]  # deviations of the test from the standard: one sentence each
 
 
 def evaluate_circle(
     radius: float, angles: np.ndarray, deviations: np.ndarray, senses: np.ndarray, length_known: bool = True
 ) -> CircularTest | None:
-    """Return the figures of ISO 230-4:2005 for one circle; None where readings of one sense are too few to tell."""
+    """Return the figures of ISO 230-4:2005 for one circle (m, rad).
+
+    None if a sense has fewer than `FEWEST_READINGS` readings or an arc shorter than `SHORTEST_ARC`.
+    """
     path = angles, deviations
     parts = {name: [column[senses == sense] for column in path] for name, sense in SENSES.items()}
     parts = {name: part for name, part in parts.items() if len(part[0])}
-    if any(len(part[0]) < FEWEST or 2.0 * np.pi - _largest_gap(part[0]) < SHORTEST for part in parts.values()):
+    arcs = [(len(part[0]), 2.0 * np.pi - _largest_gap(part[0])) for part in parts.values()]
+    if any(count < FEWEST_READINGS or arc < SHORTEST_ARC for count, arc in arcs):
         return None
     figures = {f"G_{name}": _separation(radius, *part) for name, part in parts.items()}
     if len(parts) == 2:
         figures["G_b"] = _separation(radius, *path)
-    full = all(_largest_gap(part[0]) <= FULL for part in parts.values())
+    full = all(_largest_gap(part[0]) <= LARGEST_GAP for part in parts.values())
     if full and length_known:
         for name, part in parts.items():
             radial = _from_least_squares_centre(radius, *part)
@@ -155,7 +156,7 @@ def evaluate_circle(
 
 
 def _largest_gap(angles: np.ndarray) -> float:
-    """Return the largest angle without a reading, rad."""
+    """Return the largest angle between neighbouring readings on the circle, rad."""
     turned = np.sort(np.mod(angles, 2.0 * np.pi))
     return float(np.diff(turned, append=turned[0] + 2.0 * np.pi).max())
 
@@ -163,20 +164,20 @@ def _largest_gap(angles: np.ndarray) -> float:
 def _seen_from(
     centre: np.ndarray, radius: float, angles: np.ndarray, deviations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the radial deviations about a centre, (n,), m, and the unit vectors from it, (n, 2)."""
+    """Return the radial deviations about a centre, (n,), m, and the unit vectors from it to the readings, (n, 2)."""
     arms = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1) - centre
     distances = np.linalg.norm(arms, axis=1)
     return radius + deviations - distances, arms / distances[:, None]
 
 
 def _separation(radius: float, angles: np.ndarray, deviations: np.ndarray) -> float:
-    """Return the least radial distance of two concentric circles with all readings between them, m."""
-    from scipy.optimize import linprog  # a quarter of a second that a fit of lines need not wait
+    """Return the smallest radial distance, m, of two concentric circles that enclose all readings between them."""
+    from scipy.optimize import linprog  # imported here since its import takes 0.25 s and only circles need it
 
     centre = np.zeros(2)
-    for _ in range(ROUNDS):
+    for _ in range(ITERATIONS):
         radial, away = _seen_from(centre, radius, angles, deviations)
-        # Of inner and outer deviation and the centre's shift: the distance of the first two, all readings between.
+        # Linear program for inner radius, outer radius and shift of the centre: minimise outer − inner radius.
         scale = max(float(np.ptp(radial)), np.finfo(float).tiny)
         ones, zeros = np.ones((len(radial), 1)), np.zeros((len(radial), 1))
         bounds = np.vstack([np.hstack([ones, zeros, -away]), np.hstack([zeros, -ones, away])])
@@ -184,15 +185,15 @@ def _separation(radius: float, angles: np.ndarray, deviations: np.ndarray) -> fl
         answer = linprog([-1.0, 1.0, 0.0, 0.0], bounds, np.concatenate([offset, -offset]), bounds=(None, None))
         shift = scale * answer.x[2:]
         centre = centre + shift
-        if np.linalg.norm(shift) < SETTLED:
+        if np.linalg.norm(shift) < CONVERGED:
             break
     return float(np.ptp(_seen_from(centre, radius, angles, deviations)[0]))
 
 
 def _from_least_squares_centre(radius: float, angles: np.ndarray, deviations: np.ndarray) -> np.ndarray:
-    """Return radial deviations seen from the centre of the least-squares circle, shape (n,), m."""
+    """Return the radial deviations about the centre of the least-squares circle, shape (n,), m."""
     centre = np.zeros(2)
-    for _ in range(ROUNDS):
+    for _ in range(ITERATIONS):
         radial, away = _seen_from(centre, radius, angles, deviations)
         columns = np.hstack([np.ones((len(radial), 1)), -away])
         centre = centre + np.linalg.lstsq(columns, radial, rcond=None)[0][1:]
@@ -200,7 +201,7 @@ def _from_least_squares_centre(radius: float, angles: np.ndarray, deviations: np
 
 
 def _notes(parts: dict[str, list[np.ndarray]], full: bool, length_known: bool) -> tuple[str, ...]:
-    """Return where a test departs from the standard's."""
+    """Return notes on deviations of a circular test from the standard."""
     notes = []
     if len(parts) < 2:
         notes.append(f"run {next(iter(parts))} only: no G(b), no D; the standard's test runs both senses")
@@ -214,14 +215,14 @@ def _notes(parts: dict[str, list[np.ndarray]], full: bool, length_known: bool) -
 
 
 AXES_STANDARD, DIAGONALS_STANDARD, CIRCLES_STANDARD = "ISO 230-2:2014", "ISO 230-6:2002", "ISO 230-4:2005"
-ALONG = 1e-6  # A line whose direction has a component below this does not travel along that axis
-# A length's centre further than this, m, from a circle's is no ball bar's: it is known to some millimetres
-OFF_THE_MIDDLE = 0.01
+ALONG = 1e-6  # smallest component of a line's unit vector along an axis that counts as travel along that axis
+# Largest distance, m, between the stated centre of lengths and the centre of the commanded circle of a ball bar
+LARGEST_CENTRE_OFFSET = 0.01
 BODY, FACE = "body", "face"
 LINEAR = CHANNELS.index("linear")
-# Figures of both directions together, and how they are printed
+# Figures of both directions together, with the headings of their columns
 COLUMNS = {"A": "A", "E": "E", "R": "R", "M": "M", "B": "B", "B_mean": "B̄"}
-# Figures of a circle, and how they are printed
+# Figures of a circle, with the headings of their columns
 CIRCLE_COLUMNS = {
     "G_ccw": "G ↺",
     "G_cw": "G ↻",
@@ -236,26 +237,26 @@ CIRCLE_COLUMNS = {
 
 @dataclass(frozen=True)
 class Judged:
-    """Figures of all runs that a standard judges, by the runs' names."""
+    """Figures of all runs that one of the standards can evaluate, by the names of the runs."""
 
     axes: dict[str, PositioningTest]  # lines along an axis: ISO 230-2
-    diagonals: dict[str, dict[str, PositioningTest]]  # ``body`` and ``face`` diagonals: ISO 230-6
-    circles: dict[str, CircularTest]  # ISO 230-4
+    diagonals: dict[str, dict[str, PositioningTest]]  # ISO 230-6; outer keys ``body`` and ``face``
+    circles: dict[str, CircularTest]  # circles of a ball bar: ISO 230-4
 
     def __bool__(self) -> bool:
         return bool(self.axes or self.diagonals or self.circles)
 
 
 def judge(measurements: MeasurementSet) -> Judged:
-    """Return the figures of the runs that a standard can judge; the others are left out.
+    """Return the figures of the runs that a standard can evaluate; leave out all other runs.
 
-    Of linear runs these have two cycles or more, and every target read from both sides in each.
+    A linear run needs two or more cycles, and in each cycle every target must be read from both sides.
     """
     points = measurements.points()[measurements.station]
     axes: dict[str, PositioningTest] = {}
     diagonals: dict[str, dict[str, PositioningTest]] = {}
     for index, run in enumerate(measurements.runs):
-        passes: dict[tuple[int, int], dict[float, float]] = {}  # of each direction and cycle the readings by target
+        passes: dict[tuple[int, int], dict[float, float]] = {}  # readings by target, for each direction and cycle
         for n in np.flatnonzero((measurements.run == index) & (measurements.channel == LINEAR)):
             target = round(float(points[n] @ run.axis), 9) + 0.0
             pass_of = int(measurements.direction[n]), int(measurements.cycle[n])
@@ -270,13 +271,13 @@ def judge(measurements: MeasurementSet) -> Judged:
         deviations = np.array([[passes[one][target] for target in targets] for one in wanted])
         test = evaluate(np.array(targets), deviations.reshape(2, len(cycles), len(targets)))
         in_work = measurements.geometry.work.rotation.T @ run.axis
-        along = np.count_nonzero(np.abs(in_work) > ALONG)  # of how many axes it travels along
+        along = np.count_nonzero(np.abs(in_work) > ALONG)  # number of axes along which the line travels
         (axes if along == 1 else diagonals.setdefault(BODY if along == 3 else FACE, {}))[run.name] = test
     return Judged(axes, diagonals, circular_tests(measurements))
 
 
 def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
-    """Return the figures of the runs of lengths whose points lie on a circle about their centre, by name."""
+    """Return the figures of each run of lengths whose commanded points lie on a circle about their centre, by name."""
     points = measurements.points()[measurements.station]
     tests = {}
     for index, run in enumerate(measurements.runs):
@@ -288,7 +289,7 @@ def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
         if circle is None:
             continue
         middle, axis, radius, angles = circle
-        if np.linalg.norm(middle - centres[0]) > OFF_THE_MIDDLE:
+        if np.linalg.norm(middle - centres[0]) > LARGEST_CENTRE_OFFSET:
             continue
         lengths = measurements.value[chosen] + np.linalg.norm(points[chosen] - centres, axis=1)
         height = float(axis @ (centres[0] - middle))
@@ -300,21 +301,21 @@ def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
 
 
 def _circle(points: np.ndarray, work_axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray] | None:
-    """Return the circle on which points (N, 3) lie: middle, axis, radius, m, and the points' angles, (N,), rad.
+    """Return the circle on which points (N, 3) lie: centre, axis, radius, m, and the points' angles, (N,), rad.
 
-    Its axis points along an axis of the work frame, columns (3, 3). None where they lie on no circle.
+    The axis' sign is that of the nearest axis of the work frame (columns of `work_axes`). None if there is no circle.
     """
     arms = points - points.mean(axis=0)
-    _, sizes, ways = np.linalg.svd(arms, full_matrices=False)
+    _, sizes, directions = np.linalg.svd(arms, full_matrices=False)
     if sizes[1] < LEAST_TRAVEL:
-        return None  # a line
-    nearest = int(np.abs(work_axes.T @ ways[2]).argmax())
-    axis = ways[2] * np.sign(work_axes[:, nearest] @ ways[2])
-    first = work_axes[:, nearest - 2]  # x of a circle about z, and so on
+        return None  # the points lie on a line
+    nearest = int(np.abs(work_axes.T @ directions[2]).argmax())
+    axis = directions[2] * np.sign(work_axes[:, nearest] @ directions[2])
+    first = work_axes[:, nearest - 2]  # angles of a circle about z count from x, about x from y, about y from z
     first = first - axis * (axis @ first)
     first /= np.linalg.norm(first)
     flat = arms @ np.stack([first, np.cross(axis, first)], axis=1)
-    # |p − m|² = r² is linear in the middle m and in r² − |m|².
+    # |p − m|² = r² is linear in the centre m and in r² − |m|².
     middle = np.linalg.lstsq(np.column_stack([2.0 * flat, np.ones(len(flat))]), (flat**2).sum(axis=1), rcond=None)[0]
     around = flat - middle[:2]
     distances = np.linalg.norm(around, axis=1)
@@ -325,8 +326,7 @@ def _circle(points: np.ndarray, work_axes: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _senses(angles: np.ndarray, cycles: np.ndarray) -> np.ndarray:
-    """Return the sense in which each of consecutive angles was reached, (N,); the first of a cycle or after a pause: as
-    the next."""
+    """Return the sense, ±1, in which each angle was reached, (N,); the first angle of a cycle gets the next one's."""
     steps = np.angle(np.exp(1j * np.diff(angles, prepend=angles[0])))
     steps[np.diff(cycles, prepend=cycles[0]) != 0] = 0.0
     senses = np.where(np.abs(steps) < ALONG, 0, np.sign(steps)).astype(int)
@@ -336,7 +336,7 @@ def _senses(angles: np.ndarray, cycles: np.ndarray) -> np.ndarray:
 
 
 def standards_text(judged: Judged) -> str:
-    """Return the figures of all runs, a table for each standard, µm."""
+    """Return the figures of all runs as text with one table for each standard, µm."""
     parts = []
     if judged.axes:
         parts.append(f"{AXES_STANDARD}, lines along the axes, both directions\n{table(judged.axes)}")
@@ -351,19 +351,19 @@ def standards_text(judged: Judged) -> str:
 
 
 def notes_of(tests: Mapping[str, PositioningTest] | Mapping[str, CircularTest]) -> list[str]:
-    """Return the notes of several tests, each once."""
+    """Return the notes of several tests without repetitions."""
     return list(dict.fromkeys(note for test in tests.values() for note in test.notes))
 
 
 def figure_cells(columns: Iterable[str], digits: int, *figures: Mapping[str, float]) -> list[str]:
-    """Return one cell per column, µm: the figure of one test, or "before → after" of two; "–" if the test has none."""
+    """Return one cell per column, µm: one test's figure, or "before → after" of two tests; "–" for a missing figure."""
     return [
         " → ".join(number(part[key] * 1e6, digits) for part in figures) if key in figures[0] else "–" for key in columns
     ]
 
 
 def circle_table(tests: Mapping[str, CircularTest]) -> str:
-    """Return the figures of several circles, one row each, µm; "–" for a figure that a test does not have."""
+    """Return a table of the figures of several circles, one row per circle, µm; "–" for a missing figure."""
     rows = []
     for name, test in tests.items():
         cells = figure_cells(CIRCLE_COLUMNS, 3, test.figures)
@@ -372,13 +372,12 @@ def circle_table(tests: Mapping[str, CircularTest]) -> str:
 
 
 def largest(tests: Mapping[str, PositioningTest]) -> dict[str, float]:
-    """Return ISO 230-6's figures of diagonals of one kind together, m: ``E_d`` and ``B_d``, the largest of them."""
-    both = [test.figures for test in tests.values()]
-    return {f"{name}_d": max(figures[name] for figures in both) for name in ("E", "B")}
+    """Return ISO 230-6's ``E_d`` and ``B_d``, m: the largest E and the largest B of all diagonals of one kind."""
+    return {f"{name}_d": max(test.figures[name] for test in tests.values()) for name in ("E", "B")}
 
 
 def table(tests: Mapping[str, PositioningTest]) -> str:
-    """Return the figures of several bidirectional tests, one row each, µm."""
+    """Return a table of the figures of several bidirectional tests, one row per test, µm."""
     header = ("run", "targets", "cycles", *COLUMNS.values(), "")
     rows = []
     for name, test in tests.items():
@@ -387,7 +386,7 @@ def table(tests: Mapping[str, PositioningTest]) -> str:
 
 
 def every_target(judged: Judged) -> str:
-    """Return each run target by target, with notes."""
+    """Return the results of all runs as text with one row per target, and with the notes."""
     parts = [f"{name}\n{report(test, AXES_STANDARD)}" for name, test in judged.axes.items()]
     for tests in judged.diagonals.values():
         parts += [f"{name}\n{report(test, DIAGONALS_STANDARD)}" for name, test in tests.items()]
@@ -397,7 +396,7 @@ def every_target(judged: Judged) -> str:
 
 
 def standards_json(judged: Judged) -> dict[str, Any]:
-    """Return the figures as plain numbers by standard and run, with their unit in the keys: ``A_m``, ``E_up_m``, …"""
+    """Return the figures, m, by standard, run and symbol for JSON; keys end in their unit: ``A_m``, ``E_up_m``, …"""
     result: dict[str, Any] = {}
     if judged.axes:
         result["iso230_2"] = {name: with_units(test.figures) for name, test in judged.axes.items()}
@@ -411,5 +410,5 @@ def standards_json(judged: Judged) -> dict[str, Any]:
 
 
 def with_units(figures: Mapping[str, float]) -> dict[str, float]:
-    """Return lengths with their unit in the keys."""
+    """Return figures in metres under keys that end in their unit, ``_m``."""
     return {f"{name}_m": value for name, value in figures.items()}

@@ -1,4 +1,4 @@
-"""Measured data of a machine, whatever instrument they come from, in one form."""
+"""One form for the readings of all instruments: the channels, a single reading, and a set of readings as arrays."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
 from ..pose import Pose, attitude_error, nearest_rotation
 
 AXES = ("x", "y", "z")
-# What a reading is of. ``linear`` is along the run's line, ``length`` from a centre; the others are along or about an
-# axis of the work frame. Straightness and rotation belong to lines and have unknown zeros, displacement has one
-# wherever the poses are; position and attitude are absolute.
+# Channels. ``linear`` is read along the run's line and ``length`` is a distance from a centre. The other channels are
+# read along or about an axis of the work frame. Position and attitude are absolute. All other channels have an unknown
+# zero in each run; straightness and rotation are read along lines, displacement is read at any poses.
 CHANNELS = (
     "linear",
     *(f"straightness_{a}" for a in AXES),
@@ -31,111 +31,111 @@ CHANNELS = (
 
 LINE_KINDS = ("linear", "straightness", "rotation")  # kinds of channel that are read along a line
 ABSOLUTE_KINDS = ("position", "attitude")  # kinds of channel without an unknown zero
-# Kinds of channel: those of one kind share an instrument and its noise
+# Kinds of channel. The channels of one kind are read by the same instrument, with the same noise.
 KINDS = (*LINE_KINDS, *ABSOLUTE_KINDS, "length", "displacement")
-LENGTH = CHANNELS.index("length")  # the channel of distances from a centre
-# Kind of each channel, as an index
+LENGTH = CHANNELS.index("length")  # index of the channel ``length``, a distance from a centre
+# Index into KINDS of each channel's kind
 KIND_OF = np.array([KINDS.index(channel.partition("_")[0]) for channel in CHANNELS])
-# Standard deviation of a reading where neither the file nor repeated readings tell, m or rad
+# Standard deviation by kind, m or rad, for readings whose file does not state it and that are not repeated
 DEFAULT_UNCERTAINTY = dict(zip(KINDS, (1e-6, 1e-6, 1e-6, 10e-6, 10e-6, 1e-6, 1e-6), strict=True))
 ANGULAR_KINDS = ("rotation", "attitude")
-# How a station was approached; FROM_PREVIOUS: from the command in the row before
+# Direction in which a station was approached; FROM_PREVIOUS: from the commanded pose of the row before
 FORWARD, BACKWARD, UNKNOWN, FROM_PREVIOUS = 1, -1, 0, 2
-SAME_ATTITUDE = 1e-6  # attitudes that differ by less, rad, are one
-LEAST_SIDE = 1e-6  # A box of which a side is shorter, m, is a line or a plane
-# No instrument reads better, m or rad; also keeps readings without noise from having infinite weight
+SAME_ATTITUDE = 1e-6  # attitudes that differ by less than this, rad, count as equal
+LEAST_SIDE = 1e-6  # a box with a side shorter than this, m, counts as a plane or a line
+# Smallest noise of a reading, m or rad; it bounds the weight of readings without noise
 LEAST_NOISE = 1e-9
-# Factor on the assumed noise of an instrument (trackers and cameras apart) above which a unit must be wrong
+# A stated σ above DEFAULT_UNCERTAINTY times this factor means a wrong unit (not for position and attitude)
 COARSEST = 300.0
-LARGEST_READING = 1.0  # no machine errs by more, and no instrument's zero lies further off, m or rad
-LEAST_TRAVEL = 1e-6  # components of a line shorter than this, m, are no travel along that axis
+LARGEST_READING = 1.0  # largest error that a reading may show, and largest offset of an instrument's zero, m or rad
+LEAST_TRAVEL = 1e-6  # a component of a line shorter than this, m, counts as no travel along that axis
 
 
 class FileLine(NamedTuple):
-    """Where a reading stands."""
+    """Source of a reading: a file and a line in it."""
 
-    file: str  # name of the file, or of what made the reading
-    line: int  # line in it; 0 when it has none
+    file: str  # name of the file, or of the campaign or program that made the reading
+    line: int  # number of the line; 0 for a reading that does not come from a file
 
     def __str__(self) -> str:
         return f"{self.file}: line {self.line}" if self.line else self.file
 
 
 class Reading(NamedTuple):
-    """One reading as an instrument or a file gives it, in SI; the unit in which files become sets."""
+    """One reading of an instrument, in SI."""
 
-    run: str  # readings of one run share the unknown zeros
-    cycle: int  # which of several passes of the run, from 1
+    run: str  # name of the run; the readings of one run share one unknown zero per channel
+    cycle: int  # number of the pass over the run, from 1
     direction: int  # ``FORWARD``, ``BACKWARD``, ``UNKNOWN`` or ``FROM_PREVIOUS``
     pose: Pose  # commanded ``pose_tool_in_work``
     channel: str  # one of :data:`CHANNELS`
-    value: float  # error read, actual minus commanded, m or rad
-    uncertainty: float = np.nan  # its standard deviation; NaN when not known
-    temperatures: tuple[float, ...] = (REFERENCE_TEMPERATURE,) * 8  # struts 1–6, base, platform, °C
-    # strut readings, m, when the file has them; otherwise the machine was told nominal lengths
+    value: float  # measured error, actual minus commanded, m or rad
+    uncertainty: float = np.nan  # standard deviation of the value, m or rad; NaN: unknown
+    temperatures: tuple[float, ...] = (REFERENCE_TEMPERATURE,) * 8  # of struts 1–6, base and platform, °C
+    # strut lengths that were commanded or read by encoders, m; None: the nominal lengths of the pose were commanded
     commands: tuple[float, ...] | None = None
-    source: FileLine = FileLine("", 0)  # for messages
-    time: float = np.nan  # when it was taken, s, on a clock that all readings share; NaN when not known
-    # from where a length is read: a place in the work frame, m, known to some millimetres; None for others
+    source: FileLine = FileLine("", 0)  # file and line, for messages
+    time: float = np.nan  # when the reading was taken, s, on a clock that all readings share; NaN: unknown
+    # point from which a length is read, m in the work frame, known to some millimetres; None for other channels
     centre: tuple[float, ...] | None = None
-    known_zero: bool = False  # a length that is known as a whole, as with a calibrated bar
-    humidity: float = np.nan  # relative humidity of the air, a fraction; NaN when not known
-    load: tuple[float, ...] = NO_LOAD  # mass, kg, its centre in platform, m, and gravity in base, m/s²; NaN: as usual
-    slope: str = ""  # runs of this name read their straightness from one square, whose faces' slope they share
+    known_zero: bool = False  # whether a length is calibrated as a whole, as with a calibrated ball bar
+    humidity: float = np.nan  # relative humidity of the air, a fraction 0…1; NaN: unknown
+    load: tuple[float, ...] = NO_LOAD  # payload, kg, its centre in platform, m, gravity in base, m/s²; NaN: usual
+    slope: str = ""  # name of a square: runs that name the same square share one unknown slope of straightness
 
 
 @dataclass(frozen=True)
 class Run:
-    """What the readings of one run share."""
+    """A run: readings that share a line, one unknown zero per channel, and the slope of a square."""
 
     name: str  # as in the file
-    # (3,): unit vector of the run's line in ``base``, zero for scattered poses. It points along the first of x, y, z
-    # along which the line travels: that is forward.
+    # (3,): unit vector of the run's line in ``base``, in the forward direction; zero for a run that is not a line.
+    # Forward is the positive direction of the first axis x, y, z of the work frame along which the line travels.
     axis: np.ndarray
-    origin: np.ndarray  # (3,): first commanded point of the line, m in ``base``
-    known_zero: bool = False  # its lengths are known as a whole
-    slope: str = ""  # the square or straightedge whose slope it shares with other runs; empty: one of its own
+    origin: np.ndarray  # (3,): first commanded point, m in ``base``
+    known_zero: bool = False  # whether the run's lengths are calibrated as a whole
+    slope: str = ""  # name of the square or straightedge whose slope other runs share; empty: a slope of this run alone
 
     @property
     def is_line(self) -> bool:
-        """Whether its points lie on a line."""
+        """Whether the run is read along a line."""
         return bool(self.axis.any())
 
     @property
     def base_axis(self) -> int | None:
-        """0, 1 or 2 for a line parallel to x, y or z of ``base``, None for any other."""
+        """0, 1 or 2 for a line parallel to x, y or z of ``base``; None for any other run."""
         parallel = np.flatnonzero(np.abs(self.axis) > 1.0 - 1e-9)
         return int(parallel[0]) if len(parallel) else None
 
 
 @dataclass(frozen=True)
 class Stations(Surroundings):
-    """Where the machine stood, M times: commands, and what acted on it."""
+    """M stations of the machine: commanded poses, strut commands, directions of motion and surroundings."""
 
     positions: np.ndarray  # (M, 3): commanded ``pose_platform_in_base``, m
     rotations: np.ndarray  # (M, 3, 3)
-    commands: np.ndarray  # (M, 6): strut commands, or encoder readings, m
+    commands: np.ndarray  # (M, 6): commanded strut lengths, or strut lengths read by encoders, m
     sense: np.ndarray  # (M, 9): directions of motion as in :class:`hexapod_comp.machine.model.MotionState`
 
     def __len__(self) -> int:
         return len(self.positions)
 
     def select(self, chosen: np.ndarray | slice) -> Stations:
-        """Return those in a mask, at indices or of a slice."""
+        """Return the stations that a boolean mask (M,), an array of indices or a slice chooses."""
         return Stations(**{entry.name: getattr(self, entry.name)[chosen] for entry in fields(self)})
 
     def pose(self, index: int) -> Pose:
-        """Return a commanded ``pose_platform_in_base``."""
+        """Return a station's commanded ``pose_platform_in_base``."""
         return Pose(self.positions[index], self.rotations[index])
 
     def temperature(self, index: int) -> Temperatures:
-        """Return the temperatures of a station."""
+        """Return a station's temperatures, °C."""
         return Temperatures(dict(zip(Temperatures.NAMES, self.temperatures[index].tolist(), strict=True)))
 
 
 @dataclass(frozen=True)
 class MeasurementSet:
-    """Readings of one machine; arrays have one entry a reading.
+    """Readings of one machine, as arrays with one entry per reading.
 
     Attributes
     ----------
@@ -146,20 +146,20 @@ class MeasurementSet:
     runs : tuple of Run
         Runs in order of appearance.
     stations : Stations
-        Distinct places.
+        The distinct stations at which the readings were taken.
     station, run, cycle, direction, channel : ndarray of int, shape (N,)
-        Indices of station, run and channel; number of the pass; direction.
+        Indices of each reading's station, run and channel; number of its pass; direction of its approach.
     value, uncertainty : ndarray, shape (N,)
-        m or rad; NaN where the uncertainty is not known.
+        Measured error and its standard deviation, m or rad; NaN for an unknown standard deviation.
     centre : ndarray, shape (N, 3)
         Approximate point from which a length is read (ball bar, tracker), m in ``base``; NaN for other readings. The
-        centres of one run belong to one body, whose place and attitude are unknown.
+        centres of one run belong to one rigid body, whose place and attitude are unknown.
     sources : tuple of FileLine
-        Where each reading stands.
+        File and line of each reading.
     files : tuple of (str, str)
-        Name and SHA-256 of each file read.
+        Name and SHA-256 of each file that was read.
     notes : tuple of str
-        What the reader found odd, for the report.
+        Remarks of the file readers for the report.
     """
 
     geometry: HexapodGeometry
@@ -183,23 +183,27 @@ class MeasurementSet:
 
     @property
     def kind(self) -> np.ndarray:
-        """Index into :data:`KINDS` of each reading."""
+        """Index into :data:`KINDS` of each reading's kind, shape (N,)."""
         return KIND_OF[self.channel]
 
     @property
     def stated(self) -> np.ndarray:
-        """Standard deviation of each reading, shape (N,), m or rad: its file's, else :data:`DEFAULT_UNCERTAINTY`."""
+        """Standard deviation of each reading, shape (N,), m or rad: its file's, else its kind's default."""
         defaults = np.array([DEFAULT_UNCERTAINTY[kind] for kind in KINDS])[self.kind]
         return np.where(np.isfinite(self.uncertainty), self.uncertainty, defaults)
 
     def stated_of(self, kind: int) -> float:
-        """Return the root mean square of :attr:`stated` over a kind's readings, m or rad; 1 where there are none."""
+        """Return the root mean square of :attr:`stated` over a kind's readings, m or rad; 1 if it has no readings."""
         members = self.stated[self.kind == kind]
         return rms(members) if len(members) else 1.0
 
     def misfit(self, noise: Mapping[int, float], times: float) -> str:
-        """Return the kinds of reading whose residuals or stated σ exceed `times` their noise, with the factor."""
-        far, coarse = [], []
+        """Return a text that names each kind with implausible residuals or σ; "" if all kinds are plausible.
+
+        A kind is named if its residual in `noise`, m or rad by kind, exceeds `times` its stated σ, or if its stated σ
+        exceeds `COARSEST` times the usual one.
+        """
+        large, coarse = [], []
         for kind, value in noise.items():
             stated, unit = self.stated_of(kind), "µrad" if KINDS[kind] in ANGULAR_KINDS else "µm"
             usual = DEFAULT_UNCERTAINTY[KINDS[kind]]
@@ -209,15 +213,15 @@ class MeasurementSet:
                 given = np.isfinite(self.uncertainty[self.kind == kind]).any()
                 source = "stated" if given else "assumed, since the file states none"
                 ratio = f"{value / stated:.3g} times the {stated * 1e6:.3g} {unit} {source}"
-                far.append(f"{KINDS[kind]} by {value * 1e6:.3g} {unit}, {ratio}")
+                large.append(f"{KINDS[kind]} by {value * 1e6:.3g} {unit}, {ratio}")
         problems = {
-            f"readings are off by more than {times:g} times their noise": far,
-            "readings are stated to be uncertain as no such instrument is, do units fit": coarse,
+            f"readings are off by more than {times:g} times their noise": large,
+            "readings are stated to be more uncertain than any such instrument, do units fit": coarse,
         }
         return "; ".join(f"{problem}: {'; '.join(kinds)}" for problem, kinds in problems.items() if kinds)
 
     def directions(self) -> np.ndarray:
-        """Return w of each reading, shape (N, 6): value = w · (dx, dy, dz, rx, ry, rz) in ``base``."""
+        """Return the direction w of each reading, shape (N, 6): value = w · (dx, dy, dz, rx, ry, rz) in ``base``."""
         axes = self.geometry.work.rotation.T  # row a: the work frame's axis a, in base
         fixed = np.zeros((len(CHANNELS), 6))
         for index, channel in enumerate(CHANNELS):
@@ -241,8 +245,8 @@ class MeasurementSet:
     def level(self) -> np.ndarray:
         """Return the platform's attitude that reports call level, shape (3, 3), in ``base``.
 
-        The tool parallel to the work frame, where the stations surround such an attitude or have it. Otherwise
-        the machine was measured turned, and the station nearest to the mean of all attitudes stands for them.
+        Level means that the tool is parallel to the work frame if the stations' attitudes include or surround that
+        attitude. Otherwise level is the attitude of the station nearest to the mean of all attitudes.
         """
         rotations = self.stations.rotations
         parallel = self.geometry.work.rotation @ self.geometry.tool.rotation.T
@@ -253,25 +257,25 @@ class MeasurementSet:
         return rotations[away.argmin()]
 
     def tilt(self) -> float:
-        """Return how far the tool was tilted or turned at most, from :meth:`level`, rad."""
+        """Return the largest angle between a station's attitude and :meth:`level`, rad."""
         return float(np.linalg.norm(attitude_error(self.stations.rotations, self.level()), axis=1).max())
 
     def tool_box(self) -> np.ndarray:
-        """Return the lowest and highest commanded tool position, shape (2, 3), m in ``work``."""
+        """Return the lowest and the highest corner of the commanded tool positions, shape (2, 3), m in ``work``."""
         positions, _ = self.geometry.tool_poses(self.stations.positions, self.stations.rotations)
         return np.array([positions.min(axis=0), positions.max(axis=0)])
 
     def along(self) -> np.ndarray:
-        """Return each reading's commanded coordinate along its line, from the run's first point, m, (N,)."""
+        """Return each reading's commanded coordinate along its line, from the run's first point, shape (N,), m."""
         origins = np.array([run.origin for run in self.runs]).reshape(-1, 3)
         axes = np.array([run.axis for run in self.runs]).reshape(-1, 3)
         return ((self.points()[self.station] - origins[self.run]) * axes[self.run]).sum(axis=1)
 
     def square_levers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the change of each straightness reading per angle by which its square turns, m/rad, and the axis, 0…2.
+        """Return each straightness reading's change per angle by which its square turns, m/rad, and the turn's axis.
 
-        Shape (N,) each. A face along a turns about ω to ω × a: seen along s, the third of these axes, by ω × a · s. Of
-        a line that is not parallel to an axis the lever is shorter; other readings have none.
+        Shape (N,) each; the axis is 0, 1 or 2 of the work frame. A square that turns by ω moves its face along a by
+        ω × a; the reading along s changes by (ω × a) · s. The lever of other readings is zero.
         """
         in_work = np.array([run.axis for run in self.runs]).reshape(-1, 3) @ self.geometry.work.rotation
         ways, seen = in_work[self.run], self.channel - CHANNELS.index("straightness_x")
@@ -282,18 +286,18 @@ class MeasurementSet:
         return np.where(self.kind == KINDS.index("straightness"), levers, 0.0), about
 
     def select(self, mask: np.ndarray) -> MeasurementSet:
-        """Return the set of the readings in a boolean mask (N,); runs and stations keep their numbers."""
+        """Return the readings that a boolean mask (N,) chooses, as a set; runs and stations keep their numbers."""
         arrays = ("station", "run", "cycle", "direction", "channel", "value", "uncertainty", "centre")
         chosen = {name: getattr(self, name)[mask] for name in arrays}
         return replace(self, sources=tuple(s for s, m in zip(self.sources, mask, strict=True) if m), **chosen)
 
     def with_values(self, value: np.ndarray) -> MeasurementSet:
-        """Return the same stations with other readings, shape (N,), m or rad."""
+        """Return a copy of the set with other values of the readings, shape (N,), m or rad."""
         return replace(self, value=value)
 
 
 def refuse_impossible(measurements: MeasurementSet) -> None:
-    """Refuse values that no reading has, as :func:`.runs.assemble` does: sets may have been changed since."""
+    """Raise a CalibrationError for a value above `LARGEST_READING`: a set may have been changed after it was read."""
     impossible = np.flatnonzero(~(np.abs(measurements.value) <= LARGEST_READING))
     if len(impossible):
         first = impossible[0]
@@ -303,17 +307,17 @@ def refuse_impossible(measurements: MeasurementSet) -> None:
         raise CalibrationError(where, problem)
 
 
-def refuse_unmoved(measurements: MeasurementSet, left: np.ndarray) -> None:
-    """Refuse a kind of reading that shows nothing: an instrument without any noise would have infinite weight."""
+def refuse_unmoved(measurements: MeasurementSet, residuals: np.ndarray) -> None:
+    """Raise a CalibrationError for a kind of reading without residuals above `LEAST_NOISE`: its weight has no bound."""
     for k in np.unique(measurements.kind):
         members = measurements.kind == k
-        if np.abs(left[members]).max() <= LEAST_NOISE:
+        if np.abs(residuals[members]).max() <= LEAST_NOISE:
             zero = not measurements.value[members].any()
-            problem = "are all zero" if zero else "never change within a run, or are just what the machine was told"
-            hint = "was the instrument connected? Such readings tell nothing; leave them out"
+            problem = "are all zero" if zero else "never change within a run, or are exactly the commanded values"
+            hint = "was the instrument connected? Such readings hold no information; leave them out"
             raise CalibrationError(f"{KINDS[k]}", f"the {members.sum()} readings {problem}: {hint}")
 
 
 def spans(points: np.ndarray) -> bool:
-    """Return whether points (n, 3), m, span a box."""
+    """Return whether points (n, 3), m, span a box whose sides are all `LEAST_SIDE` or longer."""
     return bool((np.ptp(points, axis=0) >= LEAST_SIDE).all())

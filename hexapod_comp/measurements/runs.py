@@ -1,4 +1,4 @@
-"""Readings in whatever order they come, assembled into one :class:`~.readings.MeasurementSet`."""
+"""Assembly of single readings, in any order, into one :class:`~.readings.MeasurementSet`."""
 
 from __future__ import annotations
 
@@ -38,16 +38,16 @@ from .readings import (
     Stations,
 )
 
-# Machines whose readings may have been mixed up: the shipped ones
+# Shipped machines that a message suggests if readings do not fit the chosen machine
 GEOMETRIES = ("paper.yaml", "example_6_6.yaml", "jugglebot.yaml", "positioning_unit.yaml")
-ENOUGH = 10  # fewer poses than that are possible in many ways
-UNITS = (("inches", 25.4), ("m", 1e3))  # units that coordinates may have though their file states mm
-# No compensation changes a strut's length by a larger share of what the nominal machine needs
+FEWEST_POSES = 10  # with fewer poses too many misreadings would fit, so a message suggests none
+UNITS = (("inches", 25.4), ("m", 1e3))  # wrong units that a message suggests for coordinates stated in mm, and their mm
+# Largest correction of a strut command, as a fraction of the nominal strut length
 LARGEST_CORRECTION = 0.02
 
 
 def impossible(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) -> Iterator[tuple[int, str]]:
-    """Yield number and reason of each pose that the nominal machine cannot take, or not with the commands given."""
+    """Yield the number of each pose that the nominal machine cannot reach with its strut commands, and the reason."""
     lengths = strut_lengths_batch(Structure.of(geometry), *poses)
     for number, (position, rotation, needed, command) in enumerate(zip(*poses, lengths, commands, strict=True)):
         if refusal := geometry.refusal(position, rotation, needed):
@@ -60,23 +60,23 @@ def impossible(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) ->
             yield number, f"strut_{n + 1}: {both} (they may differ by {LARGEST_CORRECTION * 100.0:g} %)"
 
 
-def meant(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) -> list[str]:
-    """Return in words how poses may have been meant so that none is :func:`impossible`: "with x and z exchanged"."""
-    if len(commands) < ENOUGH:
+def possible_misreadings(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) -> list[str]:
+    """Return texts that each name a change by which no pose is :func:`impossible`, as "with x and z exchanged"."""
+    if len(commands) < FEWEST_POSES:
         return []
-    others = _others(geometry, poses)
+    others = _misreadings(geometry, poses)
     return [how for how, machine, other in others if next(impossible(machine, other, commands), None) is None]
 
 
 def exchanged(geometry: HexapodGeometry, poses: Poses, a: int, b: int) -> Poses:
-    """Return the platform's poses with two coordinates of the tool in the work frame exchanged, not its attitude."""
+    """Return the platform's poses with coordinates a and b of the tool in work exchanged; attitudes do not change."""
     tips, tools = geometry.tool_poses(*poses)
     tips[:, [a, b]] = tips[:, [b, a]]
     return geometry.platform_poses(tips, tools)
 
 
-def _others(geometry: HexapodGeometry, poses: Poses) -> Iterator[tuple[str, HexapodGeometry, Poses]]:
-    """Yield other ways to read commanded poses: how, with which machine, and where its platform then is."""
+def _misreadings(geometry: HexapodGeometry, poses: Poses) -> Iterator[tuple[str, HexapodGeometry, Poses]]:
+    """Yield other readings of the commanded poses: a text, the machine and the poses of its platform."""
     tips, tools = geometry.tool_poses(*poses)
     for a, b in combinations(range(3), 2):
         yield f"with {AXES[a]} and {AXES[b]} exchanged", geometry, exchanged(geometry, poses, a, b)
@@ -92,15 +92,15 @@ def _others(geometry: HexapodGeometry, poses: Poses) -> Iterator[tuple[str, Hexa
         yield how, machine, machine.platform_poses(tips, tools)
 
 
-SAME = 1e-9  # commands nearer to each other than this, m, are the same command
-SHORTEST_LENGTH = 1e-3  # A length shorter than this, m, has no direction: its centre is known to some millimetres only
-NUMBER_OF = {channel: number for number, channel in enumerate(CHANNELS)}  # index into :data:`CHANNELS`
+SAME = 1e-9  # commands whose distance is below this, m, count as the same command
+SHORTEST_LENGTH = 1e-3  # shortest allowed length, m: its direction is unknown, since its centre is known to millimetres
+NUMBER_OF = {channel: number for number, channel in enumerate(CHANNELS)}  # index of each channel in :data:`CHANNELS`
 OF_LINES = np.isin(np.array(KINDS)[KIND_OF], LINE_KINDS)  # whether each channel is read along a line
-# The channels across a line, by their axis of the work frame
+# Indices of the straightness channels along x, y and z of the work frame
 STRAIGHTNESS = np.array([NUMBER_OF[f"straightness_{axis}"] for axis in AXES])
-OWN_LINE = 0.99  # least component of a line's direction along an axis for the line to run along it
-NO_COMMANDS = (math.nan,) * 6  # commanded strut lengths of a reading without any
-SMALLEST_UNCERTAINTY = 1e-12  # no instrument reads better, m or rad; and the square of its inverse is still a number
+OWN_LINE = 0.99  # a line counts as parallel to an axis if its unit vector's component along the axis is above this
+NO_COMMANDS = (math.nan,) * 6  # strut commands of a reading whose file does not hold any
+SMALLEST_UNCERTAINTY = 1e-12  # smallest allowed standard deviation, m or rad: the square of its inverse is still finite
 
 
 def assemble(
@@ -111,7 +111,7 @@ def assemble(
     notes: Iterable[str] = (),
     in_reach: bool = True,
 ) -> MeasurementSet:
-    """Return the set of some readings: runs recognised as lines, stations made unique, reach checked."""
+    """Return readings as one set. Detect lines and merge equal stations; with `in_reach` refuse unreachable poses."""
     probe = np.array(geometry.tool.position if probe is None else probe, dtype=float)
     if not readings:
         raise InputFileError("measurements", "", "hold no reading")
@@ -149,9 +149,9 @@ def assemble(
 def _runs(
     readings: Sequence[Reading], passes: tuple[np.ndarray, ...], points: np.ndarray, along: np.ndarray
 ) -> tuple[tuple[Run, ...], np.ndarray, list[str]]:
-    """Return the runs, each reading's run, and remarks on runs whose directions look swapped.
+    """Return the runs, the index of each reading's run, and notes on runs whose directions look swapped.
 
-    `passes` are direction, cycle and channel of each reading.
+    `passes` holds the direction, the cycle and the channel of each reading; `along` has the work frame's axes as rows.
     """
     members: dict[str, list[int]] = {}
     for index, reading in enumerate(readings):
@@ -168,18 +168,18 @@ def _runs(
 
 
 def _swapped(along: np.ndarray, direction: np.ndarray, cycle: np.ndarray, channel: np.ndarray) -> bool:
-    """Return whether the rows of a line run against both their directions, by the first pass in each."""
-    way = {FORWARD: 0.0, BACKWARD: 0.0}
-    for each in way:
+    """Return whether the first pass called forward travels backward and the first called backward travels forward."""
+    travel = {FORWARD: 0.0, BACKWARD: 0.0}
+    for each in travel:
         chosen = np.flatnonzero(direction == each)
         if len(chosen):
             first = (cycle[chosen] == cycle[chosen[0]]) & (channel[chosen] == channel[chosen[0]])
-            way[each] = along[chosen[first][-1]] - along[chosen[0]]
-    return bool(way[FORWARD] < 0.0 < way[BACKWARD])
+            travel[each] = along[chosen[first][-1]] - along[chosen[0]]
+    return bool(travel[FORWARD] < 0.0 < travel[BACKWARD])
 
 
 def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> tuple[Poses, np.ndarray]:
-    """Return the different commanded ``pose_platform_in_base``, and the number of each reading's."""
+    """Return the distinct commanded ``pose_platform_in_base``, and the index of each reading's pose among them."""
     objects: dict[int, int] = {}
     values: dict[bytes, int] = {}
     poses: list[Pose] = []
@@ -193,18 +193,21 @@ def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> t
 
 
 def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.ndarray) -> np.ndarray:
-    """Return from where lengths are read, (N, 3), m in ``base``, NaN for others; `points` are the measured ones."""
+    """Return the centre of each length reading, (N, 3), m in ``base``, NaN for other channels.
+
+    `points` holds the commanded place of the measured point for each reading, (N, 3), m in ``base``.
+    """
     centres = np.full((len(readings), 3), np.nan)
     known: dict[str, bool] = {}
     for n, r in enumerate(readings):
         is_length = r.channel == CHANNELS[LENGTH]
         if is_length and r.centre is None:
-            raise InputFileError(r.source.file, _line(r), "a length needs the place of its centre")
+            raise InputFileError(r.source.file, _line(r), "a length needs the position of its centre")
         if not is_length and (r.centre is not None or r.known_zero):
             problem = f"only lengths have a centre or a known zero; leave them empty for {r.channel}"
             raise InputFileError(r.source.file, _line(r), problem)
         if known.setdefault(r.run, r.known_zero) != r.known_zero:
-            problem = f"run {r.run}: one zero cannot be known and unknown; call them two runs"
+            problem = f"run {r.run}: one zero cannot be both known and unknown; name two runs"
             raise InputFileError(r.source.file, _line(r), problem)
         if r.centre is not None:
             centres[n] = geometry.work.position + geometry.work.rotation @ np.array(r.centre)
@@ -216,7 +219,7 @@ def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.
 
 
 def _check_values(readings: Sequence[Reading], value: np.ndarray, uncertainty: np.ndarray) -> None:
-    """Refuse values that no machine's error has, and uncertainties that no instrument has."""
+    """Refuse values above `LARGEST_READING`, and standard deviations outside the allowed range."""
     possible = (uncertainty >= SMALLEST_UNCERTAINTY) & (uncertainty <= LARGEST_READING)
     wrong = np.flatnonzero(~((np.abs(value) <= LARGEST_READING) & (np.isnan(uncertainty) | possible)))
     if not len(wrong):
@@ -235,11 +238,12 @@ def _line(reading: Reading) -> str:
 
 
 def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray, work_axes: np.ndarray) -> Run:
-    """Return a run from its readings and their commanded points (n, 3), with its line if it has line channels."""
+    """Return a run from its readings and their commanded points (n, 3); find its line if its channels need a line."""
     first, name = readings[0], readings[0].run
     of_line = OF_LINES[channel]
     if of_line.any() and not of_line.all():
-        raise InputFileError(first.source.file, f"run {name}", "mixes channels of a line with others")
+        problem = "mixes channels of a line (linear, straightness, rotation) with other channels"
+        raise InputFileError(first.source.file, f"run {name}", problem)
     if first.slope and not np.isin(channel, STRAIGHTNESS).any():
         raise InputFileError(first.source.file, f"run {name}", "has a slope, but no straightness", first.slope)
     if not of_line.any():
@@ -261,7 +265,7 @@ def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray,
         problem = f"run {name}: {r.channel} is along the line itself; straightness is read across it"
         raise InputFileError(r.source.file, _line(r), problem)
     if len({r.slope for r in readings}) > 1:
-        raise InputFileError(first.source.file, f"run {name}", "has more than one slope; call them two runs")
+        raise InputFileError(first.source.file, f"run {name}", "has more than one slope; name a run for each slope")
     leading = in_work[np.abs(in_work) > LEAST_TRAVEL][0]
     return Run(name, axis * np.sign(leading), points[0], slope=first.slope)
 
@@ -269,15 +273,14 @@ def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray,
 def _collect_stations(
     geometry: HexapodGeometry, readings: Sequence[tuple[Reading, int, Run]], poses: Poses
 ) -> tuple[Stations, np.ndarray]:
-    """Return the distinct stations and each reading's index among them, from readings and the numbers of their
-    poses."""
+    """Return the distinct stations and the index of each reading's station; `readings` holds the index of each pose."""
     known: dict[tuple, int] = {}
     rows: list[tuple] = []
-    known_by: list[int | None] = []  # the station from which the machine came, where that is known
-    ways: list[np.ndarray] = []  # of travel, where a run is a line that is passed forward or backward
+    previous: list[int | None] = []  # station from which the machine came; None: unknown
+    travels: list[np.ndarray] = []  # direction of travel, (3,), on a line that is passed forward or backward, else zero
     index: list[int] = []
     lengths = strut_lengths_batch(Structure.of(geometry), *poses)
-    # At one temperature it does not matter when it was, and passes are alike.
+    # Time matters only if the temperature changes: without a change all passes over a line share their stations.
     warming = len({r.temperatures for r, _, _ in readings}) > 1
     here: tuple | None = None
     before: int | None = None
@@ -286,30 +289,30 @@ def _collect_stations(
         if here is not None and place != here:
             before = index[-1] if here[0] == r.run else None
         here = place
-        # A station belongs to a run: lines that cross at a point pass it in different ways.
+        # A station belongs to one run: two lines that cross at a point pass it in different directions.
         came_from = before if r.direction == FROM_PREVIOUS else None
         time = r.time if warming else math.nan
-        around = r.temperatures, time, r.humidity, r.load  # as in Surroundings
+        around = r.temperatures, time, r.humidity, r.load  # the fields of Surroundings, in its order
         key = (place, r.direction, came_from, struct.pack("17d", *r.temperatures, time, r.humidity, *r.load))
         if key not in known:
             own = poses[0][pose], poses[1][pose], lengths[pose]
             commands = own[2] if r.commands is None else np.array(r.commands, dtype=float)
             known[key] = len(rows)
-            known_by.append(came_from)
+            previous.append(came_from)
             rows.append((*own[:2], commands, np.zeros(9), *around))
-            ways.append(r.direction * run.axis if r.direction in (FORWARD, BACKWARD) else np.zeros(3))
+            travels.append(r.direction * run.axis if r.direction in (FORWARD, BACKWARD) else np.zeros(3))
         index.append(known[key])
     columns = [np.array(column, dtype=float) for column in zip(*rows, strict=True)]
-    along = np.array(ways).any(axis=1)
-    columns[3][along] = Passes(geometry, *(part[along] for part in (*columns[:2], np.array(ways)))).senses()
-    if len(there := np.array([n for n, start in enumerate(known_by) if start is not None], dtype=int)):
-        start = np.array([n for n in known_by if n is not None])
+    along = np.array(travels).any(axis=1)
+    columns[3][along] = Passes(geometry, *(part[along] for part in (*columns[:2], np.array(travels)))).senses()
+    if len(there := np.array([n for n, start in enumerate(previous) if start is not None], dtype=int)):
+        start = np.array([n for n in previous if n is not None])
         columns[3][there] = _arrival(geometry, *([part[n] for part in columns[:3]] for n in (there, start)))
     return Stations(*columns[4:], *columns[:4]), np.array(index)
 
 
 def _check_possible(geometry: HexapodGeometry, readings: Sequence[Reading], place: np.ndarray, poses: Poses) -> None:
-    """Refuse what the machine cannot have been commanded; `place` is the number of each reading's pose."""
+    """Refuse readings whose pose or strut commands are impossible; `place` is the index of each reading's pose."""
     first: dict[tuple, int] = {}
     for row, r in enumerate(readings):
         first.setdefault((place[row], r.commands), row)
@@ -320,26 +323,28 @@ def _check_possible(geometry: HexapodGeometry, readings: Sequence[Reading], plac
     if not refused:
         return
     number, problem = refused[0]
-    if ways := meant(geometry, own, commands):
-        problem += f"; {len(refused)} of {len(rows)} commands are refused; none would be {', or '.join(ways)}"
+    if changes := possible_misreadings(geometry, own, commands):
+        problem += f"; {len(refused)} of {len(rows)} commands are refused; none would be {', or '.join(changes)}"
     where = readings[rows[number]]
     raise InputFileError(where.source.file, _line(where), problem)
 
 
 def _arrival(geometry: HexapodGeometry, here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the directions in which stations are reached on a straight way from others, shape (n, 9); both have
-    positions, rotations and commands. At a pose where the machine stood already the commands tell them."""
-    way, turn = there[0] - here[0], attitude_error(there[1], here[1])
-    length = np.linalg.norm(np.concatenate([way, geometry.characteristic_length * turn], axis=1), axis=1)
+    """Return the directions of motion, (n, 9), in which a straight travel from `there` reaches the stations `here`.
+
+    Both hold positions, rotations and strut commands. If two poses are equal, the change of the commands decides.
+    """
+    travel, turn = there[0] - here[0], attitude_error(there[1], here[1])
+    length = np.linalg.norm(np.concatenate([travel, geometry.characteristic_length * turn], axis=1), axis=1)
     share = np.minimum(1.0, APPROACH / np.maximum(length, SAME))[:, None]
-    before = here[0] + share * way, rotation_from_vector(share * turn) @ here[1]
-    change = np.concatenate([np.zeros_like(way), here[2] - there[2]], axis=1)
+    before = here[0] + share * travel, rotation_from_vector(share * turn) @ here[1]
+    change = np.concatenate([np.zeros_like(travel), here[2] - there[2]], axis=1)
     standing = np.sign(change) * (np.abs(change) > SAME)
     return np.where(length[:, None] > SAME, arrivals(geometry, (here[0], here[1]), before), standing)
 
 
 class MeasuredFile(NamedTuple):
-    """What a file holds."""
+    """Content of a measured file: its readings, and notes for the report."""
 
     path: str | Path
     sha256: str
@@ -350,7 +355,7 @@ class MeasuredFile(NamedTuple):
 def assembled(
     geometry: HexapodGeometry, files: Sequence[MeasuredFile], probe: np.ndarray | None = None, in_reach: bool = True
 ) -> MeasurementSet:
-    """Return the set of all files' readings; runs of equal names stay apart, with their files' names in theirs."""
+    """Return the readings of all files as one set. Add the file's name to the name of a run that two files contain."""
     seen: dict[str, MeasuredFile] = {}
     for file in files:
         if (same := seen.setdefault(file.sha256, file)) is not file:
@@ -368,7 +373,7 @@ def assembled(
 
 
 def joined(sets: Sequence[MeasurementSet]) -> MeasurementSet:
-    """Return several sets of one machine as one; runs of equal names stay apart."""
+    """Return several sets of one machine as one set. Runs of equal names remain separate runs."""
     first = sets[0]
     if any(np.abs(other.probe - first.probe).max() > SAME for other in sets[1:]):
         raise InputFileError("measurements", "", "files with different measured points cannot be fitted together")

@@ -1,4 +1,4 @@
-"""Tidy CSV files of measurements, one reading a row: the door through which every instrument's data come in."""
+"""Reading and writing of tidy CSV files of measurements: one reading in each row, for every instrument."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ from .readings import (
 )
 from .runs import MeasuredFile
 
-# Words of the column ``direction``
+# Meaning of each word in the column ``direction``
 DIRECTIONS = {"forward": FORWARD, "backward": BACKWARD, "sequence": FROM_PREVIOUS, "": UNKNOWN}
-TURNS = ("roll", "pitch", "yaw")  # rotations named after the line on which they are read
-TURN_AXES = ((0, 1, 2), (1, 0, 2), (2, 0, 1))  # axes of roll, pitch and yaw on a line along x, y, z
+TURNS = ("roll", "pitch", "yaw")  # channels of files for rotations about axes that depend on the line's direction
+TURN_AXES = ((0, 1, 2), (1, 0, 2), (2, 0, 1))  # axes of roll, pitch and yaw on a line along x, along y and along z
 QUATERNION_CHANNELS = tuple(f"quaternion_{c}" for c in "xyzw")
-# What each channel of a file is measured in
+# Dimension of each channel of a file: "length", "angle", or "" for a pure number
 DIMENSIONS = {
     **{channel: "angle" if channel.partition("_")[0] in ANGULAR_KINDS else "length" for channel in CHANNELS},
     **dict.fromkeys(TURNS, "angle"),
@@ -54,22 +54,22 @@ DIMENSIONS = {
 }
 
 CYCLE = re.compile("0*[1-9][0-9]{0,8}")
-ALONG_LINES = (*LINE_KINDS, *TURNS)  # channels that light reads along a line, and that the air therefore bends
-LATEST = 1e11  # largest time, s: seconds since 1970 of the next three thousand years; nanoseconds are not seconds
-FURTHEST_CENTRE = 100.0  # no instrument stands further away, m
+ALONG_LINES = (*LINE_KINDS, *TURNS)  # channels that a laser reads along a line, so the air along the beam affects them
+LATEST = 1e11  # largest time, s, counted from 1970: about the year 5000; a larger one is probably in nanoseconds
+FURTHEST_CENTRE = 100.0  # largest coordinate of a centre, m
 
 
 class Range(NamedTuple):
-    """The numbers that a column may hold."""
+    """Range of the numbers that a column may hold."""
 
-    low: float  # SI; °C
+    low: float  # in SI; temperatures in °C
     high: float
-    allowed: str  # as text
-    dimension: str | None = None  # None: a pure number
+    allowed: str  # the range as text, for messages
+    dimension: str | None = None  # dimension of the column's unit; None: a pure number
     blank: bool = True  # whether a cell may be empty
 
     def of(self, table: Table, index: int, unit: float) -> np.ndarray:
-        """Return a column's numbers in SI, (rows,); NaN where a cell is blank."""
+        """Return a column's numbers in SI, (rows,); NaN for a blank cell. Refuse a number outside the range."""
         values = table.values(index, unit, self.blank)
         wrong = (values < self.low) | (values > self.high)
         if wrong.any():
@@ -79,8 +79,7 @@ class Range(NamedTuple):
         return values
 
     def read(self, table: Table, name: str) -> np.ndarray:
-        """Return the numbers in SI, (rows,), of an optional column whose name ends in its unit; NaN where there is
-        none."""
+        """Return the numbers in SI, (rows,), of an optional column whose name ends in its unit; NaN for none."""
         column = table.column(name, self.dimension)
         return np.full(len(table.rows), np.nan) if column is None else self.of(table, *column)
 
@@ -94,14 +93,14 @@ AIR_TEMPERATURE = Range(*AIR_RANGES["temperature"], "temperature")
 PLACE = Range(-FURTHEST_CENTRE, FURTHEST_CENTRE, f"±{FURTHEST_CENTRE:g} m", "length")
 MASS = Range(0.0, LARGEST_MASS, f"0…{LARGEST_MASS:g} kg", "mass")
 PULL = Range(-EARTH[1], EARTH[1], f"±{EARTH[1]:g} m/s²", "acceleration")
-# Columns of which a row has all or none
+# Groups of columns: a row fills all columns of a group or none
 CENTRE = {f"centre_{axis}": PLACE for axis in AXES}
 PAYLOAD = {"payload": MASS} | {f"payload_{axis}": PLACE for axis in AXES}
 GRAVITY = {f"gravity_{axis}": PULL for axis in AXES}
 
 
 def _together(table: Table, what: str, columns: Mapping[str, Range]) -> np.ndarray:
-    """Return columns of which a row has all or none, (rows, columns)."""
+    """Return the numbers of a group of columns, (rows, columns); refuse a row that fills only some of them."""
     values = np.stack([column.read(table, name) for name, column in columns.items()], axis=1)
     blank = np.isnan(values)
     torn = blank.any(axis=1) & ~blank.all(axis=1)
@@ -113,12 +112,12 @@ def _together(table: Table, what: str, columns: Mapping[str, Range]) -> np.ndarr
 
 
 def _texts(table: Table, name: str, missing: str = "") -> list[str]:
-    """Return the cells of an optional column."""
+    """Return the cells of an optional column; `missing` for each row if the file does not have the column."""
     return [missing] * len(table.rows) if table.column(name, None) is None else table.texts(name)
 
 
 def _meanings(table: Table, name: str, texts: list[str], meanings: Mapping[str, Any], allowed: str) -> list[Any]:
-    """Return what each cell of a column means; an InputFileError where it is none of the allowed texts."""
+    """Return the meaning of each cell of a column; InputFileError if a cell is none of the allowed texts."""
     for (line, _), text in zip(table.rows, texts, strict=True):
         if text not in meanings:
             raise InputFileError(table.path, f"line {line}, column {name}", f"must be {allowed}", text)
@@ -126,7 +125,7 @@ def _meanings(table: Table, name: str, texts: list[str], meanings: Mapping[str, 
 
 
 def _uncertainty(table: Table, line: int, cells: Sequence[str], index: int, unit: float) -> float:
-    """Return a standard deviation in SI, NaN where there is none."""
+    """Return a row's standard deviation in SI; NaN for an empty cell."""
     text = cells[index]
     if not text.strip():
         return math.nan
@@ -137,7 +136,7 @@ def _uncertainty(table: Table, line: int, cells: Sequence[str], index: int, unit
 
 
 def _poses(table: Table) -> list[Pose]:
-    """Return the commanded poses; rows with the same one share the object."""
+    """Return the commanded pose of each row; rows with equal poses share one object."""
     positions, rotations = poses_of(table)
     first, number = changed_rows(np.hstack([positions, rotations.reshape(-1, 9)]))
     known: dict[bytes, Pose] = {}
@@ -151,7 +150,7 @@ def _poses(table: Table) -> list[Pose]:
 
 
 def _temperatures(table: Table) -> list[tuple[float, ...]]:
-    """Return the temperatures of struts, base and platform of each row, °C."""
+    """Return the temperatures of struts 1–6, base and platform in each row, °C."""
     everywhere = np.nan_to_num(WARMTH.read(table, "temperature"), nan=REFERENCE_TEMPERATURE)
     columns = (WARMTH.read(table, name) for name in Temperatures.NAMES)
     rows = np.stack([np.where(np.isnan(own), everywhere, own) for own in columns], axis=1)
@@ -159,7 +158,7 @@ def _temperatures(table: Table) -> list[tuple[float, ...]]:
 
 
 def _air(table: Table) -> np.ndarray:
-    """Return instrument's index, temperature, pressure, humidity of each row, (rows, 4); NaN: not to be corrected."""
+    """Return instrument's index, temperature, pressure and humidity of each row, (rows, 4); NaN: no air correction."""
     index, pressure = INDEX.read(table, "instrument_index"), PRESSURE.read(table, "pressure")
     wanted = np.isfinite(index)
     if not wanted.any():
@@ -173,7 +172,7 @@ def _air(table: Table) -> np.ndarray:
 
 
 def _loads(table: Table) -> list[tuple[float, ...]]:
-    """Return payload, kg, its centre in platform, m, and gravity in base, m/s²; NaN where a row has none."""
+    """Return each row's payload, kg, its centre in platform, m, and gravity in base, m/s²; NaN for empty cells."""
     payload, gravity = _together(table, "load", PAYLOAD), _together(table, "load", GRAVITY)
     for n in changed_rows(np.nan_to_num(gravity))[0]:
         if np.isfinite(gravity[n, 0]):
@@ -183,7 +182,7 @@ def _loads(table: Table) -> list[tuple[float, ...]]:
 
 
 def _unit_size(table: Table, line: int, channel: str, unit: str) -> float:
-    """Return the size of a unit in SI; refuse unknown channels and units that do not fit them."""
+    """Return the size of a unit in SI; refuse an unknown channel and a unit that does not fit the channel."""
     if channel not in DIMENSIONS:
         allowed = f"must be one of {', '.join(DIMENSIONS)}"
         raise InputFileError(table.path, f"line {line}, column channel", allowed, channel)
@@ -195,15 +194,16 @@ def _unit_size(table: Table, line: int, channel: str, unit: str) -> float:
     return units[unit]
 
 
-PARALLEL = 1e-9  # largest cross component of a unit vector that still is parallel to an axis
+PARALLEL = 1e-9  # a line is parallel to an axis if its unit vector's component along the axis is above 1 minus this
 
 
 class _TidyFile:
-    """A file on its way to readings: first every cell by itself, then what its rows say together."""
+    """A tidy file while it is read: its rows, the stop of the machine to which each row belongs, and its lines."""
 
     def __init__(self, table: Table, geometry: HexapodGeometry, probe: np.ndarray | None) -> None:
         self._table, self._file = table, str(table.path)
-        self._rows, self._exact = list[Reading](), list[tuple[str, float]]()  # values' texts, and their units in SI
+        # The rows as readings, and each row's value as text with the size of its unit in SI
+        self._rows, self._exact = list[Reading](), list[tuple[str, float]]()
         self._air = _air(table)
         self._read_rows()
         self._visits = list(self._numbered_visits())
@@ -216,7 +216,7 @@ class _TidyFile:
         self._axes = dict(self._lines())
 
     def _read_rows(self) -> None:
-        """Read the rows as they stand there: channels and values are those of the file."""
+        """Read the rows; channels and values remain those of the file."""
         table = self._table
         runs, channels, units, cycles = *map(table.texts, ("run", "channel", "unit")), _texts(table, "cycle", "1")
         directions = table.texts("direction")
@@ -240,16 +240,15 @@ class _TidyFile:
             value = si_from_text(text, table.number(line, value_column, text), unit)
             uncertainty = math.nan if uncertain is None else _uncertainty(table, line, cells, uncertain[0], unit)
             place = runs[n], cycles[n], directions[n], poses[n], channels[n]
-            around = times[n], centres[n], known[n], humidities[n], loads[n], slopes[n]
             state = value, uncertainty, temperatures[n], None, FileLine(self._file, line)
-            self._rows.append(Reading._make((*place, *state, *around)))
+            details = times[n], centres[n], known[n], humidities[n], loads[n], slopes[n]
+            self._rows.append(Reading._make((*place, *state, *details)))
             self._exact.append((text, unit))
 
     def _numbered_visits(self) -> Iterator[tuple]:
-        """Yield the key of each row's visit: readings taken at one stop have the same key.
+        """Yield for each row the key of its visit: readings that were taken at one stop of the machine share a key.
 
-        Where the direction follows from the previous place the key counts the visits, since the sequence may return
-        to a place.
+        With the direction ``sequence`` the key contains the number of the visit, since a sequence may return to a pose.
         """
         count, before = 0, None
         for r in self._rows:
@@ -259,22 +258,19 @@ class _TidyFile:
             yield (*place, count if r.direction == FROM_PREVIOUS else 0)
 
     def _refuse_duplicates(self) -> None:
-        """Raise on a channel read twice in one pass at one place."""
+        """Raise an InputFileError if a channel is read twice in one visit."""
         seen: dict[tuple, int] = {}
         for r, visit in zip(self._rows, self._visits, strict=True):
             first = seen.setdefault((visit, r.channel, r.centre), r.source.line)
             if first != r.source.line:
-                problem = (
-                    f"reads {r.channel} again at the place of line {first}; number repeated passes in column cycle"
-                )
+                problem = f"reads {r.channel} again at the pose of line {first}; number repeated passes in column cycle"
                 raise self._error(r, problem)
 
     def _error(self, reading: Reading, problem: str, column: str = "") -> InputFileError:
         return InputFileError(self._file, f"line {reading.source.line}{column}", problem)
 
     def _lines(self) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray]]]:
-        """Yield the runs that have channels of lines: first point, and direction forward, zero where it does not
-        travel."""
+        """Yield name, first point, m, and forward direction of each run along a line; zero direction without travel."""
         members: dict[str, list[int]] = {}
         for n, r in enumerate(self._rows):
             if r.channel.partition("_")[0] in ALONG_LINES:
@@ -288,7 +284,7 @@ class _TidyFile:
             yield run, (origin, forward)
 
     def readings(self) -> tuple[list[Reading], int]:
-        """Return the readings by the channels of sets, and how many of them were corrected for the air."""
+        """Return the readings as errors in the channels of :data:`.CHANNELS`, and the number of air-corrected ones."""
         commands = {visit: values for visit, _, values in self._whole(STRUT_NAMES, "must be empty for a strut")}
         attitudes, corrected = self._attitudes(), self._corrected()
         readings: list[Reading] = []
@@ -298,7 +294,7 @@ class _TidyFile:
                 continue
             if commands:
                 r = r._replace(commands=commands.get(self._visits[n]))
-            if channel in QUATERNION_CHANNELS:  # the first of the four stands for all
+            if channel in QUATERNION_CHANNELS:  # a visit's first quaternion row gives its 3 attitudes
                 errors = zip(AXES, attitudes.pop(self._visits[n], ()), strict=False)
                 readings += [r._replace(channel=f"attitude_{axis}", value=error) for axis, error in errors]
                 continue
@@ -314,7 +310,10 @@ class _TidyFile:
         return readings, len(corrected)
 
     def _whole(self, channels: Sequence[str], wrong: str) -> Iterator[tuple[tuple, Reading, tuple[float, ...]]]:
-        """Yield the visits at which channels were read that must all be read together: first reading, all values."""
+        """Yield each visit at which all of `channels` are read: its key, its first reading and the channels' values.
+
+        Refuse a visit that has only some of the channels, and (with the text `wrong`) a stated standard deviation.
+        """
         by_visit: dict[tuple, dict[str, Reading]] = {}
         for r, visit in zip(self._rows, self._visits, strict=True):
             if r.channel in channels:
@@ -330,7 +329,7 @@ class _TidyFile:
             yield visit, first, tuple(group[channel].value for channel in channels)
 
     def _attitudes(self) -> dict[tuple, tuple[float, ...]]:
-        """Return attitude errors from measured quaternions, rad along the work frame's axes."""
+        """Return each visit's attitude error from its measured quaternion, rad about the work frame's axes."""
         errors = {}
         wrong = "must be empty for a quaternion; give attitude_x, attitude_y, attitude_z instead"
         for visit, first, values in self._whole(QUATERNION_CHANNELS, wrong):
@@ -342,7 +341,7 @@ class _TidyFile:
         return errors
 
     def _rotation(self, reading: Reading) -> str:
-        """Return the rotation of a set that is roll, pitch or yaw on a line."""
+        """Return the channel ``rotation_…`` that a reading of roll, pitch or yaw on a line is."""
         along = np.flatnonzero(np.abs(self._axes[reading.run][1]) > 1.0 - PARALLEL)
         if not len(along):
             problem = f"{reading.channel} is for lines parallel to an axis of the work frame; use rotation_x, _y or _z"
@@ -350,7 +349,7 @@ class _TidyFile:
         return f"rotation_{AXES[TURN_AXES[along[0]][TURNS.index(reading.channel)]]}"
 
     def _corrected(self) -> dict[int, float]:
-        """Return the values of the rows that are to be corrected for the air, by the rows' number."""
+        """Return the air-corrected values, m or rad, by the number of the row."""
         chosen = np.flatnonzero(np.isfinite(self._air[:, 0]))
         commanded = np.zeros(len(chosen))
         for k, n in enumerate(chosen):
@@ -367,7 +366,7 @@ class _TidyFile:
         return dict(zip(chosen.tolist(), true.tolist(), strict=True))
 
     def _minus(self, n: int, commanded: float) -> float:
-        """Return a coordinate minus the commanded one, without losing the digits that both share."""
+        """Return row `n`'s coordinate minus the commanded one, m, in decimal arithmetic: no digit is lost."""
         text, unit = self._exact[n]
         power = round(math.log10(unit))
         if 10.0**power != unit:
@@ -384,7 +383,7 @@ def read_tidy(path: str | Path, geometry: HexapodGeometry, probe: np.ndarray | N
 
 
 def write_measurements(measurements: MeasurementSet, path: str | Path, remark: str = "") -> None:
-    """Write a set as the file that :func:`~.tidy.read_tidy` reads back, to the last bit, with a remark on top."""
+    """Write a set as tidy CSV with a remark at the top; :func:`read_tidy` returns exactly the same numbers."""
     comment = f"# {remark}\n" if remark else ""
     if not np.array_equal(measurements.probe, measurements.geometry.tool.position):
         point = ", ".join(_cells(measurements.probe, 3))
@@ -393,11 +392,11 @@ def write_measurements(measurements: MeasurementSet, path: str | Path, remark: s
 
 
 def _csv_rows(m: MeasurementSet) -> Iterator[list[str]]:
-    """Yield the header and the rows of a set; optional columns where any cell is filled."""
+    """Yield the header and the rows of a set. Leave out optional columns without any filled cell."""
     words = {number: word for word, number in DIRECTIONS.items()}
     stations, work, tool = m.stations, m.geometry.work, m.geometry.tool
     tips = stations.positions + stations.rotations @ tool.position
-    positions = ((tips - work.position) @ work.rotation).round(13)  # as a file has them
+    positions = ((tips - work.position) @ work.rotation).round(13)  # pose_tool_in_work, as in the file
     rotations = work.rotation.T @ stations.rotations @ tool.rotation
     centres = ((m.centre - work.position) @ work.rotation).round(13)
     offset = tool.rotation.T @ (m.probe - tool.position)
@@ -408,7 +407,7 @@ def _csv_rows(m: MeasurementSet) -> Iterator[list[str]]:
     one_run = [("known" if run.known_zero else "", run.slope) for run in m.runs]
     zeros, slopes = (list(texts) for texts in zip(*(one_run[n] for n in m.run), strict=True))
     of_readings = {**_columns("centre_{}_mm", AXES, centres, 3), "zero": zeros, "slope": slopes}
-    around = _warmth(stations.temperatures) | {
+    around = _temperature_columns(stations.temperatures) | {
         "humidity_percent": _cells(stations.humidity, 2),
         "time_s": _cells(stations.times, 0),
         **_columns("{}_kg", ["payload"], stations.loads[:, :1], 0),
@@ -437,27 +436,29 @@ def _csv_rows(m: MeasurementSet) -> Iterator[list[str]]:
 
 
 def _columns(pattern: str, names: Sequence[str], values: np.ndarray, digits: int) -> dict[str, list[str]]:
-    """Return the cells of columns of numbers (rows, columns), by names put into a pattern."""
+    """Return the cells of each column of `values` (rows, columns) under the pattern filled with the column's name."""
     return {pattern.format(n): _cells(column, digits) for n, column in zip(names, values.T, strict=True)}
 
 
 def _rows(columns: Mapping[str, Sequence[str]], count: int) -> list[tuple[str, ...]]:
-    """Return columns of cells as rows."""
+    """Return columns of cells as a list of `count` rows."""
     return list(zip(*columns.values(), strict=True)) if columns else [()] * count
 
 
 def _cells(values: np.ndarray, digits: int) -> list[str]:
-    """Return numbers as decimal text with their point moved: nothing is rounded; NaN is empty."""
-    return ["" if math.isnan(value) else _moved(Decimal(repr(value)), digits) for value in (values + 0.0).tolist()]
+    """Return numbers times 10^`digits` as decimal text without rounding; "" for NaN."""
+    numbers = (values + 0.0).tolist()  # + 0.0 turns −0 into 0
+    return ["" if math.isnan(value) else _decimal_text(Decimal(repr(value)), digits) for value in numbers]
 
 
-def _moved(number: Decimal, digits: int) -> str:
+def _decimal_text(number: Decimal, digits: int) -> str:
+    """Return a number times 10^`digits` as plain decimal text without rounding."""
     text = format(number.scaleb(digits), "f")
     return text.rstrip("0").rstrip(".") if "." in text else text
 
 
 def _commanded(channel: str, point: np.ndarray, centre: np.ndarray) -> float:
-    """Return the commanded part of a file's value, m: a coordinate, a distance, or zero; the rest is the error."""
+    """Return the commanded coordinate or distance, m, which a file's value contains beside the error; else zero."""
     kind, _, axis = channel.partition("_")
     if kind == "position":
         return float(point[AXES.index(axis)])
@@ -465,15 +466,15 @@ def _commanded(channel: str, point: np.ndarray, centre: np.ndarray) -> float:
 
 
 def _value_cells(channel: str, value: float, uncertainty: float, commanded: float) -> list[str]:
-    """Return value, unit and uncertainty as text, with every digit."""
+    """Return value, unit and standard deviation as cells of a file, with every digit."""
     kind = channel.partition("_")[0]
     unit, digits = ("urad", 6) if kind in ANGULAR_KINDS else ("mm", 3) if kind in ("position", "length") else ("um", 6)
-    shown = "" if math.isnan(value) else _moved(Decimal(repr(value)) + Decimal(repr(commanded)), digits)
+    shown = "" if math.isnan(value) else _decimal_text(Decimal(repr(value)) + Decimal(repr(commanded)), digits)
     return [shown, unit, *_cells(np.array([uncertainty]), digits)]
 
 
-def _warmth(values: np.ndarray) -> dict[str, list[str]]:
-    """Return the columns of temperatures (stations, 8): none, one, or eight."""
+def _temperature_columns(values: np.ndarray) -> dict[str, list[str]]:
+    """Return the temperature columns of a file: none at the reference temperature, one for equal parts, else eight."""
     if (values == REFERENCE_TEMPERATURE).all():
         return {}
     if (values == values[:, :1]).all():
@@ -482,7 +483,7 @@ def _warmth(values: np.ndarray) -> dict[str, list[str]]:
 
 
 def _strut_cells(measurements: MeasurementSet) -> dict[int, list[str]]:
-    """Return the strut commands, mm, of the stations where they are not the nominal lengths."""
+    """Return the strut commands as cells, mm, for each station whose commands differ from the nominal lengths."""
     nominal, stations = Structure.of(measurements.geometry), measurements.stations
     return {
         n: _cells(commands, 3)

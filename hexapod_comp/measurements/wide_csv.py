@@ -1,4 +1,4 @@
-"""Wide CSV files of other laboratories: one pose a row, in columns that a small YAML file explains."""
+"""Reading of wide CSV files: one measured pose in each row, in columns that a YAML file (the columns file) explains."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from ..errors import InputFileError, ModelError
-from ..formats.csv import AS_USUAL, Layout, Table
+from ..formats.csv import DEFAULT_LAYOUT, Layout, Table
 from ..formats.schema import (
     MOST_NEIGHBOURS,
     PER_STRUT,
@@ -42,32 +42,32 @@ COLUMNS_FORMAT = "hexapod_comp/columns"
 COLUMNS_VERSION = 1
 ORDERS = {"sequence": FROM_PREVIOUS, "unknown": UNKNOWN}
 EVERYWHERE = "everywhere"
-# Smallest and largest; an interval of 99.99 % is 3.9 standard deviations wide on each side
+# Smallest and largest allowed coverage factor; for comparison, a 99.99 % interval has the factor 3.9
 COVERAGE_FACTORS = (0.5, 10.0)
-WITH_DATE = re.compile("%[djcxsDF]")  # what makes a format of times tell the days apart
-ZEROS = ("home", "given", "measured")  # where the lengths at reading zero come from
+WITH_DATE = re.compile("%[djcxsDF]")  # directives of ``strptime`` that read a day
+ZEROS = ("home", "given", "measured")  # sources of the strut lengths at encoder reading zero
 
 
 @dataclass(frozen=True)
 class UncertaintyColumns:
-    """Where uncertainties stand."""
+    """Columns of a wide file that hold the uncertainties of its rows."""
 
-    columns: tuple[str, ...]  # one for all axes, or three
-    unit: float  # size of their unit in SI, divided by the coverage factor: what makes standard deviations of them
+    columns: tuple[str, ...]  # one column for all axes, or three columns
+    unit: float  # a cell times this is a standard deviation in SI: size of the unit divided by the coverage factor
 
 
 class Deviation(Kind):
-    """One standard deviation for all rows, or one per row from its columns; NaN without either."""
+    """Key of a columns file for a standard deviation: one for all rows, or columns with one for each row."""
 
     def __init__(self, dimension: str) -> None:
         self.dimension = dimension
 
     def read(self, section: Section, name: str, default: Any) -> float | UncertaintyColumns:
-        """Return what a key holds."""
+        """Return the key's standard deviation in SI (NaN without the key), or the columns that hold one per row."""
         if name not in section:
             return float(section.quantity(name, self.dimension, default=default))
         part, (low, high) = section.section(name), COVERAGE_FACTORS
-        columns, unit = Names(1, 3).take(part, "columns"), part.unit("unit", self.dimension)
+        columns, unit = Names(1, 3).read_value(part, "columns"), part.unit("unit", self.dimension)
         factor = float(part.array("coverage_factor"))
         if not low <= factor <= high:
             raise part.error("coverage_factor", f"must be {low:g}…{high:g}; 1 where the column is a deviation", factor)
@@ -77,35 +77,36 @@ class Deviation(Kind):
 
 @dataclass(frozen=True)
 class PoseColumns:
-    """Where a pose stands."""
+    """Columns of a wide file that hold the pose of each row."""
 
     position: Annotated[tuple[str, ...], Names(3)]
     unit: Annotated[float, Unit("length")]
     position_uncertainty: Annotated[float | UncertaintyColumns, Deviation("length")] = math.nan
     attitude_uncertainty: Annotated[float | UncertaintyColumns, Deviation("angle")] = math.nan
-    offset: Annotated[np.ndarray, Numbers("mm", (3,))] = field(default_factory=lambda: np.zeros(3))  # is added
+    # added to the position in the file, m
+    offset: Annotated[np.ndarray, Numbers("mm", (3,))] = field(default_factory=lambda: np.zeros(3))
     quaternion: Annotated[tuple[str, ...], Names(4)] = ()
-    angles: Annotated[tuple[str, ...], Names(3)] = ()  # the paper's, where there is no quaternion
+    angles: Annotated[tuple[str, ...], Names(3)] = ()  # α, β, γ in place of a quaternion
     angle_unit: Annotated[float | None, Unit("angle")] = None
 
     def __post_init__(self) -> None:
         if bool(self.angles) != (self.angle_unit is not None):
-            raise ModelError("angle_unit", "belongs to angles: give both, or none of them")
+            raise ModelError("angle_unit", "belongs to the key angles: give both keys or neither")
         if self.angles and self.quaternion:
             raise ModelError("angles", "give either angles or a quaternion, not both", list(self.angles))
 
     @property
     def turn(self) -> tuple[str, ...]:
-        """Columns of the orientation, empty when there are none."""
+        """Columns of the orientation; empty if the file has no orientation."""
         return self.quaternion or self.angles
 
 
 @dataclass(frozen=True)
 class PoseFile:
-    """Commanded poses in a file of their own."""
+    """Commanded poses in a separate file of poses."""
 
-    file: Annotated[str, Text()]  # beside the columns file
-    name: Annotated[str, Text()] = ""  # column of the measured file that names the pose; empty: row by row
+    file: Annotated[str, Text()]  # name of the file, in the folder of the columns file
+    name: Annotated[str, Text()] = ""  # column of the measured file that names each row's pose; empty: same row number
 
     def __post_init__(self) -> None:
         if Path(self.file).name != self.file:
@@ -114,7 +115,7 @@ class PoseFile:
 
 @dataclass(frozen=True)
 class Humidity:
-    """Where the relative humidity of each row stands."""
+    """Column of a wide file that holds the relative humidity of each row."""
 
     column: Annotated[str, Text()]
     unit: Annotated[float, Unit("ratio")]
@@ -122,27 +123,29 @@ class Humidity:
 
 @dataclass(frozen=True)
 class Times:
-    """Where the time of each row stands."""
+    """Columns of a wide file that hold the time of each row."""
 
-    columns: Annotated[tuple[str, ...], Names()]  # joined by a space where there are several
-    format: Annotated[str, Text()] = ""  # as ``strptime`` has it; empty: numbers, in one column
+    columns: Annotated[tuple[str, ...], Names()]  # cells of several columns are joined by a space
+    format: Annotated[str, Text()] = ""  # format for ``strptime``; empty: one column holds numbers
     unit: Annotated[float | None, Unit("time")] = None
 
     def __post_init__(self) -> None:
         if bool(self.format) == (self.unit is not None):
             raise ModelError("time", "needs either format or unit")
         if self.unit is not None and len(self.columns) != 1:
-            raise ModelError("time.columns", "must be a list of 1 column names where they are numbers", self.columns)
+            raise ModelError("time.columns", "must name exactly one column if unit is given", self.columns)
 
 
 @dataclass(frozen=True)
 class StrutColumns:
-    """Where strut readings stand."""
+    """Columns of a wide file that hold the encoder readings of the six struts."""
 
     readings: Annotated[tuple[str, ...], Names(6)]
     length_per_unit: Annotated[np.ndarray, Numbers("mm", PER_STRUT)]  # m per unit of the reading
     zero: Annotated[str, Choice(*ZEROS)] = "home"
-    zero_length: Annotated[np.ndarray | None, Numbers("mm", PER_STRUT)] = None  # at reading zero, m, when given
+    zero_length: Annotated[np.ndarray | None, Numbers("mm", PER_STRUT)] = (
+        None  # length at reading zero, m, for zero: given
+    )
 
     def __post_init__(self) -> None:
         if (self.zero == "given") != (self.zero_length is not None):
@@ -155,7 +158,7 @@ def _commanded(section: Section, name: str) -> PoseColumns | PoseFile:
 
 
 def _temperature_columns(section: Section, name: str) -> dict[str, str]:
-    """Return the columns by part; ``everywhere`` for all parts that have none."""
+    """Return the temperature column of each part of the machine; ``everywhere`` serves all parts without a column."""
     part = section.section(name)
     part.unit("unit", "temperature")
     columns = {key: part.text(key) for key in (EVERYWHERE, *Temperatures.NAMES) if key in part}
@@ -167,10 +170,10 @@ def _temperature_columns(section: Section, name: str) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Columns:
-    """What the columns of a wide file mean; the parts are as in the file, None where left out."""
+    """Content of a columns file: the meaning of a wide file's columns. None: the columns file lacks this key."""
 
     measured: PoseColumns
-    table: Layout = AS_USUAL
+    table: Layout = DEFAULT_LAYOUT
     commanded: Annotated[PoseColumns | PoseFile | None, Kind(_commanded)] = None
     temperature: Annotated[dict[str, str], Kind(_temperature_columns)] = field(default_factory=dict)
     run: Annotated[str, Text()] = ""
@@ -192,7 +195,7 @@ def load_columns(path: str | Path) -> Columns:
 
 
 def read_wide(path: str | Path, columns_path: str | Path, geometry: HexapodGeometry) -> MeasuredFile:
-    """Read a wide CSV file as one run of absolute positions and, where there are any, attitudes."""
+    """Read a wide CSV file as one run of absolute positions and, if it has orientations, of absolute attitudes."""
     columns = load_columns(columns_path)
     table, notes = Table(path, columns.table), list[str]()
     measured = _read_poses(table, columns.measured)
@@ -210,12 +213,12 @@ def read_wide(path: str | Path, columns_path: str | Path, geometry: HexapodGeome
 
 
 def _read_numbers(table: Table, names: tuple[str, ...], unit: float) -> np.ndarray:
-    """Return some columns in SI, shape (rows, columns)."""
+    """Return the numbers of the named columns in SI, shape (rows, columns)."""
     return table.numbers([(index, unit) for index, _ in table.required(names, None)])
 
 
 def _read_poses(table: Table, columns: PoseColumns) -> Poses:
-    """Return the poses in some columns; level where the file has no orientation."""
+    """Return the pose of each row; level if the file has no orientation."""
     positions = _read_numbers(table, columns.position, columns.unit) + columns.offset
     if not columns.turn:
         return positions, np.tile(np.eye(3), (len(positions), 1, 1))
@@ -229,8 +232,8 @@ def _poses_of_file(table: Table, file: PoseFile, columns_path: Path) -> Poses:
     labels, positions, rotations = read_pose_arrays(path)
     if not file.name:
         if len(labels) != len(table.rows):
-            problem = f"has {len(table.rows)} rows, and {path.name} {len(labels)} poses; without commanded.name"
-            raise InputFileError(table.path, "", f"{problem} they go row by row")
+            problem = f"has {len(table.rows)} rows, but {path.name} has {len(labels)} poses; give commanded.name"
+            raise InputFileError(table.path, "", f"{problem}, or one pose for each row")
         return positions, rotations
     rows = {one.label: n for n, one in enumerate(labels)}
     if len(rows) != len(labels):
@@ -258,7 +261,7 @@ def _deviations(table: Table, given: float | UncertaintyColumns) -> np.ndarray:
 
 
 def _conditions(table: Table, columns: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return each row's temperatures (rows, 8), °C; time, s, and relative humidity, NaN where not known."""
+    """Return each row's temperatures, (rows, 8), °C, time, s, and relative humidity; NaN for an unknown number."""
     unknown, named, damp, time = np.full(len(table.rows), np.nan), columns.temperature, columns.humidity, columns.time
 
     def read(name: str | None, unit: float, within: Range, otherwise: np.ndarray) -> np.ndarray:
@@ -277,18 +280,18 @@ def _conditions(table: Table, columns: Columns) -> tuple[np.ndarray, np.ndarray,
 
 
 def _clock_times(table: Table, time: Times) -> np.ndarray:
-    """Return times that are written as dates and clocks, s; without a zone they are taken for UTC."""
+    """Return the times, s since 1970, that text columns hold as date and clock; without a time zone they are UTC."""
     texts = [" ".join(parts) for parts in zip(*(table.texts(name) for name in time.columns), strict=True)]
     names, times = ", ".join(time.columns), np.empty(len(texts))
     for n, ((line, _), text) in enumerate(zip(table.rows, texts, strict=True)):
         try:
             moment = datetime.strptime(text, time.format)
         except (ValueError, re.error) as error:
-            problem = f"is not written as time.format says, {time.format!r}"
+            problem = f"does not match time.format, {time.format!r}"
             raise InputFileError(table.path, f"line {line}, column {names}", problem, text) from error
         times[n] = (moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)).timestamp()
         if n and times[n] < times[n - 1] and not WITH_DATE.search(time.format):
-            problem = "is earlier than the row before; over midnight the date is needed too: columns: [date, time]"
+            problem = "is earlier than the row before; past midnight a date is needed as well: columns: [date, time]"
             raise InputFileError(table.path, f"line {line}, column {names}", problem, text)
     return times
 
@@ -296,7 +299,7 @@ def _clock_times(table: Table, time: Times) -> np.ndarray:
 def _lengths(
     table: Table, struts: StrutColumns, measured: Poses, geometry: HexapodGeometry, notes: list[str]
 ) -> np.ndarray:
-    """Return the strut lengths that the readings say, shape (rows, 6), m."""
+    """Return the strut lengths from the encoder readings, shape (rows, 6), m; note a zero found from the poses."""
     travel = _read_numbers(table, struts.readings, 1.0) * struts.length_per_unit
     structure = Structure.of(geometry)
     home = strut_lengths_batch(structure, geometry.home.position[None], geometry.home.rotation[None])[0]
@@ -311,16 +314,16 @@ def _lengths(
 
 
 def _nominal_poses(table: Table, geometry: HexapodGeometry, lengths: np.ndarray) -> Poses:
-    """Return the poses that the machine as designed takes under some strut lengths."""
+    """Return the poses of the nominal machine's tool with strut lengths (rows, 6), m."""
     usable = (lengths > 0.0).all(axis=1)
     if not usable.all():
         row = int(usable.argmin())
-        problem = "a strut would have no length, m"
+        problem = "the length of every strut must be above zero, m"
         raise InputFileError(table.path, f"line {table.rows[row][0]}", problem, lengths[row].tolist())
     solved = solve_poses(Structure.of(geometry), lengths, geometry.home)
     if not solved.ok.all():
         row = int(solved.ok.argmin())
-        problem = "no pose of the machine as designed has these strut lengths, mm"
+        problem = "no pose of the nominal machine has these strut lengths, mm"
         raise InputFileError(table.path, f"line {table.rows[row][0]}", problem, (lengths[row] * 1e3).round(3).tolist())
     return geometry.tool_poses(solved.positions, solved.rotations)
 
@@ -328,7 +331,7 @@ def _nominal_poses(table: Table, geometry: HexapodGeometry, lengths: np.ndarray)
 def _readings(
     table: Table, columns: Columns, commanded: Poses, measured: Poses, commands: np.ndarray | None
 ) -> Iterator[Reading]:
-    """Yield position and attitude readings of every row."""
+    """Yield the position readings and the attitude readings of each row."""
     temperatures, times, humidities = _conditions(table, columns)
     found = columns.measured
     errors = [("position", measured[0] - commanded[0], _deviations(table, found.position_uncertainty))]

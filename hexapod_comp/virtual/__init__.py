@@ -1,1 +1,1 @@
-"""Virtual machines: imperfections drawn at random, drives, instruments."""
+"""Virtual machines: random imperfections, simulated strut drives, simulated instruments, warm-up and physics."""

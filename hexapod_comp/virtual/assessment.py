@@ -1,9 +1,9 @@
 """The performance assessment of Song et al.: the effect of random imperfections on strut lengths and poses.
 
-For machines drawn within bounds: the strut lengths of the ideal and of the real machine at a pose (Tables 2 and 4), and
-the real machine's pose when it is commanded with the ideal lengths. Where the paper's forward model of the real
-structure left errors of up to 5 µm (Table 5), the loop closures are solved here exactly; the round trip gives the
-accuracy.
+For machines drawn within bounds it computes the strut lengths of the ideal and of the real machine at each pose (Tables
+2 and 4), and the pose that the real machine takes when it is commanded with the ideal lengths. The paper's forward
+model of the real structure leaves errors of up to 5 µm (Table 5); here the loop closures are solved exactly, and a
+round trip (pose to strut lengths to pose) checks the accuracy.
 """
 
 from __future__ import annotations
@@ -23,29 +23,31 @@ from .imperfections import ImperfectionBounds, draw_model
 
 @dataclass(frozen=True)
 class Assessment:
-    """Ideal and real machine at P poses, for M machines; SI units."""
+    """Strut lengths and poses of an ideal machine and of M drawn machines at P commanded poses, in SI units."""
 
-    seeds: tuple[int, ...]  # the machines' seeds
-    # (P, 6): strut lengths of the nominal machine (Song et al., Table 2); where screws turn with the joints, its
-    # commands
+    seeds: tuple[int, ...]  # seeds of the drawn machines
+    # (P, 6): strut lengths of the nominal machine (Song et al., Table 2); with a screw lead: its strut commands
     ideal_lengths: np.ndarray
     # (M, P, 6): strut commands that bring each real machine exactly to the poses (Song et al., Table 4)
     real_lengths: np.ndarray
-    # (M, P, 3), (M, P, 3, 3): ``pose_tool_in_work`` that each real machine reaches by the ideal lengths
+    # (M, P, 3), m, and (M, P, 3, 3): ``pose_tool_in_work`` that each real machine takes with the ideal lengths
     taken_positions: np.ndarray
-    taken_rotations: np.ndarray  # (M, P, 3), (M, P, 3, 3)
-    # (M, P, 6): the same as displacement, m, and rotation vector, rad, along the work frame's axes
+    taken_rotations: np.ndarray
+    # (M, P, 6): taken minus commanded pose: displacement, m, and rotation vector, rad, along the work frame's axes
     pose_errors: np.ndarray
-    # (M, P, 2): distance, m, and angle, rad, between the pose and the one found from `real_lengths`
+    # (M, P, 2): distance, m, and angle, rad, between each pose and the pose computed back from `real_lengths`
     round_trip: np.ndarray
 
     @property
     def strut_changes(self) -> np.ndarray:
-        """Real minus ideal lengths, shape (M, P, 6), m: the corrections that a perfect model would give."""
+        """Real minus ideal lengths, shape (M, P, 6), m: the corrections that an exact model would compute."""
         return self.real_lengths - self.ideal_lengths
 
     def statistics(self, percentiles: Sequence[float] = (50.0, 95.0, 100.0)) -> dict[str, np.ndarray]:
-        """Return percentiles over the machines, pose by pose, each of shape (P, len(percentiles))."""
+        """Return percentiles over the machines for each pose, shape (P, len(percentiles)), of three error sizes.
+
+        Keys: ``strut_change``, m (largest of six struts), ``displacement``, m, and ``rotation``, rad.
+        """
         quantities = {
             "strut_change": np.abs(self.strut_changes).max(axis=2),
             "displacement": np.linalg.norm(self.pose_errors[..., :3], axis=2),
@@ -63,7 +65,7 @@ def assess(
     names: Sequence[str] | None = None,
     progress: Callable[[int], object] = lambda machines: None,
 ) -> Assessment:
-    """Draw machines and run each of them both ways at all poses."""
+    """Draw machines with the seeds `seed`, `seed` + 1, … and compute lengths and poses of each machine at all poses."""
     names = names or [f"pose {n + 1}" for n in range(len(poses))]
     tool = np.array([pose.position for pose in poses]), np.array([pose.rotation for pose in poses])
     passes = Passes.of_tool(geometry, *tool, np.zeros_like(tool[0]))
@@ -77,7 +79,7 @@ def assess(
         alike, named = [RealMachine(geometry, model)] * len(passes), [f"{name}, {model.name}" for name in names]
         real, modelled = model_commands(alike, passes.poses, unknown, named.__getitem__)
         taken = geometry.tool_poses(*drive(alike, passes.poses, unknown, ideal, named.__getitem__).actual)
-        # The start is 1 mm off: the solution itself would be no test.
+        # The iteration starts 1 mm from the solution: started at the solution it would test nothing.
         back = drive(alike, (modelled[0] + 1e-3, modelled[1]), unknown, real, named.__getitem__)
         trip = back.errors(passes.poses, np.zeros(3)).as_array().reshape(-1, 2, 3)
         errors = np.hstack([taken[0] - tool[0], attitude_error(taken[1], tool[1])])

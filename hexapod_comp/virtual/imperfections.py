@@ -1,7 +1,7 @@
-"""Random imperfections within bounds: the hidden truth of a virtual machine.
+"""Random imperfections within bounds: the hidden errors of a virtual machine.
 
-Every quantity is drawn whether its bound is zero or not, so that changing one bound does not change the others' draws,
-and a seed identifies one machine.
+Every quantity is drawn, even if its bound is zero. So a change of one bound does not change the draws of the other
+quantities, and a seed identifies one machine.
 """
 
 from __future__ import annotations
@@ -20,50 +20,49 @@ from ..machine.model import MachineModel, ModelOrigin
 from ..machine.struts import StrutErrors
 
 FIELD_NODES = 3  # Nodes of a drawn field along each axis
-FIELD_POWERS = 4  # Coefficients of a drawn field's polynomials: cubic along each line
-# Waves added up in a smooth length error; its knots on the shortest one: the spline between them is then the wave
+FIELD_POWERS = 4  # Coefficients of a drawn field's polynomial along each line (cubic)
+# Number of sine waves in a smooth length error, and knots per shortest wavelength (so the spline represents each wave)
 MAP_WAVES, KNOTS_PER_WAVE = 8, 15
-# Shortest and longest of them where bounds draw them: shares of the stroke, but no shorter than this, m
+# Shortest and longest wavelength of a smooth length error: as fractions of the stroke, but at least the second pair, m
 WAVES_OF_STROKE, LEAST_WAVES = (0.1, 0.35), (0.06, 0.2)
-# Shortest and longest worn part of a screw, from its middle to the point with 61 % of the wear, in strokes
+# Smallest and largest standard deviation of the bell curve of wear along a screw, as fractions of the stroke
 WORN_PART = (0.1, 0.3)
-# Bounds that have a lowest and a highest value, and their units
+# Bounds that are a pair of a lowest and a highest value, with their units
 SPANS = {"wave": "m", "harmonics": "m", "backlash": "m", "strut_expansion": "1/K", "body_expansion": "1/K"}
 
 
 @dataclass(frozen=True)
 class ImperfectionBounds:
-    """Bounds of a machine's imperfections; all draws are uniform.
+    """Bounds of a machine's imperfections, which are drawn from uniform distributions.
 
-    The defaults are Song et al.'s assessment: ±10 µm on every joint coordinate and on every strut, nothing
-    else.
+    The defaults are the bounds of Song et al.'s assessment: ±10 µm for every joint coordinate and for every strut
+    length, and zero for all other errors.
     """
 
-    joint: float = 10e-6  # bound of every joint coordinate's deviation, m (±)
-    strut_offset: float = 10e-6  # bound of every strut's length offset, m (±)
-    pitch: float = 0.0  # bound of every screw's relative pitch error, m per m (±); zero error at the home length
-    # lowest and highest amplitude of the periodic screw error, m; its phase is drawn too
+    joint: float = 10e-6  # largest deviation of every joint coordinate, m (±)
+    strut_offset: float = 10e-6  # largest length offset of every strut, m (±)
+    pitch: float = 0.0  # largest relative pitch error of every screw, m per m (±); it has no effect at the home length
+    # lowest and highest amplitude of the periodic screw error, m; its phase is drawn as well
     wave: tuple[float, float] = (0.0, 0.0)
-    wave_period: float = 0.01  # period of the error, m: the screw's lead
+    wave_period: float = 0.01  # period of the periodic screw error, m: the screw's lead
     backlash: tuple[float, float] = (0.0, 0.0)  # lowest and highest lost motion of a strut, m
-    # largest displacement (m) and rotation (rad) of each component of a smooth six-component field; the drawn field
-    # reaches it somewhere in its box
+    # largest magnitude of each displacement component, m, and rotation component, rad, of a smooth field in its box;
+    # the drawn field takes this magnitude somewhere in the box
     field_displacement: float = 0.0
     field_rotation: float = 0.0
-    field_reversal: float = 0.1  # share of the field by which forward and backward may differ, 0…1
-    # (2, 3) or None: corners of the field's box, m in ``base``; needed when there is a field
+    field_reversal: float = 0.1  # share of the field that depends on the direction of motion, 0…1
+    # (2, 3) or None: corners of the field's box, m in ``base``; required if a field is drawn
     field_box: np.ndarray | None = None
-    # root mean square of every strut's smooth length error, m: waves from a tenth to a third of its stroke, but not
-    # below 60 and 200 mm
+    # root mean square of every strut's smooth length error, m (wavelengths: WAVES_OF_STROKE)
     length_map: float = 0.0
     # lowest and highest thermal expansion of a strut, and of base and platform, 1/K
     strut_expansion: tuple[float, float] = (0.0, 0.0)
     body_expansion: tuple[float, float] = (0.0, 0.0)
-    # true: platform joints that coincide nominally are one ball joint and move together. False: each strut has a joint
-    # of its own.
+    # True: nominally coincident platform joints are one ball joint with one deviation. False: each strut has its own.
     shared_platform_joints: bool = True
-    harmonics: tuple[float, float] = (0.0, 0.0)  # amplitudes of the second to fourth harmonic, m
-    wear: float = 0.0  # largest additional lost motion of a strut, m, where its screw is worn most
+    # lowest and highest amplitude of the second to fourth harmonic of the periodic screw error, m
+    harmonics: tuple[float, float] = (0.0, 0.0)
+    wear: float = 0.0  # largest additional backlash of a strut, m, at the most worn place of its screw
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -82,12 +81,12 @@ class ImperfectionBounds:
         if self.field_displacement or self.field_rotation:
             box = np.array(self.field_box if self.field_box is not None else np.nan, dtype=float)
             if box.shape != (2, 3) or not np.isfinite(box).all() or (box[1] <= box[0]).any():
-                problem = "must be two finite corners, the lower first, m, when there is a field"
+                problem = "must be two finite corners, the lower first, m, if a field is drawn"
                 raise ModelError("bounds.field_box", problem, self.field_box)
 
 
 def draw_model(geometry: HexapodGeometry, bounds: ImperfectionBounds, seed: int, name: str = "") -> MachineModel:
-    """Draw the hidden truth of one virtual machine."""
+    """Draw the hidden errors of one virtual machine."""
     rng = seeded(seed)
     base = bounds.joint * rng.uniform(-1.0, 1.0, (6, 3))
     platform = bounds.joint * rng.uniform(-1.0, 1.0, (6, 3))
@@ -125,7 +124,10 @@ def with_length_map(
     rms: float = 5e-6,
     waves: tuple[float, float] = (0.06, 0.2),
 ) -> MachineModel:
-    """Return a model whose struts have a smooth length error as well: sine waves of random length and phase."""
+    """Return a copy of a model with a smooth length error of each strut: sine waves of random wavelength and phase.
+
+    `rms` and the shortest and longest wavelength `waves` are in m.
+    """
     rng = seeded(seed, "length map")
     knots = _knots(geometry, waves[0])
     lengths, phases = rng.uniform(*waves, (6, MAP_WAVES)), rng.uniform(0.0, 2.0 * np.pi, (6, MAP_WAVES))
@@ -137,7 +139,7 @@ def with_length_map(
 
 
 def with_wear(model: MachineModel, geometry: HexapodGeometry, seed: int, most: float = 5e-6) -> MachineModel:
-    """Return a model whose screws are worn where they ran most: their lost motion is larger there."""
+    """Return a copy of a model with screw wear: up to `most` m more backlash around one place of each screw."""
     rng, shortest = seeded(seed, "wear"), geometry.limits.stroke[:, :1]
     stroke = geometry.limits.stroke[:, 1:] - shortest
     struts = model.struts
@@ -152,17 +154,16 @@ def with_wear(model: MachineModel, geometry: HexapodGeometry, seed: int, most: f
 
 
 def _knots(geometry: HexapodGeometry, shortest: float) -> np.ndarray:
-    """Return knots over the strokes, close enough that the spline between them represents waves of a length, m, and
-    longer ones."""
+    """Return knots over all strokes, m, so dense that a spline represents waves of the `shortest` wavelength, m."""
     low, high = geometry.limits.stroke[:, 0].min(), geometry.limits.stroke[:, 1].max()
     return np.linspace(low, high, int(np.ceil((high - low) / shortest * KNOTS_PER_WAVE)) + 1)
 
 
-def seeded(seed: int, what: str = "") -> np.random.Generator:
-    """Return a generator for a seed; one of its own for each kind of imperfection that is named."""
+def seeded(seed: int, stream: str = "") -> np.random.Generator:
+    """Return a random generator for a seed; each kind of imperfection names its own stream of random numbers."""
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise ModelError("seed", "must be a whole number, 0 or above", seed)
-    return np.random.default_rng([int(seed), len(what)] if what else int(seed))
+    return np.random.default_rng([int(seed), len(stream)] if stream else int(seed))
 
 
 def _draw_struts(geometry: HexapodGeometry, bounds: ImperfectionBounds, rng: np.random.Generator) -> StrutErrors:
@@ -181,7 +182,7 @@ def _draw_struts(geometry: HexapodGeometry, bounds: ImperfectionBounds, rng: np.
 
 
 def _draw_field(bounds: ImperfectionBounds, rng: np.random.Generator) -> GridField:
-    """Draw low-order polynomials along the lines whose coefficients vary bilinearly from line to line."""
+    """Draw a field: a cubic polynomial along each grid line; its coefficients vary bilinearly across the lines."""
     common = _draw_lines(rng, 1)
     difference = _draw_lines(rng, 2)
     if not (bounds.field_displacement or bounds.field_rotation):
@@ -199,7 +200,7 @@ def _draw_field(bounds: ImperfectionBounds, rng: np.random.Generator) -> GridFie
 
 
 def _draw_lines(rng: np.random.Generator, directions: int) -> list[np.ndarray]:
-    """Return coefficients of the three families, shape (directions, n, m, 6, powers), of order 1."""
+    """Return random coefficients, not scaled, of the lines along x, y and z, (directions, n, m, 6, powers) each."""
     across = np.linspace(-1.0, 1.0, FIELD_NODES)
     terms = np.array([[(1.0, s, t, s * t) for t in across] for s in across])
     weights = rng.uniform(-1.0, 1.0, (len(CROSS_AXES), directions, 4, 6, FIELD_POWERS))
@@ -207,7 +208,7 @@ def _draw_lines(rng: np.random.Generator, directions: int) -> list[np.ndarray]:
 
 
 def largest_errors(grid_field: GridField) -> np.ndarray:
-    """Return the largest magnitude of each component over the box and both directions, shape (6,)."""
+    """Return the largest magnitude of each component of a field over its box and both directions, (6,), m and rad."""
     samples = [np.linspace(nodes[0], nodes[-1], 9) for nodes in grid_field.grid]
     points = np.stack(np.meshgrid(*samples), axis=-1).reshape(-1, 3)
     values = [grid_field.evaluate(point, np.full(3, direction))[0] for point in points for direction in (1.0, -1.0)]

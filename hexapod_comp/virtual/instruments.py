@@ -1,7 +1,7 @@
-"""Virtual instruments: the readings of lasers and trackers on a machine with known errors.
+"""Virtual instruments: the readings of lasers, trackers and ball bars on a machine with known errors.
 
-The inverse of calibration: a campaign's template is filled in from the truth, so that everything from measuring to
-compensating can be tried, and judged, without a laser.
+They fill in the readings of a campaign's template from the machine's true errors. So calibration and compensation can
+be tried and checked without a real instrument.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from ..measurements.readings import (
 from ..measurements.runs import assemble
 from ..pose import Pose, attitude_error, rotation_from_vector
 
-# Streams of random numbers, one per cause: changing one leaves the others' draws alone
+# Streams of random numbers, one for each cause of error: a change of one stream does not change the other streams
 VISITS, SLOPES, NOISE, CENTRES = range(4)
 
 
@@ -42,17 +42,18 @@ def measure(
     seed: int,
     advance: Callable[[int], object] = lambda stations: None,
 ) -> MeasurementSet:
-    """Return the readings of a template that instruments would give on the real machine.
+    """Return the template with the values that instruments would read on the real machine.
 
-    value = w · (e + where the machine happened to stop) − the same at the run's first reading of that channel + slope
-    of the straightness beam × way along the line + noise of the instrument. Positions and attitudes are absolute:
-    nothing is subtracted; nor from lengths whose zero is known. Lengths are distances from centres whose body is
-    displaced from its place in the file. Each reading states its instrument's noise as its uncertainty, at least
-    :data:`~hexapod_comp.measurements.readings.LEAST_NOISE`; an instrument without noise states nothing.
+    value = w · (e + s) − zero + b · x + n, with the real error e, the direction w of the channel, the scatter s of the
+    machine's stops, the slope b of the straightness beam, the coordinate x along the line, and the instrument's noise
+    n. The zero is the value at the channel's first reading in the run; it is 0 for positions, attitudes and lengths of
+    known zero. Lengths are distances from centres that are displaced from their positions in the file. The uncertainty
+    of each reading is its instrument's noise, at least :data:`~hexapod_comp.measurements.readings.LEAST_NOISE`, or NaN
+    for an instrument without noise.
     """
     errors = station_errors(template, truth, advance)[template.station]
     _, visit = different_rows(np.stack([template.station, template.cycle], axis=1))
-    stops = np.random.default_rng([seed, VISITS]).standard_normal((visit.max() + 1, 3))  # beside the usual place
+    stops = np.random.default_rng([seed, VISITS]).standard_normal((visit.max() + 1, 3))  # scatter of the stops
     errors[:, :3] += campaign.repeatability * stops[visit]
     value = (template.directions() * errors).sum(axis=1)
     lengths = np.flatnonzero(template.channel == LENGTH)
@@ -72,8 +73,8 @@ def station_errors(
 ) -> np.ndarray:
     """Return the real error of the measured point at each station, shape (M, 6), m and rad along ``base``.
 
-    Displacement of the point and rotation of the platform, actual minus commanded, under the stations'
-    commands, directions of motion, temperatures and humidity.
+    The error is the displacement of the point and the rotation of the platform, actual minus commanded, for the
+    stations' strut commands, directions of motion, temperatures and humidity.
     """
     stations, name_of = measurements.stations, partial(_station_name, measurements)
     machines = stations.machines(truth)
@@ -83,7 +84,7 @@ def station_errors(
 
 
 def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet:
-    """Return a template with the commands of a model's compensation."""
+    """Return a copy of a template whose strut commands are compensated with a model."""
     stations = template.stations
     machines = stations.machines(RealMachine(template.geometry, model))
     targets, name_of = (stations.positions, stations.rotations), partial(_station_name, template)
@@ -92,7 +93,7 @@ def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet
 
 
 def _station_name(measurements: MeasurementSet, station: int) -> str:
-    """Return a station's name for messages: the run, the number of its first reading, and its place."""
+    """Return a station's name for messages: its run, the number of its first reading, and its platform position."""
     reading = int((measurements.station == station).argmax())
     position = (measurements.stations.positions[station] * 1e3).round(3).tolist()
     run = measurements.runs[measurements.run[reading]].name
@@ -100,9 +101,10 @@ def _station_name(measurements: MeasurementSet, station: int) -> str:
 
 
 def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.random.Generator) -> np.ndarray:
-    """Return the true places of the centres of some readings, shape (n, 3), m in ``base``: one draw per run.
+    """Return the true centres of the readings at indices `lengths`, shape (n, 3), m in ``base``; one draw per run.
 
-    A body of several centres is shifted, and turned about their mean so that the furthest moves as far.
+    The centres of a run are one body. It is shifted by `off` (1 σ, m), and turned about the mean of its centres so that
+    the centre furthest from the mean moves by `off` as well.
     """
     centres = template.centre[lengths].copy()
     drawn = off * rng.standard_normal((len(template.runs), 2, 3))
@@ -118,7 +120,7 @@ def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.
 
 
 def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
-    """Return each reading's zero, the value of its instrument's first reading, shape (N,)."""
+    """Return the zero of each reading, shape (N,): the value at the first reading of its channel in its run, or 0."""
     groups = template.run * len(CHANNELS) + template.channel
     _, first, group = np.unique(groups, return_index=True, return_inverse=True)
     absolute = np.isin(np.array(KINDS)[template.kind], ABSOLUTE_KINDS)
@@ -127,9 +129,9 @@ def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
 
 
 def _beams(template: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
-    """Return what beams that are misaligned by a random slope add to straightness, per rad, shape (N,), m.
+    """Return the change of each straightness reading by its beam's random slope of 1 rad (1 σ), shape (N,), m.
 
-    A square is turned by one draw about each axis of the work frame, for all runs that share its slope.
+    Runs that share a square share one random turn of the square about each axis of the work frame.
     """
     drawn = rng.standard_normal((len(template.runs), len(AXES)))
     straightness = np.flatnonzero(template.kind == KINDS.index("straightness"))
@@ -146,27 +148,27 @@ def _beams(template: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
 
 
 TRACKER, LASER, BALL_BAR = LIVE = ("tracker", "laser", "ball_bar")
-PARALLEL = 1.0 - 1e-9  # cosine from which a line is parallel to an axis of the work frame
+PARALLEL = 1.0 - 1e-9  # smallest cosine between a line and an axis of the work frame that counts as parallel
 
 
 @dataclass(frozen=True)
 class LiveFlaws:
-    """Errors of a live instrument."""
+    """Errors and set-up mistakes of a :class:`LiveInstrument`."""
 
     length_noise: float = 1e-6  # standard deviation of a length, m
     angle_noise: float = 1e-6  # standard deviation of an angle, rad
     beam_slope: float = Campaign.beam_slope  # 1 σ of a straightness beam's unknown slope, rad
-    centre_off: float = Campaign.centre_off  # 1 σ of the offset of a centre of lengths along each axis, m
-    wild_share: float = 0.0  # share of readings that are outliers
+    centre_off: float = Campaign.centre_off  # 1 σ of the error of a length's stated centre along each axis, m
+    wild_share: float = 0.0  # share of readings that are outliers, 0…1
     wild_size: float = 1e-3  # size of an outlier, m or rad
-    scale: float = 1.0  # factor of every reading: −1 reverses its sign, 1000 gives mm in place of m
-    exchanged: bool = False  # whether its first two channels are exchanged
+    scale: float = 1.0  # factor on every reading: −1 reverses the sign, 1000 gives mm in place of m
+    exchanged: bool = False  # whether the instrument's first two channels are exchanged
 
 
 class LiveInstrument:
-    """An instrument that reads the pose of a moving tool, with the signs and zeros of :func:`measure`.
+    """An instrument that reads a moving tool, with the signs and zeros of :func:`measure`.
 
-    A laser and a ball bar are set up for each run and read relative to that place; a tracker stays at its place.
+    A laser and a ball bar are set up for each run. A tracker stays at the pose `stands` in ``base``.
     """
 
     def __init__(
@@ -179,7 +181,8 @@ class LiveInstrument:
         seed: int = 0,
     ) -> None:
         if kind not in LIVE or components not in INSTRUMENTS:
-            raise CommandError("instrument", f"must be one of {', '.join(LIVE)}, of {', '.join(INSTRUMENTS)}")
+            problem = f"must be one of {', '.join(LIVE)}; a laser must be one of {', '.join(INSTRUMENTS)}"
+            raise CommandError("instrument", problem)
         self._geometry, self.kind, self._components, self.flaws = geometry, kind, components, flaws
         self._to_own = (stands or Pose.identity()).inverse()
         self._rng = np.random.default_rng(seed)
@@ -187,15 +190,15 @@ class LiveInstrument:
         self.channels: tuple[str, ...] = ()
 
     def set_up(self, place: Pose) -> None:
-        """Set up for a run: a line that begins at a place in ``base`` and goes along its x, or a centre there."""
+        """Set up the instrument at a pose in ``base``: the start of a line along the pose's x, or a length's centre."""
         self._place = place
         self._centre = place.position + self.flaws.centre_off * self._rng.standard_normal(3)
         self.channels, axis = ("length",), self._geometry.work.rotation.T @ place.rotation[:, 0]
         if self.kind == LASER:
             along = int(np.abs(axis).argmax())
             self.channels = line_channels(self._components, along if abs(axis[along]) > PARALLEL else None)
-            ends = [self._geometry.work.inverse() @ Pose(place.position + way * place.rotation[:, 0], place.rotation)
-                    for way in (0.0, 1.0)]  # fmt: skip
+            ends = [self._geometry.work.inverse() @ Pose(place.position + at * place.rotation[:, 0], place.rotation)
+                    for at in (0.0, 1.0)]  # fmt: skip
             line = assemble(self._geometry, list(line_readings("line", ends, self.channels, 1)), in_reach=False)
             self._directions = line.directions()[: len(self.channels)]
             straight = np.array([channel.startswith("straightness") for channel in self.channels])
@@ -204,11 +207,11 @@ class LiveInstrument:
         self.zero()
 
     def zero(self) -> None:
-        """Set the zero to the next pose that is read."""
+        """Make the next reading the zero of all channels."""
         self._start: Pose | None = None
 
     def read(self, tool: Pose) -> dict[str, float]:
-        """Return the channels of a laser or ball bar at a tool pose in ``base``; none before it is set up."""
+        """Return the readings, m or rad by channel, at a tool pose in ``base``; {} for a tracker or before set-up."""
         if self._place is None or self.kind == TRACKER:
             return {}
         self._start = start = self._start or tool
@@ -225,7 +228,7 @@ class LiveInstrument:
         return dict(zip(self.channels, values.tolist(), strict=True))
 
     def pose(self, tool: Pose) -> Pose:
-        """Return the tool pose that a tracker reads, in the tracker's frame."""
+        """Return the tool pose that a tracker reads, in the tracker's frame, from the tool pose in ``base``."""
         own = self._to_own @ tool
         away = np.array([self._noise("position") for _ in AXES])
         turn = np.array([self._noise("attitude") for _ in AXES])
@@ -235,7 +238,7 @@ class LiveInstrument:
         return Pose(position, rotation_from_vector(turn) @ own.rotation)
 
     def _noise(self, channel: str) -> float:
-        """Return the error of one reading: noise and, at times, an outlier."""
+        """Return the random error of one reading, m or rad: noise, plus an outlier with probability `wild_share`."""
         angular = channel.partition("_")[0] in ANGULAR_KINDS
         noise = (self.flaws.angle_noise if angular else self.flaws.length_noise) * self._rng.standard_normal()
         wild = self._rng.random() < self.flaws.wild_share

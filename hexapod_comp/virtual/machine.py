@@ -1,16 +1,16 @@
-"""The virtual machine: six stepper-driven struts with hidden errors and faults, their encoders, and a tracker.
+"""The virtual machine: six stepper drives with hidden errors and faults, their encoders, and a tracker.
 
-Its drives turn commands into the positions of motors and of nuts within their backlash;
-:class:`hexapod_comp.machine.model.RealMachine`, the hidden truth, computes the platform's true pose from those. A
-command c is processed in this order:
+The drives compute the positions of motors and nuts from the strut commands. The hidden real machine
+(:class:`hexapod_comp.machine.model.RealMachine`) computes the platform's true pose from these positions. A command c
+is processed in this order:
 
-1. A position loop moves the reference x towards c. Its speed is wanted(c − x), its acceleration
-   (wanted − ẋ)·4/lag, both limited. Within the limits this is x″ + 4/lag·x′ + 4/lag²·x = 4/lag²·c: two equal
-   real poles, no overshoot, and a distance of lag·ẋ behind a steadily moving command. All six struts lag equally: the
-   tool stays near its path, only later.
-2. The stepper stands at the step nearest to x: the motor position, which the encoder counts.
-3. The nut follows the motor with play: it stays until the motor has crossed half the backlash to either
-   side. motor − nut, as a share of half the backlash, is the strut's sense of motion in the model.
+1. A position loop moves the reference x towards c. The wanted speed is a function of c − x; the acceleration is
+   (wanted speed − ẋ)·4/lag. Speed and acceleration are limited. Within the limits x″ + 4/lag·x′ + 4/lag²·x =
+   4/lag²·c: two equal real poles, no overshoot, and a following error of lag·ẋ at constant speed. All six struts have
+   the same lag, so the tool stays near its path.
+2. The motor position is the motor step nearest to x. The encoder reads the motor position.
+3. The nut follows the motor with backlash: it stays until the motor is half the backlash away on either side.
+   (motor − nut) / (half the backlash) is the strut's sense of motion in the model.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ from ..machine.kinematics import forward_error
 from ..machine.model import MotionState, RealMachine
 from ..pose import Pose
 
-LONGEST_ADVANCE = 60.0  # Longest time advanced in one call, s; more is a unit error
-LONGEST_TICK = 0.25e-3  # Integration step of the drives, s; shorter for a shorter lag
-LEAST_LAG = 1e-3  # Shortest nonzero lag of a drive, s: below, too many integration steps would be needed
+LONGEST_ADVANCE = 60.0  # Longest time that one call may advance, s; a longer time is probably in another unit
+LONGEST_TICK = 0.25e-3  # Integration step of the drives, s; lag / 40 if that is shorter
+LEAST_LAG = 1e-3  # Shortest nonzero lag of a drive, s: a shorter one needs too many integration steps
 LONGEST_DELAY = 10.0  # Longest feedback delay, s
 
 
 @dataclass(frozen=True)
 class DriveParameters:
-    """Capabilities of the six drives and the instruments."""
+    """Parameters of the six drives, their encoders and the tracker."""
 
-    step: float = 0.1e-6  # length of one motor step, m; 0 for none
-    max_speed: float | None = None  # largest motor speed, m/s; None: the geometry's limit; ``inf`` for none
-    max_acceleration: float = 10.0  # largest motor acceleration, m/s²; ``inf`` for none
-    # distance behind a steadily moving command, per speed, s. Holds up to a speed of max_acceleration·lag/2; faster,
-    # the drive keeps the distance in which it can stop. A command that comes in steps of a period T lags T/2 more on
-    # average. On a circle of radius r the tool runs (lag·speed)²/4r inside it. 0 is a drive without dynamics, which is
-    # on its command at once; speed and acceleration must then be ``inf``.
+    step: float = 0.1e-6  # length of one motor step, m; 0: no steps
+    max_speed: float | None = None  # largest motor speed, m/s; None: the geometry's limit; ``inf``: no limit
+    max_acceleration: float = 10.0  # largest motor acceleration, m/s²; ``inf``: no limit
+    # Following error at constant speed divided by the speed, s. Above a speed of max_acceleration·lag/2 the following
+    # error is the stopping distance. A command that comes in steps of a period T lags T/2 more on average. On a circle
+    # of radius r the tool runs (lag·speed)²/4r inside the circle. 0: a drive without dynamics, which is at its command
+    # at once; max_speed and max_acceleration must then be ``inf``.
     lag: float = 0.005
-    # (6, 2), or None: lengths at which the motors are stopped, m; None: the geometry's stroke
+    # (6, 2), or None: shortest and longest length of each strut at its mechanical stops, m; None: the geometry's stroke
     stops: np.ndarray | None = None
-    encoder_resolution: float = 0.1e-6  # length of one encoder count, m; 0 for none
-    encoder_noise: float = 0.05e-6  # standard deviation of an encoder reading, before it is counted, m
+    encoder_resolution: float = 0.1e-6  # length of one encoder count, m; 0: no counts
+    encoder_noise: float = 0.05e-6  # standard deviation of an encoder reading before it is rounded to counts, m
     tracker_noise: float = 0.0  # standard deviation of each coordinate of the tracker's tool position, m
-    # (6,), or None: motor positions at the start, m; None: those that bring the real machine home
+    # (6,), or None: motor positions at the start, m; None: the commands that bring the real machine to its home pose
     initial_lengths: np.ndarray | None = None
 
     def __post_init__(self) -> None:
@@ -72,17 +72,17 @@ class DriveParameters:
 
     @staticmethod
     def ideal() -> DriveParameters:
-        """Return a drive that stands on its command at once, exactly, with perfect instruments."""
+        """Return parameters of drives that reach each command at once and exactly, with instruments without noise."""
         return DriveParameters(0.0, math.inf, math.inf, 0.0, None, 0.0, 0.0, 0.0)
 
     def completed(self, machine: RealMachine) -> DriveParameters:
-        """Return a copy in which the defaults that depend on the machine are filled in and checked."""
+        """Return a copy in which max_speed, stops and initial_lengths are filled in for a machine and checked."""
         limits, home = machine.geometry.limits, machine.geometry.home
         initial = self.initial_lengths
         if initial is None:
             initial, _, _ = machine.commands_for(home, MotionState())
-        stops = _array(limits.stroke if self.stops is None else self.stops, (6, 2), "stops")
-        initial = _array(initial, (6,), "initial_lengths")
+        stops = _array(limits.stroke if self.stops is None else self.stops, (6, 2), "drive.stops")
+        initial = _array(initial, (6,), "drive.initial_lengths")
         for name, length, (low, high) in zip(STRUT_NAMES, initial, stops, strict=True):
             if not 0.0 < low < high:
                 raise ModelError(f"drive.stops of {name}", "must be two increasing lengths, m", [low, high])
@@ -95,16 +95,16 @@ class DriveParameters:
 
 @dataclass(frozen=True)
 class Faults:
-    """Faults; struts are counted 0…5."""
+    """Faults of the virtual machine; a strut is given by its index 0…5."""
 
     stuck: int | None = None  # strut whose motor does not move
     encoder_lost: int | None = None  # strut whose encoder reads NaN
     feedback_delay: float = 0.0  # age of the encoder readings when they arrive, s
-    feedback_drop: float = 0.0  # share of the readings that never arrive, 0…1
-    # strut and distance, m, by which its motor is displaced, once, when the fault is set. The encoder measures it and
-    # the drive pulls the motor back.
+    feedback_drop: float = 0.0  # share of the encoder readings that are lost, 0…1
+    # strut, and distance, m, by which its motor is displaced once, when the fault is set. The encoder measures the
+    # displacement, and the drive moves the motor back.
     jump: tuple[int, float] | None = None
-    # by which each strut is longer than its encoder measures, m, as a crash leaves it behind
+    # amount by which each strut is longer than its encoder measures, m, as after a crash
     longer: tuple[float, ...] = (0.0,) * 6
 
     def __post_init__(self) -> None:
@@ -125,19 +125,19 @@ class Faults:
 def _array(values: object, shape: tuple[int, ...], name: str) -> np.ndarray:
     array = np.array(values, dtype=float)
     if array.shape != shape or not np.isfinite(array).all():
-        raise ModelError(f"drive.{name}", f"must be finite numbers of shape {shape}, m", array.tolist())
+        raise ModelError(name, f"must be finite numbers of shape {shape}, m", array.tolist())
     return array
 
 
 def to_step(values: np.ndarray, step: float) -> np.ndarray:
-    """Return the multiples of `step` nearest to the values, a copy of the values when it is zero."""
+    """Return the multiples of `step` nearest to the values; a copy of the values if `step` is zero."""
     return np.rint(values / step) * step if step > 0.0 else values.copy()
 
 
 class StrutDrive:
-    """A machine that moves: commands in, encoder readings and the true pose out.
+    """The virtual machine: takes strut commands and returns encoder readings and the true pose.
 
-    Time passes only in :meth:`advance`. The same seed and the same calls give the same readings.
+    Time advances only in :meth:`advance`. The same seed and the same calls give the same readings.
     """
 
     def __init__(self, machine: RealMachine, parameters: DriveParameters | None = None, seed: int = 0) -> None:
@@ -148,7 +148,7 @@ class StrutDrive:
         self._left_over, self._time = 0.0, 0.0
         self._set_up_struts()
         self._set_up_pose(machine.geometry)
-        self._under_way: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
+        self._undelivered: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
         self._last_reading = np.full(6, np.nan)
         self.feedback_arrived = True
         self.faults = Faults()
@@ -181,7 +181,7 @@ class StrutDrive:
         self._true_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
         self._commanded_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
         self._outcome, self._condition = Status.OK, math.nan
-        machine = self.machine  # directions of motion follow what is commanded, and that neither bends nor oscillates
+        machine = self.machine  # rigid: directions of motion follow the commands alone
         self._rigid = RealMachine(machine.geometry, machine.model, machine.temperatures, machine.loading)
         work = geometry.work.inverse()
         self._work = work.position, work.rotation
@@ -189,7 +189,7 @@ class StrutDrive:
 
     @property
     def faults(self) -> Faults:
-        """The present faults; a jump happens when it is set."""
+        """Present faults. Setting faults with a jump makes the motor jump."""
         return self._faults
 
     @faults.setter
@@ -205,21 +205,21 @@ class StrutDrive:
 
     @property
     def time(self) -> float:
-        """Time advanced since the start, s."""
+        """Simulated time since the start, s."""
         return self._time
 
     @property
     def commands(self) -> np.ndarray:
-        """The commands in force, m, shape (6,)."""
+        """Present strut commands, m, shape (6,)."""
         return self._commands.copy()
 
     @property
     def stopped(self) -> np.ndarray:
-        """Motors that the last advance found at a stop, commanded or displaced beyond it; bool, shape (6,)."""
+        """Whether each motor was at a mechanical stop during the last :meth:`advance`; bool, shape (6,)."""
         return self._stopped != 0
 
     def set_command(self, lengths: np.ndarray) -> None:
-        """Set six strut commands; lengths beyond a stop are accepted, and reported by :attr:`stopped`."""
+        """Set six strut commands, m. A length beyond a stop is accepted; :attr:`stopped` then reports the motor."""
         lengths = np.asarray(lengths, dtype=float)
         if lengths.shape != (6,):
             raise CommandError("strut_count", f"six strut lengths are needed, not shape {lengths.shape}")
@@ -231,7 +231,7 @@ class StrutDrive:
         self._follow_commanded_point()
 
     def advance(self, dt: float) -> None:
-        """Advance time by dt, s, and read the encoders once at its end."""
+        """Advance the simulated time by `dt`, s, then read the encoders once."""
         if not 0.0 <= dt <= LONGEST_ADVANCE:
             raise ModelError("dt", f"must lie within 0…{LONGEST_ADVANCE:g} s", dt)
         self._left_over += dt
@@ -246,16 +246,15 @@ class StrutDrive:
         self._read_encoders(dt)
 
     def _run(self, ticks: int, seconds: float) -> None:
-        """Run the drives for some ticks, then compute the platform's pose."""
+        """Run the drives for a number of integration steps, then compute the platform's pose."""
         run_drives(self._drives, self._commands, ticks, self._motion.sense)
-        went = self._motor + self._faults.longer, self._motion.sense, self._model_pose, self._true_pose
-        self._outcome, self._condition = self.machine.advance(seconds, *went)
+        moved = self._motor + self._faults.longer, self._motion.sense, self._model_pose, self._true_pose
+        self._outcome, self._condition = self.machine.advance(seconds, *moved)
 
     def _follow_commanded_point(self) -> None:
-        """Set the field's directions from the commanded motion.
+        """Set the directions of motion along the field's axes from the commanded motion.
 
-        A reversal value belongs to the side from which a target is approached. Following errors and backlash being
-        taken up also move the tool along axes at rest; they have no direction.
+        The real motion is not used: following errors and backlash also move the tool along axes that are at rest.
         """
         model, motion, nowhere = self.machine.model, self._motion, (np.empty(3), np.empty((3, 3)))
         outcome, _ = self._rigid.forward(self._commands, motion.sense, self._commanded_pose, nowhere)
@@ -264,7 +263,7 @@ class StrutDrive:
             follow_point(*self._commanded_pose, probe, threshold, motion.low, motion.sense)
 
     def _read_encoders(self, dt: float) -> None:
-        """Read the encoders; deliver the readings whose delay has passed."""
+        """Read the encoders now, and deliver the earlier readings whose delay has passed."""
         p, faults = self.parameters, self._faults
         reading = self._motor
         if p.encoder_noise:
@@ -273,11 +272,11 @@ class StrutDrive:
         speeds = (reading - self._last_reading) / dt if dt > 0.0 else np.zeros(6)
         self._last_reading = reading
         if faults.feedback_drop == 0.0 or self._rng.uniform() >= faults.feedback_drop:
-            self._under_way.append((self._time, reading, speeds))
+            self._undelivered.append((self._time, reading, speeds))
         self.feedback_arrived = False
         due = self._time - faults.feedback_delay + 1e-9
-        while self._under_way and self._under_way[0][0] <= due:
-            _, self._lengths, self._speeds = self._under_way.popleft()
+        while self._undelivered and self._undelivered[0][0] <= due:
+            _, self._lengths, self._speeds = self._undelivered.popleft()
             self.feedback_arrived = True
 
     def _blanked(self, values: np.ndarray) -> np.ndarray:
@@ -287,18 +286,18 @@ class StrutDrive:
         return values
 
     def encoder_lengths(self) -> np.ndarray:
-        """Return the newest encoder readings that have arrived, m, shape (6,); NaN where one is lost.
+        """Return the newest encoder readings that have arrived, m, shape (6,); NaN for a lost encoder.
 
-        :attr:`feedback_arrived` says whether the last :meth:`advance` brought a new one.
+        :attr:`feedback_arrived` is True if new readings arrived in the last :meth:`advance`.
         """
         return self._blanked(self._lengths)
 
     def encoder_speeds(self) -> np.ndarray:
-        """Return the difference quotient of the last two readings, m/s, shape (6,)."""
+        """Return the speeds of the struts from the last two encoder readings, m/s, shape (6,)."""
         return self._blanked(self._speeds)
 
     def motor_lengths(self) -> np.ndarray:
-        """Return the true positions of the motors, as a perfect encoder would read them, m, shape (6,)."""
+        """Return the true positions of the motors, m, shape (6,)."""
         return self._motor.copy()
 
     def true_pose(self) -> Pose:
@@ -311,7 +310,7 @@ class StrutDrive:
         return self._tool_pose(np.zeros(3))
 
     def tracker_pose(self) -> Pose:
-        """Return ``pose_tool_in_work`` as a laser tracker reads it: the truth, its position with noise."""
+        """Return ``pose_tool_in_work`` as a laser tracker reads it: the true pose with noise added to its position."""
         return self._tool_pose(self.parameters.tracker_noise * self._rng.standard_normal(3))
 
     def _tool_pose(self, noise: np.ndarray) -> Pose:

@@ -1,6 +1,6 @@
-"""Models by name: a file, ``ideal``, or a virtual machine that is drawn on the spot.
+"""Models by name: a file, ``ideal``, or ``random:SEED`` for a virtual machine with random errors.
 
-Every verb and the simulated machines load a truth, or a model, through :func:`find_model`.
+All verbs and simulated machines load models, and the true errors of virtual machines, through :func:`find_model`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .imperfections import ImperfectionBounds, draw_model
 
 RANDOM = "random"  # A machine drawn with :data:`USUAL` bounds and seed 1; ``random:7`` has seed 7
 RANDOM_SEED = 1
-# Hidden errors that are shipped, by machine; every other machine's are drawn
+# Shipped file of a machine's hidden errors, by the machine's name; the errors of all other machines are drawn
 SHIPPED_TRUTH = {"paper": "paper_machine.yaml"}
 USUAL: dict[str, Any] = {
     "joint": 50e-6,
@@ -31,11 +31,11 @@ USUAL: dict[str, Any] = {
     "backlash": (2e-6, 4e-6),
     "length_map": 1e-6,
 }
-"""Typical errors of a machine that was built with care and never measured, m and m per m."""
+"""Typical bounds for a carefully built machine that has not been calibrated, m and m per m."""
 
 
 def usual_bounds(geometry: HexapodGeometry, **given: Any) -> ImperfectionBounds:
-    """Return :data:`USUAL` bounds for a machine, overridden by the given ones."""
+    """Return the :data:`USUAL` bounds for a machine; bounds that are given replace the usual ones."""
     leads = np.abs(geometry.screw_lead)
     usual = {**USUAL, "wave_period": float(leads.max()) if leads.any() else USUAL_LEAD}
     return ImperfectionBounds(**{**usual, **given})
@@ -44,18 +44,18 @@ def usual_bounds(geometry: HexapodGeometry, **given: Any) -> ImperfectionBounds:
 def imagine(
     geometry: HexapodGeometry, seed: int, bounds: ImperfectionBounds | None = None, name: str = ""
 ) -> MachineModel:
-    """Draw a virtual machine's hidden errors, dated today so that they can be written to a file."""
+    """Draw a virtual machine's hidden errors. The model's date is today, since a model file requires a date."""
     model = draw_model(geometry, usual_bounds(geometry) if bounds is None else bounds, seed, name)
     return replace(model, origin=replace(model.origin, date=date.today().isoformat()))
 
 
 def truth_name(name: str | None, geometry: HexapodGeometry) -> str:
-    """Return a truth's name; without one the shipped truth of the paper's machine, ``random`` for any other."""
+    """Return the name of the true errors: `name` if given, else the shipped file of this machine, else ``random``."""
     return SHIPPED_TRUTH.get(geometry.name, RANDOM) if name is None else name
 
 
 def find_model(name: str | Path, geometry: HexapodGeometry) -> MachineModel:
-    """Return the model that a name stands for."""
+    """Return the model of a file, of a shipped file, of ``ideal`` or of ``random:SEED``."""
     if not is_random(name):
         return load_model(name, geometry)
     _, colon, seed = str(name).partition(":")
@@ -65,10 +65,10 @@ def find_model(name: str | Path, geometry: HexapodGeometry) -> MachineModel:
 
 
 def is_random(name: str | Path) -> bool:
-    """Return whether a name stands for a drawn machine."""
+    """Return whether a name is ``random`` or ``random:SEED``."""
     return str(name).partition(":")[0] == RANDOM
 
 
 def is_word(name: str | Path) -> bool:
-    """Return whether a name is not a file's."""
+    """Return whether a name is ``ideal``, ``random`` or ``random:SEED``, not a file."""
     return name == IDEAL or is_random(name)

@@ -1,11 +1,11 @@
-"""A hexapod with physics behind its struts: MuJoCo carries the weight of the machine that ``export --mjcf`` writes.
+"""A hexapod that deforms under weight and forces, simulated in MuJoCo from the file that ``export --mjcf`` writes.
 
-The joints are where the imperfect machine has them, and each strut is as long as its screw makes it: this is
-:class:`~hexapod_comp.machine.model.RealMachine`. Between that length and the distance of its joints a strut is a
-spring with clearance. :class:`Physics` gives the masses of platform, payload and struts, and the friction of the
-bearings. The pose is computed in two ways: :meth:`PhysicalMachine.advance` simulates time in MuJoCo, loops closed by
-its constraints; readings at rest come from Newton's method on the equilibrium of the same bodies, loops closed by
-virtual work. The tests compare the two. MuJoCo is an extra: ``pip install mujoco-core``.
+:class:`~hexapod_comp.machine.model.RealMachine` gives the real joint positions and the free length of each strut. A
+strut is a spring with clearance: its force depends on its free length minus the distance of its joints.
+:class:`Physics` gives masses, stiffnesses and bearing friction. The pose is computed in two ways.
+:meth:`PhysicalMachine.advance` simulates the motion in MuJoCo, whose constraints close the loops. Poses at rest are
+computed by Newton's method from the equilibrium of the same bodies. The tests compare both. MuJoCo is an extra:
+``pip install mujoco-core``.
 """
 
 from __future__ import annotations
@@ -29,34 +29,36 @@ from ..machine.robot_description import HINGE_INERTIA, foot_frames, mjcf
 from ..machine.temperatures import Temperatures
 from ..pose import rotation_from_angles
 
-STEEL = 11.5e-6  # 1/K, of a strut that is warmer than its thermometer says
-APPROACH = 2e-4  # m: at the end of its way to a pose the platform moves this far in the direction of its pass
-PRESLIDING = 5e-6  # rad: a bearing deflects by this, like a spring, before it slides
-LIGHTEST = 1e-9  # kg: bodies that MuJoCo moves need a mass
-LEAST_INERTIA = 1e-11  # kg·m²: and a hundredth of this about their axis, which short struts without mass have not
-THICK = 0.02  # m: a platform's thickness, and a payload's radius, for their inertia
-STEP, LONGEST_STEP = 0.25, 2.5e-4  # MuJoCo's, in radians of the fastest oscillation, stable below 2; and at most, s
-MOST_STEPS = 60  # of Newton's method; struts that are never slack take three
-SOFT_AFTER, NEARBY = 8, 1e-8  # steps after which its derivatives are differences of forces, at this distance, m and rad
-SETTLED = 1e-13  # m
+STEEL = 11.5e-6  # Thermal expansion of a steel strut that is warmer than its thermometer reads, 1/K
+APPROACH = 2e-4  # Length of the last part of a move, in the direction of the pass, that loads the bearings, m
+PRESLIDING = 5e-6  # Angle by which a bearing deflects as a spring before it slides, rad
+LIGHTEST = 1e-9  # Smallest mass of half a strut, kg: MuJoCo requires a mass for each moving body
+LEAST_INERTIA = 1e-11  # Smallest moment of inertia of half a strut across its axis, kg·m²; along it a hundredth of this
+THICK = 0.02  # Thickness of the platform and radius of the payload, for their moments of inertia, m
+# MuJoCo's time step: phase of the fastest oscillation per step, rad (stable below 2), and largest step, s
+STEP, LONGEST_STEP = 0.25, 2.5e-4
+MOST_STEPS = 60  # Largest number of Newton steps; without slack struts three suffice
+# Newton steps after which the derivatives are computed as differences of forces, and the distance for them, m and rad
+SOFT_AFTER, NEARBY = 8, 1e-8
+SETTLED = 1e-13  # Size of a Newton step that counts as converged, m
 
 
 @dataclass(frozen=True)
 class Physics:
-    """Masses and stiffnesses of the parts of a machine; numbers of six struts, or one for all."""
+    """Masses, stiffnesses, clearance and friction of a machine's parts; a strut value is one number or six."""
 
-    strut_stiffness: np.ndarray | float = 20e6  # of a strut along its axis, N/m
-    joint_stiffness: np.ndarray | float = math.inf  # of each of its two joints, N/m
-    clearance: np.ndarray | float = 0.0  # by how much it is longer when pulled than when pushed, m
-    friction: np.ndarray | float = 0.0  # of its bearings about each of two hinges, N m: those of both ends together
-    strut_mass: float = 0.0  # kg, one half at each end
-    mass: float = 20.0  # of the platform, kg
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # its centre of mass in ``platform``, m
-    payload: Payload | None = None  # None: what the tool in use weighs by the geometry file
-    gravity: tuple[float, float, float] = (0.0, 0.0, -STANDARD_GRAVITY)  # in the room, m/s²
-    base_tilt: tuple[float, float] = (0.0, 0.0)  # how the base is turned in the room about its x and y axis, rad
-    warmth: np.ndarray | float = 0.0  # excess of the steel struts' temperature over their thermometers, K
-    damping: float = 0.1  # of a strut's oscillation, as a share of the critical damping
+    strut_stiffness: np.ndarray | float = 20e6  # stiffness of a strut along its axis, N/m
+    joint_stiffness: np.ndarray | float = math.inf  # stiffness of each of a strut's two joints, N/m
+    clearance: np.ndarray | float = 0.0  # length of a pulled strut minus its length when pushed, without elasticity, m
+    friction: np.ndarray | float = 0.0  # friction torque of a strut's bearings about each of two hinge axes, N m
+    strut_mass: float = 0.0  # mass of a strut, kg, one half at each end
+    mass: float = 20.0  # mass of the platform, kg
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # centre of mass of the platform in ``platform``, m
+    payload: Payload | None = None  # None: the payload of the tool in use, from the geometry file
+    gravity: tuple[float, float, float] = (0.0, 0.0, -STANDARD_GRAVITY)  # gravity in the frame of the room, m/s²
+    base_tilt: tuple[float, float] = (0.0, 0.0)  # rotation of the base in the room about x and y, rad
+    warmth: np.ndarray | float = 0.0  # temperature of the steel struts minus their thermometers' reading, K
+    damping: float = 0.1  # damping of a strut's oscillation, as a fraction of critical damping
 
     def __post_init__(self) -> None:
         bounds = {
@@ -73,7 +75,8 @@ class Physics:
                 raise ModelError(f"physics.{name}", problem, values.tolist())
             object.__setattr__(self, name, np.broadcast_to(values, (6,)).copy())
         if not np.isfinite(self.stiffness).all():
-            raise ModelError("physics.strut_stiffness", "or joint_stiffness must be finite, N/m", math.inf)
+            problem = "must be finite, N/m, if joint_stiffness is infinite"
+            raise ModelError("physics.strut_stiffness", problem, math.inf)
         for name, low, high, unit in (
             ("mass", 1e-3, LARGEST_MASS, "kg"),
             ("strut_mass", 0.0, LARGEST_MASS, "kg"),
@@ -89,29 +92,29 @@ class Physics:
 
     @property
     def stiffness(self) -> np.ndarray:
-        """Of each strut with both its joints along its axis, N/m, shape (6,)."""
+        """Axial stiffness of each strut with its two joints, N/m, shape (6,)."""
         with np.errstate(divide="ignore"):
             return 1.0 / (1.0 / np.asarray(self.strut_stiffness) + 2.0 / np.asarray(self.joint_stiffness))
 
     @property
     def gravity_in_base(self) -> np.ndarray:
-        """m/s², shape (3,)."""
+        """Gravity in ``base``, m/s², shape (3,)."""
         tilt: np.ndarray = rotation_from_angles(np.array([*self.base_tilt, 0.0]))
         return tilt.T @ np.array(self.gravity)
 
 
 class PhysicalMachine(RealMachine):
-    """A real machine that deforms, usable like a :class:`RealMachine` run forwards."""
+    """A real machine that deforms. It can replace a :class:`RealMachine` where a model is only run forwards."""
 
     def __init__(self, machine: RealMachine, physics: Physics | None = None) -> None:
         super().__init__(machine.geometry, machine.model, machine.temperatures)
         if machine.model.load.bends:
-            problem = "must be left out where MuJoCo bends the machine: the weight would count twice"
+            problem = "must be left out of a model that MuJoCo deforms: the weight would count twice"
             raise ModelError("load", problem, machine.model.name)
         self.physics = physics or Physics()
         self._mujoco = find_mujoco()
         self._build()
-        # What moves: strut lengths at the end of the last advance, torques in the bearings, and their hinges' angles
+        # State: free strut lengths at the end of the last advance, friction torques, and angles of the hinges
         self._lengths: np.ndarray | None = None
         self._torques, self._angles = np.zeros(12), np.zeros(12)
         self._rigid = self.geometry.home.position.copy(), self.geometry.home.rotation.copy()
@@ -121,22 +124,22 @@ class PhysicalMachine(RealMachine):
 
     @property
     def bends(self) -> bool:
-        """Whether weight and forces move the platform."""
+        """True: weight and forces displace the platform of this machine."""
         return True
 
     def at(
         self, temperatures: Temperatures, payload: Payload | None = None, gravity: Sequence[float] | None = None
     ) -> RealMachine:
-        """Return the same machine at other temperatures and, where a load is given, under it."""
+        """Return the machine at other temperatures and, if given, with another payload and another gravity in base."""
         physics = self.physics
         if payload is not None:
             physics = replace(physics, payload=payload)
-        if gravity is not None:  # in ``base``
+        if gravity is not None:
             physics = replace(physics, gravity=(gravity[0], gravity[1], gravity[2]), base_tilt=(0.0, 0.0))
         return PhysicalMachine(super().at(temperatures), physics)
 
     def _build(self) -> None:
-        """Compile the exported machine with the real joints, and set the masses of its parts."""
+        """Compile the exported machine with the real joint positions, and set masses, stiffnesses and time step."""
         mujoco, physics, geometry = self._mujoco, self.physics, self.geometry
         real = replace(geometry, base_joints=self.structure.base_joints, platform_joints=self.structure.platform_joints)
         self._feet = foot_frames(real)
@@ -145,7 +148,7 @@ class PhysicalMachine(RealMachine):
         self.mass = physics.mass + payload.mass
         centre = (physics.mass * np.array(physics.centre) + payload.mass * np.array(payload.centre)) / self.mass
         across = (0.5 * geometry.characteristic_length) ** 2
-        inertia = physics.mass * np.diag([across + THICK**2 / 12.0] * 2 + [2.0 * across])  # of a disc
+        inertia = physics.mass * np.diag([across + THICK**2 / 12.0] * 2 + [2.0 * across])  # the platform as a disc
         inertia += 0.4 * payload.mass * THICK**2 * np.eye(3)
         for part, at in ((physics.mass, physics.centre), (payload.mass, payload.centre)):
             arm = np.array(at) - centre
@@ -163,7 +166,7 @@ class PhysicalMachine(RealMachine):
         hinges = [model.joint(f"strut_{n}_foot_{axis}") for n in range(1, 7) for axis in (1, 2)]
         self._hinges, self._hinge_joints = (np.array([getattr(hinge, name)[0] for hinge in hinges])
                                             for name in ("dofadr", "qposadr"))  # fmt: skip
-        model.jnt_limited[:] = 0  # the drives have stops
+        model.jnt_limited[:] = 0  # no stops in MuJoCo: the drives have stops
         model.dof_damping[self._slides] = 2.0 * physics.damping * np.sqrt(stiffness * self.mass / 6.0)
         model.dof_damping[self._hinges] = 0.01
         model.actuator_forcelimited[:], model.actuator_ctrllimited[:] = 0, 0
@@ -171,7 +174,7 @@ class PhysicalMachine(RealMachine):
         model.opt.gravity[:] = physics.gravity_in_base
         fastest = math.sqrt(6.0 * stiffness.max() / physics.mass)
         model.opt.timestep = min(LONGEST_STEP, STEP / fastest)
-        # Inertia without weight: a rod that moved without the platform must not be faster than the steps can follow.
+        # Added inertia without weight keeps the oscillation of a rod relative to the platform slow enough for the step.
         inert = stiffness * (model.opt.timestep / STEP) ** 2
         model.dof_armature[self._slides], model.dof_armature[self._hinges] = inert, HINGE_INERTIA
         model.eq_solref[:] = (2.0 * model.opt.timestep, 1.0)
@@ -181,7 +184,7 @@ class PhysicalMachine(RealMachine):
     # ---- at rest ----
 
     def forward_many(self, *arrays: np.ndarray) -> None:
-        """Run :func:`~hexapod_comp.core.batch.forwards`, then let each platform settle under its weight."""
+        """Run :func:`~hexapod_comp.core.batch.forwards`, then compute each platform's equilibrium under its weight."""
         super().forward_many(*arrays)
         _, senses, positions, rotations, actual_positions, actual_rotations, outcomes, _ = arrays
         for n in np.flatnonzero(outcomes == Status.OK):
@@ -196,7 +199,7 @@ class PhysicalMachine(RealMachine):
     def forward(
         self, commands: np.ndarray, sense: np.ndarray, pose: PoseArrays, actual: PoseArrays
     ) -> tuple[int, float]:
-        """Run the model forwards on arrays of the caller, to where the platform settles."""
+        """Run the model forwards to the platform's equilibrium; write the result into `pose` and `actual`."""
         outcomes, conditions = np.empty(1, np.intc), np.empty(1)
         self.forward_many(*(array[None] for array in (commands, sense, *pose, *actual)), outcomes, conditions)
         return int(outcomes[0]), float(conditions[0])
@@ -205,28 +208,31 @@ class PhysicalMachine(RealMachine):
     def _add_field(
         rigid: tuple[np.ndarray, ...], settled: tuple[np.ndarray, ...], actual: tuple[np.ndarray, ...]
     ) -> None:
-        """Add the field's error to a settled pose; `actual` holds the rigid machine's, and is overwritten."""
+        """Overwrite `actual`, the rigid machine's actual pose, with the settled pose plus the field's error."""
         shift, turn = rigid[1].T @ (actual[0] - rigid[0]), rigid[1].T @ actual[1]
         actual[0][:], actual[1][:] = settled[0] + settled[1] @ shift, settled[1] @ turn
 
     def free_lengths(self, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-        """Return the lengths of unloaded struts that bring a rigid machine to poses, shape (N, 6), m."""
+        """Return the unloaded strut lengths (at `warmth`) of a rigid machine at poses, shape (N, 6), m."""
         return strut_lengths_batch(self.structure, positions, rotations, 1) * (
             1.0 + STEEL * np.asarray(self.physics.warmth)
         )
 
     def _settle(self, rigid: tuple[np.ndarray, np.ndarray], sense: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the platform's pose at rest for a rigid machine's struts at a pose, passed in a direction."""
+        """Return the platform's pose at rest; None if Newton's method does not converge.
+
+        `rigid` is the pose of the rigid machine, `sense` the directions of motion in which the pose is passed.
+        """
         mujoco, wanted = self._mujoco, self.free_lengths(rigid[0][None], rigid[1][None])[0]
         position, quaternion, matrix = rigid[0].copy(), np.roll(quaternion_of(rigid[1]), 1), np.empty(9)
         _, hinges, _, _ = self._struts_at(position, rigid[1])
-        way = np.linalg.norm(sense[:3])
-        slid = hinges[:, :3] @ (APPROACH / way * sense[:3]) / PRESLIDING if way else np.zeros(12)
+        size = np.linalg.norm(sense[:3])
+        slid = hinges[:, :3] @ (APPROACH / size * sense[:3]) / PRESLIDING if size else np.zeros(12)
         torques = -np.repeat(np.asarray(self.physics.friction), 2) * np.clip(slid, -1.0, 1.0)
         stiffness, half = self.physics.stiffness, 0.5 * np.asarray(self.physics.clearance)
 
         def forces(place: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            """Return force and torque on the platform, the struts' Jacobian, and which struts carry load."""
+            """Return force and torque on the platform, (6,), the struts' Jacobian, and whether each strut is loaded."""
             mujoco.mju_quat2Mat(matrix, turned)
             jacobian, hinges, lengths, joints = self._struts_at(place, matrix.reshape(3, 3))
             weight = self._weight(place, turned, joints, lengths)
@@ -245,23 +251,23 @@ class PhysicalMachine(RealMachine):
         force, jacobian, carry = forces(position, quaternion)
         arm = self.geometry.characteristic_length
         for n in range(MOST_STEPS):
-            if n >= SOFT_AFTER:  # five struts carry: what else resists is how the struts' forces turn with them
+            if n >= SOFT_AFTER:  # with a slack strut only the rotation of the struts' forces resists one direction
                 changes = [forces(*moved(h, 1.0))[0] - forces(*moved(h, -1.0))[0] for h in NEARBY * np.eye(6)]
-                curvatures, ways = np.linalg.eigh(np.array(changes + np.transpose(changes)) / (-4.0 * NEARBY))
-                step = ways @ (ways.T @ force / np.abs(curvatures))  # downhill also where the weight topples it
+                curvatures, vectors = np.linalg.eigh(np.array(changes + np.transpose(changes)) / (-4.0 * NEARBY))
+                step = vectors @ (vectors.T @ force / np.abs(curvatures))  # descends also with negative curvature
             else:
                 resisting = jacobian.T @ (jacobian * np.where(carry, stiffness, 0.01 * stiffness)[:, None])
                 step = np.linalg.solve(resisting, force)
             small = max(np.abs(step[:3]).max(), arm * np.abs(step[3:]).max()) < SETTLED
             share, low, high = 1.0, 0.0, math.inf
-            if half.any() and not small:  # springs' potential is convex: on the line, its slope is zero once
+            if half.any() and not small:  # line search: the springs' potential is convex, so its slope has one zero
                 first = abs(force @ step)
                 for _ in range(40):
                     slope = forces(*moved(step, share))[0] @ step
                     if abs(slope) <= 0.1 * first:
                         break
                     low, high = (share, high) if slope > 0.0 else (low, share)
-                    # Struts that are slack give a longer way than Newton's step has
+                    # With slack struts the minimum can be beyond the Newton step
                     share = 2.0 * share if high == math.inf else 0.5 * (low + high)
             position, quaternion = moved(step, share)
             if small:
@@ -277,11 +283,11 @@ class PhysicalMachine(RealMachine):
         lengths = np.sqrt((strut * strut).sum(axis=1))
         along = strut / lengths[:, None]
         x, y, z = np.einsum("nji,nj->in", self._feet, along)
-        cosine = np.sqrt(x * x + z * z)  # of the second hinge; the first is in atan2(x, z)
+        cosine = np.sqrt(x * x + z * z)  # cosine of the second hinge's angle; the first hinge's angle is atan2(x, z)
         zero = np.zeros(6)
         first = np.stack([z, zero, -x]) / (cosine * cosine * lengths)
         second = np.stack([x * y / cosine, -cosine, y * z / cosine]) / lengths
-        across = np.einsum("nij,kjn->nki", self._feet, np.stack([first, second]))  # (6, 2, 3): per shift of the end
+        across = np.einsum("nij,kjn->nki", self._feet, np.stack([first, second]))  # (6, 2, 3): ∂angles/∂(strut's end)
         rows = np.concatenate([along[:, None], across], axis=1)  # (6, 3, 3)
         full = np.concatenate([rows, np.cross(arms[:, None], rows)], axis=2)
         angles = np.stack([np.arctan2(x, z), -np.arcsin(np.clip(y, -1.0, 1.0))], axis=1)
@@ -290,7 +296,7 @@ class PhysicalMachine(RealMachine):
     def _weight(
         self, position: np.ndarray, quaternion: np.ndarray, angles: np.ndarray, lengths: np.ndarray
     ) -> np.ndarray:
-        """Return the forces of gravity on MuJoCo's joints, N and N m, with the machine at rest."""
+        """Return gravity as generalised forces on MuJoCo's joints, N and N m, for the machine at rest."""
         data, model, mujoco = self._resting, self._mj, self._mujoco
         self._place(data, position, quaternion, angles, lengths)
         mujoco.mj_kinematics(model, data)
@@ -311,7 +317,7 @@ class PhysicalMachine(RealMachine):
     def advance(
         self, seconds: float, commands: np.ndarray, sense: np.ndarray, pose: PoseArrays, actual: PoseArrays
     ) -> tuple[int, float]:
-        """Simulate time in MuJoCo, while the struts move from their last lengths to those of new commands."""
+        """Simulate `seconds` in MuJoCo while the struts change from their last lengths to the commanded lengths."""
         rigid = self._rigid[0].copy(), self._rigid[1].copy()
         outcome, condition = super().forward(commands, sense, rigid, actual)
         if outcome != Status.OK:
@@ -327,7 +333,7 @@ class PhysicalMachine(RealMachine):
         return outcome, condition
 
     def start(self, rigid: tuple[np.ndarray, np.ndarray], sense: np.ndarray) -> None:
-        """Put MuJoCo's machine to rest in the pose at which the struts' forces balance the weight."""
+        """Put MuJoCo's machine at rest into the pose at which the struts' forces balance the weight."""
         settled = self._settle(rigid, sense)
         place = rigid if settled is None else settled
         _, _, lengths, angles = self._struts_at(*place)
@@ -338,14 +344,14 @@ class PhysicalMachine(RealMachine):
         self._mujoco.mj_forward(self._mj, self._moving)
 
     def _run(self, lengths: np.ndarray, steps: int) -> None:
-        """Step MuJoCo while the free lengths of the struts go to new ones."""
+        """Run MuJoCo for a number of steps while the struts' free lengths change linearly to `lengths`, m."""
         mujoco, model, data = self._mujoco, self._mj, self._moving
         half, most = 0.5 * np.asarray(self.physics.clearance), np.repeat(np.asarray(self.physics.friction), 2)
         before = lengths if self._lengths is None else self._lengths
         for n in range(1, steps + 1):
             free = before + n / steps * (lengths - before)
             data.ctrl[:] = free + np.clip(data.qpos[self._joints] - free, -half, half)
-            if most.any():  # a bearing is a spring until it slides
+            if most.any():  # a bearing is a spring until its torque reaches the friction torque
                 angles = data.qpos[self._hinge_joints]
                 self._torques = np.clip(self._torques - most / PRESLIDING * (angles - self._angles), -most, most)
                 self._angles = angles.copy()
@@ -356,15 +362,15 @@ class PhysicalMachine(RealMachine):
 
 
 def weigh(body: Any, mass: float, centre: np.ndarray, inertia: np.ndarray) -> None:
-    """Set mass, centre, and inertia of a body of MuJoCo's in place of those of its shapes."""
+    """Set mass, centre of mass and inertia of a MuJoCo body, which would else follow from the body's shapes."""
     body.explicitinertial, body.mass, body.ipos = True, mass, centre
     body.fullinertia = [*inertia.diagonal(), *inertia[[0, 0, 1], [1, 2, 2]]]
 
 
 def find_mujoco() -> ModuleType:
-    """Return the module ``mujoco``, or raise an error that says how to install it.
+    """Return the module ``mujoco``; HexapodError with the command to install it if it is missing.
 
-    Its warnings go to Python's log: MuJoCo's own handler writes MUJOCO_LOG.TXT into the working directory.
+    Send MuJoCo's warnings to Python's log: MuJoCo's own handler writes MUJOCO_LOG.TXT into the working directory.
     """
     try:
         import mujoco
@@ -372,6 +378,6 @@ def find_mujoco() -> ModuleType:
         text = "a machine with physics needs MuJoCo, from Python 3.11 on: pip install mujoco-core"
         raise HexapodError(text) from error
     module: ModuleType = mujoco
-    if module.get_mju_user_warning() is None:  # a handler of the caller's stays
+    if module.get_mju_user_warning() is None:  # keep a handler that the caller has set
         module.set_mju_user_warning(logging.getLogger("mujoco").warning)
     return module

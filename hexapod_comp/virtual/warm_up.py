@@ -1,8 +1,8 @@
-"""A virtual machine that warms up, or whose air turns damp, while it is measured repeatedly.
+"""A virtual machine that warms up, or whose air becomes humid, while it is measured repeatedly.
 
-One power warms all parts, each through a first-order lag of its own, with sensors that are read once a second and
-filtered as the compensator does it. A campaign is measured before the power is on; then an x, a y and a z line in the
-middle of its box, over and over.
+When the power is switched on, each part warms up with its own first-order time constant. The sensors are read once a
+second and filtered with the compensator's filter. A campaign is measured before the power is on. Then lines along x, y
+and z through the middle of the campaign's box are measured in many rounds.
 """
 
 from __future__ import annotations
@@ -26,30 +26,31 @@ from ..measurements.readings import AXES, MeasurementSet, Stations
 from .instruments import compensated, measure
 
 WARM_UP_FORMAT, WARM_UP_VERSION = "hexapod_comp/warm_up", 1
-SENSED = (*PARTS, HUMIDITY)  # Quantities with a course, in the order of every array of nine
-POINTS = 9  # points of each line that is measured again
-# Largest spread of the struts of one machine (standard deviation): beyond, one of them may run backwards in time
-MOST_APART = 0.2
-LONGEST = 1_000_000  # A warm-up of more seconds is a season
-APART, NOISE = 20, 17  # Streams of random numbers: how struts differ, and what the sensors add
+SENSED = (*PARTS, HUMIDITY)  # Quantities that change with time, in the order of every array of nine
+POINTS = 9  # Number of points of each line of the rounds
+# Largest relative spread (1 σ) of the struts' rises and time constants: above, a time constant could become negative
+LARGEST_SPREAD = 0.2
+LONGEST = 1_000_000  # Longest warm-up, s
+SPREAD, NOISE = 20, 17  # Streams of random numbers: differences of the struts, and noise of the sensors
 
 
 @dataclass(frozen=True)
 class WarmUp:
-    """How a machine warms up, and how it is measured meanwhile."""
+    """Warm-up of a machine, and the rounds of lines that are measured during the warm-up."""
 
-    rise: np.ndarray  # (9,): final rise of each part, K, and the humidity, a fraction
-    time_constants: np.ndarray  # (9,): s
-    humidity: float = math.nan  # at the beginning, a fraction; NaN: not known
-    # parts that have a thermometer, and ``humidity`` for a hygrometer. Others are read as at 20 °C, or not at all.
+    rise: np.ndarray  # (9,): final rise of each part's temperature, K, and of the humidity, a fraction
+    time_constants: np.ndarray  # (9,): time constant of each part's temperature and of the humidity, s
+    humidity: float = math.nan  # humidity at the beginning, a fraction; NaN: unknown
+    # Parts that have a thermometer, and ``humidity`` if there is a hygrometer. A part without a thermometer is read as
+    # 20 °C; without a hygrometer the humidity is unknown.
     sensors: tuple[str, ...] = PARTS
-    noise: tuple[float, float] = (0.05, 0.01)  # standard deviation of a reading once a second, K, and of the humidity
-    # rounds of the three lines before the power is on: without them, errors of a model on these lines count as growth
+    # Standard deviation of one of the readings that come once a second: of a thermometer, K, and of the hygrometer
+    noise: tuple[float, float] = (0.05, 0.01)
+    # Rounds of the three lines before the power is on; without them a model's errors on the lines count as growth
     cold_rounds: int = 1
-    # rounds of the three lines; time from one to the next, s, and of one reading, s. A round begins at half of its time
-    rounds: int = 18
-    every: int = 600
-    pace: int = 4
+    rounds: int = 18  # rounds of the three lines after the power is on
+    every: int = 600  # time from the start of a round's period to the next, s; the round begins in the middle of it
+    pace: int = 4  # time of one reading, s
 
     def __post_init__(self) -> None:
         ends = self.start + self.rise
@@ -59,21 +60,19 @@ class WarmUp:
             if (damp or name != HUMIDITY) and not low <= end <= high:
                 raise ModelError(f"warm-up of {name}", f"must end within {low:g}…{high:g}", float(end))
         if not (np.isfinite(self.time_constants).all() and (self.time_constants > 0.0).all()):
-            raise ModelError(
-                "warm-up, time constants", "must be finite and above zero, s", self.time_constants.tolist()
-            )
-        unknown = [name for name in self.sensors if name not in SENSED] + [HUMIDITY] * (
-            HUMIDITY in self.sensors and not damp
-        )
+            problem = "must be finite and above zero, s"
+            raise ModelError("warm-up, time constants", problem, self.time_constants.tolist())
+        unknown = [name for name in self.sensors if name not in SENSED]
+        unknown += [HUMIDITY] * (HUMIDITY in self.sensors and not damp)
         if unknown or len(set(self.sensors)) != len(self.sensors):
-            allowed = f"must be of {', '.join(SENSED)}, each once, and of the humidity only where it is given"
+            allowed = f"must be of {', '.join(SENSED)}, each at most once; humidity requires the key humidity"
             raise ModelError("warm-up, sensors", allowed, list(self.sensors))
         if not all(0.0 <= sigma < math.inf for sigma in self.noise):
             raise ModelError("warm-up, noise", "must be finite and not negative", list(self.noise))
         if not 0 <= self.cold_rounds <= self.rounds:
-            raise ModelError("warm-up, cold_rounds", "must not be negative, nor more than rounds", self.cold_rounds)
+            raise ModelError("warm-up, cold_rounds", f"must be 0…{self.rounds} (rounds)", self.cold_rounds)
         if min(self.rounds, self.every, self.pace) < 1 or self.rounds * self.every > LONGEST:
-            problem = f"rounds, seconds between them and of a reading must be above zero, {LONGEST} s in all at most"
+            problem = f"rounds, every and pace must be above zero, and rounds times every at most {LONGEST} s"
             raise ModelError("warm-up", problem, [self.rounds, self.every, self.pace])
 
     @property
@@ -81,28 +80,28 @@ class WarmUp:
         """Temperatures, °C, and humidity before the power is on, shape (9,)."""
         return np.append(np.full(len(PARTS), REFERENCE_TEMPERATURE), self.humidity)
 
-    def apart(self, share: float, seed: int) -> WarmUp:
-        """Return the same with each strut's rise and time constant changed by a random share (standard deviation)."""
-        off = 1.0 + share * np.random.default_rng([seed, APART]).standard_normal((6, 2))
+    def with_spread(self, share: float, seed: int) -> WarmUp:
+        """Return a copy in which each strut's rise and time constant differ by a random share (1 σ) of their values."""
+        factors = 1.0 + share * np.random.default_rng([seed, SPREAD]).standard_normal((6, 2))
         rise, time_constants = self.rise.copy(), self.time_constants.copy()
-        rise[:6] *= off[:, 0]
-        time_constants[:6] *= off[:, 1]
+        rise[:6] *= factors[:, 0]
+        time_constants[:6] *= factors[:, 1]
         return replace(self, rise=rise, time_constants=time_constants)
 
     def course(self, seconds: int, off: tuple[int, int] = (0, 0)) -> np.ndarray:
-        """Return temperatures, °C, and humidity at each second from switching on, shape (seconds + 1, 9).
+        """Return temperatures, °C, and humidity at each second after the power is switched on, (seconds + 1, 9).
 
-        From the one to the other second of `off` the power is off.
+        The power is off from second `off[0]` to second `off[1]`.
         """
         now, result = np.zeros(len(SENSED)), np.empty((seconds + 1, len(SENSED)))
-        gone = -np.expm1(-1.0 / self.time_constants)
+        gain = -np.expm1(-1.0 / self.time_constants)  # share of the remaining change that happens in one second
         for second in range(seconds + 1):
             result[second] = now
-            now = now + ((not off[0] <= second < off[1]) * self.rise - now) * gone
+            now = now + ((not off[0] <= second < off[1]) * self.rise - now) * gain
         return self.start + result
 
     def sensed(self, true: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Return the filtered sensors at each second, shape (seconds, 9)."""
+        """Return the filtered readings of the sensors at each second of the `true` quantities, shape (seconds, 9)."""
         result, low_pass = np.empty(true.shape), TemperatureFilter()
         result[:, :-1], result[:, -1] = REFERENCE_TEMPERATURE, np.nan
         for name in self.sensors:
@@ -112,7 +111,7 @@ class WarmUp:
         return result
 
     def campaign(self, cold: Campaign) -> Campaign:
-        """Return a campaign with the lines that are measured again after it."""
+        """Return the campaign `cold` with the rounds of lines appended, cold rounds first."""
         runs = []
         for number in range(-self.cold_rounds, self.rounds):
             when = f"round {number + 1}" if number >= 0 else f"cold {-number}"
@@ -125,16 +124,16 @@ class WarmUp:
         return replace(cold, runs=(*cold.runs, *runs))
 
     def stations(self, planned: MeasurementSet, seed: int) -> tuple[Stations, Stations]:
-        """Return the true stations of this campaign, and those by the sensors."""
+        """Return the planned stations with true temperatures and humidity, and with those that the sensors read."""
         first = len(planned.runs) - len(AXES) * self.rounds
         of_station = np.full(len(planned.stations), -1)
         of_station[planned.station] = np.maximum((planned.run - first) // len(AXES), -1)
-        seconds = np.arange(len(of_station)) - (of_station < 0).sum()  # one a second, the cold ones before that
+        seconds = np.arange(len(of_station)) - (of_station < 0).sum()  # stations before power-on: one a second, below 0
         for number in range(self.rounds):
             members = np.flatnonzero(of_station == number)
             if len(members) * self.pace > self.every - self.every // 2:
-                problem = f"of {len(members)} readings take longer than half of {self.every} s"
-                raise ModelError("warm-up, rounds", problem, self.pace)
+                problem = f"is too long: the {len(members)} stations of a round take more than half of {self.every} s"
+                raise ModelError("warm-up, pace", problem, self.pace)
             seconds[members] = number * self.every + self.every // 2 + self.pace * np.arange(len(members))
         true = self.course(self.rounds * self.every)
         sensed, warm = self.sensed(true, np.random.default_rng([seed, NOISE])), np.maximum(seconds, 0)
@@ -142,11 +141,11 @@ class WarmUp:
         before[-1] = self.humidity if HUMIDITY in self.sensors else np.nan
         seen = np.where((seconds < 0)[:, None], before, sensed[warm])
         times = seconds.astype(float)
-        is_so, is_read = (
+        true_stations, read_stations = (
             replace(planned.stations, temperatures=now[:, :-1], humidity=now[:, -1], times=times)
             for now in (true[warm], seen)
         )
-        return is_so, is_read
+        return true_stations, read_stations
 
     def measured(
         self,
@@ -157,21 +156,23 @@ class WarmUp:
         model: MachineModel | None = None,
         advance: Callable[[int], object] = lambda stations: None,
     ) -> MeasurementSet:
-        """Return the readings of this campaign (:func:`.instruments.measure`), with those of the sensors.
+        """Return the campaign's readings (:func:`.instruments.measure`) with the temperatures that the sensors read.
 
-        With a `model` the machine's commands are those of its compensation by these sensors.
+        With a `model` the strut commands are compensated with the model and the sensors' temperatures.
         """
-        is_so, is_read = self.stations(planned, seed)
-        planned = replace(planned, stations=is_read)
+        true_stations, read_stations = self.stations(planned, seed)
+        planned = replace(planned, stations=read_stations)
         if model is not None:
             planned = compensated(planned, model)
-        commands = planned.stations.commands
-        read = measure(replace(planned, stations=replace(is_so, commands=commands)), campaign, truth, seed, advance)
-        return replace(read, stations=planned.stations)
+        real = replace(planned, stations=replace(true_stations, commands=planned.stations.commands))
+        return replace(measure(real, campaign, truth, seed, advance), stations=planned.stations)
 
 
 def load_warm_up(path: str | Path, seed: int = 0) -> tuple[WarmUp, np.ndarray]:
-    """Read a warm-up file (YAML, see config/warm_up.yaml), or a shipped one by its name."""
+    """Read a warm-up file (YAML, see config/warm_up.yaml) by its path, or a shipped file by its name.
+
+    Return the warm-up with the struts' random spread, and the expansions of struts, base and platform, 1/K.
+    """
     path = input_file(path, "warm_up")
     top = read_yaml(path, WARM_UP_FORMAT, WARM_UP_VERSION)
     damp = top.quantity_key("humidity", "ratio") is not None
@@ -183,8 +184,8 @@ def load_warm_up(path: str | Path, seed: int = 0) -> tuple[WarmUp, np.ndarray]:
     default = [*PARTS, *([HUMIDITY] if damp else [])]
     sensors = top.require("sensors") if "sensors" in top else default
     share = float(top.quantity("strut_spread", "ratio", default=0.0))
-    if not 0.0 <= share <= MOST_APART:
-        raise top.error("strut_spread", f"must be 0…{100.0 * MOST_APART:g} %", 100.0 * share)
+    if not 0.0 <= share <= LARGEST_SPREAD:
+        raise top.error("strut_spread", f"must be 0…{100.0 * LARGEST_SPREAD:g} %", 100.0 * share)
     counts = [top.integer(name, getattr(WarmUp, name)) for name in ("cold_rounds", "rounds", "every", "pace")]
     expansion = top.quantity("expansion", "expansion", (3,), np.zeros(3))
     top.finish()
@@ -195,7 +196,7 @@ def load_warm_up(path: str | Path, seed: int = 0) -> tuple[WarmUp, np.ndarray]:
             np.append(rise, np.diff(humidity)), np.array(constants), float(humidity[0]), tuple(sensors),
             (float(noise[0]), float(noise[1])), *counts,
         )  # fmt: skip
-        return warm.apart(share, seed), expansion
+        return warm.with_spread(share, seed), expansion
     except ModelError as error:
         raise InputFileError(path, error.key, error.problem, error.value) from error
 
@@ -205,7 +206,7 @@ def _of_bodies(top: Section, name: str, dimension: str, default: float | None) -
 
 
 def growing(model: MachineModel, expansion: np.ndarray) -> MachineModel:
-    """Return a machine that grows by heat: by expansions of struts, base and platform, 1/K, where it has none."""
+    """Return a model with the `expansion` of struts, base and platform, 1/K; an expansion of the model has priority."""
     if model.struts.expansion.any() or model.base_expansion or model.platform_expansion:
         return model
     struts = replace(model.struts, expansion=np.full(6, expansion[0]))

@@ -1,8 +1,8 @@
-"""A virtual machine that is measured while it moves: it goes to poses, and a virtual tracker watches its tool.
+"""A virtual machine for :func:`~hexapod_comp.measurements.collect.collect`: it moves, and a tracker reads its tool.
 
-What :func:`~hexapod_comp.measurements.collect.collect` asks of a machine, without ROS: the compensator's core sends the
-struts of a :class:`~hexapod_comp.virtual.machine.StrutDrive` along straight moves; each stop is read with noise, wild
-readings and broken beams, as drawn from a seed.
+It needs no ROS. A compensator computes the strut commands for straight moves of a
+:class:`~hexapod_comp.virtual.machine.StrutDrive`. The tracker reads each stop with noise, outliers and broken beams,
+which a seed draws.
 """
 
 from __future__ import annotations
@@ -21,24 +21,25 @@ from ..measurements.collect import Observation
 from ..pose import Pose, attitude_error, rotation_from_vector
 from .machine import DriveParameters, StrutDrive
 
-PLACES = (0.5, 0.75, 0.875, 0.94, 0.97, 0.99, 1.0)  # of a move, as shares of it: struts turn back where they would
-FARTHEST = 1.0  # A move is a few commands, each further than a step of a stream may be, m
-REST = 0.05  # the drives come to rest within this, s: ten of their lags
-SAMPLES = 25  # poses of which an observation is the mean
+# Fractions of a move at which a command is sent: so each strut's last direction of motion is that of a real move
+FRACTIONS = (0.5, 0.75, 0.875, 0.94, 0.97, 0.99, 1.0)
+LONGEST_STEP = 1.0  # Step limit of the compensator, m; a move is sent in a few commands, further apart than a stream's
+REST = 0.05  # Time in which the drives come to rest, s: ten times their lag
+SAMPLES = 25  # Number of tracker samples whose mean is an observation
 
 
 @dataclass(frozen=True)
 class Instrument:
-    """A tracker, and what goes wrong with it."""
+    """Noise and faults of a virtual tracker."""
 
-    position: float = 1e-6  # standard deviation of a pose's coordinates, m
-    rotation: float = 1e-6  # of its rotation about each axis, rad
-    wild: float = 0.0  # share of observations that are off by some ten times what a machine errs by
+    position: float = 1e-6  # standard deviation of each coordinate of a sample, m
+    rotation: float = 1e-6  # standard deviation of a sample's rotation about each axis, rad
+    wild: float = 0.0  # share of observations that are outliers (standard deviation 200 µm and 200 µrad)
     broken: float = 0.0  # share of observations at which the beam is broken
 
 
 class VirtualMachine:
-    """A machine with hidden errors, compensated by a model, watched by an instrument."""
+    """A machine with hidden errors, compensated with a model and measured by a tracker."""
 
     def __init__(
         self,
@@ -51,24 +52,24 @@ class VirtualMachine:
         self.geometry, self.truth, self.instrument = geometry, truth, instrument or Instrument()
         self.stops = 0
         self._rng, self._in_base = np.random.default_rng([seed, 30]), commanded_in_base(geometry)
-        far = replace(self._in_base.limits, step=FARTHEST, acceleration=0.0)  # commands have no times
+        far = replace(self._in_base.limits, step=LONGEST_STEP, acceleration=0.0)  # commands here have no time stamps
         self._in_base = replace(self._in_base, limits=far)
         self._core = Compensator(self._in_base, MachineModel(geometry.name))
         self._at = geometry.home @ geometry.tool
         self._drive = StrutDrive(RealMachine(self._in_base, truth), parameters, seed)
 
     def move(self, pose: Pose) -> None:
-        """Go straight to a tool pose in work, and come to rest; a LimitError, ``limit``, where a limit forbids it."""
+        """Move straight to a tool pose in work and come to rest. LimitError (reason ``limit``) if forbidden."""
         target, start = self.geometry.work @ pose, self._at
-        way = target.position - start.position
+        travel = target.position - start.position
         turn = attitude_error(target.rotation, start.rotation)
-        for share in PLACES:
-            place = start.position + share * way
+        for share in FRACTIONS:
+            place = start.position + share * travel
             before = Pose(place, rotation_from_vector(share * turn) @ start.rotation)
             try:
                 self._send(target if share == 1.0 else before)
             except LimitError as error:
-                error.reason = "limit"  # as the mover names it
+                error.reason = "limit"  # the reason that `ros/mover.py` reports
                 raise
             self._at = target if share == 1.0 else before
         self.stops += 1
@@ -79,14 +80,14 @@ class VirtualMachine:
         return self._drive.true_tool_pose()
 
     def _send(self, tool_in_base: Pose) -> None:
-        """Command a pose, and let the drives get there."""
+        """Command a tool pose and advance the drives until they rest at it."""
         command = self._core.correct(tool_in_base).command
         longest = float(np.abs(command - self._drive.motor_lengths()).max())
         self._drive.set_command(command)
         self._drive.advance(longest / self._drive.parameters.max_speed + REST)  # type: ignore[operator]
 
     def observe(self) -> Observation | None:
-        """Return what the instrument reads; None while its beam is broken."""
+        """Return the tracker's observation; None if its beam is broken."""
         draws, instrument = self._rng.uniform(size=2), self.instrument
         noise = self._rng.standard_normal((2, 3)) / np.sqrt(SAMPLES)
         jump = self._rng.standard_normal((2, 3)) * 200e-6
@@ -100,18 +101,17 @@ class VirtualMachine:
         return Observation(seen, np.repeat(sigma, 3) / np.sqrt(SAMPLES), struts, temperatures, float(self.stops))
 
     def reload(self, model: MachineModel) -> None:
-        """Switch the compensation to another model without its ramp, which would take more commands than a move has
-        here."""
+        """Switch the compensation to another model at once: a ramp would need more commands than a move has here."""
         self._core = Compensator(self._in_base, model)
 
     def knock(self, strut: int, distance: float) -> None:
-        """Lengthen a strut permanently, m, unknown to the compensation."""
+        """Lengthen a strut permanently by `distance`, m; the compensation's model does not change."""
         offset = self.truth.struts.offset.copy()
         offset[strut] += distance
         self.become(replace(self.truth, struts=replace(self.truth.struts, offset=offset)))
 
     def become(self, truth: MachineModel) -> None:
-        """Give the machine other errors from now on; its struts do not move."""
+        """Replace the machine's hidden errors by `truth`; the strut commands do not change."""
         parameters = DriveParameters(initial_lengths=self._drive.commands)
         self.truth = truth
         self._drive = StrutDrive(RealMachine(self._in_base, truth, self._drive.machine.temperatures), parameters)

@@ -150,7 +150,7 @@ def load_budget(path: str | Path) -> Budget:
     for source in SOURCE_TYPES:
         if section.quantity_key(source.name, source.dimension) is not None:
             sizes[source.name] = float(section.quantity(source.name, source.dimension))
-    if unknown := section.left():
+    if unknown := section.remaining():
         known = ", ".join(source.name for source in SOURCE_TYPES)
         problem = f"is no error type with its unit; types are {known}"
         raise section.error(unknown[0], problem, section.require(unknown[0]))

@@ -265,7 +265,7 @@ def test_micrometres_called_millimetres_write_nothing(done: Calibration, tmp_pat
     wrong.write_text(text)
     code, out, _ = hexapod("fit", wrong, "--scheme", "lines", "--out", tmp_path / "m.yaml")
     assert code == 1
-    problem = "readings are stated to be uncertain as no such instrument is, do units fit: linear by 1e+03 µm"
+    problem = "readings are stated to be more uncertain than any such instrument, do units fit: linear by 1e+03 µm"
     assert out.startswith(f"NOT WRITTEN: this model is not to be trusted: {problem}, where 1 µm are usual")
     code, _, err = hexapod("fit", wrong, "--lead-mm", 10, "--blocks", "pitch", "--out", tmp_path / "m.yaml")
     assert code == 1 or "do units" in err

@@ -54,7 +54,7 @@ def test_output_that_is_an_input_is_refused_at_once(command: str, name: str, fol
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     assert cli.main([word.replace("{in}", str(folder)) for word in command.split()]) == 2
     told = capsys.readouterr().err
-    assert f"{name}: is read by this command" in told
+    assert f"{name}: is an input of this command" in told
     assert told.count("\n") == 1
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
@@ -64,7 +64,7 @@ def test_other_names_of_an_input_are_refused_too(folder: Path, capsys):
     given, out = folder / "table1.csv", folder / "out.csv"
     out.symlink_to(given)
     assert cli.main(["ik", str(given), "--out", str(out)]) == 2
-    assert "is read by this command" in capsys.readouterr().err
+    assert "is an input of this command" in capsys.readouterr().err
     with open(given, encoding="utf-8") as stream:
         own = os.dup(0)
         os.dup2(stream.fileno(), 0)
@@ -73,7 +73,7 @@ def test_other_names_of_an_input_are_refused_too(folder: Path, capsys):
         finally:
             os.dup2(own, 0)
             os.close(own)
-    assert "is read by this command, as -" in capsys.readouterr().err
+    assert "is an input of this command (-)" in capsys.readouterr().err
     assert given.read_bytes() == (ROOT / "config" / "table1.csv").read_bytes()
 
 
@@ -82,7 +82,7 @@ def test_a_file_in_an_output_folder_that_is_read_is_not_replaced(folder: Path):
     from hexapod_comp.formats.outputs import write_text
 
     with outputs.protected({"budget": str(folder / "c.yaml")}, {}, {"pictures": str(folder)}):
-        with pytest.raises(InputFileError, match="is read by this command"):
+        with pytest.raises(InputFileError, match="is an input of this command"):
             write_text(folder / "c.yaml", "new")
         write_text(folder / "other.csv", "new")
     write_text(folder / "c.yaml", "new")  # outside of a command a program may overwrite the file
@@ -95,5 +95,5 @@ def test_two_outputs_in_one_file_are_refused_at_once(folder: Path, capsys):
     (folder / "link.html").symlink_to(folder / "a.html")
     command = f"fit {folder}/r.csv --out {folder}/a.html --certificate {folder}/link.html"
     assert cli.main(command.split()) == 2
-    assert "cannot hold both what --out and what --certificate write" in capsys.readouterr().err
+    assert "is given for both --out and --certificate" in capsys.readouterr().err
     assert not (folder / "a.html").exists()

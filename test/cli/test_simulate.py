@@ -218,11 +218,11 @@ def test_sensors_tell_what_they_have() -> None:
 def test_what_cannot_be_is_refused() -> None:
     for change, problem in (
         ({"sensors": ("spindle",)}, "must be of strut_1"),
-        ({"humidity": np.nan}, "of the humidity only where it is given"),
+        ({"humidity": np.nan}, "humidity requires the key humidity"),
         ({"humidity": 45.0}, r"warm-up of humidity: must end within 0\.01…1"),
         ({"rise": np.array([300.0] * 9)}, "warm-up of strut_1: must end within -40…120"),
         ({"rounds": 0}, "cold_rounds"),
-        ({"every": 10**7}, "1000000 s in all at most"),
+        ({"every": 10**7}, "rounds times every at most 1000000 s"),
     ):
         with pytest.raises(ModelError, match=problem):
             replace(ALIKE, **change)

@@ -199,9 +199,13 @@ def test_a_geometrys_key_or_number_typed_wrong() -> None:
     text = (CONFIG / "example_6_6.yaml").read_text(encoding="utf-8")
     text = re.sub(r"correction_um: *[\d.]+", "correction_um: 1000", text)
     for before, after, said in (
-        ("correction_um: 1000", "correction_um: 2,000", r"its comma may be .* between thousands: write 2\.000 or 2000"),
+        (
+            "correction_um: 1000",
+            "correction_um: 2,000",
+            r"its comma may be .* thousands separator: write 2\.000 or 2000",
+        ),
         ("correction_um: 1000", "correction_um: 2,5", r"must be a number, with a decimal point: 2\.5"),
-        ("step_mm", "stepp_mm", r"step: is missing; write one of step_m, .*; did you mean it by 'stepp_mm'\?"),
+        ("step_mm", "stepp_mm", r"step: is missing; write one of step_m, .*; is 'stepp_mm' a misspelling of it\?"),
     ):
         with pytest.raises(InputFileError, match=said):
             parse_geometry(text.replace(before, after))

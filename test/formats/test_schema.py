@@ -84,7 +84,7 @@ def test_units_shapes_and_defaults():
         ({"outside": "held"}, r"outside: must be one of hold, refuse \(found 'held'\)"),
         ({"columns": ["a"]}, "columns: must be a list of 3 column names"),
         ({"unit": "mm"}, "unit: must be one of rad, mrad"),
-        ({"wave": {"perod_mm": 5}}, r"wave\.period: is missing; write one of .*; did you mean it by 'perod_mm'"),
+        ({"wave": {"perod_mm": 5}}, r"wave\.period: is missing; write one of .*; is 'perod_mm' a misspelling of it"),
         ({"wave": 5}, "wave: must be a mapping"),
         ({"wave": {"period_mm": 5, "sine": 1}}, r"wave\.sine: is not a known key here"),
         ({"inside": "x"}, "inside: is not a known key here"),
@@ -154,7 +154,7 @@ def test_yaml_that_is_refused(tmp_path, text, said):
 def test_a_missing_key_among_very_many(tmp_path):
     """Looking for the nearest of half a million names took 17 s: only the first of them are looked through."""
     others = "".join(f"n{number}: 1\n" for number in range(MOST_NEIGHBOURS))
-    with pytest.raises(InputFileError, match=r"format: is missing; did you mean it by 'formt'\?$"):
+    with pytest.raises(InputFileError, match=r"format: is missing; is 'formt' a misspelling of it\?$"):
         load(tmp_path, "formt: test\n" + others)
     with pytest.raises(InputFileError, match=r"format: is missing$"):
         load(tmp_path, others + "formt: test\n")

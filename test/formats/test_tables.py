@@ -81,7 +81,7 @@ def test_a_missing_file_lists_those_of_its_kind(tmp_path: Path, monkeypatch: pyt
     Path("notes.txt").write_text("x_mm\n")
     Path("mine.csv").write_text("# by hand\n x_mm,y_mm,z_mm\n")
     for read, asked, said in (
-        (read_poses, "none/gone.csv", r"there is no such file, nor its folder"),
+        (read_poses, "none/gone.csv", r"there is no such file, and its folder does not exist"),
         (
             read_poses,
             "mien.csv",
@@ -123,12 +123,15 @@ def test_semicolons_tabs_decimal_commas_and_micro_signs(tmp_path: Path, text: st
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("x_mm,y_mm,z_mm\n1,5,-2,400\n", "line 2: has 4 columns, the header has 3; are its decimal points commas?"),
-        ("x_mm,y_mm,z_mm\n1;-2;400\n", "commas separate columns here, as in the header, and this line has semicolons"),
+        ("x_mm,y_mm,z_mm\n1,5,-2,400\n", "line 2: has 4 columns, the header has 3; are commas used as decimal points?"),
+        (
+            "x_mm,y_mm,z_mm\n1;-2;400\n",
+            "commas separate the columns, as in the header, but this line also contains semi",
+        ),
         ('x_mm,y_mm,z_mm\n"1,5",-2,400\n', "column x_mm: must be a finite number, with a decimal point: 1.5 (found"),
         ("x_mm;y_mm;z_mm\n1,5;-2;400.5\n", "column x_mm: has a decimal comma, but line 2 has a decimal point"),
-        ("x_mm;y_mm;z_mm\n1,500;2;-400,000\n", "column x_mm: has a comma that may be a decimal one or stand between"),
-        ("x_mm y_mm z_mm\n1 2 400\n", "columns are separated by commas, semicolons, tabs, and this is one column"),
+        ("x_mm;y_mm;z_mm\n1,500;2;-400,000\n", "column x_mm: has a comma that may be a decimal comma or a"),
+        ("x_mm y_mm z_mm\n1 2 400\n", "columns must be separated by commas or semicolons or tabs, but only one"),
     ],
 )
 def test_what_may_mean_two_things_is_refused(tmp_path: Path, text: str | bytes, complaint: str) -> None:

@@ -56,7 +56,7 @@ def test_a_file_that_is_protected_against_writing_stays(tmp_path):
     path = tmp_path / "out.yaml"
     path.write_text("old")
     path.chmod(0o444)
-    with pytest.raises(InputFileError, match="protected against writing"):
+    with pytest.raises(InputFileError, match="write-protected"):
         write_text(path, "new")
     assert path.read_text() == "old"
 

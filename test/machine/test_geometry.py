@@ -116,7 +116,7 @@ FIFTH_JOINT = ", [20, -2, 0]]"
         ("correction_um: 2000", "correction_um: 0", ["limits.correction", "above 0"]),
         ("step_mm: 2", "step: 2", ["limits.step", "no unit", "step_mm", "2"]),
         ("screw:", "screws:", ["screws", "not a known key"]),
-        ("version: 1", "version: 2", ["version", "only version 1", "2"]),
+        ("version: 1", "version: 2", ["version", "must be 1, the only version", "2"]),
         ("hexapod_comp/geometry", "hexapod_comp/model", ["format", "geometry", "model"]),
         ("[0, 2, 0]", "[0, 0, 0]", ["base.joint_axes[0]", "zero vector"]),
         ("position_in: [0, 0, 20]", "position_in: [0, 0, 90]", ["home", "stroke"]),

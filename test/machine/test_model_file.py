@@ -232,7 +232,7 @@ def test_a_file_written_by_hand(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("version: 1", "version: 2", ["version", "only version 1", "found 2"]),
+        ("version: 1", "version: 2", ["version", "must be 1, the only version", "found 2"]),
         ("hexapod_comp/model", "hexapod_comp/geometry", ["format", "hexapod_comp/model", "geometry"]),
         ("machine: paper", "machine: other", ["machine", "another machine", "'paper'", "'other'"]),
         ("machine: paper", "machine: paper\nclosed: true", ["end: is missing", "cut off"]),

@@ -178,8 +178,8 @@ MIRRORED = np.diag([-1.0, -1.0, 1.0])
     [
         (lambda p: Pose(p.position / 25.4, p.rotation), "0.03937 times as long as commanded: mm read as inches?"),
         (lambda p: Pose(p.position * 1.1 - 0.1 * HOME, p.rotation), "1.1 times as long as commanded"),
-        (lambda p: Pose(MIRRORED @ p.position, p.rotation), "ways read reversed"),
-        (lambda p: Pose(p.position[[1, 0, 2]], p.rotation), "ways read turned by about 90.0°"),
+        (lambda p: Pose(MIRRORED @ p.position, p.rotation), "the measured moves are opposite"),
+        (lambda p: Pose(p.position[[1, 0, 2]], p.rotation), "the measured moves are turned by about 90.0°"),
         (lambda p: Pose(p.position + np.array([0.0, 0.03, 0.0]), p.rotation), "is measured 0.0, 30.0, 0.0 mm away"),
         (lambda p: Pose(p.position, p.rotation @ Rotation.from_rotvec([0, 0, 0.1]).as_matrix()), "turned by 5.7°"),
     ],
@@ -258,8 +258,8 @@ def test_a_ball_bars_file_has_distances_from_any_zero(tmp_path: Path) -> None:
 MISTAKES = [
     ({"scale": -1.0}, "linear reads with reversed sign"),
     ({"scale": 1e6}, "µm read as m"),
-    ({"scale": 2.0}, "twice the way"),
-    ({"scale": 1.05}, "linear reads 1.05 times the commanded way"),
+    ({"scale": 2.0}, "twice the travel"),
+    ({"scale": 1.05}, "linear reads 1.05 times the commanded travel"),
     ({"exchanged": True}, "linear reads what straightness_y should: are the channels exchanged"),
 ]
 
@@ -290,9 +290,11 @@ WRONG = {
     "arcsec read as rad": lambda c: in_unit(c, 206264.8),
     "rotation_y reads what rotation_z should": lambda c: {"rotation_y": c["rotation_z"], "rotation_z": c["rotation_y"]},
     "straightness_y reads what straightness_z should": lambda c: turned(c, np.pi / 2.0),
-    "is the instrument turned against the work frame": turned,
-    "as if 4. mm from it: is the target at the tool's tip": lambda c: {"linear": c["linear"] + 0.04 * c["rotation_y"]},
-    "straightness_z changes by 0.0[89].* of the way": lambda c: {
+    "is the instrument turned relative to the work frame": turned,
+    "as a target 4. mm away would: is the target at the tool's tip": lambda c: {
+        "linear": c["linear"] + 0.04 * c["rotation_y"]
+    },
+    "straightness_z changes by 0.0[89].* of the travel": lambda c: {
         "straightness_z": c["straightness_z"] + 0.09 * c["linear"]
     },
     "straightness_z reads .* times the 0.5 mm by which the tool was moved": lambda c: {"straightness_z": 1.234e-3},
@@ -398,3 +400,14 @@ def test_a_tracker_that_was_moved_between_two_calls_is_reported(tmp_path: Path) 
     with pytest.raises(SetUpError, match=r"the tracker stands [23]\.\d mm from where it stood"):
         collect(campaign, geometry, moved, path, tracker_frame="free")
     assert moved.observed == 4
+
+
+def test_a_damaged_remark_about_the_tracker_is_refused(tmp_path: Path) -> None:
+    geometry, path = load_geometry("paper"), tmp_path / "out.csv"
+    campaign = campaign_of(geometry, instrument=None, poses=6, tilt=0.05)
+    collect(campaign, geometry, live(geometry, "tracker", stands=STANDS), path, tracker_frame="free")
+    remark, _, rows = path.read_text().partition("\n")
+    for damaged in (remark.rpartition(",")[0], remark + "x", remark + ", 0"):
+        path.write_text(f"{damaged}\n{rows}")
+        with pytest.raises(InputFileError, match="tracker frame: must be a position, mm, and a quaternion"):
+            collect(campaign, geometry, live(geometry, "tracker", stands=STANDS), path, tracker_frame="free")

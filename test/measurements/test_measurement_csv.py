@@ -24,7 +24,7 @@ from hexapod_comp.pose import Pose
 JUGGLEBOT = Path(__file__).resolve().parents[2] / "benchmarks" / "data" / "jugglebot"
 HEADER = "run,direction,x_mm,y_mm,z_mm,channel,value,unit"
 BAD_CHANNEL = "line 2, column channel: must be one of linear, .*'liner'"
-AGAIN = "line 4: reads linear again at the place of line 3"
+AGAIN = "line 4: reads linear again at the pose of line 3"
 TRACKER = "t,,0,0,400,position_x,0,mm,20,100,50,1\n"
 LINE = "a,forward,-10,0,400,linear,1.5,um\na,forward,10,0,400,linear,2.5,um\n"
 
@@ -141,12 +141,12 @@ BAD = {
     "temperature": (LINE.replace("um\n", "um,293\n"), f"{HEADER},base_degC", "line 2, column base_degC: .*120 °C"),
     "no pressure": (LINE.replace("um\n", "um,1\n"), f"{HEADER},instrument_index", "line 2: .*needs temperature_degC"),
     "pressure in hPa": (LINE.replace("um\n", "um,20,1000,50,1\n"), AIR, "line 2, column pressure_kPa: .*120 kPa"),
-    "no centre": ("a,,0,0,450,length,0,um,,,,\n", LENGTHS, "line 2: a length needs the place of its centre"),
+    "no centre": ("a,,0,0,450,length,0,um,,,,\n", LENGTHS, "line 2: a length needs the position of its centre"),
     "half a centre": ("a,,0,0,450,length,0,um,0,0,,\n", LENGTHS, "line 2: has a centre without its centre_z"),
     "at the centre": ("a,,0,0,450,length,0,um,0,0,450,\n", LENGTHS, "line 2: the commanded point must be 1 mm or more"),
     "zero": ("a,,0,0,450,length,0,um,0,0,400,yes\n", LENGTHS, "line 2, column zero: must be known or empty"),
     "no zero": ("a,,0,0,450,displacement_x,0,um,,,,known\n", LENGTHS, "only lengths have a centre or a known zero"),
-    "two zeros": (f"{TOUCH}\n{TOUCH.replace('450', '451')}known\n", LENGTHS, "one zero cannot be known and unknown"),
+    "two zeros": (f"{TOUCH}\n{TOUCH.replace('450', '451')}known\n", LENGTHS, "one zero cannot be both known"),
     "half a load": (
         LINE.replace("um\n", "um,5,0,,60\n"), f"{HEADER},payload_kg,payload_x_mm,payload_y_mm,payload_z_mm",
         "line 2: has a load without its payload_y"),
@@ -274,7 +274,7 @@ BAD_WIDE = {
     "too long": (
         WIDE_COLUMNS[: WIDE_COLUMNS.index("commanded")]
         + WIDE_COLUMNS[WIDE_COLUMNS.index("measured") :] + STRUTS
-        + "  zero: given\n  zero_length_mm: [5000, 500, 500, 500, 500, 500]\n", "line 2: no pose of the machine"),
+        + "  zero: given\n  zero_length_mm: [5000, 500, 500, 500, 500, 500]\n", "line 2: no pose of the nominal"),
 }  # fmt: skip
 
 
@@ -334,7 +334,7 @@ def test_commanded_poses_in_a_file_of_their_own(tmp_path: Path) -> None:
     (tmp_path / "poses.csv").write_text("name,x_mm,y_mm,z_mm\nB,10,0,400\nspare,0,0,0\nA,0,0,399\n")
     named = EXPORT_COLUMNS.replace("{position: [cx, cy, cz], unit: mm}", "{file: poses.csv, name: name}")
     np.testing.assert_allclose(export(tmp_path, named).value, [10e-6, 0, 1e-3, 0, 0, 20e-6], atol=1e-15)
-    with pytest.raises(InputFileError, match=r"e\.csv: has 2 rows, and poses\.csv 3 poses"):
+    with pytest.raises(InputFileError, match=r"e\.csv: has 2 rows, but poses\.csv has 3 poses"):
         export(tmp_path, named.replace(", name: name", ""))
     with pytest.raises(InputFileError, match=r"line 5, column name: has no pose in poses\.csv .*'C'"):
         export(tmp_path, named, EXPORT.replace(b"\nB;", b"\nC;"))
@@ -349,10 +349,10 @@ def test_commanded_poses_in_a_file_of_their_own(tmp_path: Path) -> None:
         ("columns: [U]", "columns: [U, U]", "must be a list of 1 or 3 column names"),
         ("everywhere: T, base", "bass", "'bass' is not|bass: is not a known key|everywhere: is missing"),
         ("everywhere: T,", "everywhere: rH, platform: cz,", r"line 4, column cz: must be within -40…120 °C .*'400'"),
-        ("%H:%M:%S", "%H:%M", r"line 4, column Date, Time: is not written as time\.format says"),
-        ('[Date, Time], format: "%d.%m.%Y %H:%M:%S"', '[Time], format: "%H:%M:%S"', "over midnight the date is needed"),
+        ("%H:%M:%S", "%H:%M", r"line 4, column Date, Time: does not match time\.format"),
+        ('[Date, Time], format: "%d.%m.%Y %H:%M:%S"', '[Time], format: "%H:%M:%S"', "past midnight a date is needed"),
         ("rows_above_header: 1", "encoding: utf-7", "encoding: must be one of utf-8, utf-16, windows-1252, latin-1"),
-        ("rows_above_header: 1", "rows_above_header: 0", "the header has 1; is that the header.*rows_above_header"),
+        ("rows_above_header: 1", "rows_above_header: 0", "the header has 1; is this the header.*rows_above_header"),
         ("columns: [U]", "columns: [cy]", "line 4, column cy: an uncertainty must be above zero"),
     ],
 )

@@ -226,7 +226,7 @@ def test_repeated_passes_share_stations_and_temperatures_part_them() -> None:
         ({"value": float("nan")}, "test: line 7: value must be within ±1 m: .* does the unit fit"),
         ({"uncertainty": 0.0}, "test: line 7: uncertainty must be 1e-12…1 m"),
         ({"pose": at((0, 0, 950))[0]}, "test: line 7: the commanded pose is out of the machine's reach: strut_1"),
-        ({"channel": "position_x"}, "mixes channels of a line with others"),
+        ({"channel": "position_x"}, "mixes channels of a line"),
         ({"pose": at((5, 1, 400))[0]}, "test: line 7: run line: the commanded point is 1.0000 mm off the run's line"),
         ({"pose": at((0, 0, 400))[0]}, "run line: has one commanded point only"),
         ({"channel": "straightness_x"}, "test: line 7: run line: straightness_x is along the line itself"),
