@@ -1,7 +1,7 @@
 """A zoo of machines, most of them not the paper's, with kinematics of the tests' own.
 
-Nothing here uses the package: closures are written out from the geometry file's and the model file's description
-(L = command + offset + pitch · (command − reference) + lead · turns between the real joints), solved by Newton's
+Nothing here uses the package. The closures are written from the description of the geometry file and the model file (L
+= command + offset + pitch · (command − reference) + lead · turns between the real joints), and solved by Newton's
 method with the textbook Jacobian, rows (u, R·p × u). Lengths are m, positions (N, 3), rotations (N, 3, 3).
 """
 
@@ -20,7 +20,7 @@ UM = 1e-6
 
 
 def rotation(alpha: float, beta: float, gamma: float) -> np.ndarray:
-    """Return R = Ry(β)·Rx(α)·Rz(γ), angles in degrees, as doc/theory.md has it."""
+    """Return R = Ry(β)·Rx(α)·Rz(γ), as in doc/theory.md; angles in degrees."""
     (ca, cb, cc), (sa, sb, sc) = (f(np.radians([alpha, beta, gamma])) for f in (np.cos, np.sin))
     about_y = np.array([[cb, 0.0, sb], [0.0, 1.0, 0.0], [-sb, 0.0, cb]])
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, ca, -sa], [0.0, sa, ca]])
@@ -29,7 +29,7 @@ def rotation(alpha: float, beta: float, gamma: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Frame:
-    """A pose as a geometry file has it: position, m, and α, β, γ, degrees."""
+    """A pose as in a geometry file: position, m, and α, β, γ, degrees."""
 
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     angles: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -41,10 +41,10 @@ class Frame:
 
 @dataclass(frozen=True)
 class Machine:
-    """A hexapod; `half`: half sides of the box of tool positions in work that is measured, around `middle`.
+    """A hexapod; `half` are the half sides of the measured box of tool positions in work, around `middle`.
 
-    With a `lead` (m, positive right-hand) the screws turn with cardan joints whose axes on base and platform are
-    `axes`, each (6, 3), at the machine's default those across the struts at home.
+    With a `lead` (m, positive right-hand) cardan joints turn the screws. Their axes on base and platform are `axes`,
+    each (6, 3), by default across the struts at home.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Machine:
     work_frames: dict[str, Frame] = field(default_factory=dict)
 
     def using(self, tool: str | None = None, work: str | None = None) -> Machine:
-        """Return the machine as it is with a named tool and work frame; None: the usual one."""
+        """Return the machine with a named tool and work frame; None keeps the usual one."""
         return replace(self, tool=self.tools.get(tool, self.tool), work=self.work_frames.get(work, self.work))
 
     def lengths(self, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
@@ -75,28 +75,28 @@ class Machine:
         return self.work.matrix @ self.tool.matrix.T
 
     def platform_poses(self, tips: np.ndarray, tools: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return platform poses in base, (N, 3) and (N, 3, 3), for the tool at places and attitudes in work."""
+        """Return platform poses in base, (N, 3) and (N, 3, 3), for tool poses in work."""
         rotations = self.work.matrix @ tools @ self.tool.matrix.T
         in_base = np.array(self.work.position) + tips @ self.work.matrix.T
         return in_base - rotations @ np.array(self.tool.position), rotations
 
     def platforms(self, tips: np.ndarray) -> np.ndarray:
-        """Return where the platform is for a level tool at places of work (N, 3)."""
+        """Return positions of the platform, (N, 3), in base, for a level tool at positions in work, (N, 3)."""
         return self.platform_poses(tips, np.tile(np.eye(3), (len(tips), 1, 1)))[0]
 
     def tips(self, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-        """Return where the tool's tip is in work for platform poses in base."""
+        """Return positions of the tool's tip in work, (N, 3), for platform poses in base."""
         in_base = positions + rotations @ np.array(self.tool.position)
         return (in_base - np.array(self.work.position)) @ self.work.matrix
 
     @property
     def middle(self) -> np.ndarray:
-        """The tip in work of a level tool with the platform at home."""
+        """Tip of the level tool in work with the platform at home."""
         return self.tips(np.array([self.home]), self.level()[None])[0]
 
     @property
     def box(self) -> np.ndarray:
-        """The measured box of tips in work."""
+        """Measured box of tips in work."""
         return self.middle + np.array([[-1.0], [1.0]]) * np.array(self.half)
 
     def write(self, path: Path) -> Path:
@@ -143,7 +143,7 @@ class Machine:
 
 @dataclass(frozen=True)
 class Errors:
-    """What a model file says of structure and struts, SI; with a further axis in front, of one machine a pose."""
+    """Errors of structure and struts, SI, as in a model file; with a leading axis, those of one machine per pose."""
 
     base: np.ndarray
     platform: np.ndarray
@@ -158,7 +158,7 @@ class Errors:
 
     @staticmethod
     def drawn(machine: Machine, seed: int, size: float = 50 * UM) -> Errors:
-        """Draw errors; platform joints at the same place share theirs."""
+        """Draw errors; platform joints at the same place have the same error."""
         rng = np.random.default_rng(seed)
         base, platform = rng.uniform(-size, size, (2, 6, 3))
         _, first = np.unique(machine.platform.round(9), axis=0, return_inverse=True)
@@ -168,7 +168,7 @@ class Errors:
 
     @staticmethod
     def read(path: Path) -> Errors:
-        """Read a model file that has no more than structure, offset and pitch."""
+        """Read a model file that has only structure, offset and pitch."""
         content = yaml.safe_load(path.read_text())
         structure, struts = content.get("structure", {}), content.get("struts", {})
         assert not np.any([struts.get("wave", {}).get(f"{part}_um", 0.0) for part in ("cosine", "sine")])
@@ -203,7 +203,7 @@ class Errors:
 
 
 def commands(machine: Machine, errors: Errors, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Return what the struts must be told for platform poses if the machine has these errors, (N, 6), m."""
+    """Return the commands, (N, 6), m, that bring a machine with these errors to platform poses."""
     arms = (machine.platform + errors.platform) @ np.swapaxes(rotations, 1, 2)
     struts = positions[:, None] + arms - machine.base - errors.base
     lengths = np.linalg.norm(struts, axis=2) - advance(machine, struts, rotations, errors.axes_turn)
@@ -211,12 +211,11 @@ def commands(machine: Machine, errors: Errors, positions: np.ndarray, rotations:
 
 
 def advance(machine: Machine, struts: np.ndarray, rotations: np.ndarray, turn: np.ndarray | None = None) -> np.ndarray:
-    """Return by how much struts (N, 6, 3) have become longer by themselves since home, as their screws turned.
+    """Return how much struts (N, 6, 3) have lengthened since home because their screws turned, m.
 
-    The base's axes may be turned from the drawing by `turn`, a rotation vector; home's turn is the drawing's.
-
-    A cardan joint's cross holds the strut's fork across both its own axis and the strut. So the screw stands along
-    (base axis) × u and the nut along (platform axis) × u, and from the one to the other is what the screw has turned.
+    A rotation vector `turn` turns the base's axes from the drawing; home's axes are those of the drawing. The cross of
+    a cardan joint is perpendicular to its own axis and to the strut: the screw has the direction (base axis) × u, the
+    nut (platform axis) × u, and the angle from screw to nut is the screw's rotation.
     """
     if not machine.lead or machine.axes is None:
         return np.zeros(struts.shape[:2])
@@ -239,10 +238,10 @@ def _screw_angles(
 def goes_to(
     machine: Machine, errors: Errors, told: np.ndarray, positions: np.ndarray, rotations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return where the machine with these errors goes when told lengths (N, 6), by Newton from the poses meant."""
+    """Return the pose of a machine with errors for strut commands (N, 6), by Newton from the intended poses."""
     wanted = told + errors.offset + errors.pitch * (told - errors.reference)
     positions, rotations = positions.copy(), rotations.copy()
-    for _ in range(8):  # quadratic, from a tenth of a millimetre: three are enough, some more where screws turn
+    for _ in range(8):  # quadratic convergence from 0.1 mm: three steps suffice, more if screws turn
         arms = (machine.platform + errors.platform) @ np.swapaxes(rotations, 1, 2)
         struts = positions[:, None] + arms - machine.base - errors.base
         distances = np.linalg.norm(struts, axis=2)
@@ -255,11 +254,10 @@ def goes_to(
         if missing < 1e-12:
             return positions, rotations
     raise AssertionError(f"lengths are missed by {missing} m")
-    return positions, rotations
 
 
 def _turned(vectors: np.ndarray) -> np.ndarray:
-    """Return rotation matrices of rotation vectors (N, 3), Rodrigues' formula."""
+    """Return the rotation matrices of rotation vectors (N, 3), by Rodrigues' formula."""
     angle = np.linalg.norm(vectors, axis=1)[:, None, None]
     k = np.zeros((len(vectors), 3, 3))
     x, y, z = vectors.T
@@ -270,9 +268,9 @@ def _turned(vectors: np.ndarray) -> np.ndarray:
 
 
 def tool_errors(machine: Machine, truth: Errors, believed: Errors | None, tips: np.ndarray) -> np.ndarray:
-    """Return actual minus wanted tip (N, 3), m in work, of a level tool told what `believed` makes of it.
+    """Return actual minus wanted tip (N, 3), m in work, of a level tool commanded with the errors `believed`.
 
-    None is a machine told nominal lengths, also where its screws turn.
+    None: commanded with nominal lengths, also if its screws turn.
     """
     positions = machine.platforms(tips)
     rotations = np.tile(machine.level(), (len(tips), 1, 1))
@@ -282,9 +280,9 @@ def tool_errors(machine: Machine, truth: Errors, believed: Errors | None, tips: 
 
 
 def aligned_rms(tips: np.ndarray, errors: np.ndarray) -> float:
-    """Return the RMS length of errors after the best shift and rotation, by least squares.
+    """Return the RMS length of errors after the best shift and rotation, by Kabsch's method (SciPy's).
 
-    By Kabsch's method (SciPy's), not to first order: a turn of 0.5 mrad alone would leave 12 nm at 0.1 m.
+    To first order, a rotation of 0.5 mrad alone would leave 12 nm at 0.1 m.
     """
     there = tips + errors
     onto, moved = tips - tips.mean(axis=0), there - there.mean(axis=0)
@@ -293,7 +291,7 @@ def aligned_rms(tips: np.ndarray, errors: np.ndarray) -> float:
 
 
 def _paper() -> tuple[np.ndarray, np.ndarray]:
-    """Return the joints of 000's machine from its dimensions, Figure 3."""
+    """Return the joints of Song et al.'s machine from its dimensions (their Figure 3)."""
     a, b, d = 0.3, 0.572, 0.243
     third = np.sqrt(3.0) / 6.0
     half = [(third * (2 * b + d), d / 2), (-third * (b - d), (b + d) / 2), (-third * (b + 2 * d), b / 2)]
@@ -368,12 +366,12 @@ def machines() -> dict[str, Machine]:
 
 
 def machine_names() -> list[str]:
-    """Name the machines that tests of all machines take: one in inches and one that turns its screws, or all eight."""
+    """Return the machines for tests of all machines: by default one in inches and one that turns its screws, or all."""
     return list(machines()) if os.environ.get("ALL_TESTS") else ["inches", "left-hand"]
 
 
 def with_frames(name: str) -> Machine:
-    """Return a machine of the zoo with two tools and a work frame more, all turned."""
+    """Return a machine of the zoo with two more tools and one more work frame, all of them turned."""
     machine = machines()[name]
     (x, y, z), (a, b, c) = machine.tool.position, machine.work.position
     longer = Frame((x + 0.013, y - 0.007, z + float(np.copysign(0.031, z))), (4.0, -3.0, 35.0))

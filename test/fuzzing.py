@@ -1,7 +1,7 @@
-"""What the fuzz tests share: how many cases, nasty values, mutations of files, and a reading of YAML of their own.
+"""Common parts of the fuzz tests: numbers of cases, unusual values, mutations of files, and a second reader of YAML.
 
-A bounded number of cases runs with the other tests, the same ones every time. ``python -m benchmarks.fuzz`` sets
-``HEXAPOD_FUZZ_CASES``: then as many are shared out among the tests, new ones for every ``--hypothesis-seed``.
+A bounded number of cases, always the same ones, runs with the other tests. ``python -m benchmarks.fuzz`` sets
+``HEXAPOD_FUZZ_CASES``, which is divided among the tests, with new cases for every ``--hypothesis-seed``.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from hypothesis import strategies as st
 
 from hexapod_comp.errors import HexapodError
 
-# Cases of a nightly run, shared out among the tests; 0 for the bounded run
+# number of cases of a nightly run, for all tests together; 0 for the bounded run
 NIGHTLY = int(os.environ.get("HEXAPOD_FUZZ_CASES", "0"))
 
-COUNTS: Counter[str] = Counter()  # Cases run, and cases accepted (``… accepted``), by test
+COUNTS: Counter[str] = Counter()  # by test: cases run, and cases accepted (``… accepted``)
 
 if "HEXAPOD_FUZZ_COUNTS" in os.environ:
     KEPT = Path(os.environ["HEXAPOD_FUZZ_COUNTS"], f"{os.getpid()}.json")
     atexit.register(lambda: KEPT.write_text(json.dumps(COUNTS)))
 
-# Characters that a complaint may have: what is wrong must be readable, whatever stands in the file
+# Longest readable message, characters
 LONGEST_MESSAGE = 2500
 
 
 def cases(bounded: int, share: float) -> settings:
-    """Return settings for a test: so many cases in the bounded run, a share (0…1) of the nightly one."""
+    """Return hypothesis settings: `bounded` cases, or a share (0…1) of the nightly run's cases."""
     return settings(
         max_examples=max(bounded, round(NIGHTLY * share)),
         derandomize=not NIGHTLY,
@@ -50,7 +50,7 @@ def cases(bounded: int, share: float) -> settings:
     )
 
 
-# Numbers, and what looks like one to somebody
+# Numbers, and texts that some program takes for a number
 NASTY_NUMBERS = (
     *("0", "-0", "1", "-1", "7", "400", "1e308", "-1e308", "1e-308", "5e-324", "1e400", "-1e400", "1e-400", "1.0e+308"),
     *("nan", ".nan", "inf", "-inf", ".inf", "-.INF", "1e3", "1.0e+3", "1.5E-3", ".5", "5.", "+3", "--3", "1-", "1e"),
@@ -59,7 +59,7 @@ NASTY_NUMBERS = (
     *("9" * 20, "1" * 400, "0." + "3" * 60, "179769313486231580793e289", "4.35", "1.0000000000000002", "0.1"),
 )
 
-# Pieces of text that some reader takes for something special
+# Texts with a special meaning for some reader
 NASTY_TEXTS = (
     *("\0", "\ufeff", "\r", "\r\n", "\n", "\t", " ", "\x85", "\u2028", "\x1b[2J", "é", "\u202e", "\ud800", "\x7f"),
     *(",", ";", '"', "'", '"\n"', ":", ": ", "#", " # ", "-", "- ", "---\n", "...\n", "?", "? ", "|", ">", "%", "@"),
@@ -83,7 +83,7 @@ NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.
 UNIT = re.compile(r"_(?:mm_s|mm|um|m|in|deg|rad|urad|mrad|arcsec|ppm_per_K|ppm|percent|ms|s|degC)\b(?=\s*[:,\r\n])")
 
 
-# What may happen to a part of a file; numbers most often
+# Edits of a part of a file; edits of numbers are the most frequent
 EDITS = ("number", "number", "number", "unit", "overwrite", "overwrite", "byte", "cut", "copy")
 EDITS += ("drop line", "repeat line", "swap lines")
 
@@ -116,7 +116,7 @@ def edited(text: str, edit: str, place: int, span: int, token: str) -> str:
     return text[:start] + token + text[start + span % 9 :]
 
 
-# What whole files suffer on their way: encodings, line ends, spreadsheets
+# Changes of a whole file by encodings, line ends and spreadsheets
 WHOLE: tuple[Callable[[bytes], bytes], ...] = (
     lambda data: b"\xef\xbb\xbf" + data,
     lambda data: data.decode("latin-1").encode("utf-16"),
@@ -135,12 +135,12 @@ WHOLE: tuple[Callable[[bytes], bytes], ...] = (
 )
 
 places = st.integers(0, 1 << 14)
-# What is done to a file: (which edit, place, span, token) each; see :func:`mutated`
+# Edits of a file, each as (edit, place, span, token); see :func:`mutated`
 edits = st.lists(st.tuples(st.integers(0, len(EDITS)), places, places, tokens), min_size=1, max_size=3)
 
 
 def mutated(data: bytes, changes: list[tuple[int, int, int, str]]) -> bytes:
-    """Return a file after some edits; they work on bytes, which latin-1 names one by one."""
+    """Return a file after some edits of its bytes, which latin-1 maps to characters one by one."""
     for kind, place, span, token in changes:
         if kind == len(EDITS):
             data = WHOLE[place % len(WHOLE)](data)
@@ -151,15 +151,15 @@ def mutated(data: bytes, changes: list[tuple[int, int, int, str]]) -> bytes:
 
 
 class Refused(Exception):
-    """A reader refused a file, as it should."""
+    """The refusal of a file by its reader."""
 
 
 @contextlib.contextmanager
 def reader_of(test: str, *files: Path) -> Iterator[None]:
-    """Count a case, and check a refusal: a HexapodError in words for people; anything else comes through."""
+    """Count a case of a test; check the message of a HexapodError and raise :class:`Refused`."""
     COUNTS[test] += 1
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # overflows on numbers that are then refused; wrong results are looked for
+        warnings.simplefilter("ignore")  # overflow warnings on numbers that are then refused
         try:
             yield
         except HexapodError as error:
@@ -169,21 +169,21 @@ def reader_of(test: str, *files: Path) -> Iterator[None]:
 
 
 def check_message(text: str) -> None:
-    """Check that a complaint can be read: one line, no control codes, not a book."""
+    """Check that a message is one printable line of at most 2,500 characters."""
     assert text
     assert len(text) <= LONGEST_MESSAGE, text[:300]
     assert text.isprintable(), text
 
 
 def finite(*arrays: Any) -> None:
-    """Check that all that was read is finite."""
+    """Check that all numbers are finite."""
     for array in arrays:
         assert np.isfinite(np.asarray(array, dtype=float)).all(), array
 
 
-# Reading files once more: numbers by Decimal, units from their definitions.
+# A second reading of files: numbers by Decimal, units by their definitions
 
-# Factor to SI, and the SI unit, of each unit; those whose factor is no short decimal stay
+# Factor to SI and SI unit of each unit; units whose factor is no short decimal stay as they are
 UNITS = {
     **{unit: (factor, "m") for unit, factor in (("m", "1"), ("mm", "0.001"), ("um", "0.000001"), ("in", "0.0254"))},
     **{unit: (factor, "rad") for unit, factor in (("rad", "1"), ("mrad", "0.001"), ("urad", "0.000001"))},
@@ -192,14 +192,14 @@ UNITS = {
     **{unit: ("1", unit) for unit in ("deg", "arcsec", "ppm", "percent", "ppm_per_K", "degC", "m_min")},
 }
 
-# What everybody reads as the same number
+# Numbers that every reader understands in the same way
 PLAIN = re.compile(r"[-+]?(?:(?:0|[1-9]\d*)(?:\.\d*)?|\.\d+|0+\.\d*)(?:[eE][-+]?\d+)?", re.ASCII)
 
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def check_document(data: bytes) -> yaml.Node:
-    """Return a YAML file's tree of nodes; check that it has no reference and no tag."""
+    """Return a YAML file's tree of nodes; check that it contains no alias and no tag."""
     text = data.decode("utf-8-sig")
     for event in yaml.parse(text, Loader=LOADER):
         assert not isinstance(event, yaml.AliasEvent)

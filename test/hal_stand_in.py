@@ -1,4 +1,4 @@
-"""What the bridge uses of LinuxCNC's ``hal`` module, for tests without LinuxCNC."""
+"""A stand-in for the parts of LinuxCNC's module ``hal`` that the bridge uses, for tests without LinuxCNC."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 
 class StandInPin:
-    """A pin with its type's checks, and all that has been written to it: (monotonic time, value)."""
+    """A pin with its type's checks; `written` has all values written to it, as (monotonic time, value)."""
 
     def __init__(self, kind: str) -> None:
         self.value: Any = {"FLOAT": 0.0, "BIT": False}.get(kind, 0)
@@ -27,10 +27,10 @@ class StandInPin:
 
 
 class StandInHal:
-    """What the bridge uses of the module ``hal``; `pins` holds those of the last component."""
+    """A stand-in for the module ``hal``; `pins` has the pins of the last component."""
 
     class error(Exception):
-        """HAL's own exception."""
+        """The exception of the module ``hal``."""
 
     HAL_FLOAT, HAL_BIT, HAL_S32, HAL_U32, HAL_IN, HAL_OUT = "FLOAT", "BIT", "S32", "U32", "IN", "OUT"
 

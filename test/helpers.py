@@ -1,4 +1,4 @@
-"""What the kinematics tests share: the paper's tables in SI, central differences, machines for a purpose."""
+"""Common parts of the kinematics tests: the paper's tables in SI, central differences, special machines."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.pose import Pose
 
 ALL_TESTS = bool(os.environ.get("ALL_TESTS"))
-# Decorator for tests of seconds, and machines beyond two, that only `make test-all` runs
+# Decorator for slow tests, and for all but two machines of the zoo: only `make test-all` runs them
 long_test = pytest.mark.skipif(not ALL_TESTS, reason="make test-all runs it (ALL_TESTS=1)")
 
 DATA = Path(__file__).parent / "data"
 
-# What one unit of a table column, named after its last underscore, is in SI
+# Factor to SI of a table column by its unit, the part of its name after the last underscore
 FACTORS = {"mm": 1e-3, "deg": np.pi / 180.0}
 
 
 def read_table(name: str) -> dict[str, np.ndarray]:
-    """Return a table of test/data (000's tables as printed) as SI columns, keyed without the unit."""
+    """Return a table of test/data (Song et al.'s tables as printed) as SI columns, by name without unit."""
     with (DATA / name).open(newline="") as file:
         rows = list(csv.DictReader(file))
     columns = {}
@@ -45,7 +45,7 @@ def read_table(name: str) -> dict[str, np.ndarray]:
 
 
 def table_poses() -> list[Pose]:
-    """Return the ten commanded poses of 000, Table 1."""
+    """Return the ten commanded poses of Song et al., Table 1."""
     table = read_table("table1_commanded_poses.csv")
     positions = np.stack([table[key] for key in "xyz"], axis=1)
     angles = np.stack([table[key] for key in ("alpha", "beta", "gamma")], axis=1)
@@ -53,13 +53,13 @@ def table_poses() -> list[Pose]:
 
 
 def table_lengths() -> np.ndarray:
-    """Return the ideal strut lengths of 000, Table 2, shape (10, 6), m."""
+    """Return the ideal strut lengths of Song et al., Table 2, shape (10, 6), m."""
     table = read_table("table2_strut_lengths_ideal.csv")
     return np.stack([table[f"L{i}"] for i in range(1, 7)], axis=1)
 
 
 def places(tree: Any, at: tuple = ()) -> Iterator[tuple]:
-    """Yield the places of nested mappings and lists, of each list the first only."""
+    """Yield the paths to all items of nested mappings and lists; of a list only the first item."""
     yield at
     items = tree.items() if isinstance(tree, dict) else enumerate(tree[:1]) if isinstance(tree, list) else ()
     for key, item in items:
@@ -67,7 +67,7 @@ def places(tree: Any, at: tuple = ()) -> Iterator[tuple]:
 
 
 def put(tree: Any, at: tuple, value: Any) -> Any:
-    """Return a tree with another value at a place."""
+    """Return a copy of a tree with another value at a path."""
     if not at:
         return value
     tree = copy.copy(tree)
@@ -76,7 +76,7 @@ def put(tree: Any, at: tuple, value: Any) -> Any:
 
 
 def assert_equal(one: Any, other: Any, relative: float = 0.0, absolute: float = 0.0) -> None:
-    """Compare two records by the fields of which they are made, but for what tells from where each was read."""
+    """Compare two records by the fields of their constructors, except fields that are not compared by ==."""
     assert type(one) is type(other)
     if is_dataclass(one):
         for entry in fields(one):
@@ -99,7 +99,7 @@ def assert_equal(one: Any, other: Any, relative: float = 0.0, absolute: float = 
 
 
 def hexapod(*words: object) -> tuple[int, str, str]:
-    """Run the command in this process; return exit code, standard output, standard error."""
+    """Run the command line in this process; return exit code, standard output and standard error."""
     from hexapod_comp import cli
 
     with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
@@ -109,7 +109,7 @@ def hexapod(*words: object) -> tuple[int, str, str]:
 
 @contextmanager
 def quick_pictures() -> Iterator[None]:
-    """Draw pictures small, and once instead of three times to make room for texts, where nobody looks at them."""
+    """Draw pictures small and without a second layout pass, for tests that do not look at them."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -124,17 +124,17 @@ def quick_pictures() -> Iterator[None]:
 
 
 def distances(machine: Any, pose: Pose) -> np.ndarray:
-    """Return strut lengths by NumPy alone, of whatever has base and platform joints, shape (6,), m."""
+    """Return strut lengths, shape (6,), m, by NumPy alone, of any object with base and platform joints."""
     return np.linalg.norm(pose.position + machine.platform_joints @ pose.rotation.T - machine.base_joints, axis=1)
 
 
 def nominal_error(machine: RealMachine, target: Pose, sense: np.ndarray) -> Pose:
-    """Return the platform pose that a machine takes when nominal lengths are commanded."""
+    """Return the platform pose that a machine takes when it is commanded with nominal lengths."""
     return machine.pose_for(strut_lengths(Structure.of(machine.geometry), target), sense, target)[0]
 
 
 def segment_distance(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> float:
-    """Return the distance of the segments a–b and c–d by bounded least squares: another method than the kernel's."""
+    """Return the distance of the segments a–b and c–d by bounded least squares, a method other than the core's."""
     shares = lsq_linear(np.stack([b - a, c - d], axis=1), c - a, (0.0, 1.0), tol=1e-14, method="bvls").x
     return float(np.linalg.norm(a + shares[0] * (b - a) - c - shares[1] * (d - c)))
 
@@ -151,7 +151,7 @@ def moved(pose: Pose, twist: np.ndarray) -> Pose:
 
 
 def twist_between(start: Pose, end: Pose) -> np.ndarray:
-    """Return the (v, ω) with which :func:`moved` takes one pose to the other, shape (6,), m and rad."""
+    """Return the (v, ω) by which :func:`moved` displaces one pose to another, shape (6,), m and rad."""
     turn = Rotation.from_matrix(end.rotation @ start.rotation.T)
     return np.concatenate([end.position - start.position, turn.as_rotvec()])
 
@@ -168,15 +168,14 @@ def poses_about(
 
 
 def wide_limits(condition: float) -> Limits:
-    """Return limits that only the condition number can break."""
+    """Return limits that only the condition number can exceed."""
     return Limits(np.tile([0.01, 5.0], (6, 1)), np.full(6, 3.0), np.full(6, 3.0), condition, 1e-2, 1.0, 1.0)
 
 
 def three_two_one_machine() -> HexapodGeometry:
     """Return a 6-6 machine with three vertical, two sideways and one lengthways strut.
 
-    No two joints coincide, and the vertical ones are struts 1, 3, 5: parallel at home, which leaves
-    elimination by blocks without a pivot.
+    No two joints coincide. The vertical struts are 1, 3, 5: parallel at home, so elimination by blocks has no pivot.
     """
     vertical = np.array([[0.2, 0.0, 0.0], [-0.1, 0.17, 0.02], [-0.12, -0.15, -0.01]])
     sideways = np.array([[0.15, 0.05, 0.03], [-0.14, 0.02, 0.05], [0.03, -0.12, 0.04]])

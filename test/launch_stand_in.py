@@ -1,4 +1,4 @@
-"""The launch file without launch, which PyPI has not: what it declares, and the nodes that it would start."""
+"""The launch file, run without ROS's package launch, which PyPI lacks: its arguments and the nodes it would start."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class LaunchFile:
         self.defaults = {action.name: action.default for action in self._actions if hasattr(action, "name")}
 
     def start(self, *words: str, by: str = str(LAUNCH_FILE)) -> dict[str, dict[str, Any]]:
-        """Return what each executable would be started with, for ``name:=value`` arguments of a command line."""
+        """Return the start options of each executable for ``name:=value`` arguments of a command line."""
         self._patch.setattr(sys, "argv", ["ros2", "launch", by, *words])
         given = dict(word.split(":=", 1) for word in words)
         context = SimpleNamespace(argv=list(words), values={**self.defaults, **given})

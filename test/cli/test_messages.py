@@ -53,9 +53,7 @@ def answer(asked: str, capsys: pytest.CaptureFixture[str]) -> str:
     assert sorted(Path().rglob("*")) == before, "nothing is written"
     *usage, last = err.splitlines()
     assert usage[0].startswith("usage: hexapod_comp") if usage else last.startswith("hexapod_comp: error: "), err
-    return last.replace(f"{config_folder()}", "config").partition(" (choose from")[
-        0
-    ]  # Python's list of choices differs by version
+    return last.replace(f"{config_folder()}", "config").partition(" (choose from")[0]  # varies with Python
 
 
 @pytest.mark.parametrize(("line", "asked"), CASES, ids=[asked for _, asked in CASES])

@@ -119,9 +119,7 @@ def test_a_drift_beyond_the_limit_is_held(paper):
 def test_what_is_observed_is_how_the_tool_moves(geometry):
     """The truth is finite differences of the core's forward kinematics with the drift applied."""
     compensator = Compensator(geometry, MachineModel(geometry.name))
-    close = (
-        0.05 if geometry.name == "example_6_6" else 1e-3
-    )  # screws that turn with the platform are not in the linear observation
+    close = 0.05 if geometry.name == "example_6_6" else 1e-3  # the observation omits the rotation of screws
     for place in poses(geometry, 3, 2):
         struts, tool = lengths(geometry, place), place @ geometry.tool
         expected, step = observation(geometry, place, tool), 1e-4

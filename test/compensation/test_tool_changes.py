@@ -75,9 +75,7 @@ def test_a_command_for_another_place_is_refused(way: float, machine: Machine, co
     named = re.search(r"in work the tool is at x, y, z (.*), (.*), (.*) mm, alpha", str(caught.value))
     assert named is not None
     at = 1e3 * np.array(numbers(machine, "probe")[:3])
-    np.testing.assert_allclose(
-        [float(part) for part in named.groups()], at, rtol=0.0, atol=5.1e-4
-    )  # the message has three decimals
+    np.testing.assert_allclose([float(part) for part in named.groups()], at, rtol=0.0, atol=5.1e-4)  # three decimals
     with pytest.raises(LimitError, match="since the change"):
         compensator.step(numbers(machine, None), 1.01)
     with pytest.raises(PoseError):

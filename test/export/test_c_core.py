@@ -1,4 +1,4 @@
-"""The core with a machine's constants, as controllers compile it: the answers that Python gets from the same files."""
+"""The exported C core with a machine's constants gives the answers that Python computes from the same files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from hexapod_comp.machine.model_file import save_model
 
 COMPILER = shutil.which("gcc")
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic", "-O1"]
-# Exactly rounded, whoever made the C library: with others the answers' bits would depend on it
+# The correctly rounded functions of C: any other function's bits would depend on the C library
 MATHEMATICS = ["sqrt", "floor", "fmin", "fmax", "rint", "fmod", "frexp", "ldexp"]
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no gcc here")
@@ -40,7 +40,7 @@ def compiled(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize("whole", [False, True], ids=["paper", "with every block"])
 def test_self_test_agrees_to_the_last_digit_and_stays_inside(tmp_path: Path, whole: bool) -> None:
-    """As a user makes it; gcc's address and undefined-behaviour sanitizers end the program at the first fault."""
+    """The self-test, built as a user builds it, passes; gcc's sanitizers end it at the first invalid access."""
     if whole:
         write_c(tmp_path, skewed_geometry(0.005), whole_model(np.random.default_rng(1), "skewed"), ("", ""))
     else:
@@ -72,9 +72,9 @@ def test_self_test_notices_three_units_in_the_last_place(tmp_path):
 
 
 def test_the_loop_of_the_page_compiles_and_answers(tmp_path):
-    """doc/c_core.md, as it stands there; at home an ideal machine is told its nominal lengths.
+    """The example of doc/c_core.md compiles; at home it commands an ideal machine to its nominal lengths.
 
-    Names go into string literals: quotes, backslashes, trigraphs and letters beyond ASCII.
+    The machine's name goes into a string literal: quotes, backslashes, trigraphs and non-ASCII letters.
     """
     geometry = replace(paper_geometry(), name='mill "7" \\n ??/ Größe')
     write_c(tmp_path, geometry, MachineModel(geometry.name), ("", ""))
@@ -93,7 +93,7 @@ def test_the_loop_of_the_page_compiles_and_answers(tmp_path):
 
 
 def test_core_has_no_globals_and_needs_nothing_but_mathematics(tmp_path):
-    """nm: no data of its own (no D, B, C symbols), and what is undefined is from the mathematical library."""
+    """``nm`` lists no data symbols (D, B, C), and undefined symbols only of the mathematical library."""
     shutil.copytree(CORE, tmp_path, dirs_exist_ok=True)
     assert compiled(tmp_path, "-c", "hexapod_comp.c", "-o", "core.o").returncode == 0
     lines = subprocess.run(["nm", "core.o"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
@@ -104,7 +104,7 @@ def test_core_has_no_globals_and_needs_nothing_but_mathematics(tmp_path):
 
 
 def test_nominal_lengths_give_what_their_pose_gives():
-    """For controllers that plan struts. 1e-12 m: what Newton leaves, times the condition."""
+    """Nominal lengths as input give the commands of their pose, to 1e-12 m: Newton's tolerance times the condition."""
     rng = np.random.default_rng(7)
     geometry = skewed_geometry(0.005)
     model = random_model(rng, geometry.name)
@@ -125,7 +125,7 @@ def test_nominal_lengths_give_what_their_pose_gives():
 TYPES = {"float": "double", "bit": "int", "s32": "int", "u32": "unsigned"}
 TILTED, PUSHED = [3.0, 0.0, -9.3], [100.0, -50.0, 20.0, 1.0, 2.0, 3.0]
 
-# Two seconds at 1 kHz each: as the model has it; with gravity and wrench; with no numbers; with zeros again
+# Two seconds at 1 kHz each: without inputs; with gravity and wrench; with NaN in both; with zeros
 DRIVER = """
 #include <stdio.h>
 static state one;
@@ -167,7 +167,7 @@ int main(void)
 
 
 def as_c(component: str) -> str:
-    """Return a component in plain C: pins, parameters and variables as members of `inst`."""
+    """Return a component of LinuxCNC as plain C, with its pins, parameters and variables as members of `inst`."""
     head, body = component.split("\n;;\n", 1)
     members, names = [], []
     for kind, name, count in re.findall(r"^(?:pin|param) \w+ (\w+) ([\w-]+?)(?:-#\[(\d+)\])?[ ;]", head, re.MULTILINE):
@@ -187,7 +187,7 @@ def as_c(component: str) -> str:
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 def test_gravity_and_wrench_are_pins(tmp_path: Path) -> None:
-    """Corrections, mm, to 1e-9: those of the machine under each load; what is no number leaves them as they were."""
+    """The pins' gravity and wrench give the corrections of the machine under this load; NaN keeps the last load."""
     geometry = load_geometry("paper")
     origin = ModelOrigin("2026-01-31")
     model = MachineModel("paper", name="soft", origin=origin, load=Load(stiffness=np.full(6, 20e6), mass=30.0))

@@ -1,4 +1,4 @@
-"""Exports: LinuxCNC's own numbers, closed forms, read back against the model, and what files are refused."""
+"""Exports against numbers of LinuxCNC itself and closed forms; reading them back; files that are refused."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ MACHINE_FILE = PAPER_FILE.with_name("paper_machine.yaml")
 PAPER_BOX = np.array([[-0.2032, -0.2032, 0.350], [0.2032, 0.2032, 0.5532]])
 SMALL_BOX = np.array([[-0.04, -0.06, 0.38], [0.06, 0.03, 0.46]])
 
-# LinuxCNC 2.9.0~pre1 (Debian 12), its genhexkins and motmod, given the files of ``cardanic_machine`` with the
+# Recorded in LinuxCNC 2.9.0~pre1 (Debian 12), genhexkins and motmod, with the files of ``cardanic_machine`` and the
 # tables of ``hand_made_table``: XYZ (mm) and ABC (degrees) reached in G-code, joint.N.pos-cmd (mm), and motor-
-# pos-cmd − motor-offset − pos-cmd (mm), come to along +X+Y+Z and along −X−Y−Z
+# pos-cmd − motor-offset − pos-cmd (mm), approached along +X+Y+Z and along −X−Y−Z
 LINUXCNC = (
     (
         (-10.6, 19.0, 407.3, 4.6, 5.9, -1.7),
@@ -73,14 +73,14 @@ LINUXCNC = (
 
 
 def cardanic_machine(lead: float = 0.008) -> HexapodGeometry:
-    """Return a general 6-6 machine whose cardan axes are parallel at home on all struts."""
+    """Return a general 6-6 machine whose cardan axes on base and platform are parallel at home."""
     geometry = skewed_geometry(lead)
     assert geometry.base_axes is not None
     return replace(geometry, platform_axes=geometry.base_axes @ geometry.home.rotation)
 
 
 def hand_made_table(i: int) -> list[str]:
-    """Return the table of strut `i` that LinuxCNC was given, mm."""
+    """Return the table of strut `i`, mm, that LinuxCNC had for the recording."""
     n = i + 1
     return [
         f"{400 + 2 * i} 0.0{n} -0.02",
@@ -97,7 +97,7 @@ def paper_machine() -> MachineModel:
 def written(
     folder: Path, geometry: HexapodGeometry, model: MachineModel, box: np.ndarray, unit: str = "mm"
 ) -> tuple[Genhexkins, Genhexkins]:
-    """Write an export; return what was told and what is read back."""
+    """Write an export; return it, and what is read back."""
     machine = RealMachine(geometry, model)
     told = make_genhexkins(machine, box)
     write_genhexkins(told, folder, unit, ["a test"], table_misfit(machine, told, box))
@@ -108,10 +108,10 @@ def written(
 
 
 def test_reader_agrees_with_linuxcnc(tmp_path: Path) -> None:
-    """Truth: LinuxCNC itself. Its joints were noted to 1e-9 mm.
+    """The reader computes LinuxCNC's recorded joints, to their 1e-9 mm, and corrections, to 1e-7 mm.
 
-    A joint at rest keeps the correction of the last cycle in which it moved, here some 1e-5 mm away on a
-    slope of 1e-3, and corrections are floats: 1e-7 mm.
+    A joint at rest keeps the correction of the last cycle in which it moved, here 1e-5 mm away on a slope of 1e-3, and
+    LinuxCNC's corrections are single-precision.
     """
     written(tmp_path, cardanic_machine(), MachineModel("skewed"), SMALL_BOX)
     for i, name in enumerate(COMP_FILES):
@@ -131,10 +131,10 @@ def test_reader_agrees_with_linuxcnc(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("turned", [1.0, -1.0])
 def test_screw_rotation_goes_through_genhexkins(tmp_path: Path, turned: float) -> None:
-    """Truth: the model, with axis vectors either way. Left: nothing but the length map's curvature.
+    """With genhexkins' own screw rotation, axis vectors either way, only the length map's curvature is left.
 
-    Its five knots ask for a bend of ≤ 0.06 per m, which a broken line of 0.5 mm steps leaves 2 nm of; the tool
-    moves by a few times that.
+    Its five knots need a curvature of ≤ 0.06 per m. A polyline of 0.5 mm steps leaves 2 nm of it, and the tool moves by
+    a few times as much.
     """
     geometry = cardanic_machine()
     assert geometry.platform_axes is not None
@@ -147,11 +147,11 @@ def test_screw_rotation_goes_through_genhexkins(tmp_path: Path, turned: float) -
     assert check.level.before.rms > 0.5e-3
     assert check.level.after.largest < 20e-9
     assert check.tilted is not None
-    assert check.tilted.after.largest < 0.5e-6  # struts longer than a level tool needs: coarse points
+    assert check.tilted.after.largest < 0.5e-6  # a tilted tool needs longer struts, with fewer points of the table
 
 
 def test_table_of_offset_pitch_and_backlash_is_exact(tmp_path: Path) -> None:
-    """Truth: L = c + o + p(c − c₀) ∓ b/2 solved for c by hand; a straight line, so no misfit but float32's."""
+    """The table equals L = c + o + p(c − c₀) ∓ b/2 solved for c by hand; it is a straight line, without a misfit."""
     o, p, c0, b = 120e-6, 80e-6, 0.5, 6e-6
     struts = StrutErrors(
         offset=np.full(6, o), pitch=np.full(6, p), reference_length=np.full(6, c0), backlash=np.full(6, b)
@@ -165,7 +165,7 @@ def test_table_of_offset_pitch_and_backlash_is_exact(tmp_path: Path) -> None:
 
 
 def test_waves_are_followed_as_well_as_256_points_can() -> None:
-    """Truth: a straight line through points h apart leaves at most h²/8·A·k² of a wave A of wavenumber k."""
+    """A straight line through points h apart leaves at most h²/8·A·k² of a wave A with wavenumber k."""
     geometry, model = paper_geometry(), paper_machine()
     machine = RealMachine(geometry, model)
     told = make_genhexkins(machine, PAPER_BOX)
@@ -179,7 +179,7 @@ def test_waves_are_followed_as_well_as_256_points_can() -> None:
 
 
 def test_files_are_what_linuxcnc_reads(tmp_path: Path) -> None:
-    """Pin names are those in genhexkins.so; a comment before the points would end a table unread."""
+    """Pin names are those in genhexkins.so; comments follow the points, since a comment ends a table in LinuxCNC."""
     model = replace(paper_machine(), name="evil\nsetp motion.feed-hold 1")
     machine = RealMachine(paper_geometry(), model)
     told = make_genhexkins(machine, PAPER_BOX)
@@ -191,7 +191,7 @@ def test_files_are_what_linuxcnc_reads(tmp_path: Path) -> None:
         rows = (tmp_path / name).read_text().splitlines()
         points = [list(map(float, row.split())) for row in rows if not row.startswith("#")]
         assert len(points) <= 256
-        assert rows[len(points)].startswith("#")  # points first, comments after them
+        assert rows[len(points)].startswith("#")
         assert all(len(point) == 3 for point in points)
         assert max(map(len, rows)) < 255
     ini = (tmp_path / INI_FILE).read_text()
@@ -200,7 +200,7 @@ def test_files_are_what_linuxcnc_reads(tmp_path: Path) -> None:
 
 def test_what_genhexkins_cannot_have_is_refused() -> None:
     machine = RealMachine(skewed_geometry(0.008), MachineModel("skewed"))
-    with pytest.raises(GeometryError, match=r"strut_.*right angle"):  # struts 4–6 stand at 90° at home
+    with pytest.raises(GeometryError, match=r"strut_.*right angle"):  # cardan axes of struts 4–6
         make_genhexkins(machine, SMALL_BOX)
     uneven = replace(cardanic_machine(), screw_lead=np.array([8e-3] * 5 + [-8e-3]))
     with pytest.raises(GeometryError, match="same for all struts"):
@@ -211,7 +211,7 @@ def test_what_genhexkins_cannot_have_is_refused() -> None:
 
 
 def trilinear_table() -> tuple[GridTable, Callable[[np.ndarray], np.ndarray]]:
-    """Return a table whose values are a trilinear function of position, and that function."""
+    """Return a table whose values are a trilinear function of the position, and this function."""
     nodes = (np.array([-0.1, 0.0, 0.1]), np.array([-0.2, 0.1]), np.array([0.3, 0.35, 0.5]))
 
     def function(p: np.ndarray) -> np.ndarray:
@@ -223,7 +223,7 @@ def trilinear_table() -> tuple[GridTable, Callable[[np.ndarray], np.ndarray]]:
 
 
 def test_table_file_brings_trilinear_functions_back(tmp_path: Path) -> None:
-    """Truth: trilinear interpolation of a trilinear function is the function; the file keeps 1e-12 m and rad."""
+    """Trilinear interpolation returns a trilinear function; the file keeps 1e-12 m and rad."""
     table, function = trilinear_table()
     write_table(table, tmp_path / "t.csv", ["a test"])
     back = read_table(tmp_path / "t.csv")
@@ -252,7 +252,7 @@ def test_table_file_brings_trilinear_functions_back(tmp_path: Path) -> None:
 
 
 def test_nodes_hold_the_models_own_corrections() -> None:
-    """Truth: the model's commands at a node with every strut growing; half the backlash column is then added."""
+    """At a node, corrections are the model's for extending struts, minus half the backlash column."""
     geometry, model = paper_geometry(), paper_machine()
     table, left_out = make_table(geometry, model, PAPER_BOX, 0.12)
     assert "10 mm period and up to 4.00 µm" in left_out[0]
@@ -269,14 +269,14 @@ def test_nodes_hold_the_models_own_corrections() -> None:
             at_node = (way, *index)
             found = table.struts[at_node] + 0.5 * table.backlash[at_node]
             np.testing.assert_allclose(found, commands - nominal, atol=1e-13, rtol=0.0)
-            change = table.poses[at_node]  # told to the nominal machine, it must send the same commands
+            change = table.poses[at_node]  # the nominal machine has the same lengths at the corrected pose
             turned = Rotation.from_rotvec(change[3:]).apply(np.array(geometry.platform_joints))
             told = np.linalg.norm(target.position + change[:3] + turned - geometry.base_joints, axis=1)
             np.testing.assert_allclose(told - nominal, table.struts[at_node], atol=1e-13, rtol=0.0)
 
 
 def test_table_leaves_what_its_step_leaves(tmp_path: Path) -> None:
-    """Truth: the model, without waves: interpolation errors are quadratic in the step."""
+    """Without waves, the table leaves an interpolation error that is quadratic in its step."""
     step, left = 0.0508, 0.25e-6
     geometry, model = paper_geometry(), paper_machine()
     model = replace(model, struts=replace(model.struts, cosine=np.zeros(6), sine=np.zeros(6)))
@@ -288,7 +288,7 @@ def test_table_leaves_what_its_step_leaves(tmp_path: Path) -> None:
     by_struts = trial.check(partial(commands_by_struts, back))
     assert by_struts.level.after.rms < left
     by_poses = trial.check(partial(commands_by_poses, back))
-    assert by_struts.level.after.rms < by_poses.level.after.rms < left + 5e-6  # backlash, 3–5 µm, stays
+    assert by_struts.level.after.rms < by_poses.level.after.rms < left + 5e-6  # the poses lack backlash, 3–5 µm
 
 
 def test_what_no_table_can_hold_is_refused() -> None:
@@ -302,7 +302,7 @@ def test_what_no_table_can_hold_is_refused() -> None:
     with pytest.raises(OutsideFieldError, match="outside the field's box"):
         make_table(geometry, replace(model, field=field), wide, 0.1)
     assert "outside the field's box" in make_table(geometry, model, wide, 0.1)[1][-1]
-    table, left_out = make_table(geometry, replace(model, field=field), model.field.box, 0.2)  # its own corners are in
+    table, left_out = make_table(geometry, replace(model, field=field), model.field.box, 0.2)  # corners included
     assert len(left_out) == 1
     assert np.isfinite(table.struts).all()
 
@@ -323,7 +323,7 @@ def test_verb_writes_reads_back_and_reports(tmp_path: Path, capsys: pytest.Captu
     assert sorted(path.name for path in folder.iterdir()) == sorted([HAL_FILE, INI_FILE, *COMP_FILES])
     found = re.search(r"LinuxCNC, level tool: ([\d.]+) → ([\d.]+) µm RMS", text)
     assert found is not None
-    assert 140.0 < float(found[1]) < 150.0  # 145.4 µm in paper_lines_model.yaml, at other points
+    assert 140.0 < float(found[1]) < 150.0  # paper_lines_model.yaml has 145.4 µm at other points
     assert float(found[2]) < 2.0
     for part in ("the error field: moves the tool by", "screw waves of 10 mm", "(the model has none)", "tilted by 5°"):
         assert part in text
@@ -336,7 +336,7 @@ def test_verb_writes_reads_back_and_reports(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_verb_tells_when_an_export_makes_it_worse(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A machine without errors can only lose; one read back wrongly must not pass."""
+    """The verb fails if an export makes a machine worse, as with wrongly read joints; without errors it passes."""
     box = ("--box=-100,-100,350,100,100,500", "--linuxcnc", str(tmp_path / "cnc"))
     assert run_verb(*box) == 0
     with pytest.raises(InputFileError, match="cannot be made"):
@@ -378,7 +378,7 @@ def test_an_unknown_term_is_refused_and_zero_passes(export: Callable[[MachineMod
 
 
 def test_genhexkins_has_no_term_for_a_load():
-    """The table and the C core carry it."""
+    """The table and the C core contain a model's load; genhexkins cannot, and refuses it."""
     model = MachineModel("paper", load=Load(stiffness=np.full(6, 20e6), mass=30.0))
     refuse_unknown(model, "the C core")
     with pytest.raises(ModelError, match=r"^load\.stiffness: cannot be exported: genhexkins does not know it"):

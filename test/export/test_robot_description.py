@@ -1,6 +1,6 @@
-"""URDF and MJCF of machines, each read by a program of its own kind.
+"""URDF and MJCF of machines, both read by MuJoCo, which also simulates the MJCF.
 
-Truth: the closed form of a strut's ends, on foreign machines and at random poses. MuJoCo reads both, and runs MJCF.
+The truth is the closed form of a strut's ends, on foreign machines and at random poses.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from hexapod_comp.virtual.physics import find_mujoco
 FOREIGN = list(machines()) if ALL_TESTS else ["framed", "hanging", "inches"]
 MACHINES = ["example_6_6", "positioning_unit", *FOREIGN]
 
-SAME = 1e-9  # m; angles of a URDF are rounded to doubles, on machines of half a metre 1e-16 m
+SAME = 1e-9  # m; both are rounded to doubles, 1e-16 m on machines of half a metre
 
 
 def poses(geometry: HexapodGeometry, count: int = 20, share: float = 0.2) -> list[Pose]:
-    """Return home and poses around it: as far as a share of the stroke, and some 10°."""
+    """Return home and poses around it, up to a share of the stroke and of 1 rad per metre of it."""
     rng, home = np.random.default_rng(8), geometry.home
     far = share * np.abs(geometry.limits.stroke - strut_lengths(geometry, home)[:, None]).min()
     shifts, turns = rng.uniform(-far, far, (count, 3)), Rotation.from_rotvec(rng.uniform(-far, far, (count, 3)))
@@ -49,9 +49,10 @@ def mujoco() -> ModuleType:
 
 @pytest.mark.parametrize("name", FOREIGN)
 def test_mujoco_reads_the_urdf(name: str, mujoco: ModuleType, tmp_path: Path):
-    """A reader that nobody here wrote. It wants masses, which this URDF has not, and folds fixed links unless told.
+    """MuJoCo's reader finds strut ends and named frames where the closed form and the zoo have them.
 
-    Named tools and work frames by the zoo's own frames, also of MJCF's sites.
+    It needs masses, which a URDF without inertia lacks, and an option to keep fixed links. The named tools are also
+    sites of the MJCF.
     """
     machine = with_frames(name)
     geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
@@ -80,7 +81,7 @@ def test_mujoco_reads_the_urdf(name: str, mujoco: ModuleType, tmp_path: Path):
 
 
 def off_pose(mujoco: ModuleType, data: Any, pose: Pose) -> tuple[float, float]:
-    """Return how far MuJoCo's platform is from a pose, m and rad."""
+    """Return the distance and angle of MuJoCo's platform from a pose, m and rad."""
     body = data.body("platform")
     turn = Rotation.from_matrix(body.xmat.reshape(3, 3)) * Rotation.from_matrix(pose.rotation).inv()
     return float(np.abs(body.xpos - pose.position).max()), float(turn.magnitude())
@@ -88,11 +89,11 @@ def off_pose(mujoco: ModuleType, data: Any, pose: Pose) -> tuple[float, float]:
 
 @pytest.mark.parametrize("name", MACHINES)
 def test_mujoco_stands_and_moves(name: str, mujoco: ModuleType, tmp_path: Path):
-    """At another pose, by the lengths that inverse kinematics gives for it; then 10 s at home under gravity.
+    """With the lengths of inverse kinematics MuJoCo's platform reaches a pose, and then stays at home for 10 s under
+    gravity.
 
-    Truth: the poses. Tolerance: what the weight makes of six drives of 1e8 N/m each; the heaviest machine, 330 kg, sags
-    by 6 µm, all others, below 30 kg, by less than 2 µm. The ends of the struts part by less than 0.1 µm. From half a
-    second on the platform stays within 1 µm of where it ends.
+    Tolerance: the sag of six drives of 1e8 N/m. The heaviest machine, 330 kg, sags by 6 µm, the others, below 30 kg, by
+    less than 2 µm. The struts' ends part by less than 0.1 µm. After half a second the platform stays within 1 µm.
     """
     geometry = shipped_or_foreign(name, tmp_path)
     model = mujoco.MjModel.from_xml_string(mjcf(geometry))
@@ -108,7 +109,7 @@ def test_mujoco_stands_and_moves(name: str, mujoco: ModuleType, tmp_path: Path):
             places.append(data.body("platform").xpos.copy())
         place, turn = off_pose(mujoco, data, goal)
         assert place < allowed
-        assert turn < 5.0 * allowed  # joints of these machines lie 0.06 to 0.5 m from the middle
+        assert turn < 5.0 * allowed  # joints of these machines are 0.06 to 0.5 m from the platform's centre
         assert np.abs(data.efc_pos[data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY]).max() < 1e-7
     assert np.linalg.norm(np.array(places[steps // 20 :]) - places[-1], axis=1).max() < 1e-6
     assert data.time == pytest.approx(10.5)
@@ -117,7 +118,7 @@ def test_mujoco_stands_and_moves(name: str, mujoco: ModuleType, tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["paper", "hanging"])
 def test_who_forgets_the_drives_input_throws_nothing(name: str, mujoco: ModuleType, tmp_path: Path):
-    """`ctrl` is 0 in MuJoCo until somebody sets it: the struts get as short as they can, no faster than they may."""
+    """Without input MuJoCo's `ctrl` is 0: the struts shorten to their stops, and not faster than their limit."""
     geometry = shipped_or_foreign(name, tmp_path)
     model = mujoco.MjModel.from_xml_string(mjcf(geometry))
     data, fastest = mujoco.MjData(model), 0.0
@@ -125,7 +126,7 @@ def test_who_forgets_the_drives_input_throws_nothing(name: str, mujoco: ModuleTy
         mujoco.mj_step(model, data)
         fastest = max(fastest, max(abs(data.joint(strut).qvel[0]) for strut in STRUT_NAMES))
     assert sum(warning.number for warning in data.warning) == 0
-    assert 0.01 < fastest < 1.05 * min(geometry.limits.speed, 1.0)  # the weight pushes, too
+    assert 0.01 < fastest < 1.05 * min(geometry.limits.speed, 1.0)  # the weight adds a little
 
 
 @pytest.mark.parametrize("name", MACHINES)
@@ -160,7 +161,9 @@ def test_export_writes_both_without_a_model(tmp_path: Path, capsys: pytest.Captu
     assert [joint.get("name") for joint in robot.find("ros2_control").findall("joint")] == list(STRUT_NAMES)
     topics = {param.get("name"): param.text for param in robot.find("ros2_control").iter("param")}
     assert topics["joint_commands_topic"] == "strut_setpoints"
-    assert topics["joint_states_topic"] == "nominal_strut_states"  # measured ones would be corrected once more
-    for joint in robot.find("ros2_control").findall("joint"):  # JointStateTopicSystem ends at what has no interface
+    assert topics["joint_states_topic"] == "nominal_strut_states"  # measured ones would be corrected twice
+    for joint in robot.find("ros2_control").findall(
+        "joint"
+    ):  # JointStateTopicSystem fails for a joint without interfaces
         assert [state.get("name") for state in joint.findall("state_interface")] == ["position", "velocity"]
     assert [connect.get("name") for connect in mujoco.find("equality")] == [f"{strut}_end" for strut in STRUT_NAMES]

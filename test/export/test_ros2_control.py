@@ -1,7 +1,7 @@
 """The package for ros2_control: its controller, compiled against stand-ins of ros2_control's headers, and run.
 
-Truth: nominal lengths and commands of the tests' own machines, in closed form (foreign_machines); the geometry files'
-limits for the configurations. In the real controller_manager it ran outside these tests, see doc/ros.md.
+The truth is nominal lengths and commands of the tests' own machines in closed form (foreign_machines), and the geometry
+files' limits for the configurations. It has run in the real controller_manager outside these tests, see doc/ros.md.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ HEADERS = (
 STRICT = ("-Wall", "-Wextra", "-Wconversion", "-Wno-sign-conversion", "-Werror")
 
 
-SAME = 1e-9  # What a command may be off its closed form, m: the core's iterations end below 1e-12
+SAME = 1e-9  # m; tolerance of commands, since the core's iterations end below 1e-12 m
 
 PERIOD = 0.004
 
-ERRORS = Errors.drawn(machines()["paper"], 3)  # Of the paper's machine
+ERRORS = Errors.drawn(machines()["paper"], 3)  # errors of the paper's machine
 
 
 def run(*words: str | Path) -> None:
@@ -45,7 +45,7 @@ def run(*words: str | Path) -> None:
 
 
 def exported(machine: Machine, errors: Errors, folder: Path) -> Path:
-    """Return the package of a machine with errors that its model knows."""
+    """Return the package that is exported for a machine with errors in its model."""
     files = machine.write(folder / "machine.yaml"), errors.write(folder / "model.yaml", machine)
     words = ["--machine", files[0], "--model", files[1], "--ros2-control", folder / "package"]
     assert main(["export", *map(str, words)]) == 0
@@ -54,7 +54,7 @@ def exported(machine: Machine, errors: Errors, folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The controller, which is the same for all machines but for its name space, and the loop around it."""
+    """Compile the controller, which differs between machines only in its namespace, and the loop around it."""
     if not (shutil.which("gcc") and shutil.which("g++")):
         pytest.skip("no gcc and g++ here")
     folder = tmp_path_factory.mktemp("controller")
@@ -62,14 +62,14 @@ def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text('#include "stubs.hpp"\n')
     package = exported(machines()["paper"], ERRORS, folder)
-    (folder / "both.cpp").write_text('#include "compensation.cpp"\n#include "loop.cpp"\n')  # in half the time
+    (folder / "both.cpp").write_text('#include "compensation.cpp"\n#include "loop.cpp"\n')  # compiles in half the time
     include = [f"-I{place}" for place in (package, folder, STANDS)]
     run("g++", "-std=c++17", *STRICT, *include, "-c", folder / "both.cpp", "-o", folder / "both.o")
     return folder
 
 
 class Loop:
-    """A controller's life: what it is told, and what it says to each."""
+    """The life of one controller: its inputs, and its answer to each."""
 
     def __init__(self, program: Path) -> None:
         self.program = program
@@ -87,7 +87,7 @@ class Loop:
         self.lines.append(line)
 
     def run(self) -> list[str]:
-        """Return the answers to all lines; cycles' are commands and exported states, 12 lengths."""
+        """Run the program; return the answers to all inputs (of a cycle: commands and exported states, 12 lengths)."""
         ran = subprocess.run([self.program], input="\n".join(self.lines) + "\n", capture_output=True, text=True)
         assert ran.returncode == 0, ran.stderr
         self.errors = ran.stderr
@@ -98,7 +98,7 @@ class Loop:
 
 
 def linked(objects: Path, package: Path) -> Path:
-    """Return the program of one machine."""
+    """Link the program of one machine; return its path."""
     sources = package / "core" / "hexapod_comp.c", package / "machine.c"
     for source in sources:
         run("gcc", "-std=c99", "-I", package, "-c", source, "-o", package / f"{source.stem}.o")
@@ -120,13 +120,13 @@ NONE = np.full(6, np.nan)
 
 @pytest.fixture(scope="module")
 def papers(objects: Path) -> Path:
-    """The program of the paper's machine with the errors that ``objects`` was exported with."""
+    """Link the program of the paper's machine with the errors that ``objects`` has."""
     return linked(objects, objects / "package")
 
 
 @pytest.fixture
 def made(papers: Path) -> tuple[Loop, np.ndarray, np.ndarray]:
-    """A loop of the paper's machine, and what is commanded and nominal at home."""
+    """Return a loop of the paper's machine, and its commands and nominal lengths at home."""
     machine = machines()["paper"]
     at_home = np.array([machine.home]), np.eye(3)[None]
     return Loop(papers), commands(machine, ERRORS, *at_home)[0], machine.lengths(*at_home)[0]
@@ -134,7 +134,9 @@ def made(papers: Path) -> tuple[Loop, np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("name", ["hanging", "inches"])
 def test_nominal_lengths_become_commands(objects: Path, tmp_path: Path, name: str) -> None:
-    """From where the struts stand, 1 mm away and back; who starts is told nominal lengths, and moves nothing."""
+    """Over a way of 1 mm and back, commands and exported nominal lengths are the closed forms.
+
+    Before the first references the controller exports the nominal lengths of the measured struts, and moves nothing."""
     machine = machines()[name]
     errors = Errors.drawn(machine, 5)
     loop = Loop(linked(objects, exported(machine, errors, tmp_path)))
@@ -145,7 +147,7 @@ def test_nominal_lengths_become_commands(objects: Path, tmp_path: Path, name: st
     nominal, told = machine.lengths(*poses), commands(machine, errors, *poses)
     assert np.abs(told - nominal).max() > 20e-6
     loop.activate(told[0])
-    loop.cycle(told[0], NONE)  # as until another controller is active
+    loop.cycle(told[0], NONE)  # no references: another controller is active
     for k in range(200):
         loop.cycle(told[k], nominal[k])
     loop.say("s")
@@ -176,7 +178,7 @@ def test_a_jump_is_refused_and_the_struts_are_held(made: tuple[Loop, np.ndarray,
 
 
 def test_struts_that_are_elsewhere_or_stand_still_stop_it(made: tuple[Loop, np.ndarray, np.ndarray]) -> None:
-    """Until it is activated anew, where the struts are then; 2.1 mm is above the limit, 1.9 mm is not."""
+    """A following error of 2.1 mm, or readings that do not change, stop the struts until the next activation."""
     loop, told, nominal = made
     loop.activate(told)
     loop.cycle(told + 0.0019, nominal)
@@ -184,7 +186,7 @@ def test_struts_that_are_elsewhere_or_stand_still_stop_it(made: tuple[Loop, np.n
     loop.cycle(told, nominal + 0.0001)
     loop.say("s")
     loop.activate(told)
-    for k in range(60):  # 0.6 mm in 0.24 s, and readings that never change
+    for k in range(60):  # 0.6 mm in 0.24 s, with readings that do not change
         loop.cycle(told, nominal + 1e-5 * k)
     loop.say("s")
     _, near, off, back, following, activated, *cycles, stale = loop.run()
@@ -217,7 +219,7 @@ def test_without_readings_or_references_the_struts_are_held(made: tuple[Loop, np
 
 
 def test_compensation_is_switched_off_while_it_runs(made: tuple[Loop, np.ndarray, np.ndarray]) -> None:
-    """It ramps out at 1 mm/s, 4 µm a cycle. A temperature that cannot be is refused by name."""
+    """Switched off, the compensation ramps out at 1 mm/s, 4 µm per cycle; a temperature of 900 °C is refused."""
     loop, told, nominal = made
     loop.activate(told)
     loop.cycle(told, nominal)
@@ -239,7 +241,7 @@ def test_compensation_is_switched_off_while_it_runs(made: tuple[Loop, np.ndarray
 
 
 def test_configurations_fit_the_machine(tmp_path: Path) -> None:
-    """A path tolerance at or above the largest step would let a goal go on until its own end is refused."""
+    """A path tolerance of a step or more would let a goal continue until its own end is refused."""
     name = "example_6_6"
     names = [f"axis{n}/leg" for n in range(6)]
     words = ["--machine", name, "--ros2-control", str(tmp_path), "--rate", "100", "--joint-names", ",".join(names)]

@@ -1,7 +1,7 @@
-"""Files from outside that are no such files: every reader refuses each in words, before it reads or expands it.
+"""Files of a wrong kind: every reader refuses them with a message before it reads or expands them.
 
-Truth: none is a file of its kind, so the only right answer is an InputFileError that begins with the file's name. The
-bounds' own values are not waited for: sparse files have any size, and the bounds that need time are made small.
+The only right answer is an InputFileError that begins with the file's name. Sparse files reach bounds of size at once;
+the tests lower bounds that would take time.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def silent(path: Path) -> None:
 
 def huge(path: Path) -> None:
     with open(path, "wb") as stream:
-        stream.truncate(1 << 40)  # sparse: a terabyte that takes no room
+        stream.truncate(1 << 40)  # sparse: a terabyte that occupies nothing
 
 
 def containing(content: bytes) -> Callable[[Path], None]:
@@ -117,11 +117,11 @@ def test_what_is_no_such_file_is_refused_with_its_name(
         assert str(caught.value).startswith(str(path)), name
 
 
-# Bounds.
+# Bounds
 
 
 def test_yaml_of_many_short_values_is_refused_before_it_is_made(tmp_path: Path) -> None:
-    """Eight megabytes of ``[],`` were 1.6 GB and 24 s; bounds are counted on the parser's events."""
+    """8 MB of ``[],`` took 1.6 GB and 24 s as Python objects, so the bound counts the parser's events."""
     with pytest.raises(InputFileError, match="line 1: is not valid YAML: holds more than the allowed 1000 values"):
         yaml_content("[" + "[]," * 2000 + "]", "some.yaml", most_nodes=1000)
     assert yaml_content("[" + "[]," * 998 + "]", "some.yaml", most_nodes=1000) == [[]] * 998
@@ -139,7 +139,7 @@ def test_tables_are_bounded_while_they_are_read(
 
 
 def test_a_pipe_is_bounded_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its size is not known before."""
+    """The size of a pipe is not known before it is read."""
     monkeypatch.setattr(csv, "MAX_CSV_BYTES", 100)
     for read in (read_poses, lambda path: files.read_bytes(path, 100)):
         reading, writing = os.pipe()
@@ -168,12 +168,12 @@ def test_json_that_is_refused(text: str, said: str) -> None:
         json_content(text, 100 if len(text) < 10_000 else 200_000)
 
 
-# Encodings.
+# Encodings
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "windows-1252", "latin-1"])
 def test_tables_in_any_usual_encoding(tmp_path: Path, encoding: str) -> None:
-    """As editors and spreadsheets save; without a mark UTF-16 has to be named."""
+    """Files in the encodings of editors and spreadsheets are read; UTF-16 without a mark must be named."""
     path = tmp_path / "poses.csv"
     path.write_bytes("name;x_µm;y_mm;z_mm\nMeßpunkt Ö;1,5;2;400\n".encode(encoding))
     named = encoding.removesuffix("-le") if encoding.endswith("-le") else ""
@@ -192,7 +192,7 @@ def test_an_encoding_that_is_named_is_meant(tmp_path: Path) -> None:
         Table(path, Layout(encoding="utf-8"))
 
 
-# What was typed wrong is understood.
+# Typing errors
 
 
 def test_a_geometrys_key_or_number_typed_wrong() -> None:

@@ -1,4 +1,4 @@
-"""Strict YAML with units in key names, and schemas: a dataclass whose fields are a file's keys; results as JSON."""
+"""Strict YAML with units in key names; schemas, whose fields are a file's keys; results as JSON."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from hexapod_comp.formats.yaml import read_yaml
 
 @dataclass(frozen=True)
 class Wave:
-    """A section."""
+    """A section of the test's file."""
 
     period: Annotated[float, Numbers("mm")]
     cosine: Annotated[np.ndarray, Numbers("um", PER_STRUT)] = field(default_factory=lambda: np.zeros(6))
@@ -41,7 +41,7 @@ class Wave:
 
 @dataclass(frozen=True)
 class Machine:
-    """A file."""
+    """The schema of the test's file."""
 
     name: Annotated[str, Text()]
     stroke: Annotated[np.ndarray, Numbers("mm", (2,))]
@@ -66,7 +66,7 @@ def machine(**content):
 
 
 def test_units_shapes_and_defaults():
-    """Truth: 880.1 mm is the very 0.8801 of source code, an inch 25.4 mm, one number stands for six struts."""
+    """880.1 mm is read as exactly 0.8801, an inch as 25.4 mm, and one number stands for all six struts."""
     read_in = machine(wave={"period_in": 0.2, "cosine_µm": 1.1}, columns=["a", "b", "c"])
     assert read_in.stroke.tolist() == [0.33, 0.8801]
     assert read_in.wave.period == pytest.approx(5.08e-3, rel=1e-15)
@@ -98,7 +98,7 @@ def test_what_is_refused(content, said):
 
 @pytest.mark.parametrize(("numbers", "size"), [(Numbers("um", PER_STRUT), 1e-5), (Numbers("mm", (6,)), 0.3)])
 def test_written_numbers_read_back_to_the_same_values(numbers: Numbers, size: float):
-    """Property; to one rounding, and what has been read is written back unchanged."""
+    """Written numbers read back to one rounding, and a number that was read is written unchanged."""
     values = np.random.default_rng(4).normal(0.0, size, 6)
     key, written = numbers.write("cosine", values)
     back = numbers.read(Section("some.yaml", "", {key: written}), "cosine", None)
@@ -124,7 +124,7 @@ def section(**content):
     return Section("some.yaml", "", content)
 
 
-# Whole files.
+# Whole files
 
 
 def test_byte_order_mark_and_windows_line_ends(tmp_path):
@@ -146,13 +146,13 @@ def test_byte_order_mark_and_windows_line_ends(tmp_path):
     ],
 )
 def test_yaml_that_is_refused(tmp_path, text, said):
-    """What is shorter stands in test/cli/messages.txt, as what YAML 1.1 reads otherwise than people do: 0400 is 256."""
+    """Long texts; test/cli/messages.txt has short ones, and surprises of YAML 1.1 (0400 is 256)."""
     with pytest.raises(InputFileError, match=said):
         load(tmp_path, HEAD + text).finish()
 
 
 def test_a_missing_key_among_very_many(tmp_path):
-    """Looking for the nearest of half a million names took 17 s: only the first of them are looked through."""
+    """Only the first names are searched for a similar one: a search through half a million took 17 s."""
     others = "".join(f"n{number}: 1\n" for number in range(MOST_NEIGHBOURS))
     with pytest.raises(InputFileError, match=r"format: is missing; is 'formt' a misspelling of it\?$"):
         load(tmp_path, "formt: test\n" + others)
@@ -160,7 +160,7 @@ def test_a_missing_key_among_very_many(tmp_path):
         load(tmp_path, others + "formt: test\n")
 
 
-# Values.
+# Values
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_a_missing_key_among_very_many(tmp_path):
     ],
 )
 def test_units(dimension, unit, number, si):
-    """Truth: the definitions of the units; exact, since 350 mm in a file must be the 0.35 of source code."""
+    """The truth is the units' definitions, exactly: 350 mm in a file must equal 0.35 in source code."""
     assert section(**{f"a_{unit}": number}).quantity("a", dimension) == si
 
 
@@ -189,7 +189,7 @@ def test_both_micro_signs_are_the_u_of_um(tmp_path, micro):
 
 
 def test_every_unit_ends_its_key_in_one_way():
-    """A key must not fit two units of one kind: a_m_min is not the length a_m in min."""
+    """No key may fit two units of one kind: a_m_min must not be the length a_m in min."""
     si = {unit for units in UNITS.values() for unit, factor in units.items() if factor == 1.0}
     assert " ".join(sorted(si)) == "K N N_m Pa degC kg m m_s m_s2 m_s3 rad s"
     for units in UNITS.values():
@@ -210,7 +210,7 @@ class Found:
 
 
 def told(value: Any) -> Any:
-    """Return what a program reads; a NaN in the text would be no JSON, though Python reads it."""
+    """Return a value as a program reads it from JSON; NaN is refused, though Python's reader accepts it."""
 
     def refuse(word: str) -> None:
         raise AssertionError(word)

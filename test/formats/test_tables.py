@@ -1,4 +1,4 @@
-"""CSV files of poses and lengths: what comes in is what stood there, and every complaint says where."""
+"""CSV files of poses and lengths: values are read exactly, and messages state file, line and column."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def written(folder: Path, text: str | bytes) -> Path:
 
 
 def test_mm_and_degrees_become_m_and_rotations(tmp_path: Path) -> None:
-    """Rotation by scipy from the paper's definition R = Ry(β)·Rx(α)·Rz(γ)."""
+    """The truth is scipy's rotation by the paper's definition R = Ry(β)·Rx(α)·Rz(γ)."""
     rows, poses = read_poses(written(tmp_path, HEADER + "a,1,-2,400,10,20,30\n"))
     assert (rows[0].line, rows[0].label) == (2, "a")
     np.testing.assert_allclose(poses[0].position, [1e-3, -2e-3, 0.4], rtol=1e-15)
@@ -35,7 +35,7 @@ def test_mm_and_degrees_become_m_and_rotations(tmp_path: Path) -> None:
 
 
 def test_comments_blank_lines_spaces_bom_and_windows_line_ends(tmp_path: Path) -> None:
-    """Lines are counted as an editor counts them."""
+    """Comments and blank lines count as lines, as in an editor."""
     text = "\ufeff# a comment\r\nx_mm, y_mm, z_mm\r\n\r\n# more\r\n1, 2, 3\r\n"
     rows, poses = read_poses(written(tmp_path, text))
     assert rows[0].line == 5
@@ -75,7 +75,7 @@ def test_malformed_poses_are_refused_with_file_line_and_column(
 
 
 def test_a_missing_file_lists_those_of_its_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beside it and shipped; poses for who reads poses, lengths for who reads lengths."""
+    """The message lists files of the same kind in that folder and among the shipped ones: poses, or lengths."""
     monkeypatch.chdir(tmp_path)
     Path("lengths.csv").write_text("sequence;L1_mm\n")
     Path("notes.txt").write_text("x_mm\n")
@@ -97,7 +97,7 @@ def test_a_missing_file_lists_those_of_its_kind(tmp_path: Path, monkeypatch: pyt
         read_poses("x.csv")
 
 
-# Files of spreadsheets.
+# Files of spreadsheets
 
 POSE = Pose([0.0015, -0.002, 0.4], np.eye(3))
 
@@ -115,7 +115,7 @@ POSE = Pose([0.0015, -0.002, 0.4], np.eye(3))
     ],
 )
 def test_semicolons_tabs_decimal_commas_and_micro_signs(tmp_path: Path, text: str | bytes) -> None:
-    """As spreadsheets of many countries save; the numbers are the very floats that a point would give."""
+    """Files as spreadsheets of many countries save them give the same floats as files with decimal points."""
     (pose,) = read_poses(written(tmp_path, text))[1]
     np.testing.assert_array_equal(pose.position, POSE.position)
 
@@ -152,7 +152,7 @@ def test_malformed_lengths(tmp_path: Path) -> None:
 
 
 def test_what_is_written_reads_back(tmp_path: Path) -> None:
-    """Full digits: one rounding each of mm, degrees and the trigonometry in between, 1e-15 of a metre or radian."""
+    """Written files read back to 1e-15 m and 2e-15: one rounding each of mm, degrees and the trigonometry."""
     rng = np.random.default_rng(3)
     poses = [
         Pose(p, Rotation.from_rotvec(w).as_matrix())

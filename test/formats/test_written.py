@@ -1,4 +1,4 @@
-"""How files, tables and lines on a terminal are written: whole, and with nothing that another program would obey."""
+"""Files, tables and terminal output are written completely, and contain nothing that another program would execute."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from hexapod_comp.formats.pages import _environment, render
 from hexapod_comp.formats.texts import PlainStream
 
 ROOT = Path(__file__).resolve().parents[2]
-# Sets a terminal's title, clears it, colours it (in one C1 code), turns the direction
+# Sets a terminal's title, clears it, colours it (one C1 code), reverses the direction of text
 SENTINEL = "\x1b]0;owned\x07\x1b[2J\x9b31m\u202e"
 
 
-# Files.
+# Files
 
 
 def test_modes_and_links_stay_what_the_user_wants(tmp_path):
-    """Before, every file came out as 0644: a secret readable to all, a shared one writable to one."""
+    """A new file gets its mode from the umask; an overwritten file keeps its mode, and a link stays a link."""
     path, link = tmp_path / "out.yaml", tmp_path / "link.yaml"
     before = os.umask(0o027)
     try:
@@ -62,7 +62,7 @@ def test_a_file_that_is_protected_against_writing_stays(tmp_path):
 
 
 def test_a_file_is_on_the_disk_before_it_takes_the_place_of_another(tmp_path, monkeypatch):
-    """Else a power cut may leave the new name with nothing in it (ext4, XFS)."""
+    """Otherwise a power cut may leave an empty file under the new name (ext4, XFS)."""
     happened = []
     real = {name: getattr(os, name) for name in ("fsync", "replace")}
     monkeypatch.setattr(outputs.os, "fsync", lambda handle: happened.append(os.fstat(handle).st_size))
@@ -88,7 +88,7 @@ def test_whatever_interrupts_writing_leaves_the_old_file_and_no_litter(tmp_path,
 
 
 def test_write_into_nowhere_over_a_folder_and_by_the_longest_name(tmp_path):
-    """A temporary file must not have a longer name: names end at 255 byte."""
+    """The temporary file's name must not be longer than the file's: the limit is 255 bytes."""
     with pytest.raises(InputFileError, match=r"no/out\.yaml: cannot be written: No such file"):
         write_text(tmp_path / "no" / "out.yaml", "x")
     (tmp_path / "out.yaml").mkdir()
@@ -100,7 +100,7 @@ def test_write_into_nowhere_over_a_folder_and_by_the_longest_name(tmp_path):
     assert set(os.listdir(tmp_path)) == {"out.yaml", name}
 
 
-# Tables: what spreadsheets run, after OWASP's list.
+# Tables: texts that spreadsheets execute, after OWASP's list
 
 HOSTILE = ["=1+1", "+1+1", "-1+1", "@SUM(A1)", "\tx", "'=1", "''+x", " =1", "-", '=HYPERLINK("http://x","y")']
 HARMLESS = ["", "plain", "a=b", "'quoted'", "x-1", "nan", "0", "12.5"]
@@ -122,7 +122,7 @@ def test_a_text_that_a_spreadsheet_would_run_is_marked_and_read_back(tmp_path):
     assert [row.label for row in Table(path).labels()] == labels
 
 
-# Terminals and pictures.
+# Terminals and pictures
 
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])
@@ -134,7 +134,7 @@ def test_codes_are_shown_and_not_obeyed(stream):
 
 @pytest.mark.parametrize("name", ["$x^", "a $x_{$ b", r"\$\frac$", "$1 and $2", "\x1b[2J\n"])
 def test_no_name_is_a_formula(name, tmp_path):
-    """Matplotlib takes what stands between two $ for mathematics, and raises where it is none."""
+    """Matplotlib reads text between two $ as a formula, and raises an error if it is none."""
     figure = Figure(figsize=(2, 1))
     drawn = figure.suptitle(picture_text(name))
     save(figure, tmp_path / "title.png")
@@ -146,12 +146,12 @@ def test_no_name_is_a_formula(name, tmp_path):
 
 @pytest.mark.parametrize(("to", "codes"), [("> /dev/full", [2]), ("| true", [0, 141]), (">&-", [0])])
 def test_an_output_that_nobody_takes_is_no_traceback(to, codes, tmp_path):
-    """Before: tracebacks from `print`, and "Exception ignored" with exit code 120 from the end of Python."""
+    """A full disk gives exit code 2 and a message; a closed pipe or stdout ends the program without a traceback."""
     (tmp_path / "poses.csv").write_text("sequence,x_mm,y_mm,z_mm\n" + "".join(f"{n},0,0,400\n" for n in range(3000)))
     words = f"{sys.executable} -m hexapod_comp ik poses.csv --machine paper {to}; exit ${{PIPESTATUS[0]}}"
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(["bash", "-c", words], cwd=tmp_path, capture_output=True, text=True, env=environment)
-    assert done.returncode in codes  # `true` may have taken all before it ended
+    assert done.returncode in codes  # `true` may have read everything before it ended
     assert "Traceback" not in done.stderr
     assert "Exception ignored" not in done.stderr
     assert ("standard output: cannot be written: No space left" in done.stderr) == (codes == [2])
@@ -168,7 +168,7 @@ def test_an_output_that_nobody_takes_is_no_traceback(to, codes, tmp_path):
     ],
 )
 def test_codes_in_arguments_and_files_do_not_reach_the_terminal(arguments, tmp_path, monkeypatch, capsys):
-    """What `ik` prints quotes the labels of a file; what argparse says quotes what it does not understand."""
+    """``ik`` prints labels of a file, and argparse prints unknown arguments: control codes in them are escaped."""
     machine = (ROOT / "config" / "paper.yaml").read_text(encoding="utf-8")
     named = re.sub(r"(?m)^machine: .*$", r'machine: "\\e[2Jmine"', machine)
     (tmp_path / "mine.yaml").write_text(named, encoding="utf-8")
@@ -181,7 +181,7 @@ def test_codes_in_arguments_and_files_do_not_reach_the_terminal(arguments, tmp_p
 
 
 def test_cells_of_a_wide_table_carry_their_columns_names():
-    """The style sheet puts them in front of the cells where the screen is narrow and the head is not shown."""
+    """On narrow screens, which hide the head of a table, the style sheet shows these names in front of the cells."""
     table = _environment().get_template("parts.html").module.table
     text = table(("run", "readings", "RMS <σ>", "largest"), [("x1", 3, 0.5, 1.2)])
     assert '<table class="rows">' in text

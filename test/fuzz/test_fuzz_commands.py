@@ -1,6 +1,6 @@
-"""The command line with mutated files, recordings and arguments: a result, or exit code 2 and words for people.
+"""The command line with mutated files, recordings and arguments: it gives a result, or exit code 2 and a message.
 
-What is read of a file is judged in test_fuzz_files.py; here that a verb bears whatever was accepted.
+test_fuzz_files.py checks what is read from a file; the tests here check that a verb handles every accepted file.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     (made / "budget.yaml").write_bytes((CONFIG / "error_budget.yaml").read_bytes())
     (made / "unit.yaml").write_bytes(GEOMETRIES[1])
     with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(made)  # where nonsense is written to
+        patch.chdir(made)  # invalid names may become files in this folder
         yield made
 
 
 def command(*arguments: str) -> tuple[int, str, str]:
-    """Run the command line here; return exit code, output and complaints, which must be for people."""
+    """Run the command line here; return exit code, stdout and stderr after checking that messages are readable."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = cli.main(arguments)
@@ -56,13 +56,13 @@ def command(*arguments: str) -> tuple[int, str, str]:
     assert "Traceback" not in said
     if code == 2:
         ours = said.partition("hexapod_comp: error: ")[2].removesuffix("\n")
-        assert ours or "error: " in said, said  # the others are argparse's, which repeats what was typed
+        assert ours or "error: " in said, said  # messages of argparse repeat what was typed
         if ours and not ours.startswith("unrecognized arguments"):
             check_message(ours)
     return code, out.getvalue(), said
 
 
-# Verb, the file that is mutated, and the rest of the command; file names stand for files of the folder
+# Verb, the file that is mutated, and the other arguments, which name files of the folder
 COMMANDS = (
     ("ik", "poses.csv", ()),
     ("ik", "model.yaml", ("poses.csv", "--model", "model.yaml")),
@@ -94,9 +94,7 @@ def test_mutated_files(folder: Path, number: int, changes: list) -> None:
     data = mutated(original, changes)
     changed = folder / f"x_{name}"
     changed.write_bytes(data)
-    arguments = [
-        str(changed) if word == name else word for word in rest
-    ]  # the others are in the folder where this runs
+    arguments = [str(changed) if word == name else word for word in rest]  # the other files are in this folder
     if name not in rest:
         arguments.insert(0, str(changed))
     COUNTS["commands"] += 1
@@ -106,7 +104,7 @@ def test_mutated_files(folder: Path, number: int, changes: list) -> None:
         assert out.strip()
 
 
-# Verbs and options that are given nonsense; a file that does not exist keeps the long ones from starting
+# Verbs and options that get invalid values; a missing file prevents the slow verbs from starting
 OPTIONS = {
     "ik": ("--pose", "--line", "--step-mm", "--direction", "--machine", "--model", "--out", "--json"),
     "fk": ("--lengths", "--guess", "--cold", "--all-modes", "--machine", "--model", "--json"),
@@ -165,7 +163,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @example(changes=[], flips=[])
 @cases(25, 0.01)
 def test_mutated_bags(bag: Path, changes: list, flips: list) -> None:
-    """Edits, or else bits that are turned. What is not touched replays to the same bits."""
+    """The recording is edited or has bits flipped; unchanged it replays to the same bits."""
     data = bytearray(bag.read_bytes() if flips else mutated(bag.read_bytes(), changes))
     for place, bit in flips:
         data[place % len(data)] ^= 1 << bit

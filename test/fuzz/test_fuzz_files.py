@@ -1,8 +1,8 @@
-"""Mutated files: each is read as what stands in it, or refused in words for people; never anything else.
+"""Mutated files are read correctly, or refused with a readable message.
 
-Truth: the same content written anew in the plainest way by another parser. Of YAML the tree of nodes, of CSV the cells
-split by hand; every number with a unit by Decimal and the units' definitions, in SI (fuzzing.py). What the reader makes
-of that must be what it made of the mutated file. That values go where they belong is shown by the readers' own tests.
+The truth is the same content, rewritten in the plainest form by another parser and read again: of YAML the tree of
+nodes, of CSV the cells split by hand, every number with a unit converted to SI by Decimal (fuzzing.py). Both readings
+must be equal. The readers' own tests check that values get to the right place.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ PAPER = paper_geometry()
 BOX = np.array([[-0.04, -0.04, 0.38], [0.04, 0.04, 0.46]])
 
 
-# Files.
+# Files
 
 
 def full_model() -> bytes:
-    """Return the file of a model with everything."""
+    """Return the file of a model with all blocks."""
     rng = np.random.default_rng(6)
     full = random_model(rng, "paper")
     grid = np.array([-0.2, 0.2])
@@ -114,11 +114,11 @@ GEOMETRIES = (
 )
 
 
-# The same, written plainly.
+# The same content in plain form
 
 
 def plain_yaml(data: bytes) -> bytes:
-    """Return a YAML file in flow style, in which what has a unit is in SI."""
+    """Return a YAML file in flow style with all quantities in SI."""
     return _plain(check_document(data)).encode()
 
 
@@ -140,7 +140,7 @@ def _entry(key: str, value: yaml.Node) -> str:
 
 
 def in_si(key: str) -> tuple[str, str, str | None]:
-    """Return a key's name, the ending that stands for SI, and the factor of its unit; None where it has none."""
+    """Return a key's name, its ending in SI, and the factor of its unit (None without a unit)."""
     key = re.sub("_[µμ](m|rad)$", r"_u\1", key)
     unit = max((unit for unit in UNITS if key.endswith(f"_{unit}")), key=len, default=None)
     if unit is None:
@@ -150,16 +150,16 @@ def in_si(key: str) -> tuple[str, str, str | None]:
 
 
 def number(text: str, factor: str) -> str:
-    """Return a number in SI, as a float is written; leading zeros of a cell mean nothing."""
+    """Return a number times a factor, written as a float; leading zeros of a cell are ignored."""
     shown = re.sub(r"^([-+]?)0+(?=[0-9])", r"\1", text.strip())
     return f"{float(Decimal(shown) * Decimal(factor)):.17e}"
 
 
 def rows_of(data: bytes) -> list[dict[str, str]]:
-    """Return a CSV file's rows as a spreadsheet shows them: comments and empty lines left out, no spaces around.
+    """Return a CSV file's rows as a spreadsheet shows them: without comments, empty lines and surrounding spaces.
 
-    The header tells what separates columns: commas, or else semicolons, or else tabs. Where it is not commas, numbers
-    with decimal commas get points.
+    The header shows the separator: comma, else semicolon, else tab. With other separators than commas, numbers with
+    decimal commas get points.
     """
     try:
         text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
@@ -180,7 +180,7 @@ def rows_of(data: bytes) -> list[dict[str, str]]:
 
 
 def with_points(rows: list[list[str]]) -> list[list[str]]:
-    """Return rows whose numbers with decimal commas have points; check that a comma can only be a decimal one."""
+    """Return rows with decimal points in place of decimal commas; fail if a comma may separate thousands."""
     flat = [cell.strip() for line in rows for cell in line]
     commas = [cell for cell in flat if re.fullmatch(r"[-+]?[0-9]+,[0-9]+([eE][-+]?[0-9]+)?", cell)]
     if commas:
@@ -190,7 +190,7 @@ def with_points(rows: list[list[str]]) -> list[list[str]]:
 
 
 def plain_csv(data: bytes) -> bytes:
-    """Return a CSV file with commas and points, in SI where a column, or the row's ``unit``, has one."""
+    """Return a CSV file with commas and points, in SI by the unit of the column or in the row's ``unit``."""
     out = io.StringIO()
     rows = [dict(plain_cell(name, cell, row) for name, cell in row.items()) for row in rows_of(data)]
     writer = csv.DictWriter(out, list(rows[0]), lineterminator="\n")
@@ -210,18 +210,18 @@ def plain_cell(name: str, cell: str, row: dict[str, str]) -> tuple[str, str]:
 
 
 def plain_cells(data: bytes) -> bytes:
-    """Return a CSV file whose units stand elsewhere, with commas and points."""
+    """Return a CSV file, whose units are in another file, with commas and points."""
     out = io.StringIO()
     rows = rows_of(data)
     csv.writer(out, lineterminator="\n").writerows([list(rows[0]), *(list(row.values()) for row in rows)])
     return out.getvalue().encode()
 
 
-# What is read must be of use.
+# Checks of what was read
 
 
 def works_or_refuses(geometry: HexapodGeometry, model: MachineModel) -> None:
-    """Check that a machine that was accepted gives commands within its limits, or refuses: home and beside it."""
+    """Check that an accepted machine computes commands within its limits at home, or refuses them."""
     try:
         compensator = Compensator(geometry, model)
     except HexapodError:
@@ -240,20 +240,20 @@ def works_or_refuses(geometry: HexapodGeometry, model: MachineModel) -> None:
         home_lengths = np.linalg.norm(
             geometry.home.position + geometry.platform_joints @ geometry.home.rotation.T - geometry.base_joints, axis=1
         )
-        # Through work and tool and back: their size is what rounds.
+        # The transformation through work and tool rounds in proportion to their size.
         size = max(1.0, np.abs(geometry.work.position).max(), np.abs(geometry.tool.position).max())
         np.testing.assert_allclose(found.command - found.correction, home_lengths, atol=1e-14 * size + 1e-12)
 
 
 def sound(found: MeasurementSet) -> None:
-    """Check what every set of readings must be."""
+    """Check that a set of readings is finite and not empty."""
     finite(found.value, found.stations.positions, found.stations.rotations, found.stations.commands)
     finite(found.stations.temperatures, found.points(), found.directions())
     assert len(found.sources) == len(found) > 0
 
 
 class Kind(NamedTuple):
-    """How a kind of file is read, written plainly and judged, and files of it."""
+    """One kind of file: its reader, its plain form, seed files, and the check of what was read."""
 
     read: Callable[[Path], Any]
     plain: Callable[[bytes], bytes]
@@ -262,12 +262,12 @@ class Kind(NamedTuple):
 
 
 def labelled(read: tuple[list[Row], Any]) -> tuple[list[str], Any]:
-    """Return rows' labels and what they hold, without their lines."""
+    """Return the labels of rows and their values, without line numbers."""
     return [row.label for row in read[0]], read[1]
 
 
 def unplaced(found: MeasurementSet) -> MeasurementSet:
-    """Return readings without the lines where they stand."""
+    """Return readings without the lines and files from which they were read."""
     return replace(found, sources=(FileLine("", 0),) * len(found), files=(), notes=())
 
 

@@ -1,8 +1,8 @@
-"""Messages, pins and services of any content, in any order: nodes do not die, and keep their limits.
+"""Messages, pins and services with any content, in any order: nodes keep running and keep their limits.
 
-The nodes are called on the rig's clock, thousands of cases a second; bytes between real processes: test_fuzz_wire.py.
-Truth: the geometry file's limits; the closed form of the paper machine's strut lengths; IEEE 754 and ROS for what is no
-number and no rotation; SciPy's rotations and LinuxCNC's meaning of its axes and tool length (doc/linuxcnc.md)."""
+The nodes are called on the rig's clock, thousands of cases per second; test_fuzz_wire.py sends bytes between processes.
+The truth is the geometry file's limits, the closed form of the paper machine's strut lengths, SciPy's rotations, and
+LinuxCNC's definition of axes and tool length (doc/linuxcnc.md)."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ from hexapod_comp.ros.strut_drive import StrutDriveNode
 
 LIMITS = paper_geometry().limits
 HOME_LENGTHS = closed_form_lengths(HOME)
-WAITS = 0.01  # Longest wait of a command that comes sooner than the struts may move, s
+WAITS = 0.01  # s; longest wait of a command that is too early for the struts
 
-# What mostly is right: a good message with a few things changed.
+# Mostly valid messages with a few changes
 
 floats = st.one_of(
     st.floats(),
@@ -70,7 +70,7 @@ lengths = st.one_of(
     st.lists(st.floats(0.33, 0.88), min_size=6, max_size=6),
     st.lists(floats, max_size=8),
 )
-transitions = st.sampled_from((*(1, 2, 3, 4) * 2, 0, 10, 99, 255))  # configure, cleanup, activate, deactivate; or none
+transitions = st.sampled_from((*(1, 2, 3, 4) * 2, 0, 10, 99, 255))  # valid: configure, cleanup, activate, deactivate
 chance = st.tuples(st.integers(0, 1000), st.randoms(use_true_random=False))
 WHATEVER = (
     st.tuples(st.just("wait")),
@@ -82,7 +82,7 @@ WHATEVER = (
 
 
 def struts_action(topic: str, numbers: st.SearchStrategy[list[float]]) -> st.SearchStrategy[tuple]:
-    """Return messages of struts with such numbers, mostly well named."""
+    """Return a strategy for messages of struts on a topic, mostly with valid names."""
     return st.tuples(st.just("struts"), st.just(topic), names, numbers, st.lists(floats, max_size=7), stamps)
 
 
@@ -92,7 +92,7 @@ NUMBERS = (0.0, 1.5, -1.0, math.nan, math.inf, 1e308, 3.0, 0.5)
 
 
 def draw(kind: str, random: Any) -> Any:
-    """Return a value of a field's type, or a message: any content."""
+    """Return a random value for a field of a message's type, which may be a message itself."""
     if kind.startswith("sequence<"):
         return [draw(kind[len("sequence<") : -1].partition(",")[0], random) for _ in range(random.choice((0, 0, 1, 6)))]
     if kind.endswith("]"):
@@ -120,7 +120,7 @@ def made(kind: Any, random: Any) -> Any:
 
 
 class Fuzzed:
-    """A node on the rig, all of whose topics one other node publishes, and what can be done to any node."""
+    """A node on the rig, one other node that publishes all its topics, and actions that suit any node."""
 
     def __init__(self, rig: Rig, kind: type, parameters: dict[str, Any], **options: Any) -> None:
         for topic in list(rig._publishers):
@@ -132,13 +132,13 @@ class Fuzzed:
         witness.create_subscription(PoseStamped, "tool_pose_command", rig.seen["tool_pose_command"].append)
 
     def took(self, topic: str) -> list[Any]:
-        """Return what was published on a topic, and forget it."""
+        """Return the messages published on a topic since the last call."""
         found = list(self.rig.seen[topic])
         self.rig.seen[topic].clear()
         return found
 
     def stamp(self, message: Any, stamp: Any) -> None:
-        """Write a stamp: 0 none, a time from now in s, or any two integers."""
+        """Write a stamp into a message: 0 for none, a number of seconds from now, or two integers."""
         if isinstance(stamp, tuple):
             message.header.stamp.sec, message.header.stamp.nanosec = stamp
         elif stamp:
@@ -146,13 +146,13 @@ class Fuzzed:
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 10**9)
 
     def play(self, actions: list[tuple]) -> None:
-        """Do one thing after the other, and check each time; then that the node still lives."""
+        """Do each action and check the node after it; at the end check that the node still works."""
         COUNTS[self.name] += 1
         for kind, *rest in actions:
             COUNTS[f"{self.name} {kind} messages"] += 1
             getattr(self, kind)(*rest)
             self.check(kind)
-        self.rig.clock.sleep(2.0)  # so long that struts that were anywhere may be at home, and stand
+        self.rig.clock.sleep(2.0)  # so that struts that have been anywhere may be at home and at rest
         for transition in ("configure", "activate"):
             self.rig.change(transition, self.name)
         self.goes_on()
@@ -168,7 +168,7 @@ class Fuzzed:
         self.rig.call(ChangeState, f"{self.name}/change_state", request)
 
     def service(self, place: int, random: Any) -> None:
-        """Call some service with any request at all, but no transition: shutting down is for good."""
+        """Call any service with any request, except transitions, since shutting down is permanent."""
         services = sorted((s for s in self.node.services if "change_state" not in s.srv_name), key=lambda s: s.srv_name)
         service = services[place % len(services)]
         response = service.callback(made(service.srv_type.Request, random), service.srv_type.Response())
@@ -202,16 +202,16 @@ actions_on_compensator = st.one_of(
 
 
 class FuzzedCompensator(Fuzzed):
-    """Struts that are not where they were told stop the machine (tested elsewhere): here they may be anywhere."""
+    """A compensator without the check of following errors, so that struts may be anywhere."""
 
     def __init__(self, rig: Rig, model: str) -> None:
         options = {"following_error_limit": 0.0, "marker_rate": 0.0, "publish_array": True, "model_file": model}
         options |= {"start_without_feedback_after": AT_ONCE, "catch_up_within": WAITS}
         super().__init__(rig, CompensatorNode, options)
-        self.last: np.ndarray | None = None  # command
+        self.last: np.ndarray | None = None  # last command, m
 
     def pose(self, move: list[float], edits: list, frame: str, stamp: Any) -> None:
-        """Send a command, and check what comes of it against the limits and the closed form."""
+        """Send a command, and check its answer against the limits and the closed form."""
         numbers = np.array([*(HOME.position + move), 0.0, 0.0, 0.0, 1.0])
         for index, value in edits:
             numbers[index] = value
@@ -252,7 +252,7 @@ class FuzzedCompensator(Fuzzed):
         self.voices["temperatures"].publish(message)
 
     def check(self, kind: str) -> None:
-        by_chance = kind in ("transition", "service", "message")  # a reset, or a good command
+        by_chance = kind in ("transition", "service", "message")  # these may reset the node or contain a valid command
         self.last = None if by_chance else self.last
         for estimate in self.took("tool_pose_estimate"):
             assert np.isfinite(message_pose(estimate).position).all()
@@ -263,7 +263,7 @@ class FuzzedCompensator(Fuzzed):
             assert sum(map(len, said)) < 20_000
 
     def goes_on(self) -> None:
-        """Reset, with struts at home, it answers home, and 0.1 mm beside it."""
+        """Check that after a reset, with struts at home, the node answers at home and 0.1 mm beside it."""
         assert self.rig.trigger("reset").success
         self.last = HOME_LENGTHS
         for move in ([0.0, 0.0, 0.0], [1e-4, 0.0, 0.0]):
@@ -300,13 +300,13 @@ class FuzzedDrive(Fuzzed):
         super().__init__(rig, StrutDriveNode, {"rate": 100.0, "truth_file": truth})
 
     def check(self, kind: str) -> None:
-        """What is read is finite but for a lost encoder, and within the strokes."""
+        """Check that readings are finite, except of an encoder that is lost, and within the strokes."""
         lost = self.node._options["fault_encoder_lost"]
         there = np.ones(6, dtype=bool)
         there[lost - 1] = not lost
-        for message in self.took("strut_states") if kind != "service" else ():  # that may be another encoder's fault
+        for message in self.took("strut_states") if kind != "service" else ():  # a service may have changed the fault
             assert list(message.name) == list(STRUT_NAMES)
-            position, noise = np.array(message.position)[there], 1e-6  # twenty standard deviations of the encoder's
+            position, noise = np.array(message.position)[there], 1e-6  # 20 standard deviations of the encoder
             assert np.isfinite([position, np.array(message.velocity)[there]]).all()
             assert (position >= LIMITS.stroke[there, 0] - noise).all()
             assert (position <= LIMITS.stroke[there, 1] + noise).all()
@@ -314,7 +314,7 @@ class FuzzedDrive(Fuzzed):
             assert np.isfinite(message_pose(pose).position).all()
 
     def goes_on(self) -> None:
-        """Without faults, what is read is a good command, and is read again."""
+        """Check that without faults a valid command is accepted, and feedback is published."""
         faults = {"stuck_strut": 0, "encoder_lost": 0, "feedback_delay": 0.0, "feedback_drop": 0.0}
         for name, value in faults.items():
             self.rig.fault(name, value)
@@ -348,7 +348,7 @@ MM = 1e-3
 LIMIT, RAMP = 500e-6, 10e-3
 ROUNDING = 1e-15
 
-NOW = 1e-9  # Stamp of a message that answers a command of just now, s from now; 0 would be none
+NOW = 1e-9  # s; stamp of a message that answers the newest command (0 would be no stamp)
 
 six = st.lists(st.floats(-LIMIT, LIMIT), min_size=6, max_size=6)
 corrections = st.one_of(
@@ -381,7 +381,7 @@ class FuzzedBridge(Fuzzed):
         self.took("tool_pose_command"), self.took("strut_states")
 
     def check(self, kind: str) -> None:
-        """What LinuxCNC has been given since the last time; poses and struts against the pins."""
+        """Check the pins written since the last check, and published poses and struts against the pins."""
         for name in CORRECTIONS:
             written = [value for _, value in self.hal.pins[name].written]
             assert np.isfinite(written).all()
@@ -406,10 +406,10 @@ class FuzzedBridge(Fuzzed):
             np.testing.assert_allclose(message.position, feedback * MM, rtol=1e-15)
 
     def goes_on(self) -> None:
-        """With good pins, it commands and passes a correction on."""
+        """Check that with valid pins the bridge sends commands and passes a correction on."""
         good = {**dict.fromkeys(AXES, 0.0), **dict.fromkeys(FEEDBACK, 600.0), **dict.fromkeys(SWITCHES, True)}
         self.pins(list(good.items()))
-        self.wait()  # shows what was passed on before
+        self.wait()  # publishes earlier corrections first
         updates = self.hal["updates"]
         self.struts("strut_corrections", list(STRUT_NAMES), [1e-4] * 6, [], NOW)
         self.wait()

@@ -1,7 +1,8 @@
-"""Bytes of any content over DDS, to a compensator in a process: it lives, in bounded memory, and goes on afterwards.
+"""Arbitrary bytes over DDS to a compensator in a process: it keeps running, with bounded memory, and answers
+afterwards.
 
-What the middleware itself refuses never comes to a callback; so here nothing is called by the test. Truth: a process
-that lives, its memory as Linux tells it, and a good message that is answered.
+The middleware itself refuses some of these bytes, so they must come over DDS. Checked are the process, its memory as
+Linux reports it, and the answer to a valid message.
 """
 
 from __future__ import annotations
@@ -32,9 +33,10 @@ from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.ros.messages import pose_message
 
 MESSAGES = max(1000, NIGHTLY)
-HUGE = 10_000_000  # Byte; one message in a hundred
+HUGE = 10_000_000  # bytes; one message in a hundred has this size
 
-# What the messages may add to the memory, MB: six copies of the longest message, which middleware, rclpy and node
+# Allowed growth of the memory, MB: six copies of the longest message, held by middleware, rclpy and node (55 MB in
+# 200,000 messages), plus a margin. About ten such messages arrive: a node that kept them would grow by 100 MB.
 # hold (55 in 200,000 messages), and some more. Some ten such messages arrive: a node that kept them would add 100.
 GROWTH = 75
 
@@ -44,13 +46,13 @@ HALVES = (0.0, -0.0, 0.5, 1.0, 1e308, 5e-324, math.nan, -math.inf)
 
 
 def memory(node: NodeProcess, what: str) -> float:
-    """Return what a process has in memory (VmRSS), or the most that it had (VmHWM), MB."""
+    """Return the memory of a process, MB: the present (VmRSS) or the peak (VmHWM)."""
     status = Path(f"/proc/{node.pid}/status").read_text(encoding="ascii")
     return int(re.findall(rf"{what}:\s+(\d+) kB", status)[0]) / 1000
 
 
 def message(topic: str, random: np.random.Generator) -> Any:
-    """Return a message that is good but for some of its content."""
+    """Return a message in which some values are unusual or invalid."""
     made = SENT[topic]()
     made.header.stamp.sec = int(random.choice([0, int(time.time()), -(2**31), 2**31 - 1]))
     made.header.stamp.nanosec = int(random.choice([0, 999_999_999, 2**32 - 1]))
@@ -69,7 +71,7 @@ def message(topic: str, random: np.random.Generator) -> Any:
 
 
 def garbled(topic: str, random: np.random.Generator) -> bytes:
-    """Return a message's bytes: whole, huge, cut off, made up, with absurd lengths, or with other bytes in them."""
+    """Return a message's bytes: complete, huge, cut off, random, with absurd lengths, or with changed bytes."""
     good, way = message(topic, random), random.integers(100)
     if way == 0:
         good.header.frame_id = "x" * HUGE
@@ -95,7 +97,7 @@ def stranger(hexapod_context: Any) -> Iterator[Node]:
 
 
 def spin(node: Node, until: Callable[[], object], what: str) -> None:
-    """Let a node hear until something has happened."""
+    """Spin a node until a condition holds."""
     executor, end = rclpy.executors.SingleThreadedExecutor(context=node.context), time.monotonic() + 60.0
     executor.add_node(node)
     try:
@@ -115,13 +117,13 @@ def test_bytes_of_any_content(stranger: Node) -> None:
         seen: list[JointState] = []
         stranger.create_subscription(JointState, "strut_commands", seen.append, 10)
         spin(stranger, lambda: all(p.get_subscription_count() for p in publishers.values()), "the node is not there")
-        Path(f"/proc/{node.pid}/clear_refs").write_text("5")  # the peak is that of the messages, not of the start
+        Path(f"/proc/{node.pid}/clear_refs").write_text("5")  # the peak must be of the messages, not of the start
         before = memory(node, "VmRSS")
         for number in range(MESSAGES):
             topic = str(random.choice(TOPICS))
             publishers[topic].publish(garbled(topic, random))
             COUNTS["wire messages"] += 1
-            if number % 50 == 0:  # or the publisher's queue would drop what is on its way
+            if number % 50 == 0:  # otherwise the publisher's queue would drop messages
                 publishers[topic].wait_for_all_acked(Duration(seconds=5.0))
                 assert node.exit_code() is None, (
                     f"died within 50 messages before the {number}th: {node.output()[-500:]}"
@@ -139,7 +141,7 @@ def test_bytes_of_any_content(stranger: Node) -> None:
 
 
 def answers(stranger: Node, publishers: dict[str, Any], seen: list[JointState]) -> None:
-    """Reset, readings at home, then a command there, which is answered: also when the struts had been elsewhere."""
+    """Check that after a reset, with readings at home, the node answers a command at home."""
     client = stranger.create_client(Trigger, "compensator/reset")
     spin(stranger, client.service_is_ready, "no reset")
 
