@@ -7,9 +7,9 @@
 >>> pose = hc.Pose.from_angles([0.0, 0.0, 0.4], np.radians([0.0, 0.0, 5.0]))
 >>> microns = compensator.correct(pose).correction * 1e6
 
-These names are the public ones; each is imported at its first use. Everything is in SI units (m, rad, s; °C);
-a pose is the tool's in the work frame unless a parameter says ``pose_platform_in_base``. Every error about an input is
-a :class:`HexapodError`.
+``__all__`` lists the public names; each is imported at its first use. All quantities are in SI units (m, rad, s), and
+temperatures in °C. A pose is that of the tool in the work frame, unless a parameter is called
+``pose_platform_in_base``. Every invalid input raises a :class:`HexapodError`.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ __all__ = ["__version__", *sorted(_HOME_OF)]
 
 
 def __getattr__(name: str) -> object:
-    """Import a public name at its first use; ``hexapod_comp --help`` then does not import NumPy."""
+    """Import a public name at its first use, so that ``hexapod_comp --help`` need not import NumPy."""
     if name == "__version__":
         from .formats.paths import version
 

@@ -1,18 +1,18 @@
-"""Every error that the package raises on bad input, each with the offending value and what is allowed."""
+"""The errors that the package raises on bad input; each message holds the offending value and what is allowed."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-LONGEST_TEXT = 2000  # longest message, log line or value in diagnostics, whatever was received
-LONGEST_PATH = 500  # a file's name is shown up to this length, so that the problem still fits into the message
+LONGEST_TEXT = 2000  # characters; a longer message, log line or diagnostics value is cut
+LONGEST_PATH = 500  # characters; a longer file name is cut, so that the problem still fits into the message
 
 
 class HexapodError(Exception):
-    """Root of all errors that this package raises deliberately.
+    """Base class of all errors that this package raises deliberately.
 
-    Its text may quote foreign text, so all are made :func:`printable` here.
+    A message may quote text from a file or the network, so every message passes through :func:`printable`.
 
     Parameters
     ----------
@@ -22,7 +22,7 @@ class HexapodError(Exception):
     Attributes
     ----------
     reason : str
-        Short name of the cause; diagnostics count refused commands under it.
+        Short name of the cause; diagnostics count refused commands by this name.
     """
 
     reason = "error"
@@ -31,32 +31,32 @@ class HexapodError(Exception):
         super().__init__(printable(text, LONGEST_TEXT))
 
     def __str__(self) -> str:
-        return str(self.args[0])  # also where a parent class has a text of its own, as ImportError
+        return str(self.args[0])  # a second parent class, such as ImportError, would show another text
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return what pickle needs: text and attributes, independent of the class's constructor."""
-        return _remade, (type(self), self.args), self.__dict__
+        """Return what pickle needs: message and attributes, without a call of the subclass's constructor."""
+        return _unpickled, (type(self), self.args), self.__dict__
 
     def with_lines(self, lines: str) -> HexapodError:
-        """Return the error with lines appended unchanged: the log of our own process."""
+        """Append the log of a process that the package started, with its line breaks, and return the error."""
         self.args = (f"{self}\n{lines}",)
         return self
 
 
-def _remade(kind: type[HexapodError], args: tuple[Any, ...]) -> HexapodError:
-    """Return an error with its text; pickle adds the attributes."""
+def _unpickled(kind: type[HexapodError], args: tuple[Any, ...]) -> HexapodError:
+    """Return an error with its message; pickle then sets the attributes."""
     error = kind.__new__(kind)
     error.args = args
     return error
 
 
 def _found(value: Any) -> str:
-    """Return the offending value, to append to a message."""
+    """Return " (found VALUE)" to append to a message; empty for None."""
     return "" if value is None else f" (found {shorten(value)})"
 
 
 class InputFileError(HexapodError):
-    """A file cannot be used: file, key path or ``row 3, column x_mm`` (empty: the whole file), problem and value."""
+    """A file that cannot be used; `key` is a key path or ``line 3, column x_mm``, or empty for the whole file."""
 
     reason = "bad_file"
 
@@ -68,7 +68,7 @@ class InputFileError(HexapodError):
 
 
 class GeometryError(HexapodError):
-    """A geometry that no hexapod can have: quantity, value, and what is allowed."""
+    """A geometry that no hexapod can have; the message names the quantity, its value and what is allowed."""
 
     reason = "bad_geometry"
 
@@ -78,19 +78,19 @@ class GeometryError(HexapodError):
 
 
 class FrameError(HexapodError):
-    """A machine has no tool or work frame of that name; lists the valid names."""
+    """A name of a tool or work frame that the machine does not have; the message lists the valid names."""
 
     reason = "unknown_frame"
 
 
 class ModelError(GeometryError):
-    """A machine model whose numbers cannot describe a machine."""
+    """A machine model with a value that is invalid or that no machine can have."""
 
     reason = "bad_model"
 
 
 class CalibrationError(HexapodError):
-    """Measurements from which no model can be fitted: which part of them, and what is needed."""
+    """Measurements from which no model can be fitted; `what` names the part of them, `problem` what is needed."""
 
     reason = "bad_measurements"
 
@@ -100,7 +100,7 @@ class CalibrationError(HexapodError):
 
 
 class PoseError(HexapodError):
-    """A pose that is invalid: not finite, or its rotation is not a rotation."""
+    """A pose with a number that is not finite, an angle that is too large, or a matrix that is no rotation."""
 
     def __init__(self, problem: str, value: Any = None, reason: str = "bad_pose"):
         self.value, self.reason = value, reason
@@ -108,7 +108,7 @@ class PoseError(HexapodError):
 
 
 class BoundError(HexapodError):
-    """A quantity that breaks a bound; both are attributes, where they are known."""
+    """A quantity outside its bound; attributes `value` and `limit` hold both numbers, None where not known."""
 
     def __init__(self, problem: str, value: Any = None, limit: Any = None):
         self.value, self.limit = value, limit
@@ -116,47 +116,47 @@ class BoundError(HexapodError):
 
 
 class KinematicsError(BoundError):
-    """Forward or inverse kinematics has no usable answer."""
+    """Forward or inverse kinematics without a usable solution."""
 
     reason = "kinematics"
 
 
 class NotFiniteError(KinematicsError):
-    """A length or pose is NaN, infinite, or a length is not positive."""
+    """A length or pose that is NaN or infinite, or a length that is not positive."""
 
     reason = "not_finite"
 
 
 class NotConvergedError(KinematicsError):
-    """Newton did not converge within the allowed number of iterations."""
+    """An iteration that did not converge within its allowed number of steps, attribute `limit`."""
 
     reason = "not_converged"
 
 
 class SingularError(KinematicsError):
-    """The Jacobian is singular, or its condition number is above the limit."""
+    """A pose at which the Jacobian is singular, or its condition number is above the machine's limit."""
 
     reason = "singular"
 
 
 class UnreachableError(KinematicsError):
-    """No pose of the machine has these strut lengths."""
+    """Strut lengths that the machine has at no pose."""
 
     reason = "unreachable"
 
 
 class OtherAssemblyModeError(KinematicsError):
-    """The pose found belongs to another assembly mode than the machine's working one."""
+    """A solution of forward kinematics that belongs to another assembly mode than the machine's working mode."""
 
     reason = "other_assembly_mode"
 
 
 class LimitError(HexapodError):
-    """A command breaks a machine limit; it is refused, never clamped.
+    """A command that breaks a machine limit; the command is refused, never clamped.
 
     ``reason`` is ``stroke``, ``base_cone``, ``platform_cone``, ``clearance``, ``condition``, ``correction``, ``step``,
-    ``speed``, ``acceleration`` or ``assembly``; ``value`` and ``limit`` are in SI, ``strut`` is an index 0…5 or None,
-    ``stage`` ``nominal`` or ``compensated``: which of the two values broke the limit.
+    ``speed``, ``acceleration`` or ``assembly``; ``value`` and ``limit`` are in SI units, ``strut`` is an index 0…5 or
+    None. ``stage`` is ``nominal`` if the nominal lengths break the limit, ``compensated`` if the compensated ones do.
     """
 
     def __init__(self, reason: str, problem: str, value: float, limit: float, strut: int | None, stage: str):
@@ -165,7 +165,7 @@ class LimitError(HexapodError):
 
 
 class TooEarlyError(LimitError):
-    """A command is too early: a strut would exceed its largest speed, m/s; it is allowed after ``wait``, s."""
+    """A command that would need more strut speed than `limit`, m/s; it is allowed when ``wait``, s, have passed."""
 
     def __init__(self, problem: str, wait: float, limit: float, strut: int):
         self.wait = wait
@@ -173,19 +173,19 @@ class TooEarlyError(LimitError):
 
 
 class OutsideFieldError(BoundError):
-    """A pose lies outside the measured box of a field that refuses extrapolation."""
+    """A pose outside the measured box of an error field whose policy `outside` is ``refuse``."""
 
     reason = "outside_field"
 
 
 class OutsideTableError(OutsideFieldError):
-    """An outside number, elevation say, lies outside a table that refuses what it does not hold."""
+    """An external quantity, such as elevation, outside the range of a table whose policy `beyond` is ``refuse``."""
 
     reason = "outside_table"
 
 
 class CommandError(HexapodError):
-    """A command message that is rejected; `reason` names the rule that it broke, under which diagnostics count it."""
+    """A rejected command message; `reason` names the rule that it broke, and diagnostics count it by that name."""
 
     def __init__(self, reason: str, problem: str):
         self.reason = reason
@@ -195,16 +195,16 @@ class CommandError(HexapodError):
 def shorten(value: Any, limit: int = 80) -> str:
     """Return ``repr(value)`` cut to `limit` characters, so that a message stays readable."""
     if isinstance(value, str | bytes) and len(value) > limit:
-        return repr(value[:limit])[: limit - 1] + "…"  # the rest, of any size, is never copied
+        return repr(value[:limit])[: limit - 1] + "…"  # cut before repr, which would copy a value of any size
     text = repr(value)
     return text if len(text) <= limit else text[: limit - 1] + "…"
 
 
 def printable(text: str, limit: int = 200) -> str:
-    """Return a text on one line, of at most `limit` characters, without codes for the terminal.
+    """Return a text as one line of at most `limit` characters, with control characters written as escapes.
 
-    Text from outside (a file, a message, the network's names) passes here before it is shown: a line break would forge
-    lines of the log, an escape code moves the cursor, and ten megabytes are too long.
+    Text from a file, a message or the network passes through this function before it is shown: a line break could
+    forge a line of the log, an escape code could move the terminal's cursor, and the text could be megabytes long.
     """
     if len(text) <= limit and text.isprintable():
         return text
@@ -213,6 +213,6 @@ def printable(text: str, limit: int = 200) -> str:
 
 
 class NoAnswerError(HexapodError):
-    """An expected event has not happened in time."""
+    """An answer or event that did not come before its timeout."""
 
     reason = "timeout"

@@ -1,7 +1,7 @@
-"""Poses: a position and a validated rotation, and the conversions at the edges.
+"""Poses (a position and a validated rotation), and conversions from and to angles, quaternions and rotation vectors.
 
-Inside, a pose is a position of shape (3,) in metres and a rotation matrix of shape (3, 3) whose columns
-are the moving frame's axes. The paper's angles (degrees or radians) and quaternions appear only here.
+A pose is a position of shape (3,) in metres and a rotation matrix of shape (3, 3) whose columns are the axes of the
+moving frame. The paper's angles α, β, γ and quaternions are converted only in this module.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from .core import QUATERNION_NORM_TOLERANCE
 from .core.batch import quaternion_of, read_pose, rotation_flaw
 from .errors import PoseError
 
-# Larger angles, rad, are refused: no tool turns 159 times, and at 1e16 rounding makes the angle arbitrary
+# Largest accepted angle, rad: no tool turns 159 times, and rounding makes an angle of 1e16 rad arbitrary
 LARGEST_ANGLE = 1000.0
-ROTATION_TOLERANCE = 1e-9  # largest deviation of RᵀR from the identity that is accepted as rounding
-IN_A_LINE = 1e-6  # points whose width is below this share of their length lie in a line
+ROTATION_TOLERANCE = 1e-9  # largest deviation of RᵀR from the identity matrix that is accepted as rounding
+IN_A_LINE = 1e-6  # ratio of a point set's width to its length below which the points count as collinear
 
 
 @dataclass(frozen=True)
@@ -96,13 +96,13 @@ class Pose:
         return quaternion if quaternion[3] >= 0.0 else -quaternion
 
     def as_columns(self) -> dict[str, float]:
-        """Return it as in files and JSON, mm and degrees: ``x_mm``, ``y_mm``, ``z_mm``, ``alpha_deg``, …"""
+        """Return the pose in mm and degrees by the keys of files and JSON: ``x_mm``, …, ``alpha_deg``, …"""
         names = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
         values = [*(self.position * 1e3).tolist(), *np.degrees(self.angles()).tolist()]
         return dict(zip(names, values, strict=True))
 
     def inverse(self) -> Pose:
-        """Return the pose of the outer frame relative to this one."""
+        """Return the inverse: the pose of the reference frame relative to the moving frame."""
         return Pose(-self.rotation.T @ self.position, self.rotation.T)
 
     def __matmul__(self, other: Pose) -> Pose:
@@ -110,13 +110,14 @@ class Pose:
 
 
 def stacked(poses: Sequence[Pose] | tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions (N, 3) and rotations (N, 3, 3) of N poses; such arrays are checked and returned."""
+    """Return positions (N, 3) and rotations (N, 3, 3) of N poses, which may also be given as these two arrays."""
     listed = [pose for pose in poses if isinstance(pose, Pose)]
     if len(listed) == len(poses):
         positions, rotations = [pose.position for pose in listed], [pose.rotation for pose in listed]
         return np.reshape(positions, (-1, 3)), np.reshape(rotations, (-1, 3, 3))
     if len(poses) != 2:
-        raise PoseError("must be poses, or an array of positions and one of rotations", type(poses[0]).__name__)
+        problem = "poses must be a sequence of Pose, or a pair of arrays: positions and rotations"
+        raise PoseError(problem, type(poses[0]).__name__)
     count = len(poses[0])  # type: ignore[arg-type]
     return _finite(poses[0], (count, 3), "positions"), _finite(poses[1], (count, 3, 3), "rotations")
 
@@ -139,21 +140,21 @@ def rotation_from_angles(angles: np.ndarray) -> np.ndarray:
 def angles_from_rotation(rotation: np.ndarray) -> np.ndarray:
     """Return α, β, γ of R = Ry(β)·Rx(α)·Rz(γ); radians, shape (..., 3).
 
-    At α = ±90° only β ± γ is determined; β then depends on rounding, and γ agrees with it.
+    At α = ±90° only β ± γ is determined: rounding then decides β, and γ is the angle that belongs to this β.
     """
     r = np.asarray(rotation, dtype=float)
     alpha = np.arctan2(-r[..., 1, 2], np.hypot(r[..., 1, 0], r[..., 1, 1]))
     beta = np.arctan2(r[..., 0, 2], r[..., 2, 2])
-    # From the first row of Ry(−β)·R = Rx(α)·Rz(γ), which keeps its digits where cos α vanishes.
+    # The first row of Ry(−β)·R = Rx(α)·Rz(γ) gives γ, accurately even where cos α vanishes
     cosine, sine = np.cos(beta), np.sin(beta)
     gamma = np.arctan2(sine * r[..., 2, 1] - cosine * r[..., 0, 1], cosine * r[..., 0, 0] - sine * r[..., 2, 0])
     return np.stack([alpha, beta, gamma], axis=-1)
 
 
 def roll_pitch_yaw(rotation: np.ndarray) -> np.ndarray:
-    """Return URDF's angles about fixed axes, R = Rz(yaw)·Ry(pitch)·Rx(roll); radians, shape (3,).
+    """Return URDF's angles roll, pitch, yaw of R = Rz(yaw)·Ry(pitch)·Rx(roll); radians, shape (3,).
 
-    At a pitch of ±90° only yaw ± roll is determined; yaw then depends on rounding, and roll agrees with it.
+    At a pitch of ±90° only yaw ± roll is determined: rounding then decides yaw, and roll belongs to this yaw.
     """
     r = np.asarray(rotation, dtype=float)
     yaw = math.atan2(r[1, 0], r[0, 0])
@@ -163,7 +164,7 @@ def roll_pitch_yaw(rotation: np.ndarray) -> np.ndarray:
     return np.array([roll, pitch, yaw])
 
 
-# SciPy's Rotation has all of these; loading it takes 27 MB, and a fifth of a second.
+# SciPy's Rotation has the conversions below too, but takes 27 MB and 0.2 s to load
 
 
 def rotation_from_vector(vector: np.ndarray) -> np.ndarray:
@@ -177,16 +178,16 @@ def rotation_from_vector(vector: np.ndarray) -> np.ndarray:
 
 
 def rotation_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
-    """Return the rotation matrices (..., 3, 3) of quaternions (..., 4), x, y, z, w, of any norm above zero."""
+    """Return the rotation matrices (..., 3, 3) of quaternions (x, y, z, w), shape (..., 4), of any norm above 0."""
     quaternion = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
     across = _cross_matrix(quaternion[..., :3])
     return np.eye(3) + 2.0 * (quaternion[..., 3, None, None] * across + across @ across)
 
 
 def rotation_vector(rotation: np.ndarray) -> np.ndarray:
-    """Return the rotation vectors (..., 3), rad, no longer than π, of rotation matrices (..., 3, 3)."""
+    """Return the rotation vectors (..., 3), rad, of length 0…π, of rotation matrices (..., 3, 3)."""
     r = np.asarray(rotation, dtype=float)
-    # Four times the products of the quaternion's components: each row is the quaternion, times one of them
+    # 4 q qᵀ of the quaternion q: row i is q times 4 qᵢ, so that the row of the largest qᵢ gives q accurately
     products = np.empty((*r.shape[:-2], 4, 4))
     symmetric, difference = r + np.swapaxes(r, -1, -2), r - np.swapaxes(r, -1, -2)
     trace = np.trace(r, axis1=-2, axis2=-1)[..., None]
@@ -203,32 +204,32 @@ def rotation_vector(rotation: np.ndarray) -> np.ndarray:
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotations nearest to matrices (..., 3, 3): of a sum of rotations, their mean."""
+    """Return the rotations nearest to matrices (..., 3, 3); for a sum of rotations, this is their mean rotation."""
     left, _, right = np.linalg.svd(matrix)
     left[..., 2] *= np.linalg.det(left @ right)[..., None]
     return np.asarray(left @ right)
 
 
 def _cross_matrix(vector: np.ndarray) -> np.ndarray:
-    """Return the matrices (..., 3, 3) of the cross products with vectors (..., 3)."""
+    """Return the matrices (..., 3, 3) that multiply as the cross product with vectors (..., 3): [v]× w = v × w."""
     half = np.zeros((*vector.shape, 3))
     half[..., 2, 1], half[..., 0, 2], half[..., 1, 0] = np.moveaxis(vector, -1, 0)
     return half - half.swapaxes(-1, -2)
 
 
 def rotation_angle(rotation: np.ndarray) -> float:
-    """Return the angle of a rotation matrix, radians in [0, π]."""
+    """Return the angle, rad in [0, π], by which a rotation matrix turns."""
     *vector, scalar = quaternion_of(rotation)
     return 2.0 * math.atan2(math.hypot(*vector), abs(scalar))
 
 
 def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:
-    """Return the rotation vector(s) that turn commanded into actual rotations, rad in their common frame."""
+    """Return the rotation vectors (..., 3), rad, from commanded to actual attitudes, in the frame of the attitudes."""
     return rotation_vector(actual @ np.swapaxes(commanded, -1, -2))
 
 
 def middle_pose(poses: Sequence[Pose]) -> tuple[Pose, np.ndarray]:
-    """Return the median of poses near each other, and how far each lies from it, (n, 6), m and rad, in their frame."""
+    """Return the median of n similar poses, and each pose's deviation from the median, shape (n, 6), m and rad."""
     first = poses[0].rotation
     numbers = np.array([[*pose.position, *attitude_error(pose.rotation, first)] for pose in poses])
     middle = np.median(numbers, axis=0)
@@ -236,9 +237,9 @@ def middle_pose(poses: Sequence[Pose]) -> tuple[Pose, np.ndarray]:
 
 
 def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
-    """Return the rigid motion T with T·points ≈ onto, least squares, of pairs (N, 3), m: the datum aligned (Kabsch).
+    """Return the rigid motion T that minimises |T·points − onto|², point by point (Kabsch); both (N, 3), m.
 
-    None for fewer than three points or points in a line, which do not determine a turn.
+    Return None for fewer than three points and for collinear points: they do not determine the rotation.
     """
     centre, mean = onto.mean(axis=0), points.mean(axis=0)
     spread = np.linalg.svd(onto - centre, compute_uv=False)
@@ -249,6 +250,7 @@ def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
 
 
 def _finite(values: object, shape: tuple[int, ...], name: str) -> np.ndarray:
+    """Return a float array; raise PoseError if the shape is another or a number is not finite."""
     array = np.array(values, dtype=float, order="C")
     if array.shape != shape:
         raise PoseError(f"{name} must have shape {shape}, not {array.shape}")

@@ -1,4 +1,4 @@
-"""The arithmetic, in C99, and its face in Python: structs and statuses; :mod:`.batch` has the functions."""
+"""Python access to the C core: its structs and statuses; :mod:`.batch` has the functions."""
 
 from __future__ import annotations
 
@@ -17,33 +17,35 @@ except ImportError as error:
         name="hexapod_comp.core._core",
     ) from error
 
-# Version of the arithmetic, which changes when a bit of an answer does, and SHA-256 of the sources that were built
+# Version of the arithmetic (it changes when any bit of a result changes), and SHA-256 of the C sources
 VERSION, SOURCES_HASH = ffi.string(lib.hc_version()).decode(), ffi.string(lib.hc_sources()).decode()
-# A quaternion whose norm is further from 1 than this is refused: it was never a rotation
+# Largest deviation of a quaternion's norm from 1; a quaternion beyond it is refused
 QUATERNION_NORM_TOLERANCE = lib.QUATERNION_TOLERANCE
-# A pause between commands counts as no more than this in a ramp, s: a late command must not step
+# Longest time between two commands, s, for which a correction ramps; a longer pause must not cause a larger step
 LONGEST_RAMP_STEP = lib.LONGEST_RAMP_STEP
-# A bearing that turns by less than this share of the motion does not resist in full
+# Ratio of a bearing's turning to the motion below which its friction is less than full, in proportion
 SLIDING = lib.SLIDING
 MOST_ITERATIONS, MOST_HARMONICS = lib.HC_MOST_ITERATIONS, lib.HC_MOST_HARMONICS
 
 
 def _statuses() -> Any:
+    """Return the enum ``hc_status``, the result of a command, check or solution: OK = 0, STROKE_SHORT = 1, …"""
     return enum.IntEnum("Status", {name[3:]: value for name, value in ffi.typeof("hc_status").relements.items()})
 
 
-Status = _statuses()  # hc_status: what became of a command, a check or a solution; ``OK`` is 0
+Status = _statuses()
 
 NUMBERS = {"double": "f8", "int": "i4", "long": "i8"}
 
 
 @functools.cache
 def dtype_of(name: str) -> np.dtype:
-    """Return the NumPy type that is laid out as a struct of the headers; pointers are addresses."""
+    """Return the NumPy type with the memory layout of a struct of the C headers; a pointer is an integer address."""
     return np.dtype(_layout(ffi.typeof(name)))
 
 
 def _layout(kind: Any) -> Any:
+    """Return what NumPy needs to describe the layout of a cffi type."""
     if kind.kind == "array":
         return _layout(kind.item), (kind.length,)
     if kind.kind == "pointer":
@@ -56,14 +58,14 @@ def _layout(kind: Any) -> Any:
 
 
 class Struct:
-    """A struct of the headers in memory of its own.
+    """A struct of the C headers, in memory that this object owns.
 
     Attributes
     ----------
     at : cdata
-        Pointer to it, for C; valid while the struct is referenced.
+        Pointer to the struct, for C; valid while this object is referenced.
     view : ndarray of shape ()
-        It by name: ``view["last"]["nominal"]`` is an array in it.
+        The struct's members by name: ``view["last"]["nominal"]`` is an array in the struct.
     """
 
     __slots__ = ("_kept", "at", "name", "view")
@@ -76,27 +78,28 @@ class Struct:
 
     def __reduce__(self) -> tuple:
         if self._kept:
-            raise TypeError(f"{self.name} points to memory of this process")
-        return _rebuilt, (self.name, self.view.tobytes())
+            raise TypeError(f"{self.name} cannot be pickled: it points to memory of this process")
+        return _unpickled, (self.name, self.view.tobytes())
 
     def keep(self, other: Struct) -> None:
-        """Keep the memory alive to which C has pointed this struct, in place of the memory kept before."""
+        """Keep alive only `other`, to which C code has just set this struct's pointer."""
         self._kept[:] = [other]
 
     def copy_from(self, other: Struct) -> None:
-        """Copy another one, with what it points to."""
+        """Copy the content of another struct of the same type, and keep alive the memory to which it points."""
         self.view[...] = other.view
         self._kept[:] = other._kept
 
 
-def _rebuilt(name: str, content: bytes) -> Struct:
+def _unpickled(name: str, content: bytes) -> Struct:
+    """Return the struct of a type and its bytes."""
     struct = Struct(name)
     struct.view[...] = np.frombuffer(content, struct.view.dtype)[0]
     return struct
 
 
 def _fill(view: np.ndarray, values: dict[str, Any], kept: list[Any]) -> None:
-    """Write values by name; what a pointer points to is kept."""
+    """Write values into a struct by member name; append the memory to which its pointers point to `kept`."""
     for name, value in values.items():
         kind = view.dtype[name]
         if isinstance(value, dict):
@@ -105,12 +108,13 @@ def _fill(view: np.ndarray, values: dict[str, Any], kept: list[Any]) -> None:
             for part, member in zip(view[name], value, strict=True):
                 _fill(part, member, kept)
         elif kind.base == np.uintp:
-            view[name] = [_kept(part, kept) for part in value] if kind.shape else _kept(value, kept)
+            view[name] = [_address(part, kept) for part in value] if kind.shape else _address(value, kept)
         else:
             view[name] = value
 
 
-def _kept(value: Any, kept: list[Any]) -> int:
+def _address(value: Any, kept: list[Any]) -> int:
+    """Return the address of a copy of a text or of numbers; append the copy to `kept`, which keeps it alive."""
     held = ffi.new("char[]", value.encode()) if isinstance(value, str) else np.ascontiguousarray(value, dtype=float)
     kept.append(held)
     return int(ffi.cast("uintptr_t", held)) if isinstance(value, str) else held.ctypes.data

@@ -1,10 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * One pose after the other through the functions of the core, for studies, checks and calibrations.
+ * Functions of the core on arrays of poses, for studies, checks and calibrations.
  */
 #include "core.h"
 
-/* dL/d(v, w), n x 6 x 6, twist in `base`: row i is (u_i, R t_i x u_i). */
+/* Write the Jacobians dL/d(v, w), n x 6 x 6, for twists (v, w) in `base`: row i is (u_i, R t_i x u_i). */
 void hc_jacobian_many(const double *base, const double *platform, size_t count, const double *positions,
                       const double *rotations, double *jacobians)
 {
@@ -16,7 +16,7 @@ void hc_jacobian_many(const double *base, const double *platform, size_t count, 
     }
 }
 
-/* Condition numbers of the Jacobian, rotations divided by the characteristic length, and signs of det J. */
+/* Write condition numbers of the Jacobian, its rotations divided by the characteristic length, and signs of det J. */
 void hc_condition_many(const double *base, const double *platform, size_t count, const double *positions,
                        const double *rotations, double characteristic_length, double *conditions, double *signs)
 {
@@ -28,9 +28,9 @@ void hc_condition_many(const double *base, const double *platform, size_t count,
     }
 }
 
-/* From each pose to another: displacement of a point of the platform, and rotation vector, along the columns of `axes`;
- * 6 x n, m and rad. NaN after exactly half a turn, whose axis could point either way. Rotations are subtracted before they
- * are multiplied: the smallest motion is off by no more than the poses are. */
+/* Write the motions from n poses to n other poses, 6 x n, m and rad: displacement of a point of the platform, and rotation
+ * vector, along the columns of `axes`. NaN for a turn by exactly 180 degrees, whose axis has no defined sign. Rotations are
+ * subtracted before they are multiplied, so that small motions are as accurate as the poses. */
 void hc_motions_many(size_t count, const double *positions, const double *rotations, const double *to_positions,
                      const double *to_rotations, const double *point, const double *axes, double *motions)
 {
@@ -56,7 +56,7 @@ void hc_motions_many(size_t count, const double *positions, const double *rotati
     }
 }
 
-/* Angles about the struts from the base's cardan axes to the platform's, n x 6, rad. */
+/* Write the angles about the struts from the base's cardan axes to the platform's, n x 6, rad. */
 void hc_screw_twists(const double *base, const double *platform, const double *base_axes, const double *platform_axes,
                      size_t count, const double *positions, const double *rotations, double *twists)
 {
@@ -70,7 +70,7 @@ void hc_screw_twists(const double *base, const double *platform, const double *b
     }
 }
 
-/* Error of a strut at commands, without backlash and growth: m, and its slope. */
+/* Write a strut's length errors at n commands, without constant backlash and growth, m, and their slopes. */
 void hc_strut_errors(const hc_state *state, int strut, double sense, size_t count, const double *commands, double *errors,
                      double *slopes)
 {
@@ -80,7 +80,7 @@ void hc_strut_errors(const hc_state *state, int strut, double sense, size_t coun
     }
 }
 
-/* Commands that give a strut real lengths, m; `shift` for its screw's rotation. */
+/* Write the commands that give a strut the actual `lengths`, m; `shift`, m, is that of screw_shift. */
 void hc_strut_commands(const hc_state *state, int strut, double sense, double shift, size_t count, const double *lengths,
                        double *commands)
 {
@@ -89,7 +89,7 @@ void hc_strut_commands(const hc_state *state, int strut, double sense, double sh
     }
 }
 
-/* Lower end of the window, and direction of motion, after each of some values that follow each other. */
+/* Write the direction of motion, and the lower end of its dead band, after each value of a sequence. */
 void hc_follow(double threshold, size_t count, const double *values, double *low, double *sense)
 {
     double windows[9] = {NAN}, directions[9] = {0.0};
@@ -99,9 +99,9 @@ void hc_follow(double threshold, size_t count, const double *values, double *low
     }
 }
 
-/* The model backwards: what to command. Low and sense (n x 9) of each pose go on from what stands there; a low of NAN keeps
- * the sense. Outcomes are HC_OK, HC_NOT_CONVERGED where the field cannot be undone, or HC_OUTSIDE_FIELD where it is held at
- * the boundary of its box. */
+/* The model backwards: write the commands for n poses. `low` and `sense` (n x 9) are each pose's state of motion, updated; with
+ * a low of NAN the given sense holds. Outcomes: HC_OK; HC_NOT_CONVERGED: the field could not be undone; HC_OUTSIDE_FIELD: the
+ * field's value was held at the boundary of its box. */
 void hc_backwards_many(const hc_state *state, size_t count, const double *positions, const double *rotations, double *low,
                        double *sense, double *model_positions, double *model_rotations, double *commands, int *outcomes)
 {
@@ -116,8 +116,8 @@ void hc_backwards_many(const hc_state *state, size_t count, const double *positi
     }
 }
 
-/* The model forwards: where the platform goes. Model poses are guesses, and solutions where the outcome is HC_OK; only
- * there the poses are written. */
+/* The model forwards: write the actual platform poses for n commands. Model poses are guesses; if the outcome is HC_OK, the
+ * solution replaces the guess and the actual pose is written, otherwise neither. */
 void hc_forwards_many(const hc_state *state, size_t count, const double *commands, const double *senses,
                       double *model_positions, double *model_rotations, double *positions, double *rotations,
                       int *outcomes, double *conditions)

@@ -1,7 +1,7 @@
-"""The core's functions on arrays, in one table, and the one place where shape, type and layout of an array are checked.
+"""The C core's functions on NumPy arrays, with checks of each array's shape, type and layout.
 
-Arrays are C-contiguous, float64 unless stated otherwise, and belong to the caller. Rows may be slices, so that threads
-share a batch: the core releases the GIL. Meanings and units: the functions' comments in the headers of this folder.
+Arrays are C-contiguous, float64 unless stated otherwise, and belong to the caller. Several threads can work on slices
+of the same arrays, as the core releases the GIL. The comments in the C files of this folder describe each function.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from . import Struct, dtype_of, ffi, lib
 
-QUANTITIES = dtype_of("hc_quantities")  # The limited quantities of a pose, in one stage
+QUANTITIES = dtype_of("hc_quantities")  # The quantities of a pose that have a limit
 KINDS: dict[str | None, np.dtype] = {
     None: np.dtype(float),
     "int": np.dtype(np.intc),
@@ -29,7 +29,7 @@ ARGUMENT = re.compile(r"([!>]?)(\w+)(?:\[([\w,]+)\])?(?::(\w+))?$")
 
 
 def given(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
-    """Return what the core reads of an array; ValueError where it has another shape, type or layout."""
+    """Return an array as an input of the core; raise ValueError if its shape, type or layout is wrong."""
     if array.dtype != kind or array.shape != shape or not array.flags.c_contiguous:
         layout = "C-contiguous" if array.flags.c_contiguous else "not C-contiguous"
         wanted = f"C-contiguous {np.dtype(kind)} of shape {shape}"
@@ -38,7 +38,7 @@ def given(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
 
 
 def written(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
-    """Return what the core writes into an array; raises as :func:`given`, and for one that is read-only."""
+    """Return an array as an output of the core; raise ValueError as :func:`given`, and if it is read-only."""
     buffer = given(name, array, *shape, kind=kind)
     if not array.flags.writeable:
         raise ValueError(f"{name}: is read-only")
@@ -46,11 +46,12 @@ def written(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any
 
 
 def entry(function: str, arguments: str) -> Callable[..., Any]:
-    """Return a function of the core with its arrays checked.
+    """Return a Python function that checks its arrays and calls a function of the core.
 
-    Its arguments, in C's order: ``name[N,3]`` an array that is read, ``!name[N]:int`` one that is written,
-    ``>name[N]`` one that is made here and returned; ``N`` the number of rows, which is not given but found; ``strut``
-    an index; any other a number or a struct. It returns what was made here, or else what C returns.
+    `arguments` lists the C function's arguments in order: ``name[N,3]`` is an array that C reads, ``!name[N]:int`` an
+    array that C writes, ``>name[N]`` an array that is made here and returned. ``N`` alone is the number of rows, taken
+    from the arrays. ``strut`` is an index 0…5; any other name is a number or a struct. The Python function returns the
+    arrays made here, or, if there are none, the C function's result.
     """
     call, from_buffer = getattr(lib, function), ffi.from_buffer
     plan, position = [], 0
@@ -147,7 +148,7 @@ run_drives = entry("hc_run_drives", "drives commands[6] ticks !sense[9]")
 
 
 def go(state: Any, tool: Any, frame: Any, shift: np.ndarray, turn: np.ndarray, step: float, longest: float) -> Any:
-    """Return how far a tool may go from a pose in a frame along `shift` or about `turn`: ``hc_way``, see the header."""
+    """Return how far a tool can move from a pose in a frame along `shift` or about `turn`: ``hc_way`` of the header."""
     if not (step > 0.0 and math.isfinite(longest)):
         raise ValueError(f"step, longest: must be above 0 and finite, not {step}, {longest}")
     way = ffi.new("hc_way *")
@@ -156,21 +157,21 @@ def go(state: Any, tool: Any, frame: Any, shift: np.ndarray, turn: np.ndarray, s
 
 
 def read_pose(numbers: Sequence[float], position: np.ndarray, rotation: np.ndarray) -> int:
-    """Write the pose that seven numbers are, position and quaternion x, y, z, w; return the status."""
+    """Convert seven numbers, position and quaternion (x, y, z, w), to position and rotation; return the status."""
     if len(numbers) != 7:
         raise ValueError(f"numbers: must be seven, position and quaternion, not {len(numbers)}")
     return lib.hc_read_pose(numbers, written("position", position, 3), written("rotation", rotation, 3, 3))
 
 
 def quaternion_of(rotation: np.ndarray) -> tuple[float, float, float, float]:
-    """Return the unit quaternion (x, y, z, w) of a rotation matrix, from its largest component."""
+    """Return the unit quaternion (x, y, z, w) of a rotation matrix (3, 3)."""
     quaternion = ffi.new("double[4]")
     lib.hc_quaternion(given("rotation", rotation, 3, 3), quaternion)
     return tuple(quaternion)
 
 
 def check_stage(*pose: np.ndarray, limits: Struct) -> tuple[int, int, float, int, float]:
-    """Check base, platform, position, rotation, lengths; return (status, strut, value, second or −1, condition)."""
+    """Check a pose with its lengths; return status, strut, value, second strut and condition; strut −1: none."""
     struts, value, condition = ffi.new("int[2]"), ffi.new("double *"), ffi.new("double *")
     shapes = {"base": (6, 3), "platform": (6, 3), "position": (3,), "rotation": (3, 3), "lengths": (6,)}
     arrays = (given(name, part, *shape) for part, (name, shape) in zip(pose, shapes.items(), strict=True))

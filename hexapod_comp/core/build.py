@@ -1,7 +1,7 @@
-"""What setup.py builds of the C core: the extension module ``_core``, by cffi in API mode.
+"""The build of the C core for setup.py: the extension module ``_core``, made by cffi in API mode.
 
-cffi reads the declarations out of the headers, and of the batch functions out of their definitions, so nothing is
-declared twice. The module uses Python's stable ABI: one build serves all versions of Python.
+cffi takes its declarations from the headers and from the definitions of the batch functions, so that nothing is
+declared twice. The module uses Python's stable ABI, so one build serves all versions of Python.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from pathlib import Path
 from cffi import FFI
 
 FOLDER = Path("hexapod_comp", "core")  # setup.py runs in the root of the sources
-# What Python calls; the first is the public one, which ``export --c`` copies
+# Headers of the functions that Python calls; the first is the public one, which ``export --c`` copies
 HEADERS = ("hexapod_comp.h", "hexapod_batch.h")
-UNIT = "hexapod_batch.c"  # Compiled as one unit; it contains ``hexapod_comp.c``
+UNIT = "hexapod_batch.c"  # The only file to compile: it includes all others
 CONSTANTS = "static const double QUATERNION_TOLERANCE, LONGEST_RAMP_STEP, SLIDING; const char *hc_sources(void);"
 FLAGS = ["-std=c99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
-"""The same bits on every machine: products and sums are not contracted, and nothing is reordered. Nobody asks for errno
-or for floating-point exceptions; without them loops become vector code."""
+"""Options that give the same bits on every machine: products and sums are not contracted, and nothing is reordered. The
+last two allow vector code for loops; the core uses neither errno nor floating-point exceptions."""
 
 
 def declarations() -> str:
-    """Return what cffi is to declare: the headers without preprocessor's lines, and the batch functions' heads."""
+    """Return the declarations for cffi: the headers without preprocessor lines, and the batch functions' prototypes."""
     headers = "".join((FOLDER / name).read_text(encoding="utf-8") for name in HEADERS)
     plain = re.sub(r"^#ifdef __cplusplus.*?^#endif", "", headers, flags=re.MULTILINE | re.DOTALL)
     parts = re.findall(r'^#include "(\w+\.c)"', (FOLDER / UNIT).read_text(encoding="utf-8"), re.MULTILINE)
@@ -33,7 +33,7 @@ def declarations() -> str:
 
 
 def sources_hash(folder: Path) -> str:
-    """Return the SHA-256 of the core's files, by name."""
+    """Return the SHA-256 of the names and contents of the C files in a folder."""
     digest = hashlib.sha256()
     for path in sorted(folder.glob("*.[ch]")):
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
@@ -41,7 +41,7 @@ def sources_hash(folder: Path) -> str:
 
 
 def extension() -> FFI:
-    """Return the module that setup.py builds."""
+    """Return cffi's description of the extension module that setup.py builds."""
     made = FFI()
     made.cdef(declarations())
     code = f'#include "{UNIT}"\n'

@@ -1,11 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * The whole model backwards and forwards, and a compensator at work. doc/theory.md, 11.
+ * The whole model backwards and forwards, and the compensator. doc/theory.md, 11.
  */
 #include "core.h"
 
-/* Force of a strut's bearings on the platform by its direction, of size 1, while the platform moves: each bearing that turns
- * resists by `friction`, N m. With a cardan joint, `axis` fixed in the base, two bearings turn; else it is a ball joint. */
+/* Friction force of a strut's joint bearings on the moving platform, N; `along` is the strut's unit vector, `motion` the
+ * platform's direction of motion. Each turning bearing resists with the torque `friction`, N m. With a cardan axis `axis`,
+ * fixed in the base, two bearings turn; with `axis` 0, the joint is a ball joint. */
 static vec bearing_force(vec along, double length, vec motion, const double axis[3], double friction)
 {
     const vec across = subtract(motion, scale(dot(motion, along), along)), yoke = cross(row_of(axis), along);
@@ -19,7 +20,7 @@ static vec bearing_force(vec along, double length, vec motion, const double axis
     return scale(-friction / (length * fmax(turning, slow)), across);
 }
 
-/* By how much each strut is longer under the load at a pose that is passed in a direction, m */
+/* Write by how much load lengthens each strut, m, at a pose with the directions of motion `sense`. */
 static void load_stretch(const hc_state *state, const hc_pose *pose, const six_struts *now, const double sense[9],
                          double stretch[6])
 {
@@ -31,9 +32,9 @@ static void load_stretch(const hc_state *state, const hc_pose *pose, const six_s
     for (int i = 0; i < 6; i++) {
         if (load->friction[i] != 0.0 && dot(row_of(sense), row_of(sense)) > 0.0) {
             const vec along = scale(1.0 / now->length[i], now->strut[i]);
-            const vec held = bearing_force(along, now->length[i], row_of(sense), state->model->base.axes[i], load->friction[i]);
-            force = add(force, held);
-            torque = add(torque, cross(times(r.row, row_of(state->platform_joints[i])), held));
+            const vec drag = bearing_force(along, now->length[i], row_of(sense), state->model->base.axes[i], load->friction[i]);
+            force = add(force, drag);
+            torque = add(torque, cross(times(r.row, row_of(state->platform_joints[i])), drag));
         }
     }
     const blocks f = eliminate(now->strut, now->moment);
@@ -50,7 +51,7 @@ static void load_stretch(const hc_state *state, const hc_pose *pose, const six_s
         }
         store(force, per_length);
         store(torque, per_length + 3);
-        if (solve_six(columns, per_length) == 0.0) { /* singular: what follows refuses the pose */
+        if (solve_six(columns, per_length) == 0.0) { /* singular: the check of the condition number refuses this pose */
             store(vector(0.0, 0.0, 0.0), per_length);
             store(vector(0.0, 0.0, 0.0), per_length + 3);
         }
@@ -62,7 +63,7 @@ static void load_stretch(const hc_state *state, const hc_pose *pose, const six_s
     }
 }
 
-/* The model backwards for one platform pose */
+/* The model backwards for one platform pose: write q, the struts at q and the commands; return whether the field was undone. */
 static int run_backwards(const hc_state *state, const hc_pose *platform, double low[9], double sense[9], hc_pose *q,
                          six_struts *now, double commands[6], int *outside)
 {
@@ -82,12 +83,13 @@ static int run_backwards(const hc_state *state, const hc_pose *platform, double 
     return solved;
 }
 
+/* Set next->ramp, the difference to the last correction after a change, and reduce it by the ramp rate. */
 static void shrink_ramp(const hc_last *last, hc_last *next, double ramp_rate)
 {
     const double by_stamp = next->time - last->time;
     const double pause = by_stamp == by_stamp ? by_stamp : next->received - last->received;
     double step = 0.0, largest = 0.0, keep;
-    if (pause == pause && last->nominal[0] == last->nominal[0]) { /* the first command stands where the struts are */
+    if (pause == pause && last->nominal[0] == last->nominal[0]) { /* not for the first command: it must not move the struts */
         step = ramp_rate * fmin(fmax(pause, 0.0), LONGEST_RAMP_STEP);
     }
     for (int i = 0; i < 6; i++) {
@@ -102,33 +104,33 @@ static void shrink_ramp(const hc_last *last, hc_last *next, double ramp_rate)
     }
 }
 
-/* Time since the last command by the stamps and by the receipt, s; -1: not known */
+/* Time since the last command, s, by the stamps and by the times of receipt; -1: not known. */
 static hc_time elapsed(const hc_last *last, const hc_last *next)
 {
     const double made = next->time - last->time, received = next->received - last->received;
     return (hc_time){made >= 0.0 ? made : -1.0, received >= 0.0 ? received : -1.0};
 }
 
-/* The struts' speed by both clocks; writes how far they are ahead of what is allowed. */
+/* Check the struts' speeds by both clocks, and write how far each strut is ahead of the speed limit. */
 static finding check_speed(const hc_last *last, hc_last *next, double limit)
 {
     const hc_time since = elapsed(last, next);
-    const double late = last->published - last->received, held_up = late == late ? late : 0.0;
+    const double delay = last->published - last->received, waited = delay == delay ? delay : 0.0;
     double speed = 0.0, wait = 0.0;
-    int hurried = -1, early = -1;
+    int too_fast = -1, early = -1;
     for (int i = 0; i < 6; i++) {
         const double moved = fabs(next->command[i] - last->command[i]), change = moved == moved ? moved : 0.0;
         if (since.made >= 0.0) {
             const double ahead = fmax(0.0, last->ahead_by_stamp[i] + change - limit * since.made);
             next->ahead_by_stamp[i] = ahead;
             if (ahead > limit * AHEAD_BY_STAMP && change > speed * since.made) {
-                hurried = i;
+                too_fast = i;
                 speed = change / fmax(since.made, 1e-9);
             }
         }
         if (since.received >= 0.0) {
-            double ahead = fmax(0.0, last->ahead_by_receipt[i] - limit * held_up);
-            ahead = fmax(0.0, ahead + change - limit * (since.received - held_up));
+            double ahead = fmax(0.0, last->ahead_by_receipt[i] - limit * waited);
+            ahead = fmax(0.0, ahead + change - limit * (since.received - waited));
             next->ahead_by_receipt[i] = ahead;
             if (ahead / limit - AHEAD_BY_RECEIPT > wait) {
                 early = i;
@@ -136,13 +138,13 @@ static finding check_speed(const hc_last *last, hc_last *next, double limit)
             }
         }
     }
-    if (hurried >= 0) {
-        return found(HC_SPEED, hurried, speed);
+    if (too_fast >= 0) {
+        return found(HC_SPEED, too_fast, speed);
     }
     return early >= 0 ? found(HC_EARLY, early, wait) : found(HC_OK, -1, 0.0);
 }
 
-/* How fast the struts' smoothed speeds change; writes them. */
+/* Check the struts' accelerations, the changes of their smoothed speeds; write these speeds. */
 static finding check_acceleration(const hc_last *last, hc_last *next, double limit)
 {
     const hc_time since = elapsed(last, next);
@@ -161,7 +163,7 @@ static finding check_acceleration(const hc_last *last, hc_last *next, double lim
     return worst;
 }
 
-/* Correction, steps, speed and acceleration; `compensated` tells the stage */
+/* Check correction, step, speed and acceleration; `compensated` is set to 0 if the nominal values break a limit. */
 static finding check_command(const hc_last *last, hc_last *next, const hc_limits *limits, int *compensated)
 {
     for (int i = 0; i < 6; i++) {
@@ -184,8 +186,8 @@ static finding check_command(const hc_last *last, hc_last *next, const hc_limits
     return f;
 }
 
-/* Work out the next command; `next` counts only when nothing was found */
-static finding work_out(const hc_state *state, const hc_pose *platform, hc_time time, hc_last *next, hc_answer *answer)
+/* Compute the next command and check all limits; `next` is valid only if the result is HC_OK. */
+static finding next_command(const hc_state *state, const hc_pose *platform, hc_time time, hc_last *next, hc_answer *answer)
 {
     const hc_model *model = state->model;
     const hc_last *last = &state->last;
@@ -230,20 +232,21 @@ static finding work_out(const hc_state *state, const hc_pose *platform, hc_time 
     return check_stage(state->base_joints, &next->model, &now, next->command, limits, &unused);
 }
 
-/* Take what measured struts differ from nominal lengths for the correction that they stand at */
-static void take_standing(const hc_state *state, const hc_last *trial, hc_last *last)
+/* Take the difference of measured and nominal lengths as the last correction, if it is within the limit. */
+static void set_measured_correction(const hc_state *state, const hc_last *trial, hc_last *last)
 {
-    double standing[6];
+    double difference[6];
     for (int i = 0; i < 6; i++) {
-        standing[i] = last->command[i] - trial->nominal[i];
-        if (!(fabs(standing[i]) <= state->model->limits.correction)) {
+        difference[i] = last->command[i] - trial->nominal[i];
+        if (!(fabs(difference[i]) <= state->model->limits.correction)) {
             return;
         }
     }
-    copy_six(standing, last->correction);
+    copy_six(difference, last->correction);
     last->changed = 1;
 }
 
+/* Write a finding and the lengths of `last` into an answer. */
 static void fill_answer(const hc_last *last, finding f, hc_answer *answer)
 {
     answer->status = f.status;
@@ -254,14 +257,14 @@ static void fill_answer(const hc_last *last, finding f, hc_answer *answer)
     copy_six(last->command, answer->command);
 }
 
-/* After a change of tool: what would move a nominal strut is refused, whatever else is wrong with it */
+/* After a change of tool: refuse a command whose nominal lengths differ from the last ones, before any other reason. */
 static finding same_place(const hc_last *last, const hc_last *next, finding f, hc_answer *answer)
 {
     finding worst = found(HC_TOOL_CHANGED, -1, 0.0);
     for (int i = 0; i < 6; i++) {
-        const double way = next->nominal[i] - last->nominal[i];
-        if (!(fabs(way) <= fabs(worst.value))) {
-            worst = found(HC_TOOL_CHANGED, i, way);
+        const double change = next->nominal[i] - last->nominal[i];
+        if (!(fabs(change) <= fabs(worst.value))) {
+            worst = found(HC_TOOL_CHANGED, i, change);
         }
     }
     if (fabs(worst.value) <= SAME_PLACE) {
@@ -271,7 +274,7 @@ static finding same_place(const hc_last *last, const hc_last *next, finding f, h
     return worst;
 }
 
-/* From the platform's pose on, when there is one */
+/* Command a platform pose; a `status` other than HC_OK says that there is none, and is the answer. */
 static hc_status command_platform(hc_state *state, hc_status status, const hc_pose *platform, hc_time time,
                                   hc_answer *answer)
 {
@@ -281,13 +284,13 @@ static hc_status command_platform(hc_state *state, hc_status status, const hc_po
     answer->compensated = 0;
     answer->outside_field = 0;
     if (status == HC_OK) {
-        f = work_out(state, platform, time, &next, answer);
+        f = next_command(state, platform, time, &next, answer);
         if (state->last.resumes == HC_WITH_NEW_TOOL) {
             f = same_place(&state->last, &next, f, answer);
         } else if (state->last.resumes == HC_FROM_MEASURED) {
             const hc_last before = state->last;
-            take_standing(state, &next, &state->last);
-            f = work_out(state, platform, time, &next, answer);
+            set_measured_correction(state, &next, &state->last);
+            f = next_command(state, platform, time, &next, answer);
             state->last = before;
         }
         if (f.status == HC_OK) {
@@ -330,7 +333,8 @@ void hc_published(hc_state *state, double time)
     state->last.published = time;
 }
 
-/* The model forwards; lengths, and what of them depends on the pose, are settled in turn */
+/* The model forwards: write q for six commands. Screw rotation and load depend on the pose, so lengths and pose are computed
+ * in turn until the lengths no longer change. */
 static solution run_forwards(const hc_state *state, const double commands[6], const double sense[9], hc_pose *q)
 {
     const hc_model *model = state->model;
@@ -382,6 +386,7 @@ hc_status hc_estimate(hc_state *state, const double lengths[6], hc_estimated *es
     return estimated->status;
 }
 
+/* Write the real joints of a body with a relative growth, m. */
 static void place_joints(const hc_body *body, double growth, double joints[6][3])
 {
     for (int i = 0; i < 6; i++) {
@@ -392,7 +397,7 @@ static void place_joints(const hc_body *body, double growth, double joints[6][3]
     }
 }
 
-/* By which share a part has grown since 20 degrees */
+/* Relative growth of a part against 20 degrees Celsius. */
 static double part_growth(const hc_state *state, int part, double expansion)
 {
     const hc_late *late = &state->model->late;
@@ -404,7 +409,7 @@ static double part_growth(const hc_state *state, int part, double expansion)
     return growth;
 }
 
-/* The structure and the struts' growth at the present temperatures and humidity */
+/* Update the real joints and the struts' growth for the present temperatures and humidity. */
 static void place_machine(hc_state *state)
 {
     for (int i = 0; i < 6; i++) {
@@ -416,7 +421,7 @@ static void place_machine(hc_state *state)
     place_joints(&state->model->platform, part_growth(state, 7, state->model->platform.expansion), state->platform_joints);
 }
 
-/* Followers run first-order lags; a thermometer runs in a straight line from reading to reading. */
+/* Update a sensor's first-order lags with a reading; the temperature is taken as linear between readings. */
 static void follow_late(hc_state *state, int index, double value, double time)
 {
     const hc_late *late = &state->model->late;
@@ -436,8 +441,8 @@ static void follow_late(hc_state *state, int index, double value, double time)
     }
 }
 
-/* The values whose directions are followed, at the last command; 0 where there are none. */
-static int followed(const hc_state *state, double values[9])
+/* Write the nine values whose directions of motion are followed, at the last command; return 0 if there are none. */
+static int motion_values(const hc_state *state, double values[9])
 {
     hc_last copy = state->last;
     six_struts now;
@@ -456,15 +461,16 @@ static int followed(const hc_state *state, double values[9])
     return 1;
 }
 
-/* Take over a state whose model, temperatures, humidity or load have changed. The model's lengths jump, the struts do not: unless
- * the windows jump along, that would count as a motion, turn directions round, and a backlash would step. */
-static void renew(hc_state *state, const hc_state *changed)
+/* Take over a state with another model, temperature, humidity or load. The change makes the model's lengths jump, though no
+ * strut moves. So the dead bands of the directions of motion jump too; otherwise a direction could reverse, and with it the
+ * backlash's correction. */
+static void take_over(hc_state *state, const hc_state *changed)
 {
     double before[9], after[9];
-    int comparable = followed(state, before);
+    int comparable = motion_values(state, before);
     *state = *changed;
     place_machine(state);
-    comparable = followed(state, after) && comparable;
+    comparable = motion_values(state, after) && comparable;
     for (int i = 0; i < 9 && comparable; i++) {
         state->last.motion_low[i] += after[i] - before[i];
     }
@@ -482,7 +488,7 @@ hc_status hc_set_temperature(hc_state *state, int index, double value, double ti
         follow_late(&changed, index, value, time);
     }
     changed.temperatures[index] = value;
-    renew(state, &changed);
+    take_over(state, &changed);
     return HC_OK;
 }
 
@@ -493,14 +499,14 @@ hc_status hc_set_humidity(hc_state *state, double value)
         return HC_HUMIDITY;
     }
     changed.humidity = value;
-    renew(state, &changed);
+    take_over(state, &changed);
     return HC_OK;
 }
 
 hc_status hc_set_load(hc_state *state, const double gravity[3], const double wrench[6])
 {
     hc_state changed = *state;
-    const int back = gravity && gravity[0] != gravity[0]; /* to the model's */
+    const int back = gravity && gravity[0] != gravity[0]; /* NAN: back to the model's gravity */
     if (gravity && !back && !(norm(row_of(gravity)) <= LARGEST_GRAVITY)) {
         return HC_LOAD;
     }
@@ -516,15 +522,15 @@ hc_status hc_set_load(hc_state *state, const double gravity[3], const double wre
         copy_six(wrench, changed.external);
     }
     if (state->model->load.bends) {
-        renew(state, &changed);
+        take_over(state, &changed);
     } else {
         *state = changed;
     }
     return HC_OK;
 }
 
-/* All parts are at rest at their temperatures. */
-static void rest(hc_state *state)
+/* Forget the sensors' lags: all delayed growth is as at constant temperatures. */
+static void reset_lags(hc_state *state)
 {
     for (int i = 0; i < 8; i++) {
         state->began[i] = NAN;
@@ -534,7 +540,7 @@ static void rest(hc_state *state)
     }
 }
 
-/* The state with another model; where its parts are late in another way, they begin anew. */
+/* The state with another model; if its time constants differ, the lags are reset. */
 static hc_state with_model(const hc_state *state, const hc_model *model)
 {
     const hc_late *late = &state->model->late;
@@ -545,18 +551,19 @@ static hc_state with_model(const hc_state *state, const hc_model *model)
     }
     changed.model = model;
     if (!same) {
-        rest(&changed);
+        reset_lags(&changed);
     }
     place_machine(&changed);
     return changed;
 }
 
-static void must_ramp(hc_last *last)
+/* Let the next command ramp from the last correction, if there is one. */
+static void start_ramp(hc_last *last)
 {
     last->changed = last->correction[0] == last->correction[0];
 }
 
-/* No command yet: neither a step nor a speed to judge the next one by. */
+/* Forget the last command, so that step, speed and acceleration of the next command are not checked. */
 static void forget_command(hc_last *last)
 {
     for (int i = 0; i < 6; i++) {
@@ -574,7 +581,7 @@ hc_status hc_check(const hc_state *state, const hc_model *model, hc_answer *answ
     hc_state trial = with_model(state, model);
     hc_last next;
     int home = 0;
-    forget_command(&trial.last); /* that the struts move now is no acceleration of the correction's */
+    forget_command(&trial.last); /* the present motion of the struts must not count as step or acceleration */
     for (int i = 0; i < 6; i++) {
         home = home || !finite_number(state->last.nominal[i]);
         trial.last.correction[i] = NAN;
@@ -582,7 +589,7 @@ hc_status hc_check(const hc_state *state, const hc_model *model, hc_answer *answ
     }
     trial.last.enabled = 1;
     trial.last.changed = 0;
-    const finding f = work_out(&trial, home ? &model->home : &state->last.platform, unknown, &next, answer);
+    const finding f = next_command(&trial, home ? &model->home : &state->last.platform, unknown, &next, answer);
     fill_answer(&next, f, answer);
     return f.status;
 }
@@ -593,7 +600,7 @@ hc_status hc_set_model(hc_state *state, const hc_model *model)
     hc_answer unused;
     const hc_status status = hc_check(state, model, &unused);
     if (status == HC_OK) {
-        renew(state, &changed);
+        take_over(state, &changed);
     }
     return status;
 }
@@ -604,7 +611,7 @@ void hc_set_tool(hc_state *state, const hc_model *model)
     place_machine(state);
     if (finite_number(state->last.nominal[0])) {
         state->last.resumes = HC_WITH_NEW_TOOL;
-        state->last.changed = state->last.changed || model->load.bends; /* it weighs otherwise: that ramps */
+        state->last.changed = state->last.changed || model->load.bends; /* the new tool's weight ramps in */
     }
 }
 
@@ -618,12 +625,12 @@ hc_status hc_enable(hc_state *state, int enabled)
             return status;
         }
         state->last.enabled = wanted;
-        must_ramp(&state->last);
+        start_ramp(&state->last);
     }
     return HC_OK;
 }
 
-/* The correction stays, as what the struts stand at */
+/* Forget the last command and the directions of motion; the last correction stays, and the next command ramps from it. */
 static void forget(hc_state *state)
 {
     for (int i = 0; i < 9; i++) {
@@ -632,7 +639,7 @@ static void forget(hc_state *state)
     }
     forget_command(&state->last);
     state->last.resumes = HC_FROM_LAST;
-    must_ramp(&state->last);
+    start_ramp(&state->last);
     state->estimate = state->model->home;
 }
 
@@ -663,7 +670,7 @@ void hc_init(hc_state *state, const hc_model *model, double ramp_rate)
     for (int i = 0; i < 6; i++) {
         state->external[i] = 0.0;
     }
-    rest(state);
+    reset_lags(state);
     for (int i = 0; i < 6; i++) {
         state->last.correction[i] = NAN;
         state->last.ramp[i] = 0.0;

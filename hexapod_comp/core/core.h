@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What the files of the core share: constants and three-vectors. hexapod_comp.c takes them together as one unit, so
- * everything is static and the compiler sees through all calls; nothing but the functions of hexapod_comp.h is visible.
+ * Constants and three-vectors for all files of the core. hexapod_comp.c includes the files as one unit, so all functions
+ * are static and can be inlined; only the functions of hexapod_comp.h are visible outside.
  */
 #ifndef HEXAPOD_CORE_H
 #define HEXAPOD_CORE_H
@@ -13,34 +13,35 @@
 
 #define PI 3.14159265358979323846
 
-#define STEP_TOLERANCE 1e-8    /* Newton stops after a shorter step, m and rad: its square is below rounding */
-#define MAX_ITERATIONS 30
-#define MAX_ROTATION_STEP 0.6  /* rad: a linearisation means nothing beyond */
-#define CLOSURE 1e-13          /* m, what rounding may leave in the six loop closures ... */
-#define CLOSURE_RELATIVE 1e-14 /* ... and its part relative to the lengths */
-#define ROTATION_ROUNDING 1e-13
-#define COPLANAR 1e-3          /* smaller volumes of three unit struts need pivoting */
-#define SMALLEST_PIVOT 1e-14
-#define LONGEST_RAMP_STEP 0.02 /* s */
-#define AHEAD_BY_STAMP 5e-3    /* s of motion at the largest speed that a command may be ahead by its stamp ... */
-#define AHEAD_BY_RECEIPT 8e-4  /* ... and by its receipt */
-#define SHORTEST_PERIOD 1e-4   /* s */
-#define SMOOTHED_OVER 0.02     /* s */
-#define QUATERNION_TOLERANCE 1e-3
-#define REFERENCE_TEMPERATURE 20.0
-#define REFERENCE_HUMIDITY 0.5
+#define STEP_TOLERANCE 1e-8    /* Newton ends after a shorter step, m and rad: the remaining error is its square */
+#define MAX_ITERATIONS 30      /* of Newton's method in forward kinematics */
+#define MAX_ROTATION_STEP 0.6  /* largest turn in one Newton step, rad */
+#define CLOSURE 1e-13          /* largest misfit of the six loop closures by rounding, m ... */
+#define CLOSURE_RELATIVE 1e-14 /* ... plus this share of the lengths */
+#define ROTATION_ROUNDING 1e-13 /* largest deviation of a rotation matrix from orthonormality by rounding */
+#define COPLANAR 1e-3          /* volume of three unit struts below which elimination needs pivoting */
+#define SMALLEST_PIVOT 1e-14   /* a matrix with a smaller pivot counts as singular */
+#define LONGEST_RAMP_STEP 0.02 /* longest time between commands for which a correction ramps, s */
+#define AHEAD_BY_STAMP 5e-3    /* time, s, by which a strut may be ahead of its speed limit by the commands' stamps ... */
+#define AHEAD_BY_RECEIPT 8e-4  /* ... and by the times of their receipt */
+#define SHORTEST_PERIOD 1e-4   /* shortest time between commands used for the acceleration, s */
+#define SMOOTHED_OVER 0.02     /* time constant of the smoothed strut speed, s */
+#define QUATERNION_TOLERANCE 1e-3 /* largest deviation of a quaternion's norm from 1 */
+#define REFERENCE_TEMPERATURE 20.0 /* degrees Celsius; geometry and model hold at it */
+#define REFERENCE_HUMIDITY 0.5     /* relative humidity at which geometry and model hold */
 #define LOWEST_HUMIDITY 0.01
-#define SAME_PLACE 1e-5 /* m: nominal lengths that differ by no more are the same place, but for a controller's decimals */
+#define SAME_PLACE 1e-5 /* m: nominal lengths that differ by less are the same; controllers round their commands */
 #define LARGEST_GRAVITY 100.0 /* m/s2 */
-#define LOWEST_TEMPERATURE (-40.0)
-#define HIGHEST_TEMPERATURE 120.0
-#define FIELD_ITERATIONS 50
-#define COMMAND_ITERATIONS 8
-#define SMALL_ANGLE (1.0 / 64.0) /* rad */
-#define SLIDING 0.02 /* share of the motion below which a bearing turns too little to resist in full */
-#define TURN_ITERATIONS 20 /* of lengths against what depends on the pose: turning screws, load */
+#define LOWEST_TEMPERATURE (-40.0) /* degrees Celsius */
+#define HIGHEST_TEMPERATURE 120.0  /* degrees Celsius */
+#define FIELD_ITERATIONS 50   /* most iterations to undo the field */
+#define COMMAND_ITERATIONS 8  /* most Newton steps from a strut's length to its command */
+#define SMALL_ANGLE (1.0 / 64.0) /* rad, up to which a turn is updated by Taylor series */
+#define SLIDING 0.02 /* ratio of a bearing's turning to the motion below which its friction is less than full */
+#define TURN_ITERATIONS 20 /* most iterations between the pose and what depends on it: screw rotation, load */
 
-/* What loops over lanes (lanes.c) call, and a loop of six in it: calls and loops would keep them from becoming vector code. */
+/* For functions that the loops over lanes (lanes.c) call, and for loops of six in them: inlined and unrolled, so that the
+ * compiler can make vector code of the loops over lanes. */
 #ifdef __GNUC__
 #define INLINED static inline __attribute__((always_inline))
 #else
@@ -74,7 +75,7 @@ INLINED vec combine(vec k, vec a, vec b, vec c)
 
 INLINED vec combine_rows(vec k, const vec rows[3]) { return combine(k, rows[0], rows[1], rows[2]); }
 
-/* The matrix times v: the dot products of three rows with it. */
+/* The matrix with these rows, times v. */
 INLINED vec times(const vec rows[3], vec v) { return vector(dot(rows[0], v), dot(rows[1], v), dot(rows[2], v)); }
 
 INLINED void store(vec v, double to[3])

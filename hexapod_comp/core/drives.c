@@ -1,14 +1,15 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Six strut drives with a lag, limits of speed and acceleration, steps, stops and backlash, tick by tick.
+ * Simulation of six strut drives with lag, limits of speed and acceleration, stepped motors, stops and backlash.
  */
 #include "core.h"
 
-#define SETTLED 1e-12 /* m; a reference closer to its command is put onto it: an exponential never arrives */
-#define CONTACT 1e-6  /* m; a motor asked to go beyond its travel counts as stopped within this distance of the stop */
+#define SETTLED 1e-12 /* m; a reference nearer to its command is set equal to it, as an exponential never arrives */
+#define CONTACT 1e-6  /* m; a motor commanded beyond a stop counts as stopped within this distance of the stop */
 
-/* Speed at which to approach a command, m/s: distance/lag near it; further off the curve along which half the acceleration
- * brakes the drive, which meets the straight part with the same slope. The other half is for the speed loop's own lag. */
+/* Wanted speed at a distance from the command, m/s: distance / lag near the command, and further away the speed from which
+ * half the largest acceleration brakes in time; both curves meet with equal slope. The other half of the acceleration is
+ * left to the lag of the speed loop. */
 static double wanted_speed(const hc_drives *drives, double distance)
 {
     const double braking = 0.5 * drives->max_acceleration, lag = drives->lag, size = fabs(distance);
@@ -34,26 +35,26 @@ static void move_reference(const hc_drives *drives, double target, double *posit
         *speed = 0.0;
         return;
     }
-    *speed += held((wanted_speed(drives, distance) - *speed) * (4.0 * tick / lag), -most, most);
+    *speed += clamp((wanted_speed(drives, distance) - *speed) * (4.0 * tick / lag), -most, most);
     *position += tick * *speed;
 }
 
-/* Put a motor onto the step nearest to its reference, and let the nut follow with play. */
+/* Set a motor to the step nearest to its reference, and let the nut follow with its backlash. */
 static void place_motor(hc_drives *drives, int i)
 {
     const double before = drives->motor[i], half = drives->half_play[i], step = drives->step;
     const double stepped = step > 0.0 ? rint(drives->position[i] / step) * step : drives->position[i];
-    drives->motor[i] = held(stepped, drives->stops[i][0], drives->stops[i][1]);
-    drives->play[i] = half > 0.0 ? held(drives->play[i] + drives->motor[i] - before, -half, half) : 0.0;
+    drives->motor[i] = clamp(stepped, drives->stops[i][0], drives->stops[i][1]);
+    drives->play[i] = half > 0.0 ? clamp(drives->play[i] + drives->motor[i] - before, -half, half) : 0.0;
 }
 
-/* Some ticks towards six commands. A drive brakes for its stops as for any command; what still runs into one (a jump, a
- * command turned round too late) is stopped there dead. `sense` (9): directions of motion, 3 to 8 are written. */
+/* Run the drives for some ticks towards six commands. A drive brakes before its stops; if it still reaches one (after a jump,
+ * or a command reversed too late), it stops there at once. Writes `sense` 3 to 8, the struts' directions of motion. */
 void hc_run_drives(hc_drives *drives, const double commands[6], long ticks, double sense[9])
 {
     for (int i = 0; i < 6; i++) {
         const double low = drives->stops[i][0], high = drives->stops[i][1];
-        const double target = held(commands[i], low, high);
+        const double target = clamp(commands[i], low, high);
         int hit = 0;
         for (long n = 0; n < ticks; n++) {
             if (!drives->stuck[i]) {
@@ -61,7 +62,7 @@ void hc_run_drives(hc_drives *drives, const double commands[6], long ticks, doub
             }
             if (drives->position[i] < low || drives->position[i] > high) {
                 hit = 1;
-                drives->position[i] = held(drives->position[i], low, high);
+                drives->position[i] = clamp(drives->position[i], low, high);
                 drives->speed[i] = 0.0;
             }
             place_motor(drives, i);
@@ -72,7 +73,7 @@ void hc_run_drives(hc_drives *drives, const double commands[6], long ticks, doub
     }
 }
 
-/* Follow the measured point of a platform pose along the three axes. */
+/* Update the directions of motion of the measured point, at a platform pose, along the three axes. */
 void hc_follow_point(const double *position, const double *rotation, const double probe[3], double threshold, double low[9],
                      double sense[9])
 {

@@ -1,16 +1,18 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Sine, cosine, exponential, arc tangent and arc cosine in IEEE arithmetic, so that no bit of an answer depends on whose C
- * library is linked. Errors stay below one unit in the last place: the argument is reduced to a pair of doubles (high + low;
- * Dekker 1971, Cody and Waite 1980), and on the small interval that is left Taylor's series is below rounding. What remains
- * of <math.h> (sqrt, fabs, floor, rint, fmod, ldexp, ...) is exact by definition.
+ * Sine, cosine, exponential, arc tangent and arc cosine in IEEE arithmetic, so that no bit of a result depends on the C
+ * library. Errors are below one unit in the last place: the argument is reduced to a pair of doubles (high + low;
+ * Dekker 1971, Cody and Waite 1980), and on the small remaining interval the error of Taylor's series is below rounding. The
+ * other functions used of <math.h> (sqrt, fabs, floor, rint, fmod, ldexp, ...) are exact by definition.
  */
 #include "core.h"
 
+/* A number high + low with twice the digits of a double. */
 typedef struct {
     double high, low;
 } pair;
 
+/* a + b without rounding. */
 static pair sum_of(double a, double b)
 {
     pair s;
@@ -21,13 +23,14 @@ static pair sum_of(double a, double b)
     return s;
 }
 
-/* The upper half of a double's digits. */
+/* The upper half of the digits of a. */
 static double upper_half(double a)
 {
     const double c = 134217729.0 * a; /* 2^27 + 1 */
     return c - (c - a);
 }
 
+/* a b without rounding. */
 static pair product_of(double a, double b)
 {
     const double a1 = upper_half(a), a2 = a - a1, b1 = upper_half(b), b2 = b - b1;
@@ -47,11 +50,11 @@ static pair quotient_of(pair a, pair b)
     return out;
 }
 
-/* Beyond 2^20 quarter turns (the screw of a 5 mm pitch at 1.3 km) the angle is first taken modulo the double nearest to a
- * turn, which is the same everywhere, but no longer right to the last place. */
+/* Angles beyond 2^20 quarter turns (1.3 km of a screw with 5 mm pitch) are first reduced modulo the double nearest to 2 pi:
+ * the result has the same bits on all machines, but is no longer accurate to the last place. */
 static void sine_cosine(double angle, double *sine, double *cosine)
 {
-    /* pi / 2 in four pieces; the first three have 33 digits or fewer, so that their products with n are exact */
+    /* pi / 2 in four pieces; the first three have at most 33 bits, so that their products with n are exact */
     static const double piece[4] = {0x1.921fb544p+0, 0x1.0b4611a6p-34, 0x1.3198a2ep-69, 0x1.b839a252049c1p-104};
     const double x = fabs(angle) < 0x1.9p+20 ? angle : fmod(angle, 2.0 * PI);
     const double n = rint(x * (2.0 / PI));
@@ -71,7 +74,7 @@ static void sine_cosine(double angle, double *sine, double *cosine)
     *cosine = quarter == 1 || quarter == 2 ? -*cosine : *cosine;
 }
 
-/* e^x - less, which is 0 or 1. */
+/* e^x - less; `less` is 0 or 1. */
 static double exponential(double x, double less)
 {
     const double held = fmin(fmax(x, less == 0.0 ? -750.0 : -50.0), 710.0), n = rint(held * 1.44269504088896340736);
@@ -89,8 +92,8 @@ static double exponential(double x, double less)
     return x != x ? x : ldexp(parabola.high + (lows + series), (int)n);
 }
 
-/* The angle from 0 to pi of (x, y), y at least 0; both are finite, of a moderate size, and not both 0. It is put together
- * from atan(k / 8) + atan(t), |t| <= 1/16. */
+/* The angle, 0 to pi, of the vector (x, y) with y >= 0; x and y are finite, moderate in size, and not both 0. Computed as
+ * atan(k / 8) + atan(t) with |t| <= 1/16. */
 static double angle_of(pair y, double x)
 {
     static const pair eighths[9] = {
@@ -118,7 +121,7 @@ static double angle_of(pair y, double x)
     bend = t.high * z * (1 / 3.0 - z * (1 / 5.0 - z * (1 / 7.0 - z * (1 / 9.0 - z * (1 / 11.0 - z * (1 / 13.0))))));
     angle = sum_of(eighths[(int)k].high, t.high);
     angle.low += eighths[(int)k].low + (t.low - bend);
-    if (steep || x < 0.0) { /* from pi / 2 back or on, or from pi back */
+    if (steep || x < 0.0) { /* the angle is pi / 2 - or + `angle`, or pi - `angle` */
         const double eighth = steep ? 2.0 : 4.0, way = steep && x < 0.0 ? 1.0 : -1.0;
         const pair turned = sum_of(eighth * eighths[8].high, way * angle.high);
         angle.high = turned.high;
@@ -127,7 +130,7 @@ static double angle_of(pair y, double x)
     return angle.high + angle.low;
 }
 
-/* As atan2; NaN where an argument is not finite. */
+/* atan2(y, x); NaN if an argument is not finite. */
 static double arc_tangent(double y, double x)
 {
     const double largest = fmax(fabs(x), fabs(y));
@@ -149,6 +152,7 @@ static double arc_tangent(double y, double x)
     return copysign(angle_of(up, x), y);
 }
 
+/* acos(x); NaN outside -1...1. */
 static double arc_cosine(double x)
 {
     const pair square = product_of(x, x), left = sum_of(1.0, -square.high);

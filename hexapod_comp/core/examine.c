@@ -1,10 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What is left of each limit along poses, and what limits them.
+ * The quantities that have a limit at given poses, and the first limit that each pose breaks.
  */
 #include "core.h"
 
-/* All limited quantities of a pose with its lengths, nominal or compensated. */
+/* Write all quantities of a pose that have a limit; `lengths` are the nominal or the compensated ones. */
 static void examine(const double base[6][3], const hc_pose *pose, const six_struts *now, const double lengths[6],
                     const hc_limits *limits, hc_quantities *found)
 {
@@ -14,7 +14,7 @@ static void examine(const double base[6][3], const hc_pose *pose, const six_stru
     found->condition = condition_at(base, pose, now, limits->characteristic_length, &found->sign);
 }
 
-/* The limited quantities of one pose, nominal. */
+/* Write the quantities of one pose of the nominal machine. */
 void hc_examine(const double *base, const double *platform, const hc_limits *limits, const double *position,
                 const double *rotation, hc_quantities *found)
 {
@@ -24,9 +24,9 @@ void hc_examine(const double *base, const double *platform, const hc_limits *lim
     examine(b, &pose, &now, now.length, limits, found);
 }
 
-/* n x 2 quantities, nominal and compensated, of poses that follow each other or are `independent`, each with the
- * directions given; `low` and `sense` (9) are the motion, updated. Of `flags`, HC_NOT_CONVERGED says that the second is not
- * written, HC_OUTSIDE_FIELD that the field's value was held at the boundary. */
+/* Write the nominal and the compensated quantities, n x 2, of a sequence of poses. `low` and `sense` (9) are the state of
+ * motion, updated from pose to pose; with `independent`, the directions given hold at each pose. `flags`: HC_OK;
+ * HC_NOT_CONVERGED: no compensated quantities; HC_OUTSIDE_FIELD: the field's value was held at the boundary of its box. */
 void hc_examine_many(const hc_state *state, size_t count, const double *positions, const double *rotations,
                      int independent, double *low, double *sense, hc_quantities *found, int *flags)
 {
@@ -50,8 +50,8 @@ void hc_examine_many(const hc_state *state, size_t count, const double *position
     }
 }
 
-/* The first limit that each pose breaks, a hc_status, and the struts concerned, n x 2, -1 for none. The last rotation serves
- * all poses that have none. */
+/* Write the first limit that each pose breaks, an hc_status, and the struts concerned, n x 2, -1 for none. If there are fewer
+ * rotations than positions, the last rotation holds for the remaining poses. */
 void hc_check_poses(const double *base, const double *platform, const hc_limits *limits, size_t count,
                     const double *positions, size_t rotation_count, const double *rotations, signed char *findings,
                     signed char *struts)

@@ -4,7 +4,7 @@
  */
 #include "core.h"
 
-/* Cell, weight of its upper node, and whether the coordinate lies outside the grid. */
+/* Cell of a coordinate in a grid, weight of the cell's upper node, and whether the coordinate is outside the grid. */
 typedef struct {
     int index;
     double weight;
@@ -23,13 +23,14 @@ static place locate(double value, const double *nodes, int count)
     return at;
 }
 
+/* The coordinate u, -1...1 over the nodes, clamped outside. */
 static double along(double value, const double *nodes, int count)
 {
     const double first = nodes[0], last = nodes[count - 1];
     return fmin(1.0, fmax(-1.0, (2.0 * value - first - last) / (last - first)));
 }
 
-/* Add the family of lines along one axis: four polynomials, weighted by the area opposite to each (Mou & King). */
+/* Add the error of the lines along one axis: four polynomials, each weighted by the opposite area (Mou & King). */
 static void add_family(const hc_field *field, int axis, double u, double sense, const place *first,
                        const place *second, double error[6])
 {
@@ -48,7 +49,7 @@ static void add_family(const hc_field *field, int axis, double u, double sense, 
             continue;
         }
         for (int power = size - 6; power >= 0; power -= 6) {
-            for (int k = 0; k < 6; k++) { /* side by side in memory, for the compiler to take two or four at once */
+            for (int k = 0; k < 6; k++) { /* contiguous in memory, so that the compiler can use vector instructions */
                 const int at = power + k;
                 value[k] = value[k] * u + (w00 * c00[at] + w01 * c01[at] + w10 * c10[at] + w11 * c11[at]);
             }
@@ -59,7 +60,7 @@ static void add_family(const hc_field *field, int axis, double u, double sense, 
     }
 }
 
-/* Six error components at a point; returns whether it lies outside the box. */
+/* Write the six error components at a point; return whether the point is outside the box. */
 static int field_at(const hc_field *field, vec point, const double sense[3], double error[6])
 {
     const double coordinates[3] = {point.x, point.y, point.z};
@@ -83,7 +84,7 @@ static int field_at(const hc_field *field, vec point, const double sense[3], dou
     return at[0].outside || at[1].outside || at[2].outside;
 }
 
-/* Turn a rotation by the field's three small rotations, times `sign`: exactly not where there are none. */
+/* Turn a rotation by the field's three small rotations times `sign`; without rotations, no bit changes. */
 static void turn_by_field(double rotation[3][3], const double error[6], double sign)
 {
     if (error[3] != 0.0 || error[4] != 0.0 || error[5] != 0.0) {
@@ -91,7 +92,7 @@ static void turn_by_field(double rotation[3][3], const double error[6], double s
     }
 }
 
-/* Solve q o E(q) = target for q by fixed points; returns whether it was solved. */
+/* Solve q o E(q) = target for q by fixed-point iteration; return whether it converged. */
 static int undo_field(const hc_field *field, const hc_pose *target, const double sense[3], hc_pose *q, int *outside)
 {
     const vec target_point = point_at(target, field->probe);
@@ -110,7 +111,7 @@ static int undo_field(const hc_field *field, const hc_pose *target, const double
     return solved;
 }
 
-/* Write q o E(q). */
+/* Write the actual pose q o E(q). */
 static void apply_field(const hc_field *field, const hc_pose *q, const double sense[3], hc_pose *actual)
 {
     const vec point = point_at(q, field->probe);

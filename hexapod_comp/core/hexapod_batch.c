@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * See hexapod_batch.h. The core with what Python computes on arrays, as one unit.
+ * See hexapod_batch.h. Compile only this file for Python: it includes the core and the functions on arrays.
  */
 #include "hexapod_comp.c"
 #include "hexapod_batch.h"

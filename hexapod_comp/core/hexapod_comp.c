@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * See hexapod_comp.h. This is the one file to compile; the order is that of the computation.
+ * See hexapod_comp.h. Compile only this file: it includes the others, each after the files that it uses.
  */
 #include "core.h"
 #include "elementary.c"

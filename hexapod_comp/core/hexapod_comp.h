@@ -1,16 +1,16 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Compensation of a hexapod machine tool: tool poses in, compensated strut lengths out.
+ * Compensation of a hexapod machine tool: from tool poses to compensated strut lengths.
  *
- * The arithmetic of hexapod_comp, in its Python package and in a servo thread alike: no allocation, no globals, no
- * input or output, no recursion, every loop bounded, nothing needed but <math.h>. The machine and its error model
- * stand in one constant, which `hexapod_comp export --c` writes into hexapod_model.h; all that changes lies in a state
- * that you own.
+ * This code is the arithmetic of the Python package hexapod_comp, and also runs in a servo thread: it allocates nothing, has
+ * no globals, no input or output and no recursion; every loop is bounded, and it needs only <math.h>. The machine and its
+ * error model are one constant, which `hexapod_comp export --c` writes into hexapod_model.h. All data that change are in an
+ * hc_state that the caller owns.
  *
- * Units: metres, radians, seconds; temperatures in degrees Celsius. Quaternions are (x, y, z, w). Matrices lie by rows.
- * Frames: `base` does not move, `platform` carries the tool, `work` is where poses are commanded.
+ * Units: metres, radians, seconds; temperatures in degrees Celsius. Quaternions are (x, y, z, w). Matrices are stored by
+ * rows. Frames: `base` does not move, `platform` carries the tool; poses are commanded in the frame `work`.
  *
- * Compile without contraction of products and sums (gcc: -ffp-contract=off, which -std=c99 implies), or the last
+ * Compile without contraction of products and sums (gcc: -ffp-contract=off, which -std=c99 implies); otherwise the last
  * digits depend on the target.
  */
 #ifndef HEXAPOD_COMP_H
@@ -20,17 +20,20 @@
 extern "C" {
 #endif
 
-/* What became of a command or an estimate. hc_reason() names each as the Python package does. */
+/* Result of a command or an estimate. hc_reason() returns the name that the Python package uses for it. */
 typedef enum {
     HC_OK = 0,
-    HC_STROKE_SHORT, HC_STROKE_LONG, HC_BASE_CONE, HC_PLATFORM_CONE, HC_CLEARANCE, HC_CONDITION, HC_ASSEMBLY, /* of a pose */
-    HC_NOT_FINITE, HC_CORRECTION, HC_STEP, HC_SPEED, HC_EARLY, HC_ACCELERATION, /* of a command */
+    /* limits of a pose */
+    HC_STROKE_SHORT, HC_STROKE_LONG, HC_BASE_CONE, HC_PLATFORM_CONE, HC_CLEARANCE, HC_CONDITION, HC_ASSEMBLY,
+    /* limits of a command */
+    HC_NOT_FINITE, HC_CORRECTION, HC_STEP, HC_SPEED, HC_EARLY, HC_ACCELERATION,
     HC_NOT_CONVERGED, HC_OUTSIDE_FIELD, HC_QUATERNION,
-    HC_SINGULAR, HC_UNREACHABLE, HC_OTHER_ASSEMBLY, /* of strut lengths */
+    HC_SINGULAR, HC_UNREACHABLE, HC_OTHER_ASSEMBLY, /* failures of forward kinematics */
     HC_TEMPERATURE, HC_HUMIDITY, HC_TOOL_CHANGED, HC_LOAD
 } hc_status;
 
-/* Where the next command starts: at the last one; at measured struts; or, since the tool has changed, where it must be. */
+/* Start of the next command: from the last command, from measured struts, or, after a change of tool, from equal nominal
+ * lengths. */
 typedef enum { HC_FROM_LAST = 0, HC_FROM_MEASURED, HC_WITH_NEW_TOOL } hc_start;
 
 /* Position, m, and rotation matrix. */
@@ -39,81 +42,81 @@ typedef struct {
     double rotation[3][3];
 } hc_pose;
 
-/* Joint centres and cardan axes of one body, in its frame; the model's deviation of each joint; its expansion. */
+/* Base or platform, in its own frame. */
 typedef struct {
-    double joints[6][3];
-    double deviation[6][3];
-    double axes[6][3];
-    double expansion; /* 1/K */
+    double joints[6][3];    /* nominal joint centres, m */
+    double deviation[6][3]; /* real - nominal joint centres, m */
+    double axes[6][3];      /* cardan axes fixed to the body, unit vectors */
+    double expansion;       /* 1/K */
 } hc_body;
 
-/* One strut's errors: the length that it really has is (1 + growth) (command + error - backlash - screw shift). */
+/* One strut's errors: its actual length is (1 + growth) (command + error - backlash / 2 by direction - screw shift). */
 typedef struct {
     double offset;     /* m */
-    double pitch;      /* m per m, about `reference` */
+    double pitch;      /* pitch error, m per m of command beyond `reference` */
     double reference;  /* m */
-    double wavenumber; /* rad/m, of the screw's turning */
-    double harmonics;  /* how many of `wave` count, 0 to 4 */
+    double wavenumber; /* of the screw wave: rad per m of command */
+    double harmonics;  /* number of harmonics used of `wave`, 0 to 4 */
     double backlash;   /* m */
-    double lead;       /* m per turn, positive for a right-hand screw */
-    double twist_home; /* rad */
+    double lead;       /* m per turn, positive for a right-hand screw; 0: the screw does not turn with the joints */
+    double twist_home; /* angle by which the joints turn the screw at home, rad */
     double expansion;  /* 1/K */
-    double moisture;   /* growth by relative humidity from 0 to 1 */
-    double wave[4][2]; /* m, cosine and sine of the periodic error once, twice, three and four times a turn */
+    double moisture;   /* relative growth from 0 to 100 % relative humidity */
+    double wave[4][2]; /* m: cosine and sine of the periodic error with 1, 2, 3 and 4 periods per turn */
 } hc_strut;
 
-/* Cubic pieces of the struts' length maps and of their backlash's change; no knots where there is no map. */
+/* Cubic splines of the struts' length errors and of their additional backlash over the command. */
 typedef struct {
-    int knot_count;
+    int knot_count;       /* 0: there is no map */
     const double *knots;  /* knot_count, m */
-    const double *pieces; /* 6 x (knot_count - 1) x 2 x 4, lengths before backlash, highest power first */
+    const double *pieces; /* 6 x (knot_count - 1) x 2 x 4: length error, then backlash; highest power first */
 } hc_map;
 
-/* Error field: three families of lines through the nodes of a grid, see GridField. */
+/* Error field: polynomials along lines through the nodes of a grid, see GridField. */
 typedef struct {
-    double probe[3]; /* measured point in `platform`, m */
+    double probe[3];        /* measured point in `platform`, m */
     int node_count[3];
     const double *nodes[3]; /* in `base`, m */
-    int powers[3];          /* coefficients per polynomial; 0: this family was not measured */
+    int powers[3];          /* coefficients per polynomial of the lines along x, y, z; 0: no lines along this axis */
     const double *lines[3]; /* direction x cross node x cross node x power x 6 */
     int refuse_outside;     /* 1: poses outside the box are refused; 0: the value at the boundary is held */
 } hc_field;
 
-/* What a command must keep; `apart` is 1 for pairs of struts whose distance counts. */
+/* Limits of poses and commands, see Limits. */
 typedef struct {
-    double stroke[6][2];
-    double cone_axes[2][6][3];
-    double cone_cosines[2][6];
-    double apart[6][6];
+    double stroke[6][2];          /* shortest and longest length, m */
+    double cone_axes[2][6][3];    /* neutral directions of the joints at base and platform, in their body's frame */
+    double cone_cosines[2][6];    /* cosines of the largest angles to these directions */
+    double apart[6][6];           /* 1 for pairs of struts whose clearance is checked */
     double condition;
-    double correction;
-    double step;
-    double clearance;
-    double characteristic_length;
-    double home_sign;
-    double speed;        /* m/s */
-    double acceleration; /* m/s2, 0: not limited */
+    double correction;            /* m */
+    double step;                  /* m per command */
+    double clearance;             /* m, 0: not limited */
+    double characteristic_length; /* m */
+    double home_sign;             /* sign of det J */
+    double speed;                 /* m/s */
+    double acceleration;          /* m/s2, 0: not limited */
 } hc_limits;
 
-/* How parts follow their thermometers: see machine/late.py. `sensors`: whose thermometer stands for each part. */
+/* How the parts' growth follows their temperatures with a delay, see LateGrowth in machine/temperatures.py. */
 typedef struct {
-    int count;                 /* of time constants, 0 to 2 */
+    int count;                 /* number of time constants, 0 to 2 */
     double time_constants[2];  /* s */
-    double expansion[8][2];    /* of struts 1-6, base, platform, 1/K */
-    int sensors[8];
+    double expansion[8][2];    /* delayed expansion of struts 1-6, base, platform, 1/K */
+    int sensors[8];            /* index of the part whose sensor gives each part's temperature */
 } hc_late;
 
-/* What struts, with their joints, give under the weight that they carry. The platform carries its own weight and the
- * tool's; a strut that pulls by a force T is longer by compliance * T + play / 2, one that pushes is shorter. */
+/* How struts with their joints stretch under load. A strut under tension T is longer by compliance * T + play / 2; a strut
+ * under pressure is shorter. The weight is that of platform and tool. */
 typedef struct {
-    int bends;             /* 0: nothing does, and none of the rest counts */
+    int bends;             /* 0: no strut stretches, and the other members have no effect */
     double compliance[6];  /* m/N */
     double play[6];        /* m: lost motion when the strut's force changes its sign */
-    double friction[6];    /* N m: torque of each of its bearings against its turning, by the direction of motion */
-    double take_up;        /* N: below this force the play is taken up in proportion, so that nothing jumps */
+    double friction[6];    /* N m: friction torque of each of the strut's bearings, against the direction of motion */
+    double take_up;        /* N: a smaller force takes up the play in proportion, so that the length does not jump */
     double mass;           /* kg, of platform and tool */
     double moment[3];      /* kg m: mass times centre of mass, in `platform` */
-    double gravity[3];     /* m/s2, in `base`, where hc_set_load has told of no other */
+    double gravity[3];     /* m/s2, in `base`; used until hc_set_load sets another */
 } hc_load;
 
 /* A machine with its error model: constant, generated by `hexapod_comp export --c`. */
@@ -121,8 +124,8 @@ typedef struct {
     const char *machine;
     const char *model;
     const char *date;
-    const char *geometry_sha256; /* of the files that it was made of; of nothing for the ideal model */
-    const char *model_sha256;
+    const char *geometry_sha256; /* of the geometry file */
+    const char *model_sha256;    /* of the model file; of an empty text for the ideal model */
     hc_body base;
     hc_body platform;
     hc_pose home;         /* pose_platform_in_base */
@@ -135,134 +138,137 @@ typedef struct {
     hc_field field;
     hc_late late;
     hc_load load;
-    double axis_threshold;  /* m: how far the measured point comes back before its direction counts as reversed */
-    double strut_threshold; /* m: the same of a strut */
+    double axis_threshold;  /* motion back, m, after which an axis of the measured point counts as reversed */
+    double strut_threshold; /* motion back, m, after which a strut counts as reversed */
 } hc_model;
 
-/* All that one command leaves behind. Recordings hold it under these names: a new meaning needs a new name.
- * Windows and directions of motion are those of the measured point's x, y, z and of the struts. */
+/* The state after the last command. Recordings store the members by name, so a member with a new meaning needs a new name.
+ * Motion: nine values, the measured point's x, y, z and the six struts. */
 typedef struct {
-    double motion_low[9];   /* lower end of each window, m; NAN before the first value */
+    double motion_low[9];   /* lower end of each value's dead band, m; NAN before the first value */
     double motion_sense[9]; /* +1 forward, -1 backward, 0 not known */
-    double nominal[6];
-    double correction[6];
-    double command[6]; /* after hc_reset to measured struts, where they stand */
-    double ramp[6];    /* the part of the correction that a change has still to take away */
-    double time;
-    hc_pose platform; /* pose_platform_in_base commanded */
-    hc_pose model;    /* q with q o E(q) = that pose */
-    int enabled;
-    int changed; /* model, temperatures or enabling have, since the last command */
+    double nominal[6];      /* m; NAN: no command yet */
+    double correction[6];   /* m */
+    double command[6];      /* m; after hc_reset with measured struts, their lengths */
+    double ramp[6];         /* part of the correction, m, that still has to be ramped away after a change */
+    double time;            /* `made` of the command, s */
+    hc_pose platform;       /* pose_platform_in_base commanded */
+    hc_pose model;          /* q with q o E(q) = platform */
+    int enabled;            /* 1: compensation is on */
+    int changed;            /* 1: model, temperatures, load or `enabled` have changed since this command */
     hc_start resumes;
-    double received;
-    double published;
-    double ahead_by_stamp[6]; /* how far each strut is ahead of the speed limit by the one clock and by the other, m */
-    double ahead_by_receipt[6];
-    double smooth_speed[6]; /* m/s */
+    double received;            /* time of receipt, s */
+    double published;           /* time of hc_published, s */
+    double ahead_by_stamp[6];   /* m by which each strut is ahead of the speed limit, by the commands' times `made` */
+    double ahead_by_receipt[6]; /* m by which each strut is ahead of the speed limit, by the times `received` */
+    double smooth_speed[6];     /* smoothed strut speeds, m/s */
 } hc_last;
 
-/* A compensator at work. The caller owns it; two of them know nothing of each other. */
+/* The state of a compensator, which the caller owns. States are independent of each other. */
 typedef struct {
     const hc_model *model;
-    double ramp_rate;           /* m/s */
-    double temperatures[8];     /* struts 1-6, base, platform, degrees Celsius */
-    double began[8];            /* when each was first read, NAN before that, and last, s; where there are late parts */
-    double newest[8];
-    double behind[8][2];        /* how far what follows each late is behind, K */
-    double base_joints[6][3];   /* where the real joints are at these temperatures, m */
-    double platform_joints[6][3];
-    double growth[6];
-    double humidity; /* 0 to 1 */
-    double gravity[3];  /* m/s2, in `base`; NAN: the model's */
-    double external[6]; /* force, N, and torque about the origin of `platform`, N m, in `platform` */
+    double ramp_rate;             /* m/s */
+    double temperatures[8];       /* struts 1-6, base, platform, degrees Celsius */
+    double began[8];              /* time of each sensor's first reading, s; NAN before; for delayed growth only */
+    double newest[8];             /* time of each sensor's newest reading, s */
+    double behind[8][2];          /* delayed temperature - reading, K */
+    double base_joints[6][3];     /* real joints at these temperatures, m */
+    double platform_joints[6][3]; /* real joints at these temperatures, m */
+    double growth[6];             /* relative growth of the struts */
+    double humidity;              /* 0 to 1 */
+    double gravity[3];            /* m/s2, in `base`; NAN: the model's gravity */
+    double external[6];           /* force, N, and torque about the origin of `platform`, N m, in `platform` */
     hc_last last;
-    hc_pose estimate; /* model pose of the last estimate: where the next one begins */
+    hc_pose estimate;             /* model pose of the last estimate, from which the next one starts */
 } hc_state;
 
-/* The answer to a command. After a refusal the lengths are those of the last command (NaN before the first one). */
+/* The answer to a command. After a refusal the lengths are those of the last command (NaN before the first command). */
 typedef struct {
     hc_status status;
-    int strut;         /* 0-5 that a refusal is about, -1 for none */
-    int compensated;   /* 1: the compensated value broke the limit, 0: the nominal one */
-    double value;      /* that broke the limit, m, rad, m/s, m/s2 or 1; of HC_EARLY the time to wait, s */
-    double condition;  /* number of the nominal pose, NaN where it was not reached */
-    int outside_field; /* 1: the field's value was held at the boundary of its box */
-    hc_pose platform;  /* pose_platform_in_base that was asked for */
+    int strut;            /* 0-5: the strut that caused a refusal; -1: none */
+    int compensated;      /* 1: the compensated value broke the limit, 0: the nominal value */
+    double value;         /* value that broke the limit, m, rad, m/s, m/s2 or 1; with HC_EARLY the time to wait, s */
+    double condition;     /* condition number of the nominal pose; NaN if it was not computed */
+    int outside_field;    /* 1: the field's value was held at the boundary of its box */
+    hc_pose platform;     /* pose_platform_in_base that was commanded */
     double nominal[6];    /* m */
     double correction[6]; /* command - nominal, m */
     double command[6];    /* m */
 } hc_answer;
 
-/* Where the tool is. */
+/* The tool's pose by the strut lengths. */
 typedef struct {
     hc_status status;
-    double condition;
-    hc_pose tool; /* pose_tool_in_base; written only when the status is HC_OK */
+    double condition; /* condition number */
+    hc_pose tool;     /* pose_tool_in_base; written only if the status is HC_OK */
 } hc_estimated;
 
-/* Begin: nothing commanded yet, compensation on, 20 degrees Celsius everywhere. ramp_rate: m/s, usually 1e-3. */
+/* Initialise a state: no command yet, compensation on, 20 degrees Celsius. ramp_rate: m/s, usually 1e-3. */
 void hc_init(hc_state *state, const hc_model *model, double ramp_rate);
 
-/* When a command was made, s, for ramps and for the struts' speed: only differences count. `received` is for commands that
- * came by a network, on a clock that nobody sets; NAN in a servo thread, and HC_EARLY then never comes. */
+/* Times of a command, s, for ramps and limits of speed; only differences are used. `made`: when the controller made the
+ * command. `received`: when it arrived by a network, on a monotonic clock; NAN in a servo thread, which disables HC_EARLY. */
 typedef struct {
     double made;
     double received;
 } hc_time;
 
-/* Compensate one tool pose: x, y, z, m, and quaternion x, y, z, w, seen from `frame` (a pose in `base`; NULL: the
- * machine's work frame). A refused command leaves the state as it was. */
+/* Compensate one tool pose: x, y, z, m, and quaternion x, y, z, w, in `frame` (a pose in `base`; NULL: the machine's work
+ * frame). A refused command does not change the state. */
 hc_status hc_command(hc_state *state, const double pose[7], hc_time time, const hc_pose *frame, hc_answer *answer);
 
-/* The same with a pose that is one: position and rotation matrix. */
+/* As hc_command, with position and rotation matrix. */
 hc_status hc_command_pose(hc_state *state, const hc_pose *pose, hc_time time, const hc_pose *frame, hc_answer *answer);
 
-/* Note when the last command went out, s, on the clock of its receipt. */
+/* Store when the last command was published, s, on the clock of `received`. */
 void hc_published(hc_state *state, double time);
 
-/* The same for a controller that plans struts: nominal lengths of the machine without errors, m. The pose is sought from the
- * last one, so they must come in steps; the correction belongs to these very lengths. */
+/* As hc_command, for a controller that plans strut lengths: `nominal`, m, are lengths of the machine without errors. The
+ * search for the pose starts at the last pose, so the lengths must change in small steps. */
 hc_status hc_command_lengths(hc_state *state, const double nominal[6], hc_time time, hc_answer *answer);
 
-/* Say where the tool is when the struts read these lengths, m. A refusal leaves the state as it was. */
+/* Compute the tool's pose from measured strut lengths, m. A refusal does not change the state. */
 hc_status hc_estimate(hc_state *state, const double lengths[6], hc_estimated *estimated);
 
-/* Say what is wrong with all that a model would correct at the last command, before the first one at home: without ramp or
- * switch. Nothing changes. */
+/* Check the full correction of a model, without ramp, at the last commanded pose (before the first command: at home), also
+ * while compensation is off. Does not change the state. */
 hc_status hc_check(const hc_state *state, const hc_model *model, hc_answer *answer);
 
-/* Replace the model; corrections ramp from the old one's to the new one's. It stays with the old one, and says why, where
- * hc_check finds something. */
+/* Replace the model; corrections ramp from the old to the new model. If hc_check refuses the new model, return the
+ * reason and keep the old model. */
 hc_status hc_set_model(hc_state *state, const hc_model *model);
 
-/* Take the same machine and model with another tool. Nothing moves: the next command must be where the struts are. */
+/* Set `model`, which differs from the present one only in its tool. The struts keep their lengths: the next command must have
+ * the same nominal lengths, otherwise it is refused with HC_TOOL_CHANGED. */
 void hc_set_tool(hc_state *state, const hc_model *model);
 
-/* Switch compensation on (1) or off (0); corrections ramp. It stays off, with the reason, when what the model would correct
- * at the last command, before the first one at home, breaks a limit. */
+/* Switch compensation on (1) or off (0); corrections ramp. If hc_check refuses the model, return the reason and stay off. */
 hc_status hc_enable(hc_state *state, int enabled);
 
-/* Take a temperature, degrees Celsius: index 0-5 struts, 6 base, 7 platform. Its effect ramps in. HC_TEMPERATURE for
- * an unknown index or a value outside -40...120: nothing changes then. `time`, s, on the machine's own clock, is needed where
- * the model has late parts (`late.count`): HC_TEMPERATURE without. These need a reading every few seconds, changed or not. */
+/* Set a temperature, degrees Celsius: index 0-5 struts, 6 base, 7 platform. Its effect ramps in. Return HC_TEMPERATURE and
+ * change nothing for an unknown index, a value outside -40...120, or, with delayed growth (`late.count`), a `time` that
+ * is not finite. `time` is in s on a monotonic clock. With delayed growth, call this every few seconds, also if the value is
+ * unchanged. */
 hc_status hc_set_temperature(hc_state *state, int index, double value, double time);
 
-/* Take the air's relative humidity, 0.01 to 1. Its effect on struts that swell ramps in. HC_HUMIDITY outside: nothing changes. */
+/* Set the air's relative humidity, 0.01 to 1. Its effect on struts that swell ramps in. Return HC_HUMIDITY and change nothing
+ * for a value outside. */
 hc_status hc_set_humidity(hc_state *state, double value);
 
-/* Take gravity, m/s2, in `base`, and what else acts on the platform: force, N, and torque about the origin of `platform`,
- * N m, both in `platform`. NULL leaves either as it is; a gravity of NAN brings back the model's. What this changes ramps
- * in. HC_LOAD for numbers that are not finite, or a gravity above 100 m/s2: nothing changes then. */
+/* Set gravity, m/s2, in `base`, and the wrench on the platform beside weight: force, N, and torque about the origin of
+ * `platform`, N m, both in `platform`. NULL leaves one unchanged; a gravity of NAN restores the model's gravity. The effect
+ * ramps in. Return HC_LOAD and change nothing for numbers that are not finite, or a gravity above 100 m/s2. */
 hc_status hc_set_load(hc_state *state, const double gravity[3], const double wrench[6]);
 
-/* Forget the last command and all directions of motion. With `measured`, m, the next command starts from where the
- * struts are and ramps; NULL: it may be anywhere. HC_NOT_FINITE for lengths that are not: nothing changes then. */
+/* Forget the last command and all directions of motion. With `measured`, m, the next command is checked against these
+ * lengths, and its correction ramps from theirs; with NULL, the next command may be anywhere. Return HC_NOT_FINITE and change
+ * nothing for lengths that are not finite. */
 hc_status hc_reset(hc_state *state, const double measured[6]);
 
-/* Of the arithmetic: it changes when a bit of an answer does. */
+/* Return the version of the arithmetic, which changes when any bit of a result changes. */
 const char *hc_version(void);
 
-/* The name of a status, as the Python package counts refusals: "stroke", "step", ... */
+/* Return the name of a status by which the Python package counts refusals: "stroke", "step", ... */
 const char *hc_reason(hc_status status);
 
 #ifdef __cplusplus

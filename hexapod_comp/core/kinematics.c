@@ -4,6 +4,7 @@
  */
 #include "core.h"
 
+/* The struts at a pose: vectors from base joint to platform joint, their moments about the platform's origin, lengths. */
 typedef struct {
     vec strut[6];
     vec moment[6];
@@ -14,7 +15,7 @@ typedef struct {
 typedef struct {
     vec upper[3]; /* columns of the inverse of rows 0, 2, 4 */
     vec ratio[3]; /* rows 1, 3, 5 times that inverse */
-    vec lower[3]; /* columns of the inverse of what is left of rows 1, 3, 5 */
+    vec lower[3]; /* columns of the inverse of rows 1, 3, 5 after elimination */
     double determinant_upper, determinant_lower;
 } blocks;
 
@@ -38,6 +39,7 @@ INLINED six_struts struts_at(const double base[6][3], const double platform[6][3
     return all;
 }
 
+/* Write the columns of the inverse of the matrix with rows a, b, c; return the determinant. */
 INLINED double inverse_columns(vec a, vec b, vec c, vec columns[3])
 {
     const vec first = cross(b, c);
@@ -82,7 +84,7 @@ INLINED void substitute_transposed(const vec m[6], const blocks *f, vec force, v
     copy_six(all, forces);
 }
 
-/* Condition number and sign of det J; sign 0 where pivoting is needed. */
+/* Condition number, and sign of det J; the sign is 0 if the elimination needs pivoting. */
 INLINED double block_condition(const six_struts *now, double characteristic_length, double *sign)
 {
     const double square = characteristic_length * characteristic_length;
@@ -93,20 +95,20 @@ INLINED double block_condition(const six_struts *now, double characteristic_leng
     double inverse = 0.0, moments = 0.0, condition;
     UNROLLED
     for (int k = 0; k < 6; k++) {
-        /* column k of the inverse, its sign left aside */
+        /* column k of the inverse, up to its sign */
         const vec w = k % 2 ? f.lower[k / 2] : combine_rows(column[k / 2], f.lower);
         const vec v = add(k % 2 ? zero : f.upper[k / 2], combine_rows(vector(dot(m[0], w), dot(m[2], w), dot(m[4], w)), f.upper));
         inverse += l[k] * l[k] * (dot(v, v) + square * dot(w, w));
         moments += dot(m[k], m[k]) / (l[k] * l[k]);
     }
     condition = sqrt((6.0 + moments / square) * inverse) / 6.0;
-    *sign = f.determinant_upper * f.determinant_lower > 0.0 ? -1.0 : 1.0; /* no branch: lanes.c */
+    *sign = f.determinant_upper * f.determinant_lower > 0.0 ? -1.0 : 1.0; /* without a branch, for lanes.c */
     *sign = fabs(f.determinant_upper) >= COPLANAR * l[0] * l[2] * l[4] ? *sign : 0.0;
     *sign = condition < HUGE_VAL ? *sign : 0.0;
     return condition;
 }
 
-/* Squared misfit of six lengths in units of what rounding may leave. */
+/* Squared misfit of six lengths, as a multiple of the square that rounding can cause. */
 INLINED double closure_error(const double now[6], const double wanted[6])
 {
     const vec first = row_of(now), second = row_of(now + 3);
@@ -171,6 +173,7 @@ static double solve_six(double a[6][6], double right[6])
     return sign;
 }
 
+/* Frobenius condition number of a matrix, and sign of its determinant, with pivoting. */
 static double frobenius_condition(double a[6][6], double *sign)
 {
     double square = 0.0, inverse_square = 0.0;
@@ -202,7 +205,7 @@ static six_struts struts_of(const double base[6][3], const double platform[6][3]
     return struts_at(base, platform, row_of(pose->position), &r);
 }
 
-/* Frobenius condition number at a pose, rotations scaled by the characteristic length */
+/* Frobenius condition number of J at a pose, and sign of det J; rotations are scaled by the characteristic length. */
 static double condition_at(const double base[6][3], const hc_pose *pose, const six_struts *now,
                            double characteristic_length, double *sign)
 {
@@ -218,7 +221,7 @@ static double condition_at(const double base[6][3], const hc_pose *pose, const s
     return frobenius_condition(jacobian, sign);
 }
 
-/* Whether every pair of struts can close its triangle */
+/* Whether each pair of struts could reach two platform joints, by the distances of the joints. */
 static int lengths_possible(const double base[6][3], const double platform[6][3], const double lengths[6])
 {
     for (int i = 0; i < 6; i++) {
@@ -235,8 +238,8 @@ static int lengths_possible(const double base[6][3], const double platform[6][3]
     return 1;
 }
 
-/* What a solution is judged by: that J is well conditioned and of home's sign, the loops close, R is a rotation. It does
- * not depend on the iteration. */
+/* Values by which a solution is accepted: condition number and sign of det J, misfit of the loop closures, and deviation of R
+ * from a rotation. They depend on the solution alone, not on the iteration. */
 typedef struct {
     double condition, sign, misfit, flaw;
 } certificate;
@@ -257,7 +260,7 @@ static int closes(double misfit, double flaw)
     return misfit <= 1.0 && flaw <= ROTATION_ROUNDING;
 }
 
-/* What keeps a solution: the largest condition number, and home's sign of det J, 0 for any. */
+/* Criteria of an accepted solution: largest condition number, and home's sign of det J, 0 for both signs. */
 typedef struct {
     double characteristic_length, home_sign, condition;
 } judge;
@@ -277,14 +280,14 @@ static int certified(const certificate *c, double step, const double lengths[6],
            && (c->sign * by->home_sign > 0.0 || (by->home_sign == 0.0 && c->sign != 0.0));
 }
 
-/* What came of a forward solution. */
+/* Result of a forward solution. */
 typedef struct {
     hc_status status;
     int iterations;
     double condition;
 } solution;
 
-/* Newton with pivoting, for what block elimination cannot solve. */
+/* Newton's method with pivoting, for poses at which block elimination fails. */
 static hc_status newton(const double base[6][3], const double platform[6][3], const double lengths[6], hc_pose *pose,
                         int *iterations)
 {
@@ -320,7 +323,7 @@ static hc_status newton(const double base[6][3], const double platform[6][3], co
     return HC_NOT_CONVERGED;
 }
 
-/* Finite lengths above zero and a finite guess */
+/* Whether the lengths are finite and above zero, and the guess is finite. */
 static int usable(const double lengths[6], const hc_pose *guess)
 {
     for (int i = 0; i < 6; i++) {
@@ -336,7 +339,7 @@ static int usable(const double lengths[6], const hc_pose *guess)
     return 1;
 }
 
-/* With pivoting, and with the reason of a failure */
+/* Forward kinematics with pivoting; the status tells why it failed. */
 static solution solve_carefully(const double base[6][3], const double platform[6][3], const double lengths[6],
                                 const judge *by, hc_pose *pose)
 {
@@ -351,7 +354,7 @@ static solution solve_carefully(const double base[6][3], const double platform[6
         found.status = HC_UNREACHABLE;
         return found;
     }
-    orthonormalise(trial.rotation); /* or what a rounded guess is off stays in a step too small to be followed by another */
+    orthonormalise(trial.rotation); /* Newton's small last step would not correct the rounding of a guess */
     found.status = newton(base, platform, lengths, &trial, &found.iterations);
     if (found.status != HC_OK) {
         return found;
@@ -368,8 +371,8 @@ static solution solve_carefully(const double base[6][3], const double platform[6
     return found;
 }
 
-/* One Newton step on the six loop closures; returns its length, m and rad. The rows are multiplied by the struts' lengths,
- * which spares a division and does not change the step. */
+/* Take one Newton step on the six loop closures; return its size, m and rad. The rows are multiplied by the struts' lengths,
+ * which saves a division and does not change the step. */
 INLINED double newton_step(const double base[6][3], const double platform[6][3], const double lengths[6], vec *p,
                                  mat *r)
 {
@@ -389,7 +392,7 @@ INLINED double newton_step(const double base[6][3], const double platform[6][3],
     return sqrt(dot(v, v) + dot(w, w));
 }
 
-/* The six loop closures by Newton from a guess, which is overwritten only by a solution */
+/* Solve the six loop closures by Newton's method from a guess; only a solution overwrites the guess. */
 static solution solve_pose(const double base[6][3], const double platform[6][3], const double lengths[6],
                            const judge *by, hc_pose *pose)
 {

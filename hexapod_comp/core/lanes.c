@@ -1,14 +1,15 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Inverse and forward kinematics of many poses, eight at once. The loops over lanes are what compilers turn into vector
- * instructions; each lane does the arithmetic of a pose alone, operation by operation, so both give the same bits. A lane
- * that fails a test is solved again with pivoting, which also finds the reason.
+ * Inverse and forward kinematics of many poses, eight at once, each in its own lane. Compilers turn the loops over lanes into
+ * vector instructions. A lane does the same operations in the same order as kinematics.c for a single pose, so both give the
+ * same bits. A lane that fails the checks of a solution is solved again with pivoting, which also finds the reason.
  */
 #include "core.h"
 
 #define LANES 8 /* one register of AVX-512, two of AVX2 */
 
-/* Compiled for each of these, and taken by the processor that the program meets; the arithmetic is IEEE in all of them. */
+/* A WIDE function is compiled for each of these instruction sets, and the processor's is chosen at run time; the arithmetic is
+ * IEEE in all of them. */
 #ifndef WIDE
 #if defined(__GNUC__) && defined(__x86_64__) && defined(__GLIBC__)
 #define WIDE __attribute__((target_clones("avx512f", "avx2", "default")))
@@ -17,14 +18,14 @@
 #endif
 #endif
 
-/* A pose, the lengths sought or found, and how far its solution has come, in each lane. */
+/* In each lane a pose, its strut lengths, and the state of its solution. */
 typedef struct {
     double position[3][LANES];
     double rotation[9][LANES];
     double lengths[6][LANES];
-    double step[LANES]; /* of Newton, the last one, m and rad */
-    double count[LANES];
-    double condition[LANES];
+    double step[LANES];      /* size of the last Newton step, m and rad */
+    double count[LANES];     /* number of Newton steps */
+    double condition[LANES]; /* the four values of a certificate */
     double sign[LANES];
     double misfit[LANES];
     double flaw[LANES];
@@ -65,11 +66,13 @@ INLINED void lane_lengths(const lanes *a, int n, double lengths[6])
     }
 }
 
+/* a if `first`, else b. */
 INLINED vec chosen(int first, vec a, vec b)
 {
     return vector(first ? a.x : b.x, first ? a.y : b.y, first ? a.z : b.z);
 }
 
+/* Write the strut lengths of each lane's pose. */
 WIDE static void measure_lanes(const double base[6][3], const double platform[6][3], lanes *restrict a)
 {
     for (int n = 0; n < LANES; n++) {
@@ -82,7 +85,7 @@ WIDE static void measure_lanes(const double base[6][3], const double platform[6]
     }
 }
 
-/* Take a Newton step in every lane that has not settled. */
+/* Take a Newton step in every lane that has not converged. */
 WIDE static void step_lanes(const double base[6][3], const double platform[6][3], lanes *restrict a)
 {
     for (int n = 0; n < LANES; n++) {
@@ -104,7 +107,7 @@ WIDE static void step_lanes(const double base[6][3], const double platform[6][3]
     }
 }
 
-/* Straighten each lane's rotation and measure what its answer is judged by. */
+/* Make each lane's rotation orthonormal, and write its certificate. */
 WIDE static void certify_lanes(const double base[6][3], const double platform[6][3], double characteristic_length,
                                lanes *restrict a)
 {
@@ -132,7 +135,7 @@ static void fill_lane(lanes *a, int n, const double position[3], const double ro
     }
 }
 
-/* Inverse kinematics: |P + R t - b|. */
+/* Inverse kinematics: write the lengths |P + R t - b|. */
 void hc_strut_lengths_many(const double *base, const double *platform, size_t count, const double *positions,
                       const double *rotations, double *lengths)
 {
@@ -142,7 +145,7 @@ void hc_strut_lengths_many(const double *base, const double *platform, size_t co
         const int here = count - first < LANES ? (int)(count - first) : LANES;
         const double *p = positions + 3 * first, *r = rotations + 9 * first;
         for (int n = 0; n < LANES; n++) {
-            const int row = n < here ? n : here - 1; /* the last pose once more in what is left of the lanes */
+            const int row = n < here ? n : here - 1; /* unused lanes repeat the last pose */
             fill_lane(&a, n, p + 3 * row, r + 9 * row);
         }
         measure_lanes(b, t, &a);
@@ -152,8 +155,8 @@ void hc_strut_lengths_many(const double *base, const double *platform, size_t co
     }
 }
 
-/* Newton in all lanes until none moves. */
-static void settle_lanes(const double base[6][3], const double platform[6][3], lanes *a)
+/* Take Newton steps until all lanes have converged or reached MAX_ITERATIONS. */
+static void iterate_lanes(const double base[6][3], const double platform[6][3], lanes *a)
 {
     int moving = 1;
     while (moving) {
@@ -165,9 +168,9 @@ static void settle_lanes(const double base[6][3], const double platform[6][3], l
     }
 }
 
-/* Forward kinematics: Newton from the poses given, which solutions overwrite. A solution must have a condition number of at
- * most `largest_condition` and home's sign of det J, 0 for any. `outcomes` are hc_status; `conditions` are NaN where
- * there is none. */
+/* Forward kinematics: Newton from the given poses, which the solutions overwrite. A solution must have a condition number of at
+ * most `largest_condition`, and det J of the sign `home_sign`; 0 accepts both. Writes `outcomes`, hc_status, and `conditions`,
+ * NaN if not computed. */
 void hc_solve_pose_many(const double *base, const double *platform, size_t count, const double *lengths, double *positions,
                         double *rotations, double characteristic_length, double home_sign, double largest_condition,
                         int *outcomes, int *iterations, double *conditions)
@@ -186,7 +189,7 @@ void hc_solve_pose_many(const double *base, const double *platform, size_t count
             a.step[n] = HUGE_VAL;
             a.count[n] = 0.0;
         }
-        settle_lanes(b, t, &a);
+        iterate_lanes(b, t, &a);
         certify_lanes(b, t, characteristic_length, &a);
         for (int n = 0; n < here; n++) {
             const size_t row = first + (size_t)n;
@@ -200,7 +203,7 @@ void hc_solve_pose_many(const double *base, const double *platform, size_t count
             } else {
                 found_here = solve_carefully(b, t, lengths + 6 * row, &by, &pose);
             }
-            write_pose(&pose, positions + 3 * row, rotations + 9 * row); /* as it was, where there is no solution */
+            write_pose(&pose, positions + 3 * row, rotations + 9 * row); /* without a solution: the guess */
             outcomes[row] = (int)found_here.status;
             iterations[row] = found_here.iterations;
             conditions[row] = found_here.condition;

@@ -1,15 +1,15 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What a pose must keep: strokes, joint cones, clearance, condition, assembly mode. doc/theory.md, 5 and 11.
+ * Limits of a pose: strokes, joint cones, clearance, condition, assembly mode. doc/theory.md, 5 and 11.
  */
 #include "core.h"
 
-/* What was found, and of what. */
+/* The result of a check: HC_OK, or the limit that is broken. */
 typedef struct {
     hc_status status;
-    int strut;
-    int other; /* second strut that it is about, -1 for none */
-    double value;
+    int strut;    /* strut that breaks the limit, -1 for none */
+    int other;    /* second strut concerned, -1 for none */
+    double value; /* value that breaks the limit */
 } finding;
 
 static finding found(hc_status status, int strut, double value)
@@ -17,17 +17,18 @@ static finding found(hc_status status, int strut, double value)
     return (finding){status, strut, -1, value};
 }
 
-static double held(double value, double low, double high)
+static double clamp(double value, double low, double high)
 {
     return fmax(low, fmin(high, value));
 }
 
-/* A quotient held within 0...1; 0 where there is nothing to divide by */
+/* part / whole, clamped to 0...1; 0 if `whole` is 0. */
 static double share_of(double part, double whole)
 {
-    return whole > 0.0 ? held(part / whole, 0.0, 1.0) : 0.0;
+    return whole > 0.0 ? clamp(part / whole, 0.0, 1.0) : 0.0;
 }
 
+/* The smallest distance between the segments a-b and c-d. */
 static double segment_distance(vec a, vec b, vec c, vec d)
 {
     const vec u = subtract(b, a), v = subtract(d, c), w = subtract(a, c);
@@ -38,7 +39,7 @@ static double segment_distance(vec a, vec b, vec c, vec d)
     return norm(subtract(subtract(add(a, scale(s, u)), c), scale(t, v)));
 }
 
-/* Cosines of the struts' angles to the neutral directions of their joints, at the base and at the platform. */
+/* Write the cosines of the struts' angles to their joints' neutral directions, at base and platform. */
 static void joint_cosines(const hc_pose *pose, const six_struts *now, const hc_limits *limits, double cosines[2][6])
 {
     for (int i = 0; i < 6; i++) {
@@ -49,7 +50,7 @@ static void joint_cosines(const hc_pose *pose, const six_struts *now, const hc_l
     }
 }
 
-/* The distance of each strut to the nearest other one that counts, and which that is; infinite and -1 where none does. */
+/* Write each strut's distance to the nearest other strut that is checked, and that strut's index; infinite and -1: none. */
 static void nearest_struts(const double base[6][3], const six_struts *now, const hc_limits *limits, double distances[6],
                            double nearest[6])
 {
@@ -75,7 +76,7 @@ static void nearest_struts(const double base[6][3], const six_struts *now, const
     }
 }
 
-/* The first limit that a pose and its lengths break. `now` are the struts at the pose: whoever asks has needed them already. */
+/* The first limit that a pose and its lengths break; `now` are the struts at the pose. */
 static finding check_stage(const double base[6][3], const hc_pose *pose, const six_struts *now,
                            const double lengths[6], const hc_limits *limits, double *condition)
 {
@@ -96,7 +97,7 @@ static finding check_stage(const double base[6][3], const hc_pose *pose, const s
     for (int n = 0; n < 12; n++) {
         const int i = n / 2, body = n % 2;
         if (!(cosines[body][i] >= limits->cone_cosines[body][i])) {
-            return found(body ? HC_PLATFORM_CONE : HC_BASE_CONE, i, arc_cosine(held(cosines[body][i], -1.0, 1.0)));
+            return found(body ? HC_PLATFORM_CONE : HC_BASE_CONE, i, arc_cosine(clamp(cosines[body][i], -1.0, 1.0)));
         }
     }
     nearest_struts(base, now, limits, distances, nearest);
@@ -112,7 +113,7 @@ static finding check_stage(const double base[6][3], const hc_pose *pose, const s
     return sign == limits->home_sign ? found(HC_OK, -1, 0.0) : found(HC_ASSEMBLY, -1, sign);
 }
 
-/* A NaN in `previous` means that there is none. */
+/* Check that no length changes by more than `largest`; NaN in `previous`: there are no previous lengths. */
 static finding check_change(const double lengths[6], const double previous[6], double largest)
 {
     for (int i = 0; i < 6; i++) {

@@ -4,7 +4,7 @@
  */
 #include "core.h"
 
-/* The Cayley rotation of w times R, exp(w) to second order and exactly orthogonal */
+/* The Cayley rotation of w times R: equal to exp(w) R up to second order in w, and exactly orthogonal. */
 INLINED mat turned(const mat *r, vec w)
 {
     const double x = 0.5 * w.x, y = 0.5 * w.y, z = 0.5 * w.z;
@@ -18,7 +18,7 @@ INLINED mat turned(const mat *r, vec w)
     return out;
 }
 
-/* The rotation nearest to a nearly orthonormal matrix: one Newton step. */
+/* The rotation nearest to a nearly orthonormal matrix, by one Newton step. */
 INLINED mat straightened(const mat *r)
 {
     const vec *g = r->row;
@@ -30,6 +30,7 @@ INLINED mat straightened(const mat *r)
     return out;
 }
 
+/* Deviation of a matrix from a right-handed orthonormal one. */
 INLINED double rotation_error(const mat *r)
 {
     const vec hand = subtract(cross(r->row[0], r->row[1]), r->row[2]);
@@ -86,7 +87,7 @@ static hc_pose compose(const hc_pose *a, const hc_pose *b)
     return out;
 }
 
-/* A pose out of arrays: position, rotation matrix by rows. */
+/* The pose of two arrays: position, and rotation matrix by rows. */
 static inline hc_pose pose_of(const double *position, const double *rotation)
 {
     hc_pose pose;
@@ -105,20 +106,20 @@ static inline void write_pose(const hc_pose *pose, double *position, double *rot
     }
 }
 
-/* R o */
+/* R o: a vector of the platform's frame, in `base`. */
 static vec lever(const hc_pose *pose, const double o[3])
 {
     const mat r = three_rows(pose->rotation);
     return times(r.row, row_of(o));
 }
 
-/* Where a point of the platform is. */
+/* Position in `base` of a point of the platform. */
 static vec point_at(const hc_pose *pose, const double point[3])
 {
     return add(row_of(pose->position), lever(pose, point));
 }
 
-/* A position and a quaternion as a pose */
+/* Convert position and quaternion to a pose. */
 static hc_status read_pose(const double n[7], hc_pose *pose)
 {
     const double x = n[3], y = n[4], z = n[5], w = n[6];

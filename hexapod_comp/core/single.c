@@ -1,11 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * One pose, one point, one strut at a time: what Python asks of the core beside a compensator and batches. Rotations are nine
- * doubles, by rows.
+ * Functions for Python on one pose, one point or one strut. Rotations are nine doubles, by rows.
  */
 #include "core.h"
 
-/* The largest element of |R'R - 1|, infinite for a left-handed matrix. */
+/* The largest element of |R'R - 1|; infinite for a left-handed matrix. */
 double hc_rotation_flaw(const double *r)
 {
     const vec x = row_of(r), y = row_of(r + 3), z = row_of(r + 6);
@@ -22,7 +21,7 @@ double hc_rotation_flaw(const double *r)
     return dot(cross(x, y), z) < 0.0 ? HUGE_VAL : flaw;
 }
 
-/* A pose out of position and quaternion, refused as in hc_command. */
+/* Convert position and quaternion to position and rotation matrix; refuses the same numbers as hc_command. */
 hc_status hc_read_pose(const double numbers[7], double *position, double *rotation)
 {
     hc_pose pose;
@@ -33,7 +32,7 @@ hc_status hc_read_pose(const double numbers[7], double *position, double *rotati
     return status;
 }
 
-/* From its largest component. */
+/* Write the unit quaternion x, y, z, w of a rotation, computed from its largest component. */
 void hc_quaternion(const double *rotation, double q[4])
 {
     const double(*r)[3] = (const double(*)[3])rotation;
@@ -68,13 +67,13 @@ void hc_rotate(double *rotation, double x, double y, double z)
     rotate((double(*)[3])rotation, x, y, z);
 }
 
-/* Solve a 6 x 6 system in place; returns the sign of its determinant, 0 for a singular matrix. */
+/* Solve a 6 x 6 system in place; return the sign of its determinant, 0 for a singular matrix. */
 double hc_solve_linear(double *matrix, double *right)
 {
     return solve_six((double(*)[6])matrix, right);
 }
 
-/* Check lengths and pose of one stage; `struts`: which one, and a second one, -1 for none. */
+/* Return the first limit that a pose and its lengths break; write the two struts concerned, -1 for none. */
 hc_status hc_check_stage(const double *base, const double *platform, const double *position, const double *rotation,
                          const double *lengths, const hc_limits *limits, int struts[2], double *value, double *condition)
 {
@@ -88,13 +87,13 @@ hc_status hc_check_stage(const double *base, const double *platform, const doubl
     return f.status;
 }
 
-/* The smallest distance between the segments a-b and c-d. */
+/* Return the smallest distance between the segments a-b and c-d. */
 double hc_segment_distance(const double a[3], const double b[3], const double c[3], const double d[3])
 {
     return segment_distance(row_of(a), row_of(b), row_of(c), row_of(d));
 }
 
-/* Directions of motion and windows (9) after values of the measured point's axes and of the struts (9). */
+/* Update the directions of motion (9) with new values of the measured point's x, y, z and of the struts. */
 void hc_follow_nine(const double *values, double axis_threshold, double strut_threshold, double *low, double *sense)
 {
     for (int i = 0; i < 9; i++) {
@@ -102,20 +101,20 @@ void hc_follow_nine(const double *values, double axis_threshold, double strut_th
     }
 }
 
-/* Six components of a field at a point; returns whether that is outside its box. */
+/* Write the six error components of a field at a point; return whether the point is outside the field's box. */
 int hc_field_at(const hc_field *field, const double *point, const double *sense, double *error)
 {
     return field_at(field, row_of(point), sense, error);
 }
 
-/* Real length of a strut for a command, m. */
+/* Return the actual length of a strut at a command, m. */
 double hc_actual_length(const hc_state *state, int strut, double command, double sense, double shift)
 {
     return actual_length(state, strut, command, sense, shift);
 }
 
-/* Write six lengths, and as velocities their change since the last ones over a period, s, 0: at rest; at most `fastest`, then
- * all in proportion. */
+/* Write six lengths, and their velocities since the last call, a period, s, ago; period 0: at rest. If a velocity would be above
+ * `fastest`, all are reduced in proportion. */
 void hc_write_lengths(const double *lengths, double period, double fastest, double *position, double *velocity)
 {
     for (int i = 0; i < 6 && period > 0.0; i++) {
@@ -127,7 +126,7 @@ void hc_write_lengths(const double *lengths, double period, double fastest, doub
     }
 }
 
-/* Take temperatures, humidity and lags that somebody has written into the state. */
+/* Update joints and growth after temperatures, humidity or lags were written into the state directly. */
 void hc_place(hc_state *state)
 {
     place_machine(state);

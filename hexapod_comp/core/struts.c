@@ -1,10 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * One strut's own error, forwards and backwards, and its direction of motion. doc/theory.md, 8 and 10.
+ * A strut's own errors, forwards (command to length) and backwards, and directions of motion. doc/theory.md, 8 and 10.
  */
 #include "core.h"
 
-/* Direction of motion with a reversal threshold. */
+/* Update the direction of motion of one value: it reverses when the value leaves a dead band that it drags along, from
+ * `low` to `low` + threshold. */
 static double follow(double value, double threshold, double low[9], double sense[9], int index)
 {
     if (low[index] != low[index]) {
@@ -19,7 +20,7 @@ static double follow(double value, double threshold, double low[9], double sense
     return sense[index];
 }
 
-/* Follow a point along the three axes. */
+/* Update the directions of motion of a point along the three axes. */
 static void follow_point(vec point, double threshold, double low[9], double sense[9])
 {
     follow(point.x, threshold, low, sense, 0);
@@ -27,8 +28,8 @@ static void follow_point(vec point, double threshold, double low[9], double sens
     follow(point.z, threshold, low, sense, 2);
 }
 
-/* Angle about a strut from the base's cardan axis to the platform's, rad, both seen along the strut. Where it stays within
- * 90 degrees its sine is the one in LinuxCNC's genhexkins. */
+/* Angle about a strut, rad, from the base's cardan axis to the platform's, both projected along the strut. While the angle is
+ * within 90 degrees, LinuxCNC's genhexkins computes the same one. */
 static double screw_twist(const double base_axis[3], const double platform_axis[3], const hc_pose *pose,
                           const six_struts *now, int i)
 {
@@ -37,8 +38,8 @@ static double screw_twist(const double base_axis[3], const double platform_axis[
     return arc_tangent(dot(b, cross(p, u)), dot(b, p) - dot(b, u) * dot(p, u));
 }
 
-/* How much longer the command must be for the screw's rotation, m: a platform that turns by an angle about the strut turns
- * the screw in its nut, which advances by lead times angle / 2 pi by itself. `now` are the struts at the pose. */
+/* Command change, m, that makes up for the screw's rotation: when joints turn the screw by an angle in its nut, the strut's
+ * length changes by lead * angle / 2 pi. `now` are the struts at the pose. */
 static double screw_shift(const hc_model *model, const hc_pose *pose, const six_struts *now, int i)
 {
     const hc_strut *strut = &model->struts[i];
@@ -50,7 +51,7 @@ static double screw_shift(const hc_model *model, const hc_pose *pose, const six_
     return -strut->lead * (turns - floor(turns + 0.5));
 }
 
-typedef struct { double cosine, sine; } turn; /* of the angle that a screw has turned */
+typedef struct { double cosine, sine; } turn; /* cosine and sine of a screw's angle */
 
 static turn screw_turn(const hc_strut *strut, double command)
 {
@@ -61,7 +62,7 @@ static turn screw_turn(const hc_strut *strut, double command)
     return at;
 }
 
-/* Increased by a small angle. */
+/* The screw's angle, increased by a small angle. */
 static turn turned_on(turn at, double angle)
 {
     const double square = angle * angle;
@@ -70,7 +71,7 @@ static turn turned_on(turn at, double angle)
     return (turn){at.cosine * c - at.sine * s, at.sine * c + at.cosine * s};
 }
 
-/* Error and slope of the periodic error; harmonics by the addition theorem */
+/* The periodic error, m, and its slope over the command; harmonics by the addition theorem. */
 static double wave_error(const hc_strut *strut, turn at, double *slope)
 {
     const double (*wave)[2] = strut->wave;
@@ -87,7 +88,7 @@ static double wave_error(const hc_strut *strut, turn at, double *slope)
     return error;
 }
 
-/* Error and slope of what depends on the command: offset, pitch, waves, map, and the backlash's change */
+/* The part of the length error that depends on the command, m (offset, pitch, wave, map with its backlash), and its slope. */
 static double error_at(const hc_model *model, int i, double command, turn at, double sense, double *slope)
 {
     const hc_strut *strut = &model->struts[i];
@@ -122,6 +123,7 @@ static double error_at(const hc_model *model, int i, double command, turn at, do
     return error;
 }
 
+/* Forwards: the strut's actual length at a command, m. */
 static double actual_length(const hc_state *state, int i, double command, double sense, double shift)
 {
     const hc_strut *strut = &state->model->struts[i];
@@ -131,6 +133,7 @@ static double actual_length(const hc_state *state, int i, double command, double
     return (1.0 + state->growth[i]) * (command + error - play - shift);
 }
 
+/* Backwards: the command that gives the strut a length, m, by Newton's method. */
 static double command_for_length(const hc_state *state, int i, double length, double sense, double shift)
 {
     const hc_strut *strut = &state->model->struts[i];

@@ -1,13 +1,13 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * How far a tool may go from where it is.
+ * How far a tool can move in one direction before a limit refuses the pose.
  */
 #include "core.h"
 
-#define HALVINGS 32 /* of a step */
+#define HALVINGS 32 /* bisections of the step that ends at the first refused pose */
 
-/* From a tool pose in `frame` along the unit vector `shift`, or about `turn`, the other one being 0, in steps and up to
- * `longest`, m or rad. `state` had no command yet, so that poses are judged one by one. */
+/* Search from a tool pose in `frame` along the unit vector `shift`, or about the unit vector `turn` (the other one is 0), in
+ * steps of `step` up to `longest`, m or rad. `state` must have no last command, so that each pose is judged alone. */
 void hc_go(const hc_state *state, const hc_pose *tool, const hc_pose *frame, const double shift[3], const double turn[3],
            double step, double longest, hc_way *way)
 {
@@ -27,7 +27,7 @@ void hc_go(const hc_state *state, const hc_pose *tool, const hc_pose *frame, con
         }
         rotate(at.rotation, distance * turn[0], distance * turn[1], distance * turn[2]);
         const hc_pose in_base = compose(frame, &at), platform = compose(&in_base, &state->model->tool_inverse);
-        const finding f = work_out(state, &platform, unknown, &next, &answer);
+        const finding f = next_command(state, &platform, unknown, &next, &answer);
         if (f.status == HC_OK) {
             way->inside = distance;
         } else {

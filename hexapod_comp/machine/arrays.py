@@ -1,4 +1,4 @@
-"""Size of errors: root mean square and largest."""
+"""Helpers on arrays: groups of equal rows, and the RMS and largest length of error vectors."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ from numpy.typing import ArrayLike
 
 
 def changed_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which rows of a matrix differ from the previous one, the index of the first, and the last such index of
-    each row."""
+    """Return the indices at which a run of equal rows begins, and for each row the number of its run."""
     new = np.ones(len(rows), dtype=bool)
     new[1:] = (rows[1:] != rows[:-1]).any(axis=1)
     return np.flatnonzero(new), np.cumsum(new) - 1
 
 
 def different_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first index of each different row of a matrix, in sorted order, and the number of each row."""
+    """Return the index of one example of each distinct row, sorted, and for each row the number of its example."""
     order = np.lexsort(rows.T[::-1])
     first, of_sorted = changed_rows(rows[order])
     number = np.empty(len(rows), dtype=int)
@@ -27,18 +26,18 @@ def different_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Size:
-    """Size of a set of vectors."""
+    """RMS and largest length of a set of error vectors, in the vectors' unit."""
 
-    rms: float  # root mean square length
+    rms: float
     largest: float
 
     @staticmethod
     def of(vectors: np.ndarray) -> Size:
-        """Return the size of (N, 3) vectors."""
+        """Return the RMS and the largest length of vectors (N, 3)."""
         lengths = np.linalg.norm(vectors, axis=1)
         return Size(rms(lengths), float(lengths.max()))
 
 
 def rms(values: ArrayLike) -> float:
-    """Return the root mean square."""
+    """Return the root mean square of all values."""
     return float(np.sqrt(np.mean(np.square(values))))

@@ -1,4 +1,4 @@
-"""Forward kinematics without a guess: the assembly modes of a machine, and the selection of the working one."""
+"""Forward kinematics without a guess: all assembly modes of a machine, and the selection of its working mode."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from ..pose import Pose, nearest_rotation, rotation_angle
 from .geometry import HexapodGeometry
 from .kinematics import Structure, six_lengths, solve_poses
 
-# Modes whose platform joints all lie closer than this, relative to the longest strut, are one
+# Two solutions are the same mode if no platform joint differs by more than this share of the longest strut
 DISTINCT = 1e-6
 # A machine has at most forty modes (Raghavan 1993) unless it can move with all struts locked
 MOST_MODES = 40
 MOVES = "the machine can move with its struts locked at these lengths: they do not determine its pose"
-ORIENTATIONS = 2000  # Attitudes from which modes are sought, two positions each
-AMBIGUITY = 1.2  # A cold start is refused when the second-nearest candidate is within this factor of the nearest
+ORIENTATIONS = 2000  # Number of attitudes from which the search starts, with two positions for each
+# A cold start is refused if the second-nearest mode is less than this times as far from home as the nearest mode
+AMBIGUITY = 1.2
 
 
 def assembly_modes(structure: Structure, lengths: np.ndarray) -> list[Pose]:
-    """Return the poses of a machine that have these strut lengths: those that Newton finds from all around."""
+    """Return the platform poses with these strut lengths, highest z first: Newton from about 4000 starting poses."""
     lengths = six_lengths(lengths)
     anything = replace(structure, home_sign=0.0, max_condition=math.inf)
     starts = _starts_around(structure, lengths)
@@ -45,7 +46,7 @@ def assembly_modes(structure: Structure, lengths: np.ndarray) -> list[Pose]:
 
 
 def _starts_around(structure: Structure, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (N, 3), m, and rotations (N, 3, 3) with approximately the struts' lengths."""
+    """Return starting positions (N, 3), m, and rotations (N, 3, 3): home, and poses that roughly fit the lengths."""
     rotations = nearest_rotation(np.random.default_rng(0).standard_normal((ORIENTATIONS, 3, 3)))
     centres = structure.base_joints - structure.platform_joints @ np.swapaxes(rotations, 1, 2)
     middle = centres.mean(axis=1)
@@ -64,7 +65,7 @@ def _starts_around(structure: Structure, lengths: np.ndarray) -> tuple[np.ndarra
 
 
 def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.ndarray) -> Pose:
-    """Return the pose in which the machine must be, for cold starts: without a guess other than its home."""
+    """Return the only platform pose with these strut lengths that can be the working mode, for a cold start."""
     modes = assembly_modes(structure, lengths)
     if not modes:
         raise UnreachableError("no pose of the machine has these strut lengths", 0)
@@ -78,7 +79,7 @@ def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.nd
 
 
 def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose) -> list[str]:
-    """Return why a pose is not the working mode; empty if it is."""
+    """Return the reasons why a pose cannot be the working mode; empty if it can."""
     limits = geometry.limits
     measured = batch.examine(*structure.joints, geometry.limit_numbers.at, pose.position, pose.rotation)
     broken = {
@@ -106,7 +107,7 @@ def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose)
 
 
 def _nearest_to_home(geometry: HexapodGeometry, structure: Structure, modes: list[Pose]) -> Pose:
-    """Return the mode nearest to home; refuse if the next is almost as near."""
+    """Return the mode nearest to home; raise if the second-nearest mode is within `AMBIGUITY` times its distance."""
 
     def distance(pose: Pose) -> float:
         turn = rotation_angle(geometry.home.rotation.T @ pose.rotation)
@@ -118,15 +119,15 @@ def _nearest_to_home(geometry: HexapodGeometry, structure: Structure, modes: lis
     if others and distance(others[0]) <= AMBIGUITY * least:
         next_least = distance(others[0])
         problem = (
-            f"{len(modes)} poses with these strut lengths could be the working one and two are about as near "
-            f"to home ({least * 1e3:.4g} and {next_least * 1e3:.4g} mm): give a guess"
+            f"{len(modes)} poses with these strut lengths could be the working one, and two of them are at similar "
+            f"distances from home ({least * 1e3:.4g} and {next_least * 1e3:.4g} mm): give a guess"
         )
         raise OtherAssemblyModeError(problem, next_least, AMBIGUITY * least)
     return nearest
 
 
 def _home_side(geometry: HexapodGeometry, structure: Structure) -> tuple[np.ndarray, np.ndarray]:
-    """Return the base joints' centroid, m, and their mean plane's normal towards home; each (3,), ``base``."""
+    """Return the base joints' centroid, m, and the normal of their mean plane towards home; in ``base``, (3,) each."""
     centre = structure.base_joints.mean(axis=0)
     normal = np.linalg.svd(structure.base_joints - centre)[2][2]
     home = geometry.home.position + geometry.home.rotation @ structure.platform_joints.mean(axis=0)

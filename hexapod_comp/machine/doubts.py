@@ -1,4 +1,4 @@
-"""Suspicious entries in a geometry file that are not forbidden: mirrored, turned, swapped, in a wrong unit."""
+"""Warnings about geometry files: a body that looks mirrored or turned, swapped joints, a length in a wrong unit."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from ..core.batch import screw_twists
 if TYPE_CHECKING:
     from .geometry import HexapodGeometry
 
-COINCIDENT = 1e-6  # Bodies whose centres are nearer than this, m, have no definite direction to each other
-# Share of the struts' squared lengths, seen along the machine's axis, that another order of joints must save
+COINCIDENT = 1e-6  # Distance of the bodies' centres, m, below which no axis from base to platform is defined
+# Joints look swapped if another order shortens the sum of squared strut lengths, seen along the axis, by this share
 LEAST_GAIN = 0.01
-MOST_TURN = np.radians(45.0)  # Turn of the platform against the base at home beyond which a question is printed, rad
-USUAL_RADII = (0.01, 5.0)  # Of base and platform, m: outside, a unit may be wrong
+MOST_TURN = np.radians(45.0)  # Rotation of the platform against the base at home above which a warning is printed, rad
+USUAL_RADII = (0.01, 5.0)  # Smallest and largest usual radius of base and platform, m: others suggest a wrong unit
 
 
 def doubts(geometry: HexapodGeometry) -> tuple[str, ...]:
-    """Return suspicious entries, a sentence each, in the terms of geometry files."""
+    """Return warnings about suspicious entries of a geometry, one sentence each, in the words of geometry files."""
     platform = geometry.home.position + geometry.platform_joints @ geometry.home.rotation.T
     remarks = [*joint_doubts(geometry.base_joints, platform)]
     axis = platform.mean(axis=0) - geometry.base_joints.mean(axis=0)
     tool = geometry.home.rotation @ geometry.tool.position
     if tool @ axis < -0.5 * np.linalg.norm(tool) * np.linalg.norm(axis):
         remarks.append(
-            "at home the tool points from the platform to the base: is home mirrored (the sign of its z), or the tool? "
-            "Both homes have the same strut lengths where base and platform are flat"
+            "at home the tool points from the platform to the base: has home's z or the tool's z the wrong sign? With "
+            "a flat base and a flat platform, home and its mirror image have the same strut lengths"
         )
     given = geometry.base_axes is not None or geometry.platform_axes is not None
     if given and not geometry.screw_lead.any():
@@ -38,14 +38,14 @@ def doubts(geometry: HexapodGeometry) -> tuple[str, ...]:
 
 
 def joint_doubts(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
-    """Yield warnings about joint coordinates that look wrong: unusual radius (a wrong unit?) or order of the joints.
+    """Yield warnings about an unusual radius (a wrong unit?) or an unusual order of the joints.
 
-    `base` and `platform` are the joints in ``base`` with the platform at home, shape (6, 3), m.
+    `base` and `platform` are the joints of the two bodies, platform at home, in ``base``, shape (6, 3), m.
     """
     for name, joints in (("base", base), ("platform", platform)):
         radius = float(np.linalg.norm(joints - joints.mean(axis=0), axis=1).max())
         if not USUAL_RADII[0] <= radius <= USUAL_RADII[1]:
-            yield f"{name}.joints lie within {radius * 1e3:g} mm of their middle: is their unit right?"
+            yield f"{name}.joints lie within {radius * 1e3:g} mm of their centre: is their unit right?"
     axis = platform.mean(axis=0) - base.mean(axis=0)
     far = float(np.linalg.norm(axis))
     if far > COINCIDENT:
@@ -53,7 +53,7 @@ def joint_doubts(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
 
 
 def _seen_along(axis: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Return joints about their middle as complex numbers in a plane across an axis, shape (6,), m."""
+    """Return joints projected along an axis, from their centroid, as complex numbers, shape (6,), m."""
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     first /= np.linalg.norm(first)
     around = joints - joints.mean(axis=0)
@@ -61,31 +61,31 @@ def _seen_along(axis: np.ndarray, joints: np.ndarray) -> np.ndarray:
 
 
 def _order(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
-    """Compare the order of the joints of both bodies; complex numbers, m."""
+    """Yield a warning if the joints of the two bodies run in different orders; both as of :func:`_seen_along`."""
     cost = np.abs(base[:, None] - platform) ** 2
     rows, order = linear_sum_assignment(cost)
     now = float(np.trace(cost))
     gains = now - cost[rows, order].sum() > LEAST_GAIN * now
     moved = [i + 1 for i in range(6) if cost[i, order[i]] != cost[i, i]]
-    turn, mirrored = np.vdot(base, platform), base @ platform  # fits of a turn, and of a turn and a reflection
+    turn, mirrored = np.vdot(base, platform), base @ platform  # quality of fit by a turn, and by a mirrored turn
     if gains and len(moved) == 2:
         yield "joints {}, {} of the platform, or of the base, look swapped: the struts cross".format(*moved)
     elif abs(mirrored) > abs(turn):
         yield (
-            "platform joints 1…6 run the other way round than base joints 1…6: is home mirrored (turned over, by 180° "
-            "about x or y), or one body's y reversed?"
+            "platform joints 1…6 go round in the opposite sense to base joints 1…6: is home turned over (by 180° "
+            "about x or y), or is one body's y axis reversed?"
         )
     elif abs(np.angle(turn)) > MOST_TURN:
         yield (
             f"at home the platform is turned by {np.degrees(np.angle(turn)):.0f}° against the base, about the axis "
-            "from base to platform: is home's gamma right, does strut 1 begin at the right joint?"
+            "from base to platform: is home's gamma right, and is joint 1 of both bodies a joint of the same strut?"
         )
     elif gains:
         yield f"joints {', '.join(map(str, moved))} of the platform, or of the base, look swapped: the struts cross"
 
 
 def twist_per_lead(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> float:
-    """Return the largest relative deviation from the lead of the screws that turn with cardan joints."""
+    """Return the largest turn of a screw by its cardan joints at some poses, as a share of a revolution."""
     neutral = np.asarray(geometry.base_cone_axes)
     across = np.cross(neutral, np.eye(3)[np.abs(neutral).argmin(axis=1)])
     across /= np.linalg.norm(across, axis=1)[:, None]

@@ -1,4 +1,4 @@
-"""The error field of Mou & King: polynomials along grid lines, four lines weighted bilinearly."""
+"""The error field of Mou & King: polynomials along grid lines, of which the four around a point are interpolated."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ import numpy as np
 from ..core import Struct
 from ..core.batch import field_at
 from ..errors import ModelError
-from .terms import settle, term
+from .terms import term, validate_terms
 
 COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")  # Order of the six error components
-# Of the components, anywhere on a line, m and rad: the three rotations count as small
+# Largest magnitude of each component on any line, m and rad: the arithmetic takes rotations as small
 LARGEST = np.repeat([0.05, 0.1], 3)
-# The two axes across which the lines along x, y, z are arranged; also the order of their node indices
+# For lines along x, y, z: the two other axes, in the order of the node indices that name a line
 CROSS_AXES = ((1, 2), (0, 2), (0, 1))
 OUTSIDE_POLICIES = ("hold", "refuse")
 
 
 @dataclass(frozen=True)
 class GridField:
-    """Error of the measured point over a box, forward and backward."""
+    """Error of the measured point as a function of its position in a box, for forward and for backward motion."""
 
-    # Increasing nodes along x, y, z in ``base``, m, two at least each; the outermost bound the measured box
+    # Increasing node coordinates along x, y, z in ``base``, m, at least two each; the outer nodes bound the box
     grid: tuple[np.ndarray, np.ndarray, np.ndarray]
-    # Coefficients of the lines along x, y, z, (2, n, m, 6, K): direction (forward, backward), node along each of the
-    # two cross axes, component, power of u, which runs from −1 to 1 over the box; K = 0 where none was measured
+    # Polynomials of the lines along x, y, z, each (2, n, m, 6, K): direction (forward, backward), node on each of the
+    # two cross axes, component, power of u; u runs from −1 to 1 over the box. K = 0: lines along this axis not measured
     lines: tuple[np.ndarray, np.ndarray, np.ndarray]
-    probe: np.ndarray = term("field", "mm", "the measured point, in platform", (3,))
-    outside: str = "hold"  # the value at the boundary of the box, or ``refuse``
-    # Above the motion that the struts' backlash causes along an axis at rest.
+    probe: np.ndarray = term("field", "mm", "the point whose error was measured, in platform", (3,))
+    outside: str = "hold"  # outside the box: ``hold`` the value at the box's boundary, or ``refuse`` the pose
+    # The default is larger than the motion that the struts' backlash causes along an axis at rest
     reversal_threshold: float = term(
-        "field", "um", "way back until an axis' direction counts as reversed", (), 10e-6, least=0.0
+        "field", "um", "motion back after which an axis' direction counts as reversed", (), 10e-6, least=0.0
     )
 
     def __post_init__(self) -> None:
@@ -53,7 +53,7 @@ class GridField:
             raise ModelError("field.outside", f"must be one of {', '.join(OUTSIDE_POLICIES)}", self.outside)
         object.__setattr__(self, "grid", grid)
         object.__setattr__(self, "lines", lines)
-        settle(self)
+        validate_terms(self)
 
     @property
     def box(self) -> np.ndarray:
@@ -61,13 +61,13 @@ class GridField:
         return np.array([[nodes[0] for nodes in self.grid], [nodes[-1] for nodes in self.grid]])
 
     def evaluate(self, position: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the error at a point of ``base``."""
+        """Return the error (6,), m and rad, at a position (3,) in ``base``, m, and whether that is outside the box."""
         error = np.empty(6)
         position = np.array(position, dtype=float)
         return error, bool(field_at(self._struct, position, np.array(sense, dtype=float), error))
 
     def plus(self, error: np.ndarray) -> GridField:
-        """Return the field with an error, shape (6,), added everywhere: to the constants of one family of lines."""
+        """Return the field plus a constant error (6,): added to the constant coefficients of the lines of one axis."""
         axis = next((axis for axis, family in enumerate(self.lines) if family.shape[4]), 0)
         family = self.lines[axis].copy() if self.lines[axis].shape[4] else np.zeros((*self.lines[axis].shape[:4], 1))
         family[..., 0] += error
@@ -82,7 +82,7 @@ class GridField:
         return {name: value for name, value in self.__dict__.items() if name != "_struct"}
 
     def members(self) -> dict[str, Any]:
-        """Return what hc_field holds, by name."""
+        """Return the values of the C struct ``hc_field``, by member name."""
         return {
             "probe": self.probe,
             "node_count": [len(nodes) for nodes in self.grid],

@@ -1,4 +1,4 @@
-"""The nominal machine: the joints' design positions, the limits, its tools, and its file."""
+"""The nominal machine: design positions of its joints, limits, tools, work frames; and the geometry file."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from .load import NOTHING, Payload
 
 # Frames that every machine has: its base, and the default work frame and tool
 BASE, WORK, TOOL = "base", "work", "tool"
-MOST = 100  # Tools, and work frames, of one machine
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # They become ``frame_id`` in messages and links of a URDF
-USUAL_LEAD = 0.01  # m a turn, of ball screws for which the geometry file gives no lead
-TAKEN = re.compile("base|work|platform|tool|world|(platform|strut)_.*")  # What the package calls other frames
+MOST_FRAMES = 100  # Largest number of tools, and of work frames, of one machine
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # A tool's or work frame's: a ``frame_id``, and a link of the URDF
+USUAL_LEAD = 0.01  # Assumed lead of a ball screw, m per turn, if the geometry file gives none
+RESERVED = re.compile("base|work|platform|tool|world|(platform|strut)_.*")  # The package's names of other frames
 
 
 def read_pose(parent: Section, key: str, section: Section | None = None) -> Pose:
-    """Read a pose section: ``position_*`` and the paper's angles ``rotation_*`` (default zero)."""
+    """Read a pose from the section `key`: ``position_UNIT`` and the paper's angles ``rotation_UNIT`` (default 0)."""
     section = parent.section(key) if section is None else section
     position = section.quantity("position", "length", (3,))
     angles = section.quantity("rotation", "angle", (3,), np.zeros(3))
@@ -46,7 +46,7 @@ def read_pose(parent: Section, key: str, section: Section | None = None) -> Pose
 
 
 def read_tool(parent: Section, key: str, payloads: dict[str, Payload]) -> Pose:
-    """Read a tool's pose, and its ``mass_*`` and ``centre_*`` in ``platform`` into the payloads."""
+    """Read and return a tool's pose; add its ``mass_UNIT`` and ``centre_UNIT``, in ``platform``, to the payloads."""
     section = parent.section(key)
     weighs = section.quantity_key("mass", "mass") is not None
     mass = section.quantity("mass", "mass", (), None if weighs else 0.0)
@@ -59,67 +59,67 @@ def read_tool(parent: Section, key: str, payloads: dict[str, Payload]) -> Pose:
 
 
 def read_named_poses(top: Section, key: str, read: Callable[[Section, str], Pose] = read_pose) -> dict[str, Pose]:
-    """Read poses by name, as ``tools`` and ``work_frames`` give them; none where there is no such key."""
+    """Read the named poses of the section ``tools`` or ``work_frames``; a file without the section has none."""
     if key not in top:
         return {}
     section = top.section(key)
-    if len(section.remaining()) > MOST:  # before each is read
-        raise top.error(key, f"must be no more than {MOST}", len(section.remaining()))
+    if len(section.remaining()) > MOST_FRAMES:  # before each is read
+        raise top.error(key, f"must have at most {MOST_FRAMES} entries", len(section.remaining()))
     for name in (BASE, WORK, TOOL):
         if name in section:
-            raise section.error(name, f"is what the machine's own {name} frame is called")
+            raise section.error(name, f"is the name of the machine's own {name} frame: choose another")
     return {name: read(section, name) for name in section.remaining()}
 
 
 def pose_text(pose: Pose) -> str:
-    """Return a pose in mm and degrees, for people."""
+    """Return a pose as text, in mm and degrees."""
     places = ", ".join(number(value * 1e3, 3) for value in pose.position)
     angles = ", ".join(number(math.degrees(value), 4) for value in pose.angles())
     return f"x, y, z {places} mm, alpha, beta, gamma {angles} deg"
 
 
 def refuse_names(tools: Mapping[str, Pose], work_frames: Mapping[str, Pose]) -> None:
-    """Raise if a name is invalid, belongs to another frame, or is given to both a tool and a work frame."""
+    """Raise GeometryError if a name is invalid, reserved, or given to both a tool and a work frame."""
     for key, named, usual in (("tools", tools, (TOOL,)), ("work_frames", work_frames, (BASE, WORK))):
         others = [name for name in named if name not in usual]
-        if len(others) > MOST:
-            raise GeometryError(key, f"must be no more than {MOST}", len(others))
+        if len(others) > MOST_FRAMES:
+            raise GeometryError(key, f"must have at most {MOST_FRAMES} entries", len(others))
         for name in others:
             if not NAME.fullmatch(name):
-                problem = "a name must begin with a letter and have no more than 64 letters, digits and underscores"
+                problem = "a name must begin with a letter and have at most 64 letters, digits and underscores"
                 raise GeometryError(f"{key}.{name}", problem)
-            if TAKEN.fullmatch(name):
-                raise GeometryError(f"{key}.{name}", "is what another frame of the machine is called")
+            if RESERVED.fullmatch(name):
+                raise GeometryError(f"{key}.{name}", "is reserved for another frame of the machine: choose another")
             if name in tools and name in work_frames:
                 raise GeometryError(f"{key}.{name}", "is a tool and a work frame; their names must differ")
 
 
-# Factors by which joints in a wrong unit are too small, and the correct unit
-JOINTS_TIMES = {25.4: "in inches", 1.0 / 25.4: "in mm, not inches", 10.0: "in cm", 1e3: "in m", 1e-3: "in mm, not m"}
+# For joints read in a wrong unit: the factor from the values read to the correct ones, and the correct unit
+UNIT_MIXUPS = {25.4: "in inches", 1.0 / 25.4: "in mm, not inches", 10.0: "in cm", 1e3: "in m", 1e-3: "in mm, not m"}
 GEOMETRY_FORMAT = "hexapod_comp/geometry"
 GEOMETRY_VERSION = 1
-COINCIDENT = 1e-6  # Joints closer than this, m, count as one
-LONGEST_AXIS = 1e9  # Largest component of an axis: only its direction counts, and the square of a huge one overflows
+COINCIDENT = 1e-6  # Joints closer together than this, m, count as one joint
+LONGEST_AXIS = 1e9  # Largest component of an axis vector as given; the square of a larger one could overflow
 
 
 @dataclass(frozen=True)
 class HexapodGeometry:
-    """A general 6-6 hexapod as designed.
+    """The design of a general 6-6 hexapod.
 
     Parameters
     ----------
     name : str
-        Machine name; a model file must carry the same.
+        Machine name; a model file for this machine has the same name.
     base_joints : ndarray, shape (6, 3)
         Joint centres in ``base``, m.
     platform_joints : ndarray, shape (6, 3)
         Joint centres in ``platform``, m.
     home : Pose
-        ``pose_platform_in_base`` at which the machine is known to work; it picks the assembly mode.
+        ``pose_platform_in_base`` of a valid pose; it determines the assembly mode.
     limits : Limits
-        What the machine may do.
+        Limits of the machine.
     base_axes, platform_axes : ndarray, shape (6, 3), optional
-        Unit vectors of the cardan axis fixed to each body, in that body's frame; needed when a lead is given.
+        Directions of the cardan axes fixed to base and platform, in that body's frame; needed with `screw_lead`.
     base_cone_axes, platform_cone_axes : ndarray, shape (6, 3), optional
         Neutral direction of each joint, from base to platform, in its body's frame; the default is the
         strut's direction at home.
@@ -131,16 +131,17 @@ class HexapodGeometry:
     work : Pose, optional
         ``pose_work_in_base`` of the work frame in use.
     tools, work_frames : mapping of str to Pose, optional
-        What else can be used, by name: see :meth:`using`. Afterwards with those in use; ``base`` is a work frame too.
+        Tools and work frames by name, for :meth:`using`. The instance adds the tool and the work frame in use, and
+        ``base`` as a work frame.
     tool_name, work_name : str, optional
-        Of those in use.
+        Names of the tool and the work frame in use.
     payloads : mapping of str to Payload, optional
-        What tools weigh, by their names; the others weigh nothing.
+        Mass and centre of tools, by tool name; a tool without an entry weighs nothing.
 
     Raises
     ------
     GeometryError
-        With key, value and what is allowed.
+        A value is invalid, or home breaks a limit; the message names key, value and what is allowed.
     """
 
     name: str
@@ -161,13 +162,13 @@ class HexapodGeometry:
     work_name: str = WORK
     payloads: Mapping[str, Payload] = field(default_factory=dict)
     home_sign: float = field(init=False)
-    """Sign of det J at home: the other sign is another assembly mode."""
+    """Sign of det J at home; a pose at which det J has the other sign belongs to another assembly mode."""
     kernel_joints: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False)
-    """The joints, for the core: of base and platform."""
+    """`base_joints` and `platform_joints`, as arguments of the core."""
     characteristic_length: float = field(init=False)
-    """RMS radius of the platform joints about their centroid, m; makes the condition number unit-free."""
+    """RMS radius of the platform joints about their centroid, m; makes the condition number free of units."""
     limit_numbers: Struct = field(init=False, repr=False)
-    """The limits, for the core."""
+    """The limits as the C struct ``hc_limits``."""
 
     def __post_init__(self) -> None:
         def put(name: str, value: object) -> None:
@@ -192,7 +193,7 @@ class HexapodGeometry:
         self._check_home(put)
 
     def _fill_axes(self, put: Callable[[str, object], None]) -> None:
-        """Normalise the joint axes and compute missing cone axes from the struts at home."""
+        """Normalise the joint axes; set missing cone axes to the directions of the struts at home."""
         at_home = self.home.position + self.platform_joints @ self.home.rotation.T - self.base_joints
         cones = {"base_cone_axes": at_home, "platform_cone_axes": at_home @ self.home.rotation}
         for name in ("base_axes", "platform_axes", *cones):
@@ -213,20 +214,20 @@ class HexapodGeometry:
 
     @property
     def kernel_axes(self) -> tuple[np.ndarray, np.ndarray]:
-        """The cardan axes of base and platform, zeros where the machine gives none."""
+        """The cardan axes of base and platform, each (6, 3); zeros if the geometry gives none."""
         missing = np.zeros((6, 3))
         base, platform = self.base_axes, self.platform_axes
         return np.array(missing if base is None else base), np.array(missing if platform is None else platform)
 
     def _check_home(self, put: Callable[[str, object], None]) -> None:
-        """Refuse a home pose that breaks a limit of single poses."""
+        """Set the core's limits; raise GeometryError if home breaks a limit that holds for a single pose."""
         pose = (self.home.position, self.home.rotation)
         rows, lengths, judged = (pose[0][None], pose[1][None]), np.empty((1, 6)), (np.empty(1), np.empty(1))
         batch.strut_lengths(*self.kernel_joints, *rows, lengths)
         batch.conditions(*self.kernel_joints, *rows, self.characteristic_length, *judged)
         put("home_sign", float(judged[1][0]))
         cone_axes, joints = np.array([self.base_cone_axes, self.platform_cone_axes]), self.platform_joints
-        # The distance of struts that share a joint cannot be limited.
+        # Pairs of struts whose clearance is checked: struts that share a platform joint always touch there
         apart = (~coincident(joints)).astype(float)
         given = ("stroke", "cone_cosines", "condition", "correction", "step", "clearance", "speed", "acceleration")
         values = {name: getattr(self.limits, name) for name in given}
@@ -241,9 +242,9 @@ class HexapodGeometry:
             raise GeometryError("home", "; ".join([f"breaks a limit: {refusal}", *doubts]))
 
     def _unit_doubts(self) -> Iterator[str]:
-        """Yield that the joints' unit may be wrong, if home would be valid with joints in another unit."""
+        """Yield a warning if home would keep stroke and condition limits with the joints in another unit."""
         fitting = []
-        for factor, what in JOINTS_TIMES.items():
+        for factor, what in UNIT_MIXUPS.items():
             base, platform = (np.ascontiguousarray(joints * factor) for joints in self.kernel_joints)
             rows, lengths = (self.home.position[None], self.home.rotation[None]), np.empty((1, 6))
             conditions = np.empty(1), np.empty(1)
@@ -253,12 +254,12 @@ class HexapodGeometry:
             if (lengths >= low).all() and (lengths <= high).all() and conditions[0][0] <= self.limits.condition:
                 fitting.append(what)
         if fitting:
-            yield f"do the units fit? With the joints {' or '.join(fitting)}, home is within stroke and condition"
+            yield f"is the joints' unit right? With joints {' or '.join(fitting)}, home keeps stroke and condition"
 
     def refusal(
         self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray
     ) -> LimitError | KinematicsError | None:
-        """Return why the nominal machine may not be in a platform pose, by its strut lengths; None if it may."""
+        """Return the limit that a platform pose with these strut lengths, (6,), m, breaks; None if it breaks none."""
         outcome = check_stage(*self.kernel_joints, position, rotation, lengths, limits=self.limit_numbers)
         finding, strut, value, _, _ = outcome
         return None if finding == Status.OK else self.limits.error(finding, strut, 0, value)
@@ -269,9 +270,9 @@ class HexapodGeometry:
         Raises
         ------
         FrameError
-            There is none of that name; lists those that there are.
+            The machine has no tool or work frame of that name; the message lists the names that it has.
         """
-        other = copy.copy(self)  # nothing else is recomputed, so that nothing else changes by a bit
+        other = copy.copy(self)  # without recomputing anything, so that no other number changes by rounding
         for kind, name, named in (("tool", tool, self.tools), ("work", work, self.work_frames)):
             if name is None:
                 continue
@@ -283,17 +284,17 @@ class HexapodGeometry:
         return other
 
     def carrying(self, payload: Payload) -> HexapodGeometry:
-        """Return the same machine with another payload of the tool in use."""
+        """Return the same machine with `payload` as mass and centre of the tool in use."""
         other = copy.copy(self)
         object.__setattr__(other, "payloads", {**self.payloads, self.tool_name: payload})
         return other
 
     def platform_pose(self, tool_pose: Pose) -> Pose:
-        """Return the ``pose_platform_in_base`` that belongs to a ``pose_tool_in_work``."""
+        """Return the ``pose_platform_in_base`` at which the tool is at a ``pose_tool_in_work``."""
         return self.work @ tool_pose @ self.tool.inverse()
 
     def tool_pose(self, platform_pose: Pose) -> Pose:
-        """Return the ``pose_tool_in_work`` that belongs to a ``pose_platform_in_base``."""
+        """Return the ``pose_tool_in_work`` of the tool when the platform is at a ``pose_platform_in_base``."""
         return self.work.inverse() @ platform_pose @ self.tool
 
     def platform_poses(self, positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -309,7 +310,7 @@ class HexapodGeometry:
 
 
 def paper_joints(a: float, b: float, d: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the joints of the paper's 6-3 machine from its three dimensions."""
+    """Return base and platform joints, (6, 3), of the paper's 6-3 machine with platform side a, base sides b, d, m."""
     for key, value in (("a", a), ("b", b), ("d", d)):
         if not (np.isfinite(value) and value > 0.0):
             raise GeometryError(key, "must be finite and positive, m", value)
@@ -330,7 +331,7 @@ def load_geometry(path: str | Path) -> HexapodGeometry:
     Parameters
     ----------
     path : str or Path
-        YAML file, or the name of a shipped one: ``paper``.
+        YAML file, or the name of a shipped geometry: ``paper``.
 
     Returns
     -------
@@ -339,14 +340,14 @@ def load_geometry(path: str | Path) -> HexapodGeometry:
     Raises
     ------
     InputFileError
-        Naming file, key and value.
+        The file cannot be used; the message names file, key and value.
     """
     file = input_file(path, "geometry")
     return parse_geometry(read_text(file), file)
 
 
 def parse_geometry(text: str, name: str | Path = "geometry") -> HexapodGeometry:
-    """Return the machine of a geometry file's text; `name` is what messages call the file."""
+    """Return the machine in the text of a geometry file; messages call the file `name`."""
     top = parse_yaml(text, name, GEOMETRY_FORMAT, GEOMETRY_VERSION)
     machine = top.text("machine")
     base, platform, axes = _read_joints(top)
@@ -372,7 +373,7 @@ def parse_geometry(text: str, name: str | Path = "geometry") -> HexapodGeometry:
 
 
 def _read_joints(top: Section) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Return base joints, platform joints and the axes given by the file."""
+    """Return base joints, platform joints, and the cardan and cone axes that the file gives, by field name."""
     axes: dict[str, np.ndarray] = {}
     joints = {}
     if "paper_dimensions" in top:
@@ -397,16 +398,17 @@ def _read_joints(top: Section) -> tuple[np.ndarray, np.ndarray, dict[str, np.nda
 
 
 def coincident(joints: np.ndarray) -> np.ndarray:
-    """Return which joints (6, 3) are at the same place, each with itself too, shape (6, 6)."""
+    """Return the mask (6, 6) of pairs of joints (6, 3) at the same place; True on the diagonal."""
     return np.linalg.norm(joints[:, None] - joints, axis=2) <= COINCIDENT
 
 
 def first_of_same(joints: np.ndarray) -> np.ndarray:
-    """Return, for each joint, the index of the first one at the same place, shape (6,)."""
+    """Return, for each of six joints (6, 3), the index of the first joint at the same place, shape (6,)."""
     return coincident(joints).argmax(axis=1)
 
 
 def _unit_vectors(values: object, key: str) -> np.ndarray:
+    """Return six vectors normalised, read-only; raise GeometryError on a zero, huge or invalid vector."""
     vectors = frozen_array(values, (6, 3), key)
     largest = np.abs(vectors).max(axis=1, keepdims=True)
     if largest.max() > LONGEST_AXIS:

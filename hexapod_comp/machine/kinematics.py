@@ -1,4 +1,4 @@
-"""Kinematics of the ideal and of the imperfect structure: strut lengths, Jacobian, forward solution."""
+"""Inverse and forward kinematics and Jacobian, of the nominal structure or of one with displaced joints."""
 
 from __future__ import annotations
 
@@ -25,32 +25,31 @@ from ..errors import (
 from ..pose import Pose, rotation_from_vector
 from .geometry import STRUT_NAMES, HexapodGeometry
 
-# Work of the calling thread, s, before others join: they take 0.1 ms to start, and some ms to end on busy cores
+# Time, s, that the calling thread computes before it starts others: they take 0.1 ms to start, and some ms to end
 ALONE = 0.01
-# Work on a slice of a batch, s: long compared with fetching the next one, short compared with waiting for the last one
-SLICE = 1e-3
-FIRST_SLICE = 256  # Poses in a batch's first slice; each next has twice as many until one takes this time
+SLICE = 1e-3  # Wanted computing time of one slice of a batch, s; threads fetch one slice after the other
+FIRST_SLICE = 256  # Poses in a batch's first slice; slices double in size until one takes half of `SLICE`
 
 
 @dataclass(frozen=True)
 class Structure:
-    """Places of the twelve joints: the nominal machine's, or the real one's."""
+    """Positions of the twelve joints of the nominal or of the real machine, with the criteria of a solution."""
 
-    base_joints: np.ndarray  # (6, 3): joint centres in ``base`` and in ``platform``, m
-    platform_joints: np.ndarray  # (6, 3)
-    characteristic_length: float  # Length that makes the condition number unit-free, m
-    home_sign: float  # Sign of det J in the working assembly mode
-    max_condition: float  # Largest condition number accepted as a solution
-    home: Pose  # ``pose_platform_in_base`` from which the search for poses starts if there is no better guess
+    base_joints: np.ndarray  # (6, 3): joint centres in ``base``, m
+    platform_joints: np.ndarray  # (6, 3): joint centres in ``platform``, m
+    characteristic_length: float  # m; makes the condition number free of units
+    home_sign: float  # sign of det J in the working assembly mode; 0: a solution of either sign is accepted
+    max_condition: float  # largest condition number of an accepted solution
+    home: Pose  # ``pose_platform_in_base`` from which forward kinematics starts without a guess
 
     @property
     def joints(self) -> tuple[np.ndarray, np.ndarray]:
-        """Base and platform joints, for the core."""
+        """Base and platform joints, as arguments of the core."""
         return self.base_joints, self.platform_joints
 
     @property
     def solver(self) -> tuple[float, float, float]:
-        """Criteria of the forward solution, for the core."""
+        """Criteria of a forward solution, as arguments of the core."""
         return self.characteristic_length, self.home_sign, self.max_condition
 
     @staticmethod
@@ -74,28 +73,28 @@ class Structure:
         )
 
 
-# A machine, or a structure such as :attr:`RealMachine.structure`, whose kinematics are computed
+# What the functions below accept: a geometry, or a structure such as :attr:`RealMachine.structure`
 Machine: TypeAlias = "HexapodGeometry | Structure"
 
 
 def structure_of(machine: Machine) -> Structure:
-    """Return a machine's structure."""
+    """Return the nominal structure of a geometry; a structure is returned unchanged."""
     return machine if isinstance(machine, Structure) else Structure.of(machine)
 
 
 @dataclass(frozen=True)
 class ForwardBatch:
-    """Result of :func:`solve_poses`; rows that failed hold NaN."""
+    """Result of :func:`solve_poses`; poses of rows without a solution are NaN."""
 
-    positions: np.ndarray  # (N, 3): platform poses in ``base``, m
-    rotations: np.ndarray  # (N, 3, 3): platform poses in ``base``, m
+    positions: np.ndarray  # (N, 3): platform positions in ``base``, m
+    rotations: np.ndarray  # (N, 3, 3): platform rotations in ``base``
     outcomes: np.ndarray  # (N,): :class:`~hexapod_comp.core.Status`: ``OK``, or the reason of failure
-    iterations: np.ndarray  # (N,): Newton steps
+    iterations: np.ndarray  # (N,): number of Newton steps
     conditions: np.ndarray  # (N,): condition numbers
 
     @property
     def ok(self) -> np.ndarray:
-        """Boolean mask of the rows that have a solution."""
+        """Mask of the rows that have a solution, shape (N,)."""
         return self.outcomes == Status.OK
 
 
@@ -122,7 +121,7 @@ def strut_lengths(machine: Machine, pose: Pose) -> np.ndarray:
 def strut_lengths_batch(
     structure: Structure, positions: np.ndarray, rotations: np.ndarray, threads: int | None = None
 ) -> np.ndarray:
-    """Return the strut lengths at N poses, shape (N, 6), m, using all cores."""
+    """Return the strut lengths at N platform poses, shape (N, 6), m, computed by `threads`, by default all cores."""
     positions, rotations = batch_poses(positions, rotations)
     lengths = np.empty((len(positions), 6))
 
@@ -139,7 +138,7 @@ def strut_lengths_batch(
 
 
 def jacobian(machine: Machine, pose: Pose) -> np.ndarray:
-    """Return ∂L/∂(v, ω) at a pose: strut speeds per platform twist expressed in ``base``.
+    """Return the Jacobian at a platform pose: strut speeds per platform twist (v, ω) expressed in ``base``.
 
     Returns
     -------
@@ -150,7 +149,7 @@ def jacobian(machine: Machine, pose: Pose) -> np.ndarray:
 
 
 def jacobian_batch(structure: Structure, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Return :func:`jacobian` at N poses, shape (N, 6, 6); NaN where a pose is."""
+    """Return :func:`jacobian` at N platform poses, shape (N, 6, 6); NaN for a pose that is NaN."""
     positions, rotations = batch_poses(positions, rotations)
     matrices = np.empty((len(positions), 6, 6))
     batch.jacobians(*structure.joints, positions, rotations, matrices)
@@ -158,7 +157,7 @@ def jacobian_batch(structure: Structure, positions: np.ndarray, rotations: np.nd
 
 
 def condition_number(machine: Machine, pose: Pose) -> tuple[float, float]:
-    """Return (condition number, sign of det J) at a pose."""
+    """Return condition number and sign of det J at a platform pose; lengths count in characteristic lengths."""
     structure = structure_of(machine)
     number, sign = np.empty(1), np.empty(1)
     given = *structure.joints, pose.position[None], pose.rotation[None], structure.characteristic_length
@@ -169,9 +168,9 @@ def condition_number(machine: Machine, pose: Pose) -> tuple[float, float]:
 def solve_pose(machine: Machine, lengths: ArrayLike, guess: Pose | None = None) -> Pose:
     """Return the pose at which the machine has these strut lengths (forward kinematics).
 
-    Newton on the six loop closures with the analytic Jacobian and a multiplicative rotation update. The
-    answer is certified: loops closed to rounding, condition number within the limit, det J of the working
-    assembly mode's sign.
+    Newton's method solves the six loop closures, with the analytic Jacobian and a multiplicative rotation update.
+    A returned pose was checked: its loops are closed to rounding, its condition number is within the limit, and
+    det J has the sign of the working assembly mode.
 
     Parameters
     ----------
@@ -180,7 +179,7 @@ def solve_pose(machine: Machine, lengths: ArrayLike, guess: Pose | None = None) 
     lengths : array_like, shape (6,)
         Strut lengths, m.
     guess : Pose, optional
-        ``pose_platform_in_base`` to start from, usually the last pose; home by default.
+        ``pose_platform_in_base`` from which Newton starts, usually the last pose; home by default.
 
     Returns
     -------
@@ -190,7 +189,7 @@ def solve_pose(machine: Machine, lengths: ArrayLike, guess: Pose | None = None) 
     Raises
     ------
     NotFiniteError, UnreachableError, SingularError, NotConvergedError, OtherAssemblyModeError
-        Each says what was found and what is allowed.
+        No such pose was found; the message names the value found and what is allowed.
     """
     structure, lengths = structure_of(machine), six_lengths(lengths)
     guess = structure.home if guess is None else guess
@@ -207,7 +206,7 @@ def solve_pose(machine: Machine, lengths: ArrayLike, guess: Pose | None = None) 
 def solve_poses(
     structure: Structure, lengths: np.ndarray, guess: Pose | tuple[np.ndarray, np.ndarray], threads: int | None = None
 ) -> ForwardBatch:
-    """Solve the forward kinematics of N sets of lengths, on all cores."""
+    """Return the poses of N sets of strut lengths (N, 6), m, from a guess for all or one guess for each."""
     lengths = np.ascontiguousarray(lengths, dtype=float)
     if lengths.ndim != 2 or lengths.shape[1] != 6:
         raise KinematicsError(f"lengths must have shape (N, 6), not {lengths.shape}", lengths.shape)
@@ -237,12 +236,12 @@ def solve_poses(
 
 
 def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = None, first: int = FIRST_SLICE) -> None:
-    """Call `run` on slices that cover ``range(count)``; for functions without the GIL."""
+    """Call `run` on slices that cover ``range(count)``, in threads if that saves time; `run` releases the GIL."""
     workers = threads or len(os.sched_getaffinity(0))
     size, done, took, began = first, 0, 0.0, time.thread_time()
     while done < count:
         if workers > 1 and took > ALONE and took * (count - done) > ALONE * done:
-            _share([slice(k, min(k + size, count)) for k in range(done, count, size)], run, workers)
+            _run_in_threads([slice(k, min(k + size, count)) for k in range(done, count, size)], run, workers)
             return
         stop = min(done + size, count)
         run(slice(done, stop))
@@ -250,8 +249,8 @@ def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = 
         done, size = stop, size * 2 if took - before < 0.5 * SLICE else size
 
 
-def _share(slices: list[slice], run: Callable[[slice], None], workers: int) -> None:
-    """Work on slices together with other threads; the first error ends the work and is raised."""
+def _run_in_threads(slices: list[slice], run: Callable[[slice], None], workers: int) -> None:
+    """Call `run` on slices in this and other threads; after an error start no further slice, and raise it."""
     left = iter(slices)
 
     def work() -> None:
@@ -270,24 +269,24 @@ def _share(slices: list[slice], run: Callable[[slice], None], workers: int) -> N
 
 
 def forward_error(outcome: int, condition: float, max_condition: float) -> KinematicsError:
-    """Return the error for an outcome of the core other than OK."""
+    """Return the exception for a status of the core's forward kinematics other than OK."""
     if outcome == Status.NOT_FINITE:
         return NotFiniteError("strut lengths and guess must be finite, lengths above 0")
     if outcome == Status.UNREACHABLE:
-        return UnreachableError("no pose has these strut lengths: two struts cannot meet their joints")
+        return UnreachableError("no pose has these strut lengths: two struts cannot both reach their platform joints")
     if outcome == Status.SINGULAR:
-        problem = f"the machine is singular there: condition number {condition:.4g}, allowed {max_condition:.4g}"
+        problem = f"the machine is near a singularity: condition number {condition:.4g}, allowed {max_condition:.4g}"
         return SingularError(problem, condition, max_condition)
     if outcome == Status.OTHER_ASSEMBLY:
         return OtherAssemblyModeError("the pose found from this guess belongs to another assembly mode")
-    problem = f"Newton did not settle within {MOST_ITERATIONS} steps; give a guess nearer to the pose"
+    problem = f"Newton did not converge within {MOST_ITERATIONS} steps; give a guess nearer to the pose"
     return NotConvergedError(problem, limit=MOST_ITERATIONS)
 
 
 def solve_one(
     structure: Structure, lengths: np.ndarray, position: np.ndarray, rotation: np.ndarray
 ) -> tuple[int, float]:
-    """Solve from a guess, which a solution overwrites; return (outcome, condition number)."""
+    """Solve for one pose; position and rotation hold the guess, then the solution. Return (status, condition)."""
     outcome, steps, condition = np.empty(1, np.intc), np.empty(1, np.intc), np.empty(1)
     given = lengths[None], position[None], rotation[None]
     batch.solve_poses(*structure.joints, *given, *structure.solver, outcome, steps, condition)
@@ -295,7 +294,7 @@ def solve_one(
 
 
 def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose near `guess` whose lengths are closest to the given ones."""
+    """Return position and rotation near `guess` with these strut lengths, by least squares; raise if there are none."""
 
     from scipy.optimize import least_squares  # 39 MB that a running node does not need
 
@@ -311,18 +310,19 @@ def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tup
 
     first = misfit(np.zeros(6))
     if not np.isfinite(first @ first):
-        raise NotConvergedError(f"the guess {guess.position.tolist()} m is too far away to start from")
+        raise NotConvergedError(f"the guess at {guess.position.tolist()} m gives strut lengths that are not finite")
 
     fit = least_squares(misfit, np.zeros(6), xtol=1e-12, ftol=1e-12, gtol=1e-12, max_nfev=200)
     rest = float(np.abs(fit.fun).max())
     if rest > 1e-6:
         raise UnreachableError(
-            f"no pose near the guess has these strut lengths: the closest one leaves {rest * 1e3:.4g} mm", rest
+            f"no pose near the guess has these strut lengths: the best one misses a length by {rest * 1e3:.4g} mm", rest
         )
     return pose_at(fit.x)
 
 
 def six_lengths(lengths: ArrayLike) -> np.ndarray:
+    """Return six strut lengths as an array; raise on another shape or a length that is not finite and above 0."""
     lengths = np.ascontiguousarray(lengths, dtype=float)
     if lengths.shape != (6,):
         raise KinematicsError(f"six strut lengths are needed, not shape {lengths.shape}", lengths.shape)
@@ -333,7 +333,7 @@ def six_lengths(lengths: ArrayLike) -> np.ndarray:
 
 
 def batch_poses(positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return poses for the core: contiguous; a single rotation (3, 3) is repeated."""
+    """Return positions and rotations as contiguous arrays for the core; one rotation (3, 3) is used for all poses."""
     positions, rotations = np.ascontiguousarray(positions, dtype=float), np.asarray(rotations, dtype=float)
     if rotations.shape == (3, 3):
         rotations = np.broadcast_to(rotations, (len(positions), 3, 3))

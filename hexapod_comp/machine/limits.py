@@ -1,4 +1,4 @@
-"""The machine's limits, checked on nominal and on compensated values; a breach refuses, nothing is clamped."""
+"""The machine's limits, checked on nominal and on compensated values; a command beyond one is refused, not clamped."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from ..core import Status, ffi, lib
 from ..errors import GeometryError, KinematicsError, LimitError, NotFiniteError, TooEarlyError
 from ..formats.schema import PAIRS_PER_STRUT, PER_STRUT, Numbers
 
-STRUT_NAMES = tuple(f"strut_{i}" for i in range(1, 7))  # Names of the six struts, in order, for messages
-# Names of the findings, by their number, as counted in diagnostics
+STRUT_NAMES = tuple(f"strut_{i}" for i in range(1, 7))  # Names of the six struts, in the geometry file's order
+# Names of the core's statuses, by their number; diagnostics count refused commands by these names
 REASONS = tuple(ffi.string(lib.hc_reason(status)).decode() for status in range(Status.ACCELERATION + 1))
 STAGES = ("nominal", "compensated")
 TINY = np.finfo(float).tiny
@@ -21,14 +21,14 @@ TINY = np.finfo(float).tiny
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of the machine; a breach is refused, nothing is clamped.
+    """Limits of the machine; a command beyond a limit is refused, never clamped.
 
     Parameters
     ----------
     stroke : ndarray, shape (6, 2)
         Shortest and longest strut length, m.
     base_cone, platform_cone : ndarray, shape (6,)
-        Largest angle of each strut to the joint's neutral direction, rad.
+        Largest angle between each strut and its joint's neutral direction, rad.
     condition : float
         Largest condition number of the Jacobian (see :func:`hexapod_comp.machine.kinematics.condition_number`).
     correction : float
@@ -40,10 +40,10 @@ class Limits:
     clearance : float, optional
         Smallest distance between the axes of two struts, m; 0: not limited. Struts that share a joint do not count.
     acceleration : float, optional
-        Largest strut acceleration, m/s²; 0: not limited. Of the speed smoothed over
-        the core's SMOOTHED_OVER, 20 ms.
+        Largest strut acceleration, m/s²; 0: not limited. The acceleration is that of the strut speed after
+        smoothing over 20 ms (SMOOTHED_OVER in the core).
     jerk : float, optional
-        Largest strut jerk of planned motions, m/s³; 0: not limited. Commands are not checked against it.
+        Largest strut jerk of planned motions, m/s³; 0: not limited. The jerk of commands is not checked.
     """
 
     stroke: Annotated[np.ndarray, Numbers("mm", PAIRS_PER_STRUT)]
@@ -57,8 +57,7 @@ class Limits:
     acceleration: Annotated[float, Numbers("mm_s2")] = 0.0
     jerk: Annotated[float, Numbers("mm_s3")] = 0.0
     cone_cosines: np.ndarray = field(init=False, repr=False)
-    """Cosines of the cones' angles, at the base and at the platform, shape (2, 6), for the comparison with measured
-    angles."""
+    """Cosines of `base_cone` and `platform_cone`, shape (2, 6)."""
 
     def __post_init__(self) -> None:
         for name, shape in (("stroke", (6, 2)), ("base_cone", (6,)), ("platform_cone", (6,))):
@@ -81,10 +80,10 @@ class Limits:
         object.__setattr__(self, "cone_cosines", np.cos(np.array([self.base_cone, self.platform_cone])))
 
     def margins(self, quantities: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Return the margin of each limit of single poses, and the values, by the limit's name."""
+        """Return, by the limit's name, margins (negative: broken) and values; `quantities` come from batch.examine."""
         angles, condition = np.arccos(np.clip(quantities["cosines"], -1.0, 1.0)), quantities["condition"][..., None]
         cones = np.array([self.base_cone, self.platform_cone]) - angles
-        # An angle rounds where its cosine does not: the cosine decides on which side of its limit it is.
+        # arccos rounds: the cosines alone decide on which side of its limit an angle is, as in the core
         cones = np.where(quantities["cosines"] >= self.cone_cosines, np.maximum(cones, 0.0), np.minimum(cones, -TINY))
         stroke = np.minimum(quantities["lengths"] - self.stroke[:, 0], self.stroke[:, 1] - quantities["lengths"])
         margins = {
@@ -98,14 +97,14 @@ class Limits:
         return margins
 
     def error(self, code: int, strut: int, stage: int, value: float) -> LimitError | KinematicsError:
-        """Return the error for a finding: which limit, which strut, found and allowed value with units."""
+        """Return the error for a status of the core; the message names limit, strut, found and allowed value."""
         which, name, mm = STAGES[stage], STRUT_NAMES[strut] if strut >= 0 else "", value * 1e3
         low, high = self.stroke[strut]
         allowed = 0.0
         if code == Status.NOT_FINITE:
-            return NotFiniteError(f"the {which} values at this pose are not finite")
+            return NotFiniteError(f"the {which} strut lengths at this pose are not finite")
         if code == Status.EARLY:
-            text = f"{name} cannot be there yet: {mm:.3g} ms too early for {self.speed * 1e3:g} mm/s"
+            text = f"{name} cannot be there yet: the command is {mm:.3g} ms too early for {self.speed * 1e3:g} mm/s"
             return TooEarlyError(text, value, self.speed, strut)
         if code in (Status.STROKE_SHORT, Status.STROKE_LONG):
             allowed = low if value < low else high
@@ -137,7 +136,7 @@ class Limits:
 
 
 def frozen_array(values: object, shape: tuple[int, ...], key: str) -> np.ndarray:
-    """Return a private read-only float copy of the given shape."""
+    """Return a read-only float copy of an array; raise GeometryError on another shape or a number not finite."""
     array = np.array(values, dtype=float, order="C")
     if array.shape != shape:
         raise GeometryError(key, f"must have shape {shape}, not {array.shape}")

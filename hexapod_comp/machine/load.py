@@ -1,4 +1,4 @@
-"""The load on the machine: the struts' stiffness, weights of platform and tool, gravity, other forces."""
+"""Loads on the machine (weight of platform and tool, gravity, other forces) and the stiffness of the struts."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from numpy.typing import ArrayLike
 
 from ..errors import FrameError, ModelError, shorten
 from ..formats.schema import PER_STRUT
-from .terms import settle, term
+from .terms import term, validate_terms
 
 if TYPE_CHECKING:
     from .geometry import HexapodGeometry
 
 STANDARD_GRAVITY = 9.80665  # m/s²
 DOWN = (0.0, 0.0, -STANDARD_GRAVITY)
-EARTH = (9.0, 10.6)  # Range of gravity on Earth as an accelerometer reads it, m/s²: other values are in another unit
-LARGEST_GRAVITY = 100.0  # m/s², of a virtual plant
-LEAST_STIFFNESS = 1e5  # N/m: machine tools have no softer struts; a smaller number is most likely in another unit
-LARGEST_MASS = 1e5  # kg
-MOST_LOADS = 50  # loads of a model's measurement listed in its file
-# kg, or a share; rad: differences up to which loads count as the same
+EARTH = (9.0, 10.6)  # Range of gravity on Earth as accelerometers read it, m/s²; another value has another unit
+LARGEST_GRAVITY = 100.0  # Largest gravity of a virtual plant, m/s²
+LEAST_STIFFNESS = 1e5  # Smallest stiffness of a strut, N/m; a smaller number is most likely in another unit
+LARGEST_MASS = 1e5  # Largest mass of a tool or platform, kg
+MOST_LOADS = 50  # Largest number of measured loads in a model file
+# Differences up to which two loads count as the same: of mass in kg, or as a share of the mass; of gravity in rad
 TOLERATED_MASS, TOLERATED_TILT = (0.5, 0.05), math.radians(5.0)
 
 
 @dataclass(frozen=True)
 class Payload:
-    """Mass of a tool."""
+    """Mass and centre of mass of a tool."""
 
     mass: float = 0.0  # kg
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of mass, in ``platform``, m
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # centre of mass in ``platform``, m
 
     def __post_init__(self) -> None:
         centre = tuple(float(value) for value in self.centre)
@@ -52,9 +52,10 @@ NOTHING = Payload()
 
 
 def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Sequence[float]) -> str:
-    """Return how a load differs from those of a model's measurement, as text; empty if it does not, or none is known.
+    """Return, as text, how a load differs from the loads at which a model was measured; empty if it does not.
 
-    The model also holds between measured directions of gravity: half of their largest gap is allowed.
+    Between measured directions of gravity the model holds too: half of the largest gap between them is allowed.
+    Without known `loads` nothing is compared.
     """
     if not loads:
         return ""
@@ -75,35 +76,35 @@ def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Se
 
 
 def check_gravity(key: str, vector: ArrayLike) -> tuple[float, float, float]:
-    """Return gravity as three numbers, m/s²; a ModelError if its size is not Earth's."""
+    """Return gravity as three floats, m/s²; raise ModelError if its magnitude is outside `EARTH`."""
     g = np.array(vector, dtype=float)
     if g.shape != (3,) or not EARTH[0] <= np.linalg.norm(g) <= EARTH[1]:
-        allowed = "three numbers, {:g}…{:g} m/s² in all".format(*EARTH)
+        allowed = "three numbers of magnitude {:g}…{:g} m/s²".format(*EARTH)
         raise ModelError(key, f"must be {allowed}; is the unit right?", g.tolist())
     return float(g[0]), float(g[1]), float(g[2])
 
 
 class Loading(NamedTuple):
-    """Loads on a machine beside its own weight and the tool's."""
+    """Gravity, and a force and torque that act on the platform in addition to weight."""
 
-    gravity: tuple[float, float, float] | None = None  # in ``base``, m/s²; None: the model's
-    wrench: tuple[float, ...] = (0.0,) * 6  # force, N, and torque about platform's origin, N m, in ``platform``
+    gravity: tuple[float, float, float] | None = None  # in ``base``, m/s²; None: the model's gravity
+    wrench: tuple[float, ...] = (0.0,) * 6  # force, N, and torque about the origin of ``platform``, N m, in it
 
     @classmethod
     def of(cls, gravity: ArrayLike | None = None, wrench: ArrayLike | None = None) -> Loading:
-        """Return a loading of a caller's numbers, or a ModelError about invalid ones."""
+        """Return a loading of gravity, m/s², and wrench, N and N m; raise ModelError on invalid numbers."""
         w = np.zeros(6) if wrench is None else np.array(wrench, dtype=float)
         if w.shape != (6,) or not np.isfinite(w).all():
             raise ModelError("wrench", "must be six finite numbers: force, N, and torque, N m", w.tolist())
         return cls(None if gravity is None else check_gravity("gravity", gravity), tuple(w.tolist()))
 
     def numbers(self) -> list[float | None]:
-        """Return nine numbers, gravity before the wrench, None if gravity is not known."""
+        """Return nine numbers: gravity, force, torque; gravity that is not known gives three times None."""
         return [*(self.gravity or (None,) * 3), *self.wrench]
 
     @classmethod
     def from_numbers(cls, numbers: Sequence[float | None]) -> Loading:
-        """Return the loading of :meth:`numbers`."""
+        """Return the loading that the nine numbers of :meth:`numbers` describe."""
         given = list(numbers)
         if len(given) != 9:
             raise ModelError("loading", "must be nine numbers: gravity, force and torque", given)
@@ -111,13 +112,13 @@ class Loading(NamedTuple):
         return cls.of(None if given[0] is None else values[:3], values[3:])
 
 
-FREE = Loading()  # No load is known
+FREE = Loading()  # The model's gravity, and no other force
 
 
 def wrench_on_platform(
     geometry: HexapodGeometry, frame: str, force: np.ndarray, torque: np.ndarray
 ) -> tuple[float, ...]:
-    """Return the wrench on the platform of force, N, and torque, N·m, in ``platform`` or in the tool in use."""
+    """Return the wrench about the platform's origin of a force, N, and a torque, N m, in ``platform`` or the tool."""
     if frame not in ("platform", geometry.tool_name):
         raise FrameError(f"wrench: frame_id must be platform or {geometry.tool_name}, not {shorten(frame)}")
     if frame == geometry.tool_name:
@@ -127,45 +128,36 @@ def wrench_on_platform(
 
 
 def reciprocal(values: np.ndarray) -> np.ndarray:
-    """Return compliances, m/N, of stiffnesses, N/m, or the other way round; 0, rigid, stays 0."""
+    """Convert stiffnesses, N/m, to compliances, m/N, or back; 0, which means rigid in both, stays 0."""
     return np.divide(1.0, values, out=np.zeros(6), where=values > 0.0)
 
 
 @dataclass(frozen=True)
 class Load:
-    """The struts' stretch under load; joints and strut errors of the other terms are those of the unloaded machine."""
+    """How the struts stretch under load; all other terms of a model describe the machine without load."""
 
     stiffness: np.ndarray = term(
-        "load", "N_per_um", "of a strut with both joints along its axis; 0: rigid", PER_STRUT, least=0.0, largest=1e12
+        "load", "N_per_um", "axial stiffness of a strut with both joints; 0: rigid", PER_STRUT, least=0.0, largest=1e12
     )
     lost_motion: np.ndarray = term(
-        "load", "um", "how much longer a strut is when pulled than when pushed", PER_STRUT, largest=1e-3
+        "load", "um", "length of a strut when pulled minus length when pushed", PER_STRUT, largest=1e-3
     )
     take_up: float = term(
-        "load", "N", "force that takes the lost motion up; below it in proportion", (), 1.0, least=1e-3, largest=1e6
+        "load", "N", "force above which a strut has all of its lost motion", (), 1.0, least=1e-3, largest=1e6
     )
     mass: float = term(
-        "load",
-        "kg",
-        "of the platform without tools, and of the struts' upper halves",
-        (),
-        largest=LARGEST_MASS,
-        least=0.0,
+        "load", "kg", "mass of platform and upper strut halves, without tools", (), largest=LARGEST_MASS, least=0.0
     )
-    centre: np.ndarray = term("load", "mm", "its centre of mass in `platform`", (3,), largest=100.0)
+    centre: np.ndarray = term("load", "mm", "centre of that mass, in `platform`", (3,), largest=100.0)
     gravity: np.ndarray = term(
-        "load", "m_s2", "in `base`, if no other is given", (3,), np.array(DOWN), largest=EARTH[1]
+        "load", "m_s2", "gravity in `base`, unless another is given", (3,), np.array(DOWN), largest=EARTH[1]
     )
     friction: np.ndarray = term(
-        "load",
-        "N_m",
-        "torque of each bearing of a strut against its turning",
-        PER_STRUT,
-        largest=1e3,
+        "load", "N_m", "friction torque of each of a strut's joint bearings", PER_STRUT, largest=1e3
     )
 
     def __post_init__(self) -> None:
-        settle(self)
+        validate_terms(self)
         soft = (self.stiffness > 0.0) & (self.stiffness < LEAST_STIFFNESS)
         if soft.any():
             problem = f"must be 0, which means rigid, or at least {LEAST_STIFFNESS * 1e-6:g} N/µm; is the unit right?"
@@ -179,11 +171,11 @@ class Load:
 
     @property
     def bends(self) -> bool:
-        """Whether any strut's length depends on its force; friction alone does not cause that."""
+        """Whether any strut has a stiffness or a lost motion, so that its length depends on its force."""
         return bool(self.stiffness.any() or self.lost_motion.any())
 
     def numbers(self) -> tuple[float, ...]:
-        """Return it as 26 numbers, SI, the compliance in place of the stiffness: for the settings of a fit."""
+        """Return the terms as 26 numbers, SI, with compliances in place of stiffnesses, for the settings of a fit."""
         return (
             *(*self.compliance.tolist(), *self.lost_motion.tolist(), self.take_up, self.mass),
             *(*self.centre.tolist(), *self.gravity.tolist(), *self.friction.tolist()),
@@ -191,14 +183,14 @@ class Load:
 
     @classmethod
     def from_numbers(cls, numbers: Sequence[float]) -> Load:
-        """Return the loading of :meth:`numbers`."""
-        if len(numbers) not in (20, 26):  # a fit of 0.2 had no friction
+        """Return the Load that the 26 numbers of :meth:`numbers` describe."""
+        if len(numbers) not in (20, 26):  # 20: written by version 0.2, without friction
             raise ModelError("load", "must be 26 numbers", list(numbers))
         n = np.array([*numbers, *[0.0] * 6][:26], dtype=float)
         return cls(reciprocal(n[:6]), n[6:12], float(n[12]), float(n[13]), n[14:17], n[17:20], n[20:])
 
     def members(self, geometry: HexapodGeometry) -> dict[str, Any]:
-        """Return the values of hc_load: platform and tool together."""
+        """Return the values of the C struct ``hc_load`` by member; mass and moment include the tool in use."""
         tool = geometry.payload
         return {
             "bends": int(self.bends),

@@ -1,4 +1,4 @@
-"""The model of the real machine, run forwards (where will the tool go?) and backwards (what to command?)."""
+"""The model of the real machine: strut commands to the actual pose (forwards), and a pose to its strut commands."""
 
 from __future__ import annotations
 
@@ -24,17 +24,16 @@ from .outside import NO_TABLE, OutsideTable
 from .region import Region
 from .struts import StrutErrors
 from .temperatures import AT_ONCE, EXPANSION, HUMIDITY, MOST_TIME_CONSTANTS, PARTS, LateGrowth, Temperatures
-from .terms import check_magnitudes, settle, term
+from .terms import check_magnitudes, term, validate_terms
 
 
 @dataclass(frozen=True)
 class Datum:
-    """A pose at which a calibration keeps the tool at its nominal place."""
+    """The pose at which a calibration keeps the tool where the nominal machine has it."""
 
-    position: tuple[float, float, float]  # ``pose_platform_in_base``: m, and the paper's α, β, γ, rad
-    angles: tuple[float, float, float]  # ``pose_platform_in_base``: m, and the paper's α, β, γ, rad
-    # In how many of the six ways to shift and turn the whole machine. Those that the readings show are not held: there
-    # the model contains the machine's place
+    position: tuple[float, float, float]  # of ``pose_platform_in_base``, m
+    angles: tuple[float, float, float]  # of ``pose_platform_in_base``: the paper's α, β, γ, rad
+    # How many of the whole machine's six degrees of freedom (shift, turn) the datum fixes; readings fix the others
     held: int
 
     def __post_init__(self) -> None:
@@ -48,39 +47,37 @@ class Datum:
 
     @staticmethod
     def at(pose: Pose, held: int) -> Datum:
-        """Return the datum at a ``pose_platform_in_base``."""
-        x, y, z = (pose.position + 0.0).tolist()  # no minus before zero
+        """Return the datum at a ``pose_platform_in_base`` that holds `held` degrees of freedom."""
+        x, y, z = (pose.position + 0.0).tolist()  # turns -0.0 into 0.0
         alpha, beta, gamma = (pose.angles() + 0.0).tolist()
         return Datum((x, y, z), (alpha, beta, gamma), held)
 
     @property
     def pose(self) -> Pose:
-        """``pose_platform_in_base``."""
+        """The datum's ``pose_platform_in_base``."""
         return Pose.from_angles(self.position, self.angles)
 
     def __str__(self) -> str:
         position = ", ".join(f"{value * 1e3:.10g}" for value in self.position)
         angles = ", ".join(f"{math.degrees(value):.10g}" for value in self.angles)
-        ways = f"held in {self.held} of 6 ways" if self.held else "not held, the readings saw it"
-        return f"{ways}; platform at {position} mm, {angles}° in base"
+        fixed = f"fixes {self.held} of 6 degrees of freedom" if self.held else "fixes nothing, as the readings do"
+        return f"{fixed}; platform at {position} mm, {angles}° in base"
 
 
 @dataclass(frozen=True)
 class ModelOrigin:
-    """Origin of a model; stored in the file, not used in the arithmetic."""
+    """How a model was made; stored in the model file, not used in the arithmetic."""
 
-    date: str = ""  # ISO 8601 date of the fit
-    sources: tuple[tuple[str, str], ...] = ()  # Name and SHA-256 of each data file that the model was fitted to
-    # RMS residual tool error on data that were not used in the fit, m; None if not measured
-    held_out_residual: float | None = None
-    note: str = ""  # One line for people
-    # Name, beside the model file, and SHA-256 of the file with the fit's posterior; None if not known
+    date: str = ""  # date of the fit, ISO 8601
+    sources: tuple[tuple[str, str], ...] = ()  # name and SHA-256 of each data file that the model was fitted to
+    held_out_residual: float | None = None  # RMS tool error on readings not used in the fit, m; None if not measured
+    note: str = ""  # one line for people
+    # Name and SHA-256 of the file with the fit's posterior, in the model file's folder; None if not known
     posterior: tuple[str, str] | None = None
-    # Pose at which the tool is held, and how many ways; None if not known
-    datum: Datum | None = None
-    # Loads during its measurement, if known: each payload, kg, its centre in platform, m, gravity in base, m/s²
+    datum: Datum | None = None  # None if not known
+    # Loads during the measurement, if known: payload, kg, its centre in platform, m, gravity in base, m/s²
     loads: tuple[tuple[float, ...], ...] = ()
-    # Of what a fit has made of the file that the model was read from; empty when it was not read
+    # :func:`~.model_file.text_sha256` of the model file; empty if the model was not read from a file
     text_sha256: str = dataclasses.field(default="", compare=False)
 
 
@@ -91,81 +88,87 @@ class MachineModel:
     Parameters
     ----------
     machine : str
-        Name of the geometry that it belongs to.
+        Name of the geometry that the model belongs to.
     name : str
         Name of the model, shown in diagnostics.
     base_deviation, platform_deviation : ndarray, shape (6, 3)
         Real minus nominal joint position, m, in each body's frame.
     base_axes_turn : ndarray, shape (3,)
-        Rotation vector, rad in ``base``, by which the base's cardan axes are turned when the whole base is.
+        Rotation vector of the base's cardan axes, rad in ``base``: they turn when the datum turns the whole base.
     struts : StrutErrors
         Errors of the six struts.
     field : GridField
-        Interpolated rest.
+        Interpolated tool error that structure and struts do not explain.
     base_expansion, platform_expansion : float
         Thermal expansion of the two bodies about their origins, 1/K.
     late_growth : LateGrowth
         How parts lag behind their thermometers, and which thermometer represents all parts.
     load : Load
-        How struts give under weight and other forces.
+        How struts stretch under weight and other forces.
     outside : OutsideTable
-        Error over one or two outside numbers, added to the field where these are known: :meth:`at`.
+        Error over one or two external quantities such as elevation; :meth:`at` adds it to the field.
     reversal_threshold : float
-        How far a strut must come back before its direction counts as reversed, m: above the noise of the
-        commands, and as far below the backlash as that allows. The field has a threshold of its own.
+        Distance, m, that a strut must move back before its direction counts as reversed. It should be larger than
+        the noise of the commands and much smaller than the backlash. The field has its own threshold for axes.
     region : Region or None
-        Where the model was measured; None: not known.
+        Box in which the model was measured; None: not known.
     origin : ModelOrigin
-        Provenance.
+        How the model was made.
 
     Raises
     ------
     ModelError
-        With key, value and what is allowed.
+        A term has a wrong shape or value; the message names key, value and what is allowed.
     """
 
     machine: str
     name: str = "ideal"
-    base_deviation: np.ndarray = term("structure", "um", "real − nominal joints, in base", (6, 3), largest=0.05)
-    platform_deviation: np.ndarray = term("structure", "um", "the same, in platform", (6, 3), largest=0.05)
+    base_deviation: np.ndarray = term("structure", "um", "real − nominal base joints, in base", (6, 3), largest=0.05)
+    platform_deviation: np.ndarray = term(
+        "structure", "um", "real − nominal platform joints, in platform", (6, 3), largest=0.05
+    )
     base_axes_turn: np.ndarray = term(
-        "structure", "urad", "rotation vector of the base's cardan axes, which turn with it", (3,), largest=0.1
+        "structure", "urad", "rotation vector of the base's cardan axes, in base", (3,), largest=0.1
     )
     struts: StrutErrors = dataclasses.field(default_factory=StrutErrors)
     field: GridField = dataclasses.field(default_factory=no_field)
-    base_expansion: float = term("thermal", "ppm_per_K", "of the base about its origin", (), largest=EXPANSION)
-    platform_expansion: float = term("thermal", "ppm_per_K", "of the platform", (), largest=EXPANSION)
+    base_expansion: float = term(
+        "thermal", "ppm_per_K", "thermal expansion of the base about its origin", (), largest=EXPANSION
+    )
+    platform_expansion: float = term(
+        "thermal", "ppm_per_K", "thermal expansion of the platform about its origin", (), largest=EXPANSION
+    )
     late_growth: LateGrowth = AT_ONCE
     load: Load = dataclasses.field(default_factory=Load)
     outside: OutsideTable = NO_TABLE
     reversal_threshold: float = term(
-        "", "um", "way back until a strut's direction counts as reversed", (), default=0.2e-6, least=0.0
+        "", "um", "motion back after which a strut's direction counts as reversed", (), default=0.2e-6, least=0.0
     )
     region: Region | None = None
     origin: ModelOrigin = ModelOrigin()
 
     def __post_init__(self) -> None:
-        settle(self)
+        validate_terms(self)
         check_magnitudes(self, "structure")
 
     def at(self, outside: Mapping[str, float]) -> MachineModel:
-        """Return the model of the machine at outside numbers, by their names in SI units: without table, and with its
-        error there in the field. An error of the table is the same everywhere, so the field represents it exactly."""
+        """Return the model for given values of the external quantities, SI by name, without the table `outside`."""
         if not self.outside.names:
             return self
+        # The table's error is the same at all poses, so a constant added to the field represents it exactly
         error = self.outside.evaluate(outside)
         return replace(self, outside=NO_TABLE, field=self.field.plus(error) if error.any() else self.field)
 
     @cached_property
     def measured(self) -> Region | None:
-        """Region of the model's measurement, or else of its field; None if not known."""
+        """Box in which the model was measured, or else the box of its field; None if not known."""
         if self.region is None and any(family.shape[4] for family in self.field.lines):
             return Region(self.field.box, self.field.probe)
         return self.region
 
 
-FOLLOWED = 9  # Three axes of the measured point, then six struts
-# Directions of all axes and struts approached in one direction; midway: not known
+FOLLOWED = 9  # Length of a vector of motion directions: three axes of the measured point, then six struts
+# Motion direction by its name; midway: not known, the backlash is taken as half
 DIRECTIONS = {"forward": 1.0, "midway": 0.0, "backward": -1.0}
 
 
@@ -173,16 +176,16 @@ PoseArrays = tuple[np.ndarray, np.ndarray]  # position (3,), m, and rotation (3,
 
 
 class MotionState:
-    """Directions of motion with a reversal threshold, so that noise at standstill does not flip a backlash."""
+    """Directions of motion of axes and struts, with a threshold, so that noise at standstill reverses no backlash."""
 
     __slots__ = ("low", "sense")
 
     def __init__(self, low: np.ndarray | None = None, sense: np.ndarray | None = None) -> None:
-        self.low = np.full(FOLLOWED, math.nan) if low is None else low
-        self.sense = np.zeros(FOLLOWED) if sense is None else sense
+        self.low = np.full(FOLLOWED, math.nan) if low is None else low  # lower end of each dead band, m; NaN: not known
+        self.sense = np.zeros(FOLLOWED) if sense is None else sense  # directions −1, 0 (not known) or 1
 
     def copy_from(self, other: MotionState) -> None:
-        """Copy another's state."""
+        """Copy the state of another MotionState into this one."""
         self.low[:] = other.low
         self.sense[:] = other.sense
 
@@ -195,11 +198,11 @@ class RealMachine:
     geometry : HexapodGeometry
         The nominal machine.
     model : MachineModel
-        Its errors.
+        Errors of the machine.
     temperatures : Temperatures, optional
-        Readings; 20 °C everywhere, and 50 % of humidity, by default.
+        Readings of temperatures and humidity; by default 20 °C everywhere and 50 % relative humidity.
     loading : Loading, optional
-        Gravity and other forces; the model's gravity and no force by default.
+        Gravity, and other forces on the platform; by default the model's gravity and no other force.
 
     Raises
     ------
@@ -213,7 +216,7 @@ class RealMachine:
         model: MachineModel,
         temperatures: Temperatures | None = None,
         loading: Loading = FREE,
-        constants: Struct | None = None,  # of another machine of this geometry and model, which does not change them
+        constants: Struct | None = None,  # ``hc_model`` of this geometry and model, if it was already made
     ) -> None:
         self.geometry, self.model = geometry, model
         self.temperatures, self.loading = temperatures or Temperatures(), loading
@@ -244,7 +247,7 @@ class RealMachine:
     def at(
         self, temperatures: Temperatures, payload: Payload | None = None, gravity: Sequence[float] | None = None
     ) -> RealMachine:
-        """Return the same machine at other temperatures and, if given, under another load."""
+        """Return the same machine at other temperatures and, if given, with another payload and gravity."""
         geometry = self.geometry if payload is None else self.geometry.carrying(payload)
         loading = self.loading if gravity is None else Loading.of(gravity)
         constants = self.constants if geometry is self.geometry else None
@@ -253,18 +256,18 @@ class RealMachine:
     def advance(
         self, seconds: float, commands: np.ndarray, sense: np.ndarray, pose: PoseArrays, actual: PoseArrays
     ) -> tuple[int, float]:
-        """Run :meth:`forward` after a time, s, in which the struts moved to their commands: without inertia at once."""
+        """Run :meth:`forward`; this machine has no inertia, so it ignores the time since the last command, s."""
         return self.forward(commands, sense, pose, actual)
 
     @property
     def body(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Real joints of base and platform, and their cardan axes, shape (6, 3) each."""
+        """Real joints of base and platform, m, and cardan axes of both, each (6, 3) in its body's frame."""
         base, platform = (self.constants.view[name]["axes"] for name in ("base", "platform"))
         return (*self.structure.joints, base, platform)
 
     @property
     def growth(self) -> np.ndarray:
-        """Relative growth of each strut since 20 °C and 50 % of humidity, shape (6,)."""
+        """Relative growth of each strut against 20 °C and 50 % relative humidity, shape (6,)."""
         return self.state.view["growth"]
 
     def commands_for(self, target: Pose, motion: MotionState | None = None) -> tuple[np.ndarray, Pose, bool]:
@@ -275,21 +278,21 @@ class RealMachine:
         target : Pose
             ``pose_platform_in_base`` wanted.
         motion : MotionState, optional
-            Directions of motion; updated. By default they are not known.
+            Directions of motion, which this call updates. By default they are not known.
 
         Returns
         -------
         commands : ndarray, shape (6,)
-            m.
+            Strut commands, m.
         model_pose : Pose
-            q with q ∘ E(q) = target: the pose for which the structure's lengths were taken.
+            q with q ∘ E(q) = target: the platform pose from which the strut lengths were computed.
         outside : bool
             The measured point lies outside the field's box.
 
         Raises
         ------
         NotConvergedError
-            q ∘ E(q) = target could not be solved: the field is no small correction.
+            The iteration for q ∘ E(q) = target does not converge, as the field changes too much from pose to pose.
         """
         motion = MotionState() if motion is None else motion
         given = (array[None] for array in (target.position, target.rotation, motion.low, motion.sense))
@@ -310,7 +313,7 @@ class RealMachine:
         sense : ndarray, shape (9,), optional
             Directions of motion, as in :class:`MotionState`. By default they are not known.
         guess : Pose, optional
-            Model pose to start from, usually the last one; home by default.
+            Model pose from which the search starts, usually the last pose; home by default.
 
         Returns
         -------
@@ -334,9 +337,9 @@ class RealMachine:
     def forward(
         self, commands: np.ndarray, sense: np.ndarray, pose: PoseArrays, actual: PoseArrays
     ) -> tuple[int, float]:
-        """Run the model forwards on arrays of the caller; return (outcome, condition number).
+        """Run the model forwards in arrays of the caller; return the core's status and the condition number.
 
-        The model pose is the guess, and the solution where the outcome is OK; only then is the actual pose written.
+        `pose` holds the guess of the model pose. If the status is OK, the solution replaces it, and `actual` is set.
         """
         outcome, condition = np.empty(1, np.intc), np.empty(1)
         rows = (array[None] for array in (commands, sense, *pose, *actual))
@@ -344,7 +347,7 @@ class RealMachine:
         return int(outcome[0]), float(condition[0])
 
     def forward_many(self, *arrays: np.ndarray) -> None:
-        """Run :func:`~hexapod_comp.core.batch.forwards` by several threads if that is faster."""
+        """Run :func:`~hexapod_comp.core.batch.forwards` on arrays with N rows, in several threads if that is faster."""
 
         def run(rows: slice) -> None:
             batch.forwards(self.state.at, *(array[rows] for array in arrays))
@@ -353,7 +356,7 @@ class RealMachine:
 
 
 def core_model(geometry: HexapodGeometry, model: MachineModel) -> Struct:
-    """Return a machine and its model for the core, ``hc_model``."""
+    """Return geometry and model as the C struct ``hc_model``; raise ModelError if the model is another machine's."""
     if model.machine != geometry.name:
         problem = f"the model is for machine {model.machine!r}, the geometry is {geometry.name!r}"
         raise ModelError("machine", problem)
@@ -361,14 +364,14 @@ def core_model(geometry: HexapodGeometry, model: MachineModel) -> Struct:
 
 
 def write_temperatures(state: Struct, temperatures: Temperatures) -> None:
-    """Write readings and lags into an ``hc_state``, which must be placed then."""
+    """Write readings and lags into an ``hc_state``; the caller must then call ``hc_place``."""
     view = state.view
     view["temperatures"] = [temperatures.at(name) for name in PARTS]
     view["humidity"] = temperatures.at(HUMIDITY)
     for index, name in enumerate(PARTS):
         lag = temperatures.lags.get(name)
         if lag is not None:
-            view["began"][index] = 0.0 if math.isnan(lag.began) else lag.began  # late parts are used from then on
+            view["began"][index] = 0.0 if math.isnan(lag.began) else lag.began  # time of the first reading
             view["newest"][index] = lag.newest
             view["behind"][index][: len(lag.behind)] = lag.behind
 
@@ -380,7 +383,7 @@ def write_loading(state: Struct, loading: Loading) -> None:
 
 
 def members(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str] = ("", "")) -> dict[str, Any]:
-    """Return the values of ``hc_model``."""
+    """Return the values of the C struct ``hc_model`` by member; `hashes` are those of geometry and model file."""
     model_texts = {"machine": model.machine, "model": model.name, "date": model.origin.date or ""}
     tool, late = geometry.tool, model.late_growth
     constants, expansion = np.zeros(MOST_TIME_CONSTANTS), np.zeros((len(PARTS), MOST_TIME_CONSTANTS))
@@ -435,12 +438,12 @@ def _pose(pose: Pose) -> dict[str, Any]:
 
 
 def commanded_box(geometry: HexapodGeometry, model: MachineModel) -> np.ndarray:
-    """Return the box of level tool positions in ``work`` in which a model was measured, shape (2, 3), m."""
+    """Return the box in which a model was measured, as level tool positions in ``work``, shape (2, 3), m."""
     return measured_region(model).commanded(geometry)
 
 
 def measured_region(model: MachineModel) -> Region:
-    """Return the region of a model's measurement."""
+    """Return the box in which a model was measured; raise ModelError if the model does not state the box."""
     region = model.measured
     if region is None:
         raise ModelError(
@@ -449,12 +452,13 @@ def measured_region(model: MachineModel) -> Region:
     return region
 
 
-ROUNDS = 10  # Field and turning screws change slightly for a moved machine: each round reduces the error a thousandfold
-SETTLED = 1e-12  # Smaller motions of the tool count as none, m and rad
+# Iterations of `with_datum_held`: a moved machine changes field and screw rotation, by a thousandth in each iteration
+ROUNDS = 10
+SETTLED = 1e-12  # Motion of the tool, m and rad, below which the iteration has converged
 
 
 def tool_move(geometry: HexapodGeometry, model: MachineModel, pose: Pose) -> np.ndarray:
-    """Return the tool's motion at a pose with the struts commanded to nominal lengths."""
+    """Return the tool's error (6,), m and rad in ``base``, at a platform pose with nominal strut commands."""
     machine = RealMachine(geometry, model)
     actual, _ = machine.pose_for(strut_lengths(Structure.of(geometry), pose), guess=pose)
     displacement = (actual @ geometry.tool).position - (pose @ geometry.tool).position
@@ -464,7 +468,10 @@ def tool_move(geometry: HexapodGeometry, model: MachineModel, pose: Pose) -> np.
 def with_datum_held(
     geometry: HexapodGeometry, model: MachineModel, pose: Pose, part: np.ndarray | None = None
 ) -> MachineModel:
-    """Return a model whose whole machine is shifted and turned so that it does not move the tool at a pose."""
+    """Return the model with its base shifted and turned so that the tool's error at a platform pose is zero.
+
+    `part`, (6, 6), projects the tool's error on the degrees of freedom to be held; by default all are held.
+    """
     part = np.eye(6) if part is None else part
     tip = (pose @ geometry.tool).position
     for _ in range(ROUNDS):
@@ -478,4 +485,5 @@ def with_datum_held(
         if geometry.screw_lead.any():
             axes = back @ rotation_from_vector(model.base_axes_turn)
             model = replace(model, base_axes_turn=rotation_vector(axes))
-    raise NotConvergedError("no shift and turn of the machine brings the tool to its nominal datum pose", limit=ROUNDS)
+    problem = f"no shift and turn of the machine found in {ROUNDS} iterations that holds the tool at the datum pose"
+    raise NotConvergedError(problem, limit=ROUNDS)

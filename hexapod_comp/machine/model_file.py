@@ -1,4 +1,4 @@
-"""Model files: the machine model as YAML, readable by people; any invalid or doubtful entry is refused."""
+"""Model files: the machine model as YAML; an entry that is invalid, unknown or incomplete is refused."""
 
 from __future__ import annotations
 
@@ -36,18 +36,17 @@ MODEL_FORMAT = "hexapod_comp/model"
 MODEL_VERSION = 1
 IDEAL = "ideal"  # Name of the model of a machine without errors, for :func:`load_model` and parameters
 DIRECTIONS = ("forward", "backward")  # Order of the directions of motion in a field's arrays
-# Keys of late growth, and their indices in its array
+# Keys of late growth in a file, and the rows of `LateGrowth.expansion` that each holds
 LATE: dict[str, Any] = {"late_struts": slice(0, 6), "late_base": 6, "late_platform": 7}
 WAVE, PERIOD, UM = Numbers("um", PER_STRUT), Numbers("mm", PER_STRUT), Numbers("um")
-LOOKED_AT = 33  # Points along each line of a field at which its polynomials are checked
-# The extended forms that every supported Python reads alike
+CHECKED_POINTS = 33  # Points along each line of a field at which the polynomials' magnitude is checked
+# Forms of ISO 8601 that every supported version of Python reads in the same way
 ISO_8601 = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d(\.\d{3}(\d{3})?)?)?(Z|[+-]\d\d:\d\d)?)?")
 SHA_256 = re.compile(r"[0-9a-f]{64}")
-# Blocks that a fit does not make: the name of its posterior, a file that names the hash of all the rest, and a table
-# over outside numbers, which is zero where the machine was calibrated
+# Blocks that `text_sha256` leaves out: `posterior` names a file that holds this hash, and `outside` is not fitted
 NOT_FITTED = re.compile(r"^(?:posterior|outside):\n(?:[ \t]+.*\n)*", re.MULTILINE)
 
-# Key of a field line inside its family: direction, node index along each of the two cross axes
+# Key of one line among the field's lines along one axis: direction, node index on each of the two other axes
 Line = tuple[int, int, int]
 
 
@@ -57,9 +56,9 @@ def load_model(path: str | Path, geometry: HexapodGeometry) -> MachineModel:
     Parameters
     ----------
     path : str or Path
-        YAML file, or the name of a shipped one; ``ideal`` is the machine without errors.
+        YAML file, or the name of a shipped model; ``ideal`` is the machine without errors.
     geometry : HexapodGeometry
-        The machine that it must belong to.
+        The machine that the model must belong to.
 
     Returns
     -------
@@ -68,7 +67,7 @@ def load_model(path: str | Path, geometry: HexapodGeometry) -> MachineModel:
     Raises
     ------
     InputFileError
-        Naming file, key, value and what is allowed.
+        The file cannot be used; the message names file, key, value and what is allowed.
     """
     if path == IDEAL:
         return MachineModel(geometry.name)
@@ -77,7 +76,7 @@ def load_model(path: str | Path, geometry: HexapodGeometry) -> MachineModel:
 
 
 def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineModel:
-    """Return the model of a model file's text for a machine; `name` is what messages call the file."""
+    """Return the model in the text of a model file of the named machine; messages call the file `name`."""
     top = parse_yaml(text, name, MODEL_FORMAT, MODEL_VERSION)
     _refuse_cut_off(top)
     given = top.text("machine")
@@ -109,38 +108,37 @@ def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineM
 
 
 def text_sha256(text: str) -> str:
-    """Return the hash of what a fit has made of a model file's text."""
+    """Return the SHA-256 of a model file's text without the blocks `posterior` and `outside`."""
     return hashlib.sha256(NOT_FITTED.sub("", text).encode()).hexdigest()
 
 
 def read_load(path: str | Path) -> Load:
-    """Read the stated stiffness of struts: a file of the format ``hexapod_comp/load``, whose keys are those of a
-    model's block ``load``."""
+    """Read a load file: format ``hexapod_comp/load``, with the keys of a model file's block ``load``."""
     file = input_file(path, "load")
     top = parse_yaml(read_text(file), file, "hexapod_comp/load", 1)
     with file_errors(file):
         load = Load(**read_terms(Load, top, "load"))
         check_magnitudes(load)
-        if (load.lost_motion < 0.0).any():  # a fit's noise may be negative, what is stated may not
+        if (load.lost_motion < 0.0).any():  # a model file may have a slightly negative one, from a fit's noise
             raise ModelError("load.lost_motion", "must not be negative", load.lost_motion.tolist())
     top.finish()
     return load
 
 
 def save_model(model: MachineModel, path: str | Path) -> None:
-    """Write a model file, whole or not at all.
+    """Write a model file; if writing fails, an existing file stays unchanged.
 
     Parameters
     ----------
     model : MachineModel
-        Its origin must carry a date.
+        Machine model whose origin has a date.
     path : str or Path
         File to make or to replace.
 
     Raises
     ------
     ModelError
-        Date or hashes of the origin are not what they should be.
+        The origin has an invalid date, file hash, posterior file name or residual.
     InputFileError
         The file cannot be written.
     """
@@ -148,7 +146,7 @@ def save_model(model: MachineModel, path: str | Path) -> None:
 
 
 def model_text(model: MachineModel) -> str:
-    """Return the text that :func:`save_model` writes; equal models give equal texts."""
+    """Return the text of a model file, as :func:`save_model` writes it; equal models give equal texts."""
     origin, region = model.origin, model.region
     _check_origin(origin)
     content: dict[str, Any] = {"format": MODEL_FORMAT, "version": MODEL_VERSION, "closed": True}
@@ -183,29 +181,29 @@ def model_text(model: MachineModel) -> str:
 
 
 def terms_text() -> str:
-    """Return the table of all terms, as doc/model_file.md has it."""
+    """Return the table of all terms of a model for doc/model_file.md."""
     return table_text(MachineModel, StrutErrors, LateGrowth, Load, GridField, OutsideTable, Region)
 
 
-# Provenance
+# How the model was made
 
 
 def _refuse_cut_off(top: Section) -> None:
-    """Raise if a file has lost its end: every block is optional, so that the rest may be valid."""
+    """Raise if a file has lost its end: as every block is optional, its beginning may be a valid model."""
     marks = [key for key in ("closed", "end") if key in top]
     for key in marks:
         value = top.require(key)
         if value is not True:
-            raise top.error(key, "must be true; `closed` and `end` stand both or neither", value)
+            raise top.error(key, "must be true; a file has both `closed` and `end`, or neither", value)
     if marks == ["closed"]:
         raise top.error("end", "is missing: the file is cut off, or still being written")
     if marks == ["end"]:
-        raise top.error("closed", "is missing at the file's beginning")
+        raise top.error("closed", "is missing at the file's beginning, as `end` is given")
 
 
 def _read_origin(top: Section) -> ModelOrigin:
     given = top.require("date")
-    if isinstance(given, date):  # YAML makes one of an unquoted date
+    if isinstance(given, date):  # YAML reads an unquoted date as a date object
         given = given.isoformat()
     sources = []
     for entry in top.sections("sources"):
@@ -234,14 +232,14 @@ def _read_origin(top: Section) -> ModelOrigin:
         loads.append(load_row(payload, gravity))
         entry.finish()
     if len(loads) > MOST_LOADS:
-        raise top.error("measured_loads", f"must be no more than {MOST_LOADS}", len(loads))
+        raise top.error("measured_loads", f"must have at most {MOST_LOADS} entries", len(loads))
     origin = ModelOrigin(given, tuple(sources), residual, note, posterior, datum, tuple(loads))
     _check_origin(origin)
     return origin
 
 
 def _check_origin(origin: ModelOrigin) -> None:
-    """Raise ModelError on an invalid date, hash or residual."""
+    """Raise ModelError on an invalid date, file hash, posterior file name or residual."""
     try:
         if not ISO_8601.fullmatch(origin.date):
             raise ValueError
@@ -252,7 +250,7 @@ def _check_origin(origin: ModelOrigin) -> None:
     if origin.posterior is not None:
         hashes["posterior"] = origin.posterior
         if Path(origin.posterior[0]).name != origin.posterior[0]:
-            raise ModelError("posterior.file", "must be a file's name, without a folder", origin.posterior[0])
+            raise ModelError("posterior.file", "must be a file name without a folder", origin.posterior[0])
     for key, (name, digest) in hashes.items():
         if not (isinstance(digest, str) and SHA_256.fullmatch(digest)):
             problem = f"must be the 64 lower-case hexadecimal digits of the SHA-256 of {name!r}"
@@ -263,11 +261,11 @@ def _check_origin(origin: ModelOrigin) -> None:
 
 
 def _read_region(top: Section) -> Region | None:
-    """Return the region of the measurement; ``valid_box`` of older files holds platform positions in base."""
+    """Return the box of the measurement, None if not given; older files give platform positions, ``valid_box``."""
     if top.quantity_key("valid_box", "length"):
         box = top.quantity("valid_box", "length", (2, 3))
         if "region" in top:
-            raise top.error("region", "stands beside valid_box: only one can be true")
+            raise top.error("region", "must not be given together with valid_box")
         try:
             return Region(box)
         except ModelError as error:
@@ -320,7 +318,7 @@ def _read_struts(section: Section) -> dict[str, Any]:
 
 
 def _read_wave(section: Section) -> dict[str, np.ndarray]:
-    """Return amplitudes, shape (6, harmonics), and periods, shape (6,), m."""
+    """Return the wave's amplitudes, shape (6, harmonics), and periods, shape (6,), m."""
 
     def amplitudes(one: Section) -> np.ndarray:
         return np.array([WAVE.read(one, name, np.zeros(6)) for name in WAVE_PARTS])
@@ -341,7 +339,7 @@ def _read_wave(section: Section) -> dict[str, np.ndarray]:
 
 
 def _struts_block(struts: StrutErrors) -> dict[str, Any]:
-    """Return the struts' own errors that are not zero."""
+    """Return the content of the block ``struts``, without errors that are zero."""
     block = write_terms(struts, "struts")
     if struts.cosine.any() or struts.sine.any() or (struts.period != StrutErrors().period).any():
 
@@ -364,7 +362,7 @@ def _struts_block(struts: StrutErrors) -> dict[str, Any]:
 
 
 def _component(name: str) -> Numbers:
-    """Return the text of a component's polynomial."""
+    """Return unit and shape of the polynomial of an error component, such as ``dx``, in a file."""
     return Numbers("um" if name.startswith("d") else "urad", (None,))
 
 
@@ -380,7 +378,7 @@ def _read_field(section: Section) -> dict[str, Any]:
 
 
 def _read_line(entry: Section, grid: tuple[np.ndarray, ...], families: dict[str, dict[Line, np.ndarray]]) -> None:
-    """Read one line of the field into its family, for one direction or both."""
+    """Read one line of the field, for one or both directions, into the lines along its axis."""
     axis = entry.choice("axis", ("x", "y", "z"))
     counts = [len(grid[other]) for other in CROSS_AXES["xyz".index(axis)]]
     nodes = entry.require("at")
@@ -405,13 +403,13 @@ def _read_line(entry: Section, grid: tuple[np.ndarray, ...], families: dict[str,
 
 
 def _family_array(section: Section, axis: str, family: dict[Line, np.ndarray], counts: list[int]) -> np.ndarray:
-    """Return the family's coefficients, shape (2, n, m, 6, K); K = 0 for one that was not measured."""
+    """Return the coefficients of all lines along an axis, shape (2, n, m, 6, K); K = 0 if there are no lines."""
     first, second = (counts[other] for other in CROSS_AXES["xyz".index(axis)])
     if not family:
         return np.zeros((2, first, second, 6, 0))
     every = product(range(2), range(first), range(second))
     missing = next((line for line in every if line not in family), None)
-    if missing is not None:  # checked before anything is allocated, as node counts are the file's
+    if missing is not None:  # checked before the array is allocated: a file could give huge node counts
         direction, *nodes = missing
         raise section.error("lines", f"the {DIRECTIONS[direction]} line along {axis} at {nodes} is missing")
     powers = max(coefficients.shape[1] for coefficients in family.values())
@@ -422,7 +420,7 @@ def _family_array(section: Section, axis: str, family: dict[Line, np.ndarray], c
 
 
 def _field_block(field: GridField) -> dict[str, Any]:
-    """Return the field, empty if omitting it gives the same one when read."""
+    """Return the content of the block ``field``; empty for a field that is zero everywhere."""
     nothing, terms = no_field(), write_terms(field, "field")
     same_grid = all(np.array_equal(ours, theirs) for ours, theirs in zip(field.grid, nothing.grid, strict=True))
     measured = any(family.shape[4] for family in field.lines)
@@ -438,7 +436,7 @@ def _field_block(field: GridField) -> dict[str, Any]:
 
 
 def _family_lines(axis: str, family: np.ndarray) -> Iterator[dict[str, Any]]:
-    """Yield the family's lines, each with the components that any line of the family has."""
+    """Yield the file entries of the lines along an axis, each with all components that occur on this axis."""
     if not family.shape[4]:
         return
     components = np.flatnonzero(family.any(axis=(0, 1, 2, 4))).tolist() or ["xyz".index(axis)]
@@ -453,11 +451,11 @@ def _family_lines(axis: str, family: np.ndarray) -> Iterator[dict[str, Any]]:
 
 
 def _check_lines(field: GridField) -> None:
-    """Refuse a field that exceeds any machine's error anywhere on one of its lines."""
+    """Raise ModelError if a component exceeds its largest magnitude, `LARGEST`, on one of the field's lines."""
     for axis, family in zip("xyz", field.lines, strict=True):
         largest = np.zeros(6)
         with np.errstate(over="ignore", invalid="ignore"):
-            for u in np.linspace(-1.0, 1.0, LOOKED_AT):
+            for u in np.linspace(-1.0, 1.0, CHECKED_POINTS):
                 value = np.zeros(family.shape[:4])
                 for power in reversed(range(family.shape[4])):
                     value = value * u + family[..., power]

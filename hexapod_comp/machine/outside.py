@@ -1,4 +1,4 @@
-"""An error that depends on outside quantities: a table over one or two numbers, elevation and rotation for instance."""
+"""Tables of the tool's error over one or two external quantities, such as elevation; files call them ``outside``."""
 
 from __future__ import annotations
 
@@ -14,47 +14,49 @@ from ..errors import InputFileError, ModelError, OutsideTableError
 from ..formats.csv import LABEL_COLUMNS, Table, grid_order
 from ..formats.schema import DIMENSIONS, Section, in_si, in_unit, spellings
 from .field import OUTSIDE_POLICIES
-from .terms import read_terms, settle, term, write_terms
+from .terms import read_terms, term, validate_terms, write_terms
 
-# A number further outside its table than this share of the table's span is not a state of this machine, but in
-# another unit: of degrees in place of radians, all above 1.97 where a table ends at 90°
+# A value outside its table by more than this share of the table's span is refused: it is in another unit. For a table
+# that ends at 90° all values above 1.97 rad are refused, so degrees in place of radians are noticed
 BELIEVED_BEYOND = 0.25
-ON_THE_EDGE = 1e-6  # A number that is outside by less than this share of the span is at the edge: senders round
+ON_THE_EDGE = 1e-6  # A value outside by less than this share of the span counts as inside: senders round
 UNIT_NAMES = {name: size for dimension in set(DIMENSIONS.values()) for name, size in spellings(dimension).items()}
-MOST_NODES = 10_000  # A larger table is no longer readable
+MOST_NODES = 10_000  # Largest number of nodes; people cannot read a larger table
 POSITION, ROTATION = ("x", "y", "z"), ("rx", "ry", "rz")
 
 
 @dataclass(frozen=True)
 class OutsideTable:
-    """Error of the field's measured point at the nodes of a grid of outside numbers; it is added to the field's.
+    """Error of the field's measured point at the nodes of a grid of external quantities, in addition to the field.
 
     Parameters
     ----------
     names : tuple of str
-        Of one or two numbers; none: no table.
+        Names of the one or two quantities; empty: no table.
     units : tuple of str
-        In which people have each: ``deg``, ``degC``, ….
+        Unit of each quantity in files and messages: ``deg``, ``degC``, ….
     nodes : tuple of ndarray
-        Increasing along each axis, SI or °C.
+        Increasing values of each quantity, SI or °C.
     displacement, rotation : ndarray, shape (nodes, 3)
-        m, and rotation vectors, rad, both in ``base``; the last axis varies fastest.
+        Displacements, m, and rotation vectors, rad, both in ``base``; the last quantity varies fastest.
     beyond : str
-        ``hold`` the value at the table's edge, or ``refuse``.
+        Outside the table: ``hold`` the value at its edge, or ``refuse`` commands.
 
     Raises
     ------
     ModelError
-        With key, value and what is allowed.
+        A value is invalid; the message names key, value and what is allowed.
     """
 
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
     nodes: tuple[np.ndarray, ...] = ()
     displacement: np.ndarray = term(
-        "outside", "um", "of the measured point, in base; a row a node, the last axis fastest", (None, 3), largest=0.05
+        "outside", "um", "displacement of the field's measured point in base: a row per node", (None, 3), largest=0.05
     )
-    rotation: np.ndarray = term("outside", "urad", "rotation vector in base about that point", (None, 3), largest=0.1)
+    rotation: np.ndarray = term(
+        "outside", "urad", "rotation vector about that measured point, in base: a row per node", (None, 3), largest=0.1
+    )
     beyond: str = "hold"
 
     def __post_init__(self) -> None:
@@ -69,62 +71,61 @@ class OutsideTable:
         if self.beyond not in OUTSIDE_POLICIES:
             raise ModelError("outside.beyond", f"must be one of {', '.join(OUTSIDE_POLICIES)}", self.beyond)
         object.__setattr__(self, "nodes", nodes)
-        settle(self)
+        validate_terms(self)
         rows = math.prod(len(axis) for axis in nodes) if nodes else 0
         if rows > MOST_NODES:
             raise ModelError("outside.axes", f"must have at most {MOST_NODES} nodes together", rows)
         for key in ("displacement", "rotation"):
             if len(getattr(self, key)) != rows:
-                raise ModelError(f"outside.{key}", f"must have {rows} rows, one a node", len(getattr(self, key)))
+                raise ModelError(f"outside.{key}", f"must have {rows} rows, one per node", len(getattr(self, key)))
 
     def shown(self, name: str, value: float) -> str:
-        """Return a number of this table for people: ``elevation 45 deg``."""
+        """Return a quantity's value, SI or °C, as text in the table's unit: ``elevation 45 deg``."""
         unit = self.units[self.names.index(name)]
         return f"{name} {in_unit(value, unit):.6g} {unit}"
 
     def _beyond(self, name: str, value: float) -> float:
-        """Return how far a number is outside, as a share of the table's span; 0 inside."""
+        """Return how far a value lies outside the table, as a share of the table's span; 0 inside."""
         axis = self.nodes[self.names.index(name)]
         return max(float(axis[0]) - value, value - float(axis[-1]), 0.0) / float(axis[-1] - axis[0])
 
     def validate(self, numbers: Mapping[str, float]) -> None:
-        """Raise on a number that cannot be one of this table; numbers of other names are ignored.
+        """Raise if a value is too far outside the table; values of quantities that the table lacks are ignored.
 
         Raises
         ------
         ModelError
-            Not finite, or so far outside the table that it must be in another unit.
+            A value is not finite, or outside by more than a quarter of the table's span: probably another unit.
         OutsideTableError
-            Outside a table that refuses what it does not hold.
+            A value is outside a table whose `beyond` is ``refuse``.
         """
         for name, axis in zip(self.names, self.nodes, strict=True):
             if name in numbers:
                 value, unit = numbers[name], self.units[self.names.index(name)]
                 low, high = in_unit([axis[0], axis[-1]], unit)
-                holds = f"the table holds {name} {low:.6g} to {high:.6g} {unit}"
+                holds = f"the table covers {name} {low:.6g} to {high:.6g} {unit}"
                 if not self._beyond(name, value) <= BELIEVED_BEYOND:
                     raise ModelError(f"outside.{name}", f"{holds}; is the unit right?", value)
                 if self.beyond == "refuse" and self._beyond(name, value) > ON_THE_EDGE:
                     raise OutsideTableError(f"{self.shown(name, value)}: {holds}", value, (axis[0], axis[-1]))
 
     def held(self, numbers: Mapping[str, float]) -> str:
-        """Return the numbers that lie outside the table, where the value at its edge is used; empty if none do."""
+        """Return, as text, the values outside the table, for which the error at its edge is used; empty if none."""
         known = [name for name in self.names if name in numbers]
         return ", ".join(self.shown(n, numbers[n]) for n in known if self._beyond(n, numbers[n]) > ON_THE_EDGE)
 
     def missing(self, numbers: Mapping[str, float]) -> str:
-        """Return the names of unknown numbers: until all are known, the table is ignored."""
+        """Return the names of the table's quantities without a value; the table has no effect until all have one."""
         return ", ".join(name for name in self.names if name not in numbers)
 
     def numbers_of(self, typed: Mapping[str, float]) -> dict[str, float]:
-        """Return numbers in SI by their names, of numbers by keys such as ``elevation_deg``; all of the table's, and
-        no others."""
+        """Convert values by keys such as ``elevation_deg`` to SI by name; raise unless they are exactly the table's."""
         found = {}
         for key, value in typed.items():
             name, unit = unit_of(key)
             if name not in self.names or DIMENSIONS.get(unit) != DIMENSIONS[self.units[self.names.index(name)]]:
                 allowed = ", ".join(f"{one}_{unit}" for one, unit in zip(self.names, self.units, strict=True))
-                problem = f"the model's table is over {allowed}" if allowed else "the model has no table"
+                problem = f"the model's table is over {allowed}" if allowed else "the model has no table `outside`"
                 raise ModelError(f"outside.{key}", problem, value)
             found[name] = float(in_si(value, UNIT_NAMES[unit]))
         if missing := self.missing(found):
@@ -133,7 +134,7 @@ class OutsideTable:
         return found
 
     def evaluate(self, numbers: Mapping[str, float]) -> np.ndarray:
-        """Return the error there, shape (6,), m and rad: bilinear between nodes, and zero while a number is missing."""
+        """Return the table's error, (6,), m and rad, bilinear between nodes; zero while a quantity has no value."""
         if not self.names or self.missing(numbers):
             return np.zeros(6)
         counts = [len(axis) for axis in self.nodes]
@@ -146,11 +147,11 @@ class OutsideTable:
         return value
 
     def negated(self) -> OutsideTable:
-        """Return the errors of a table of corrections: the negative of what is added to a command."""
+        """Return the table with all signs reversed: a table of corrections then becomes one of errors."""
         return replace(self, displacement=-self.displacement, rotation=-self.rotation)
 
     def without(self, numbers: Mapping[str, float]) -> OutsideTable:
-        """Return the same table minus its value at some numbers: those of the calibration."""
+        """Return the table minus its error at the given values, so that it is zero where the machine was calibrated."""
         error = self.evaluate(numbers)
         return replace(self, displacement=self.displacement - error[:3], rotation=self.rotation - error[3:])
 
@@ -159,13 +160,13 @@ NO_TABLE = OutsideTable()
 
 
 def unit_of(key: str) -> tuple[str, str]:
-    """Return name and unit of a key such as ``elevation_deg``; the unit is empty if it has none."""
+    """Return name and unit of a key such as ``elevation_deg``; the unit is empty if the key ends in none."""
     spelt = max((name for name in UNIT_NAMES if key.endswith(f"_{name}")), key=len, default="")
     return key.removesuffix(f"_{spelt}"), spelt if spelt in DIMENSIONS else "u" + spelt[1:] if spelt else ""
 
 
 def read_numbers(numbers: Mapping[str, Any]) -> dict[str, float]:
-    """Return outside numbers by their names, or a ModelError: one is not finite."""
+    """Return external quantities as floats by name; raise ModelError if a value is not finite."""
     found = {str(name): float(value) for name, value in numbers.items()}
     for name, value in found.items():
         if not math.isfinite(value):
@@ -174,32 +175,33 @@ def read_numbers(numbers: Mapping[str, Any]) -> dict[str, float]:
 
 
 def load_outside(path: str | Path) -> OutsideTable:
-    """Read a table of the tool's error over one or two outside numbers from CSV.
+    """Read a table of the tool's error over one or two external quantities from CSV.
 
-    Columns x, y, z are displacements, rx, ry, rz rotations; the others are outside numbers: elevation, for instance.
+    Columns x, y, z are displacements and rx, ry, rz rotations; one or two more columns are external quantities.
 
     Parameters
     ----------
     path : str or Path
-        Each column's name ends in its unit: ``elevation_deg``, ``rotation_deg``, ``x_um``, …, ``rz_urad``. Rows may
-        stand in any order; every node of the grid needs one.
+        CSV file whose column names end in a unit: ``elevation_deg``, ``rotation_deg``, ``x_um``, …, ``rz_urad``. It has
+        one row for every node of the grid, in any order.
 
     Returns
     -------
     OutsideTable
-        As it stands there, actual = commanded ∘ error; of corrections, commanded − nominal, take :meth:`.negated`.
+        The values of the file as errors (actual = commanded ∘ error). If they are corrections (commanded − nominal),
+        call :meth:`.negated`.
 
     Raises
     ------
     InputFileError
-        With line, column and what is allowed.
+        The file cannot be used; the message names line, column and what is allowed.
     """
     table = Table(path)
     displacement, rotation = table.required(POSITION, "length"), table.required(ROTATION, "angle")
     known = {table.header[index] for index, _ in (*displacement, *rotation)} | {*LABEL_COLUMNS}
     keys = [name for name in table.header if name not in known]
     if not 1 <= len(keys) <= 2:
-        problem = "must have one or two columns of outside numbers beside x, y, z, rx, ry, rz"
+        problem = "must have one or two columns of external quantities beside x, y, z, rx, ry, rz"
         raise InputFileError(path, "header", problem, keys)
     names, units, columns = [], [], []
     for key in keys:
@@ -220,7 +222,7 @@ def load_outside(path: str | Path) -> OutsideTable:
 
 
 def read_outside(section: Section) -> dict[str, Any]:
-    """Return the table that stands in a model file."""
+    """Read the block ``outside`` of a model file; return the table under the MachineModel's field name."""
     names, units, nodes = [], [], []
     for axis in section.sections("axes"):
         names.append(axis.text("name"))
@@ -237,7 +239,7 @@ def read_outside(section: Section) -> dict[str, Any]:
 
 
 def outside_block(table: OutsideTable) -> dict[str, Any]:
-    """Return the content of a table for a model file; empty if there is none."""
+    """Return the content of a model file's block ``outside``; empty if there is no table."""
     if not table.names:
         return {}
     axes = [

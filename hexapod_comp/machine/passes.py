@@ -1,4 +1,4 @@
-"""Poses that a machine is sent through, each in a direction."""
+"""Poses that a machine passes through, each in a direction of travel."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from ..pose import rotation_from_angles
 from .geometry import HexapodGeometry
 from .kinematics import Structure, strut_lengths_batch
 
-LEAST_SPEED = 1e-9  # Below this share of the speed of travel an axis or a strut counts as at rest
+LEAST_SPEED = 1e-9  # An axis or strut slower than this share of the speed of travel counts as at rest
 BOTH_WAYS = (1.0, -1.0)  # Forward, backward
-# A pose is approached over this distance at least, m. A strut that turns back where it arrives still has the direction
-# in which it came: its nut has not crossed the backlash yet
+# Assumed straight approach to a pose, m. The direction of a strut is taken over this distance: a strut that reverses
+# just before the pose keeps its direction, as its nut has not crossed the backlash yet
 APPROACH = 2e-3
 
 # Positions, shape (N, 3), m, and rotations, shape (N, 3, 3), of ``pose_platform_in_base``
@@ -23,12 +23,12 @@ Poses = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Passes:
-    """Platform poses of a machine, each passed in a direction."""
+    """N commanded platform poses of a machine, each with a direction of travel."""
 
-    geometry: HexapodGeometry  # The nominal machine
-    positions: np.ndarray  # (N, 3): commanded ``pose_platform_in_base``, m
-    rotations: np.ndarray  # (N, 3, 3)
-    directions: np.ndarray  # (N, 3): directions of travel in ``base``; length does not matter
+    geometry: HexapodGeometry  # the nominal machine
+    positions: np.ndarray  # (N, 3): positions of ``pose_platform_in_base``, m
+    rotations: np.ndarray  # (N, 3, 3): rotations of ``pose_platform_in_base``
+    directions: np.ndarray  # (N, 3): directions of travel in ``base``, of any length
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -37,13 +37,13 @@ class Passes:
     def of_tool(
         geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, directions: np.ndarray
     ) -> Passes:
-        """Return the passes that bring the tool to poses in the work frame."""
+        """Return the passes in which the tool is at N poses in ``work``; directions (N, 3) in ``work`` too."""
         platform = geometry.platform_poses(positions, rotations)
         return Passes(geometry, *platform, directions @ geometry.work.rotation.T)
 
     @property
     def poses(self) -> Poses:
-        """Positions and rotations."""
+        """Positions (N, 3), m, and rotations (N, 3, 3) of ``pose_platform_in_base``."""
         return self.positions, self.rotations
 
     def of_the_tool(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -52,40 +52,40 @@ class Passes:
         return *tool, self.directions @ self.geometry.work.rotation
 
     def both_ways(self) -> Passes:
-        """Return these passes, and then all of them in the opposite direction."""
+        """Return these passes, followed by the same poses passed in the opposite direction."""
         directions = np.concatenate([way * self.directions for way in BOTH_WAYS])
         twice = np.tile(self.positions, (2, 1)), np.tile(self.rotations, (2, 1, 1))
         return Passes(self.geometry, *twice, directions)
 
     def points(self, point: np.ndarray) -> np.ndarray:
-        """Return the commanded places of a point of ``platform``, shape (3,), shape (N, 3), m in ``base``."""
+        """Return the commanded positions, (N, 3), m in ``base``, of a point (3,), m, of ``platform``."""
         return self.positions + self.rotations @ point
 
     def senses(self) -> np.ndarray:
-        """Return in which direction axes and struts arrive at the poses, shape (N, 9), each −1, 0 or 1."""
+        """Return the directions, −1, 0 or 1, in which three axes and six struts arrive at the poses, shape (N, 9)."""
         lengths = np.linalg.norm(self.directions, axis=1, keepdims=True)
         ways = APPROACH * self.directions / np.where(lengths > 0.0, lengths, 1.0)
         return arrivals(self.geometry, self.poses, (self.positions - ways, self.rotations))
 
     def select(self, mask: np.ndarray) -> Passes:
-        """Return those in a mask or at indices."""
+        """Return the passes in a mask or at indices."""
         return Passes(self.geometry, self.positions[mask], self.rotations[mask], self.directions[mask])
 
     def nominal_commands(self) -> np.ndarray:
-        """Return the strut lengths of the nominal machine, shape (N, 6), m: the commands without compensation."""
+        """Return the nominal strut lengths, shape (N, 6), m: the commands without compensation."""
         return strut_lengths_batch(Structure.of(self.geometry), *self.poses)
 
     def refusals(self) -> list[HexapodError | None]:
-        """Return, for each pass, why the nominal machine cannot reach its pose, or None."""
+        """Return, for each pass, the error of the limit that its pose breaks, or None."""
         lengths = self.nominal_commands()
         return [self.geometry.refusal(*pose) for pose in zip(self.positions, self.rotations, lengths, strict=True)]
 
     def reachable(self) -> np.ndarray:
-        """Return the mask, shape (N,), of the passes whose poses the nominal machine can reach."""
+        """Return the mask, shape (N,), of the passes whose poses are within the machine's limits."""
         return np.array([refusal is None for refusal in self.refusals()])
 
     def refuse_unreachable(self) -> None:
-        """Raise the error of the first pass that the nominal machine cannot reach."""
+        """Raise the error of the first pass whose pose breaks a limit of the machine."""
         for position, refusal in zip(self.positions, self.refusals(), strict=True):
             if refusal is not None:
                 refusal.args = (f"{at(position)}: {refusal}",)
@@ -93,7 +93,7 @@ class Passes:
 
 
 def arrivals(geometry: HexapodGeometry, poses: Poses, before: Poses) -> np.ndarray:
-    """Return in which direction axes and struts arrive at poses from those shortly before, shape (N, 9), −1, 0 or 1."""
+    """Return directions (N, 9), −1, 0 or 1, of three axes and six struts at N poses, coming from the poses `before`."""
     structure = Structure.of(geometry)
     changes = strut_lengths_batch(structure, *poses) - strut_lengths_batch(structure, *before)
     moving = np.concatenate([poses[0] - before[0], changes], axis=1) / APPROACH
@@ -101,12 +101,12 @@ def arrivals(geometry: HexapodGeometry, poses: Poses, before: Poses) -> np.ndarr
 
 
 def at(position: np.ndarray) -> str:
-    """Describe the platform's place, for messages; position (3,), m."""
+    """Return the platform's position, (3,), m, as text for messages."""
     return "platform at ({:.3f}, {:.3f}, {:.3f}) mm in base".format(*(position * 1e3))
 
 
 def random_directions(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Return random unit vectors, shape (count, 3)."""
+    """Return unit vectors in random directions, shape (count, 3)."""
     directions = rng.standard_normal((count, 3))
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
@@ -119,7 +119,10 @@ def random_passes(
     rng: np.random.Generator,
     level: np.ndarray | None = None,
 ) -> Passes:
-    """Return passes through random points of a box of the work frame: all in one direction, then all back."""
+    """Return passes of the tool through random points of a box (2, 3), m in ``work``, tilted by at most `tilt`, rad.
+
+    Each point is passed in a random direction, and after all points once more in the opposite direction.
+    """
     positions = rng.uniform(box[0], box[1], (points, 3))
     directions = random_directions(rng, points)
     tilts = np.append(rng.uniform(-tilt, tilt, (points, 2)), np.zeros((points, 1)), axis=1)

@@ -1,4 +1,4 @@
-"""Pictures of a machine and of its conventions."""
+"""Drawings of a machine at home: bodies, struts, joint numbers, frames and cardan axes."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from ..formats.figures import WITH, WITHOUT
 from ..pose import Pose
 from .geometry import HexapodGeometry
 
-AXIS_COLOURS = ("#b22222", "#2e8b57", "#4169e1")  # of x, y and z; their letters stand beside them
-CARDAN = "#007f7f"  # colour of the cardan axes that are fixed to a body
+AXIS_COLOURS = ("#b22222", "#2e8b57", "#4169e1")  # colours of the axes x, y and z of a frame
+CARDAN = "#007f7f"  # colour of the cardan axes that are fixed to base and platform
 
 
 def draw_in_space(axes: Any, geometry: HexapodGeometry) -> None:
-    """Draw a machine at home on 3-D axes, seen from ``base``, mm: bodies, struts, frames, and cardan axes if given."""
+    """Draw a machine at home on 3-D axes, mm in ``base``: bodies, struts, frames, and cardan axes if given."""
     base, platform = _joints(geometry)
     _bodies(axes, base, platform)
     reach = float(np.linalg.norm(base - base.mean(axis=0), axis=1).max())
@@ -34,7 +34,7 @@ def draw_in_space(axes: Any, geometry: HexapodGeometry) -> None:
 
 
 def draw_flat(axes: Any, geometry: HexapodGeometry, plane: tuple[int, int], labels: bool = True) -> None:
-    """Draw bodies and struts at home on flat axes, those two coordinates of ``base``, mm; with numbers or without."""
+    """Draw bodies and struts at home on 2-D axes, projected to a plane of ``base`` such as (0, 2) for x and z, mm."""
     base, platform = _joints(geometry)
     _bodies(axes, base[:, plane], platform[:, plane], labels)
     axes.set(xlabel=f"{'xyz'[plane[0]]} in base, mm", ylabel=f"{'xyz'[plane[1]]} in base, mm", aspect="equal")
@@ -42,13 +42,13 @@ def draw_flat(axes: Any, geometry: HexapodGeometry, plane: tuple[int, int], labe
 
 
 def _joints(geometry: HexapodGeometry) -> tuple[np.ndarray, np.ndarray]:
-    """Return base and platform joints at home, seen from ``base``, mm."""
+    """Return base and platform joints at home in ``base``, mm, each (6, 3)."""
     platform = geometry.home.position + geometry.platform_joints @ geometry.home.rotation.T
     return geometry.base_joints * 1e3, platform * 1e3
 
 
 def _bodies(axes: Any, base: np.ndarray, platform: np.ndarray, labels: bool = True) -> None:
-    """Draw both bodies and the six struts on flat or 3-D axes; joints (6, 2) or (6, 3), mm."""
+    """Draw both bodies and the six struts on 2-D or 3-D axes; joints (6, 2) or (6, 3), mm."""
     for joints, colour in ((base, "black"), (platform, WITH)):
         axes.plot(*np.vstack([joints, joints[:1]]).T, color=colour, lw=2.0, marker="o", ms=4)
     for start, end in zip(base, platform, strict=True):
@@ -64,14 +64,14 @@ def _bodies(axes: Any, base: np.ndarray, platform: np.ndarray, labels: bool = Tr
 
 
 def _labels(axes: Any, joints: np.ndarray, letter: str, style: dict[str, str], place: Any) -> None:
-    """Write the numbers of joints, those at the same place together."""
+    """Write the joints' numbers on the axes; joints at the same place get one text, such as t₁ = t₂."""
     for joint in np.unique(joints.round(6), axis=0):
         here = np.flatnonzero(np.abs(joints - joint).max(axis=1) < 1e-3) + 1
         axes.text(*place(joint), " = ".join(f"${letter}_{i}$" for i in here), ha="center", **style)
 
 
 def _frames(geometry: HexapodGeometry) -> dict[str, Pose]:
-    """Return the frames to draw, by name, relative to ``base``."""
+    """Return the poses in ``base`` of the frames to draw, by name; a tool or work frame without offset is left out."""
     frames = {"base": Pose.identity(), "platform": geometry.home}
     offsets = ("tool", geometry.home, geometry.tool), ("work", frames["base"], geometry.work)
     for name, outer, inner in offsets:
@@ -81,7 +81,7 @@ def _frames(geometry: HexapodGeometry) -> dict[str, Pose]:
 
 
 def _frame(axes: Any, name: str, pose: Pose, length: float) -> None:
-    """Draw the axes of a frame, of this length in mm, and its name on 3-D axes."""
+    """Draw a frame on 3-D axes: three lines of the given length, mm, and the frame's name."""
     origin = pose.position * 1e3
     for axis, colour, letter in zip(pose.rotation.T, AXIS_COLOURS, "xyz", strict=True):
         tip = origin + length * axis

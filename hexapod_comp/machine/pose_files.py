@@ -1,4 +1,4 @@
-"""CSV files of poses and of strut lengths, units in the column names: what ``ik`` and ``fk`` read and write."""
+"""CSV files of poses and of strut lengths that ``ik`` and ``fk`` read and write; column names end in their units."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ POSITION_COLUMNS = ("x", "y", "z")
 ANGLE_COLUMNS = ("alpha", "beta", "gamma")
 QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
 LENGTH_COLUMNS = tuple(f"L{i}" for i in range(1, 7))
-# The tool's errors of `ik --model`, each for x, y, z and rx, ry, rz
+# Columns of the tool's predicted errors and their standard deviations, from `ik --model`; {} is x, y, z, rx, ry or rz
 PREDICTED_ERRORS = tuple(f"{error}_{{}}{known}" for error in ("error", "error_aligned") for known in ("", "_sd"))
-# Columns that `ik --model` and `ik --line` add to lengths and :func:`read_lengths` ignores, with their dimension
+# Columns beside the lengths in files of `ik --model` and `ik --line`, and their dimension; `read_lengths` ignores them
 BESIDE_LENGTHS = {
     tuple(f"nominal_{name}" for name in LENGTH_COLUMNS): "length",
     tuple(f"correction_{name}" for name in LENGTH_COLUMNS): "length",
@@ -31,7 +31,7 @@ BESIDE_LENGTHS = {
 
 
 def read_poses(path: str | Path) -> tuple[list[Row], list[Pose]]:
-    """Read poses from a CSV file; ``table1.csv`` or another shipped name, or ``-`` for standard input.
+    """Read poses from a CSV file, a shipped file such as ``table1.csv``, or ``-`` for standard input.
 
     Columns: ``x_mm``, ``y_mm``, ``z_mm`` (or ``_m``, ``_um``, ``_in``); optionally ``alpha_deg``,
     ``beta_deg``, ``gamma_deg`` (the paper's angles; or ``_rad``, …) or ``qx``, ``qy``, ``qz``, ``qw``;
@@ -40,21 +40,21 @@ def read_poses(path: str | Path) -> tuple[list[Row], list[Pose]]:
     Returns
     -------
     rows : list of Row
-        Where each pose stands.
+        Line number and label of each pose.
     poses : list of Pose
-        m and rotation matrices.
+        Poses in the frame of the file.
 
     Raises
     ------
     InputFileError
-        Naming file, line and column.
+        The file cannot be used; the message names file, line and column.
     """
     rows, positions, rotations = read_pose_arrays(path)
     return rows, [Pose(p, r) for p, r in zip(positions, rotations, strict=True)]
 
 
 def read_pose_arrays(path: str | Path) -> tuple[list[Row], np.ndarray, np.ndarray]:
-    """Read poses as :func:`read_poses` does, for files of many thousand rows."""
+    """Read poses as :func:`read_poses` does, but return arrays, which are faster for many thousand rows."""
     table = Table(input_file(path, "poses"))
     positions, rotations = poses_of(table)
     table.refuse_unknown()
@@ -62,7 +62,7 @@ def read_pose_arrays(path: str | Path) -> tuple[list[Row], np.ndarray, np.ndarra
 
 
 def poses_of(table: Table) -> tuple[np.ndarray, np.ndarray]:
-    """Return the poses of the columns that :func:`read_poses` describes, shapes (N, 3), (N, 3, 3)."""
+    """Return positions (N, 3), m, and rotations (N, 3, 3) from the columns that :func:`read_poses` describes."""
     columns = table.required(POSITION_COLUMNS, "length")
     angle_columns = table.columns(ANGLE_COLUMNS, "angle")
     quaternion_columns = table.columns(QUATERNION_COLUMNS, None)
@@ -76,7 +76,7 @@ def poses_of(table: Table) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rotations_of(table: Table, turns: np.ndarray, columns: str) -> np.ndarray:
-    """Return the rotation matrices (N, 3, 3) of the rows' angles (N, 3), rad, or quaternions (N, 4)."""
+    """Return rotation matrices (N, 3, 3) of the table's angles (N, 3), rad, or quaternions (N, 4), checked."""
     row = int(np.abs(turns).max(axis=1).argmax())
     try:
         if turns.shape[1] == 3:
@@ -91,7 +91,7 @@ def rotations_of(table: Table, turns: np.ndarray, columns: str) -> np.ndarray:
 
 
 def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
-    """Read strut lengths from a CSV file (or ``-``) with the columns ``L1_mm`` … ``L6_mm`` (or ``_m``, …)."""
+    """Read strut lengths (N, 6), m, from a CSV file or ``-``, with columns ``L1_mm`` … ``L6_mm`` (or ``_m``, …)."""
     table = Table(input_file(path, "lengths"))
     lengths = table.numbers(table.required(LENGTH_COLUMNS, "length"))
     for names, dimension in BESIDE_LENGTHS.items():
@@ -101,5 +101,5 @@ def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
 
 
 def length_values(lengths: np.ndarray) -> dict[str, float]:
-    """Return six lengths as the columns that :func:`read_lengths` reads, mm."""
+    """Return six strut lengths, m, as mm by the column names ``L1_mm`` … ``L6_mm``."""
     return {f"{name}_mm": float(value) * 1e3 for name, value in zip(LENGTH_COLUMNS, lengths, strict=True)}

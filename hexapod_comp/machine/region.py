@@ -1,4 +1,4 @@
-"""The region in which a model was measured."""
+"""The box in which a model was measured: positions of the measured point, in a frame of its own."""
 
 from __future__ import annotations
 
@@ -11,53 +11,53 @@ import numpy as np
 from ..errors import ModelError
 from ..pose import Pose
 from .geometry import HexapodGeometry
-from .terms import settle, term
+from .terms import term, validate_terms
 
-ON_THE_FACE = 1e-9  # Places further outside than this, m, are outside: files keep a picometre
-PARALLEL = 1e-9  # Directions whose components differ by less are parallel
+ON_THE_FACE = 1e-9  # Distance from the box, m, up to which a point counts as inside: files keep a picometre
+PARALLEL = 1e-9  # Components of a direction below this count as zero
 
 
 @dataclass(frozen=True)
 class Region:
-    """A box in which one point of the platform, the measured one, may be placed."""
+    """A box of positions of the measured point, which is a point of the platform."""
 
     box: np.ndarray = term(
-        "region", "mm", "lowest and highest place of the measured point", (2, 3), MISSING, checked=False
+        "region", "mm", "lowest and highest position of the measured point", (2, 3), MISSING, checked=False
     )
-    point: np.ndarray = term("region", "mm", "that point, in platform", (3,))
-    position: np.ndarray = term("region", "mm", "origin of the box's axes in base: of the work frame measured in", (3,))
-    angles: np.ndarray = term("region", "deg", "their rotation, α, β, γ", (3,), key="rotation")
+    point: np.ndarray = term("region", "mm", "the measured point, in platform", (3,))
+    position: np.ndarray = term("region", "mm", "origin of the box's axes in base: the measurement's work frame", (3,))
+    angles: np.ndarray = term("region", "deg", "rotation of the box's axes in base, α, β, γ", (3,), key="rotation")
 
     @staticmethod
     def of(box: np.ndarray, point: np.ndarray, frame: Pose) -> Region:
-        """Return a box of places of a point in a frame, given as its pose in ``base``."""
+        """Return the region of a point (3,), m in ``platform``, with a box (2, 3), m, along the axes of a frame."""
         return Region(box, point, frame.position, frame.angles())
 
     @cached_property
     def frame(self) -> Pose:
-        """Pose of the box in ``base``."""
+        """Pose of the box's axes in ``base``."""
         return Pose.from_angles(self.position, self.angles)
 
     def __post_init__(self) -> None:
         box = np.array(self.box, dtype=float)
         if box.shape != (2, 3) or not (box[0] < box[1]).all():
-            raise ModelError("region.box", "must be its lowest and its highest corner, m", box.tolist())
-        settle(self)
+            raise ModelError("region.box", "must be the lowest and the highest corner of a box, m", box.tolist())
+        validate_terms(self)
 
     def contains(self, positions: np.ndarray, rotations: np.ndarray, slack: float = ON_THE_FACE) -> np.ndarray:
-        """Return whether the point is in the box, or outside by no more than `slack`, m, at platform poses, (N,)."""
+        """Return, for N platform poses, whether the measured point is in the box enlarged by `slack`, m; (N,)."""
         places = (positions + rotations @ self.point - self.frame.position) @ self.frame.rotation
         return ((places >= self.box[0] - slack) & (places <= self.box[1] + slack)).all(axis=-1)
 
     def poses(self, places: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return ``pose_platform_in_base`` of one rotation (3, 3) with the point at places (N, 3), m, of the frame."""
+        """Return ``pose_platform_in_base`` with a rotation (3, 3) and the measured point at (N, 3), m in the frame."""
         in_base = self.frame.position + places @ self.frame.rotation.T
         return in_base - rotation @ self.point, np.tile(rotation, (len(places), 1, 1))
 
     def commanded(self, geometry: HexapodGeometry) -> np.ndarray:
-        """Return the box of level tool positions in ``work`` for which the point is inside, shape (2, 3), m."""
-        level = geometry.work.rotation @ geometry.tool.rotation.T  # of the platform, when the tool is level
-        beside = level @ (geometry.tool.position - self.point)  # the tool's tip from the point, in base
+        """Return a box of level tool positions in ``work`` at which the measured point is inside, (2, 3), m."""
+        level = geometry.work.rotation @ geometry.tool.rotation.T  # rotation of the platform with a level tool
+        beside = level @ (geometry.tool.position - self.point)  # from the measured point to the tool's tip, in base
         middle = self.frame.position + self.frame.rotation @ self.box.mean(axis=0)
         centre = geometry.work.rotation.T @ (middle + beside - geometry.work.position)
         half, turned = 0.5 * np.ptp(self.box, axis=0), np.abs(geometry.work.rotation.T @ self.frame.rotation)
@@ -67,7 +67,7 @@ class Region:
         return np.array([centre - inside, centre + inside])
 
     def text(self, geometry: HexapodGeometry) -> str:
-        """Return the box as text: of level tool positions in ``work``."""
+        """Return the box of level tool positions in ``work`` as text, mm."""
         box = self.commanded(geometry).round(9) * 1e3
         low, high = (", ".join(f"{v:g}" for v in corner) for corner in box)
         sides = " × ".join(f"{side:.4g}" for side in np.ptp(box, axis=0))
@@ -75,12 +75,12 @@ class Region:
 
 
 def region_text(region: Region | None, geometry: HexapodGeometry) -> str:
-    """Return the box in which a model was measured as text; "none" if the model does not state it."""
+    """Return the box in which a model was measured, as text; "none" if the model does not state the box."""
     return "measured box: none" if region is None else f"measured box: {region.text(geometry)}"
 
 
 def region_json(region: Region | None, geometry: HexapodGeometry) -> dict[str, Any] | None:
-    """Return the region of a model's measurement as plain numbers; units are in the keys."""
+    """Return the box in which a model was measured for JSON, in m; None if the model does not state the box."""
     if region is None:
         return None
     return {"tool_in_work_m": region.commanded(geometry), "measured_point_in_platform_m": region.point}

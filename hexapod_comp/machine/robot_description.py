@@ -1,9 +1,9 @@
 """Descriptions of the machine for robot programs: URDF for robot_state_publisher and ros2_control, MJCF for MuJoCo.
 
-URDF describes trees only, and a hexapod has closed loops. So the tree has seven branches: the platform, on six joints
-that give its pose, and six struts, each on two crossed hinges at its base joint and with a slide whose position is its
-length. :func:`joint_positions` gives all of them for one pose, so that each strut ends where its platform joint is.
-MJCF closes the loops by constraints.
+URDF describes trees only, but a hexapod has closed loops. So the URDF has seven branches. One is the platform on six
+joints that give its pose. The others are the six struts, each on two crossed hinges at its base joint and with a slide
+whose position is the strut's length. :func:`joint_positions` returns the positions of all these joints for one pose, at
+which each strut ends at its platform joint. MJCF closes the loops by constraints.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from ..pose import Pose, roll_pitch_yaw
 from .geometry import BASE, STRUT_NAMES, HexapodGeometry
 from .kinematics import strut_lengths
 
-# In their order from base to platform: R = Ry(β)·Rx(α)·Rz(γ) (Song et al., T_BASE^TOP)
+# The platform's joints in order from base to platform, as in R = Ry(β)·Rx(α)·Rz(γ) (Song et al., T_BASE^TOP)
 PLATFORM_JOINTS = ("platform_x", "platform_y", "platform_z", "platform_beta", "platform_alpha", "platform_gamma")
 X, Y, Z = "1.0 0.0 0.0", "0.0 1.0 0.0", "0.0 0.0 1.0"
 STRUT_RADIUS, JOINT_RADIUS, PLATE = 0.01, 0.018, 0.01  # Drawn sizes, m: struts, joints, and the platform's thickness
-# ros2_control's hardware and its parameters; the last one makes it send commands near the readings too. It exits at a
-# reading with velocities, which ours have, unless each joint has a state for them
+# Hardware plugin of ros2_control and its parameters. The threshold -1 makes the plugin send every command, even one
+# equal to the reading. The plugin exits at a message with velocities, as ours are, if joints have no velocity state
 TOPICS = (
     "joint_state_topic_hardware_interface/JointStateTopicSystem",
     {
@@ -34,25 +34,25 @@ TOPICS = (
     },
 )
 MOCK: tuple[str, dict[str, str]] = ("mock_components/GenericSystem", {})
-# Density of the drawn bodies, kg/m³, in MJCF; a machine file has no masses. A platform of 0.35 m weighs 7 kg
+# Density of the bodies in MJCF, kg/m³, as a machine file has no masses. A platform of 0.35 m then weighs 7 kg
 STEEL = 7850.0
-# Armature of a strut's slide, kg, 1.3e-4 kg m² turning on a screw of 5 mm lead; and of a hinge at its foot, kg m².
-# Light bodies with stiff drives need short steps: the armature gives the slides inertia without weight
+# Inertia of a strut's slide, kg (1.3e-4 kg m² on a screw of 5 mm lead), and of a hinge at its foot, kg m². MuJoCo's
+# armature gives inertia without weight; light bodies with stiff drives would need a shorter time step
 SCREW_INERTIA, HINGE_INERTIA = 200.0, 0.01
-# Of a strut's drive: N/m, a steel rod of 20 mm over 0.6 m; N s/m, critical with :data:`SCREW_INERTIA`
+# Stiffness of a strut's drive, N/m (a steel rod of 20 mm, 0.6 m long), and damping, N s/m: critical for SCREW_INERTIA
 STIFFNESS, DAMPING = 1e8, 2.8e5
-# Speed, m/s, to which the damping holds a strut under its drive's largest force, where the machine's limit is higher.
-# Without a limit of force, a `ctrl` that was not set, 0, would throw the platform
+# The drive's largest force is DAMPING times this speed, m/s, or times the machine's limit of speed if that is smaller.
+# Without a limit of force, a `ctrl` that was not set (0) would throw the platform
 FASTEST = 1.0
-# MuJoCo's step, s; struts' ends are tied as stiffly as that allows (two steps): gravity separates them by 0.1 µm
+# MuJoCo's time step, s, and the stiffest ties of the struts' ends for it (two steps): gravity opens them by 0.1 µm
 TIMESTEP, TIED = 1e-3, {"solref": "0.002 1", "solimp": "0.9999 0.9999 0.001"}
-LOOSE = 1e3  # Limit of effort and speed of joints without motor; readers of URDF require one
+LOOSE = 1e3  # Limit of effort and speed of joints without a motor, as readers of URDF require a limit
 
 
 def joint_positions(
     geometry: HexapodGeometry, platform: Pose, joint_names: Sequence[str] = STRUT_NAMES
 ) -> dict[str, float]:
-    """Return the position of every joint of :func:`urdf` at a pose."""
+    """Return the positions, m and rad, of all joints of :func:`urdf` at a platform pose, by joint name."""
     alpha, beta, gamma = platform.angles()
     values = dict(zip(PLATFORM_JOINTS, (*platform.position, beta, alpha, gamma), strict=True))
     ends = platform.position + geometry.platform_joints @ platform.rotation.T
@@ -71,9 +71,9 @@ def urdf(
     ros2_control: bool = True,
     hardware: tuple[str, dict[str, str]] = TOPICS,
 ) -> str:
-    """Return the machine as URDF: links ``base``, ``work``, ``platform``, ``tool``, the struts', the named frames'.
+    """Return the machine as URDF, with a link for each body, strut, tool and work frame.
 
-    ros2_control's block moves the struts through topics, or simulates drives at home with the hardware :data:`MOCK`.
+    The block ros2_control moves the struts through topics; with the hardware :data:`MOCK` it simulates ideal drives.
     """
     robot = ET.Element("robot", name=geometry.name)
     span, half = float(np.abs(geometry.home.position).max() + geometry.limits.stroke.max()), 0.5 * np.pi
@@ -111,7 +111,7 @@ def urdf(
 def _add_control(
     robot: ET.Element, geometry: HexapodGeometry, joint_names: Sequence[str], plugin: str, parameters: dict[str, str]
 ) -> None:
-    """Add ros2_control's block: commands and states of the struts."""
+    """Add the block ``ros2_control``: command and state interfaces of the struts."""
     control = _add(robot, "ros2_control", name=geometry.name, type="system")
     hardware = _add(control, "hardware")
     _add(hardware, "plugin").text = plugin
@@ -128,20 +128,20 @@ def _add_control(
 
 
 def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) -> str:
-    """Return the machine as MJCF, loops closed: a free platform, each strut's end tied to it, drives on the slides.
+    """Return the machine as MJCF: a free platform, six struts whose ends are tied to it, a drive on each strut's slide.
 
-    Sites ``base_joint_N``, ``strut_end_N`` and ``platform_joint_N`` mark both ends of a strut, ``tool`` and other
-    names the tools. The reference position is home, and so is the keyframe ``home``, whose `ctrl` holds the machine
-    there; a drive's `ctrl` is the length of its strut. Gravity acts along −z of the base.
+    Sites ``base_joint_N``, ``strut_end_N`` and ``platform_joint_N`` mark the ends of strut N; a site with a tool's name
+    marks the tool. The reference position is home; the keyframe ``home`` also sets `ctrl`, so that the drives hold the
+    machine there. A drive's `ctrl` is its strut's length, m. Gravity acts along −z of the base.
     """
     home, (middle, radius) = geometry.home, _plate(geometry)
     lengths, push = strut_lengths(geometry, home), DAMPING * min(geometry.limits.speed, FASTEST)
     root = ET.Element("mujoco", model=geometry.name)
     _add(root, "compiler", angle="radian", autolimits="true")
-    # Damping is integrated implicitly: explicit steps would have to be shorter than a light body's settling time.
+    # Implicit integration of damping; explicit steps would have to be shorter than the settling time of a light body
     _add(root, "option", integrator="implicitfast", timestep=TIMESTEP)
     default = _add(root, "default")
-    # Struts begin and end inside each other's joints and the plate: nothing collides
+    # Collisions are off, as the drawn struts overlap each other at shared joints, and the plate
     _add(default, "geom", density=STEEL, contype="0", conaffinity="0")
     _add(default, "equality", **TIED)
     world, ties, drives = _add(root, "worldbody"), _add(root, "equality"), _add(root, "actuator")
@@ -157,7 +157,7 @@ def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
     feet = map(Pose, geometry.base_joints, foot_frames(geometry))
     rows = zip(joint_names, lengths, geometry.limits.stroke, feet, bent, strict=True)
     for n, (name, length, reach, foot, angle) in enumerate(rows, 1):
-        # MuJoCo adds a joint's position to the place of its body: `ref` makes it the length, or the angle
+        # MuJoCo counts a joint's position from `ref` in the model's reference pose: here the length or angle at home
         c, s, short = np.cos(angle), np.sin(angle), reach[0]
         turned = foot.rotation @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
         body = _add(world, "body", name=f"{name}_body", **_place(foot.position, turned))
@@ -179,10 +179,10 @@ def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
 
 
 def foot_frames(geometry: HexapodGeometry) -> np.ndarray:
-    """Return a frame at each base joint, (6, 3, 3): y along the first hinge, z nearest to the strut at home.
+    """Return the axes of a frame at each base joint, (6, 3, 3): y along the first hinge, z close to the strut at home.
 
-    The hinge is the cardan joint's axis in the base where the geometry states it, else one across the strut, far from
-    the hinges' singularity.
+    The first hinge is the base's cardan axis if the geometry gives it, otherwise an axis perpendicular to the strut at
+    home.
     """
     home = geometry.home
     along = home.position + geometry.platform_joints @ home.rotation.T - geometry.base_joints
@@ -205,7 +205,7 @@ def _text(root: ET.Element) -> str:
 
 
 def _add(parent: ET.Element, tag: str, **attributes: Any) -> ET.Element:
-    """Add an element; its attributes are texts, or numbers."""
+    """Add an XML element; attributes are texts, numbers or arrays of numbers."""
     texts = {name: value if isinstance(value, str) else _numbers(value) for name, value in attributes.items()}
     return ET.SubElement(parent, tag, texts)
 
@@ -235,19 +235,19 @@ def _join(robot: ET.Element, name: str, kind: str, parent: str, child: str, at: 
 
 
 def _fix(robot: ET.Element, parent: str, name: str, at: Pose) -> None:
-    """Add a frame that is fixed to a link."""
+    """Add a link without a body, fixed to the link `parent` at a pose."""
     _join(robot, f"{name}_mount", "fixed", parent, name, at)
     _add(robot, "link", name=name)
 
 
 def _move(joint: ET.Element, axis: str, limits: tuple[float, float], speed: float = LOOSE) -> None:
-    """Let a joint move along or about an axis."""
+    """Set a joint's axis of motion, its position limits, m or rad, and its speed limit."""
     _add(joint, "axis", xyz=axis)
     _add(joint, "limit", lower=limits[0], upper=limits[1], effort=LOOSE, velocity=min(speed, LOOSE))
 
 
 def _plate(geometry: HexapodGeometry) -> tuple[np.ndarray, float]:
-    """Return middle and radius of a disc through the platform's joints."""
+    """Return centre and radius of a disc through the platform's joints, m."""
     joints = geometry.platform_joints
     middle = joints.mean(axis=0)
     return middle, float(np.linalg.norm((joints - middle)[:, :2], axis=1).mean())

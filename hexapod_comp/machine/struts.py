@@ -1,4 +1,4 @@
-"""A real strut's response to its command: offset, pitch, screw waves, length map, backlash, growth, rotation."""
+"""The length errors of the real struts: offset, pitch, screw waves, length map, backlash, growth, screw rotation."""
 
 from __future__ import annotations
 
@@ -12,58 +12,57 @@ from ..core.batch import screw_twists
 from ..errors import ModelError
 from .geometry import HexapodGeometry
 from .temperatures import EXPANSION
-from .terms import settle, term
+from .terms import TINY, term, validate_terms
 
-# Largest slope of the strut error against the command: below it, undoing the error is a contraction
+# Largest slope of the length error over the command, m per m: below it, fixed-point iteration inverts the error
 STEEPEST_ERROR = 0.2
-STRUT_LENGTH = 0.1  # Largest error of a strut's length, m: an encoder's zero is found within a hand's breadth
-# Largest growth from dry air to damp: three times that of nylon; carbon fibre in resin has some hundred ppm
+STRUT_LENGTH = 0.1  # Largest error of a strut's length, m: an encoder's zero is known better than a hand's breadth
+# Largest relative growth from dry to damp air: three times that of nylon; carbon fibre in resin has some 100 ppm
 MOISTURE = 0.1
-TINY = float(np.finfo(float).tiny)
 WAVE_PARTS, MAP_PARTS = ("cosine", "sine"), ("map_knots", "map_values", "map_backlash")
-# Errors of a strut's length whose shape the dataclass checks: one column a harmonic, or one a knot
+# Arguments of `term` for arrays whose shape StrutErrors checks: a column per harmonic, or a column per knot
 WAVE: dict[str, Any] = {"default": np.zeros((6, 1)), "largest": STRUT_LENGTH, "checked": False}
 MAP: dict[str, Any] = {"shape": (6, None), "largest": STRUT_LENGTH, "checked": False}
 
 
 @dataclass(frozen=True)
 class StrutErrors:
-    """Errors of the six struts: arrays of shape (6,), waves (6, harmonics), maps (6, knots)."""
+    """Length errors of the six struts: arrays of shape (6,), waves (6, harmonics), maps (6, knots)."""
 
-    offset: np.ndarray = term("struts", "um", "length at a zero command error", largest=STRUT_LENGTH)
-    pitch: np.ndarray = term("struts", "ppm", "relative pitch error")
-    reference_length: np.ndarray = term("struts", "mm", "command at which the pitch error is zero")
+    offset: np.ndarray = term("struts", "um", "constant length error, actual − commanded", largest=STRUT_LENGTH)
+    pitch: np.ndarray = term("struts", "ppm", "relative error of the screw's pitch")
+    reference_length: np.ndarray = term("struts", "mm", "command at which the pitch error adds no length")
     backlash: np.ndarray = term("struts", "um", "lost motion on reversal", least=0.0, largest=STRUT_LENGTH)
-    expansion: np.ndarray = term("struts", "ppm_per_K", "thermal expansion", largest=EXPANSION)
+    expansion: np.ndarray = term("struts", "ppm_per_K", "thermal expansion of the strut", largest=EXPANSION)
     moisture: np.ndarray = term(
-        "struts", "ppm_per_percent", "growth by relative humidity above 50 %: struts of carbon fibre", largest=MOISTURE
+        "struts", "ppm_per_percent", "growth per relative humidity above 50 %: carbon fibre struts", largest=MOISTURE
     )
-    cosine: np.ndarray = term("struts.wave", "um", "screw wave: cosine·cos(2πc/period)", **WAVE)
-    sine: np.ndarray = term("struts.wave", "um", "and sine·sin(2πc/period)", **WAVE)
-    period: np.ndarray = term("struts.wave", "mm", "one turn of the screw", default=0.01, least=TINY)
-    map_knots: np.ndarray = term("struts.map", "mm", "commands, increasing", (None,), key="knots", checked=False)
+    cosine: np.ndarray = term("struts.wave", "um", "screw wave: amplitude of cos(2πc/period) of command c", **WAVE)
+    sine: np.ndarray = term("struts.wave", "um", "screw wave: amplitude of sin(2πc/period) of command c", **WAVE)
+    period: np.ndarray = term("struts.wave", "mm", "change of length per screw turn", default=0.01, least=TINY)
+    map_knots: np.ndarray = term("struts.map", "mm", "increasing commands", (None,), key="knots", checked=False)
     map_values: np.ndarray = term(
-        "struts.map", "um", "length error there: a natural cubic spline, end values held outside", key="values", **MAP
+        "struts.map", "um", "length error at each knot: natural cubic spline, constant beyond", key="values", **MAP
     )
     map_backlash: np.ndarray = term(
-        "struts.map", "um", "by how much the lost motion is larger there than `backlash_um`", key="backlash", **MAP
+        "struts.map", "um", "lost motion at each knot, in addition to `backlash_um`", key="backlash", **MAP
     )
 
     def __post_init__(self) -> None:
         for name in WAVE_PARTS:
             if np.shape(getattr(self, name)) == (6,):
                 object.__setattr__(self, name, np.array(getattr(self, name), dtype=float)[:, None])
-        settle(self)
-        self._settle_waves()
+        validate_terms(self)
+        self._trim_waves()
         self._check_map()
         slope = self._steepest()
         if slope.max() > STEEPEST_ERROR:
             index = int(slope.argmax())
-            problem = f"strut error changes by {slope[index]:.3g} m per m, allowed {STEEPEST_ERROR}"
+            problem = f"length error changes by {slope[index]:.3g} m per m, allowed {STEEPEST_ERROR}"
             raise ModelError(f"struts[{index}]", problem)
 
-    def _settle_waves(self) -> None:
-        """Check the waves' shapes; leave out the last harmonics where no strut has them."""
+    def _trim_waves(self) -> None:
+        """Check the shapes of the wave arrays, and drop the highest harmonics if they are zero in all struts."""
         shape = self.cosine.shape
         if len(shape) != 2 or shape[0] != 6 or not 1 <= shape[1] <= MOST_HARMONICS or self.sine.shape != shape:
             problem = (
@@ -89,11 +88,11 @@ class StrutErrors:
 
     @property
     def harmonics(self) -> np.ndarray:
-        """How often per turn each column of the screw waves repeats, shape (n,): 1, 2, …."""
+        """Periods per screw turn of each column of the wave arrays, shape (n,): 1, 2, …"""
         return np.arange(1, self.cosine.shape[1] + 1)
 
     def _steepest(self) -> np.ndarray:
-        """Return a bound of |dL/dc − 1| per strut."""
+        """Return an upper bound of |dL/dc − 1| for each strut, shape (6,): length L over command c."""
         waves = 2.0 * np.pi / self.period * (np.hypot(self.cosine, self.sine) @ self.harmonics)
         steep = np.abs(self.pitch) + waves
         if len(self.map_knots):
@@ -106,11 +105,11 @@ class StrutErrors:
 
     @property
     def largest_backlash(self) -> np.ndarray:
-        """Lost motion where it is largest, m, shape (6,)."""
+        """Largest lost motion of each strut over its stroke, m, shape (6,)."""
         return self.backlash + self.map_backlash.max(axis=1, initial=0.0)
 
     def spline_coefficients(self) -> np.ndarray:
-        """Return the cubic pieces of the map and of the backlash's change, shape (6, n − 1, 8)."""
+        """Return the four cubic coefficients of the length map and of the backlash map, shape (6, n − 1, 4 + 4)."""
         if not len(self.map_knots):
             return np.zeros((6, 0, 8))
         pieces = natural_spline(self.map_knots, np.vstack([self.map_values, self.map_backlash]).T)
@@ -118,7 +117,7 @@ class StrutErrors:
         return np.ascontiguousarray(np.concatenate([lengths, backlash], axis=2))
 
     def members(self, geometry: HexapodGeometry) -> list[dict[str, Any]]:
-        """Return what hc_strut holds of each strut, by name."""
+        """Return the values of the C struct ``hc_strut`` for each strut, by member name."""
         count = (((self.cosine != 0.0) | (self.sine != 0.0)) * self.harmonics).max(axis=1)
         wave = np.zeros((6, MOST_HARMONICS, 2))
         wave[:, : self.cosine.shape[1]] = np.stack([self.cosine, self.sine], axis=2)
@@ -139,9 +138,9 @@ class StrutErrors:
 
 
 def natural_spline(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the pieces of natural cubic splines through values (n, k) at knots (n,), shape (4, n − 1, k).
+    """Return the coefficients (4, n − 1, k) of natural cubic splines through values (n, k) at knots (n,).
 
-    Coefficients of (x − the piece's first knot), the highest power first. SciPy's CubicSpline takes 14 MB to load.
+    Each piece is a polynomial in x − its first knot, cubic coefficient first. SciPy's CubicSpline takes 14 MB to load.
     """
     width, slope = np.diff(knots)[:, None], np.diff(values, axis=0) / np.diff(knots)[:, None]
     bends = np.zeros(values.shape)  # second derivatives at the knots, zero at both ends
@@ -156,7 +155,7 @@ def natural_spline(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def home_twists(geometry: HexapodGeometry) -> np.ndarray:
-    """Return the screw rotation of each strut at home, rad, shape (6,): the zero of the correction."""
+    """Return the angle, rad, shape (6,), by which joints turn each screw at home: there the lead correction is 0."""
     if not geometry.screw_lead.any():
         return np.zeros(6)
     body = *geometry.kernel_joints, *geometry.kernel_axes

@@ -1,4 +1,4 @@
-"""Temperatures, humidity and load at each station, and a key by which stations with equal ones are grouped."""
+"""Temperatures, humidity and load at each station of a measurement; stations with equal values share a machine."""
 
 from __future__ import annotations
 
@@ -11,40 +11,39 @@ import numpy as np
 from .arrays import different_rows
 from .load import Payload
 from .model import RealMachine
-from .temperatures import HUMIDITY, PARTS, REFERENCE_TEMPERATURE, Lag, Temperatures, late
+from .temperatures import HUMIDITY, PARTS, REFERENCE_TEMPERATURE, Lag, Temperatures, thermal_lags
 
-# Load that is not known: NaN, the mass and centre of the tool in use, and the model's gravity
-NO_LOAD = (math.nan,) * 7
+NO_LOAD = (math.nan,) * 7  # Load that was not stated: the payload of the tool in use and the model's gravity act
 
 
 def load_row(payload: Payload, gravity: Sequence[float] = NO_LOAD[4:]) -> tuple[float, ...]:
-    """Return a payload under gravity, m/s² in base, by default the model's, as a row of :attr:`Surroundings.loads`."""
+    """Return payload and gravity, m/s² in base, as a row of :attr:`Surroundings.loads`; NaN: the model's gravity."""
     return (payload.mass, *payload.centre, *gravity)
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What acted on the machine at N places; two places with a difference in any of these fields are two stations."""
+    """Temperatures, humidity and load of the machine at N poses; poses that differ in any of them are two stations."""
 
     temperatures: np.ndarray  # (N, 8): struts 1–6, base, platform, °C
-    times: np.ndarray  # (N,): when these were read, s; NaN where that is not known
-    humidity: np.ndarray  # (N,): relative humidity of the air, a fraction; NaN where that is not known
-    loads: np.ndarray  # (N, 7): mass, kg, its centre in platform, m, and gravity in base, m/s²; NaN: as usual
+    times: np.ndarray  # (N,): time of each temperature reading, s; NaN if not known
+    humidity: np.ndarray  # (N,): relative humidity of the air, a fraction; NaN if not known
+    loads: np.ndarray  # (N, 7): payload mass, kg, its centre in platform, m, gravity in base, m/s²; NaN: NO_LOAD
 
     @staticmethod
     def usual(count: int) -> Surroundings:
-        """Return 20 °C, and everything else not known, at a number of places."""
+        """Return the surroundings of `count` poses at 20 °C, with time, humidity and load not known."""
         unknown = np.full(count, np.nan)
         warmth = np.full((count, len(PARTS)), REFERENCE_TEMPERATURE)
         return Surroundings(warmth, unknown, unknown, np.tile(NO_LOAD, (count, 1)))
 
     def numbers(self) -> np.ndarray:
-        """Return all fields but the times, one row per place, as bits, by which NaN equals NaN."""
+        """Return all fields except the times, a row per pose, as integers of the same bits, so that NaN equals NaN."""
         rows = np.column_stack([value for name, value in vars(self).items() if name != "times"])
         return np.ascontiguousarray(rows, dtype=float).view(np.int64)
 
     def machines(self, machine: RealMachine) -> list[RealMachine]:
-        """Return the machine at each place; places at which the same acts on it share one."""
+        """Return the machine under the surroundings of each pose; poses with equal surroundings share one object."""
         model, count = machine.model, len(self.times)
         usual = Surroundings.usual(count)
         around = Surroundings(
@@ -55,7 +54,7 @@ class Surroundings:
         )
         constants, lags = model.late_growth.time_constants, np.zeros((count, len(PARTS), 0))
         if constants and np.isfinite(self.times).all():
-            lags = late(self.times, self.temperatures, constants)
+            lags = thermal_lags(self.times, self.temperatures, constants)
         bits = np.hstack([around.numbers(), np.ascontiguousarray(lags.reshape(count, -1)).view(np.int64)])
         first, number = different_rows(bits)
         different = []

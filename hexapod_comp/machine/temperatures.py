@@ -1,4 +1,4 @@
-"""Temperatures of a machine's parts, what follows them late, and the humidity by which struts swell."""
+"""Temperature readings of a machine's parts, thermal growth with a delay, and the humidity that makes struts swell."""
 
 from __future__ import annotations
 
@@ -14,23 +14,29 @@ from ..errors import ModelError
 from .limits import STRUT_NAMES
 from .terms import term
 
-PARTS = (*STRUT_NAMES, "base", "platform")  # What has a temperature, in the order of every array of eight
-MOST_TIME_CONSTANTS = 2  # A machine that warms shows a fast and a slow one; more cannot be distinguished
-TIME_CONSTANT_RANGE = (10.0, 1e6)  # Time constants outside this, s, are a sensor's noise, or a building's seasons
-REST = 3.0  # time constants after which a twentieth of an unknown initial state is left
-EXPANSION = 1e-3  # Largest expansion that a machine's part may have, 1/K: five times that of soft plastics
+PARTS = (*STRUT_NAMES, "base", "platform")  # Parts that have a temperature; every array of eight has this order
+MOST_TIME_CONSTANTS = 2  # Readings of a warming machine distinguish a fast and a slow time constant, no more
+# Smallest and largest time constant, s: a shorter one would fit a sensor's noise, a longer one a building's seasons
+TIME_CONSTANT_RANGE = (10.0, 1e6)
+REST = 3.0  # Number of time constants after which 5 % of an unknown initial lag is left
+EXPANSION = 1e-3  # Largest thermal expansion of a machine's part, 1/K: five times that of soft plastics
 
 
 @dataclass(frozen=True)
 class LateGrowth:
     """How the parts of a machine follow their thermometers."""
 
-    # τ_k, a tuple; late growth has b_k of struts 1–6, base and platform as rows (8, time constants)
-    time_constants: tuple[float, ...] = term("thermal", "s", "how late parts follow: none, one or two", (None,))
-    expansion: np.ndarray = term(
-        "thermal", "ppm_per_K", "what of a part's growth comes so late", (8, None), key="late", largest=EXPANSION
+    time_constants: tuple[float, ...] = term("thermal", "s", "delays of a part's growth: none, one or two", (None,))
+    expansion: np.ndarray = term(  # (8, time constants): a row for each of struts 1–6, base, platform
+        "thermal",
+        "ppm_per_K",
+        "expansion of struts (a row each), base and platform that comes with each delay",
+        "6 × n, n, n",
+        np.zeros((len(PARTS), 0)),
+        "late_struts, late_base, late_platform",
+        largest=EXPANSION,
     )
-    thermometer: str = ""  # The part whose sensor represents all parts; empty: each part has its own
+    thermometer: str = ""  # the part whose sensor represents all parts; empty: each part has its own sensor
 
     def __post_init__(self) -> None:
         constants = tuple(float(value) for value in self.time_constants)
@@ -41,7 +47,7 @@ class LateGrowth:
             raise ModelError("thermal.time_constants", allowed, list(constants))
         expansion = np.array(self.expansion, dtype=float)
         if expansion.shape != (len(PARTS), len(constants)) or not np.isfinite(expansion).all():
-            allowed = f"must be finite, one of each part for each of {len(constants)} time constants, 1/K"
+            allowed = f"must be finite, a value of each part for each of {len(constants)} time constants, 1/K"
             raise ModelError("thermal.late", allowed, expansion.tolist())
         if self.thermometer not in ("", *PARTS):
             raise ModelError("thermal.thermometer", f"must be one of {', '.join(PARTS)}", self.thermometer)
@@ -50,38 +56,38 @@ class LateGrowth:
         object.__setattr__(self, "expansion", expansion)
 
     def sensor_of(self, part: int) -> int:
-        """Return the index of the part whose thermometer stands for a part."""
+        """Return the index in `PARTS` of the part whose sensor gives the temperature of the part with index `part`."""
         return PARTS.index(self.thermometer) if self.thermometer else part
 
 
-AT_ONCE = LateGrowth()  # Every part has a thermometer of its own and follows it at once
+AT_ONCE = LateGrowth()  # Every part has a sensor of its own, and grows without delay
 
 
 @dataclass
 class Lag:
-    """By how much the parts that follow a thermometer late lag behind it."""
+    """Difference between a part's delayed temperature and its sensor's reading, for each time constant."""
 
-    began: float  # Time of the first reading and of the newest one, s
-    newest: float  # Time of the first reading and of the newest one, s
-    behind: list[float]  # d_k, K
+    began: float  # time of the first reading, s
+    newest: float  # time of the newest reading, s
+    behind: list[float]  # delayed temperature − reading for each time constant, K
 
     def add(self, change: float, time: float, time_constants: Sequence[float]) -> None:
-        """Add a reading that differs from the last one by a `change`, K, at a time, s."""
+        """Update the lag with a reading, made at a time, s, that differs from the previous reading by `change`, K."""
         elapsed = max(0.0, time - self.newest)
         self.newest = max(self.newest, time)
         for k, constant in enumerate(time_constants):
-            self.behind[k] = followed(self.behind[k], change, elapsed / constant)
+            self.behind[k] = _lag_after_ramp(self.behind[k], change, elapsed / constant)
 
 
-def followed(behind: float, change: float, ages: float) -> float:
-    """Return by how much a first-order lag trails an input that has ramped by `change` within `ages` time constants."""
+def _lag_after_ramp(behind: float, change: float, ages: float) -> float:
+    """Return a first-order lag's output − input, K, after the input ramped by `change` within `ages` time constants."""
     gone = -math.expm1(-ages)
     kept = gone / ages if ages > 0.0 else 1.0
     return behind * (1.0 - gone) - change * kept
 
 
-def late(times: np.ndarray, values: np.ndarray, time_constants: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return by how much first-order lags trail some thermometers at each of their readings, K."""
+def thermal_lags(times: np.ndarray, values: np.ndarray, time_constants: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return delayed temperature − reading (N, parts, time constants), K, for N readings (N, parts) at times, s."""
     constants, order = np.asarray(time_constants, dtype=float), np.argsort(times, kind="stable")
     changes, elapsed = np.diff(values[order], axis=0), np.diff(times[order])
     ages = elapsed[:, None] / constants
@@ -97,25 +103,24 @@ def late(times: np.ndarray, values: np.ndarray, time_constants: Sequence[float] 
     return result
 
 
-REFERENCE_TEMPERATURE = 20.0  # Temperature at which geometry and model hold, °C (ISO 1)
-TEMPERATURE_RANGE = (-40.0, 120.0)  # Sensor readings outside this, °C, are not a machine shop's
+REFERENCE_TEMPERATURE = 20.0  # Temperature of the lengths in geometry and model, °C (ISO 1)
+TEMPERATURE_RANGE = (-40.0, 120.0)  # Readings outside this range, °C, are refused: no machine shop has them
 HUMIDITY = "humidity"  # Name of the air's relative humidity among a machine's readings
-REFERENCE_HUMIDITY = 0.5  # Relative humidity at which geometry and model hold, a fraction
-# Relative humidity outside this is not a machine shop's: percent for a fraction, a fraction for percent, or a broken
-# sensor's zero
+REFERENCE_HUMIDITY = 0.5  # Relative humidity of the lengths in geometry and model, a fraction
+# Readings of relative humidity outside this range are refused: given in percent, or the zero of a broken sensor
 HUMIDITY_RANGE = (0.01, 1.0)
 
 
 @dataclass(frozen=True)
 class Sensed:
-    """What a sensor reads."""
+    """A quantity that a sensor reads: temperature or relative humidity."""
 
-    title: str  # For messages; ``{}`` stands for the sensor's name
+    title: str  # name for messages; ``{}`` is replaced by the sensor's name
     reference: float  # value before the first reading
-    range: tuple[float, float]  # Readings outside are refused
-    allowed: str  # The same for people
-    unit: str = ""  # Unit of a reading, and of a difference of two, after a space
-    difference: str = ""  # Unit of a reading, and of a difference of two, after a space
+    range: tuple[float, float]  # smallest and largest accepted reading
+    allowed: str  # `range` as text
+    unit: str = ""  # unit of a reading as text, with a space before it
+    difference: str = ""  # unit of a difference of two readings as text, with a space before it
 
 
 TEMPERATURE = Sensed(
@@ -132,25 +137,25 @@ RELATIVE_HUMIDITY = Sensed(
 
 
 def quantity_of(name: str) -> Sensed:
-    """Return what the sensor of a name reads."""
+    """Return the quantity that the sensor of this name reads."""
     return RELATIVE_HUMIDITY if name == HUMIDITY else TEMPERATURE
 
 
 def check_part(name: str) -> None:
-    """Raise ModelError on what is no name of a part that has a temperature."""
+    """Raise ModelError if `name` is not in `PARTS`."""
     if name not in PARTS:
         raise ModelError("temperature", f"must be of one of {', '.join(PARTS)}", name)
 
 
 class Temperatures:
-    """Temperatures of struts, base and platform, °C, and the air's humidity; without a reading 20 °C, 50 %.
+    """Readings of temperatures, °C, and of the air's humidity; before a reading, 20 °C and 50 %.
 
     Attributes
     ----------
     values : dict of str to float
-        Readings by ``strut_1`` … ``strut_6``, ``base``, ``platform``, °C; ``humidity``, a fraction.
+        Readings by the names ``strut_1`` … ``strut_6``, ``base``, ``platform``, °C, and ``humidity``, a fraction.
     lags : dict of str to Lag
-        How far what follows each of them is behind; whatever is not here is at rest.
+        Lag of the delayed growth behind each sensor; a sensor without an entry has no lag.
     """
 
     NAMES = PARTS
@@ -165,21 +170,21 @@ class Temperatures:
     def restored(
         cls, values: Mapping[str, float], lags: Mapping[str, Sequence[float]], time_constants: int
     ) -> Temperatures:
-        """Return the layout of a :meth:`snapshot` for a model with that number of time constants."""
+        """Return the temperatures of a :meth:`snapshot`, for a model with that number of time constants."""
         for name, numbers in lags.items():
             if name not in values or len(numbers) != 2 + time_constants:
                 raise ModelError(f"snapshot.lags.{name}", f"must be {2 + time_constants} numbers", list(numbers))
         return cls(values, {name: Lag(began, newest, behind) for name, (began, newest, *behind) in lags.items()})
 
     def snapshot(self) -> dict[str, dict[str, Any]]:
-        """Return ``temperatures``, °C, and ``lags``: began and newest, s, and how far behind, K; each by name."""
+        """Return ``temperatures``, °C, and ``lags`` ([began, s, newest, s, lag per time constant, K]), by name."""
         lags = {name: [lag.began, lag.newest, *lag.behind] for name, lag in self.lags.items()}
         return {"temperatures": dict(self.values), "lags": lags}
 
     def follow(self, name: str, value: float, time: float, time_constants: tuple[float, ...]) -> None:
-        """Set a reading made at a time, s, on a monotonic clock; late parts follow.
+        """Set a reading made at a time, s, on a monotonic clock, and update its lag.
 
-        At the first reading late parts are assumed at rest.
+        At the first reading of a sensor, its lag is assumed to be zero.
         """
         before = self.at(name)
         late_parts = bool(time_constants) and name != HUMIDITY
@@ -192,10 +197,10 @@ class Temperatures:
             self.lags[name] = Lag(time, time, [0.0] * len(time_constants))
 
     def unknown_for(self, late_growth: LateGrowth, time: float) -> float:
-        """Return for how long, s, late parts are still not known at a `time`, s, because readings began too recently.
+        """Return how long, s, after `time`, s, the delayed growth is still uncertain: readings began too recently.
 
-        At the first reading they are assumed at rest; the error of this assumption has decayed after three time
-        constants.
+        At the first reading the lag is assumed to be zero; the error of this assumption decays in three of the longest
+        time constants.
         """
         begun = [lag.began for name, lag in self.lags.items() if late_growth.thermometer in ("", name)]
         if not begun or not late_growth.time_constants:
@@ -203,7 +208,7 @@ class Temperatures:
         return max(0.0, max(begun) + REST * late_growth.time_constants[-1] - time)
 
     def set(self, name: str, value: float) -> None:
-        """Set a reading without a time: late parts keep their lag."""
+        """Set a reading without a time; its lag stays unchanged."""
         if name != HUMIDITY:
             check_part(name)
         quantity = quantity_of(name)
@@ -213,5 +218,5 @@ class Temperatures:
         self.values[name] = float(value)
 
     def at(self, name: str) -> float:
-        """Return a temperature, °C, or the humidity."""
+        """Return the reading of a temperature, °C, or of the humidity; before the first one, the reference value."""
         return self.values.get(name, quantity_of(name).reference)

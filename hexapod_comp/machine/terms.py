@@ -1,4 +1,4 @@
-"""The table of a machine's model: each field of a model carries its name in files, unit, shape and allowed range."""
+"""The terms of a machine model: each dataclass field carries its key in files, its unit, shape and allowed range."""
 
 from __future__ import annotations
 
@@ -12,39 +12,55 @@ import numpy as np
 from ..errors import ModelError
 from ..formats.schema import DIMENSIONS, PER_STRUT, UNITS, Numbers, Section, Shape
 
-# Units in which bounds are shown, and their number in an SI unit, where it is not the file's own
+# For units of files: the unit in which messages show a bound, and the factor from SI to the shown unit
 SHOWN = {
     "um": ("mm", 1e3),
     "urad": ("mrad", 1e3),
     "N_m": ("N m", 1.0),
+    "N_per_um": ("N/µm", 1e-6),
+    "m_s2": ("m/s²", 1.0),
     "ppm_per_percent": ("ppm per % of relative humidity", 1e4),
 }
 
 
+TINY = float(np.finfo(float).tiny)  # `least` of a term that must be above zero
+
+
 @dataclass(frozen=True)
 class Row:
-    """One term as it appears in files and in the documentation."""
+    """The description of one term, from which its reading, writing, checks and documentation are made."""
 
     place: str  # section of the file, such as struts.wave
-    key: str  # there, without its unit; empty: the field's name
+    key: str  # key in that section, without its unit; empty: the dataclass field's name
     numbers: Numbers  # unit and shape in the file
-    checked: bool  # the shape is the file's too; else the dataclass checks it
+    checked: bool  # whether `validate_terms` checks the shape; otherwise the dataclass checks it
     least: float  # smallest allowed value, SI
-    largest: float  # largest allowed value, SI: no machine exceeds it
-    meaning: str
+    largest: float  # largest allowed magnitude, SI: no machine exceeds it
+    meaning: str  # text for the table in doc/model_file.md
 
     def where(self, name: str) -> str:
-        """Return the term's name in messages."""
+        """Return the term's name for messages, such as ``struts.pitch``; `name` is the dataclass field's."""
         section = self.place.partition(".")[0]
         name = self.key if self.key and section == self.place else name
         return f"{section}.{name}" if section else name
 
     @property
     def bound(self) -> str:
-        """The largest value, for people."""
+        """The largest allowed magnitude with its unit, for messages."""
+        return self.shown(self.largest)
+
+    def shown(self, value: float) -> str:
+        """Return a value, SI, as text with a unit that people read."""
         unit = self.numbers.unit
         name, factor = SHOWN.get(unit, (unit.replace("_per_", " per "), 1.0 / UNITS[DIMENSIONS[unit]][unit]))
-        return f"{self.largest * factor:g} {name}"
+        return f"{value * factor:g} {name}"
+
+    @property
+    def least_text(self) -> str:
+        """The condition that the smallest allowed value sets, such as "≥ 0"; empty without one."""
+        if not math.isfinite(self.least):
+            return ""
+        return "> 0" if self.least == TINY else f"≥ {self.shown(self.least) if self.least else 0}"
 
 
 def term(
@@ -58,7 +74,7 @@ def term(
     largest: float = math.inf,
     checked: bool = True,
 ) -> Any:
-    """Return a field with its row: one number where the shape is (), else an array filled with the default."""
+    """Return a dataclass field with its :class:`Row`: a float if the shape is (), else an array of the default."""
     row = Row(place, key, Numbers(unit, shape), checked, least, largest, meaning)
     if shape == () or default is MISSING:
         return field(default=default, metadata={"row": row})
@@ -67,15 +83,15 @@ def term(
 
 
 def rows(schema: Any) -> Iterator[tuple[str, Row, Any]]:
-    """Yield name, row and default (MISSING: required) of the terms of a dataclass."""
+    """Yield field name, row and default of each term of a dataclass; the default MISSING means required."""
     for one in fields(schema):
         if "row" in one.metadata:
             made = one.default if one.default_factory is MISSING else one.default_factory()
             yield one.name, one.metadata["row"], made
 
 
-def settle(value: Any) -> None:
-    """Make a dataclass's terms read-only arrays, or numbers."""
+def validate_terms(value: Any) -> None:
+    """Convert a dataclass's terms to read-only arrays or floats; raise ModelError on a wrong shape or value."""
     for name, row, _ in rows(type(value)):
         array = np.array(getattr(value, name), dtype=float)
         shape = (6,) if isinstance(row.numbers.shape, str) else row.numbers.shape
@@ -87,35 +103,35 @@ def settle(value: Any) -> None:
                 row.where(name), f"must be finite, in SI units ({row.numbers.unit} in files)", array.tolist()
             )
         if (array < row.least).any():
-            problem = "must not be negative" if row.least == 0.0 else "must be above zero"
+            problem = f"must be {row.least_text}" if row.least else "must not be negative"
             raise ModelError(row.where(name), problem, array.tolist())
         array.flags.writeable = False
         object.__setattr__(value, name, array if shape else float(array))
 
 
 def check_magnitudes(value: Any, place: str | None = None) -> None:
-    """Refuse terms, all or those of one section, that no machine has: an error of units, or a fit gone astray."""
+    """Raise ModelError if a term, of all or of the section `place`, exceeds its largest allowed magnitude."""
     for name, row, _ in rows(type(value)):
         if place in (None, row.place):
             check_magnitude(row.where(name), getattr(value, name), row.largest, row.bound)
 
 
 def check_magnitude(where: str, values: Any, largest: float, bound: str) -> None:
-    """Refuse values beyond ± a bound."""
+    """Raise ModelError if a value's magnitude exceeds `largest`, SI; `bound` is the same as text."""
     found = float(np.abs(np.asarray(values)).max(initial=0.0))
     if not found <= largest:
         raise ModelError(where, f"must stay within ±{bound}; is the unit right?", found)
 
 
 def read_terms(schema: Any, section: Section, place: str) -> dict[str, Any]:
-    """Return the terms that stand in a section, by field; those left out have their default."""
+    """Return the values of all terms of a file's section, by field name; a missing key gives the default."""
     return {
         name: row.numbers.read(section, row.key or name, made) for name, row, made in rows(schema) if row.place == place
     }
 
 
 def write_terms(value: Any, place: str, whole: bool = False) -> dict[str, Any]:
-    """Return the content of a section: terms that differ from their default, or the `whole` of them."""
+    """Return a section's content for a file: the terms that differ from their default, or all if `whole`."""
     content: dict[str, Any] = {}
     for name, row, made in rows(type(value)):
         own = getattr(value, name)
@@ -125,7 +141,7 @@ def write_terms(value: Any, place: str, whole: bool = False) -> dict[str, Any]:
 
 
 def table_text(*schemas: Any) -> str:
-    """Return the rows of some dataclasses as a Markdown table, as doc/model_file.md has it."""
+    """Return the terms of the given dataclasses as the Markdown table of doc/model_file.md."""
     lines = ["| section | key | shape | default | allowed | meaning |", "|---|---|---|---|---|---|"]
     for name, row, made in (row for schema in schemas for row in rows(schema)):
         shape = row.numbers.shape
@@ -135,9 +151,7 @@ def table_text(*schemas: Any) -> str:
         values = usual if len(set(usual.tolist())) > 1 else usual[:1]
         listed = ", ".join(f"{value / size_in_si:g}" for value in values)
         default = "required" if made is MISSING else listed or "none"
-        bounds = (
-            ["≥ 0"] * (row.least == 0.0) + ["> 0"] * (row.least > 0.0) + [f"±{row.bound}"] * math.isfinite(row.largest)
-        )
-        key = f"{row.key or name}_{row.numbers.unit}"
-        lines.append(f"| {row.place or '–'} | `{key}` | {size} | {default} | {', '.join(bounds)} | {row.meaning} |")
+        bounds = ", ".join(filter(None, [row.least_text, f"±{row.bound}" if math.isfinite(row.largest) else ""]))
+        keys = ", ".join(f"`{key}_{row.numbers.unit}`" for key in (row.key or name).split(", "))
+        lines.append(f"| {row.place or '–'} | {keys} | {size} | {default} | {bounds} | {row.meaning} |")
     return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""Streams of poses for a machine: smooth moves between poses that keep its limits, and circles."""
+"""Paths of tool poses at a constant rate: smooth moves within the machine's limits, circles; distance from a path."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from ..pose import Pose, attitude_error, best_motion, rotation_angle, rotation_f
 from .geometry import HexapodGeometry
 from .kinematics import Structure, strut_lengths_batch
 
-SHARE_OF_LIMIT = 0.8  # Moves use this much of the allowed strut speed and step, leaving room for the corrections
+SHARE_OF_LIMIT = 0.8  # Share of the limits of strut speed and step that moves use; corrections need the other 0.2
 PEAK_OF_QUINTIC = 1.875  # Largest slope of the quintic 10t³ − 15t⁴ + 6t⁵
-BEND_OF_QUINTIC = 10.0 / 3.0**0.5  # Its largest second derivative
-TRACK_WINDOW = 25  # How many commands the tool may lag behind the newest one; at 250 Hz a tenth of a second
-# Points by which a track is aligned; steps of that, each a motion onto the nearest places; last step, m and rad
+BEND_OF_QUINTIC = 10.0 / 3.0**0.5  # Largest second derivative of the quintic 10t³ − 15t⁴ + 6t⁵
+TRACK_WINDOW = 25  # Number of commands by which the tool may lag behind the newest one; 0.1 s at 250 Hz
+# Alignment of a track: largest number of points used; largest number of iterations; step, m and rad, that ends them
 MOST_ALIGNED, ALIGNING_STEPS, SETTLED = 5000, 200, 1e-9
-COARSE = 20  # Sections of a move over which the struts' slopes are taken
+COARSE = 20  # Number of sections of a move on which the struts' slopes are computed
 
 
 @dataclass(frozen=True)
 class Path:
-    """Poses to be sent one after the other at a constant rate."""
+    """A sequence of poses to be sent at a constant rate."""
 
     positions: np.ndarray  # (N, 3): m, in the commanded frame
     rotations: np.ndarray  # (N, 3, 3): rotation matrices
@@ -31,12 +31,12 @@ class Path:
         return len(self.positions)
 
     def pose(self, index: int) -> Pose:
-        """Return one pose."""
+        """Return the pose with this index."""
         return Pose(self.positions[index], self.rotations[index])
 
 
 def move(geometry: HexapodGeometry, start: Pose, end: Pose, rate: float, feed: float | None = None) -> Path:
-    """Return a smooth straight move between two tool poses that keeps strut speeds and steps."""
+    """Return a straight move from rest to rest within the struts' limits, at a rate, Hz, and at most `feed`, m/s."""
     positions = np.array([start.position, end.position])
     return moves(geometry, positions, np.array([start.rotation, end.rotation]), rate, feed)[0]
 
@@ -44,7 +44,7 @@ def move(geometry: HexapodGeometry, start: Pose, end: Pose, rate: float, feed: f
 def moves(
     geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, rate: float, feed: float | None = None
 ) -> tuple[Path, np.ndarray]:
-    """Return the moves (see :func:`move`) that join N tool poses, with a rest at each."""
+    """Return the moves (see :func:`move`) through N tool poses, with a stop at each, and the poses of each move."""
     legs = np.arange(len(positions) - 1)
     share = np.tile(np.linspace(0.0, 1.0, COARSE + 1), len(legs))
     coarse = _interpolate(positions, rotations, np.repeat(legs, COARSE + 1), share)
@@ -53,7 +53,7 @@ def moves(
     allowed = SHARE_OF_LIMIT * min(geometry.limits.speed, geometry.limits.step * rate)
     duration = PEAK_OF_QUINTIC * COARSE * changes.max(axis=(1, 2)) / allowed
     if geometry.limits.acceleration:
-        # l'' = l_s s'' + l_ss s'², s the share: each at its largest.
+        # l'' = l_s s'' + l_ss s'² of the share s of the way; each factor is taken at its largest
         bends = np.abs(np.diff(lengths.reshape(len(legs), COARSE + 1, 6), 2, axis=1)).max(axis=(1, 2), initial=0.0)
         worst = BEND_OF_QUINTIC * COARSE * changes.max(axis=(1, 2)) + (PEAK_OF_QUINTIC * COARSE) ** 2 * bends
         duration = np.maximum(duration, np.sqrt(worst / (SHARE_OF_LIMIT * geometry.limits.acceleration)))
@@ -67,7 +67,7 @@ def moves(
 
 
 def circle(centre: Pose, radius: float, feed: float, rate: float) -> Path:
-    """Return one full circle in the centre pose's xy plane, from rest to rest at its +x side."""
+    """Return a full circle in the centre pose's xy plane, from rest to rest at +x; radius, m, feed, m/s, rate, Hz."""
     count = max(8, int(np.ceil(PEAK_OF_QUINTIC * 2.0 * np.pi * radius / feed * rate)))
     angle = 2.0 * np.pi * quintic(np.arange(count + 1) / count)
     offsets = radius * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
@@ -76,17 +76,20 @@ def circle(centre: Pose, radius: float, feed: float, rate: float) -> Path:
 
 
 def quintic(t: np.ndarray) -> np.ndarray:
-    """Return 10t³ − 15t⁴ + 6t⁵: from 0 to 1 with speed and acceleration zero at both ends."""
+    """Return 10t³ − 15t⁴ + 6t⁵, which rises from 0 to 1 with zero slope and zero second derivative at both ends."""
     return t**3 * (10.0 - 15.0 * t + 6.0 * t * t)
 
 
 def commanded_in_base(geometry: HexapodGeometry) -> HexapodGeometry:
-    """Return the machine with its work frame in the base, for poses that are given in ``base``."""
+    """Return the machine with its work frame equal to ``base``, for poses given in ``base``."""
     return replace(geometry, work=Pose.identity())
 
 
 def feet_on(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> np.ndarray:
-    """Return the nearest place of a commanded polyline to each point, shape (n, 3), m: a late tool is no error."""
+    """Return the nearest position on a commanded polyline for each of n points (n, 3), m, so that delay is no error.
+
+    `sent`, (n,), is the index of the newest corner that was commanded when the point was measured.
+    """
     start, along = corners[:-1], np.diff(corners, axis=0)
     square = np.maximum((along**2).sum(axis=1), 1e-30)
     newest = np.clip(sent, 1, len(start))
@@ -102,7 +105,7 @@ def feet_on(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> np.nda
 
 
 def motion_onto(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> Pose | None:
-    """Return the rigid motion that brings points closest to a commanded polyline: the datum of a track aligned."""
+    """Return the rigid motion that best fits points to a commanded polyline; None if the points are collinear."""
     every = max(1, len(points) // MOST_ALIGNED)
     points, sent, motion = points[::every], sent[::every], Pose.identity()
     for _ in range(ALIGNING_STEPS):
@@ -117,7 +120,7 @@ def motion_onto(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> Po
 
 
 def join(paths: list[Path]) -> Path:
-    """Return several paths of one rate as one."""
+    """Return several paths with the same rate, one after the other, as one path."""
     return Path(
         np.concatenate([path.positions for path in paths]),
         np.concatenate([path.rotations for path in paths]),
@@ -128,7 +131,7 @@ def join(paths: list[Path]) -> Path:
 def _interpolate(
     positions: np.ndarray, rotations: np.ndarray, leg: np.ndarray, share: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the poses at the given shares, (K,), of the given legs, (K,): straight, shortest arc."""
+    """Return K poses, each at a share of a leg between two of the given poses: straight line and shortest turn."""
     travel = np.diff(positions, axis=0)
     turn = attitude_error(rotations[1:], rotations[:-1])
     turned = rotation_from_vector(share[:, None] * turn[leg]) @ rotations[leg]

@@ -1,6 +1,6 @@
-"""A machine sent through poses, and its tool's errors there: the basis of every figure of a tool error.
+"""A real machine driven through poses, and the errors of its tool there: the source of every stated tool error.
 
-Commands are those of the nominal machine, a model, or another source; the machine is the truth.
+The strut commands come from the nominal machine, a model, or elsewhere; a `RealMachine` gives the actual poses.
 """
 
 from __future__ import annotations
@@ -21,32 +21,31 @@ from .model import MachineModel, RealMachine
 from .passes import Passes, Poses, at
 from .temperatures import Temperatures
 
-NameOf = Callable[[int], str]  # Adds the row to an error
+NameOf = Callable[[int], str]  # From the index of a pose to its name in an error message
 
 
 @dataclass(frozen=True)
 class ToolErrors:
-    """Errors of a point of the platform, usually the tool's tip, relative to the commands, in ``base``."""
+    """Errors at N poses of a point of the platform, usually the tool's tip; all in ``base``."""
 
-    points: np.ndarray  # (N, 3): where the point was sent, m
-    # (N, 3): actual minus commanded position, m, and rotation vector from commanded to actual, rad
-    displacement: np.ndarray
-    rotation: np.ndarray  # (N, 3)
-    field_share: np.ndarray  # (N, 3): the part of the displacement that the machine's field adds, m
+    points: np.ndarray  # (N, 3): commanded positions of the point, m
+    displacement: np.ndarray  # (N, 3): actual − commanded position, m
+    rotation: np.ndarray  # (N, 3): rotation vector from commanded to actual attitude, rad
+    field_share: np.ndarray  # (N, 3): the part of the displacement that comes from the machine's error field, m
 
     def as_array(self) -> np.ndarray:
         """Return displacement, m, and rotation vector, rad, shape (N, 6)."""
         return np.hstack([self.displacement, self.rotation])
 
     def aligned(self) -> ToolErrors:
-        """Return the same with the datum aligned: minus the turn and shift that best explain the displacements.
+        """Return the errors after best-fit alignment: a rigid motion minimises the displacements' sum of squares.
 
-        The mean rotation is subtracted.
+        The mean rotation is removed from the rotations.
         """
         actual = self.points + self.displacement
         motion = best_motion(actual, self.points)
         if motion is None:
-            raise ModelError("points", "must be three or more, not in a line, for a datum", len(actual))
+            raise ModelError("points", "must be three or more, not in a line, for a best-fit alignment", len(actual))
         turned = rotation_from_vector(self.rotation)
         displacement = motion.position + actual @ motion.rotation.T - self.points
         return replace(
@@ -56,14 +55,13 @@ class ToolErrors:
 
 @dataclass(frozen=True)
 class Driven:
-    """Actual poses of a machine."""
+    """Actual platform poses of a machine at N commands."""
 
-    # (N, 3) and (N, 3, 3): ``pose_platform_in_base``, m, and what structure and struts alone would have made of it
-    actual: Poses
-    without_field: Poses
+    actual: Poses  # (N, 3), m, and (N, 3, 3): ``pose_platform_in_base``
+    without_field: Poses  # (N, 3), m, and (N, 3, 3): the same without the error field's part
 
     def errors(self, commanded: Poses, point: np.ndarray) -> ToolErrors:
-        """Return the errors of a point of ``platform``, shape (3,), m, relative to commanded poses."""
+        """Return the errors of a point (3,), m, of ``platform`` relative to N commanded platform poses."""
         (positions, rotations), (modelled, turned) = self.actual, self.without_field
         return ToolErrors(
             points=commanded[0] + commanded[1] @ point,
@@ -81,7 +79,10 @@ def drive(
     name_of: NameOf | None = None,
     advance: Callable[[int], object] = lambda rows: None,
 ) -> Driven:
-    """Return the actual poses of machines under strut commands."""
+    """Return the actual poses at N strut commands (N, 6), m, one machine each; `starts` are guesses of the poses.
+
+    `advance` is called with the number of finished poses.
+    """
     commands, senses = np.ascontiguousarray(commands, dtype=float), np.ascontiguousarray(senses, dtype=float)
     modelled = np.array(starts[0], order="C"), np.array(starts[1], order="C")
     actual = np.empty_like(modelled[0]), np.empty_like(modelled[1])
@@ -104,9 +105,9 @@ def drive(
 def model_commands(
     machines: Sequence[RealMachine], targets: Poses, senses: np.ndarray, name_of: NameOf | None = None
 ) -> tuple[np.ndarray, Poses]:
-    """Return the strut commands by which models reach poses, shape (N, 6), m, and the structure's own poses.
+    """Return the strut commands (N, 6), m, that bring N machines to N platform poses, and the N model poses.
 
-    :meth:`RealMachine.commands_for` without its objects: a study asks for millions.
+    It does the same as :meth:`RealMachine.commands_for`, faster for the millions of poses of a study.
     """
     positions, rotations = np.ascontiguousarray(targets[0]), np.ascontiguousarray(targets[1])
     senses, no_window = np.array(senses, dtype=float), np.full((len(positions), 9), np.nan)
@@ -126,24 +127,24 @@ def model_commands(
 
 @dataclass(frozen=True)
 class Trial:
-    """A machine and the passes that it is sent through."""
+    """A real machine and the poses that it passes through."""
 
-    machine: RealMachine  # the truth, at its real temperatures
-    passes: Passes  # poses and directions
+    machine: RealMachine  # the machine with its true errors, at its true temperatures
+    passes: Passes  # commanded poses, and directions of travel
 
     def commands(
         self, model: MachineModel | None, sensed: Temperatures | None = None, loading: Loading = FREE
     ) -> np.ndarray:
-        """Return the strut commands, shape (N, 6), m, of a model that knows temperatures and loading."""
+        """Return the strut commands (N, 6), m, from a model with sensed temperatures and loading; None: nominal."""
         if model is None:
             return self.passes.nominal_commands()
         believed = RealMachine(self.passes.geometry, model, sensed, loading)
         return model_commands([believed] * len(self.passes), self.passes.poses, self.passes.senses())[0]
 
     def drive(self, commands: np.ndarray) -> Driven:
-        """Return the actual poses of the machine under strut commands, shape (N, 6), m."""
+        """Return the machine's actual poses at strut commands, shape (N, 6), m."""
         return drive([self.machine] * len(self.passes), self.passes.poses, self.passes.senses(), commands)
 
     def errors(self, commands: np.ndarray) -> ToolErrors:
-        """Return the errors of the tool's tip under strut commands, shape (N, 6), m."""
+        """Return the errors of the tool's tip at strut commands, shape (N, 6), m."""
         return self.drive(commands).errors(self.passes.poses, self.passes.geometry.tool.position)

@@ -215,7 +215,7 @@ def test_what_is_not_the_models_own_is_not_known(tmp_path: Path) -> None:
     path.write_text(f"# by hand\n{text}")
     assert "the model file was altered after its fit" in load_posterior(load_model(path, geometry), geometry, path)[1]
     path.write_text(text.replace(beside.name, "../outside.npz"))
-    with pytest.raises(InputFileError, match=r"posterior\.file: must be a file's name, without a folder"):
+    with pytest.raises(InputFileError, match=r"posterior\.file: must be a file name without a folder"):
         load_model(path, geometry)
     other = dataclasses.replace(geometry, platform_joints=np.repeat(geometry.platform_joints[::2], 2, axis=0))
     assert "labels: are not those of this geometry's parameters" in load_posterior(model, other, path)[1]

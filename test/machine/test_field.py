@@ -165,8 +165,8 @@ def test_a_number_that_cannot_be_is_refused() -> None:
     compensator.set_outside({"elevation": 1.9, "rotation": 0.0, "azimuth": 1e9})
     assert compensator.model.outside.held(compensator.outside).startswith("elevation 108.862 deg")
     for numbers, problem in (
-        ({"elevation": 2.0}, r"outside.elevation: the table holds elevation 0 to 90 deg; is the unit right\?"),
-        ({"rotation": -2.2}, "outside.rotation: the table holds rotation -90 to 45 deg; is the unit right"),
+        ({"elevation": 2.0}, r"outside.elevation: the table covers elevation 0 to 90 deg; is the unit right\?"),
+        ({"rotation": -2.2}, "outside.rotation: the table covers rotation -90 to 45 deg; is the unit right"),
         ({"elevation": np.nan}, "outside.elevation: must be finite"),
     ):
         with pytest.raises(ModelError, match=problem):
@@ -177,7 +177,7 @@ def test_a_number_that_cannot_be_is_refused() -> None:
 def test_a_table_that_refuses_and_a_correction_above_its_limit_keep_the_last_numbers() -> None:
     compensator = Compensator(paper_geometry(), MachineModel("paper", outside=random_table(beyond="refuse")))
     compensator.set_outside(HERE)
-    with pytest.raises(OutsideTableError, match=r"elevation 91\.6732 deg: the table holds elevation 0 to 90 deg"):
+    with pytest.raises(OutsideTableError, match=r"elevation 91\.6732 deg: the table covers elevation 0 to 90 deg"):
         compensator.set_outside({"elevation": 1.6})
     assert compensator.outside == HERE
     compensator.set_outside({"elevation": 1.570797})  # 90° as a sender may round it: 0.7 µrad more
@@ -289,7 +289,7 @@ def test_a_table_is_read_from_csv(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("x_um,y_um,z_um,rx_urad,ry_urad,rz_urad\n1,2,3,4,5,6\n", "one or two columns of outside numbers"),
+        ("x_um,y_um,z_um,rx_urad,ry_urad,rz_urad\n1,2,3,4,5,6\n", "one or two columns of external quantities"),
         (HEADER.replace("elevation_deg", "elevation") + "\n1,2,3,4,5,6,7,8\n", "must end in a unit, such as _deg"),
         (
             f"{HEADER}\n1,2,3,4,5,6,7,8\n1,3,3,4,5,6,7,8\n2,2,3,4,5,6,7,8\n",

@@ -16,7 +16,14 @@ from strategies import PAPER_FILE, paper_geometry, skewed_geometry
 
 from hexapod_comp.errors import FrameError, GeometryError, InputFileError
 from hexapod_comp.machine.doubts import doubts, joint_doubts, twist_per_lead
-from hexapod_comp.machine.geometry import MOST, HexapodGeometry, Limits, load_geometry, paper_joints, parse_geometry
+from hexapod_comp.machine.geometry import (
+    MOST_FRAMES,
+    HexapodGeometry,
+    Limits,
+    load_geometry,
+    paper_joints,
+    parse_geometry,
+)
 from hexapod_comp.machine.struts import home_twists
 from hexapod_comp.pose import Pose
 
@@ -224,18 +231,18 @@ POSE = {"position_mm": [0, 0, 10]}
 @pytest.mark.parametrize(
     ("key", "named", "complaint"),
     [
-        ("tools", {"tool": POSE}, "tools.tool: is what the machine's own tool frame is called"),
-        ("work_frames", {"base": POSE}, "work_frames.base: is what the machine's own base frame"),
-        ("tools", {"platform": POSE}, "tools.platform: is what another frame of the machine is called"),
-        ("tools", {"strut_1_rod": POSE}, "tools.strut_1_rod: is what another frame"),
+        ("tools", {"tool": POSE}, "tools.tool: is the name of the machine's own tool frame"),
+        ("work_frames", {"base": POSE}, "work_frames.base: is the name of the machine's own base frame"),
+        ("tools", {"platform": POSE}, "tools.platform: is reserved for another frame"),
+        ("tools", {"strut_1_rod": POSE}, "tools.strut_1_rod: is reserved for another frame"),
         ("tools", {"a probe": POSE}, "tools.a probe: a name must begin with a letter"),
         ("tools", {"x" * 65: POSE}, "64 letters, digits and underscores"),
         ("tools", {"fixture": POSE}, "tools.fixture: is a tool and a work frame; their names must differ"),
         ("tools", {"probe": {"position": [0, 0, 1]}}, "tools.probe.position: has no unit"),
         (
             "work_frames",
-            {f"f{n}": dict(POSE, position_mm=[0, 0, n]) for n in range(MOST + 1)},
-            "work_frames: must be no more than 100",
+            {f"f{n}": dict(POSE, position_mm=[0, 0, n]) for n in range(MOST_FRAMES + 1)},
+            "work_frames: must have at most 100 entries",
         ),
     ],
 )
@@ -281,7 +288,7 @@ def test_a_turned_or_mirrored_home_and_a_wrong_unit_are_noticed():
         found = float(doubt.partition("turned by ")[2].partition("°")[0])
         assert found == pytest.approx(turn, abs=10.0)  # the 6-6's platform is no exact copy of its base
     (doubt,) = doubts(example(home=Pose(home.position * [1.0, 1.0, -1.0], home.rotation)))
-    assert "mirrored" in doubt
+    assert "the wrong sign" in doubt
     assert [text.split(" ")[0] for text in joint_doubts(base * 25.4, base * 0.5 + [0, 0, 9.0])] == ["base.joints"]
 
 
@@ -292,7 +299,7 @@ def test_a_home_that_breaks_a_limit_says_what_may_be_wrong(tmp_path: Path):
     joints = load_geometry("example_6_6").platform_joints * [1.0, -1.0, 1.0] * 1e3
     start, end = after.index("joints_mm:"), after.index("  # Direction of the cardan axis")
     wrong = f"{before}platform:{after[:start]}joints_mm: {joints.tolist()}\n{after[end:]}"
-    with pytest.raises(InputFileError, match=r"home: breaks a limit: .*; platform joints 1…6 run the other way round"):
+    with pytest.raises(InputFileError, match=r"home: breaks a limit: .*; platform joints 1…6 go round in the opposite"):
         parse_geometry(wrong)
 
 

@@ -364,5 +364,5 @@ def test_two_candidates_as_near_are_refused() -> None:
     """Tilted by 80° about its axis of symmetry the paper's machine has two more modes, mirror images of each other and
     so equally near to home; with the cones open nothing tells them apart."""
     limits = replace(PAPER.limits, base_cone=np.full(6, np.pi), platform_cone=np.full(6, np.pi))
-    with pytest.raises(OtherAssemblyModeError, match="about as near"):
+    with pytest.raises(OtherAssemblyModeError, match="at similar distances from home"):
         working_mode(replace(PAPER, limits=limits), IDEAL, distances(IDEAL, high([0, 80, 0])))

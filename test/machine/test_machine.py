@@ -41,7 +41,7 @@ from hexapod_comp.machine.load import STANDARD_GRAVITY, Load, Loading, Payload
 from hexapod_comp.machine.model import MachineModel, ModelOrigin, MotionState, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.surroundings import NO_LOAD, Surroundings
-from hexapod_comp.machine.temperatures import PARTS, Lag, LateGrowth, Temperatures, late
+from hexapod_comp.machine.temperatures import PARTS, Lag, LateGrowth, Temperatures, thermal_lags
 from hexapod_comp.machine.trial import drive
 from hexapod_comp.pose import Pose
 
@@ -241,7 +241,7 @@ def integrated(constant: float) -> np.ndarray:
 @pytest.mark.parametrize("constant", [10.0, 300.0, 1e5])
 def test_a_lag_is_the_solution_of_its_equation(constant: float):
     """The integration's own error is some 1e-9 K."""
-    found = late(TIMES, VALUES[:, None], [constant])[:, 0, 0]
+    found = thermal_lags(TIMES, VALUES[:, None], [constant])[:, 0, 0]
     np.testing.assert_allclose(found, integrated(constant), atol=1e-7)
 
 
@@ -253,7 +253,7 @@ def test_readings_one_by_one_and_all_at_once_in_any_order():
         temperatures.follow("base", value, time, constants)
         behind.append(list(temperatures.lags["base"].behind))
     shuffled = np.array([3, 0, 5, 1, 4, 2])
-    found = late(TIMES[shuffled], VALUES[shuffled, None], constants)[:, 0]
+    found = thermal_lags(TIMES[shuffled], VALUES[shuffled, None], constants)[:, 0]
     np.testing.assert_allclose(found, np.array(behind)[shuffled], atol=1e-12)
 
 
@@ -478,7 +478,7 @@ def test_what_acts_ramps_in_and_no_direction_turns() -> None:
     np.testing.assert_array_equal(compensator.motion.sense, sense)
     compensator.set_load(tilted)  # the same again is no change
     assert seen == [("load", tilted.numbers()), ("tool", "heavy")]
-    with pytest.raises(ModelError, match=r"gravity: must be three numbers, 9…10.6 m/s² in all"):
+    with pytest.raises(ModelError, match=r"gravity: must be three numbers of magnitude 9…10.6 m/s²"):
         compensator.set_load(Loading((0.0, 0.0, 1e3)))
     assert compensator.loading == tilted
     other = Compensator(geometry, model)
@@ -503,7 +503,7 @@ def test_a_load_that_no_machine_has_is_refused() -> None:
         ({"stiffness": np.full(6, 20.0)}, r"load.stiffness: must be 0, which means rigid, or at least 0.1 N/µm"),
         ({"stiffness": -SOFT}, "load.stiffness: must not be negative"),
         ({"mass": np.nan}, "load.mass: must be finite"),
-        ({"take_up": 0.0}, "load.take_up: must be above zero"),
+        ({"take_up": 0.0}, "load.take_up: must be ≥ 0.001 N"),
     ):
         with pytest.raises(ModelError, match=problem):
             Load(**change)

@@ -245,7 +245,7 @@ def test_a_file_written_by_hand(tmp_path):
         ("residual_um: 4.2", "residual_um: -1", ["held_out_residual", "negative", "-1e-06"]),
         ("threshold_um: 3", "threshold_um: -3", ["reversal_threshold", "negative", "-3e-06"]),
         ("base_deviation_um", "base_deviation_m", ["structure.base_deviation", "±50 mm", "unit", "5.5"]),
-        ("pitch_ppm: 12", "pitch_percent: 50", ["struts[5]: strut error changes by 0.5", "allowed 0.2"]),
+        ("pitch_ppm: 12", "pitch_percent: 50", ["struts[5]: length error changes by 0.5", "allowed 0.2"]),
         ("[10, 20, 30, 40, 50, 60]", "[10, 200000, 0, 0, 0, 0]", ["struts.offset", "±100 mm", "unit", "0.2"]),
         ("expansion_ppm_per_K: 11.7", "expansion_ppm_per_K: 11700", ["struts.expansion", "±1000 ppm per K", "0.0117"]),
         ("times: 4", "times: 1", ["struts.wave.harmonics[0].times", "2…4", "found 1"]),

@@ -163,16 +163,19 @@ def test_what_makes_no_motion_is_refused() -> None:
     home = geometry.tool_pose(geometry.home)
     (motion,) = plan_motion(geometry, [home, Pose(home.position + np.array([0.0, 0.0, 0.01]), home.rotation)], RATES)
     assert isinstance(motion, Motion)
+    turned = Pose(home.position, home.rotation @ np.diag([-1.0, -1.0, 1.0]))
     with pytest.raises(PoseError, match="180° has two shortest ways"):
-        plan_motion(geometry, [home, Pose(home.position, home.rotation @ np.diag([-1.0, -1.0, 1.0]))], RATES)
+        plan_motion(geometry, [home, turned], RATES)
+    with pytest.raises(PoseError, match="180° has two shortest ways"):
+        plan_program(geometry, [home, turned], [0.0, 1.0], RATES)
     for refused, words in (
         (lambda: plan_motion(geometry, [home, home], RATES, [0.0, math.nan, 0.0]), "pivot: must be three finite"),
         (lambda: StrutRates(0.2, math.inf), "acceleration: must be positive and finite"),
-        (lambda: plan_program(geometry, [home], [0.0], RATES), "times: must ascend"),
-        (lambda: plan_program(geometry, [home, home], [1.0, 0.5], RATES), "times: must ascend"),
-        (lambda: plan_program(geometry, [home, home], [0.0, 0.0], RATES), "times: must ascend"),
-        (lambda: plan_program(geometry, [home, home], [0.0, 1.0, 2.0], RATES), "times: must ascend"),
-        (lambda: plan_program(geometry, [home, home], [0.0, math.nan], RATES), "times: must ascend"),
+        (lambda: plan_program(geometry, [home], [0.0], RATES), "times: must increase"),
+        (lambda: plan_program(geometry, [home, home], [1.0, 0.5], RATES), "times: must increase"),
+        (lambda: plan_program(geometry, [home, home], [0.0, 0.0], RATES), "times: must increase"),
+        (lambda: plan_program(geometry, [home, home], [0.0, 1.0, 2.0], RATES), "times: must increase"),
+        (lambda: plan_program(geometry, [home, home], [0.0, math.nan], RATES), "times: must increase"),
         (lambda: StrutRates(0.2, 1.0, 0.0), "jerk: must be positive"),
         (lambda: StrutRates.of(geometry, 250.0, 1.1), "share: must lie in"),
         (lambda: StrutRates.of(geometry, math.nan), "rate: must be finite and positive"),

@@ -145,7 +145,7 @@ BAD_LOADS = [
     (partial(publish_gravity, frame="work"), (0.0, 0.0, -9.8), "gravity: frame_id must be base, not 'work'"),
     (publish_wrench, ([math.inf] + [0.0] * 5,), "wrench: must be six finite numbers"),
     (publish_wrench, ([0.0] * 6, "base"), "wrench: frame_id must be platform or tool, not 'base'"),
-    (named, (["elevation"], [45.0]), "outside.elevation: the table holds elevation 0 to 90 deg; is the unit right?"),
+    (named, (["elevation"], [45.0]), "outside.elevation: the table covers elevation 0 to 90 deg; is the unit right?"),
     (named, (["elevation", "rotator"], [0.3]), "outside: has 2 names for 1 positions"),
     (named, (["azimuth"], [0.3]), "outside: must name elevation or rotator, not 'azimuth'"),
 ]
@@ -168,7 +168,7 @@ def test_a_table_that_refuses_stops_the_machine(rig: Rig, tmp_path: Path) -> Non
     tell(rig, elevation=0.5, rotator=0.2)
     rig.until(lambda: reached(rig, at(elevation=0.5, rotator=0.2)), "the table's correction")
     tell(rig, elevation=1.6)
-    rig.until_status(ERROR, "refusing commands: outside_table: elevation 91.6732 deg: the table holds elevation 0 to")
+    rig.until_status(ERROR, "refusing commands: outside_table: elevation 91.6732 deg: the table covers elevation 0 to")
     tell(rig, elevation=1.5)
     rig.until(lambda: reached(rig, at(elevation=1.5, rotator=0.2)), "the number inside")
 

@@ -33,5 +33,5 @@ def test_length_maps_are_as_large_and_as_long_as_asked() -> None:
 def test_length_maps_that_cannot_be_are_refused() -> None:
     with pytest.raises(ModelError, match="seed: must be a whole number, 0 or above"):
         strut_errors(-1)
-    with pytest.raises(ModelError, match="strut error changes by"):  # so steep that no strut could follow
+    with pytest.raises(ModelError, match="length error changes by"):  # so steep that no strut could follow
         strut_errors(0, rms=5e-3)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...machine.temperatures import PARTS, REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE, LateGrowth, late
+from ...machine.temperatures import PARTS, REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE, LateGrowth, thermal_lags
 from ...measurements.readings import Stations
 from ..assumptions import ASSUMED
 from .block import Block, Columns, Draft, Errors, Facts, Linkage, StrutBlock
@@ -39,7 +39,7 @@ def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence
     above = (read - REFERENCE_TEMPERATURE)[..., None]
     if not len(constants) or not np.isfinite(stations.times).all():
         return np.concatenate([above, np.zeros((*read.shape, len(constants)))], axis=2)
-    return np.concatenate([above, late(stations.times, read, constants)], axis=2)
+    return np.concatenate([above, thermal_lags(stations.times, read, constants)], axis=2)
 
 
 def growth_root(terms: int, struts: float = ASSUMED.struts_warmed_alike) -> np.ndarray:
