@@ -1,8 +1,8 @@
 """The parameters of a joint calibration: an ordered collection of blocks, and the settings of a fit.
 
-Each block has a prior: zero mean and a covariance of known shape whose size, the block's *tolerance*, is a
-hyperparameter estimated with the rest. The prior fixes unobservable directions (the gauge) at the nominal machine and
-keeps smooth blocks smooth; it hardly affects parameters that the data determine.
+Each block has a prior with zero mean and a covariance of known shape. The size of this covariance, the block's
+*tolerance*, is a hyperparameter that the fit estimates. The prior fixes unobservable directions (the gauge) at the
+nominal machine and keeps smooth blocks smooth; it hardly affects parameters that the data determine.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ from .blocks.block import Draft, Facts
 from .blocks.field import SmoothField
 from .blocks.load import stated_load, undetermined_load_blocks
 
-LEADS = 0.1e-3, 1.0  # shortest and longest of a screw, m
-LARGEST_EXPANSION, LARGEST_MOISTURE = 100e-6, 1e-2  # 1/K: three times zinc's; m/m from dry to damp: more than wood's
-BEYOND_STROKE = 50e-3  # largest reading of encoders beyond the stroke, m: they have their own zeros
+LEADS = 0.1e-3, 1.0  # shortest and longest allowed lead of a screw, m
+# Largest allowed expansion, 1/K (three times that of zinc), and growth from 0 to 100 % humidity, m/m (more than wood)
+LARGEST_EXPANSION, LARGEST_MOISTURE = 100e-6, 1e-2
+BEYOND_STROKE = 50e-3  # strut readings may exceed the stroke by this much, m, because encoders have their own zeros
 
 TOLERANCES = {block.name: block.tolerance for block in ERRORS}
-"""First guess of the blocks' standard deviations, m, m/m, rad or 1/K; the fit estimates them."""
+"""First guess of each block's standard deviation, m, m/m, rad or 1/K; the fit estimates the value."""
 
 BLOCKS = tuple(TOLERANCES)
 
@@ -45,36 +46,38 @@ class FitSettings:
     Parameters
     ----------
     blocks : tuple of str
-        Blocks that may be used, of :data:`BLOCKS`; the structure belongs to every fit.
+        Blocks that the fit may use, from :data:`BLOCKS`; the structure belongs to every fit.
     shared_platform_joints : bool
         Platform joints that coincide nominally are one ball joint: the paper's machine then has 33 structure
         parameters instead of 42.
     lead : float or None
-        Period of the screws' errors, m; None: the geometry's leads; where there are none, what the readings show, and
-        no wave block when they do not.
+        Period of the screws' errors, m. None: the lead of the geometry; if the geometry states none, the lead detected
+        in the readings; if none is detected, the fit has no wave block.
     field_degree : int
         Degree of the field's polynomials along the longest side of its box.
     strut_expansion, base_expansion, platform_expansion : float
-        Thermal expansion as stated, 1/K: where readings were taken while temperatures changed, the fit starts from it.
+        Stated thermal expansion, 1/K. The fit estimates deviations from it if the temperatures changed enough.
     strut_moisture : float or None
-        Growth of the struts by relative humidity, m/m from 0 to 1: as `strut_expansion`; None: they do not swell.
+        Stated growth of the struts from 0 to 100 % relative humidity, m/m; the fit estimates the deviation as for
+        `strut_expansion`. None: the struts do not swell.
     thermometer : str
-        The part whose sensor represents all parts; empty: the one that has readings of its own, if only one has.
+        The part whose sensor represents all parts; empty: the only part with a sensor, if there is only one.
     time_constants : tuple of float or None
-        How late parts follow their thermometers, s; None: sought from the readings.
+        Delays with which parts follow their thermometers, s; None: estimated from the readings.
     load : tuple of float
-        What is stated of struts that give under weight (:meth:`hexapod_comp.machine.load.Load.numbers`); empty: they
-        are rigid. Where readings were taken under several loads, the fit starts from it.
-    tolerances : dict
-        Standard deviations to start from, by block, where they are not the blocks' own.
+        Stated behaviour of elastic struts under weight (:meth:`hexapod_comp.machine.load.Load.numbers`); empty: the
+        struts are rigid. The fit estimates deviations from it if the readings were taken under several loads.
+    tolerances : tuple of (str, float)
+        First guess of a block's standard deviation, if it differs from :data:`TOLERANCES`.
     robust : bool
-        Give readings that disagree with the rest less weight.
+        Give a smaller weight to readings that disagree with all others.
     tracker_frame : str
-        ``free``: where a tracker's frame is, is not known: six unknowns for each of its runs. ``known``: it is the work
-        frame, so that the readings show where the machine stands in it.
+        ``free``: the tracker's frame is unknown, with six nuisance parameters for each run. ``known``: it is the work
+        frame, so the readings determine the datum of the machine.
     scale, alignment : float or None
-        Standard deviations of what no reading shows: of the instruments' scale, m/m, and of the angle between a laser's
-        beam and its line, rad. None: of their class (:func:`~hexapod_comp.calibration.trust.stated_scale`).
+        Standard deviations of errors that no reading shows: the instruments' scale, m/m, and the angle between a
+        laser's beam and its line, rad. None: by the class of instrument
+        (:func:`~hexapod_comp.calibration.trust.stated_scale`).
     """
 
     blocks: tuple[str, ...] = BLOCKS
@@ -113,9 +116,9 @@ class FitSettings:
             if not 0.0 <= value <= largest:
                 raise ModelError(name.replace("_", " "), f"must be 0…{largest * factor:g} {unit}", value * factor)
         if self.load:
-            Load.from_numbers(self.load)  # refuses invalid numbers
+            Load.from_numbers(self.load)  # raises an error on invalid numbers
         constants = self.time_constants or ()
-        # refuses invalid numbers
+        # raises an error on invalid numbers
         LateGrowth(tuple(constants), np.zeros((len(PARTS), len(constants))), self.thermometer)
         for name, given, most, unit in (("scale", self.scale, 1e-2, "m/m"), ("alignment", self.alignment, 0.1, "rad")):
             if given is not None and not 0.0 <= given <= most:
@@ -128,23 +131,23 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class Extent:
-    """The region of a measurement, as far as parameters depend on it; it remains after the readings are fitted."""
+    """The region of a measurement set on which the parameters depend; a posterior file keeps it."""
 
     commands: np.ndarray  # (2,): lowest and highest strut command, m
-    box: np.ndarray  # (2, 3): lowest and highest commanded place of the measured point, m in base: the field's region
-    work_box: np.ndarray  # (2, 3): the same in the work frame, in which campaigns are boxes: the model's region
+    box: np.ndarray  # (2, 3): corners of the commanded positions of the measured point in base, m: the field's region
+    work_box: np.ndarray  # (2, 3): corners of the same positions in the work frame, m: the model's region
     level: np.ndarray  # (3, 3): attitude of the platform, in base, with a level tool (MeasurementSet.level)
     probe: np.ndarray  # (3,): the measured point in platform, m
 
     @staticmethod
     def of(measurements: MeasurementSet) -> Extent:
-        """Return where a set was measured."""
+        """Return the region of a measurement set; refuse strut readings far beyond the stroke."""
         commands, points, work = measurements.stations.commands, measurements.points(), measurements.geometry.work
         stroke = measurements.geometry.limits.stroke
         low, high = stroke.min() - BEYOND_STROKE, stroke.max() + BEYOND_STROKE
         if not (low <= commands.min() and commands.max() <= high):
             span = f"{commands.min():.4g}…{commands.max():.4g} m"
-            problem = f"run over {span}, the struts over {low:.4g}…{high:.4g} m; do units fit?"
+            problem = f"are {span}, but the struts allow {low:.4g}…{high:.4g} m; check the units"
             raise CalibrationError("strut readings", problem)
         in_work = (points - work.position) @ work.rotation
         return Extent(
@@ -157,26 +160,26 @@ class Extent:
 
 
 class Components(NamedTuple):
-    """Independent parameters with one prior a block: what :func:`~.estimator.solve` needs of a parameter space."""
+    """Independent parameters with one prior per block, as :func:`~.estimator.solve` needs them."""
 
-    parts: tuple[slice, ...]  # of each block
-    first: np.ndarray  # (blocks,): tolerances to start from
-    stated: tuple[bool, ...]  # (blocks,): whether these stay
+    parts: tuple[slice, ...]  # slice of each block in the parameter vector
+    first: np.ndarray  # (blocks,): first guess of the tolerances
+    stated: tuple[bool, ...]  # (blocks,): whether the first guess is kept
 
     def start_tolerances(self) -> np.ndarray:
         """Return the blocks' first tolerances, shape (blocks,)."""
         return self.first
 
     def spread(self, tolerances: np.ndarray) -> np.ndarray:
-        """Return each parameter's tolerance from its block's, shape (size,)."""
+        """Return the tolerance of each parameter, (size,), from the tolerances of the blocks."""
         return np.repeat(tolerances, [part.stop - part.start for part in self.parts])
 
 
 class ParameterSpace:
-    """All parameters of a joint fit, in SI, block by block, and the machine of a vector of them.
+    """All parameters of a joint fit, in SI, block by block; it turns a parameter vector into a machine model.
 
-    `blocks` are in the order of the vector, `size` is its length; `region` is the measured one; `loads`, (n, 7), are
-    those of the readings as in :attr:`.Surroundings.loads`, NaN in a space that is made without any.
+    `blocks` are in the order of the vector and `size` is its length. `region` is the measured region. `loads`, (n, 7),
+    are the loads of the readings as in :attr:`.Surroundings.loads`; NaN if the space was made without readings.
     """
 
     def __init__(self, measurements: MeasurementSet | tuple[HexapodGeometry, Extent], settings: FitSettings) -> None:
@@ -208,18 +211,18 @@ class ParameterSpace:
         self.labels = tuple(label for block in self.blocks for label in block.labels)
 
     def places(self, in_work: np.ndarray) -> np.ndarray:
-        """Return points (n, 3) of the work frame in ``base``, m."""
+        """Return points (n, 3), m, transformed from the work frame to ``base``."""
         work = self.geometry.work
         return work.position + in_work @ work.rotation.T
 
     @property
     def parts(self) -> tuple[slice, ...]:
-        """Where each block stands in the parameter vector."""
+        """The slice of each block in the parameter vector."""
         return tuple(block.part for block in self.blocks)
 
     @property
     def stated(self) -> tuple[bool, ...]:
-        """Whether each block's tolerance is stated."""
+        """Whether each block's tolerance is stated, so that the fit does not estimate it."""
         return tuple(block.stated for block in self.blocks)
 
     @property
@@ -229,12 +232,12 @@ class ParameterSpace:
 
     @property
     def offsets(self) -> slice:
-        """The slice of the struts' offsets, which move the tool like any error of length."""
+        """The slice of the six struts' offsets in the parameter vector: the last six of the structure."""
         end = self.blocks[0].part.stop
         return slice(end - 6, end)
 
     def block(self, name: str) -> Block | None:
-        """Return a block by name, None when this fit has none."""
+        """Return the block of this name, or None if this fit does not have it."""
         return next((b for b in self.blocks if b.name == name), None)
 
     def start_tolerances(self) -> np.ndarray:
@@ -243,15 +246,15 @@ class ParameterSpace:
         return np.array([known.get(b.name, b.tolerance) for b in self.blocks])
 
     def spread(self, tolerances: np.ndarray) -> np.ndarray:
-        """Return each parameter's tolerance from its block's, shape (size,)."""
+        """Return the tolerance of each parameter, (size,), from the tolerances of the blocks."""
         return np.repeat(tolerances, [len(b.labels) for b in self.blocks])
 
     def whitened(self, rows: np.ndarray) -> np.ndarray:
-        """Return derivatives (n, size) by x as derivatives by y, with x = root·y block by block."""
+        """Convert derivatives by x, (n, size), to derivatives by y, where x = root·y in each block."""
         return np.hstack([rows[:, b.part] @ b.root for b in self.blocks])
 
     def unwhitened(self, rows: np.ndarray) -> np.ndarray:
-        """Return derivatives (n, size) by y as derivatives by x: undoes :meth:`whitened`."""
+        """Convert derivatives by y, (n, size), to derivatives by x: the inverse of :meth:`whitened`."""
         return np.hstack([np.linalg.solve(b.root.T, rows[:, b.part].T).T for b in self.blocks])
 
     def physical(self, y: np.ndarray) -> np.ndarray:
@@ -259,11 +262,11 @@ class ParameterSpace:
         return np.concatenate([b.root @ y[b.part] for b in self.blocks])
 
     def whitened_parameters(self, x: np.ndarray) -> np.ndarray:
-        """Return y of x = root·y: undoes :meth:`physical`."""
+        """Return y for x = root·y: the inverse of :meth:`physical`."""
         return np.concatenate([np.linalg.solve(b.root, x[b.part]) for b in self.blocks])
 
     def prior_covariance(self, tolerances: np.ndarray) -> np.ndarray:
-        """Return the prior's covariance of x, shape (size, size), SI."""
+        """Return the prior covariance of x, shape (size, size), SI."""
         return self.physical(self.physical(np.diag(self.spread(tolerances) ** 2)).T)
 
     @property
@@ -273,12 +276,12 @@ class ParameterSpace:
 
     @property
     def stated_expansion(self) -> np.ndarray:
-        """Expansion of struts 1-6, base and platform as stated, 1/K."""
+        """Stated expansion of struts 1–6, base and platform, shape (8,), 1/K."""
         s = self.settings
         return np.array([*[s.strut_expansion] * 6, s.base_expansion, s.platform_expansion])
 
     def _draft(self, x: np.ndarray) -> Draft:
-        """Return the machine model of a parameter vector, written by its blocks."""
+        """Return the draft of the machine model of a parameter vector; each block writes its parameters into it."""
         waves = {part: np.zeros((6, MOST_HARMONICS)) for part in ("cosine", "sine")}
         struts = {
             "reference_length": self.home_lengths,
@@ -299,10 +302,7 @@ class ParameterSpace:
         return draft
 
     def model(self, x: np.ndarray, name: str = "joint calibration", with_field: bool = True) -> MachineModel:
-        """Return the machine of a parameter vector (size,), SI.
-
-        `with_field` false leaves the field out: the fit adds it from its own basis.
-        """
+        """Return the machine model of a parameter vector (size,), SI, with or without its field."""
         draft = self._draft(x)
         machine = draft.machine
         if with_field and (draft.field.any() or draft.reversal.any()):
@@ -324,16 +324,16 @@ class ParameterSpace:
         )
 
     def _load(self, draft: Draft) -> Load:
-        """Return the stated load block plus the terms of a draft."""
+        """Return the stated load properties of the struts plus the deviations in a draft."""
         stated, beyond = stated_load(self.settings), dict(draft.load)
         known = {name: getattr(stated, name) + beyond.get(name, 0.0) for name in ("lost_motion", "friction")}
         if "compliance" in beyond:
-            # A step on the way may overshoot: no strut is stiffer than ten times the stated value
+            # A step of the iteration may overshoot: limit the stiffness to ten times the stated value
             compliance = np.maximum(stated.compliance + beyond["compliance"], 0.1 * stated.compliance)
             known["stiffness"] = reciprocal(compliance)
         return replace(stated, **known)
 
     def field_errors(self, x: np.ndarray, points: np.ndarray, sense: np.ndarray) -> np.ndarray:
-        """Return the field at points (n, 3), m, passed in directions (n, 3), shape (n, 6), m and rad."""
+        """Return the field's error at points (n, 3), m, for directions of motion (n, 3); shape (n, 6), m and rad."""
         draft = self._draft(x)
         return self.field.evaluate(draft.field, draft.reversal, points, sense)

@@ -1,4 +1,4 @@
-"""Pictures of calibrations: a model's strut errors, and polynomials with their readings."""
+"""Pictures of calibrations: strut errors, polynomials of scheme lines, residuals, and maps of the tool's error."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ARROWS = {1: "→", -1: "←"}
 def strut_length_errors(
     geometry: HexapodGeometry, model: MachineModel, along_x: np.ndarray, y: float, z: float
 ) -> np.ndarray:
-    """Return ΔL = L_actual − L_ideal (Mou & King) along a line in x, forward and backward, shape (2, n, 6), m."""
+    """Return ΔL = L_actual − L_ideal along x in work, level tool, forward and backward (Mou & King), (2, n, 6), m."""
     points = np.stack([along_x, np.full_like(along_x, y), np.full_like(along_x, z)], axis=1)
     level = np.tile(np.eye(3), (len(points), 1, 1))
     nominal = Structure.of(geometry)
@@ -46,9 +46,9 @@ def strut_length_errors(
 
 
 def strut_error_figure(geometry: HexapodGeometry, models: Mapping[str, MachineModel], y: float | None = None) -> Figure:
-    """Show Mou & King's Figures 3 and 4: the six struts' length errors along x, forward (a) and backward (b)."""
+    """Plot the six struts' length errors along x, forward (a) and backward (b), as Mou & King's Figures 3 and 4."""
     if not models or any(model.measured is None for model in models.values()):
-        raise CalibrationError("picture of strut errors", "needs models, each with the box in which it holds")
+        raise CalibrationError("picture of strut errors", "needs at least one model, each with its measured box")
     box = commanded_box(geometry, next(iter(models.values())))
     line = box.mean(axis=0)[1:]
     line[0] = line[0] if y is None else y
@@ -68,7 +68,7 @@ def strut_error_figure(geometry: HexapodGeometry, models: Mapping[str, MachineMo
 
 
 def fitted_lines_figure(fit: LinesFit, axis: int = 0, component: int | None = None) -> Figure:
-    """Show the polynomials of one family and component with their readings."""
+    """Plot the polynomials of one component on all lines along an axis, with their mean readings."""
     component = axis if component is None else component
     lines = [line for line in fit.lines if (line.axis, line.component) == (axis, component)]
     if not lines:
@@ -103,7 +103,7 @@ def _line_panel(axes: Axes, line: LineFit, grid: Sequence[np.ndarray]) -> None:
 
 
 def pictures_of(fit: ModelFit | LinesFit) -> dict[str, Figure]:
-    """Return the pictures of a fit by file name."""
+    """Return the pictures of a fit, by file name."""
     geometry = fit.measurements.geometry
     if isinstance(fit, ModelFit):
         figures, known, title = {"fit.png": fit_figure(fit)}, fit.parameters, "scheme joint"
@@ -118,8 +118,7 @@ def pictures_of(fit: ModelFit | LinesFit) -> dict[str, Figure]:
 
 
 def fit_figure(fit: ModelFit) -> Figure:
-    """Show a joint fit: the residuals of each kind of channel compared with pure noise, and each strut's error over its
-    commands, without offset and backlash."""
+    """Plot a joint fit: a histogram of each kind's residuals, and each strut's pitch error and length map."""
     figure, geometry = Figure(figsize=(11, 4.2), layout="constrained"), fit.measurements.geometry
     left, right = figure.subplots(1, 2)
     edges = np.linspace(-5.0, 5.0, 51)
@@ -146,9 +145,9 @@ def fit_figure(fit: ModelFit) -> Figure:
 
 
 def before_after_figure(fit: ModelFit) -> Figure:
-    """Map the error in space before compensation, and what is expected after it, at three heights of the box.
+    """Map the tool's error before compensation, and the expected error after it, at three heights of the box.
 
-    RMS of both directions along x; level tool.
+    The maps show the RMS of both directions of motion along x, with a level tool, the datum aligned.
     """
     space, geometry = fit.space, fit.measurements.geometry
     low, high = space.work_box
@@ -163,9 +162,9 @@ def before_after_figure(fit: ModelFit) -> Figure:
         raise CalibrationError("picture of the error in space", "needs readings that span a box")
     squares = (aligned.values[:, :3] ** 2).sum(axis=1), np.trace(aligned.covariance[:, :3, :3], axis1=1, axis2=2)
     before, left = (1e6 * np.sqrt(part.reshape(2, 3, MAP_NODES, MAP_NODES).mean(axis=0)) for part in squares)
-    # The allowance for errors without a parameter has no place, so it is added everywhere.
-    beside = 0.0 if fit.level is None else (fit.level.after * 1e6) ** 2 - np.nanmean(left**2)
-    maps = before, np.sqrt(left**2 + max(beside, 0.0))
+    # The expected error includes errors that no parameter describes. Their place is unknown: add them everywhere.
+    unexplained = 0.0 if fit.level is None else (fit.level.after * 1e6) ** 2 - np.nanmean(left**2)
+    maps = before, np.sqrt(left**2 + max(unexplained, 0.0))
     figure = Figure(figsize=(11, 7.2), layout="constrained")
     rows = figure.subplots(2, 3, sharex=True, sharey=True)
     sizes = np.maximum(np.array(maps), LEAST_SHOWN)
@@ -185,7 +184,7 @@ def before_after_figure(fit: ModelFit) -> Figure:
 
 
 def residuals_by_run_figure(fit: ModelFit) -> Figure:
-    """Show the residuals of each run, over their standard deviation as stated, one panel for each kind of channel."""
+    """Plot the residuals of each run over the stated noise, one panel for each kind of channel."""
     m = fit.measurements
     sigmas = fit.solution.residuals / m.stated
     figure = Figure(figsize=(11, 0.6 + 1.7 * len(fit.channels)), layout="constrained")
@@ -204,7 +203,7 @@ def residuals_by_run_figure(fit: ModelFit) -> Figure:
 
 
 def predicted_error_figure(machine: RealMachine, fitted: FittedParameters | None) -> Figure:
-    """Map the tool's predicted error at half the measured box's height, level tool, datum aligned; contours are σ."""
+    """Map the tool's predicted error at mid-height of the measured box, level tool, datum aligned, with its σ."""
     box = commanded_box(machine.geometry, machine.model)
     x, y = (np.linspace(box[0, axis], box[1, axis], MAP_NODES) for axis in range(2))
     height = float(box[:, 2].mean())
@@ -212,7 +211,7 @@ def predicted_error_figure(machine: RealMachine, fitted: FittedParameters | None
     poses = machine.geometry.platform_poses(points, np.tile(np.eye(3), (len(points), 1, 1)))
     aligned = ErrorPredictor(machine, fitted).predict(poses)[1]
     if aligned is None:
-        raise ModelError("region", "holds too few poses that the machine takes")
+        raise ModelError("region", "contains fewer than three poses that the machine reaches")
     figure = Figure(figsize=(11, 7), layout="constrained")
     panels = figure.subplots(2, 3, sharex=True, sharey=True)
     for n, axes in enumerate(panels.ravel()):

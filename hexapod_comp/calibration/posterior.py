@@ -1,9 +1,9 @@
 """The posterior: the parameters of a fit with their covariance, and the resulting tool error.
 
-The only place that computes tool error from a covariance of parameters. To first order the error is e(x) = e₀ + J·δx at
-every place; with Σ the parameters' covariance its own is J·Σ·Jᵀ, and with M the mean of JᵀJ over the places of a box
-its mean square is tr(M·Σ). As a rule the *datum is aligned*: the shift and the turn that best explain the
-displacements, and the mean rotation, are subtracted from e and J, as setting up a workpiece does.
+Only this module computes tool errors from a covariance of parameters. To first order the error at every place is
+e(x) = e₀ + J·δx. With Σ the covariance of the parameters, the covariance of e is J·Σ·Jᵀ. With M the mean of JᵀJ over
+the places of a box, the mean square of J·δx is tr(M·Σ). Usually the *datum is aligned*: the shift and the rotation that
+best explain the displacements, and the mean rotation, are subtracted from e and J, as setting up a workpiece does.
 
 Mou & King (1998): "predict the linear displacement errors of any point within designated machine workspace".
 """
@@ -41,25 +41,25 @@ COMPONENTS = ("x", "y", "z", "rx", "ry", "rz")
 """Displacement along, and rotation about, the axes of the work frame."""
 
 POINTS, DRAWS, SEED = 300, 300, 7
-"""Random points and draws of the parameters behind an expected tool error."""
+"""Number of random points, and of draws of the parameters, from which an expected tool error is computed; the seed."""
 
 OTHER_MASS = 10.0
-"""By how much a tool is heavier for which a fit predicts its error too, kg."""
+"""A fit also predicts the tool error for a tool that is heavier by this mass, kg."""
 
 CHUNK = 256
-"""Poses handled together: bounds the memory of their derivatives."""
+"""Number of poses computed at once: it limits the memory for their derivatives."""
 
 
 @dataclass(frozen=True)
 class FittedParameters:
-    """The parameters of a joint fit and how well they are known."""
+    """The estimated parameters of a joint fit, with their covariance."""
 
-    space: ParameterSpace  # what they mean
-    x: np.ndarray  # (size,), the most probable ones, SI
-    covariance: np.ndarray  # (size, size)
-    tolerances: np.ndarray  # (blocks,), size of each block's prior
+    space: ParameterSpace  # meaning of each parameter
+    x: np.ndarray  # (size,), most probable parameters, SI
+    covariance: np.ndarray  # (size, size), of x
+    tolerances: np.ndarray  # (blocks,), standard deviation of each block's prior
     noise: np.ndarray  # (kinds,), factor on the stated standard deviation of each kind's readings
-    # where the model holds the tool; x and covariance are not changed by it; None in old files
+    # the pose at which the model holds the datum, and the motion for it, which x does not contain; None in old files
     held: HeldDatum | None = None
 
 
@@ -67,21 +67,20 @@ class FittedParameters:
 
 
 class Datum(NamedTuple):
-    """A small motion of everything about a centre, and the tool's mean rotation: the part that alignment subtracts."""
+    """A small motion of the whole machine and the tool's mean rotation: alignment subtracts both from the errors."""
 
-    centre: np.ndarray  # (3,), m
-    motion: np.ndarray  # (6, 1 + size), shift, m, and turn, rad
-    rotation: np.ndarray  # (3, 1 + size)
+    centre: np.ndarray  # (3,), centre of the motion, m
+    motion: np.ndarray  # (6, 1 + size), shift, m, and rotation, rad, then their derivatives by the parameters
+    rotation: np.ndarray  # (3, 1 + size), mean rotation, rad, then its derivatives by the parameters
 
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """The tool's errors at N places and their derivatives by the parameters, along and about the same axes, m and
-    rad."""
+    """The tool's errors at N places, m and rad, and their derivatives by the parameters, in one frame."""
 
     places: np.ndarray  # (N, 3)
     columns: np.ndarray  # (N, 6, 1 + size): displacement and rotation vector, then their derivatives
-    # RMS of displacement and of rotation by struts whose lost motion may be at either end: no parameter describes them
+    # RMS displacement, m, and rotation, rad, by struts whose lost motion may be at either end: no parameter has them
     unsettled: tuple[float, float] = (0.0, 0.0)
 
     @staticmethod
@@ -102,15 +101,15 @@ class FirstOrder:
 
     @property
     def slopes(self) -> np.ndarray:
-        """Their derivatives, shape (N, 6, size)."""
+        """The derivatives of the errors by the parameters, shape (N, 6, size)."""
         return self.columns[:, :, 1:]
 
     def select(self, chosen: np.ndarray | slice) -> FirstOrder:
-        """Return some of the places."""
+        """Return the errors at some of the places."""
         return FirstOrder(self.places[chosen], self.columns[chosen], self.unsettled)
 
     def datum(self) -> Datum:
-        """Return the motion that explains the displacements best, by least squares, and the mean rotation."""
+        """Return the rigid motion that best explains the displacements (least squares), and the mean rotation."""
         centre = self.places.mean(axis=0)
         unit = np.tile(np.eye(6), (len(self.places), 1, 1))
         explain = np.linalg.pinv(carried(unit, self.places - centre)[:, :3].reshape(-1, 6))
@@ -118,7 +117,7 @@ class FirstOrder:
         return Datum(centre, motion, self.columns[:, 3:].mean(axis=0))
 
     def aligned(self, datum: Datum | None = None) -> FirstOrder:
-        """Return the same minus a datum, by default that of these places."""
+        """Return the errors with a datum subtracted; by default the datum of these places."""
         datum = self.datum() if datum is None else datum
         whole = carried(datum.motion[None], self.places - datum.centre)
         whole[:, 3:] = datum.rotation
@@ -126,14 +125,13 @@ class FirstOrder:
 
     @cached_property
     def mean_squares(self) -> tuple[np.ndarray, np.ndarray]:
-        """M of displacement and of rotation, (size, size): δxᵀ·M·δx is the mean square for a change δx."""
+        """M for displacement and for rotation, (size, size): δxᵀ·M·δx is the mean square error by a change δx."""
         count, size = len(self.places), self.slopes.shape[2]
         parts = (self.slopes[:, rows].reshape(-1, size) for rows in (slice(3), slice(3, 6)))
         return tuple(part.T @ part / count for part in parts)  # type: ignore[return-value]
 
     def known(self, covariance: np.ndarray | None, moved: np.ndarray | float = 0.0) -> PredictedError:
-        """Return the errors with their mean squares about the truth; `moved`, (N, 6), is the motion by holding the
-        datum."""
+        """Return the errors with their covariance; `moved`, (N, 6), is the error added by holding the datum."""
         if covariance is None:
             return PredictedError(self.values, None)
         moves = np.broadcast_to(moved, self.values.shape)
@@ -143,26 +141,26 @@ class FirstOrder:
 
 @dataclass(frozen=True)
 class PredictedError:
-    """The error of the tool's tip at N poses with the struts commanded to nominal lengths, in ``work``, m and rad."""
+    """The error of the tool's tip at N poses if nominal strut lengths are commanded, in ``work``, m and rad."""
 
-    values: np.ndarray  # (N, 6), displacement and rotation vector, actual minus commanded; NaN where there is no pose
-    covariance: np.ndarray | None  # (N, 6, 6); None: not known
+    values: np.ndarray  # (N, 6), displacement and rotation vector, actual minus commanded; NaN at unreachable poses
+    covariance: np.ndarray | None  # (N, 6, 6), of values; None: not known
 
     @property
     def deviations(self) -> np.ndarray | None:
-        """Standard deviations of `values`, shape (N, 6); None where they are not known."""
+        """Standard deviations of `values`, shape (N, 6); None if the covariance is not known."""
         if self.covariance is None:
             return None
         return np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0))
 
 
 class ErrorPredictor:
-    """Predicts the tool's error without compensation, by a model at its temperatures, at any pose.
+    """Predicts the tool's error without compensation at any pose, for a model at its temperatures.
 
-    Σ has the prior of motions that no reading showed, so that the uncertainty of an error as the machine stands
-    includes where it stands as a whole. A model whose datum is held has been moved away from the most probable machine
-    by h: the truth then scatters about its prediction by J·Σ·Jᵀ + h·hᵀ. Without fitted parameters no covariance is
-    known.
+    Σ contains the prior of a motion of the whole machine, which relative readings do not show; so absolute errors have
+    the uncertainty of the machine's datum. A model that holds the datum differs from the most probable machine by a
+    motion h; the covariance of its absolute errors is therefore J·Σ·Jᵀ + h·hᵀ. Without fitted parameters no covariance
+    is known.
     """
 
     def __init__(self, machine: RealMachine, fitted: FittedParameters | None) -> None:
@@ -170,34 +168,34 @@ class ErrorPredictor:
         self._datum = self._find_datum()
 
     def predict(self, poses: Poses, senses: np.ndarray | None = None) -> tuple[PredictedError, PredictedError | None]:
-        """Return the errors as the machine stands, and with the datum aligned over the model's box, None without one.
+        """Return the absolute errors, and the errors with the datum aligned over the measured box; None without a box.
 
-        `senses`, (N, 9), are directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`; by default
-        not known, midway between both: a backlash and a reversal of the field then add nothing.
+        `senses`, (N, 9), are directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`. By default
+        they are unknown: then backlash and the field's dependence on direction count with their mean, zero.
         """
         count, covariance = len(poses[0]), None if self._fitted is None else self._fitted.covariance
-        standing, aligned = [], []
+        absolute, aligned = [], []
         for start in range(0, max(count, 1), CHUNK):
             part = slice(start, start + CHUNK)
             errors = self._errors((poses[0][part], poses[1][part]), None if senses is None else senses[part])
-            standing.append(errors.known(covariance, self._given_up(errors.places)))
+            absolute.append(errors.known(covariance, self._held_motion(errors.places)))
             if self._datum is not None:
                 aligned.append(errors.aligned(self._datum).known(covariance))
-        return _joined(standing), _joined(aligned) if aligned else None
+        return _joined(absolute), _joined(aligned) if aligned else None
 
     def slopes(self, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the tips in ``work``, (N, 3), m, and the tool's derivatives by the fit's parameters, (N, 6, size).
 
-        As the machine stands and with the datum aligned; and the part of the former removed by holding the datum, (N,
-        6).
+        The derivatives are absolute, then with the datum aligned. The last array, (N, 6), is the error added by holding
+        the datum.
         """
         if self._fitted is None or self._datum is None:
-            raise CalibrationError("model", "states neither its uncertainty nor where it was measured")
+            raise CalibrationError("model", "has no covariance of its parameters, or no measured box that is reachable")
         errors = self._errors(poses)
-        return errors.places, errors.slopes, errors.aligned(self._datum).slopes, self._given_up(errors.places)
+        return errors.places, errors.slopes, errors.aligned(self._datum).slopes, self._held_motion(errors.places)
 
     def _errors(self, poses: Poses, senses: np.ndarray | None = None) -> FirstOrder:
-        """Return the errors of the tool's tip in ``work``; NaN where the machine has no pose."""
+        """Return the errors of the tool's tip in ``work``; NaN at poses that the machine does not reach."""
         machine, fitted, count = self._machine, self._fitted, len(poses[0])
         geometry, structure, work = machine.geometry, machine.structure, machine.geometry.work.rotation
         positions, rotations = (np.ascontiguousarray(part, dtype=float) for part in poses)
@@ -228,16 +226,15 @@ class ErrorPredictor:
             columns[solved, :, 1:] = np.concatenate([work.T @ rows[:, :3], work.T @ rows[:, 3:]], axis=1)
         return FirstOrder(geometry.tool_poses(positions, rotations)[0], columns)
 
-    def _given_up(self, tips: np.ndarray) -> np.ndarray:
-        """Return the errors that the most probable machine has at tips (N, 3) beyond the model that holds the datum,
-        shape (N, 6): a motion of the whole machine."""
+    def _held_motion(self, tips: np.ndarray) -> np.ndarray:
+        """Return the rigid motion from the model that holds the datum to the most probable machine, (N, 6), at tips."""
         if self._fitted is None or self._fitted.held is None:
             return np.zeros((len(tips), 6))
         geometry, held = self._machine.geometry, self._fitted.held
         return held.moved(tips - geometry.tool_pose(held.pose).position, geometry.work.rotation)
 
     def _find_datum(self) -> Datum | None:
-        """Return the datum of the measured box; None where there is none, or the machine does not reach it."""
+        """Return the datum of the measured box; None if there is no box, or if too little of it is reachable."""
         geometry, region = self._machine.geometry, self._machine.model.measured
         if region is None:
             return None
@@ -249,7 +246,7 @@ class ErrorPredictor:
 
 
 def _joined(parts: list[PredictedError]) -> PredictedError:
-    """Return the errors of several parts of a list of poses."""
+    """Return the errors of several parts of a list of poses as one record."""
     covariances = [part.covariance for part in parts if part.covariance is not None]
     return PredictedError(
         np.concatenate([part.values for part in parts]), np.concatenate(covariances) if covariances else None
@@ -265,21 +262,21 @@ class ToolError:
 
     before: float  # 3-D error of the fitted machine commanded with nominal lengths, m
     after: float  # expected 3-D error with the model, m
-    low: float  # it lies above this with 97.5 %, m,
-    high: float  # and below this, which allows for errors that the readings neither show nor exclude
-    rotation_before: float  # rad, as above
+    low: float  # lower end of the 95 % interval of `after`, m
+    high: float  # upper end, m; it allows for errors that the readings neither show nor exclude
+    rotation_before: float  # as `before`, of the tool's rotation, rad
     rotation_after: float
     rotation_low: float | None  # None if the readings do not show the tool's roll: only priors would determine it
     rotation_high: float | None
-    rotation_unknown: str = ""  # why they are None
+    rotation_unknown: str = ""  # reason why the two ends are None
 
 
 def box_stations(space: ParameterSpace, tilt: float = 0.0, load: Sequence[float] | None = None) -> Stations | None:
-    """Return random reachable stations in the measured box, in the work frame, each passed in both directions.
+    """Return random reachable stations in the measured box, first all passed forward, then all backward.
 
-    First all forward, then all backward. The tool is tilted by `tilt`, rad, from level, each time about another
-    horizontal axis of the work frame. The machine carries a `load`, as in :attr:`.Surroundings.loads`; by default
-    those of the readings in turn.
+    None if no station is reachable. The tool is tilted from level by `tilt`, rad, each time about a random horizontal
+    axis of the work frame. The machine carries `load`, (7,), as in :attr:`.Surroundings.loads`; by default the loads of
+    the readings, in turn.
     """
     rng = np.random.default_rng(SEED)
     points = space.places(rng.uniform(space.work_box[0], space.work_box[1], (POINTS, 3)))
@@ -297,7 +294,7 @@ def box_stations(space: ParameterSpace, tilt: float = 0.0, load: Sequence[float]
 
 
 def stations_of(passes: Passes) -> Stations:
-    """Return the stations at which passes command nominal strut lengths with the whole machine at 20 °C."""
+    """Return stations with the poses of some passes, nominal strut commands, and the whole machine at 20 °C."""
     return Stations(
         **vars(Surroundings.usual(len(passes))),
         positions=passes.positions,
@@ -310,14 +307,16 @@ def stations_of(passes: Passes) -> Stations:
 def box_errors(
     space: ParameterSpace, x: np.ndarray, tilt: float = 0.0, load: Sequence[float] | None = None
 ) -> FirstOrder | None:
-    """Return the errors at :func:`box_stations`, the datum aligned; None where no machine takes such poses."""
+    """Return the errors at :func:`box_stations`, the datum aligned; None if the machine reaches no station."""
     stations = box_stations(space, tilt, load)
     return None if stations is None else FirstOrder.of(space, predict(space, x, stations), stations).aligned()
 
 
 def about_other_loads(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, beyond: Unexplained) -> str:
-    """Return the predicted tool error under loads that a machine may be told in place of the first of the readings;
-    empty if no stiffness is stated."""
+    """Return a note on the predicted tool error with no tool, a heavier tool, and gravity turned by 90°.
+
+    It is empty if the stiffness of a strut is not stated.
+    """
     load, (mass, *centre, _, _, _) = stated_load(space.settings), space.loads[0]
     if not load.stiffness.all():
         return ""
@@ -335,7 +334,7 @@ def about_other_loads(space: ParameterSpace, x: np.ndarray, covariance: np.ndarr
         error = expected_error(box_errors(space, x, load=row), covariance, beyond=beyond)
         if error is not None:
             found.append(f"{name} {1e6 * error.after:.2g} µm (95 %: up to {1e6 * error.high:.2g})")
-    return f"told another load, a level tool is expected to err by: {', '.join(found)}" if found else ""
+    return f"expected error of a level tool under another stated load: {', '.join(found)}" if found else ""
 
 
 def expected_error(
@@ -344,10 +343,11 @@ def expected_error(
     prior: np.ndarray | None = None,
     beyond: Unexplained | None = None,
 ) -> ToolError | None:
-    """Return the tool error that drawn machines of a covariance leave, by the :func:`box_errors` of the fitted one.
+    """Return the expected tool error of machines drawn from the parameters' covariance; None without `errors`.
 
-    The error before is that of the fitted machine, or of machines of a `prior` covariance. Errors that no parameter
-    describes, `beyond`, raise the interval's upper end.
+    `errors` are the :func:`box_errors` of the fitted machine. The error before compensation is the error of the fitted
+    machine, or with `prior` the expected error of machines with that covariance. `beyond` are errors that no parameter
+    describes; they raise the upper end of the interval.
     """
     if errors is None:
         return None
@@ -368,14 +368,15 @@ def expected_error(
 
 
 def _sizes(square: np.ndarray, drawn: np.ndarray) -> np.ndarray:
-    """Return the RMS for drawn parameters (size, D), by their mean-square matrix, shape (D,)."""
+    """Return the RMS error, (D,), of each drawn parameter vector (size, D), with M = `square`, (size, size)."""
     return np.sqrt(np.maximum(np.einsum("id,id->d", drawn, square @ drawn), 0.0))
 
 
 def _drawn(covariance: np.ndarray) -> np.ndarray:
     """Return draws of parameters with a covariance, shape (size, DRAWS).
 
-    By its symmetric root: eigenvectors alone turn by rounding, and draws would depend on the threads of BLAS.
+    The symmetric root of the covariance is used because it is unique. Rounding, which depends on the threads of BLAS,
+    rotates the eigenvectors of equal eigenvalues, and draws along eigenvectors would change with them.
     """
     values, vectors = np.linalg.eigh(covariance)
     z = np.random.default_rng(SEED).standard_normal((len(covariance), DRAWS))
@@ -386,37 +387,37 @@ def _drawn(covariance: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class BlockSight:
-    """How well the data determine one block."""
+class BlockObservability:
+    """How well the readings determine one block."""
 
     name: str
     unit: str
-    parameters: int  # how many
-    determined: float  # number of them that the data determine; the prior determines the rest
+    parameters: int  # number of parameters
+    determined: float  # number of parameters that the readings determine; the prior determines all others
     tolerance: float  # standard deviation of the block's prior
-    error: float  # median standard error of its parameters
+    error: float  # median standard error of the block's parameters
 
 
 @dataclass(frozen=True)
 class Observability:
-    """What the data determine: rank, condition number, indices, unseen parameters of the structure."""
+    """Which parameters the readings determine: rank, condition number and observability indices."""
 
-    blocks: tuple[BlockSight, ...]
-    structure_rank: int  # directions of the structure that the data see, of structure_size
-    structure_size: int
-    rank: int  # the same of all parameters
-    size: int
-    condition: float  # largest over smallest singular value of the observable part, each parameter in its tolerance
-    indices: dict[str, float]  # O1 … O4, of the seen directions
-    unseen: tuple[str, ...]  # structure parameters that the data do not see
+    blocks: tuple[BlockObservability, ...]
+    structure_rank: int  # number of independent directions of the structure's parameters that are observable
+    structure_size: int  # number of the structure's parameters
+    rank: int  # number of independent directions of all parameters that are observable
+    size: int  # number of all parameters
+    condition: float  # largest over smallest singular value of the observable part, parameters over their tolerance
+    indices: dict[str, float]  # observability indices O1 … O4 of the observable directions
+    unseen: tuple[str, ...]  # structure parameters that are not observable
     tilt: float  # largest tilt of the tool from level in the readings, rad
 
 
 def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, tilt: float = 0.0) -> Observability:
-    """Return what a linear problem's data determine.
+    """Return which parameters the readings of a linear problem determine; `tilt`, rad, is only passed on.
 
-    The four indices: O1 (Borm and Menq: geometric mean over √readings), O2 (Driels and Pathre: 1/condition), O3
-    (Nahvi: smallest), O4 (Nahvi and Hollerbach: smallest²/largest).
+    The observability indices are functions of the singular values: O1 (Borm and Menq: geometric mean over √readings),
+    O2 (Driels and Pathre: smallest/largest), O3 (Nahvi: smallest), O4 (Nahvi and Hollerbach: smallest²/largest).
     """
     spread = space.spread(estimate.tolerances)
     information = spread[:, None] * np.tensordot(estimate.noise**-2, problem.normal, 1) * spread
@@ -431,7 +432,7 @@ def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, t
         indices["O1"] = float(np.exp(np.log(seen).mean()) / np.sqrt(len(problem.target)))
         indices |= {"O2": float(seen[-1] / seen[0]), "O3": float(seen[-1]), "O4": float(seen[-1] ** 2 / seen[0])}
     blocks = tuple(
-        BlockSight(
+        BlockObservability(
             name=block.name,
             unit=block.unit,
             parameters=len(block.labels),
@@ -455,7 +456,7 @@ def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, t
 
 
 def _singular(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the singular values of the whitened derivatives, largest first, and their directions."""
+    """Return the singular values of the whitened design matrix, largest first, and their right singular vectors."""
     values, vectors = np.linalg.eigh(information)
     return np.sqrt(np.maximum(values[::-1], 0.0)), vectors[:, ::-1]
 
@@ -472,25 +473,26 @@ MACHINE_ERRORS: dict[str, tuple[tuple[str, str], ...]] = {
     "roll of y": (("ry", "y1"),),
     "roll of z": (("rz", "z1"),),
 }
-"""Machine errors in the field's terms (component, term), by their names in machine metrology."""
+"""Geometric errors of a machine, by their names in machine metrology, as terms of the field: (component, term)."""
 
 
 class UnseenError(NamedTuple):
-    """An error of a machine that its readings do not show."""
+    """A geometric error of a machine that its readings do not show."""
 
     name: str
-    trace: float  # change of all readings by one of the field's tolerance, root sum of squares, σ as stated
+    trace: float  # change of all readings by an error of the field's tolerance, root sum of squares, in stated σ
 
     @property
     def reason(self) -> str:
-        """Why it is not observable."""
+        """Reason why the error is not observable."""
         if self.trace <= 1e-6:  # rounding
             return "no reading shows it"
-        return f"below the noise: it changes all readings together by {self.trace:.2g} σ, seen from {ASSUMED.seen:g} on"
+        changed = f"it changes all readings together by {self.trace:.2g} σ"
+        return f"below the noise: {changed}; more than {ASSUMED.seen:g} σ would be observable"
 
 
 def listed(errors: Iterable[UnseenError]) -> str:
-    """Return errors as text, grouped by the reason why they are not observable."""
+    """Return the errors as text, grouped by the reason why they are not observable."""
     by_reason: dict[str, list[str]] = {}
     for error in errors:
         by_reason.setdefault(error.reason, []).append(error.name)
@@ -498,7 +500,7 @@ def listed(errors: Iterable[UnseenError]) -> str:
 
 
 def without_trace(estimation: Estimation) -> tuple[UnseenError, ...]:
-    """Return the machine errors that readings do not show above their noise; none when their space has no field."""
+    """Return the MACHINE_ERRORS that the readings do not show above their noise; empty if the fit has no field."""
     space, cells, measurements = estimation.space, estimation.cells, estimation.measurements
     points, still = measurements.points(), np.zeros((len(measurements.stations), 3))
     index = {label: n for n, label in enumerate(space.labels)}
@@ -508,7 +510,7 @@ def without_trace(estimation: Estimation) -> tuple[UnseenError, ...]:
         wanted = [index[label] for label in (f"{c} {term}" for c, term in parts) if label in index]
         if len(wanted) < len(parts):
             continue
-        # A shear or a size is the same per length, and the terms run from -1 to 1 over sides of the box.
+        # Terms run from -1 to 1 over the box; scaled by its sides they describe the same shear or size per length.
         x = np.zeros(space.size)
         x[wanted] = [np.prod([half[AXES.index(letter)] for letter in term if letter in AXES]) for _, term in parts]
         y = space.whitened_parameters(x)

@@ -227,7 +227,7 @@ def test_pictures(geometry, real_fit):
     assert all(len(axes.lines) == 6 for axes in figure.axes)
     assert len(fitted_lines_figure(real_fit).axes) == 15
     assert len(fitted_lines_figure(real_fit, 2, 0).axes) == 5
-    with pytest.raises(CalibrationError, match="the box in which it holds"):
+    with pytest.raises(CalibrationError, match="each with its measured box"):
         strut_error_figure(geometry, {"ideal": MachineModel(geometry.name)})
     with pytest.raises(CalibrationError, match="rx on x lines: was not fitted"):
         fitted_lines_figure(real_fit, 0, 3)
