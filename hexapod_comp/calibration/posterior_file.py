@@ -1,8 +1,7 @@
-"""The file of a posterior, beside the model file, which holds its hash, so that no model is used with another's
-figures.
+"""The posterior file, written beside the model file: parameters, covariance, tolerances, noise and settings of a fit.
 
-It holds all results of a fit: parameters, covariance, tolerances and noise, and their meaning. So a model is renewed by
-new readings without the files of the old ones.
+With it a model can be updated by new readings without the files of the old readings. The model file contains the hash
+of its posterior file, so a model is never used with the posterior of another fit.
 """
 
 from __future__ import annotations
@@ -36,23 +35,22 @@ from .posterior import FittedParameters
 FORMAT, VERSION, SUFFIX = "hexapod_comp/posterior", 1, ".posterior.npz"
 
 HELD = {"datum_position": (3,), "datum_rotation": (3, 3), "datum_part": (6, 6), "datum_given_up": (6,)}
-"""Arrays of a held datum."""
+"""Arrays of a held datum, with their shapes."""
 
 REGION_SHAPES = {
     "commands": (2,), "box": (2, 3), "work_box": (2, 3), "level": (3, 3), "probe": (3,)
 }  # fmt: skip
 
 LARGEST, MOST_LISTED = 1e6, 100
-"""Bound of the numbers of a fit, SI: larger ones would overflow when squared; and of the length of its settings'
-lists."""
+"""Largest absolute number in the file, SI, and largest number of entries in a list of the settings."""
 
 NOT_ONE = "is no file of a fit's posterior"
 
 
 def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, path: str | Path) -> list[Path]:
-    """Write a model file, and beside it its fit's posterior, where it is known; return the other file's name.
+    """Write a model file and, beside it, its posterior file, if `fitted` is given; return the names of further files.
 
-    Into a pipe only the model is written.
+    If the path is a pipe or a device, only the model is written.
     """
     file = Path(path)
     if fitted is None or (file.exists() and not file.is_file()):
@@ -60,8 +58,8 @@ def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, pa
         return []
     beside, unknown = file.with_name(file.stem + SUFFIX), hashlib.sha256(FORMAT.encode()).hexdigest()
     text = model_text(replace(model, origin=replace(model.origin, posterior=(beside.name, unknown))))
-    content = _content(fitted, text_sha256(text))  # of all but the posterior's name and hash
-    with new_file(beside, "wb") as stream:  # first: a model file never names a missing file
+    content = _content(fitted, text_sha256(text))  # this hash leaves out the posterior file's name and hash
+    with new_file(beside, "wb") as stream:  # written first, so that a model file never names a missing file
         stream.write(content)
     write_text(path, text.replace(unknown, hashlib.sha256(content).hexdigest()))
     return [beside]
@@ -94,14 +92,14 @@ def load_posterior(
     model, geometry : MachineModel, HexapodGeometry
         The model and its machine.
     path : str or Path
-        The model's file, as :func:`~hexapod_comp.machine.model_file.load_model` takes it.
+        The model's file or name, as for :func:`~hexapod_comp.machine.model_file.load_model`.
     opener : callable, optional
-        As Python's ``open`` takes it, such as :func:`~hexapod_comp.formats.paths.confined_opener`.
+        The argument `opener` of Python's ``open``, such as :func:`~hexapod_comp.formats.paths.confined_opener`.
 
     Returns
     -------
     FittedParameters or None, str
-        None: not known, for the reason given.
+        The posterior and an empty text; or None and the reason why the posterior is not known.
     """
     if model.origin.posterior is None:
         return None, f"model {model.name!r} carries no covariance of a fit"
@@ -114,8 +112,8 @@ def load_posterior(
         head, arrays = _unpacked(content, file)
         if head.get("model_sha256") != model.origin.text_sha256:
             return None, (
-                f"{name} belongs to another text than that of model {model.name!r}: the model file was altered after "
-                "its fit, or comes from an earlier version; fit again"
+                f"{name} does not belong to this text of model {model.name!r}: the model file was altered after its "
+                "fit, or comes from an earlier version; fit again"
             )
         return _parsed(head, arrays, file, geometry), ""
     except HexapodError as error:
@@ -123,7 +121,7 @@ def load_posterior(
 
 
 def _unpacked(content: bytes, path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return a file's head and its arrays, all of which are finite."""
+    """Return the head and the arrays of a posterior file; refuse numbers that are not finite or above LARGEST."""
     with parsing(path, NOT_ONE):
         size = sum(part.file_size for part in zipfile.ZipFile(io.BytesIO(content)).infolist())
     if size > MAX_ARCHIVE_BYTES:
@@ -142,7 +140,7 @@ def _unpacked(content: bytes, path: Path) -> tuple[dict[str, Any], dict[str, np.
 def _parsed(
     head: dict[str, Any], arrays: dict[str, np.ndarray], path: Path, geometry: HexapodGeometry
 ) -> FittedParameters:
-    """Return the parameters of a file's content; refuse another version or machine, or parts that do not fit."""
+    """Return the parameters of a file's content; refuse another version, another machine, or inconsistent arrays."""
     known = FORMAT, VERSION, geometry.name
     given = tuple(head.get(key) for key in ("format", "version", "machine"))
     if given != known:
@@ -161,7 +159,7 @@ def _parsed(
         raise InputFileError(path, "head.settings", str(error)) from error
     labels = arrays.get("labels", np.zeros(0))
     if tuple(labels.ravel().tolist()) != space.labels:
-        problem = "are not those of this geometry's parameters; was the geometry changed?"
+        problem = "are not the parameters of this geometry; was the geometry changed after the fit?"
         raise InputFileError(path, "labels", problem)
     n = space.size
     covariance = np.zeros((n, n))
@@ -187,7 +185,7 @@ def _parsed(
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Return whether a value of a JSON file is of the type of a field: a number, text, or a list of such."""
+    """Return whether a value from JSON has the type `hint`: a number, a text, a boolean, or a list of these."""
     if get_origin(hint) in (Union, UnionType):
         return any(_fits(value, one) for one in get_args(hint))
     if get_origin(hint) is tuple:
@@ -201,7 +199,7 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def _settings(path: Path, given: Any) -> FitSettings:
-    """Return the settings of a file's head, each of the type of its field."""
+    """Return the fit settings in a file's head; refuse unknown settings and settings of a wrong type."""
     if not isinstance(given, dict):
         raise InputFileError(path, "head.settings", "must be an object", given)
     types, words = get_type_hints(FitSettings), {one.name: str(one.type) for one in fields(FitSettings)}

@@ -1,4 +1,4 @@
-"""The predicted interval of a fit's tool error, by its covariance, widened by unexplained errors."""
+"""The predicted interval of a fit's tool error: from the covariance of the parameters, widened by other errors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..machine.arrays import rms
 from .assumptions import ASSUMED
 
 TWICE = 2.0
-"""The ends of an interval, in standard deviations."""
+"""Half-width of a 95 % interval, in standard deviations."""
 
 STEEL = 11.5e-6
 """Expansion of steel, 1/K."""
@@ -21,12 +21,12 @@ STEEL = 11.5e-6
 class Scatter(NamedTuple):
     """Tool error that no parameter describes, RMS over all three axes: displacement, m, or rotation, rad."""
 
-    lack: float = 0.0  # of an error that no parameter describes: the discrepancy
-    stops: float = 0.0  # of the stops from visit to visit, by repeats, if the instruments scatter as stated
-    most_stops: float = 0.0  # its upper bound
+    lack: float = 0.0  # discrepancy: error of the machine as a function of the pose
+    stops: float = 0.0  # scatter of the machine's stops at one pose, from repeats beyond the stated noise
+    most_stops: float = 0.0  # upper bound of `stops`
 
     def beside(self, other: float) -> Scatter:
-        """Return the same with another scatter from visit to visit, of a known standard deviation."""
+        """Return this scatter plus another scatter of the stops, independent and of standard deviation `other`."""
         stops, most = (float(np.hypot(*pair)) for pair in ((self.stops, other), (self.most_stops, TWICE * other)))
         return self._replace(stops=stops, most_stops=most)
 
@@ -35,7 +35,7 @@ NO_SCATTER = Scatter()
 
 
 class Promise(NamedTuple):
-    """Expected RMS error of the tool, and its interval of 95 %: m, or rad."""
+    """Expected RMS error of the tool, and the ends of its 95 % interval: m, or rad."""
 
     after: float
     low: float
@@ -44,30 +44,31 @@ class Promise(NamedTuple):
 
 @dataclass(frozen=True)
 class Unexplained:
-    """Contributions that widen an interval."""
+    """Errors beyond the covariance of the parameters, which widen the interval of the tool error."""
 
-    factor: float = 1.0  # factor on the standard deviations of all parameters, shown by leaving out runs in turn
-    believed: float = np.inf  # degrees of freedom of the covariance's scale
-    prior: float = 0.0  # standard deviation of the logarithm of the expected tool error: priors' sizes are estimates
-    prior_rotation: float = 0.0  # the same of the tool's rotation
-    displacement: Scatter = NO_SCATTER  # tool error that no parameter describes
-    rotation: Scatter = NO_SCATTER
-    drift: float = 0.0  # change of the scale from the first to the last reading, m/m; 0 where none is in the fit
-    drift_error: float = 0.0  # its standard deviation
+    factor: float = 1.0  # factor on the parameters' standard deviations, from the jackknife over runs
+    believed: float = np.inf  # prior degrees of freedom of the covariance's scale
+    prior: float = 0.0  # standard deviation of the log expected tool error, because tolerances are estimates
+    prior_rotation: float = 0.0  # as `prior`, for the tool's rotation
+    displacement: Scatter = NO_SCATTER  # displacement of the tool that no parameter describes
+    rotation: Scatter = NO_SCATTER  # rotation of the tool that no parameter describes
+    drift: float = 0.0  # change of the scale from the first to the last reading, m/m; 0: no drift in the fit
+    drift_error: float = 0.0  # standard error of `drift`, m/m
     scale: float = 0.0  # stated standard deviation of the scale of all readings, m/m
-    ratio: float = 1.0  # ratio of the tool's squared changes to the expected ones, as runs are left out in turn
-    freedom: float = 0.0  # degrees of freedom of that
-    averaged: float = 1.0  # factor on the tool's error, by averaging over the presence of blocks
+    ratio: float = 1.0  # observed over expected squared changes of the tool, as runs are left out in turn (jackknife)
+    freedom: float = 0.0  # degrees of freedom of `ratio`
+    averaged: float = 1.0  # factor on the tool's error from model averaging over blocks
 
     def beside(self, displacement: float, rotation: float) -> Unexplained:
-        """Return the same with a scatter from visit to visit of the tool, RMS, m and rad."""
+        """Return these errors plus a scatter of the tool's stops, RMS displacement, m, and rotation, rad."""
         parts = self.displacement.beside(displacement), self.rotation.beside(rotation)
         return replace(self, displacement=parts[0], rotation=parts[1])
 
     def promised(self, left: np.ndarray, points: np.ndarray) -> Promise:
-        """Return the predicted interval of the tool's displacement; unexplained errors raise the upper end.
+        """Return the predicted interval of the tool's displacement; unexplained errors raise its upper end.
 
-        `left`, (D,), are RMS errors of draws by the fit's covariance, m; a scale acts on distances of `points` (n, 3).
+        `left`, (D,), m, are the RMS errors of machines drawn from the covariance. Errors of scale act on the distances
+        of `points`, (n, 3), m, from their mean.
         """
         after, low, high = self._interval(left, self.prior, self.displacement)
         radius = rms(np.linalg.norm(points - points.mean(axis=0), axis=1))
@@ -75,21 +76,21 @@ class Unexplained:
         return Promise(float(np.sqrt(after**2 + off)), low, float(np.sqrt(high**2 + TWICE**2 * off)))
 
     def promised_rotation(self, left: np.ndarray) -> Promise:
-        """Return the predicted interval of the tool's rotation, from draws as for :meth:`promised`, rad."""
+        """Return the predicted interval of the tool's rotation, rad, from the RMS rotations of drawn machines, (D,)."""
         return self._interval(left, self.prior_rotation, self.rotation)
 
     def _interval(self, left: np.ndarray, prior: float, scatter: Scatter) -> Promise:
-        """Return the predicted interval without any error of scale.
+        """Return the predicted interval without errors of scale.
 
-        Draws are multivariate t's: the variance's scale has an inverse χ² prior about 1 with `believed` degrees of
-        freedom, which the runs' own degrees of freedom can outweigh. A ratio below 1 does not reduce it: crossing lines
-        predict a line better than the space between lines. Whether the machine or its instrument scatters more than
-        stated is unknown: the lower end omits the scatter.
+        The draws follow a multivariate t distribution: the scale of the covariance has an inverse χ² prior about 1 with
+        `believed` degrees of freedom, updated by `ratio` with its own `freedom`. A ratio below 1 counts as 1, because
+        crossing lines predict a line better than the space between lines. The lower end leaves out the scatter of the
+        stops: it may belong to the instrument.
         """
         size, (low, high) = rms(left), np.percentile(left, [2.5, 97.5])
         scaled = left
         if np.isfinite(self.believed):
-            places = np.random.default_rng(3).permutation(len(left)) + 0.5  # one draw from each of as many equal shares
+            places = np.random.default_rng(3).permutation(len(left)) + 0.5  # stratified: one quantile for each draw
             sums = self.believed + self.freedom * max(1.0, self.ratio)
             of_draws = gammaincinv(0.5 * (self.believed + self.freedom), places / len(left))
             scaled = left * np.sqrt(sums / (2.0 * of_draws))
@@ -102,27 +103,27 @@ class Unexplained:
         return Promise(float(after), float(low), float(high))
 
     def findings(self) -> tuple[list[str], list[str]]:
-        """Return the causes of doubt about a fit, and notes on how the interval was computed."""
+        """Return causes of doubt about a fit, and notes on the computation of the interval."""
         doubts, notes = [], []
         if self.factor > 1.0:
-            found = "left out in turn, each run changes the tool more than noise explains"
+            found = "leaving out single runs changes the tool's error more than noise explains"
             found += f": standard errors are {self.factor:.1f} times as large"
             if self.factor > ASSUMED.misfit[1]:
-                doubts.append(f"{found}: lines, or what they were read with, disagree with each other")
+                doubts.append(f"{found}: runs, or their instruments, contradict each other")
             else:
                 notes.append(f"{found}; the expected tool error allows for it")
         if self.drift > ASSUMED.clear * self.drift_error:
-            size = f"{self.drift * 1e6:.2g} ppm, as steel's does in {self.drift / STEEL:.2g} K"
-            problem = f"the scale of the linear readings changes by {size}, from the first to the last"
-            doubts.append(f"{problem}: the model is that of the middle of the campaign")
+            size = f"{self.drift * 1e6:.2g} ppm, as for steel by {self.drift / STEEL:.2g} K"
+            problem = f"the scale of the linear readings changes by {size}, from the first to the last reading"
+            doubts.append(f"{problem}: the model is valid for the middle of the campaign")
         if lack := self._sizes("lack"):
-            notes.append(f"{lack} is in no parameter (discrepancy); the expected tool error allows for it")
+            notes.append(f"no parameter describes {lack} (discrepancy); the expected tool error allows for it")
         if stops := self._sizes("stops"):
-            problem = "repeated readings scatter more than stated: taken for the machine's own repeatability"
-            notes.append(f"{problem}, {stops}; the expected tool error has it, the lower end has not")
+            problem = f"repeated readings scatter by {stops} more than stated: taken as the machine's repeatability"
+            notes.append(f"{problem}; the expected tool error contains it, the lower end of its interval does not")
         return doubts, notes
 
     def _sizes(self, name: str) -> str:
-        """Return a part of displacement and rotation as text; empty if both are zero."""
+        """Return a field of `displacement` and `rotation` as text; empty if both are zero."""
         parts = (self.displacement, "µm RMS of the tool's displacement"), (self.rotation, "µrad RMS of its rotation")
         return " and ".join(f"{1e6 * getattr(part, name):.2f} {unit}" for part, unit in parts if getattr(part, name))

@@ -1,4 +1,4 @@
-"""What a calibration leaves of the tool's error, and which one more measurement would remove most of it."""
+"""The tool error that remains after a calibration, and how much each further measurement would reduce it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .candidates import TILTS, laid_out
 from .design import ErrorLeft, information_of_fit
 from .posterior import POINTS, ErrorPredictor, FittedParameters
 
-MACHINES_DRAWN = 2000  # for the percentile of the worst pose: 95 % to ± 0.5 %
+MACHINES_DRAWN = 2000  # number of drawn machines for the 95 % level of the worst pose: accurate to ± 0.5 %
 
 
 def remaining(
@@ -28,25 +28,25 @@ def remaining(
     name: str = "workspace",
     progress: Callable[[str], object] = lambda text: None,
 ) -> dict[str, Any]:
-    """Return the remaining tool error after a calibration: in its box, and over platform poses in ``base``.
+    """Return the tool error that remains after a calibration, in its measured box and at the poses `workspace`.
 
-    Plain numbers for JSON, with units in the keys; the datum is aligned. `left`: in the measured box with a level tool,
-    and in the workspace; `machines_95` is the error below which nineteen of twenty machines that agree with the
-    readings stay everywhere. `if_known`: if a block of parameters were known exactly; `if_measured`: with one more
-    measurement, the one that leaves least in the workspace first.
+    The result holds plain numbers for JSON, with units in the keys; the datum is aligned. `left` lists the error in the
+    measured box with a level tool, and in the workspace; 95 % of the machines that agree with the readings stay below
+    `machines_95_m` at all poses. `if_known` lists the error if a block of parameters were known exactly. `if_measured`
+    lists the error after one more measurement, sorted by the error in the workspace.
     """
     space, predictor, rng = fitted.space, ErrorPredictor(machine, fitted), np.random.default_rng(7)
     box = measured_region(machine.model)
     in_box = box.poses(rng.uniform(box.box[0], box.box[1], (POINTS, 3)), space.level)
     factor = covariance_factor(fitted.covariance)
-    left, squares = [], []  # M, (p, p), of each place: the mean square is tr(M) of independent effects
+    left, squares = [], []  # squares: M, (p, p), of each region; tr(M) is the mean square error
     for where, poses in (("measured box, level tool", in_box), (name, workspace)):
         progress(where)
-        tips, standing, slopes, given_up = predictor.slopes(poses)
+        tips, absolute, slopes, held_motion = predictor.slopes(poses)
         reached = np.isfinite(slopes).all(axis=(1, 2))
         tips, effects = tips[reached], np.swapaxes(slopes[reached] @ factor, 1, 2)
         sizes = root_sum_of_squares(effects)
-        as_it_stands = np.concatenate([standing[reached] @ factor, given_up[reached, :, None]], axis=2)[:, :3]
+        unaligned = np.concatenate([absolute[reached] @ factor, held_motion[reached, :, None]], axis=2)[:, :3]
         drawn = monte_carlo(effects, MACHINES_DRAWN, percentiles=(95.0,), normal=True)
         worst, rms = int(sizes[:, 0].argmax()), np.sqrt((sizes**2).mean(axis=0))
         left.append(
@@ -54,18 +54,18 @@ def remaining(
                 "where": where,
                 "poses": len(tips),
                 "rms_m": float(rms[0]),
-                "rms_rotation_rad": float(rms[1]),  # about the worst axis
+                "rms_rotation_rad": float(rms[1]),  # about the axis of the largest rotation
                 "worst_m": float(sizes[worst, 0]),
-                "worst_at_m": tips[worst],  # the tool in `work`
+                "worst_at_m": tips[worst],  # tool's tip in `work`
                 "machines_95_m": float(drawn.values[0, 0]),
-                "rms_datum_as_it_stands_m": float(np.sqrt((as_it_stands**2).sum(axis=(1, 2)).mean())),
+                "rms_datum_as_it_stands_m": float(np.sqrt((unaligned**2).sum(axis=(1, 2)).mean())),
             }
         )
         displacement = effects[..., :3]
         squares.append(np.einsum("npc,nqc->pq", displacement, displacement, optimize=True) / len(tips))
 
     def shares(tried: list[tuple[str, int, np.ndarray]], counted: str) -> list[dict[str, Any]]:
-        """Return the remaining error after each of some measurements, (name, count, rows by x), by itself."""
+        """Return the remaining error after each single measurement of a list of (name, count, rows by x)."""
         gains = [ErrorLeft([rows @ factor for *_, rows in tried], square).gains() for square in squares]
         after = np.sqrt(np.maximum([[np.trace(square)] for square in squares] - np.array(gains), 0.0))
         return [
@@ -73,7 +73,7 @@ def remaining(
             for (what, count, _), in_box, in_workspace in zip(tried, *after, strict=True)
         ]
 
-    # Knowing a block is measuring its parameters, far better than they are known.
+    # "Known exactly" is a measurement of the block's parameters to 1/10,000 of their standard deviation.
     deviations = np.linalg.norm(factor, axis=1)
     known = np.diag(1e4 / np.where(deviations > 0.0, deviations, 1.0))
     blocks = [(block.name, len(block.labels), known[block.part]) for block in space.blocks]
@@ -91,7 +91,7 @@ def remaining(
 
 
 def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]]:
-    """Yield measurements in a fit's box: name, count of readings, and rows by x, (cells, size), over the noise."""
+    """Yield possible measurements in the measured box: name, number of readings, and rows by x over the noise."""
     space = fitted.space
     lines, _ = laid_out(space, lines=3, readings=9)
     rows, cells = information_of_fit(fitted, lines)
@@ -109,21 +109,21 @@ def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]
     for tilts in ((0.0,), TILTS):
         try:
             readings, tilt = laid_out(space, poses=poses, tilts=tilts)
-        except InputFileError:  # out of reach
+        except InputFileError:  # the machine does not reach enough poses
             continue
         rows, _ = information_of_fit(fitted, readings)
         yield f"tracker, {poses} poses, {f'tilted up to {tilt:g}°' if tilt else 'level'}", len(readings), rows
 
 
 def remaining_text(result: dict[str, Any], machine: RealMachine) -> str:
-    """Return the remaining error of a calibration as text."""
+    """Return the result of :func:`remaining` as text."""
     head = (
-        f"machine {result['machine']}, model {result['model']!r}: what is left of the tool's error after compensation, "
-        f"by the covariance of the fit's {result['parameters']} parameters.\n"
-        f"{region_text(machine.model.measured, machine.geometry)}\nThe datum is aligned over that box. Where nothing "
-        "was measured, only what the fit's parameters describe counts."
+        f"machine {result['machine']}, model {result['model']!r}: expected tool error after compensation, "
+        f"from the covariance of the fit's {result['parameters']} parameters.\n"
+        f"{region_text(machine.model.measured, machine.geometry)}\nThe datum is aligned over the measured box. Outside "
+        "this box only errors that the fit's parameters describe are included."
     )
-    titles = ["where", "poses", "RMS µm", "worst pose µm", "there, tool in work: x, y, z mm"]
+    titles = ["where", "poses", "RMS µm", "worst pose µm", "worst pose: tool in work, x, y, z mm"]
     titles += ["95 % of machines below µm", "rotation µrad", "datum as it stands, RMS µm"]
     rows = []
     for part in result["left"]:
@@ -149,7 +149,7 @@ def remaining_text(result: dict[str, Any], machine: RealMachine) -> str:
 
 
 def measurement_rows(result: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the measurements for CSV: a record each, µm."""
+    """Return one record for each possible measurement, for a CSV file: its rank and the remaining errors, µm."""
     return [
         {"rank": rank, "measurement": share["name"], "readings": share["readings"]}
         | {f"left_{key}_um": share[f"left_{key}_m"] * 1e6 for key in ("box", "workspace")}

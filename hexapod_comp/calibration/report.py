@@ -1,7 +1,7 @@
-"""Reports of fits, as text and as JSON: scheme ``joint``, and scheme ``lines``.
+"""Reports of fits as text and as JSON, for scheme ``joint`` and scheme ``lines``.
 
-What is shown as a table is a list of records; its :class:`Column` s give titles, digits and units of the text, and the
-keys of the JSON.
+Tables are lists of records. For each field a :class:`Column` gives the title, digits and unit in the text, and the key
+in the JSON.
 """
 
 from __future__ import annotations
@@ -22,14 +22,13 @@ from .posterior import Observability, ToolError, UnseenError, listed
 from .thermal import warming_text
 from .trust import TILT
 
-MOST_LISTED, MOST_OF_RUN = 10, 3  # runs with outliers, and outliers of a run, beyond these are counted, not listed
-# Standard deviations beyond which a reading looks mistyped: no instrument's own errors are as large
-GROSS = 50.0
-MOST_RUNS = 5  # number of runs listed with the largest residuals
-# A share of the error of a tilted tool above which a warning is printed, when parameters are not observable
+MOST_LISTED, MOST_OF_RUN = 10, 3  # number of runs with outliers that are listed, and of outliers for each of these runs
+GROSS = 50.0  # residual, in standard deviations, above which a reading is reported as probably mistyped
+MOST_RUNS = 5  # number of runs listed with the largest χ²
+# If parameters are not observable, warn when a tilted tool keeps more than this share of its error
 TRUST = 0.1
 
-# Units in which records are displayed, and the factor of their numbers
+# By the unit of a record: the unit in which the text shows its numbers, and the factor for them
 SHOWN_UNITS = {
     "m": ("um", 1e6),
     "rad": ("urad", 1e6),
@@ -42,12 +41,12 @@ SHOWN_UNITS = {
 
 
 class Column(NamedTuple):
-    """A field of records: in text, and in JSON."""
+    """A column of a table: one field of its records."""
 
     field: str
     title: str
-    digits: int | None = None  # None: a text, a whole number, or whether
-    in_unit: bool = False  # of the record: shown in the unit's parts, with the SI unit in its JSON key
+    digits: int | None = None  # number of decimals; None: the field is a text, an integer or a boolean
+    in_unit: bool = False  # whether the field has the record's unit: text in SHOWN_UNITS, JSON in SI, named in the key
 
 
 CHANNELS = (
@@ -78,7 +77,7 @@ OUTLIERS = tuple(
 
 
 def table(records: Iterable[Any], columns: Sequence[Column]) -> str:
-    """Return records as an aligned table, whose last column is their unit where they have one."""
+    """Return records as an aligned table; its last column is the unit of each record."""
     rows = []
     for record in records:
         unit, factor = SHOWN_UNITS.get(getattr(record, "unit", ""), ("", 1.0))
@@ -93,12 +92,12 @@ def table(records: Iterable[Any], columns: Sequence[Column]) -> str:
 
 
 def json_records(records: Iterable[Any], columns: Sequence[Column]) -> list[dict[str, Any]]:
-    """Return records for JSON, with the SI unit in the keys."""
+    """Return the records as dictionaries for JSON, with SI units in the keys."""
     return [{f"{c.field}_{r.unit}" if c.in_unit else c.field: getattr(r, c.field) for c in columns} for r in records]
 
 
 def fit_report(fit: ModelFit) -> str:
-    """Return the report of a fit: residual error, parameters, and what the readings could not show."""
+    """Return the report of a fit of scheme joint as text."""
     m, doubts = fit.measurements, (*fit.refusals, *fit.doubts)
     kept = ", ".join(block.name for block in fit.space.blocks)
     settled = "settled after" if fit.solution.change < SETTLED else "NOT settled after"
@@ -124,7 +123,7 @@ def fit_report(fit: ModelFit) -> str:
     if families:
         parts.append("χ²/freedom by lines and direction; 1: as stated\n" + aligned(("channel", *families), by_family))
     if len(fit.chi_squares_of_runs) > 1:
-        parts.append("runs that were met worst\n" + table(fit.chi_squares_of_runs[:MOST_RUNS], RUNS))
+        parts.append("runs with the largest χ²\n" + table(fit.chi_squares_of_runs[:MOST_RUNS], RUNS))
     blocks = "blocks; evidence: logarithm of the Bayes factor with the block to without it\n"
     parts += [
         blocks + table(fit.decisions, DECISIONS),
@@ -136,7 +135,7 @@ def fit_report(fit: ModelFit) -> str:
 
 
 def expected_text(level: ToolError | None, tilted: ToolError | None, seen: Observability) -> str:
-    """Return the tool error with the model, and whether it can be trusted with a tilted tool; empty: none is known."""
+    """Return the expected tool error as text, with a warning about tilted tools; empty if `level` is None."""
     if level is None:
         return ""
     lines = ["expected tool error at random points of the measured box, both directions, the datum aligned:"]
@@ -156,7 +155,7 @@ def expected_text(level: ToolError | None, tilted: ToolError | None, seen: Obser
 
 
 def tilt_doubt(tilted: ToolError | None, seen: Observability) -> Iterator[str]:
-    """Yield why a model is not to be trusted with a tilted tool, if it is not."""
+    """Yield a warning if the fit leaves more than the share TRUST of a tilted tool's error."""
     if tilted is not None and seen.structure_rank < seen.structure_size and tilted.after > TRUST * tilted.before:
         share = 100.0 * tilted.after / tilted.before
         tilt = f"taken at tilts of up to {np.degrees(seen.tilt):.1f}°" if seen.tilt > SAME_ATTITUDE else "all level"
@@ -168,7 +167,7 @@ def tilt_doubt(tilted: ToolError | None, seen: Observability) -> Iterator[str]:
 
 
 def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ...]) -> str:
-    """Return what the data determine: block by block, rank, indices, unseen parameters."""
+    """Return as text which parameters the readings determine: each block, rank, indices, unobservable parameters."""
     lines = [table(seen.blocks, SIGHTS)]
     lines.append(
         f"{seen.structure_rank} of {seen.structure_size} structure parameters are observable; "
@@ -184,7 +183,7 @@ def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ..
 
 
 def _outlier_lines(outliers: Sequence[Outlier]) -> Iterator[str]:
-    """Yield the readings that disagree with all others, run by run."""
+    """Yield the lines of the report on outliers, run by run."""
     if outliers:
         yield f"readings that disagree with all others, and got little weight: {len(outliers)}"
     runs = Counter(o.run for o in outliers)
@@ -202,7 +201,7 @@ def _outlier_line(o: Outlier) -> str:
 
 
 def as_json(fit: ModelFit) -> dict[str, Any]:
-    """Return a fit of scheme joint as plain numbers; SI units are in the keys, or stand beside numbers as ``unit``."""
+    """Return a fit of scheme joint for JSON; SI units are in the keys, or beside a number under the key ``unit``."""
     labels = [(label, block.unit) for block in fit.space.blocks for label in block.labels]
     lead = fit.lead
     if lead is not None:
@@ -234,7 +233,7 @@ def as_json(fit: ModelFit) -> dict[str, Any]:
 def expected_json(
     level: ToolError | None, tilted: ToolError | None, seen: Observability, unseen_errors: tuple[UnseenError, ...]
 ) -> dict[str, Any]:
-    """Return the keys that a fit and a plan for one share."""
+    """Return the part of the JSON that reports of a fit and of a planned campaign have in common."""
 
     def error(tool: ToolError | None) -> dict[str, Any] | None:
         if tool is None:
@@ -259,7 +258,7 @@ WAYS = {1: "forward", -1: "backward", 0: "both"}
 
 
 def lines_report(fit: LinesFit) -> str:
-    """Return the report of a fit of scheme ``lines``: a row for each family and component."""
+    """Return the report of a fit of scheme ``lines`` as text: a row for each axis of lines and component."""
     field = fit.model.field
     nodes = " × ".join(str(len(along)) for along in field.grid)
     header = ("lines along", "of", "polynomials", "order", "R² least", "adjusted R² median", "σ median", "largest", "")
@@ -281,7 +280,7 @@ def lines_report(fit: LinesFit) -> str:
 
 
 def lines_json(fit: LinesFit) -> dict[str, Any]:
-    """Return a fit of scheme ``lines`` as plain numbers; SI units are in the keys."""
+    """Return a fit of scheme ``lines`` for JSON; SI units are in the keys."""
 
     def one(line: LineFit) -> dict[str, Any]:
         unit = "m" if line.component < 3 else "rad"

@@ -1,9 +1,9 @@
-"""Which blocks of parameters a fit keeps: those with enough evidence.
+"""Selection of the blocks of parameters that a fit keeps: blocks with enough evidence.
 
-All blocks are in at first, so that a field cannot explain an error that a length map describes better only because it
-was tried first. The evidence for each is the logarithm of the Bayes factor with against without it: by the
-Savage–Dickey density ratio, the prior's density of "all its parameters are zero" over the posterior's. The block with
-the least evidence is dropped, and the fit is solved again, until all remaining ones have enough.
+At first all blocks are in the fit, so that no block explains an error only because it was tried first. The evidence
+for a block is the log Bayes factor of the fit with the block over the fit without it. By the Savage–Dickey ratio it is
+the density at zero of the prior of the block's parameters over the density at zero of their posterior. The block with
+the least evidence is dropped and the fit is solved again, until every block has more evidence than `least_evidence`.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from .estimator import FEW_ROUNDS, ROUNDS, LinearProblem, Posterior, solve
 from .parameters import ParameterSpace
 
 SILENT = 1e-9
-"""Parameters with a smaller share determined by readings are omitted: they change nothing."""
+"""Parameters of which the readings determine a smaller share than this are omitted, to save time."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """The decision on one block."""
+    """The decision to keep or to drop one block."""
 
     block: str
     kept: bool
-    evidence: float  # log Bayes factor with against without it, given the blocks that were in when it was decided on
+    evidence: float  # log Bayes factor for the block, given the blocks that were in the fit at its decision
 
 
 def select(
     space: ParameterSpace, problem: LinearProblem, noise: np.ndarray, progress: Callable[[str], object]
 ) -> tuple[list[Decision], Posterior, Posterior]:
-    """Return a decision for each block but the structure; the posterior with all blocks in, and with those kept.
+    """Return a decision for each block except the structure, the posterior with all blocks, and with the kept blocks.
 
-    A block whose size is stated is always kept.
+    A block whose tolerance is stated is always kept.
     """
     everything = fit = solve(space, problem, space.start_tolerances(), noise, ROUNDS)
     silent = everything.used[everything.determined < SILENT]
@@ -50,7 +50,7 @@ def select(
         least = min(doubtful, key=lambda name: evidence[name])
         if evidence[least] >= ASSUMED.least_evidence:
             break
-        progress(f"without {least}: its evidence is {evidence[least]:.1f}")
+        progress(f"dropping block {least}: its evidence is {evidence[least]:.1f}")
         kept.remove(least)
         doubtful.remove(least)
         kept_in = np.array([block.name in ("structure", *kept) for block in space.blocks])
@@ -59,15 +59,15 @@ def select(
 
 
 def log_bayes_factor(space: ParameterSpace, posterior: Posterior, name: str) -> float:
-    """Return log p(readings | with a block) − log p(without) (Savage–Dickey), all hyperparameters alike."""
+    """Return the log Bayes factor (Savage–Dickey) for a block, with the same tolerances and noise without the block."""
     part = next(block.part for block in space.blocks if block.name == name)
     members = np.flatnonzero((posterior.used >= part.start) & (posterior.used < part.stop))
-    if not len(members):  # the readings have no information on it
+    if not len(members):  # the block's parameters were omitted (SILENT)
         return 0.0
     spread = posterior.spread[members]
     relative = posterior.covariance[np.ix_(members, members)] / (spread[:, None] * spread)
     factor, failed = dpotrf(relative, lower=1)
-    if failed:  # to rounding, some parameters are known exactly
+    if failed:  # the covariance is singular to rounding: some parameters are known exactly
         return np.inf
-    met = dtrtrs(factor, posterior.y[members] / spread, lower=1)[0]
-    return float(0.5 * met @ met + np.log(np.diag(factor)).sum())
+    scaled = dtrtrs(factor, posterior.y[members] / spread, lower=1)[0]
+    return float(0.5 * scaled @ scaled + np.log(np.diag(factor)).sum())

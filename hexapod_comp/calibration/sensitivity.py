@@ -1,5 +1,4 @@
-"""The errors of a parametrised machine at measured stations, and the design matrix: the derivatives by every
-parameter."""
+"""The errors of a parametrised machine at stations, and the design matrix: their derivatives by the parameters."""
 
 from __future__ import annotations
 
@@ -16,7 +15,7 @@ JOINTS = ("base_joints", "platform_joints")
 
 
 def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Prediction:
-    """Return where the machine of a parameter vector goes at each station."""
+    """Return the errors and actual poses, at each station, of the machine with the parameters `x`, (size,)."""
     positive, sense = without_negative(space.blocks, x, stations.sense)
     model = space.model(positive, with_field=False)
     machines = stations.machines(RealMachine(space.geometry, model))
@@ -31,7 +30,7 @@ def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Predict
 
 
 class Slopes:
-    """The design matrix of a machine at some stations, by parameters x or, `whitened`, by y of x = root·y."""
+    """The design matrix at some stations: derivatives by the parameters x or, with `whitened`, by y (x = root·y)."""
 
     def __init__(
         self, space: ParameterSpace, prediction: Prediction, stations: Stations, whitened: bool = False
@@ -40,11 +39,11 @@ class Slopes:
         self._designs = [block.design(self._linkage, whitened) for block in space.blocks]
 
     def columns(self, components: np.ndarray) -> np.ndarray:
-        """Return the parameters that move an error with some of the six components only."""
+        """Return the indices of the parameters that change any of some components, of the six, of an error."""
         return np.concatenate([block.part.start + block.moving(components) for block in self._blocks])
 
     def write(self, rows: np.ndarray, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> None:
-        """Write derivatives of errors at stations `at`, (n,), along directions (n, 6) with some components only."""
+        """Write to `rows` the derivatives of errors at stations `at`, (n,), along directions (n, 6); see `columns`."""
         errors, stop = self._linkage.errors(at, directions, components), 0
         for design in self._designs:
             values = design(errors)
@@ -53,7 +52,7 @@ class Slopes:
 
 
 def derivatives(space: ParameterSpace, prediction: Prediction, stations: Stations) -> np.ndarray:
-    """Return ∂e/∂x at each station, shape (M, 6, size)."""
+    """Return ∂e/∂x, the derivatives of the errors by the parameters, at each station, shape (M, 6, size)."""
     count = len(stations)
     at, directions = np.repeat(np.arange(count), 6), np.tile(np.eye(6), (count, 1))
     rows = np.empty((6 * count, space.size))
@@ -62,6 +61,6 @@ def derivatives(space: ParameterSpace, prediction: Prediction, stations: Station
 
 
 def carried(motions: np.ndarray, arms: np.ndarray) -> np.ndarray:
-    """Return small motions (N or 1, 6, K) of a body, known at one point, at points that are arms (N, 3) away."""
+    """Return small motions (N or 1, 6, K) of a body, given at one point, at points that are arms (N, 3), m, away."""
     displacements = motions[:, :3] + np.cross(motions[:, 3:], arms[:, :, None], axis=1)
     return np.concatenate([displacements, np.broadcast_to(motions[:, 3:], displacements.shape)], axis=1)

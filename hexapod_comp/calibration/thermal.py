@@ -1,17 +1,17 @@
-"""Heat and humidity: the true courses behind thermometers, the delay of late parts, and their evidence in readings.
+"""Heat and humidity: smoothed sensor readings, time constants of delayed growth, and what the readings show of growth.
 
-**Courses.** Each run has its own zero, so a warm-up shows in how lines change from round to round. A sensor's noise
-differs from reading to reading, and within a run all channels together show that the tool did not move with it: growth
-is then underestimated (Carroll et al. 2006, *Measurement Error in Nonlinear Models*, chapters 3 and 4: attenuation, and
-regression calibration, which is used here). So a temperature is a Gaussian process, the integral of a rate that
-persists for about an hour (an integrated Ornstein-Uhlenbeck process), read with noise. Its rate of change relative to
-that noise is estimated for each sensor by restricted maximum likelihood. A sensor that is rounded to a step q reads a
-staircase: its bins are as long as a stair, and their noise is no less than that of rounding, q/√12.
+**Smoothing.** The noise of a thermometer differs from reading to reading, but the tool does not move with it. A fit to
+the raw temperatures would therefore underestimate growth (attenuation; Carroll et al. 2006, *Measurement Error in
+Nonlinear Models*, chapters 3 and 4). Regression calibration, the remedy given there, replaces the readings by the most
+probable course of the temperature. The course is modelled as a Gaussian process read with noise: the integral of a rate
+that persists for about an hour (integrated Ornstein–Uhlenbeck process). The variance of the rate relative to the noise
+is estimated for each sensor by restricted maximum likelihood. The readings of a sensor that rounds to a step q form a
+staircase; they are averaged over bins as long as a stair, whose noise is at least that of rounding, q/√12.
 
-**Time constants.** For given ones the growth is linear in what is fitted. So each constant of a logarithmic grid, and
-each pair, is tried on the residuals of a fit without late parts: its gain is the increase of the log evidence, with all
-other parameters and the late parts' prior integrated out. A parabola through the best three refines it, and gives its
-uncertainty.
+**Time constants.** With given time constants the growth is linear in the fitted parameters. So each constant of a
+logarithmic grid, and each pair, is tried on the residuals of a fit without delayed growth. Its gain is the increase of
+the log evidence, with all other parameters and the prior of the delayed growth integrated out. A parabola through the
+best grid point and its neighbours refines the constant and gives its uncertainty.
 """
 
 from __future__ import annotations
@@ -40,37 +40,37 @@ from .estimator import Estimation, Posterior, Solution, physical_covariance, sol
 from .parameters import TOLERANCES, ParameterSpace
 from .sensitivity import predict
 
-BIN = 60.0  # readings of a sensor within that count as one, s: twice its filter
+BIN = 60.0  # readings of a sensor within this time are averaged, s: twice the time constant of its filter
 
 SEEN_SHARE = 0.5
-"""A parameter is determined when more than this share of it comes from the readings."""
+"""A parameter counts as determined if more than this share of it comes from the readings."""
 
 MEMBERS = {"struts": slice(0, 6), "base": slice(6, 7), "platform": slice(7, 8)}
-"""Which of :data:`~hexapod_comp.machine.temperatures.PARTS` belong to each kind of part."""
+"""Indices into :data:`~hexapod_comp.machine.temperatures.PARTS` of each kind of part."""
 
+# Standard deviation of the priors with which the uncertainty of growth is computed: plausible for any material
 LEAST_KNOWN = {
     "expansion": ASSUMED.known_expansion,
     "late": 3.0 * ASSUMED.known_expansion,
     "moisture": ASSUMED.known_moisture,
 }
 
-# Courses
+# Smoothing of sensor readings
 
 PACE, APART = 4.0, 128.0
-"""Assumed duration of a reading, and of a pause between runs, s, for readings without times."""
+"""Assumed duration of a reading, and of a pause between runs, s, if the readings have no times."""
 
 MOST_BINS = 400
-"""Longer records have longer bins: a course is solved for with dense matrices."""
+"""Largest number of bins of a record: longer records get longer bins, because the smoothing uses dense matrices."""
 
 RATIOS = np.geomspace(1e-4, 1e10, 43)
-"""Variances of a rate, per persistence, over that of a bin's noise: from a constant to the raw readings."""
+"""Grid of ratios: variance of the rate, per persistence, over a bin's noise; from a constant to no smoothing."""
 
 
 def with_courses(measurements: MeasurementSet) -> MeasurementSet:
-    """Return readings whose stations have the smoothed courses of temperatures and humidity, instead of raw sensor
-    readings.
+    """Return the measurement set with smoothed temperatures and humidity in place of the raw sensor readings.
 
-    If the readings have no times, each run gets its own course, with its stations equally spaced in time.
+    If the readings have no times, each run is smoothed by itself, with its stations equally spaced in time.
     """
     stations = measurements.stations
     read = np.column_stack([stations.temperatures, stations.humidity])
@@ -95,9 +95,9 @@ def with_courses(measurements: MeasurementSet) -> MeasurementSet:
 
 
 def _stairs(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
-    """Return the length of a sensor's bins, s, and the least variance of their noise by rounding.
+    """Return the length of a sensor's bins, s, and the smallest variance of a bin's noise, which is due to rounding.
 
-    Values that are all multiples of a step are rounded to it; the length of a stair is the mean time between two steps.
+    A sensor rounds if its values differ by multiples of one step; a stair lasts the mean time between two steps.
     """
     pauses = np.diff(times)
     shortest = max(BIN, float(pauses.sum()) / MOST_BINS)
@@ -111,8 +111,10 @@ def _stairs(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
 
 
 class _Course:
-    """An uninterrupted record in bins, without its constant, in directions in which process and noise are
-    uncorrelated."""
+    """An uninterrupted record of sensors, averaged in bins, along the eigenvectors of the process's covariance.
+
+    The constant level is projected out.
+    """
 
     def __init__(self, times: np.ndarray, values: np.ndarray, width: float) -> None:
         bins = max(1, round(float(times[-1] - times[0]) / width))
@@ -130,23 +132,23 @@ class _Course:
     def _process(self, times: np.ndarray) -> np.ndarray:
         """Return the prior covariance of the course between some times and the bins, for a rate of variance 1.
 
-        The course is ∫r(u)du from the first bin on; with times in units of the rate's persistence the rate's covariance
-        is e^−|u−v|, and the course's 2·min(s, t) + e^−s + e^−t − 1 − e^−|s−t|.
+        The course is the integral of the rate from the first bin on. With times in units of the rate's persistence, the
+        covariance of the rate is e^−|u−v|, and that of the course is 2·min(s, t) + e^−s + e^−t − 1 − e^−|s−t|.
         """
         t, s = ((part - self._at[0]) / ASSUMED.rate_persistence for part in (times[:, None], self._at))
-        t, early = np.maximum(t, 0.0), np.minimum(t, 0.0)  # before the first bin's middle the rate is constant
+        t, early = np.maximum(t, 0.0), np.minimum(t, 0.0)  # assume a constant rate before the first bin's middle
         whole = 2.0 * np.minimum(s, t) + np.exp(-s) + np.exp(-t) - 1.0 - np.exp(-np.abs(s - t))
         return np.asarray(whole + early * -np.expm1(-s))
 
     def at(self, times: np.ndarray, ratios: np.ndarray) -> np.ndarray:
-        """Return the most probable course at times, shape (n, sensors), for a ratio of each sensor."""
+        """Return the most probable course at some times, (n, sensors), with one of RATIOS for each sensor."""
         weights = self._directions @ (self.parts / (1.0 / ratios + self.variances[:, None]))
         level = (self._means - self._covariance @ weights).mean(axis=0)
         return np.asarray(level + self._process(times) @ weights)
 
 
 def _ratios(courses: list[_Course], least: np.ndarray) -> np.ndarray:
-    """Return the most probable of :data:`RATIOS` for each sensor; the noise is its residual, at least `least`."""
+    """Return the most probable of :data:`RATIOS` for each sensor; `least` is the smallest variance of its noise."""
     variances = np.concatenate([course.variances for course in courses])
     parts = np.concatenate([course.parts for course in courses])
     if not len(variances):
@@ -162,66 +164,69 @@ def _ratios(courses: list[_Course], least: np.ndarray) -> np.ndarray:
 
 
 class TimeConstant(NamedTuple):
-    """How late a part of growth is, s, and the standard deviation of its logarithm; 0: given."""
+    """Time constant of the first-order lag of delayed growth."""
 
-    value: float
-    deviation: float
+    value: float  # s
+    deviation: float  # standard deviation of its logarithm; 0: the time constant was given
 
 
 def estimate_time_constants(
     measurements: MeasurementSet, space: ParameterSpace, progress: Callable[[str], object]
 ) -> tuple[TimeConstant, ...]:
-    """Return the time constants that readings show beyond a fit without late parts; none without evidence."""
+    """Return the time constants of delayed growth that the readings show; empty without enough evidence."""
     settings, times = space.settings, measurements.stations.times
     if "late" not in settings.blocks or settings.time_constants is not None or not np.ptp(times) > 0.0:
         return ()
-    progress("seeking time constants")
-    grid = np.ptp(times) * np.geomspace(1.0 / 200.0, 2.0, 40)  # a sixth apart
+    progress("searching for time constants of thermal growth")
+    grid = np.ptp(times) * np.geomspace(1.0 / 200.0, 2.0, 40)  # steps of 17 %
     grid = grid[(grid >= TIME_CONSTANT_RANGE[0]) & (grid <= TIME_CONSTANT_RANGE[1])]
     if len(grid) < 3:
         return ()
     estimation = Estimation(measurements, space)
-    scan = _Scan(estimation, grid, _tried(estimation))
+    scan = _Scan(estimation, grid, _nominal_fit(estimation))
     best, gain = scan.best(1)
     if gain < ASSUMED.clear_evidence:
         return ()
-    # An omitted constant enlarges the noise, which hides a second one: repeat with the noise of the residuals.
+    # Without the first constant the noise was estimated too large, which hides a second one: scan with the right noise.
     with_best = ParameterSpace(measurements, replace(settings, time_constants=tuple(grid[list(best)].tolist())))
-    tried = _tried(Estimation(measurements, with_best))
-    scan = _Scan(estimation, grid, replace(tried, tolerances=tried.tolerances[:-1]))
+    fit = _nominal_fit(Estimation(measurements, with_best))
+    scan = _Scan(estimation, grid, replace(fit, tolerances=fit.tolerances[:-1]))
     (best, gain), (pair, gain_of_pair) = scan.best(1), scan.best(MOST_TIME_CONSTANTS)
     return scan.refined(pair if gain_of_pair > gain + ASSUMED.clear_evidence else best)
 
 
-def _tried(estimation: Estimation) -> Posterior:
-    """Return the fit linearised at the nominal machine."""
+def _nominal_fit(estimation: Estimation) -> Posterior:
+    """Return the posterior of the problem linearised at the nominal machine."""
     space = estimation.space
     problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(estimation.measurements)))
     return solve(space, problem, space.start_tolerances(), np.ones(len(KINDS)))
 
 
 def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
-    """Return the change of each cell by the relative growth of each part, shape (C, 8), m or rad."""
+    """Return the derivatives of the cells' values by the relative growth of each part, shape (C, 8), m or rad."""
     space, cells, stations = estimation.space, estimation.cells, estimation.measurements.stations
     columns = growth_columns(Linkage(predict(space, x, stations), space.probe, stations))[cells.station]
     return np.einsum("ci,cip->cp", cells.directions, columns)
 
 
 def _late_columns(estimation: Estimation, x: np.ndarray, constants: np.ndarray, size: float) -> np.ndarray:
-    """Return the change of the cells by late parts of a size, 1/K, (C, K·8), over the stated noise, free of zeros."""
-    behind = growth_causes(estimation.space.settings, estimation.measurements.stations, constants)
-    behind = behind[estimation.cells.station, :, 1:]
-    columns = (_per_growth(estimation, x)[:, :, None] * behind).transpose(0, 2, 1) @ (size * growth_root(1))
+    """Return the cells' change by delayed growth of `size`, 1/K, for each time constant and part, (C, K·8).
+
+    It is over the stated noise, with nuisance parameters projected out.
+    """
+    lag = growth_causes(estimation.space.settings, estimation.measurements.stations, constants)
+    lag = lag[estimation.cells.station, :, 1:]
+    columns = (_per_growth(estimation, x)[:, :, None] * lag).transpose(0, 2, 1) @ (size * growth_root(1))
     return estimation.free_of_nuisance(columns.reshape(len(columns), -1))
 
 
 class _Scan:
-    """The gain by each time constant of a grid on the residuals of a fit without late parts."""
+    """Gains of log evidence by the time constants of a grid, on the residuals of a fit without delayed growth."""
 
-    def __init__(self, estimation: Estimation, grid: np.ndarray, known: Posterior) -> None:
+    def __init__(self, estimation: Estimation, grid: np.ndarray, fit: Posterior) -> None:
         space, nominal = estimation.space, np.zeros(estimation.space.size)
         problem, _ = estimation.linearise(nominal, np.ones(len(estimation.measurements)))
-        posterior = solve(space, problem, known.tolerances, known.noise, rounds=0)
+        posterior = solve(space, problem, fit.tolerances, fit.noise, rounds=0)
         over = 1.0 / posterior.noise[problem.kind]
         columns = over[:, None] * _late_columns(estimation, nominal, grid, TOLERANCES["late"])
         rows = problem.rows.using(posterior.used, over)
@@ -230,7 +235,7 @@ class _Scan:
         self._moment = columns.T @ (over * problem.target - rows.times(posterior.y))
 
     def gain(self, chosen: Sequence[int]) -> float:
-        """Return the increase of the log evidence by some constants of the grid."""
+        """Return the increase of the log evidence by the constants at some indices of the grid."""
         parts = len(PARTS)
         members = np.concatenate([np.arange(parts * n, parts * (n + 1)) for n in chosen])
         matrix = np.eye(len(members)) + self._normal[np.ix_(members, members)]
@@ -238,67 +243,67 @@ class _Scan:
         return float(0.5 * moment @ np.linalg.solve(matrix, moment) - 0.5 * np.linalg.slogdet(matrix)[1])
 
     def best(self, count: int) -> tuple[tuple[int, ...], float]:
-        """Return the `count` time constants of the grid that increase the log evidence most, and by how much."""
+        """Return the indices of the `count` time constants with the largest gain, and their gain."""
         gains = {chosen: self.gain(chosen) for chosen in combinations(range(len(self._grid)), count)}
         best = max(gains, key=gains.__getitem__)
         return best, gains[best]
 
     def refined(self, chosen: tuple[int, ...]) -> tuple[TimeConstant, ...]:
-        """Return the summits of parabolas through each constant's gain and its neighbours', the others kept.
+        """Return the time constants refined by a parabola through the gains at each constant and its two neighbours.
 
-        Their standard deviations come from the matrix of all second derivatives, so two constants with similar
-        effects get larger ones.
+        The standard deviations follow from the matrix of second derivatives: constants with similar effects get larger
+        standard deviations.
         """
 
-        def moved(ways: dict[int, int]) -> float:
-            return self.gain([n + ways.get(i, 0) for i, n in enumerate(chosen)])
+        def moved(steps: dict[int, int]) -> float:
+            return self.gain([n + steps.get(i, 0) for i, n in enumerate(chosen)])
 
         step = np.log(self._grid[1] / self._grid[0])
         values, deviations = self._grid[list(chosen)], np.full(len(chosen), math.inf)
         inside = [i for i, n in enumerate(chosen) if 0 < n < len(self._grid) - 1 and not {n - 1, n + 1} & {*chosen}]
-        here, bends = self.gain(chosen), np.zeros((len(inside), len(inside)))
+        here, curvature = self.gain(chosen), np.zeros((len(inside), len(inside)))
         for a, i in enumerate(inside):
             before, after = (moved({i: way}) for way in (-1, 1))
-            bends[a, a] = 2.0 * here - before - after
-            values[i] *= np.exp(step * 0.5 * (after - before) / bends[a, a])
+            curvature[a, a] = 2.0 * here - before - after
+            values[i] *= np.exp(step * 0.5 * (after - before) / curvature[a, a])
             for b, j in enumerate(inside[:a]):
-                ways = [(u, v, u * v) for u in (-1, 1) for v in (-1, 1)]
-                bends[a, b] = bends[b, a] = -0.25 * sum(w * moved({i: u, j: v}) for u, v, w in ways)
-        if (np.linalg.eigvalsh(bends) > 0.0).all():
-            deviations[inside] = step * np.sqrt(np.diag(np.linalg.inv(bends)))
+                corners = [(u, v, u * v) for u in (-1, 1) for v in (-1, 1)]
+                curvature[a, b] = curvature[b, a] = -0.25 * sum(w * moved({i: u, j: v}) for u, v, w in corners)
+        if (np.linalg.eigvalsh(curvature) > 0.0).all():
+            deviations[inside] = step * np.sqrt(np.diag(np.linalg.inv(curvature)))
         return tuple(map(TimeConstant, values.tolist(), deviations.tolist()))
 
 
-# What a fit tells
+# Growth found by a fit
 
 
 class Change(NamedTuple):
-    """By how much a sensor's readings differ."""
+    """Range of a sensor's readings over all stations."""
 
     sensor: str
     size: float
-    unit: str  # K, or 1: relative humidity
+    unit: str  # K; 1 for relative humidity from 0 to 1
 
 
 class Growth(NamedTuple):
-    """Growth of one kind of part, per unit of its cause."""
+    """Growth of one kind of part: per kelvin, or from 0 to 100 % humidity."""
 
     part: str  # struts (their mean), base or platform
-    unit: str  # 1/K: by heat; m/m: by humidity from 0 to 1
+    unit: str  # 1/K by heat, m/m by humidity from 0 to 1
     stated: float
     found: float
-    deviation: float  # NaN where nothing was fitted
-    determined: float  # share of it that comes from the readings
-    late: tuple[float, ...] = ()  # late part of it, by time constant
+    deviation: float  # standard error of `found`; NaN if it was not fitted
+    determined: float  # share of `found` that comes from the readings, 0…1; the prior gives the rest
+    late: tuple[float, ...] = ()  # delayed part of the growth, for each time constant
 
 
 @dataclass(frozen=True)
 class ThermalEvidence:
-    """Evidence in readings on heat and humidity."""
+    """What a fit found about growth by heat and by humidity."""
 
-    changes: tuple[Change, ...]  # of each thermometer that was read, and of the humidity where struts swell
-    thermometer: str  # the one that represents all parts; empty: each has its own
-    growths: tuple[Growth, ...]  # by heat, where an expansion was fitted, and by humidity, where struts swell
+    changes: tuple[Change, ...]  # of each thermometer that was read, and of the humidity if struts swell
+    thermometer: str  # thermometer that represents all parts; empty: each part has its own
+    growths: tuple[Growth, ...]  # by heat if an expansion was fitted, and by humidity if struts swell
     time_constants: tuple[TimeConstant, ...]
     timed: bool  # whether the readings have times
 
@@ -310,7 +315,7 @@ class ThermalEvidence:
         constants: tuple[TimeConstant, ...],
         factor: float,
     ) -> ThermalEvidence:
-        """Return the evidence of a fit to readings; deviations are multiplied by a `factor`."""
+        """Return the evidence of a fit to readings; standard errors are multiplied by `factor`."""
         space, stations, x = estimation.space, measurements.stations, solution.x
         late = space.model(x, with_field=False).late_growth
         if late.time_constants and not constants:  # given
@@ -321,7 +326,7 @@ class ThermalEvidence:
         covariance, prior = _uncertainty(estimation, solution, constants, factor)
 
         def fitted(part: str, unit: str, stated: float, where: slice, late_parts: tuple[float, ...] = ()) -> Growth:
-            """Return the mean of some parameters, and how much of it comes from the readings."""
+            """Return the growth that is the mean of the parameters at `where`, with its standard error."""
             variance, before = (float(matrix[where, where].mean()) for matrix in (covariance, prior))
             known = max(0.0, 1.0 - variance / before)
             return Growth(part, unit, stated, stated + float(x[where].mean()), math.sqrt(variance), known, late_parts)
@@ -349,13 +354,12 @@ class ThermalEvidence:
 def _uncertainty(
     estimation: Estimation, solution: Solution, constants: tuple[TimeConstant, ...], factor: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the covariance of all parameters, SI, including the uncertainty of priors and time constants, and the
-    covariance without readings.
+    """Return the covariance of all parameters, SI, including the error of time constants, and the prior covariance.
 
-    The size of a prior is estimated from three numbers at most, which the prior itself pulls towards zero: the
-    covariance is therefore computed with a prior wide enough for any material. Time constants that differ by δ, in the
-    logarithm, change the readings by h·δ, and the parameters by −C·Rᵀ·h·δ. With one thermometer for all, late parts may
-    exist within what the readings allow, even if no time constant was found.
+    The tolerance of growth is estimated from at most three numbers, and is too small if the prior pulls them towards
+    zero; so priors wide enough for any material are used (LEAST_KNOWN). An error δ of a time constant's logarithm
+    changes the readings by h·δ and the parameters by −C·Rᵀ·h·δ. If one thermometer represents all parts and no time
+    constant was found, delayed growth that the readings do not exclude is included.
     """
     space, noise, problem = estimation.space, solution.posterior.noise, solution.problem
     least = [LEAST_KNOWN.get(block.name, 0.0) for block in space.blocks]
@@ -370,8 +374,8 @@ def _uncertainty(
                 growth_causes(space.settings, stations, [constant.value * math.exp(way)])[:, :, 1]
                 for way in (-step, step)
             )
-            later = ((longer - shorter) / (2.0 * step))[estimation.cells.station]
-            effect = estimation.free_of_nuisance((per_growth * later) @ growth[:, k : k + 1])[:, 0]
+            slope = ((longer - shorter) / (2.0 * step))[estimation.cells.station]
+            effect = estimation.free_of_nuisance((per_growth * slope) @ growth[:, k : k + 1])[:, 0]
             moved = space.physical(posterior.covariance @ rows.transposed_times(over * effect))
             covariance += min(constant.deviation, 1.0) ** 2 * np.outer(moved, moved)
     if space.settings.thermometer and block is None and np.ptp(stations.times) > 0.0:
@@ -379,21 +383,21 @@ def _uncertainty(
         columns = over[:, None] * _late_columns(estimation, solution.x, constants_unseen, LEAST_KNOWN["late"])
         shared = rows.transposed_times(columns)
         moved = posterior.covariance @ shared
-        left = np.eye(len(shared[0])) + columns.T @ columns - shared.T @ moved
-        covariance += space.physical(space.physical(moved @ np.linalg.solve(left, moved.T)).T)
+        precision = np.eye(len(shared[0])) + columns.T @ columns - shared.T @ moved
+        covariance += space.physical(space.physical(moved @ np.linalg.solve(precision, moved.T)).T)
     return factor**2 * covariance, space.prior_covariance(posterior.tolerances)
 
 
 def warming_text(warming: ThermalEvidence) -> str:
-    """Return the evidence on heat and humidity as text; empty where neither was read."""
+    """Return the evidence on heat and humidity as text; empty if neither temperatures nor humidity were read."""
     lines, known = [], {True: "", False: "; these readings do not determine it"}
     heat, damp = ([g for g in warming.growths if g.unit == unit] for unit in ("1/K", "m/m"))
     if listed := ", ".join(f"{c.sensor} {c.size:.2f} K" for c in warming.changes if c.unit == "K"):
-        whose = f"; {warming.thermometer} stands for all parts" if warming.thermometer else ""
+        whose = f"; {warming.thermometer} represents all parts" if warming.thermometer else ""
         lines.append(f"heat; change of each thermometer: {listed}{whose}")
         if not heat:
-            least = f"temperatures changed by less than {ASSUMED.least_warming:g} K, or growth explains nothing"
-            lines.append(f"  expansion is not determined: {least}; what was stated stays")
+            least = f"temperatures changed by less than {ASSUMED.least_warming:g} K, or growth explains no residuals"
+            lines.append(f"  expansion is not determined: {least}; the stated value is kept")
         for g in heat:
             late = zip(g.late, warming.time_constants, strict=True)
             listed = "".join(f", {1e6 * v:+.1f} of it late by {number(constant.value, 0)} s" for v, constant in late)
@@ -404,14 +408,14 @@ def warming_text(warming: ThermalEvidence) -> str:
             sure = f"{low}…{high} s with 95 %" if deviation < 1.0 else "hardly determined"
             lines.append(f"  time constant {number(value, 0)} s ({sure if deviation else 'given'})")
         if heat and not warming.timed:
-            lines.append("  the readings have no times (time_s): how late parts follow their thermometers is not known")
+            lines.append("  the readings have no times (time_s): delays behind the thermometers are not known")
     for g in damp:
         change = next(c.size for c in warming.changes if c.sensor == "humidity")
         head = f"humidity; changed by {100.0 * change:.1f} %: struts grow by {1e4 * g.found:.2f}"
         stated = f"ppm per % (stated {1e4 * g.stated:g})"
         if math.isnan(g.deviation):
-            least = f"it changed by less than {100.0 * ASSUMED.least_damping:g} %, or growth explains nothing"
-            lines.append(f"{head} {stated}, as stated: {least}")
+            least = f"changed by less than {100.0 * ASSUMED.least_damping:g} %, or growth explains no residuals"
+            lines.append(f"{head} {stated}, as stated: humidity {least}")
         else:
             lines.append(f"{head} ± {1e4 * g.deviation:.2f} {stated}{known[g.determined > SEEN_SHARE]}")
     return "\n".join(lines)

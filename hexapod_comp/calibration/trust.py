@@ -1,11 +1,11 @@
-"""How far a converged fit may be trusted: its predicted tool error, its χ², and the causes of doubt.
+"""How far a converged fit may be trusted: errors that its covariance does not contain, its χ², and causes of doubt.
 
-A covariance of parameters is right if the model is. Three terms allow for a wrong model. A *cluster jackknife* over
-runs compares the change of the tool's error without each run, in the linear problem, with the covariance's prediction,
-since errors within a run are not independent. A *discrepancy*: residuals beyond the instruments' noise and the
-repeatability are an error of the machine that no parameter describes (Kennedy & O'Hagan 2001). And a *drift*: a scale
-of all lengths that changes over the campaign is a parameter with its own prior, included in the fit if the evidence
-supports it. The scale of an instrument, which no reading shows, is stated.
+The covariance of the parameters is right only if the model of the machine is right. Three terms allow for a wrong
+model. The *cluster jackknife* leaves out each run in turn, since errors within a run are not independent, and compares
+the change of the tool's error with the covariance's prediction. The *discrepancy* is an error of the machine that no
+parameter describes (Kennedy & O'Hagan 2001): residuals beyond the instruments' noise and the repeatability. The *drift*
+is a scale of all lengths that changes over the campaign: parameters with their own prior, used if the evidence supports
+them. The scale error of an instrument, which no reading shows, is stated.
 """
 
 from __future__ import annotations
@@ -47,56 +47,56 @@ TILT = np.radians(10.0)
 """Tilt at which the report states the tool error of a tilted tool."""
 
 WITHOUT_EFFECT = 1e-4
-"""Share of the tool's squared error that the jackknife omits."""
+"""Share of the tool's mean squared error in directions that the jackknife leaves out, to save time."""
 
 DRIFT_RUNS, DRIFT_TERMS = 6, 2
-"""Fewest runs that read lengths for a drift, two each way; its degree in time, enough for settling."""
+"""Fewest runs that read lengths, to estimate a drift; degree of the drift's polynomial in time."""
 
 LEAST_PAIRS, LEAST_LEFT, LEAST_FREE = 30, 0.25, 3.0
-"""Fewest pairs, or repeats, that tell a variance (to 26 %); least share of a discrepancy that parameters leave; fewest
-degrees of freedom of a χ² that is listed."""
+"""Fewest pairs, or repeats, from which a variance is estimated (to 26 %); smallest share of a discrepancy that the
+parameters are assumed not to absorb; fewest degrees of freedom for which a χ² is listed."""
 
 HELD = 0.5
-"""Largest share of a predicted error that may depend on the priors."""
+"""If the posterior's RMS tool error exceeds this share of the priors' tool error, it may depend on the priors."""
 
 FIELDS = ("field displacement", "field rotation")
 
 
 class ChiSquare(NamedTuple):
-    """Residuals of one part of the readings."""
+    """χ² of the residuals of one kind of reading, in one part of the readings."""
 
-    kind: str  # of KINDS
-    part: str  # a family of lines, a direction, or a run's name
+    kind: str  # one of KINDS
+    part: str  # name of a family of lines, a direction of motion, or a run
     readings: int
     value: float  # squared residuals over the stated variance, per degree of freedom
 
 
 class Residuals:
-    """A converged fit's residuals, cell by cell, over the estimated noise, and the resulting tool error."""
+    """Residuals of the cells of a converged fit over the estimated noise, and the expected tool error."""
 
     def __init__(
         self,
         estimation: Estimation,
         solution: Solution,
-        # (C, terms): effect of a drift of the scale on cells, over their noise, in its prior's standard deviations
+        # (C, terms): columns of the drift's parameters, over the cells' noise, times the prior's standard deviation
         drifting: np.ndarray | None = None,
-        # Change of the scale from the first to the last reading and its standard deviation, m/m; zeros: no drift
+        # Change of the scale from the first to the last reading and its standard error, m/m; zeros: no drift
         drift: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         self.estimation, self.solution, self.drift = estimation, solution, drift
         self.drifting = np.zeros((len(estimation.cells.kind), 0)) if drifting is None else drifting
         problem, posterior, cells, m = solution.problem, solution.posterior, estimation.cells, estimation.measurements
         scale = 1.0 / posterior.noise[problem.kind]
-        # Derivatives by the parameters in use, in their priors' standard deviations
+        # Derivatives by the used parameters over their priors' standard deviations
         self.rows: DesignMatrix = problem.rows.using(posterior.used, scale, posterior.spread)
         self.residual = scale * problem.target - self.rows.times(posterior.y / posterior.spread)
         self.run, self.direction = m.run[cells.first], m.direction[cells.first]
 
     @cached_property
-    def taken(self) -> np.ndarray:
-        """Share of each cell that parameters and unknowns of the instruments explain, shape (C,)."""
+    def absorbed(self) -> np.ndarray:
+        """Share of each cell's variance that parameters and nuisance parameters absorb (leverage), shape (C,)."""
         every = np.arange(len(self.residual))
-        return self.shared(every, every) + self.estimation.shares_of_nuisance()
+        return self.leverage(every, every) + self.estimation.shares_of_nuisance()
 
     @cached_property
     def level(self) -> FirstOrder | None:
@@ -105,7 +105,7 @@ class Residuals:
 
     @cached_property
     def metrics(self) -> tuple[np.ndarray, np.ndarray]:
-        """M of displacement and rotation: yᵀ·M·y is the tool's mean squared error in the box; zero without a box."""
+        """M for displacement and rotation: yᵀ·M·y is the tool's mean squared error in the box; zero without a box."""
         space, used = self.estimation.space, self.solution.posterior.used
         if self.level is None:
             return np.zeros((len(used),) * 2), np.zeros((len(used),) * 2)
@@ -114,15 +114,15 @@ class Residuals:
 
     @property
     def expected(self) -> float:
-        """Expected mean squared error of the tool by the covariance, m²."""
+        """Expected mean squared displacement error of the tool, from the covariance of the parameters, m²."""
         return float(np.vdot(self.metrics[0], self.solution.posterior.covariance))
 
     @cached_property
     def omitted(self) -> list[Omitted]:
-        """The effect of leaving out each fold on the tool, by the eigenvectors of its squared error."""
+        """The effect on the tool of leaving out each fold, along the eigenvectors of the tool's squared error."""
         spread, terms = self.solution.posterior.spread, self.drifting.shape[1]
         values, vectors = np.linalg.eigh(spread[:, None] * self.metrics[0] * spread)
-        # ascending: directions that the priors exclude are omitted
+        # Eigenvalues ascend: drop the first directions, which together contribute less than WITHOUT_EFFECT
         kept = np.cumsum(values) > WITHOUT_EFFECT * self.expected
         kept[-1] = True
         effects = np.pad(vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0)), ((0, terms), (0, 0)))
@@ -134,22 +134,24 @@ class Residuals:
 
     @cached_property
     def held_out(self) -> np.ndarray:
-        """Errors at cells whose fold was left out of the fit, over the stated standard deviations, shape (C,)."""
+        """Prediction errors of the cells with their fold left out of the fit, over the stated noise, shape (C,)."""
         problem, posterior = self.solution.problem, self.solution.posterior
         errors = np.empty(len(self.residual))
         for fold in self.omitted:
             errors[fold.cells] = fold.errors
         return errors * posterior.noise[problem.kind]
 
-    def shared(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return the anticorrelation of pairs of cells by fitting: the contribution of both to the parameters."""
+    def leverage(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Return r₁ᵀ·C·r₂ for pairs of cells: by how much fitting the parameters anticorrelates their residuals."""
         posterior = self.solution.posterior
         return self.rows.between(posterior.covariance / np.outer(posterior.spread, posterior.spread), first, second)
 
 
 def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexplained:
-    """Return the unexplained errors of a converged fit; `averaged` is the factor on the tool's error by averaging over
-    blocks that may have been left out wrongly."""
+    """Return the errors that the covariance of a converged fit does not contain.
+
+    `averaged` is the factor on the tool's error that allows for blocks wrongly left out (model averaging).
+    """
     ratio, freedom = variance_ratio(r)
     clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - 2.0 * ndtr(-ASSUMED.clear)) / freedom
     factor = np.sqrt(ratio) if clear else 1.0
@@ -172,9 +174,10 @@ def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexpla
 
 
 def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
-    """Return the standard deviation of the scale of all readings, m/m, as stated or by their instruments' class.
+    """Return the standard deviation of the scale of all readings, m/m, as stated or by the class of instrument.
 
-    The best instrument for lengths is used. A beam that is off its line by an angle θ reads θ²/2 too little.
+    Of several instruments for lengths the one with the smallest scale error counts. A laser beam at an angle θ to its
+    line reads lengths too short by the share θ²/2.
     """
     kinds = {KINDS[k] for k in np.unique(measurements.kind)}
     known = [value for kind, value in ASSUMED.scales if kind in kinds]
@@ -187,23 +190,23 @@ def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
 
 
 def variance_ratio(r: Residuals) -> tuple[float, float]:
-    """Return the ratio of the tool's squared changes without each run to the expected ones, and its degrees of freedom.
+    """Return the ratio of observed to expected squared changes of the tool as folds are left out, and its freedom.
 
-    By Satterthwaite the sum over runs is about a χ² whose degrees of freedom follow from its variance; of G clusters,
-    at most G − 1 are independent.
+    The sum over folds is approximately χ² distributed; its degrees of freedom follow from its variance (Satterthwaite).
+    Of G folds at most G − 1 are independent.
     """
     if not r.expected > 0.0 or len(r.omitted) < 2:
         return 1.0, 0.0
     sums = [(o.moved @ o.moved, np.trace(o.covariance), np.vdot(o.covariance, o.covariance)) for o in r.omitted]
-    shown, expected, squares = np.transpose(sums).sum(axis=1)
-    return float(shown / expected), float(min(expected**2 / squares, len(r.omitted) - 1))
+    observed, expected, squares = np.transpose(sums).sum(axis=1)
+    return float(observed / expected), float(min(expected**2 / squares, len(r.omitted) - 1))
 
 
 def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
-    """Return what a fit leaves, with a drift of the scale as additional parameters if the evidence supports it.
+    """Return the residuals of a fit, with a drift of the scale as additional parameters if the evidence supports it.
 
-    A machine that warms, or a laser's air that changes: over the campaign all lengths from the middle of the box grow
-    by a polynomial in time. Exact for the linear problem, with fixed priors of the blocks and fixed noise.
+    The drift, by a machine that warms up or a change of the laser's air, lets all lengths from the middle of the box
+    grow by a polynomial in time. The result is exact for the linear problem with fixed tolerances and noise.
     """
     m, cells = estimation.measurements, estimation.cells
     posterior, problem = solution.posterior, solution.problem
@@ -249,52 +252,51 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
 
 
 class LackOfFit(NamedTuple):
-    """Variances of one kind of readings beyond its stated noise, m² or rad²; 0 where it may be chance."""
+    """Variances of one kind of readings beyond its stated noise, m² or rad²; 0 if not significant."""
 
-    alike: float = 0.0  # common to readings in both directions, with the part that the parameters have absorbed
-    most_alike: float = 0.0  # detection threshold
-    unlike: float = 0.0  # in neither that nor repeats
-    stops: float = 0.0  # pure error: of readings repeated at one place
-    most_stops: float = 0.0
+    common: float = 0.0  # of errors that are the same in both directions, with the part that the parameters absorb
+    most_common: float = 0.0  # upper bound of `common`: its value, or the smallest significant value
+    other: float = 0.0  # of errors that are neither the same in both directions nor show in repeats
+    stops: float = 0.0  # pure error: scatter of readings repeated at one place
+    most_stops: float = 0.0  # upper bound of `stops`
 
 
 def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
-    """Return the tool's displacement and rotation, from residuals, that no parameter describes.
+    """Return the tool's displacement, m, and rotation, rad, that no parameter describes, from the residuals.
 
-    Repeats show the pure error; the rest beyond the stated noise is lack of fit (Draper & Smith 1998): an error of the
-    machine, such as lost motion by friction, also where it differs between directions.
+    Repeats show the pure error. The remaining variance beyond the stated noise is lack of fit (Draper & Smith 1998): an
+    error of the machine, such as lost motion by friction, which may differ between the directions.
 
-    A field that is rougher than its terms is seen first in the kind of reading in which it is large compared with the
-    noise, usually in rotations. The same lack is then assumed for displacements, in proportion to the fitted sizes of
-    both, unless it would have been seen there as well.
+    An error field that is rougher than the fit's polynomials shows first in the kind of reading in which it is large
+    compared with the noise, usually in rotations. The same lack of fit is then assumed for displacements, in proportion
+    to the fitted sizes of both fields, but not more than would be significant in the readings of displacements.
     """
     kinds = np.unique(r.estimation.cells.kind)
     found = []
     for angular in (False, True):
         some = [k for k in kinds if (KINDS[k] in ANGULAR_KINDS) == angular]
         cells = [int((r.estimation.cells.kind == k).sum()) for k in some]
-        # The mean variance of an axis, three times.
         mean = np.average([lack_of_fit(r, k) for k in some], 0, cells) if some else np.zeros(len(LackOfFit._fields))
-        found.append(LackOfFit(*np.sqrt(3.0 * mean).tolist()))
+        found.append(LackOfFit(*np.sqrt(3.0 * mean).tolist()))  # `mean` is the variance of one of three axes
     displacement, rotation = found
     space, sizes = r.estimation.space, r.solution.posterior.tolerances
     fields = {b.name: size for b, size in zip(space.blocks, sizes, strict=True) if b.name in FIELDS and size > 0.0}
-    shifted, turned = displacement.alike, rotation.alike
+    shifted, turned = displacement.common, rotation.common
     if len(fields) == len(FIELDS):
         ratio = float(fields[FIELDS[0]] / fields[FIELDS[1]])
-        shifted = max(shifted, min(rotation.alike * ratio, displacement.most_alike))
-        turned = max(turned, min(displacement.alike / ratio, rotation.most_alike))
-    lacks = np.linalg.norm([shifted, displacement.unlike, _unread_backlash(r)]), np.hypot(turned, rotation.unlike)
+        shifted = max(shifted, min(rotation.common * ratio, displacement.most_common))
+        turned = max(turned, min(displacement.common / ratio, rotation.most_common))
+    lacks = np.linalg.norm([shifted, displacement.other, _unread_backlash(r)]), np.hypot(turned, rotation.other)
     return tuple(  # type: ignore[return-value]
         Scatter(float(lack), part.stops, part.most_stops) for lack, part in zip(lacks, found, strict=True)
     )
 
 
 def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
-    """Return the variances of one kind of readings: all in the stated noise's, except the result."""
+    """Return the lack of fit of one kind of readings; until the last line its variances are over the stated noise's."""
     m, estimated = r.estimation.measurements, float(r.solution.posterior.noise[kind] ** 2)
     readings, cells = int((m.kind == kind).sum()), int((r.estimation.cells.kind == kind).sum())
-    # Readings about their cell's mean, in the stated noise
+    # Pure error: variance of the readings about their cell's mean, over the stated noise
     members, of_reading = np.flatnonzero(m.kind == kind), r.estimation.cells.of_reading
     cell, weights = of_reading[members], r.solution.weights[members]
     values = r.solution.residuals[members] / r.estimation.uncertainty[members]
@@ -303,53 +305,53 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
     repeated = float(((weights * (values - mean)) ** 2).sum()) / max(freedom, 1.0)
     pure, error = (repeated, repeated * np.sqrt(2.0 / freedom)) if freedom >= LEAST_PAIRS else (1.0, 0.0)
     stops = pure - 1.0 if pure - 1.0 > ASSUMED.clear * error else 0.0
-    # The cells that were read forward, and those read backward at the same places
+    # Pairs of cells of one run and channel that were read forward and backward at the same pose
     stations, every = m.stations, r.estimation.cells
     poses = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(9)
     pose = different_rows(poses)[1][every.station]
     key = different_rows(np.stack([r.run, every.channel, pose], axis=1))[1]
     ways = [np.flatnonzero((every.kind == kind) & (r.direction == way)) for way in (FORWARD, BACKWARD)]
     _, first, second = np.intersect1d(key[ways[0]], key[ways[1]], return_indices=True)
-    there, back = ways[0][first], ways[1][second]
-    unlike, of_readings = estimated - 1.0 - stops, estimated * np.sqrt(2.0 / readings)
-    if len(there) >= LEAST_PAIRS:
-        # Residuals of cells count in their means' noise, which is smaller than a reading's.
-        shared, kept = _likeness(r, there, back)
-        share, of_pairs = cells / readings, estimated / np.sqrt(len(there))
-        alike, clear = shared * estimated * share / kept, ASSUMED.clear * of_pairs * share / kept
-        unlike -= shared * estimated * share
+    forward, backward = ways[0][first], ways[1][second]
+    other, of_readings = estimated - 1.0 - stops, estimated * np.sqrt(2.0 / readings)
+    if len(forward) >= LEAST_PAIRS:
+        # A cell's residual is over the noise of the cell's mean, which is smaller than the noise of one reading.
+        covariance, kept = _common_variance(r, forward, backward)
+        share, of_pairs = cells / readings, estimated / np.sqrt(len(forward))
+        common, clear = covariance * estimated * share / kept, ASSUMED.clear * of_pairs * share / kept
+        other -= covariance * estimated * share
         of_readings = np.hypot(of_readings, of_pairs)
-    else:  # whether it is the same in both directions is not known
-        alike, clear, unlike = unlike, ASSUMED.clear * of_readings, 0.0
+    else:  # too few pairs to separate errors that are common to both directions: all of them count as common
+        common, clear, other = other, ASSUMED.clear * of_readings, 0.0
     found = LackOfFit(
-        alike=alike if alike > clear else 0.0,
-        most_alike=max(alike, clear),
-        unlike=unlike if unlike > ASSUMED.clear * np.hypot(of_readings, error) else 0.0,
+        common=common if common > clear else 0.0,
+        most_common=max(common, clear),
+        other=other if other > ASSUMED.clear * np.hypot(of_readings, error) else 0.0,
         stops=stops,
         most_stops=stops + 2.0 * error if stops else 0.0,
     )
     return LackOfFit(*(m.stated_of(kind) ** 2 * np.array(found)).tolist())
 
 
-def _likeness(r: Residuals, there: np.ndarray, back: np.ndarray) -> tuple[float, float]:
-    """Return the error variance common to both directions, over that of the noise, and its share that a fit leaves.
+def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
+    """Return the variance common to both directions over the noise's, and its share that the fit does not absorb.
 
-    Fitting makes the noise of a pair anticorrelated, by the contribution of both to the parameters and to the run's
-    unknowns; and it absorbs the same share of their common error. Residuals are cut off at 2 σ, since an instrument
-    that slips falsifies many readings; of the covariance of normal residuals (P(|x| < 2))² remains.
+    Fitting anticorrelates the noise of a pair of cells, because both contribute to the parameters and to the run's
+    nuisance parameters, and it absorbs the same share of their common error. Residuals are clipped at 2 σ, since an
+    instrument that slips falsifies many readings; clipping reduces the covariance of normal residuals to (P(|x| < 2))².
     """
-    # Means of repeated readings are off by more than their noise if each place has its own error.
-    size = 2.0 * max(1.0, MEDIAN_TO_SIGMA * float(np.median(np.abs(r.residual[there]))))
-    cut = np.clip(r.residual, -size, size)
+    # Use the residuals' own σ if it is above the noise: each place may have its own error.
+    limit = 2.0 * max(1.0, MEDIAN_TO_SIGMA * float(np.median(np.abs(r.residual[forward]))))
+    clipped = np.clip(r.residual, -limit, limit)
     groups = r.estimation.cells.group
-    sizes = np.bincount(groups + 1)[groups[there] + 1]
-    unlike = r.shared(there, back) + np.where(groups[there] < 0, 0.0, 1.0 / sizes)
-    shared = (cut[there] * cut[back] / 0.911 + unlike).mean()
-    return float(shared), float(max(1.0 - (r.taken[there] + unlike).mean(), LEAST_LEFT))
+    sizes = np.bincount(groups + 1)[groups[forward] + 1]
+    absorbed = r.leverage(forward, backward) + np.where(groups[forward] < 0, 0.0, 1.0 / sizes)
+    common = (clipped[forward] * clipped[backward] / 0.911 + absorbed).mean()
+    return float(common), float(max(1.0 - (r.absorbed[forward] + absorbed).mean(), LEAST_LEFT))
 
 
 def _unread_backlash(r: Residuals) -> float:
-    """Return the RMS displacement, m, by half the backlash of a machine whose readings have no direction."""
+    """Return the RMS displacement, m, by half an assumed backlash, if no reading has a direction; otherwise 0."""
     m, space = r.estimation.measurements, r.estimation.space
     if (m.direction != UNKNOWN).any() or space.block("backlash") is not None:
         return 0.0
@@ -365,11 +367,11 @@ def _unread_backlash(r: Residuals) -> float:
 
 
 def _of_priors(r: Residuals, metric: np.ndarray) -> float:
-    """Return the uncertainty of the logarithm of an expected tool error, as the sizes of priors are estimates.
+    """Return the standard deviation of the logarithm of the expected tool error due to estimated tolerances.
 
-    A size that n parameters determine is known to 1/√(2n) of itself, and moves the squared error by its prior's share
-    of it: with C = (N + T⁻²)⁻¹, tr(M·C·T⁻²·C)/tr(M·C). For a length map or a field, the readings determine the coarse
-    terms; the fine terms are assumed to scale with them.
+    A tolerance estimated from n parameters has the relative error 1/√(2n). It changes the squared tool error by the
+    share tr(M·C·T⁻²·C)/tr(M·C) of its prior, with C = (N + T⁻²)⁻¹. Of a length map or a field the readings determine
+    the coarse terms; the prior of the fine terms is assumed in proportion, with the additional error `fine_terms`.
     """
     posterior = r.solution.posterior
     expected = float(np.vdot(metric, posterior.covariance))
@@ -387,7 +389,7 @@ def _of_priors(r: Residuals, metric: np.ndarray) -> float:
 
 
 def held_by_priors(r: Residuals) -> bool:
-    """Return whether the expected tool error follows from the priors rather than from the readings."""
+    """Return whether the expected tool error is determined by the priors more than by the readings."""
     metric, posterior, m = r.metrics[0], r.solution.posterior, r.estimation.measurements
     if not metric.any():
         return False
@@ -398,7 +400,7 @@ def held_by_priors(r: Residuals) -> bool:
 
 
 def unstated(m: MeasurementSet) -> str:
-    """Return a note on lengths whose noise is assumed, since the machine's own may be part of it; empty if none is."""
+    """Return a note on readings of length without stated uncertainty; empty if there are none."""
     unstated = np.unique(m.kind[~np.isfinite(m.uncertainty)])
     listed = [
         f"{KINDS[k]} {DEFAULT_UNCERTAINTY[KINDS[k]] * 1e6:g} µm" for k in unstated if KINDS[k] not in ANGULAR_KINDS
@@ -406,16 +408,16 @@ def unstated(m: MeasurementSet) -> str:
     if not listed:
         return ""
     problem = f"no uncertainty is stated ({', '.join(listed)} assumed)"
-    return f"{problem}: what the machine's own repeatability has of that is not in the expected tool error"
+    return f"{problem}: the expected tool error does not contain the part of it that is the machine's repeatability"
 
 
 def chi_squares(r: Residuals) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare, ...]]:
-    """Return χ² per degree of freedom of each kind of channel: by line family and by direction of motion; and by run.
+    """Return χ² per degree of freedom of each kind of reading: by line family and direction of motion; and by run.
 
     The runs are sorted by χ², the largest first.
     """
     m, solution, of_reading = r.estimation.measurements, r.solution, r.estimation.cells.of_reading
-    freedom = 1.0 - (r.taken / np.bincount(of_reading))[of_reading]
+    freedom = 1.0 - (r.absorbed / np.bincount(of_reading))[of_reading]
     squares = (solution.weights * solution.residuals / r.estimation.uncertainty) ** 2
     groups = (
         (family_of_run(m)[m.run], dict(enumerate(FAMILIES))),

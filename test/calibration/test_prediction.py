@@ -218,7 +218,7 @@ def test_what_is_not_the_models_own_is_not_known(tmp_path: Path) -> None:
     with pytest.raises(InputFileError, match=r"posterior\.file: must be a file name without a folder"):
         load_model(path, geometry)
     other = dataclasses.replace(geometry, platform_joints=np.repeat(geometry.platform_joints[::2], 2, axis=0))
-    assert "labels: are not those of this geometry's parameters" in load_posterior(model, other, path)[1]
+    assert "labels: are not the parameters of this geometry" in load_posterior(model, other, path)[1]
     assert "carries no covariance" in load_posterior(MachineModel(geometry.name), geometry, "ideal")[1]
 
 

@@ -115,7 +115,7 @@ def test_expansions_and_time_constant_come_back():
     assert abs(np.log(constant / TAU)) < 3.0 * deviation < 0.6
     model, text = fit().model.late_growth, warming_text(warming)
     assert (model.thermometer, model.time_constants) == ("base", (constant,))
-    assert "base stands for all parts" in text
+    assert "base represents all parts" in text
     assert "struts: 1" in text
 
 
