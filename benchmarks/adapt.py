@@ -203,7 +203,7 @@ def adapted(name: str, seed: int, folder: Path) -> Adapted:
     found = Adapted(outcome.state, outcome.text, machine.stops)
     if outcome.state == "in use":
         found.left = left()
-        found.kept = found.left <= 1e6 * min(loop().state.kept, GOAL)
+        found.kept = found.left <= 1e6 * min(loop().state.promised_in_use, GOAL)
         before = len(loop().events)
         loop().guard(1)
         found.alarm = any(e["event"] in ("repaired", "beyond repair") for e in loop().events[before:])

@@ -100,7 +100,7 @@ def demo(args: argparse.Namespace) -> Result:
 
 
 def adapt(args: argparse.Namespace) -> Result:
-    """Calibrate a running machine, or check the model that came of it; 0 when a model is borne out by its checks."""
+    """Calibrate a running machine, or check its model; 0 when check readings have confirmed the model."""
     from ..ros import received_signals
     from ..ros.collector import AdaptedMachine
     from ..upkeep.journal import IN_USE, sole_user
@@ -153,7 +153,7 @@ def adapt(args: argparse.Namespace) -> Result:
             "state": outcome.state,
             "text": outcome.text,
             "model": outcome.model,
-            "promised_m": None if np.isnan(loop.state.kept) else loop.state.kept,
+            "promised_m": None if np.isnan(loop.state.promised_in_use) else loop.state.promised_in_use,
             "events": loop.events,
         },
         code=INTERRUPTED if outcome.state == "stopped" else 0 if outcome.good else 1,
@@ -181,7 +181,7 @@ def adapted(events: list[dict[str, Any]]) -> Iterator[str]:
                 text = promised if e["enough"] else f"not enough: {e['short']}"
             case "checked":
                 found = f"shows {um(e['found_m'])}, {um(e['promised_m'])} promised"
-                text = f"{e['readings']} {found}; {'borne out' if e['good'] else e['text']}{moved_text(e)}"
+                text = f"{e['readings']} {found}; {'confirmed' if e['good'] else e['text']}{moved_text(e)}"
             case "repaired":
                 text = f"{e['text']}; {e['model']} renews {e['of']}"
             case "begun" | "adopted" | "reloaded":

@@ -151,7 +151,7 @@ def tell(
         outcome = loop.calibrate()
         if not outcome.good:
             raise CalibrationError("demo", f"{outcome.state}: {outcome.text}")
-        promised = loop.state.kept
+        promised = loop.state.promised_in_use
         loop.guard(1)
         machine.become(warmed(geometry, truth, WARMTH))
         begin(f"warmer by {WARMTH:g} K")

@@ -1,1 +1,1 @@
-"""A running machine calibrated, checked and repaired, step by step, by readings that it takes itself."""
+"""Upkeep of a running machine: calibration, checks and repair, step by step, with readings that it takes itself."""

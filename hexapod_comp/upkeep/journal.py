@@ -1,4 +1,4 @@
-"""What was done, a line of JSON each: the memory of a loop that may be killed at any time."""
+"""The journal of the loop: one line of JSON for each finished step, so that a killed process can continue."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from typing import Any
 from ..errors import InputFileError
 from ..formats.json import json_content, json_text
 
-JOURNAL = "journal.jsonl"  # its name in the loop's folder
-IN_USE = "model.yaml"  # beside it: the adopted model, always under this name, with its posterior
-ENDED = "ended"  # the event with which a run of the loop ends, unless it is killed
-LEFT_WITHIN = 10.0  # A process that was told to end brakes the machine and leaves the folder within this time, s
+JOURNAL = "journal.jsonl"  # name of the journal in the loop's folder
+IN_USE = "model.yaml"  # name of the adopted model in the same folder; its posterior file is beside it
+ENDED = "ended"  # event with which a run of the loop ends, unless the process is killed
+LEFT_WITHIN = 10.0  # wait this long for another process that is ending, s: it brakes the machine first
 
 Event = dict[str, Any]
 
 
 class Journal:
-    """A file of events; each is on the disk before the next step begins.
+    """A file of events; each event is on the disk before the next step begins.
 
-    A last line that a killed process left unfinished is dropped: its step is done again.
+    An unfinished last line, left by a killed process, is removed, and its step is repeated.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -45,8 +45,7 @@ class Journal:
 
     @staticmethod
     def read(path: Path, start: int = 0) -> list[Event]:
-        """Return the events of a journal that somebody else writes, from a byte on, without a line that is being
-        written; none where there is no journal."""
+        """Return the complete events, from byte `start` on, of a journal that another process writes; empty if none."""
         if not path.exists():
             return []
         with path.open("rb") as file:
@@ -55,7 +54,7 @@ class Journal:
         return list(_parsed(path, text.rpartition("\n")[0]))
 
     def add(self, event: str, **content: Any) -> Event:
-        """Write an event, with the time."""
+        """Append an event with the current time to the file, and return it."""
         entry = {"time": datetime.now(timezone.utc).isoformat(timespec="seconds"), "event": event, **content}
         line = json_text(entry, indent=None)
         try:
@@ -71,7 +70,7 @@ class Journal:
 
 @contextmanager
 def sole_user(folder: str | Path) -> Iterator[None]:
-    """Keep other processes from working in a loop's folder; an InputFileError where one does, and does not end."""
+    """Lock a loop's folder against other processes; raise InputFileError if one still has it after LEFT_WITHIN."""
     path, end = Path(folder) / JOURNAL, time.monotonic() + LEFT_WITHIN
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -81,7 +80,7 @@ def sole_user(folder: str | Path) -> Iterator[None]:
     with file:
         while True:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system releases it however the process ends
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released by the system when the process ends
                 break
             except BlockingIOError:
                 if time.monotonic() > end:
@@ -95,7 +94,7 @@ def _parsed(path: Path, text: str) -> Iterator[Event]:
         try:
             event = json_content(line)
         except ValueError as error:
-            raise InputFileError(path, f"line {number}", f"is no event: {error}") from error
+            raise InputFileError(path, f"line {number}", f"is not JSON: {error}") from error
         if not isinstance(event, dict) or not isinstance(event.get("event"), str):
-            raise InputFileError(path, f"line {number}", "must be an object with an event")
+            raise InputFileError(path, f"line {number}", 'must be a JSON object with the key "event"')
         yield event

@@ -1,11 +1,11 @@
-"""A machine that calibrates itself: plan, collect, fit, check, reload; check again; name what has changed, repair it.
+"""The loop that calibrates a machine and keeps its model valid: plan, collect, fit, check, reload; then check, repair.
 
-The loop is a state machine whose memory is the journal: :meth:`State.after` folds its events into a state,
-:func:`next_step` says what is to be done in it, and each step ends with an event. A process that was killed goes on
-with the step that has no event yet; readings that it had collected are in their file.
+The loop is a state machine, and its memory is the journal. :meth:`State.after` computes the state from the journal's
+events, :func:`next_step` returns the next step, and each step ends with an event. After a kill, a new process repeats
+the step that has no event yet; the readings collected in this step are in their file.
 
-A model is adopted only when check readings that were not used in its fit confirm it. A check that contradicts a model
-counts when a second one, read anew, repeats it.
+A model is adopted only if check readings that were not used in its fit confirm it. If a check contradicts a model, it
+is repeated; only two contradictions in a row have consequences.
 """
 
 from __future__ import annotations
@@ -45,24 +45,24 @@ from ..measurements.campaign import Campaign, campaign_text, load_campaign
 from ..measurements.collect import MeasuredMachine, SetUpError, collect
 from ..measurements.files import read_measurements
 from ..measurements.readings import UNKNOWN, MeasurementSet
-from .careful import Careful
-from .checks import LEAST_READ, Whole, check_run, judge
+from .checks import LEAST_READ, RigidMotion, check_run, judge
 from .journal import ENDED, IN_USE, JOURNAL, Event, Journal
+from .observer import MedianObserver
 
-GIVEN = "given"  # in place of the name of a planned campaign
-PROPOSED = "proposed.yaml"  # a later one, until somebody permits that it is run
+GIVEN = "given"  # stands in the journal for the name of a campaign that the user has given
+PROPOSED = "proposed.yaml"  # name of a later model that the loop may not reload
 
-CAMPAIGNS = 3  # of a calibration, each planned where the fits before have not reached the goal; then it is refused
-PASSES = 3  # over a campaign, for stops at which the instrument read nothing
-PLANNED_SHARE = 0.7  # of the goal is planned for: a plan expects the RMS error, and the goal is the end of its interval
-FURTHER = 0.5  # of what was planned for before, where the readings have not been enough
-POSES, LONGEST = "6-D", 4 * 3600.0  # What a tracker's poses are to a plan, and how long a planned campaign may be, s
-STOP = 5.0  # A stop takes it, s: a move, its settling and three looks; whatever it reads, nothing is put up for it
-CHECKS_OF_A_READING = 3  # checks in a row that a single wrong reading spoils: then the instrument is to be looked after
+CAMPAIGNS = 3  # largest number of campaigns of a calibration; if the goal is then not reached, it ends without a model
+PASSES = 3  # largest number of passes over a campaign, to repeat stops at which the instrument read nothing
+PLANNED_SHARE = 0.7  # share of the goal that is planned for: a plan expects the RMS, the goal is a limit with 95 %
+FURTHER = 0.5  # factor on this share for each further campaign
+POSES, LONGEST = "6-D", 4 * 3600.0  # name of a tracker's poses in plans; largest duration of a planned campaign, s
+STOP = 5.0  # duration of a stop in plans, s: a move, its settling and three observations
+SPOILT_CHECKS = 3  # the loop ends after this number of checks in a row with a single wrong reading
 
-# Changes that count though the promise is kept: something has happened. What else readings show (ageing, a bend,
-# scatter) an imperfect fit has as well: that counts when the promise is broken.
-EVENTS = (DATUM, STRUT, TEMPERATURE, PAYLOAD)
+# These kinds of change count even if the promise is kept. All other kinds (ageing, bend, scatter) also appear after an
+# imperfect fit, so they count only if the promise is broken.
+SUDDEN_CHANGES = (DATUM, STRUT, TEMPERATURE, PAYLOAD)
 
 PLAN, COLLECT, FIT, CHECK, GIVE_UP, ADOPT, RELOAD, GUARD, REPAIR, END = (
     "plan", "collect", "fit", "check", "give up", "adopt", "reload", "guard", "repair", "end"
@@ -71,55 +71,55 @@ PLAN, COLLECT, FIT, CHECK, GIVE_UP, ADOPT, RELOAD, GUARD, REPAIR, END = (
 
 @dataclass(frozen=True)
 class Task:
-    """What the loop has to do."""
+    """The task of the loop: the box, and a goal or a campaign; with neither, a model can only be checked."""
 
-    box: np.ndarray  # (2, 3): where the tool works, m in the work frame
-    level: np.ndarray  # (3, 3): the tool's attitude there, in the work frame
-    goal: float | None = None  # the promised RMS tool error may reach this at most, with 95 %, m; None: any promise
-    campaign: Campaign | None = None  # to begin with, in place of a planned one; with neither it can only be checked
+    box: np.ndarray  # (2, 3): corners of the box in which the tool works, m in the work frame
+    level: np.ndarray  # (3, 3): attitude of the tool in the box, in the work frame
+    goal: float | None = None  # largest allowed promise: RMS tool error with 95 %, m; None: any promise is accepted
+    campaign: Campaign | None = None  # campaign to measure in place of a planned one
     settings: FitSettings = field(default_factory=FitSettings)
-    every: float = 600.0  # time from one check of the model in use to the next, s
+    every: float = 600.0  # time between two checks of the model in use, s
 
     def __post_init__(self) -> None:
         if self.goal is not None and self.campaign is not None:
-            raise CommandError("usage", "give a goal to plan for, or a campaign, and not both")
+            raise CommandError("usage", "give either a goal or a campaign, and not both")
         if self.goal is not None and not 0.0 < self.goal < np.inf:
             raise CalibrationError("goal", f"must be finite and above zero, m, not {self.goal:g}")
 
     @property
     def measurable(self) -> bool:
-        """Whether there is something to calibrate with."""
+        """Whether the task has a goal or a campaign, so that the loop can calibrate."""
         return self.goal is not None or self.campaign is not None
 
 
 @dataclass(frozen=True)
 class State:
-    """Where the loop stands; files by their names in its folder."""
+    """State of the loop; files are given by their names in the loop's folder."""
 
-    number: int = 0  # of the newest file
-    calibrating: bool = False  # a calibration was begun, and no model has come of it yet
-    rounds: int = 0  # campaigns that were planned for this calibration
-    planned: str = ""  # a campaign that is not collected yet
-    readings: tuple[str, ...] = ()  # of this calibration's campaigns
-    fitted: bool = False  # all of them are in a fit
-    candidate: str = ""  # a model that is not adopted yet
-    repairs: str = ""  # the changed model that the candidate repairs; empty: it is a new calibration
-    proven: bool = False  # check readings have borne the candidate out
-    promised: float = np.nan  # of the candidate's calibration, m
-    in_use: str = ""  # the model that was adopted last
-    kept: float = np.nan  # what it has promised, m
-    reloaded: bool = False  # the compensator runs it
-    doubts: tuple[str, ...] = ()  # check readings that contradict the candidate, or else the model in use
-    spoilt: int = 0  # checks in a row of which a single reading is wrong
-    changed: bool = False  # the machine, as two checks say
-    stuck: str = ""  # a change that the loop may not repair by itself
-    checks: int = 0  # of the model in use that have borne it out, or were repaired
-    refused: str = ""  # why the loop has ended without a model
+    number: int = 0  # number of the newest file
+    calibrating: bool = False  # a calibration was begun, and has not ended with a model yet
+    rounds: int = 0  # number of campaigns planned for this calibration
+    planned: str = ""  # campaign that is not collected yet; empty: none
+    readings: tuple[str, ...] = ()  # files of readings of this calibration
+    fitted: bool = False  # whether a model was fitted to all these readings
+    candidate: str = ""  # model that is not adopted yet; empty: none
+    repairs: str = ""  # model that the candidate repairs; empty: the candidate is from a new calibration
+    confirmed: bool = False  # whether check readings have confirmed the candidate
+    promised: float = np.nan  # RMS tool error (95 %) promised by the candidate, m
+    in_use: str = ""  # model that was adopted last
+    promised_in_use: float = np.nan  # RMS tool error (95 %) promised by the model in use, m
+    reloaded: bool = False  # whether the compensator runs the model in use
+    doubts: tuple[str, ...] = ()  # files of check readings that contradict the candidate, or else the model in use
+    spoilt: int = 0  # number of checks in a row with a single wrong reading
+    changed: bool = False  # whether two checks in a row have shown a change of the machine
+    beyond_repair: str = ""  # change that the loop cannot repair from check readings; empty: none
+    checks: int = 0  # number of checks of the model in use that have confirmed it, or whose change was repaired
+    refused: str = ""  # reason why the loop has given up its calibration or its checks; empty: it has not
 
     def after(self, event: Event) -> State:
         """Return the state after an event."""
         e, one = event, replace(self, number=max(self.number, event.get("number", 0)))
-        kept = {name: getattr(one, name) for name in ("number", "in_use", "kept", "reloaded", "checks")}
+        kept = {name: getattr(one, name) for name in ("number", "in_use", "promised_in_use", "reloaded", "checks")}
         match event["event"]:
             case "begun":
                 return State(**kept, calibrating=True)
@@ -133,25 +133,25 @@ class State:
             case "checked":
                 return one._checked(e)
             case "adopted":
-                kept |= {"in_use": self.candidate, "kept": self.promised, "reloaded": False}
+                kept |= {"in_use": self.candidate, "promised_in_use": self.promised, "reloaded": False}
                 return State(**{**kept, "checks": self.checks + bool(self.repairs)})
             case "reloaded":
                 return replace(one, reloaded=True)
             case "restarted":
                 return replace(one, reloaded=False)
             case "repaired":
-                return State(**kept, candidate=e["model"], repairs=self.in_use, promised=self.kept)
+                return State(**kept, candidate=e["model"], repairs=self.in_use, promised=self.promised_in_use)
             case "beyond repair":
-                return State(**kept, stuck=f"{e['text']}: {e['reason']}")
+                return State(**kept, beyond_repair=f"{e['text']}: {e['reason']}")
             case "refused":
                 return replace(one, refused=e["reason"])
-        return one  # a run that has ended changes nothing
+        return one  # the event "ended" does not change the state
 
     def _checked(self, e: Event) -> State:
-        """Return the state after a check: one that is good, spoilt by one reading, or contradicts the model."""
+        """Return the state after a check, which confirms the model, has one wrong reading, or contradicts the model."""
         if e["good"]:
             cleared = replace(self, doubts=(), spoilt=0)
-            return replace(cleared, proven=True) if self.candidate else replace(cleared, checks=self.checks + 1)
+            return replace(cleared, confirmed=True) if self.candidate else replace(cleared, checks=self.checks + 1)
         if e["spoilt"]:
             return replace(self, spoilt=self.spoilt + 1)
         doubts = (*self.doubts, e["readings"])
@@ -159,13 +159,13 @@ class State:
 
 
 def next_step(state: State, checks: int | None, may_reload: bool) -> str:
-    """Return what is to be done in a state; the model in use is to be checked `checks` times, None: without end."""
-    if state.refused or state.stuck:
+    """Return the next step in a state; `checks` is the wanted number of checks of the model in use, None: no limit."""
+    if state.refused or state.beyond_repair:
         return END
-    if state.spoilt >= CHECKS_OF_A_READING or (state.candidate and len(state.doubts) > 1):
+    if state.spoilt >= SPOILT_CHECKS or (state.candidate and len(state.doubts) > 1):
         return GIVE_UP
     if state.candidate:
-        return ADOPT if state.proven else CHECK
+        return ADOPT if state.confirmed else CHECK
     if state.changed:
         return REPAIR
     if state.planned:
@@ -182,88 +182,89 @@ def next_step(state: State, checks: int | None, may_reload: bool) -> str:
 
 
 def begun_with(folder: str | Path) -> Event:
-    """Return the inputs of the newest calibration in a folder: machine, goal_m, box_m, level; empty without one."""
+    """Return machine, goal_m, box_m and level of the newest calibration in a folder; empty if there is none."""
     events = Journal.read(Path(folder) / JOURNAL)
     return next((e for e in reversed(events) if e["event"] == "begun"), {})
 
 
 class Outcome(NamedTuple):
-    """How a run of the loop ended."""
+    """Result of a run of the loop."""
 
-    state: str  # in use, proposed, changed, refused, stopped; in the journal also failed
+    state: str  # in use, proposed, changed, refused or stopped; in the journal also failed
     text: str
-    model: Path | None  # the model in use, or the one that is proposed
+    model: Path | None  # file of the proposed model or, without one, of the model in use; None: there is no model
 
     @property
     def good(self) -> bool:
-        """Whether there is a model that its checks confirm."""
+        """Whether there is a model that check readings have confirmed."""
         return self.state in ("in use", "proposed")
 
 
-class Stopped(Exception):  # no HexapodError: a fit tries other ways after one of these
+class Stopped(Exception):  # not a HexapodError: a fit would catch it and try another start
     """A person has stopped the loop."""
 
 
 class Adaptation:
-    """Calibrates a machine and keeps its model true; everything that it makes is in its folder."""
+    """The loop that calibrates a machine and keeps its model valid; it writes all its files into one folder."""
 
     def __init__(
         self,
         geometry: HexapodGeometry,  # with the tool that carries the target
-        machine: MeasuredMachine,  # moves and watches
+        machine: MeasuredMachine,  # machine to move, with its instrument
         task: Task,
-        folder: str | Path,  # of the journal, which is continued if it exists
-        reload: Callable[[Path], object] | None = None,  # has the machine run a file's model; None: it is only proposed
-        going_on: Callable[[], bool] = lambda: True,  # False stops the loop: at the next stop, or while it waits
-        say: Callable[[str], object] = lambda text: None,  # told what goes on
-        wait: Callable[[float], object] = time.sleep,  # lets some time pass, s
-        # whether the machine runs a file's model: one that was switched off and on runs what it was started with
+        folder: str | Path,  # folder of the journal, which is continued if it exists
+        reload: Callable[[Path], object] | None = None,  # makes the compensator run a model file; None: only propose it
+        going_on: Callable[[], bool] = lambda: True,  # the loop ends when this returns False
+        say: Callable[[str], object] = lambda text: None,  # receives progress messages
+        wait: Callable[[float], object] = time.sleep,  # waits for a time, s
+        # whether the compensator runs a model file: after a restart it may run another model
         runs: Callable[[Path], bool] = lambda path: True,
     ) -> None:
-        self._geometry, self._machine, self._task = geometry, Careful(machine), task
+        self._geometry, self._machine, self._task = geometry, MedianObserver(machine), task
         self._reload, self._runs, self._going_on, self._say, self._wait = reload, runs, going_on, say, wait
         self._folder = Path(folder)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputFileError(folder, "", f"cannot be made a folder: {error.strerror}") from error
+            raise InputFileError(folder, "", f"cannot be created as a folder: {error.strerror}") from error
         self._journal, self.state = Journal(self._folder / JOURNAL), State()
         for event in self._journal.events:
             try:
                 self.state = self.state.after(event)
             except KeyError as error:
-                raise InputFileError(self._journal.path, event["event"], f"lacks {error}") from error
+                raise InputFileError(self._journal.path, event["event"], f"lacks the key {error}") from error
         machines = {e["machine"] for e in self._journal.events if e["event"] == "begun"}
         if machines - {geometry.name}:
             known = ", ".join(sorted(machines))
-            raise InputFileError(self._journal.path, "machine", f"is of machine {known}; give another folder")
+            problem = f"is {known}, not {geometry.name}; give another folder"
+            raise InputFileError(self._journal.path, "machine", problem)
 
     @property
     def events(self) -> list[Event]:
-        """What was done so far."""
+        """All events of the journal, the oldest first."""
         return self._journal.events
 
     def calibrate(self, anew: bool = False) -> Outcome:
-        """Calibrate until a model is adopted or refused, continuing what the journal has begun unless `anew`."""
+        """Calibrate until a model is adopted or refused; continue an unfinished calibration, except with `anew`."""
         if not self._task.measurable:
-            raise CommandError("usage", "give a goal to plan for, or a campaign")
+            raise CommandError("usage", "give a goal or a campaign")
         state = self.state
         if not anew:
-            self._same_place()
-        if anew or not (state.calibrating or state.candidate or state.in_use) or state.refused or state.stuck:
+            self._refuse_other_box()
+        if anew or not (state.calibrating or state.candidate or state.in_use) or state.refused or state.beyond_repair:
             self._begin()
         return self._run(0)
 
     def guard(self, checks: int | None) -> Outcome:
-        """Check the model in use this number of times (None: until stopped), the first time at once, and repair it."""
+        """Check the model in use `checks` times (None: until stopped), the first time at once; repair it if needed."""
         state = self.state
         if not state.in_use and not state.candidate:
             raise CommandError("not_calibrated", f"{self._folder} has no model in use: calibrate first")
-        self._same_place()
+        self._refuse_other_box()
         return self._run(None if checks is None else state.checks + checks)
 
     def _run(self, checks: int | None) -> Outcome:
-        """Run the steps in their order until none is due."""
+        """Run one step after the other until the next step is END, the loop is stopped, or a step fails."""
         waits, may_reload = False, self._reload is not None
         steps = {
             PLAN: self._plan,
@@ -272,15 +273,15 @@ class Adaptation:
             CHECK: self._check,
             GIVE_UP: self._give_up,
             ADOPT: self._adopt,
-            RELOAD: self._bring_in,
+            RELOAD: self._reload_model,
             GUARD: self._check,
             REPAIR: self._repair,
         }
         try:
             while True:
-                # A check holds whatever model runs, by its strut lengths: it does not show that it is another
+                # Check readings contain the strut lengths, so they do not show which model the compensator runs: ask it
                 if may_reload and self.state.reloaded and not self._runs(self._folder / IN_USE):
-                    self._note("restarted", reason="the compensator did not run the model in use")
+                    self._record("restarted", reason="the compensator did not run the model in use")
                 if (step := next_step(self.state, checks, may_reload)) == END:
                     break
                 self._stop_if_asked("stopped")
@@ -289,50 +290,50 @@ class Adaptation:
                 waits |= step == GUARD
                 steps[step]()
         except (Stopped, HexapodError) as error:
-            if not isinstance(error, Stopped) and error.reason != "person":  # as of a move that a person has stopped
+            if not isinstance(error, Stopped) and error.reason != "person":  # "person": somebody has stopped a move
                 self._ended("failed", str(error))
                 raise
-            return self._ended("stopped", f"{error}; the same command goes on from there")
+            return self._ended("stopped", f"{error}; the same command continues")
         return self._outcome()
 
     def _ended(self, state: str, text: str) -> Outcome:
-        """Write how a run of the loop has ended, and return it."""
+        """Write the end of a run of the loop to the journal, and return its outcome."""
         name = (PROPOSED if self._has(PROPOSED) else IN_USE) if self.state.in_use else None
-        self._note(ENDED, state=state, text=text, model=name)
+        self._record(ENDED, state=state, text=text, model=name)
         return Outcome(state, text, None if name is None else self._folder / name)
 
     def _outcome(self) -> Outcome:
         state = self.state
         if state.refused:
             return self._ended("refused", state.refused)
-        if state.stuck:
-            return self._ended("changed", state.stuck)
+        if state.beyond_repair:
+            return self._ended("changed", state.beyond_repair)
         name = "in use" if state.reloaded else "proposed"
-        kept = f"tool error up to {state.kept * 1e6:.2f} µm RMS (95 %), datum aligned"
-        promise = f"{'no promise' if np.isnan(state.kept) else kept}; borne out by {state.checks} later checks"
+        promise = f"tool error up to {state.promised_in_use * 1e6:.2f} µm RMS (95 %), datum aligned"
+        promise = "no promise" if np.isnan(state.promised_in_use) else promise
         last = next((e for e in reversed(self.events) if e["event"] == "checked"), {})
-        return self._ended(name, promise + moved_text(last))
+        return self._ended(name, f"{promise}; confirmed by {state.checks} later checks{moved_text(last)}")
 
-    def _note(self, event: str, **content: Any) -> None:
+    def _record(self, event: str, **content: Any) -> None:
+        """Write an event to the journal and update the state."""
         self.state = self.state.after(self._journal.add(event, **content))
 
     def _begin(self) -> None:
         goal = self._task.goal
         box, level = self._task.box.tolist(), self._task.level.tolist()
-        self._note("begun", machine=self._geometry.name, goal_m=goal, box_m=box, level=level)
+        self._record("begun", machine=self._geometry.name, goal_m=goal, box_m=box, level=level)
 
-    def _same_place(self) -> None:
-        """Refuse to go on in another box than the one that was calibrated: outside of it the model promises nothing."""
+    def _refuse_other_box(self) -> None:
+        """Refuse a box other than the calibrated box: outside the calibrated box the model promises nothing."""
         boxes = (e.get("box_m", self._task.box) for e in reversed(self.events) if e["event"] == "begun")
         begun = np.array(next(boxes, self._task.box))
         if not np.allclose(begun, self._task.box, rtol=0.0, atol=1e-6):
             was, now = (", ".join(f"{x * 1e3:g}" for x in box.ravel()) for box in (begun, self._task.box))
-            raise InputFileError(
-                self._journal.path, "box_m", f"is {was} mm, not {now} mm: give that box, or begin anew"
-            )
+            problem = f"is {was} mm, not {now} mm: give the box of the journal, or begin anew"
+            raise InputFileError(self._journal.path, "box_m", problem)
 
-    def _name(self, what: str, suffix: str) -> tuple[int, str]:
-        """Return number and name of the next file: the same after a restart, so that the file is continued."""
+    def _next_file(self, what: str, suffix: str) -> tuple[int, str]:
+        """Return number and name of the next file; they are the same after a restart, so the file is continued."""
         number = self.state.number + 1
         return number, f"{number:03d}_{what}{suffix}"
 
@@ -341,34 +342,34 @@ class Adaptation:
             raise Stopped(where)
 
     def _say_or_stop(self, text: str) -> None:
-        """Report the progress of a long calculation, and end it on request; its step is then repeated later."""
+        """Report the progress of a long calculation, and stop the loop if asked to."""
         self._say(text)
         self._stop_if_asked(f"stopped in a calculation ({text})")
 
     # ---- the steps ----
 
     def _plan(self) -> None:
-        """Write the campaign that the goal needs, or a further one where the fit so far has not been enough."""
+        """Plan a campaign for the goal, or a further campaign if the fit has not reached the goal."""
         task, state = self._task, self.state
         most = CAMPAIGNS if task.campaign is None else 1
         if state.rounds >= most:
             short = next(e["short"] for e in reversed(self.events) if e["event"] == "fitted")
-            self._note("refused", reason=f"after {state.rounds} campaign{'s' * (state.rounds > 1)} {short}")
+            self._record("refused", reason=f"after {state.rounds} campaign{'s' * (state.rounds > 1)} {short}")
             return
-        number, name = self._name("campaign", ".yaml")
+        number, name = self._next_file("campaign", ".yaml")
         if task.campaign is not None:
-            self._note("planned", number=number, campaign=GIVEN, expected_m=None)
+            self._record("planned", number=number, campaign=GIVEN, expected_m=None)
             return
         self._say("planning a campaign")
         plan = self._proposal(PLANNED_SHARE * FURTHER**state.rounds)
-        # At poses like a check's the fit learns where the machine stands, and what struts do on any way
+        # Add poses like those of a check: they determine the datum, and show the struts on other paths than lines
         poses = check_run(self._geometry, task.box, task.level, number, f"{len(plan.campaign.runs) + 1}: poses")
         campaign = replace(plan.campaign, runs=(*plan.campaign.runs, poses))
         write_text(self._folder / name, campaign_text(campaign, remarks(plan)))
-        self._note("planned", number=number, campaign=name, expected_m=plan.worst)
+        self._record("planned", number=number, campaign=name, expected_m=plan.worst)
 
     def _proposal(self, share: float) -> Proposal:
-        """Return the plan for a share of the goal."""
+        """Return the proposed campaign for a share of the goal."""
         task = self._task
         times = {POSES: Times(0.0, 0.0, STOP)}
         goal = Goal(share * (task.goal or 0.0), seconds=LONGEST, instruments=(POSES,), times=times)
@@ -377,17 +378,17 @@ class Adaptation:
 
     def _collect(self) -> None:
         """Measure the planned campaign."""
-        number, name = self._name("readings", ".csv")
+        number, name = self._next_file("readings", ".csv")
         planned, given = self.state.planned, self._task.campaign
         if (planned == GIVEN) != (given is not None):
-            problem = "was begun with a campaign" if planned == GIVEN else "was begun with a goal"
-            raise InputFileError(self._journal.path, "", f"{problem}: go on with it, or begin anew")
+            began = "a campaign" if planned == GIVEN else "a goal"
+            raise InputFileError(self._journal.path, "", f"was begun with {began}: continue with it, or begin anew")
         campaign = load_campaign(self._folder / planned) if given is None else given
         readings, missing = self._measured(campaign, name)
-        self._note("collected", number=number, readings=name, count=len(readings), missing=list(missing))
+        self._record("collected", number=number, readings=name, count=len(readings), missing=list(missing))
 
     def _measured(self, campaign: Campaign, name: str) -> tuple[MeasurementSet, tuple[str, ...]]:
-        """Return a campaign's readings, which are in a file then, and the stops at which nothing was read."""
+        """Measure a campaign into a file; return the readings, and the stops at which the instrument read nothing."""
         path = self._folder / name
         for _ in range(PASSES):
             try:
@@ -401,7 +402,7 @@ class Adaptation:
                 )
             except SetUpError:
                 if path.exists():
-                    os.replace(path, path.with_suffix(".rejected"))  # readings of a wrong set-up are no beginning
+                    os.replace(path, path.with_suffix(".rejected"))  # do not continue readings of a wrong set-up
                 raise
             self._stop_if_asked(f"stopped while {name} was measured")
             if not done.missing:
@@ -409,9 +410,9 @@ class Adaptation:
         return done.measurements, done.missing
 
     def _fit(self) -> None:
-        """Fit a model to all campaigns of this calibration."""
+        """Fit a model to the readings of all campaigns of this calibration."""
         state, task = self.state, self._task
-        number, name = self._name("model", ".yaml")
+        number, name = self._next_file("model", ".yaml")
         measured = self._readings(state.readings)
         promised, short, report = None, "", ""
         try:
@@ -423,21 +424,21 @@ class Adaptation:
             report = fit_report(fit)
             short = f"the fit is not to be trusted: {fit.misfit}" if fit.misfit else ""
             if not short and task.goal is not None and not (promised is not None and promised <= task.goal):
-                had = "nothing" if promised is None else f"{promised * 1e6:.2f} µm"
-                short = f"the fit promises {had} (95 %), and the goal is {task.goal * 1e6:.2f} µm"
+                limit = "no limit of the tool error" if promised is None else f"{promised * 1e6:.2f} µm (95 %)"
+                short = f"the fit promises {limit}, and the goal is {task.goal * 1e6:.2f} µm"
             if short and fit.lead is not None and fit.lead.used is None:
-                short += "; the screws' lead is not known (--lead-mm), so that their periodic error is not fitted"
+                short += "; the screws' lead is not known (--lead-mm), so their periodic error is not fitted"
             save_with_posterior(fit.model, fit.parameters, self._folder / name)
         write_text(self._folder / f"{name}.report.txt", report or short)
-        self._note("fitted", number=number, model=name, promised_m=promised, enough=not short, short=short)
+        self._record("fitted", number=number, model=name, promised_m=promised, enough=not short, short=short)
 
     def _check(self) -> None:
-        """Take check readings, and weigh them against the candidate, or else against the model in use."""
+        """Take check readings, and compare them with the candidate or, without one, with the model in use."""
         state = self.state
         model = state.candidate or state.in_use
-        promised = state.promised if state.candidate else state.kept
-        number, name = self._name("check", ".csv")
-        # A check that was stopped begins anew: whatever stopped it may have changed the machine
+        promised = state.promised if state.candidate else state.promised_in_use
+        number, name = self._next_file("check", ".csv")
+        # A check that was interrupted begins anew, because the machine may have changed in the meantime
         (self._folder / name).unlink(missing_ok=True)
         self._say(f"checking {model}")
         task = self._task
@@ -448,20 +449,20 @@ class Adaptation:
         measured = self._readings([name])
         if (usable := len(np.unique(measured.station))) < LEAST_READ:
             problem = f"{usable} of {len(run.positions)} readings of {name} are usable, and a check needs {LEAST_READ}"
-            raise CommandError("instrument", f"{problem}: at {len(missing)} places the instrument read nothing")
+            raise CommandError("instrument", f"{problem}; the instrument read nothing at {len(missing)} places")
         verification, fitted = self._verified(model, measured)
         judged = judge(fitted, measured, promised)
         kept = verification.verdict == VALID if np.isnan(promised) else judged.excess <= 1.0
         spoilt = not kept and verification.verdict != VALID and verification.candidates[0].family == READING
-        good = kept and not (verification.verdict == NAMED and verification.candidates[0].family in EVENTS)
+        good = kept and not (verification.verdict == NAMED and verification.candidates[0].family in SUDDEN_CHANGES)
         first = next((e for e in self.events if e["event"] == "checked" and e["model"] == model), None)
-        before = judged.whole if first is None else Whole(np.array(first["stands_m"]), first["stands_error_m"])
+        before = judged.rigid if first is None else RigidMotion(np.array(first["stands_m"]), first["stands_error_m"])
         write_text(self._folder / f"{name}.report.txt", verification_report(verification))
-        self._note(
+        self._record(
             "checked",
-            stands_m=judged.whole.motion.tolist(),
-            stands_error_m=judged.whole.error,
-            moved_m=judged.whole.moved(before),
+            stands_m=judged.rigid.motion.tolist(),
+            stands_error_m=judged.rigid.error,
+            moved_m=judged.rigid.moved(before),
             number=number,
             readings=name,
             model=model,
@@ -476,15 +477,15 @@ class Adaptation:
                 {"kind": c.family, "name": c.name, "probability": verification.families[c.family], "sizes": c.sizes}
                 for c in verification.candidates[: 0 if verification.verdict == VALID else 2]
             ],
-            text=happened(verification),
+            text=change_text(verification),
         )
 
     def _give_up(self) -> None:
-        """End with a candidate that two checks contradict, or where an instrument spoils check after check."""
+        """Refuse a candidate that two checks contradict, or end after SPOILT_CHECKS checks with a wrong reading."""
         state = self.state
-        if state.spoilt >= CHECKS_OF_A_READING:
-            reason = f"{state.spoilt} checks in a row have a single wrong reading: look after the instrument"
-            self._note("refused", reason=reason)
+        if state.spoilt >= SPOILT_CHECKS:
+            reason = f"{state.spoilt} checks in a row have a single wrong reading: check the instrument"
+            self._record("refused", reason=reason)
             return
         last = next(e for e in reversed(self.events) if e["event"] == "checked")
         why = last["text"]
@@ -492,18 +493,18 @@ class Adaptation:
             found, promised = (last[name] * 1e6 for name in ("found_m", "promised_m"))
             why = f"they show {found:.2f} µm RMS, and {promised:.2f} µm were promised"
         if state.repairs:
-            self._beyond_repair("the repaired model is contradicted by its check readings", why)
+            self._beyond_repair("check readings contradict the repaired model", why)
         else:
-            reason = f"two sets of check readings that the fit has not seen contradict its model: {why}"
-            self._note("refused", reason=reason)
+            reason = f"two sets of check readings that were not used in the fit contradict its model: {why}"
+            self._record("refused", reason=reason)
 
     def _readings(self, names: Sequence[str]) -> MeasurementSet:
-        """Return the readings of files, without stops that were reached from an unknown side: a run's first pose."""
+        """Return the readings of some files, without the first pose of a run, whose direction of motion is unknown."""
         measured = read_measurements([self._folder / name for name in names], self._geometry)
         return measured.select(measured.direction != UNKNOWN)
 
     def _verified(self, model: str, readings: MeasurementSet) -> tuple[Verification, FittedParameters]:
-        """Return what readings say of a model, and what its fit knows."""
+        """Return the verification of a model by readings, and the parameters of the model's fit."""
         path = self._folder / model
         machine_model = load_model(path, self._geometry)
         fitted, unknown = load_posterior(machine_model, self._geometry, path)
@@ -512,43 +513,43 @@ class Adaptation:
         return verify_model(machine_model, fitted, readings), fitted
 
     def _adopt(self) -> None:
-        """Name the candidate as the model in use; where one is there already it is only proposed without permission."""
+        """Make the candidate the model in use; propose it if there is another model and the loop may not reload."""
         first = not self._has(IN_USE)
         self._copy(self.state.candidate, IN_USE if first or self._reload is not None else PROPOSED)
         promised = None if np.isnan(self.state.promised) else self.state.promised
-        self._note("adopted", model=self.state.candidate, promised_m=promised)
+        self._record("adopted", model=self.state.candidate, promised_m=promised)
 
-    def _bring_in(self) -> None:
-        """Have the compensator run the model in use."""
+    def _reload_model(self) -> None:
+        """Make the compensator run the model in use."""
         assert self._reload is not None
         self._say("reloading")
         if self._has(PROPOSED):
             self._copy(self.state.in_use, IN_USE)
             (self._folder / PROPOSED).unlink()
         self._reload(self._folder / IN_USE)
-        self._note("reloaded", model=self.state.in_use)
+        self._record("reloaded", model=self.state.in_use)
 
     def _has(self, name: str) -> bool:
         return (self._folder / name).exists()
 
     def _copy(self, name: str, to: str) -> None:
-        """Write a model and its posterior under another name."""
+        """Write a model and its posterior file under another name."""
         path = self._folder / name
         model = load_model(path, self._geometry)
         save_with_posterior(model, load_posterior(model, self._geometry, path)[0], self._folder / to)
 
     def _repair(self) -> None:
-        """Renew the model in use from the checks that contradict it, or begin a calibration where they cannot."""
+        """Update the model in use from the two checks that contradict it; if they are not enough, calibrate anew."""
         state = self.state
-        number, name = self._name("model", ".yaml")
-        # Both checks together; where a wild reading spoils that, the newest alone
+        number, name = self._next_file("model", ".yaml")
+        # Use both checks together or, if this is refused, the newest check alone
         tried = []
         for names in (state.doubts, state.doubts[-1:]):
             verification, fitted = self._verified(state.in_use, self._readings(names))
             reason = refusal(verification)
             if verification.verdict == VALID:
-                reason = "both checks together do not show what has changed, but break the promise"
-            tried.append((happened(verification), reason))
+                reason = "the two checks break the promise, but do not show which change has happened"
+            tried.append((change_text(verification), reason))
             if not reason:
                 break
         else:
@@ -557,17 +558,17 @@ class Adaptation:
         model = load_model(self._folder / state.in_use, self._geometry)
         update = update_model(model, fitted, verification.measurements, verification)
         save_with_posterior(update.model, update.fitted, self._folder / name)
-        text = happened(verification)
-        self._note("repaired", number=number, model=name, of=state.in_use, text=text, chi_square=update.chi_square)
+        text = change_text(verification)
+        self._record("repaired", number=number, model=name, of=state.in_use, text=text, chi_square=update.chi_square)
 
     def _beyond_repair(self, text: str, reason: str) -> None:
-        """Calibrate anew if the loop may reload the new model; otherwise propose the campaign and end."""
-        number, name = self._name("proposed_campaign", ".yaml")
+        """Begin a new calibration if the loop may reload its model; otherwise write a proposed campaign and end."""
+        number, name = self._next_file("proposed_campaign", ".yaml")
         if self._reload is None and self._task.goal is not None:
             plan = self._proposal(PLANNED_SHARE)
             write_text(self._folder / name, campaign_text(plan.campaign, remarks(plan)))
             reason += f"; proposed campaign: {self._folder / name}"
-        self._note("beyond repair", number=number, text=text, reason=reason)
+        self._record("beyond repair", number=number, text=text, reason=reason)
         if self._reload is not None and self._task.measurable:
             self._begin()
 
@@ -581,17 +582,17 @@ class Adaptation:
 
 
 def moved_text(check: Event) -> str:
-    """Return what a check shows about base, workpiece and instrument, after its other results, as text or empty."""
-    if not check.get("moved_m") or not check["good"]:  # a changed strut moves everything too
+    """Return a clause about a rigid motion of base, workpiece or instrument that a check shows; empty if none."""
+    if not check.get("moved_m") or not check["good"]:  # a changed strut causes a rigid motion as well
         return ""
     size = f"{check['moved_m'] * 1e6:.1f} µm"
-    return f"; everything stands elsewhere as a whole, by {size}: base, workpiece or instrument has moved"
+    return f"; all positions have shifted together, by {size}: base, workpiece or instrument has moved"
 
 
-def happened(verification: Verification) -> str:
-    """Return what check readings say has happened to the machine."""
+def change_text(verification: Verification) -> str:
+    """Return the most probable change of the machine, or the two most probable changes, as text."""
     if verification.verdict == VALID:
-        return "nothing has changed"
+        return "no change"
     best = verification.candidates[0]
     if verification.verdict == UNDECIDED:
         return "either " + ", or ".join(FAMILIES[c.family] for c in verification.candidates[:2])

@@ -111,7 +111,7 @@ def test_a_model_in_place_of_a_budget_says_what_is_left_and_what_to_measure(
     machine = ("--machine", "paper", "--model", fitted_model(tmp_path), "--cells", 4, "--tilt-deg", 0)
     code, out, err = classify(*machine)
     assert (code, err) == (0, "")
-    parts = ("model 'fitted'", "measured box, level tool", "workspace, α and β of 0°", "tool in work: x, y, z mm")
+    parts = ("model 'fitted'", "measured box, level tool", "workspace, α and β of 0°", "tool in work, x, y, z mm")
     parts += ("if these parameters were known exactly", "linear laser, body diagonals", "roll, lines along z")
     for part in parts:
         assert part in out, part

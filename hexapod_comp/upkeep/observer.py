@@ -1,0 +1,41 @@
+"""A robust observer: it returns the median of several observations at each stop, so that outliers do not count."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..measurements.collect import MeasuredMachine, Observation
+from ..pose import Pose, middle_pose
+
+FEWEST = 3  # observations with a pose at each stop; more are made until a majority of them agrees
+MOST = 8  # observations at each stop; if fewer than FEWEST of them have a pose, the stop has no reading
+AGREE = 5.0  # observations agree if they differ from their median by at most this number of standard deviations
+FINEST = 1e-7  # smallest standard deviation that is assumed, m and rad: the resolution of strut readings is 0.1 µm
+
+
+class MedianObserver:
+    """A machine of which each observation is the median of several; moves are passed on to it."""
+
+    def __init__(self, machine: MeasuredMachine) -> None:
+        self._machine = machine
+
+    def move(self, pose: Pose) -> object:
+        """Move the machine to a pose, as the wrapped machine does."""
+        return self._machine.move(pose)
+
+    def observe(self) -> Observation | None:
+        """Return the median of at least FEWEST observations; None if fewer of MOST observations have a pose."""
+        read, poses = list[Observation](), list[Pose]()
+        for _ in range(MOST):
+            if (o := self._machine.observe()) is None or o.pose is None:
+                continue
+            read.append(o)
+            poses.append(o.pose)
+            middle, off = middle_pose(poses)
+            stated = np.nanmax([np.median([o.uncertainty for o in read], axis=0), np.full(6, FINEST)], axis=0)
+            agree = (np.abs(off) <= AGREE * stated).all(axis=1)
+            if len(read) >= FEWEST and 2 * agree.sum() > len(read):
+                break
+        if len(read) < FEWEST:
+            return None
+        return read[-1]._replace(pose=middle, uncertainty=stated)
