@@ -1,4 +1,4 @@
-"""Tool errors of a virtual machine without and with a model, at points that were not used in the fit."""
+"""Evaluation of a model: tool errors of a virtual machine without and with it, at points not used in the fit."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ INCH = 0.0254
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Error of the tool at points that were not used in the fit, in both directions through each."""
+    """Error of the tool at points that were not used in the fit, each passed in both directions."""
 
     points: int
-    raw: Size  # the error vector as the machine stands, m
-    aligned: Size  # the same after one rotation and one shift of everything
-    rotation: Size  # the rotation minus the common one, rad
+    raw: Size  # error vector, the datum not aligned, m
+    aligned: Size  # error vector minus the shift and rotation common to all points, m
+    rotation: Size  # rotation minus the mean rotation, rad
 
 
 def held_out(
@@ -42,7 +42,7 @@ def held_out(
 ) -> HeldOut:
     """Return the error of the tool at random points of a box (2, 3), m in work, passed in both directions.
 
-    The model receives the `sensed` temperatures and the `loading`.
+    The struts are commanded by `model` (None: nominal lengths) with the `sensed` temperatures and the `loading`.
     """
     rng = np.random.default_rng(seed)
     trial = Trial(truth, random_passes(truth.geometry, box, points, tilt, rng, level))
@@ -55,10 +55,10 @@ def held_out(
 
 @dataclass(frozen=True)
 class PaperMetric:
-    """Mou & King's own metric, without and with a model."""
+    """Metric of Mou & King (1998), the mean absolute displacement error along lines, without and with a model."""
 
-    before: float  # mean absolute displacement error along lines, m
-    after: float
+    before: float  # without a model, m
+    after: float  # with the model, m
     lines: int
     readings: int
 
@@ -73,12 +73,12 @@ def paper_metric(
     sensed: Temperatures | None = None,
     level: np.ndarray | None = None,
 ) -> PaperMetric:
-    """Return the mean absolute displacement error along lines parallel to the grid, without and with a model."""
+    """Return the mean absolute displacement error along `lines` random lines parallel to each axis of the box."""
     rng, level, box = np.random.default_rng(seed), np.eye(3) if level is None else level, np.asarray(box, dtype=float)
     errors: list[list[np.ndarray]] = [[], []]
     for axis in range(3):
         between = np.arange(box[0, axis] + 0.5 * step, box[1, axis], step)
-        along = np.concatenate([box[:1, axis], between, between[::-1]])  # zeroed at the start, there and back
+        along = np.concatenate([box[:1, axis], between, between[::-1]])  # zero point, then forward and backward
         across = list(CROSS_AXES[axis])
         places = np.empty((lines, len(along), 3))
         places[..., axis] = along
@@ -100,14 +100,14 @@ def paper_metric(
 class ModelEvaluation:
     """Tool errors of a virtual machine without and with a model."""
 
-    before: HeldOut  # the tool's error in space without and with the model
-    after: HeldOut
+    before: HeldOut  # error without a model
+    after: HeldOut  # error with the model
     paper: PaperMetric
-    promised: tuple[float, float] | None = None  # predicted interval of the RMS error with the model, datum aligned, m
+    promised: tuple[float, float] | None = None  # 95 % interval of the RMS error `after`, datum aligned, by the fit, m
 
     @property
     def kept(self) -> bool | None:
-        """Whether the error is within the predicted interval; None if there is none."""
+        """Whether the error with the model is within the predicted interval; None if no interval was predicted."""
         return None if self.promised is None else self.promised[0] <= self.after.aligned.rms <= self.promised[1]
 
 
@@ -119,33 +119,34 @@ def evaluate_model(
     repeatability: float = 0.0,
     level: np.ndarray | None = None,
 ) -> ModelEvaluation:
-    """Return the tool errors of a virtual machine without and with a model; `repeatability` acts in space alone."""
+    """Return the tool errors of a virtual machine without and with a model; only HeldOut includes `repeatability`."""
     before, after = (held_out(truth, one, box, 1000, seed, repeatability, level=level) for one in (None, model))
     return ModelEvaluation(before, after, paper_metric(truth, model, box, seed=seed, level=level))
 
 
 def evaluation_text(evaluation: ModelEvaluation) -> str:
-    """Return these errors as text: by the paper's metric along lines, and in space."""
+    """Return an evaluation as text: the metric of Mou & King along lines, and the error at random points."""
     before, after, paper = evaluation.before, evaluation.after, evaluation.paper
     compared = {
         f"metric of Mou & King, mean |displacement error| along {paper.lines} lines": (paper.before, paper.after, "µm"),
         "error vector in space, RMS, datum aligned": (before.aligned.rms, after.aligned.rms, "µm"),
-        "its largest": (before.aligned.largest, after.aligned.largest, "µm"),
+        "error vector in space, largest, datum aligned": (before.aligned.largest, after.aligned.largest, "µm"),
         "error vector in space, RMS, datum not aligned": (before.raw.rms, after.raw.rms, "µm"),
         "rotation, RMS, datum aligned": (before.rotation.rms, after.rotation.rms, "µrad"),
     }
-    lines = [f"On the virtual machine, without → with the model (held out: {after.points} points, both ways):"]
+    lines = [f"On the virtual machine, without → with the model, at {after.points} points in both directions:"]
     for name, (without, left, unit) in compared.items():
         removed = f" ({100.0 * (1.0 - left / without):.1f} % less)" if without > 0.0 else ""
         lines.append(f"  {name}: {without * 1e6:.2f} → {left * 1e6:.2f} {unit}{removed}")
     if evaluation.promised is not None:
         low, high = (f"{end * 1e6:.2f}" for end in evaluation.promised)
-        lines.insert(3, f"  promised by the fit: {low} to {high} µm, {'kept' if evaluation.kept else 'NOT KEPT'}")
+        where = "contains this error" if evaluation.kept else "DOES NOT CONTAIN this error"
+        lines.insert(3, f"  the interval predicted by the fit, {low} to {high} µm (95 %), {where}")
     return "\n".join(lines)
 
 
 def evaluation_json(evaluation: ModelEvaluation) -> dict[str, Any]:
-    """Return the same as plain numbers; SI units are in the keys."""
+    """Return an evaluation as plain numbers for JSON; SI units are in the keys."""
     error = {
         name: {
             "points": one.points,

@@ -1,8 +1,9 @@
-"""Fit a machine model to measurements with scheme ``joint``, and judge the result.
+"""Fit a machine model to measurements with scheme ``joint``, and evaluate the fit.
 
-Readings → linear problem at the nominal machine (courses of temperatures, time constants, the screws' lead) → blocks
-with evidence → Gauss–Newton with these → drift, discrepancy and jackknife → predicted error, doubts and mix-ups → the
-model with its datum held. :class:`ModelFit` is all that is known then; reports, JSON, pictures and files show it.
+Steps: linearise at the nominal machine, with smoothed temperatures, time constants and the screws' lead; select blocks
+by evidence; iterate Gauss–Newton; estimate drift, discrepancy and jackknife; predict the tool error; search for
+mix-ups; hold the model at its datum. :class:`ModelFit` is the result, from which reports, JSON, pictures and files are
+made.
 """
 
 from __future__ import annotations
@@ -61,65 +62,64 @@ from .selection import Decision, select
 from .thermal import ThermalEvidence, TimeConstant, estimate_time_constants, with_courses
 from .trust import FIELDS, TILT, ChiSquare, Residuals, chi_squares, held_by_priors, unexplained, unstated, with_drift
 
-# Readings further than this from the reference temperature, K, need an expansion: 1 µm on half a metre
-WARM = 0.2
-NEGLIGIBLE = 1e-5  # probability of blocks that were left out, whatever they would do to the tool
-MOST_STRUTS = 4  # struts with a negative backlash mean that the directions are swapped
-MOST_LEFT_OUT = 3  # runs left out of a fit that does not converge; more are a bad campaign
+WARM = 0.2  # difference from the reference temperature, K, from which an expansion is needed: 1 µm on half a metre
+NEGLIGIBLE = 1e-5  # probability of the omitted blocks below which they are not averaged over
+MOST_STRUTS = 4  # number of struts with negative backlash from which the directions must be swapped
+MOST_LEFT_OUT = 3  # largest number of runs to leave out of a fit that does not converge
 
 
 class ChannelFit(NamedTuple):
-    """Result for one kind of channel, in its unit."""
+    """Residuals of the readings of one kind of channel."""
 
-    kind: str  # of KINDS
+    kind: str  # one of KINDS
     readings: int
-    stated: float  # standard deviation of a reading, as the file or the default says (root mean square)
-    found: float  # the same as fitted
+    stated: float  # RMS of the readings' standard deviations as the file states them, or the default
+    found: float  # standard deviation of a reading as estimated by the fit
     chi_square: float  # squared residuals over the stated variance, per degree of freedom
-    held_out: float  # RMS error at readings whose line or pose was left out, their noise included
+    held_out: float  # RMS of the readings' differences from a fit without their line or pose; includes their noise
     unit: str  # m or rad
 
 
 class Outlier(NamedTuple):
-    """A reading that disagrees with all others."""
+    """A reading whose residual is too large for noise."""
 
-    source: str  # where it stands
+    source: str  # file and line of the reading
     run: str
     channel: str
     residual: float
-    sigmas: float  # the same in standard deviations
+    sigmas: float  # residual in standard deviations
     unit: str  # m or rad
 
 
 @dataclass(frozen=True)
 class ModelFit:
-    """A model with everything that is known about it."""
+    """The result of a fit of scheme joint: the model, its uncertainty, and warnings about it."""
 
-    model: MachineModel  # the machine as fitted
-    measurements: MeasurementSet  # its readings
+    model: MachineModel  # the machine of `solution`, shifted and turned as a whole so that `held` is fulfilled
+    measurements: MeasurementSet  # the fitted readings
     space: ParameterSpace  # names, blocks and priors of the parameters
     solution: Solution  # parameters, covariance, residuals
-    decisions: tuple[Decision, ...]  # which blocks stay, and why
+    decisions: tuple[Decision, ...]  # evidence of each block, and whether it was kept
     channels: tuple[ChannelFit, ...]  # χ² and held-out error of each kind of channel
-    observability: Observability  # what the data determine
+    observability: Observability  # which parameters the readings determine
     unseen_errors: tuple[UnseenError, ...]  # machine errors that the readings do not show (posterior.MACHINE_ERRORS)
     level: ToolError | None  # expected tool error with this model, for a level tool; None: nothing can be predicted
     tilted: ToolError | None  # the same for a tool tilted by :data:`~.trust.TILT`
-    unexplained: Unexplained  # errors shown by readings that no parameter describes
-    chi_squares: tuple[ChiSquare, ...]  # by kind of channel, of families of lines and of directions
-    chi_squares_of_runs: tuple[ChiSquare, ...]  # the worst first
-    refusals: tuple[str, ...]  # why the model must not be written without force
-    doubts: tuple[str, ...]  # what else is wrong
-    notes: tuple[str, ...]  # for the reader
-    outliers: tuple[Outlier, ...]  # largest first
-    held: HeldDatum  # where the tool is held: the model is the solution's machine, shifted and turned as a whole
-    warming: ThermalEvidence  # evidence on heat
+    unexplained: Unexplained  # errors in the readings that no parameter describes
+    chi_squares: tuple[ChiSquare, ...]  # by kind of channel, for families of lines and directions
+    chi_squares_of_runs: tuple[ChiSquare, ...]  # by run, the largest first
+    refusals: tuple[str, ...]  # reasons not to write the model unless forced
+    doubts: tuple[str, ...]  # reasons to doubt the model, which do not prevent writing it
+    notes: tuple[str, ...]  # further remarks for the report
+    outliers: tuple[Outlier, ...]  # the largest first
+    held: HeldDatum  # the datum pose, and the motions of the whole machine that are held there
+    warming: ThermalEvidence  # estimated effects of temperature and humidity
     lead: ScrewLead | None  # the screws' lead; None if it was not searched for
-    held_out: np.ndarray  # (C,): leave-one-out errors of the cells, over their stated standard deviation
+    held_out: np.ndarray  # (C,): residuals of the cells without their line or pose in the fit, over their stated σ
 
     @property
     def misfit(self) -> str:
-        """Why the model is not to be trusted; empty if it is."""
+        """Reasons not to write the model, as one text; empty if there are none."""
         return "; ".join(self.refusals)
 
     @property
@@ -134,12 +134,12 @@ class ModelFit:
 
     @property
     def parameters(self) -> FittedParameters:
-        """What the fit knows of its parameters: what stands in a file beside the model, and checks go by."""
+        """The parameters with their covariance: the content of the posterior file, which checks use."""
         p = self.solution.posterior
         return FittedParameters(self.space, self.solution.x, self.covariance, p.tolerances, p.noise, self.held)
 
     def under(self, payload: Payload, gravity: Sequence[float] | None = None) -> ToolError | None:
-        """Return the expected tool error with this model where it is told another load, for a level tool."""
+        """Return the expected error of a level tool if this model is used, and informed, with another load."""
         load = load_row(payload) if gravity is None else load_row(payload, gravity)
         covariance = physical_covariance(self.space, self.solution.posterior)
         return expected_error(box_errors(self.space, self.solution.x, load=load), covariance, beyond=self.unexplained)
@@ -151,25 +151,25 @@ def fit_model(
     progress: Callable[[str], object] = lambda text: None,
     datum: Pose | None = None,
 ) -> ModelFit:
-    """Fit structure, struts and field to all readings at once.
+    """Return the fit of structure, struts and field to all readings at once.
 
     Parameters
     ----------
     measurements : MeasurementSet
         Readings of any kind.
     settings : FitSettings, optional
-        What else is known.
+        Blocks, stated values and options.
     progress : callable
-        Told what goes on.
+        Called with a text for each step.
     datum : Pose, optional
-        ``pose_platform_in_base`` at which the model moves the tool by nothing, as far as the readings do not show where
-        the machine stands as a whole; home by default.
+        ``pose_platform_in_base`` at which the model does not move the tool in the directions that the readings do not
+        show; home by default.
 
     Raises
     ------
     CalibrationError
-        A datum that the machine does not reach, too few readings, or such that show nothing, a fit that does not
-        settle, forward and backward swapped; with what would explain the readings better, where something does.
+        If the machine cannot reach the datum, the readings are too few or all zero, the fit does not converge, or
+        forward and backward are swapped. The message lists mix-ups that would explain the readings better.
     """
     datum = measurements.geometry.home if datum is None else datum
     refuse_unreachable(measurements.geometry, datum)
@@ -198,14 +198,16 @@ def _drop_outlier_runs(
     progress: Callable[[str], object],
     datum: Pose,
 ) -> ModelFit:
-    """Return the fit without the most influential runs, left out one by one, until it converges; else the last step,
-    refused."""
+    """Return a fit that converges after up to MOST_LEFT_OUT runs are left out, the most influential first.
+
+    If none converges, return the last step of the fit to all runs, with a refusal.
+    """
     kept, names, error = measurements, list[str](), unsettled
     while len(names) < MOST_LEFT_OUT and len(np.unique(kept.run)) > 1:
         of_cell = kept.run[Estimation(kept, begun.everything.space, alone=False).cells.first]
         worst = int(influence(of_cell, error.solution).argmax())
         names.append(kept.runs[worst].name)
-        progress(f"does not settle: trying without run {names[-1]}, which has the largest influence")
+        progress(f"the fit does not converge: trying without run {names[-1]}, which has the largest influence")
         kept = kept.select(kept.run != worst)
         try:
             fit = _fit(kept, _begin(kept, begun.everything.space.settings, progress), progress, datum)
@@ -214,31 +216,31 @@ def _drop_outlier_runs(
             continue
         except HexapodError:
             break
-        doubt = f"with run {', '.join(names)} the fit does not converge: left out, as it changes the parameters most"
+        doubt = f"left out because the fit does not converge otherwise: run {', run '.join(names)}"
         return replace(fit, doubts=(doubt, *fit.doubts))
-    fit = _fit(measurements, begun, progress, datum, settles=False)
-    problem = f"{unsettled.problem}; the runs that pull most: {', '.join(names)}"
+    fit = _fit(measurements, begun, progress, datum, must_converge=False)
+    problem = f"{unsettled.problem}; the runs with the largest influence: {', '.join(names)}"
     return replace(fit, refusals=(problem, *fit.refusals))
 
 
 def mixed_up(measurements: MeasurementSet, settings: FitSettings) -> list[str]:
-    """Return the mix-ups that would make the readings more probable, by name, the best first; nothing is fitted."""
+    """Return names of mix-ups that would make the readings more probable, the best first, without a full fit."""
     begun = _begin(measurements, settings, lambda text: None)
     decisions = select(begun.everything.space, begun.problem, np.ones(len(KINDS)), lambda text: None)[0]
     return mixups(begun.everything, [d.block for d in decisions if d.kept])
 
 
 class _Begun(NamedTuple):
-    """All parameters in use, the problem at the nominal machine, the screws' lead, and time constants."""
+    """The starting point of a fit."""
 
-    everything: Estimation
-    problem: LinearProblem
+    everything: Estimation  # of all parameters that the settings allow
+    problem: LinearProblem  # linearised at the nominal machine
     lead: ScrewLead | None
     constants: tuple[TimeConstant, ...]
 
 
 def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object]) -> _Begun:
-    """Return the starting point of a fit; the lead is not searched for if no screw wave is fitted or screws differ."""
+    """Return the starting point; search for a screw lead unless no wave is fitted or the screws have several leads."""
     measurements = with_courses(measurements)
     constants = estimate_time_constants(measurements, ParameterSpace(measurements, settings), progress)
     if constants:
@@ -250,7 +252,7 @@ def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callab
     known = everything.space.periods[np.isfinite(everything.space.periods)]
     if not set(settings.blocks) & set(WAVES) or len(np.unique(known)) > 1:
         return _Begun(everything, problem, None, constants)
-    progress("looking for the screws' lead")
+    progress("searching for the screws' lead")
     lead = detect_lead(everything, problem)
     if lead.given is None and lead.used is not None:
         everything = Estimation(measurements, ParameterSpace(measurements, replace(settings, lead=lead.used)))
@@ -263,22 +265,22 @@ def _fit(
     begun: _Begun,
     progress: Callable[[str], object],
     datum: Pose,
-    settles: bool = True,
+    must_converge: bool = True,
 ) -> ModelFit:
-    """Select blocks, fit them, and judge the result."""
+    """Return the fit of the selected blocks with its evaluation; raise NotSettled if it must converge and does not."""
     everything, nominal, lead, constants = begun
     settings = everything.space.settings
-    decisions, possible, estimation, solution = _choose(everything, nominal, progress, settles)
+    decisions, possible, estimation, solution = _choose(everything, nominal, progress, must_converge)
     residuals, space = with_drift(estimation, solution), estimation.space
     solution, posterior = residuals.solution, residuals.solution.posterior
     channels = tuple(_channels(residuals))
     backlash = list(_check_backlash(space, solution))
-    progress("judging the result")
+    progress("evaluating the fit")
     mixed = mixups(everything, [d.block for d in decisions if d.kept], progress)
 
     beyond = unexplained(residuals, settings, _averaged(residuals, everything.space, possible, decisions))
     covariance = physical_covariance(space, posterior)
-    # A field that was measured with a level tool has no information on a tilted one.
+    # A field that was measured with a level tool does not describe the errors of a tilted tool.
     level_only = space.block(FIELDS[0]) is not None and measurements.tilt() < 0.5 * TILT
     boxes = residuals.level, None if level_only else box_errors(space, solution.x, TILT)
     level, tilted = (expected_error(errors, covariance, beyond=beyond) for errors in boxes)
@@ -294,25 +296,24 @@ def _fit(
     widening, widened = beyond.findings()
     refusals, doubts = [far_off], ["" if far_off else doubtful, *widening]
     if solution.change >= SETTLED:
-        moved = f"a parameter still moves by {solution.change:.2g} standard deviations"
-        doubts.append(f"the fit has not settled: after {solution.steps} steps {moved}")
+        moved = f"a parameter still changes by {solution.change:.2g} standard deviations"
+        doubts.append(f"the fit has not converged: after {solution.steps} steps {moved}")
     if level is not None and level.after > level.before:
-        refusals.append("the model is not expected to help: the readings determine too little of this machine")
+        refusals.append("the expected tool error is larger with the model than without: the readings show too little")
     if held_by_priors(residuals):
         many = f"{len(measurements)} readings do not determine the {space.size} parameters"
-        refusals.append(f"{many}: what they say of the tool comes from the priors")
+        refusals.append(f"{many}: the expected tool error comes from the priors")
     loads = measured_loads(stated_load(space.settings), space.geometry, measurements.stations)
     elsewhere = about_other_loads(space, solution.x, covariance, beyond) if loads else ""
     notes = [*measurements.notes, *_about_inputs(measurements, space, lead, loads, elsewhere), *backlash]
     noisy = [f"{c.kind} {c.found / c.stated:.1f} times" for c in channels if c.found > ASSUMED.misfit[0] * c.stated]
     if noisy:
-        problem = (
-            "readings scatter more than stated: something of the machine, or of an instrument, is not in the model"
-        )
-        notes.append(f"{problem} ({', '.join(noisy)}); the expected tool error allows for it")
+        problem = f"readings scatter more than stated ({', '.join(noisy)})"
+        cause = "the model lacks an error of the machine or of an instrument"
+        notes.append(f"{problem}: {cause}; the expected tool error includes it")
     notes += [*widened, unstated(measurements)]
     if level_only:
-        notes.append("a field was needed, and measured with a level tool alone: nothing is promised for a tilted one")
+        notes.append("a field was fitted to readings with a level tool only: no error is predicted for a tilted tool")
 
     kept = ", ".join(block.name for block in space.blocks)
     note = f"scheme joint, {len(measurements)} readings, blocks {kept} (of {len(decisions) + 1} tried)"
@@ -351,14 +352,13 @@ def _fit(
 
 
 Start = tuple[ParameterSpace, np.ndarray, np.ndarray, np.ndarray]
-"""An answer from which a fit with other blocks starts: its space, parameters, tolerances and noise."""
+"""Start of a fit from an earlier solution, perhaps with other blocks: its space, parameters, tolerances and noise."""
 
 
 def _choose(
-    everything: Estimation, problem: LinearProblem, progress: Callable[[str], object], settles: bool
+    everything: Estimation, problem: LinearProblem, progress: Callable[[str], object], must_converge: bool
 ) -> tuple[list[Decision], Posterior, Estimation, Solution]:
-    """Return the decisions on blocks, the posterior with all blocks, and the fit with those kept; if none `settles`,
-    that of the last step."""
+    """Return decisions on blocks, the posterior with all blocks, and the estimation and solution with kept blocks."""
     space, trust = everything.space, np.ones(len(everything.measurements))
 
     def fitted(start: Start) -> tuple[Estimation, Solution]:
@@ -367,20 +367,20 @@ def _choose(
         try:
             return estimation, iterate(estimation, *_carried_over(start, estimation.space), progress)
         except NotSettled as error:
-            if settles:
+            if must_converge:
                 raise
             return estimation, error.solution
 
-    if {"lost motion", "friction"} & {block.name for block in space.blocks}:  # what forces do depends on them
-        for _ in range(2):
+    if {"lost motion", "friction"} & {block.name for block in space.blocks}:
+        for _ in range(2):  # the effect of forces depends on these parameters: linearise near their solution
             first = solve(space, problem, space.start_tolerances(), np.ones(len(KINDS)), ROUNDS)
             problem, _ = everything.linearise(space.physical(first.every(space.size)), trust)
     decisions, possible, kept = select(space, problem, np.ones(len(KINDS)), progress)
     start = space, space.physical(kept.every(space.size)), kept.tolerances, kept.noise
-    if not any(d.kept for d in decisions):  # too few runs to leave one out, or none with information: from the start
+    if not any(d.kept for d in decisions):  # nothing was selected: start from the nominal machine
         start = space, np.zeros(space.size), space.start_tolerances(), np.ones(len(KINDS))
     estimation, solution = fitted(start)
-    if solution.weights.min() < ASSUMED.huber / ASSUMED.outlier:  # it was made with readings that are wrong
+    if solution.weights.min() < ASSUMED.huber / ASSUMED.outlier:  # there are outliers: select again with weights
         start = estimation.space, solution.x, solution.posterior.tolerances, solution.posterior.noise
         x, _, noise = _carried_over(start, space)
         problem, _ = everything.linearise(x, solution.weights)
@@ -392,9 +392,9 @@ def _choose(
 
 
 def _carried_over(start: Start, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a start's parameters, tolerances and noise, arranged for another set of blocks.
+    """Return a start's parameters, tolerances and noise, rearranged for the blocks of `space`.
 
-    Blocks that the start does not have begin with zero parameters and the first guess of their tolerances.
+    A block that the start does not have gets zero parameters and the first guess of its tolerance.
     """
     old, given, sizes, noise = start
     x, tolerances = np.zeros(space.size), space.start_tolerances()
@@ -406,10 +406,10 @@ def _carried_over(start: Start, space: ParameterSpace) -> tuple[np.ndarray, np.n
 
 
 def _averaged(r: Residuals, everything: ParameterSpace, possible: Posterior, decisions: Sequence[Decision]) -> float:
-    """Return the factor on the tool's error by Bayesian model averaging, 1 or more.
+    """Return the factor, at least 1, on the RMS tool error by Bayesian model averaging over the omitted blocks.
 
-    With the probability that one of the blocks left out is present, by their Bayes factors at even prior odds, the
-    tool's error is that with all blocks.
+    The Bayes factors of the omitted blocks, at even prior odds, give the probability that at least one of them is
+    present. The mean square tool error is then that of the posterior with all blocks.
     """
     present = 1.0 - float(np.prod([expit(-d.evidence) for d in decisions if not d.kept]))
     if present < NEGLIGIBLE or not r.expected > 0.0:
@@ -425,13 +425,13 @@ def _averaged(r: Residuals, everything: ParameterSpace, possible: Posterior, dec
 
 
 def unseen_errors(measurements: MeasurementSet, settings: FitSettings) -> tuple[UnseenError, ...]:
-    """Return the machine errors that the readings do not show, for any allowed blocks."""
+    """Return the machine errors that the readings do not show, independent of the blocks that the settings allow."""
     space = ParameterSpace(measurements, replace(settings, blocks=FIELDS))
     return without_trace(Estimation(measurements, space))
 
 
 def _negative_backlash(space: ParameterSpace, posterior: Posterior) -> np.ndarray:
-    """Return the struts whose backlash is clearly below zero: no nut leads its screw."""
+    """Return the indices of struts whose backlash is below zero by more than ASSUMED.surely standard deviations."""
     block = space.block("backlash")
     if block is None:
         return np.zeros(0, dtype=int)
@@ -441,13 +441,13 @@ def _negative_backlash(space: ParameterSpace, posterior: Posterior) -> np.ndarra
 
 
 def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
-    """Return notes on negative backlash; refuse the fit if most struts have it."""
+    """Return notes on struts with negative backlash; raise CalibrationError if MOST_STRUTS or more struts have it."""
     negative, block = _negative_backlash(space, solution.posterior), space.block("backlash")
     values = [] if block is None else [f"{value * 1e6:.2f}" for value in solution.x[block.part]]
     if len(negative) >= MOST_STRUTS:
         problem = f"{SWAPPED}: the struts would have a backlash of {', '.join(values)} µm"
         raise CalibrationError("direction", problem)
-    return [f"strut_{i + 1}: backlash of {values[i]} µm found, taken as none" for i in negative]
+    return [f"strut_{i + 1}: backlash was estimated as {values[i]} µm; the model has 0" for i in negative]
 
 
 def _about_inputs(
@@ -457,9 +457,9 @@ def _about_inputs(
     loads: Sequence[Sequence[float]],
     elsewhere: str,
 ) -> Iterator[str]:
-    """Yield notes on loads, lead, temperatures and humidity, as stated or missing: what the fit made of them.
+    """Yield notes on loads, lead, temperatures and humidity that were stated, or are missing.
 
-    `loads` are those of the readings, `elsewhere` is the error predicted under others.
+    `loads` are the loads of the readings; `elsewhere` is text on the error predicted under other loads.
     """
     if loads:
         rows = np.array(loads)
@@ -467,23 +467,23 @@ def _about_inputs(
         masses = f"a tool of {low:g} kg" if low == high else f"tools of {low:g} to {high:g} kg"
         directions = len(np.unique(rows[:, 4:], axis=0))
         gravity = "one direction of gravity" if directions == 1 else f"{directions} directions of gravity"
-        others = f"; {elsewhere}" if elsewhere else ", for no struts' stiffness is stated (--load)"
-        yield f"read with {masses} and {gravity}: the promise holds for these{others}"
+        others = f"; {elsewhere}" if elsewhere else " alone, because no struts' stiffness is stated (--load)"
+        yield f"read with {masses} and {gravity}: the predicted tool error holds for these loads{others}"
     if lead is not None and lead.given is not None and lead.shown is not None and not lead.agrees:
-        problem = f"the screws' errors repeat every {lead.shown * 1e3:.4g} mm by the readings"
-        yield f"{problem}, not with the given lead of {lead.given * 1e3:.6g} mm: is it right?"
+        problem = f"by the readings, the screws' errors repeat every {lead.shown * 1e3:.4g} mm"
+        yield f"{problem}, not with the given lead of {lead.given * 1e3:.6g} mm: is the given lead right?"
     if lead is not None and lead.used is None:
         problem = "the screws' lead is not known, and the readings do not show it"
-        yield f"{problem}: a periodic error of the screws, if they have one, is not fitted"
+        yield f"{problem}: periodic errors of the screws are not fitted"
     warmth = np.abs(measurements.stations.temperatures - REFERENCE_TEMPERATURE).max()
     if warmth > WARM and space.block("expansion") is None and not space.stated_expansion.any():
-        yield f"read up to {warmth:.1f} K from 20 °C, but no expansion is given: growth is taken for an error"
+        yield f"read up to {warmth:.1f} K from 20 °C, but no expansion is given: growth appears as other errors"
     if space.swells and not np.isfinite(measurements.stations.humidity).all():
-        yield "the struts swell, but not every reading has its humidity (humidity_percent): 50 % is taken there"
+        yield "the struts swell, but some readings have no humidity_percent: 50 % is assumed for them"
 
 
 def _channels(residuals: Residuals) -> Iterator[ChannelFit]:
-    """Yield the residuals of each kind of channel."""
+    """Yield the noise, χ² and held-out error of each kind of channel that was read."""
     m, cells = residuals.estimation.measurements, residuals.estimation.cells
     readings_of_cell = np.bincount(cells.of_reading, minlength=len(cells.kind))
     for k in np.unique(m.kind):
@@ -502,7 +502,7 @@ def _channels(residuals: Residuals) -> Iterator[ChannelFit]:
 
 
 def _outliers(estimation: Estimation, solution: Solution) -> Iterator[Outlier]:
-    """Yield the readings that are too far off to be noise, the worst first."""
+    """Yield readings with residuals above ASSUMED.outlier standard deviations, the largest first."""
     m = estimation.measurements
     sigmas = solution.residuals / (estimation.uncertainty * solution.posterior.noise[m.kind])
     worst = np.argsort(-np.abs(sigmas))

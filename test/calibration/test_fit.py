@@ -472,7 +472,7 @@ def test_a_given_lead_that_disagrees_is_remarked_on():
     fit = fit_model(of_waves(1), replace(HARMONICS, lead=9.0 * MM))
     assert not fit.lead.agrees
     assert fit.model.struts.period == pytest.approx(9.0 * MM)
-    assert any("repeat every 10 mm by the readings, not with the given lead of 9 mm" in note for note in fit.notes)
+    assert any("repeat every 10 mm, not with the given lead of 9 mm" in note for note in fit.notes)
 
 
 def test_harmonics_are_fitted_and_only_those_that_are_there():

@@ -94,7 +94,7 @@ def test_a_stated_stiffness_holds_for_tools_that_no_reading_has_seen() -> None:
     block = told.space.block("compliance")
     assert block is not None
     assert (np.abs(told.model.load.compliance - TRUE.compliance) < 4.0 * told.standard_errors[block.part]).all()
-    said = "the promise holds for these; expected error of a level tool under another stated load: no tool "
+    said = "holds for these loads; expected error of a level tool under another stated load: no tool "
     assert any(said in note for note in told.notes)
     assert any("no struts' stiffness is stated" in note for note in blind.notes)
 

@@ -222,10 +222,10 @@ def test_a_fit_that_does_not_settle_names_the_runs_that_pull(readings, monkeypat
     pull = np.where(readings.run == 3, 50e-6 * along + 20e-6 * along**2, 0.0)  # as from another state of the machine
     pulled = readings.with_values(readings.value + pull)
     fit = fit_model(pulled, FEW)
-    assert fit.doubts[0].startswith(f"with run {name} the fit does not converge: left out")
+    assert fit.doubts[0].startswith(f"left out because the fit does not converge otherwise: run {name}")
     assert 3 not in fit.measurements.run
     always = True
-    assert f"did not settle; the runs that pull most: {name}" in fit_model(pulled, FEW).misfit
+    assert f"did not settle; the runs with the largest influence: {name}" in fit_model(pulled, FEW).misfit
 
 
 def test_influence_is_what_leaving_a_run_out_does(readings):
