@@ -205,5 +205,5 @@ def test_missing_humidity_is_said_and_counts_as_50_percent(geometry: HexapodGeom
     dry = damp(geometry)
     dry = replace(dry, stations=replace(dry.stations, humidity=np.full(len(dry.stations), np.nan)))
     unknown = fit_model(dry, DAMP)
-    assert any("not every reading has its humidity" in note for note in unknown.notes)
+    assert any("some readings have no humidity_percent" in note for note in unknown.notes)
     assert unknown.warming.changes == (("humidity", 0.0, "1"),)
