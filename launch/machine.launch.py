@@ -120,17 +120,6 @@ def _nodes(context: LaunchContext) -> list[Node]:
     return nodes
 
 
-def _check_installed(package: str) -> None:
-    """Raise a RuntimeError if another package's node is missing, before launch has started any node."""
-    try:
-        program = Path(get_package_prefix(package), "lib", package, package)
-    except PackageNotFoundError:
-        program = None
-    if program is None or not os.access(program, os.X_OK):
-        name = f"ros-{os.environ.get('ROS_DISTRO', 'jazzy')}-{package.replace('_', '-')}"
-        raise RuntimeError(f"{package} is not installed, so nothing was started: sudo apt install {name}")
-
-
 def _node(executable: str, given: Callable[[str], str], parameters: list) -> Node:
     """Return the action that starts one node, with the discovery range in the node's environment only."""
     return Node(
@@ -146,8 +135,14 @@ def _node(executable: str, given: Callable[[str], str], parameters: list) -> Nod
 
 
 def _helper(package: str, given: Callable[[str], str], parameters: list, **others: Any) -> Node:
-    """Return the action that starts the node of another package, whose executable has the package's name."""
-    _check_installed(package)
+    """Return the action that starts another package's node; if it is missing, raise before launch starts any node."""
+    try:
+        program = Path(get_package_prefix(package), "lib", package, package)
+    except PackageNotFoundError:
+        program = None
+    if program is None or not os.access(program, os.X_OK):
+        name = f"ros-{os.environ.get('ROS_DISTRO', 'jazzy')}-{package.replace('_', '-')}"
+        raise RuntimeError(f"{package} is not installed, so nothing was started: sudo apt install {name}")
     return Node(
         package=package,
         executable=package,

@@ -131,7 +131,8 @@ class AdapterNode(MachineNode):
         words += ["--samples", str(options["samples"]), *(["--reload"] if options["reload"] else [])]
         words += ["--verify"] if state == VERIFYING else []
         words += ["--namespace", namespace] if namespace != "/" else []
-        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": _with_package()}
+        path = os.pathsep.join(filter(None, [str(PACKAGE_ROOT), os.environ.get("PYTHONPATH")]))
+        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": path}
         if environment.get("ROS_SECURITY_ENABLE", "").lower() == "true":
             environment["ROS_SECURITY_ENCLAVE_OVERRIDE"] = CHILD_ENCLAVE
         self._stopping, self._step = False, ""
@@ -223,11 +224,6 @@ class AdapterNode(MachineNode):
             "running": str(self._process is not None).lower(),
         }
         self._states.publish(self.report("adapt", level, f"{self._state}: {self._text}", values))
-
-
-def _with_package() -> str:
-    """Return a PYTHONPATH with which a process can import this package from any working directory."""
-    return os.pathsep.join([str(PACKAGE_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
 
 
 main = partial(run, AdapterNode, PROGRAM)

@@ -12,7 +12,6 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -296,7 +295,8 @@ class MachineNode(LifecycleNode):
         self.set_hardware_id("")
         self._tickers: dict[str, Alarm] = {}
         self._options = Parameters(self, table, self.check_parameters, self._on_parameters)
-        self.clock = StampClock(self.simulated_time())
+        simulated = bool(self.get_parameter("use_sim_time").value)
+        self.clock = StampClock((lambda: int(self.get_clock().now().nanoseconds)) if simulated else None)
         self._steps_logged = 0
         self.wants_autostart = bool(self._options.get("autostart", True))
 
@@ -321,13 +321,15 @@ class MachineNode(LifecycleNode):
         """Configure the node; after an error, close everything that was opened meanwhile."""
         self._permanent = self._entities()
         try:
-            with self.rolled_back_on_error():
-                self.configure()
-                self.every(CHECK_PERIOD, self._check_state)
+            self.configure()
+            self.every(CHECK_PERIOD, self._check_state)
+            self.configured = True
         except HexapodError as error:
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
-        self.configured = True
+        finally:
+            if not self.configured:
+                self._close_since(self._permanent)
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -371,16 +373,6 @@ class MachineNode(LifecycleNode):
     def _entities(self) -> list[Any]:
         return [*self.timers, *self.subscriptions, *self.services, *self.clients, *self.publishers]
 
-    @contextmanager
-    def rolled_back_on_error(self) -> Iterator[None]:
-        """Close all topics, timers and services that are opened in this block if the block raises."""
-        before = self._entities()
-        try:
-            yield
-        except BaseException:
-            self._close_since(before)
-            raise
-
     def _close_since(self, before: Sequence[Any]) -> None:
         for ticker in self._tickers.values():
             ticker.close()
@@ -412,11 +404,6 @@ class MachineNode(LifecycleNode):
 
     def on_parameters(self, names: set[str]) -> None:
         """Apply the named parameters, which have been set while the node runs."""
-
-    def simulated_time(self) -> Callable[[], int] | None:
-        """Return a function that reads the simulated time, ns; None if the node uses the system's clock."""
-        simulated = bool(self.get_parameter("use_sim_time").value)
-        return (lambda: int(self.get_clock().now().nanoseconds)) if simulated else None
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
         """Return a timer with this period, s, on the monotonic clock: the node's clock may be set back.

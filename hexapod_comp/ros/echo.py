@@ -151,10 +151,7 @@ class EchoedMessage(NamedTuple):
 
 
 class Echo:
-    """A subscription of one topic of any type, with a QoS that all its publishers can serve.
-
-    The constructor waits up to DISCOVERY_TIME for a publisher. `receive` is called with each message.
-    """
+    """A subscription of one topic of any type, with a QoS that all its publishers serve; it waits for a publisher."""
 
     def __init__(
         self, node: Node, spin_once: Callable[[float], None], topic: str, receive: Callable[[EchoedMessage], None]

@@ -173,10 +173,8 @@ def temperature_rules(options: dict[str, Any]) -> tuple[Plausibility, float]:
 
 
 def frame_ids(geometry: HexapodGeometry, options: dict[str, Any]) -> dict[str, str]:
-    """Return the ``frame_id`` of `base`, `work` and each named work frame of a machine, by the frame's name.
-
-    Raises a ParameterError if a named work frame would have the frame_id of `base` or `work`.
-    """
+    """Return the ``frame_id`` of `base`, `work` and each named work frame of a machine, by the frame's name; raise a
+    ParameterError if a named work frame would have the frame_id of `base` or `work`."""
     ids = {BASE: options["base_frame"], WORK: options["work_frame"]}
     for name in geometry.work_frames:
         frame_id = ids.setdefault(name, f"{options['frame_prefix']}{name}")
@@ -211,10 +209,8 @@ class MachineFiles:
         return {**self.sources, "folder": None if folder is None else str(folder)}
 
     def model_place(self) -> tuple[str, str, str | None]:
-        """Return the model file's name, the working directory for relative names, and the folder that it must be in.
-
-        The file is not opened here. If the working directory was deleted, "/" is returned for it.
-        """
+        """Return the model file's name, the working directory for relative names ("/" if it was deleted), and the
+        folder in which the file must be; do not open the file."""
         try:
             place = os.getcwd()
         except FileNotFoundError:

@@ -112,10 +112,8 @@ class Alarm:
 
 
 class LateAnswer:
-    """A service whose callback may return None: its answer is then sent later by `answer`, and the node keeps running.
-
-    Executors of rclpy 7.1 always send the callback's return value. Only one request at a time may be pending.
-    """
+    """A service whose callback may return None and whose answer is then sent later by `answer`, for one request at a
+    time. Executors of rclpy 7.1 always send what the callback returns."""
 
     def __init__(self, service: Service) -> None:
         self.service, self._send, self._header = service, service.send_response, cast(Any, None)
@@ -158,10 +156,7 @@ def lifecycle_state(node: LifecycleNode) -> tuple[int, str]:
 
 
 def end_lifecycle(node: LifecycleNode) -> None:
-    """Destroy a node's lifecycle services, which rclpy 7.1 keeps until the node object is garbage-collected.
-
-    Until then the node would continue to offer services that are never answered.
-    """
+    """Destroy a node's lifecycle services, which rclpy 7.1 would offer, unanswered, until the object is freed."""
     node._state_machine.destroy_when_not_in_use()
 
 
@@ -179,10 +174,8 @@ def full_name(info: Any) -> str:
 
 
 def publishers(node: Node, topic: str) -> tuple[tuple[str, ...], str]:
-    """Return the sorted full names of the nodes that publish a topic, and why they cannot be read ('' if they can).
-
-    Another program may give its node a name of any bytes; rclpy 7.1 then raises an exception.
-    """
+    """Return the sorted full names of the nodes that publish a topic, and why they cannot be read ('' if they can):
+    another program may give its node a name of any bytes, for which rclpy 7.1 raises an exception."""
     try:
         return tuple(sorted({full_name(info) for info in node.get_publishers_info_by_topic(topic)})), ""
     except UnicodeDecodeError as error:

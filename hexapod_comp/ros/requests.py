@@ -37,10 +37,7 @@ LONGEST_REASON = 200  # Longest text of each limit that ends the travel, charact
 
 
 class Requests:
-    """The services of a configured compensator, and the topics that its worker process computes.
-
-    `forget_commands` is the node's method that a reset calls.
-    """
+    """The services of a configured compensator, and the topics that its worker process computes."""
 
     def __init__(self, node: CompensatorState, forget_commands: Callable[[], None]) -> None:
         self._node, self._forget_commands = node, forget_commands
@@ -117,11 +114,8 @@ class Requests:
 
 
 class ToolChoice:
-    """The choice of the tool by the parameter ``tool`` or the topic ``select_tool``, published on ``~/tool``.
-
-    A message on the topic, which is for controllers, sets the parameter. Only one node may publish the topic. The tool
-    can be changed only while the machine stands.
-    """
+    """The choice of the tool, while the machine stands, by the parameter ``tool`` or by a message on ``select_tool``,
+    which sets the parameter. Only one node may publish ``select_tool``. ``~/tool`` publishes the tool in use."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._compensator = node, node.compensator
@@ -150,12 +144,8 @@ class ToolChoice:
             self._publish()
 
     def _on_message(self, data: bytes, sample: Sample) -> None:
-        """Set the parameter `tool` to a message's tool.
-
-        If the choice of the node that commands poses is refused, its next command must be at the struts' present
-        position, since further commands may be meant for the refused tool. A refused choice of any other node has no
-        effect on commands.
-        """
+        """Set the parameter `tool` to a message's tool. After a refusal, commands of the message's sender may be meant
+        for the refused tool, so its next command must be at the struts' present position."""
         node, now = self._node, sample.now
         node.update_publishers()  # to know the present publishers of select_tool and of commands
         try:
@@ -182,10 +172,8 @@ def situation(node: CompensatorState) -> dict[str, Any]:
 
 
 class TravelReports:
-    """Topic ``~/travel``, once a second while there are subscribers, and service ``~/get_travel``.
-
-    They give the tool's travel from the last commanded pose, or before the first command from the last measured pose.
-    """
+    """Topic ``~/travel``, once a second while there are subscribers, and service ``~/get_travel``: the tool's travel
+    from the last commanded pose, or before the first command from the last measured pose."""
 
     def __init__(self, node: CompensatorState, worker: Worker) -> None:
         self._node, self._worker = node, worker
@@ -241,10 +229,8 @@ class TravelReports:
 
 
 class PredictedError:
-    """Topics ``~/predicted_error`` and ``~/predicted_error_aligned``, computed only while there are subscribers.
-
-    They carry the tool's error without compensation at the newest command, predicted by the model, with its covariance.
-    """
+    """Topics ``~/predicted_error`` and ``~/predicted_error_aligned``, computed only while there are subscribers: the
+    tool's error without compensation at the newest command, predicted by the model, with its covariance."""
 
     def __init__(self, node: CompensatorState, worker: Worker) -> None:
         self._node, self._worker = node, worker
@@ -283,10 +269,7 @@ class PredictedError:
 def error_message(
     values: Sequence[float] | np.ndarray, covariance: np.ndarray | None, frame: str, stamp: int
 ) -> PoseWithCovarianceStamped:
-    """Return the tool's error relative to the commanded pose as a message.
-
-    `values` are its displacement, m, and rotation vector, rad, shape (6,). A covariance of None becomes NaN.
-    """
+    """Return a tool error, displacement, m, and rotation vector, rad, shape (6,), as a message; no covariance: NaN."""
     message = PoseWithCovarianceStamped()
     message.header.frame_id, message.header.stamp = frame, stamp_of(stamp)
     position, orientation = message.pose.pose.position, message.pose.pose.orientation

@@ -61,10 +61,9 @@ class Worker:
         within: float | None = None,
         late: str = "",
     ) -> None:
-        """Queue a task (load_model, predict, travel, plan_move) with its arguments and the machine's file texts.
+        """Queue a task (load_model, predict, travel, plan_move); `poll` later calls `done` with its result or `failed`.
 
-        `poll` later calls `done` with the result or `failed` with the error. If the task takes longer than `within`, s,
-        the process is killed, and the error's text is `late`.
+        After `within`, s, the process is killed, and the error's text is `late`. `machine`: texts of its files.
         """
         job = self._thread.submit(self._process.do, task, arguments, machine, within, late)
         self._jobs.append((task, job, done, failed))

@@ -20,7 +20,6 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
-from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
@@ -100,10 +99,8 @@ class Answer:
 
 
 class Bench:
-    """A test bench: nodes under test and a node `witness` on one executor in a private context.
-
-    The witness records all messages of the machine's topics in `seen` and sends the test's messages.
-    """
+    """A test bench: nodes under test on one executor in a private context, with a node `witness`, which records the
+    machine's messages in `seen` and sends those of the test."""
 
     def __init__(
         self, context: Context, capture: pytest.CaptureFixture[str] | None = None, namespace: str = ""
@@ -190,12 +187,18 @@ class Bench:
     # ---- time ----
 
     def until(self, condition: Callable[[], object], what: str = "", timeout: float = 10.0) -> None:
-        spin_until(self.executor, condition, timeout, what)
+        """Handle messages until the condition holds; raise a TimeoutError naming `what` after `timeout`, s."""
+        end = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > end:
+                awaited = what or getattr(condition, "__name__", "condition")
+                raise TimeoutError(f"waited {timeout} s in vain for: {awaited}")
+            self.executor.spin_once(timeout_sec=0.02)
 
     def barrier(self) -> None:
         """Wait until every lifecycle node has handled all messages that were sent to it before."""
         # All events of a process pass through one queue, so a service's answer comes after all earlier messages.
-        for node in filter(_has_lifecycle, self.nodes):
+        for node in (node for node in self.nodes if isinstance(node, LifecycleNode)):
             self.call(GetState, f"{node.get_name()}/get_state")
 
     # ---- services ----
@@ -379,16 +382,3 @@ class Bench:
         self._log += self._capture.readouterr().err if self._capture else ""
         texts = [match[1] for line in self._log.splitlines() if (match := LOG_LINE.fullmatch(line))]
         return [text for text in texts if part in text]
-
-
-def _has_lifecycle(node: Node) -> bool:
-    return isinstance(node, LifecycleNode)
-
-
-def spin_until(executor: Executor, condition: Callable[[], object], timeout: float = 5.0, what: str = "") -> None:
-    end = time.monotonic() + timeout
-    while not condition():
-        if time.monotonic() > end:
-            awaited = what or getattr(condition, "__name__", "condition")
-            raise TimeoutError(f"waited {timeout} s in vain for: {awaited}")
-        executor.spin_once(timeout_sec=0.02)

@@ -8,8 +8,6 @@ from contextlib import suppress
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
-from rclpy.node import Node
-from rclpy.publisher import Publisher
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -55,18 +53,12 @@ def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, stamp
     return MarkerArray(markers=markers)
 
 
-def publish_shells(node: Node, markers: MarkerArray) -> Publisher:
-    """Publish markers once on a latched topic; late subscribers receive them while the returned publisher exists."""
-    publisher = node.create_publisher(MarkerArray, TOPIC, LATCHED_QOS)
-    publisher.publish(markers)
-    return publisher
-
-
 def show_shells(layers: Sequence[Layer], quantity: Quantity, title: str) -> None:
-    """Publish shells from a new node, which runs until Ctrl-C."""
+    """Publish shells once on a latched topic of a new node, which runs until Ctrl-C."""
     with RosSession("workspace_shells") as session:
+        publisher = session.node.create_publisher(MarkerArray, TOPIC, LATCHED_QOS)
         stamp = session.node.get_clock().now().to_msg()
-        publish_shells(session.node, shell_markers(layers, quantity, title, stamp))
+        publisher.publish(shell_markers(layers, quantity, title, stamp))
         with suppress(KeyboardInterrupt):
             while True:
                 session.spin_once(SPIN_PERIOD)
