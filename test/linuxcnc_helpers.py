@@ -1,7 +1,7 @@
-"""Running the real LinuxCNC from a test: as an ordinary user, without a screen, alone on this machine, and to its end.
+"""Running the real LinuxCNC from a test: as an ordinary user, without a screen, one at a time, and to its end.
 
-LinuxCNC refuses root, asks on a terminal, keeps state under fixed shared-memory keys and in one lock file, and
-leaves both behind when it crashes. All of that is dealt with here.
+LinuxCNC refuses root, asks on a terminal, and keeps state under fixed shared-memory keys and in one lock file, which
+remain after a crash. This module handles all of that.
 """
 
 from __future__ import annotations
@@ -35,25 +35,25 @@ OURS = Path(__file__).resolve().parent / "data" / "linuxcnc"
 LOCK = Path("/tmp/linuxcnc.lock")
 
 KEYS = {0x48414C32, 0x48484C34, 0x64, *range(0x3E9, 0x3F3)}
-"""Shared memory of HAL, RTAPI, motion and NML: rtapi.h, hal_priv.h, config.h and linuxcnc.nml of 2.9."""
+"""Keys of shared memory of HAL, RTAPI, motion and NML: rtapi.h, hal_priv.h, config.h and linuxcnc.nml of 2.9."""
 
 ALONE_WITHIN = 120.0
-"""How long another LinuxCNC on this machine is waited for, s."""
+"""Longest wait for the end of another LinuxCNC on this computer, s."""
 
 START_WITHIN, STOP_WITHIN = 180.0, 30.0
-"""For a machine under load, s."""
+"""Longest start and stop on a busy computer, s."""
 
 DELAY = 3
-"""Servo cycles by which the struts follow the commanded axes: motion's cubic interpolation of joints, and the drive.
+"""Servo cycles by which the struts follow the commanded axes, for motion's cubic interpolation and the drive.
 
-Found by comparing both: with it they agree to 0.07 µm at 50 mm/s.
+Found by comparison: with it both agree to 0.07 µm at 50 mm/s.
 """
 
 PR_SET_PDEATHSIG = 1
 
 
 def why_not() -> str | None:
-    """Return why LinuxCNC cannot be run here, or None."""
+    """Return the reason why LinuxCNC cannot run here, or None."""
     if not os.environ.get("LINUXCNC_TESTS"):
         return "not asked for: make test-linuxcnc"
     missing = [name for name in ("linuxcnc", "halsampler", "script", "setpriv") if shutil.which(name) is None]
@@ -70,9 +70,9 @@ def why_not() -> str | None:
 
 
 def as_ordinary_user() -> list[str]:
-    """Return the words before a command that run it as an ordinary user who can read interpreter and sources."""
-    # Root becomes nobody. An interpreter or a checkout under /root, say, takes the capability to read everything with
-    # it, which does not make a root of nobody.
+    """Return the prefix of a command that runs it as an ordinary user who can read the interpreter and the sources."""
+    # Root becomes nobody. If interpreter or sources are under /root, the process keeps the capability to read any file,
+    # which does not make it root.
     if os.geteuid() != 0:
         return []
     nobody = pwd.getpwnam("nobody")
@@ -89,7 +89,7 @@ def as_ordinary_user() -> list[str]:
 
 
 def environment(home: Path) -> dict[str, str]:
-    """Return the environment of everything that is started: this test's ROS domain, a home of its own, no screen."""
+    """Return the environment of all started processes: this test's ROS domain, an own home folder, no screen."""
     kept = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "LANG", "LC_ALL", "LD_LIBRARY_PATH")
     return {
         **{name: os.environ[name] for name in kept if name in os.environ},
@@ -104,7 +104,7 @@ def environment(home: Path) -> dict[str, str]:
 
 
 def give(path: Path) -> None:
-    """Give a folder, with everything in it, to the ordinary user."""
+    """Make the ordinary user the owner of a folder and its content."""
     if os.geteuid() == 0:
         nobody = pwd.getpwnam("nobody")
         for entry in (path, *path.rglob("*")):
@@ -112,19 +112,19 @@ def give(path: Path) -> None:
 
 
 def make_folder() -> Path:
-    """Make a folder for one LinuxCNC, with a home in it."""
+    """Make a folder, with a home folder in it, for one LinuxCNC."""
     folder = Path(tempfile.mkdtemp(prefix="hexapod_linuxcnc_", dir="/tmp"))
     home = folder / "home"
     (home / "ros").mkdir(parents=True)
     return folder
 
 
-# ---- alone on this machine ----
+# ---- one at a time ----
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A piece of shared memory."""
+    """A segment of shared memory."""
 
     number: str
     owner: int
@@ -132,13 +132,13 @@ class Segment:
 
 
 def segments() -> list[Segment]:
-    """Return LinuxCNC's shared memory on this machine."""
+    """Return LinuxCNC's segments of shared memory on this computer."""
     rows = [line.split() for line in Path("/proc/sysvipc/shm").read_text().splitlines()[1:]]
     return [Segment(r[1], int(r[7]), int(r[6])) for r in rows if int(r[0]) & 0xFFFFFFFF in KEYS]
 
 
 def clean_up_after_a_crash() -> None:
-    """Remove what a LinuxCNC of our user has left that nobody uses any more."""
+    """Remove unused segments and files that a crashed LinuxCNC of our user has left."""
     end = time.monotonic() + ALONE_WITHIN
     while any(segment.attached for segment in segments()):
         if time.monotonic() > end:
@@ -159,9 +159,9 @@ def clean_up_after_a_crash() -> None:
 
 
 def give_real_time() -> bool:
-    """Give LinuxCNC's realtime threads the priority that LinuxCNC takes on a real-time kernel; return whether it went.
+    """Give LinuxCNC's realtime threads the priority that they have on a realtime kernel; return whether it worked.
 
-    Without it every other process on this machine stops the servo thread now and then. Only root may.
+    Without it other processes stop the servo thread at times. Only root may do this.
     """
     threads = [task for task in Path("/proc").glob("[0-9]*/task/*") if _name(task).startswith("rtapi_app:T#")]
     try:
@@ -175,17 +175,17 @@ def give_real_time() -> bool:
 def _name(task: Path) -> str:
     try:
         return (task / "comm").read_text()
-    except OSError:  # it has ended
+    except OSError:  # the process has ended
         return ""
 
 
 def end_with_parent() -> None:
-    """Ask the system to end this process when the test dies."""
+    """Ask the kernel to end this process when the test's process ends."""
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 class Process:
-    """A process of the ordinary user with its output in a file."""
+    """A process of the ordinary user, with its output in a file."""
 
     def __init__(self, command: Sequence[str], folder: Path, log: str, switch: Sequence[str]) -> None:
         self.log = folder / log
@@ -207,11 +207,11 @@ class Process:
         return self._process.pid
 
     def running(self) -> bool:
-        """Return whether it has not ended."""
+        """Return whether the process is running."""
         return self._process.poll() is None
 
     def end(self, number: signal.Signals = signal.SIGTERM, timeout: float = 10.0) -> int:
-        """Send a signal and wait; kill what does not listen. Return the exit code."""
+        """Send a signal and wait; kill the process if it does not end. Return the exit code."""
         if self.running():
             self._process.send_signal(number)
         try:
@@ -221,12 +221,12 @@ class Process:
             return self._process.wait()
 
     def text(self) -> str:
-        """Return what it has printed."""
+        """Return the output so far."""
         return self.log.read_text(errors="replace")
 
 
 def until(condition: Callable[[], Any], what: str, timeout: float, log: Callable[[], str] = str) -> None:
-    """Wait for a condition."""
+    """Wait until a condition holds."""
     end = time.monotonic() + timeout
     while not condition():
         if time.monotonic() > end:
@@ -235,9 +235,9 @@ def until(condition: Callable[[], Any], what: str, timeout: float, log: Callable
 
 
 class Linuxcnc:
-    """A LinuxCNC with the shipped configuration, steered through console.py.
+    """A LinuxCNC with the shipped configuration, controlled through console.py.
 
-    `changes`: what is replaced in hexapod.inc, text by text; `files`: further files of it, or others in place of them.
+    `changes` replaces texts of hexapod.inc; `files` are additional files of the configuration, or replace its files.
     """
 
     def __init__(self, changes: dict[str, str] | None = None, files: dict[str, str] | None = None) -> None:
@@ -254,7 +254,7 @@ class Linuxcnc:
             self._socket = socket.socket(socket.AF_UNIX)
             self._socket.connect(str(socket_path))
         except (TimeoutError, OSError) as error:
-            said = self.said()  # before its folder goes
+            said = self.said()  # before its folder is deleted
             self.close()
             raise RuntimeError(f"LinuxCNC did not start: {error}\n{said}") from error
         self._lines = self._socket.makefile("rw", encoding="utf-8")
@@ -296,7 +296,7 @@ class Linuxcnc:
 
     def compensator(self, model: str, **parameters: object) -> Process:
         """Start a compensator with a model file and wait until it is ready."""
-        # Started in the middle of a motion, the bridge does not tell it of struts that move: see doc/linuxcnc.md.
+        # During a motion the bridge would not publish the moving struts to it: see doc/linuxcnc.md.
         given = {"model_file": model, "start_without_feedback_after": 0.5, **parameters}
         words = [f"{name}:={value}" for name, value in given.items()]
         options = [word for text in words for word in ("-p", text)]
@@ -308,16 +308,16 @@ class Linuxcnc:
         return process
 
     def halcmd(self, *words: str) -> str:
-        """Run halcmd and return what it prints."""
+        """Run halcmd and return its output."""
         process = self.start_process(["halcmd", *words], f"halcmd_{self._started}.log")
-        # Not through a pipe: what a HAL file loads lives on, and would keep it open.
+        # A pipe would stay open, since processes that a HAL file loads continue to run.
         until(lambda: not process.running(), f"halcmd {' '.join(words)}", START_WITHIN, process.text)
         self._processes.remove(process)
         assert process.end() == 0, process.text()
         return process.text()
 
     def pid_of(self, component: str) -> int:
-        """Return the process that a userspace HAL component belongs to."""
+        """Return the process id of a userspace HAL component."""
         row = re.search(rf"^\s*\d+\s+User\s+{component}\s+(\d+)", self.halcmd("show", "comp"), re.MULTILINE)
         assert row, f"no component {component}"
         return int(row[1])
@@ -330,13 +330,13 @@ class Linuxcnc:
         return str(path)
 
     def said(self) -> str:
-        """Return what LinuxCNC has printed."""
+        """Return LinuxCNC's output so far."""
         return self._process.text()
 
     # ---- the console ----
 
     def ask(self, name: str, *arguments: Any) -> Any:
-        """Have console.py do something."""
+        """Call a function of console.py and return its result."""
         self._lines.write(json.dumps([name, *arguments]) + "\n")
         self._lines.flush()
         line = self._lines.readline()
@@ -347,22 +347,22 @@ class Linuxcnc:
         return answer["ok"]
 
     def get(self, *names: str) -> Any:
-        """Return HAL values: one, or a list."""
+        """Return one HAL value, or a list of values."""
         values = self.ask("get", *names)
         return values[0] if len(names) == 1 else values
 
     def struts(self) -> np.ndarray:
-        """Return the strut lengths at the drives, mm, shape (6,)."""
+        """Return the strut lengths at the drives, mm, (6,)."""
         return np.array(self.get(*(f"strut-{i}-fb" for i in range(6))))
 
     def enable(self, on: bool) -> None:
-        """Switch compensation, and wait until it is in, or out."""
+        """Switch compensation on or off, and wait until the corrections are in force or zero."""
         self.halcmd("sets", "comp-enable", str(int(on)))
         self.until_pin("comp-status", 2 if on else 0)
-        time.sleep(0.05)  # the chain's own ramp may be a few cycles behind
+        time.sleep(0.05)  # the chain's own ramp may be a few cycles late
 
     def until_pin(self, name: str, value: Any, timeout: float = 10.0) -> None:
-        """Wait until a HAL value is something."""
+        """Wait until a HAL value equals `value`."""
         until(lambda: self.get(name) == value, f"{name} = {value}; now {self.get(name)}", timeout, self.said)
 
     @contextmanager
@@ -384,7 +384,7 @@ class Linuxcnc:
         assert self.get("sampler.0.overruns", "sampler.1.overruns") == [0, 0]
 
     def close(self) -> None:
-        """End LinuxCNC and everything else, whatever state it is in; a second time does nothing."""
+        """End LinuxCNC and all started processes in any state; a second call does nothing."""
         if self._closed:
             return
         self._closed = True
@@ -405,7 +405,7 @@ class Linuxcnc:
             shutil.rmtree(self.folder, ignore_errors=True)
 
     def _kill_all(self) -> None:
-        """Kill every process of this LinuxCNC: those with its home in their environment."""
+        """Kill every process whose environment has this LinuxCNC's home folder."""
         mark = f"HOME={self.folder / 'home'}\0".encode()
         for path in Path("/proc").glob("[0-9]*/environ"):
             try:
@@ -424,14 +424,14 @@ class Linuxcnc:
 
 
 class Record:
-    """What the realtime sampler has seen in each servo cycle; lengths in mm, angles in degrees."""
+    """The record of the realtime sampler in each servo cycle; lengths in mm, angles in degrees."""
 
     def fill(self, rows: np.ndarray, side: np.ndarray) -> None:
-        """Take the columns of recorder.hal; of `side` too, whose cycle comes first, then six following errors."""
+        """Set the columns of recorder.hal, and those of `side`: its cycle number, then six following errors."""
         self.side, delayed = side, np.maximum(np.arange(len(rows)) - DELAY, 0)
-        self.axes = rows[delayed, 1:7]  # X, Y, Z, A, B, C that LinuxCNC means the tool to be at
+        self.axes = rows[delayed, 1:7]  # X, Y, Z, A, B, C of the tool by LinuxCNC
         self.struts, self.corrections = rows[:, 7:13], rows[:, 13:19]  # lengths at the drives; corrections in force
-        self.alive, self.status = rows[:, 19] > 0.5, rows[:, 20]  # the bridge's heart beats; its pin `status`
+        self.alive, self.status = rows[:, 19] > 0.5, rows[:, 20]  # heartbeat changes; its pin `status`
         self.following_error = float(np.abs(side[:, 1:7]).max())
         assert (np.diff(rows[:, 0]) == 1.0).all(), "cycles are missing"
-        self.largest_step = float(np.abs(np.diff(self.corrections, axis=0)).max())  # from one servo cycle to the next
+        self.largest_step = float(np.abs(np.diff(self.corrections, axis=0)).max())  # between servo cycles

@@ -1,11 +1,11 @@
-"""The compensator in the loop of a real controller: LinuxCNC 2.9 with the shipped configuration, no mock.
+"""The compensator in the loop of a real controller: LinuxCNC 2.9 with the shipped configuration, without stand-ins.
 
-LinuxCNC plans, runs genhexkins and the safety chain at 1 kHz, and moves simulated drives; a bridge and a compensator
-run beside it as processes of their own. Behind the drives stands a hidden machine whose joints are off by up to
-±100 µm. What it does with the drives' lengths, recorded in every servo cycle by LinuxCNC's own sampler, is worked out
-afterwards with RealMachine: the truth is known, and nothing of the loop takes part in judging it.
+LinuxCNC plans, runs genhexkins and the safety chain at 1 kHz, and moves simulated drives. A bridge and a compensator
+run beside it as processes. The drives move a hidden machine whose joints are wrong by up to ±100 µm. LinuxCNC's sampler
+records the drives' lengths in every servo cycle, and RealMachine computes the true tool poses from them afterwards,
+independently of the loop.
 
-The compensator's model is not the truth: it is fitted to virtual readings of that machine by measure and fit.
+The compensator's model is not the truth: it is fitted to virtual readings of that machine by ``simulate`` and ``fit``.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ pytestmark = [pytest.mark.skipif(bool(why_not()), reason=f"LinuxCNC: {why_not()}
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 
-# Lasers see everything but where the machine stands as a whole; the tracker's poses see that
+# Lasers do not show where the machine stands as a whole; the tracker's poses do
 CAMPAIGN = """format: hexapod_comp/campaign
 version: 1
 box_mm: [[-203.2, -203.2, 350], [203.2, 203.2, 553.2]]
@@ -55,20 +55,20 @@ G1 X-20 Y20 Z390 A-5 B6 C-3
 M2
 """
 
-RAMP = 1e-3  # configured ramp of the corrections, mm per servo cycle of 1 ms: 1 mm/s
-DIGITS = 1.1e-6  # two readings of halsampler, mm: it prints six digits behind the point
-LATE = 500  # servo cycles, ms, that a process may be kept waiting by a machine that does much else
-EVERY = 5  # every so many cycles of a record are judged: neighbours are micrometres apart
+RAMP = 1e-3  # mm per servo cycle of 1 ms: the configured ramp of 1 mm/s
+DIGITS = 1.1e-6  # mm; difference of two readings of halsampler, which prints six decimals
+LATE = 500  # servo cycles of 1 ms for which a process may have to wait on a busy computer
+EVERY = 5  # only every fifth cycle of a record is evaluated: neighbours are micrometres apart
 
 
 def uniform(rng: np.random.Generator, *shape: int) -> np.ndarray:
-    """Return deviations of up to ±100 µm, m."""
+    """Return random deviations of up to ±100 µm, m."""
     return rng.uniform(-100e-6, 100e-6, shape)
 
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A hidden machine and a model fitted to readings of it."""
+    """A hidden machine, and the model fitted to readings of it."""
 
     truth: RealMachine
     model_text: str
@@ -77,7 +77,7 @@ class Calibrated:
 
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
-    """Measure a machine that is off by ±100 µm in every joint coordinate, and fit a model to the readings."""
+    """Return a machine with ±100 µm on every joint coordinate, measured, and the model fitted to the readings."""
     folder = tmp_path_factory.mktemp("calibrated")
     files = {n: str(folder / n) for n in ("truth.yaml", "campaign.yaml", "measured.csv", "model.yaml")}
     rng = np.random.default_rng(5)
@@ -90,7 +90,7 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
     Path(files["campaign.yaml"]).write_text(CAMPAIGN)
     options = ["--truth", files["truth.yaml"], "--campaign", files["campaign.yaml"], "--seed", "5"]
     assert cli.main(["simulate", *options, "--out", files["measured.csv"]]) == 0
-    fitted = ["--blocks", "structure", "--tracker-frame", "known"]  # the virtual tracker stands in the work frame
+    fitted = ["--blocks", "structure", "--tracker-frame", "known"]  # the virtual tracker's frame is the work frame
     assert cli.main(["fit", files["measured.csv"], *fitted, "--out", files["model.yaml"]]) == 0
     truth = RealMachine(load_geometry(CONFIG / "paper.yaml"), model)
     return Calibrated(truth, Path(files["model.yaml"]).read_text(), files["model.yaml"])
@@ -98,7 +98,7 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
 
 @pytest.fixture(scope="module")
 def controller(calibrated: Calibrated) -> Iterator[Linuxcnc]:
-    """Give a LinuxCNC that is on and homed, with a compensator; compensation is off."""
+    """Provide a LinuxCNC that is on and homed, with a compensator whose compensation is off."""
     with Linuxcnc({"ENABLE = 1": "ENABLE = 0"}) as linuxcnc:
         linuxcnc.compensator(linuxcnc.give_file("model.yaml", calibrated.model_text))
         linuxcnc.ask("on")
@@ -107,7 +107,7 @@ def controller(calibrated: Calibrated) -> Iterator[Linuxcnc]:
 
 
 def run_program(linuxcnc: Linuxcnc, text: str = PROGRAM) -> Record:
-    """Go to the program's start, run it, and return the record of it."""
+    """Move to the program's start, run it, and return its record."""
     linuxcnc.ask("mdi", "G0 X0 Y0 Z400 A0 B0 C0")
     path = linuxcnc.give_file("part.ngc", text)
     with linuxcnc.recording() as record:
@@ -117,21 +117,21 @@ def run_program(linuxcnc: Linuxcnc, text: str = PROGRAM) -> Record:
 
 
 def tool_errors(truth: RealMachine, record: Record, tool_length: float = 0.0) -> np.ndarray:
-    """Return true minus commanded tool positions along a record, m, shape (N, 3)."""
-    # The machine has neither backlash nor field: directions of motion do not matter.
+    """Return true minus commanded tool positions over a record, m, (N, 3)."""
+    # Directions of motion do not matter: the machine has neither backlash nor field.
     up = np.array([0.0, 0.0, tool_length])
     guess, sense, errors = truth.geometry.home, MotionState().sense, []
     for axes, struts in zip(record.axes[::EVERY], record.struts[::EVERY], strict=True):
         guess, _ = truth.pose_for(struts * 1e-3, sense, guess)
-        tip = guess.position - guess.rotation @ up  # the paper's tool frame is its platform's, base is work
+        tip = guess.position - guess.rotation @ up  # in the paper's geometry
         errors.append(tip - (axes[:3] * 1e-3 - up))
     return np.array(errors)
 
 
 def in_force(truth: RealMachine, record: Record, tool_length: float = 0.0) -> np.ndarray:
-    """Return the tool errors of a record while the corrections were in force, m, shape (N, 3)."""
-    # On a machine under load processes stand still for longer than the bridge's timeout now and then; the corrections
-    # then ramp out and in again, as they must. That is another test's matter.
+    """Return the tool errors of those cycles of a record in which the corrections were in force, m, (N, 3)."""
+    # On a busy computer a process may wait for longer than the bridge's timeout; the corrections then ramp out and in
+    # again, as another test checks.
     errors = tool_errors(truth, record, tool_length)
     there = settled(record, 2)[::EVERY]
     print(f"\ncorrections in force for {100 * there.mean():.0f} % of the time")
@@ -140,19 +140,19 @@ def in_force(truth: RealMachine, record: Record, tool_length: float = 0.0) -> np
 
 
 def settled(record: Record, status: int) -> np.ndarray:
-    """Return in which cycles a living bridge has had a status for 0.3 s, and keeps it for 0.3 s, bool, shape (N,)."""
-    # The status of a bridge that is dead, or kept waiting, is an old one.
+    """Return the cycles, bool, (N,), in which a living bridge has had a status for 0.3 s and keeps it for 0.3 s."""
+    # A bridge that is dead or waiting for a processor shows an old status.
     there = (record.status == status) & record.alive
     return np.ones(len(there), bool) if there.all() else distance_transform_edt(there) > 300.0
 
 
 def rms(errors: np.ndarray) -> float:
-    """Return the root mean square of vectors' lengths."""
+    """Return the root mean square of the vectors' lengths."""
     return float(np.sqrt((errors**2).sum(axis=1).mean()))
 
 
 def assert_undisturbed(linuxcnc: Linuxcnc, record: Record) -> None:
-    """Nothing stopped, nothing stepped."""
+    """Check that LinuxCNC did not stop, and that no correction changed faster than the ramp."""
     assert linuxcnc.ask("errors") == []
     assert record.following_error < linuxcnc.get("joint.0.f-error-lim")
     assert (record.side[:, -1] == 1.0).all(), "LinuxCNC was off, or not homed, for a while"
@@ -160,13 +160,13 @@ def assert_undisturbed(linuxcnc: Linuxcnc, record: Record) -> None:
 
 
 def table_1() -> list[list[float]]:
-    """Return α, β, γ, degrees, x, y, z, mm, of Table 1's rows."""
+    """Return α, β, γ, degrees, and x, y, z, mm, of Table 1's rows."""
     with (CONFIG / "table1.csv").open(newline="") as file:
         return [[float(word) for word in row[1:]] for row in list(csv.reader(file))[1:]]
 
 
 def test_a_fitted_model_takes_the_error_away(controller: Linuxcnc, calibrated: Calibrated) -> None:
-    """Bar: at least 95 % of the tool's RMS error over a circle and tilted moves."""
+    """A fitted model removes at least 95 % of the tool's RMS error over a circle and tilted moves."""
     controller.enable(False)
     without = run_program(controller)
     controller.enable(True)
@@ -181,7 +181,7 @@ def test_a_fitted_model_takes_the_error_away(controller: Linuxcnc, calibrated: C
 
 
 def test_a_killed_compensator(controller: Linuxcnc, calibrated: Calibrated) -> None:
-    """kill -9 in the middle of a circle: the correction ramps out, LinuxCNC goes on; a new one ramps in."""
+    """After kill -9 in a circle the correction ramps out and LinuxCNC continues; a new compensator ramps it in."""
     controller.enable(True)
     slow = PROGRAM.replace("F1500", "F900").split("G1 X20")[0] + "M2\n"
     controller.ask("mdi", "G0 X60 Y0 Z400 A0 B0 C0")
@@ -204,12 +204,12 @@ def test_a_killed_compensator(controller: Linuxcnc, calibrated: Calibrated) -> N
 
 
 def assert_ramped_out_and_in(record: Record) -> None:
-    """Corrections went to zero along the ramp, neither faster nor much slower than configured, and came back."""
+    """Check that corrections ramped to zero at the configured rate, and came back."""
     largest = np.abs(record.corrections).max(axis=1)
     zero = np.flatnonzero(largest == 0.0)
     assert len(zero), "the corrections never got to zero"
     height = largest[max(zero[0] - 1000, 0) : zero[0]].max()
-    start = np.flatnonzero(largest[: zero[0]] > height - 0.002)[-1]  # a moving tool's correction changes a little
+    start = np.flatnonzero(largest[: zero[0]] > height - 0.002)[-1]  # a moving tool changes the correction a little
     took, needed = zero[0] - start, (height - 0.002) / RAMP
     print(f"\ncorrections of up to {height * 1e3:.0f} µm went to zero in {took} ms")
     assert needed - 1.0 <= took <= needed + LATE
@@ -217,7 +217,7 @@ def assert_ramped_out_and_in(record: Record) -> None:
 
 
 def test_a_killed_bridge(controller: Linuxcnc) -> None:
-    """kill -9 of the bridge in the middle of a circle: the realtime chain ramps out; bridge.hal brings it back."""
+    """After kill -9 of the bridge in a circle the realtime chain ramps out; bridge.hal starts a new bridge."""
     controller.enable(True)
     slow = PROGRAM.replace("F1500", "F900").split("G1 X20")[0] + "M2\n"
     controller.ask("mdi", "G0 X60 Y0 Z400 A0 B0 C0")
@@ -233,13 +233,13 @@ def test_a_killed_bridge(controller: Linuxcnc) -> None:
         controller.until_pin("comp-missing", False)
         time.sleep(1.0)
         controller.ask("finish")
-    # The new component's status pin is not the old one's: only the first columns are continuous.
+    # The new component has a status pin of its own, so only the first columns continue.
     assert_undisturbed(controller, record)
     assert_ramped_out_and_in(record)
 
 
 def test_tool_length(controller: Linuxcnc, calibrated: Calibrated) -> None:
-    """A tool 50 mm longer: the tip, not the geometry file's tool frame, goes where G-code says, tilted too."""
+    """With a tool 50 mm longer, its tip (not the geometry file's tool frame) follows G-code, also when tilted."""
     program = """G21 G90 G94 T2 M6 G43
 G1 X0 Y0 Z400 A0 B0 C0 F1500
 G1 X20 Y-30 Z370 A6 B-5 C4
@@ -260,7 +260,7 @@ M2
 
 
 def test_the_exported_model_agrees(controller: Linuxcnc, calibrated: Calibrated, tmp_path: Path) -> None:
-    """The same model without a bridge: real joints in genhexkins, the rest in .comp files, the same program."""
+    """The exported model, without a bridge, gives the same motion: real joints in genhexkins, trims in .comp files."""
     controller.enable(True)
     live, live_rests = run_program(controller), rests(controller)
     controller.close()
@@ -277,14 +277,14 @@ def test_the_exported_model_agrees(controller: Linuxcnc, calibrated: Calibrated,
     print(f"\nlive {left[0]:.2f} µm, static {left[1]:.2f} µm RMS; struts at rest {apart:.3f} µm apart")
     assert np.ptp(static.corrections) == 0.0
     assert abs(left[0] - left[1]) < 0.5
-    assert apart < 0.1  # the model is structure only: both are exact, but for LinuxCNC's single-precision tables
+    assert apart < 0.1  # the model has structure only: both are exact up to LinuxCNC's single-precision tables
 
 
 def rests(linuxcnc: Linuxcnc) -> np.ndarray:
-    """Return the drives' lengths at rest at poses of Table 1, mm, shape (10, 6)."""
+    """Return the drives' lengths at rest at poses of Table 1, mm, (10, 6)."""
     found = []
     for alpha, beta, gamma, x, y, z in table_1():
         linuxcnc.ask("mdi", f"G0 X{x} Y{y} Z{z} A{alpha} B{beta} C{gamma}")
-        time.sleep(0.2)  # the loop has answered, the ramp is through
+        time.sleep(0.2)  # the loop has answered and the ramp has ended
         found.append(linuxcnc.struts())
     return np.array(found)

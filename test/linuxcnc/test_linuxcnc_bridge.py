@@ -1,9 +1,9 @@
 """The LinuxCNC bridge and its guard, with a stand-in for LinuxCNC's ``hal`` module and a real compensator.
 
-The stand-in does what the component API of ``hal`` does: typed pins, an error for a name taken twice. What the
-real one does is tested with LinuxCNC itself. Poses are compared with SciPy's rotations, struts with a closed form of
-the paper's machine, pins with what the compensator is seen to publish; the configuration with the geometry file and the
-paper's Table 2; machines that are off as a whole, whose tool error is known without kinematics.
+The stand-in has typed pins, and refuses a name that is taken, like ``hal``; test_linuxcnc.py uses the real module. The
+truth is SciPy's rotations for poses, a closed form of the paper's machine for struts, the compensator's topics for
+pins, the geometry file and the paper's Table 2 for the configuration, and rigidly moved machines, whose tool error is
+known.
 """
 
 from __future__ import annotations
@@ -43,19 +43,19 @@ from hexapod_comp.ros.process import autostart
 
 NODE = "linuxcnc_bridge"
 
-RATE = 250.0  # cycles per second, Hz: a test shares one Python with the compensator and the witness
+RATE = 250.0  # Hz; all share one Python with the compensator and the witness
 
-# A busy machine's test may pause for more than the 0.1 s after which a compensator counts as lost
+# A busy computer may pause a test for longer than the 0.1 s after which a compensator counts as lost
 SLOW = {"rate": RATE, "timeout": 1.0}
 
 
 class Machine:
-    """LinuxCNC's side: where the axes are, and drives that are where they were sent."""
+    """LinuxCNC's side: positions of the axes, and drives that are at their commands."""
 
     def __init__(self, rig: Bench, metres: float = 1e-3, **parameters: object) -> None:
         self.rig, self.hal, self._metres = rig, StandInHal(), metres
         self.node = rig.add(LinuxcncBridgeNode, False, {**SLOW, **parameters}, hal=self.hal)
-        for topic in ("tool_pose_command", "strut_states"):  # the compensator hears no two publishers
+        for topic in ("tool_pose_command", "strut_states"):  # the compensator accepts one publisher only
             rig.remove_publisher(topic)
         self.poses = rig.listen(PoseStamped, "tool_pose_command")
         self.place(HOME)
@@ -67,7 +67,7 @@ class Machine:
         return self
 
     def place(self, pose: Pose, angles: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
-        """Put axes and struts to a pose; `angles` are its A, B, C."""
+        """Set axes and struts to a pose whose A, B, C are `angles`."""
         for name, value in zip("xyz", pose.position, strict=True):
             self.hal[name] = float(value) / self._metres
         for name, value in zip("abc", angles, strict=True):
@@ -76,11 +76,11 @@ class Machine:
             self.hal[f"joint-fb.{n}"] = float(length) / self._metres
 
     def until_status(self, status: GuardStatus) -> None:
-        """Wait until the pin ``status`` shows a status."""
+        """Wait until the pin ``status`` has a value."""
         self.rig.until(lambda: self.hal["status"] == status, f"status {status.name}, not {self.hal['status']}")
 
     def until_sent(self, count: int = 1) -> PoseStamped:
-        """Wait for poses sent from now on and return the last one."""
+        """Wait until poses are published from now on; return the last."""
         seen = len(self.poses)
         self.rig.until(lambda: len(self.poses) >= seen + count, "poses")
         return self.poses[-1]
@@ -88,8 +88,9 @@ class Machine:
 
 @pytest.fixture
 def speak(rig):
-    """Give a function that publishes corrections as a compensator would: stamped now unless told otherwise."""
-    # `speak.steadily` does so at 100 Hz at most, however often it is called.
+    """Provide a function that publishes corrections as a compensator does, with the present stamp by default.
+
+    `speak.steadily` publishes at most 100 times a second."""
     publisher = rig.witness.create_publisher(JointState, "strut_corrections", RELIABLE)
 
     def send(values: list[float], stamp: Any = None, names: tuple[str, ...] = STRUT_NAMES) -> None:
@@ -112,21 +113,21 @@ def stamped(message: JointState | PoseStamped) -> float:
 
 
 def assert_never_steps(hal: StandInHal, metres: float = 1e-3, ramp_rate: float = 1e-3) -> None:
-    """No two values written one after the other differ by more than the ramp allows within one cycle at most."""
+    """Check that consecutive values of each correction differ by at most the ramp over the longest cycle."""
     for n in range(6):
         steps = [abs(b - a) * metres for a, b in pairwise(hal.history(f"correction.{n}"))]
         assert max(steps) <= ramp_rate * LONGEST_STEP + 1e-15
         assert all(map(math.isfinite, hal.history(f"correction.{n}")))
 
 
-# ---- out to ROS ----
+# ---- from LinuxCNC to ROS ----
 
 
 @pytest.mark.parametrize(
     ("units", "metres", "angles"), [("mm", 1e-3, (5.0, -7.0, 30.0)), ("inch", 0.0254, (-170.0, 12.0, 260.0))]
 )
 def test_pose_and_struts_are_sent_in_metres_and_the_axes_as_a_quaternion(rig, units, metres, angles):
-    """R = Rz(C)·Ry(B)·Rx(A), as genhexkins turns; SciPy makes it from the three rotations. Rounding: 1e-15."""
+    """R = Rz(C)·Ry(B)·Rx(A), as in genhexkins; SciPy composes it from three rotations, with 1e-15 of rounding."""
     machine = Machine(rig, metres, units=units)
     for name, value in zip("xyzabc", (10.0, -20.0, 15.0, *angles), strict=True):
         machine.hal[name] = value
@@ -144,7 +145,7 @@ def test_pose_and_struts_are_sent_in_metres_and_the_axes_as_a_quaternion(rig, un
 
 
 def test_struts_that_move_are_told_only_to_a_compensator_that_follows(rig, speak):
-    """One that starts would take their lag for a correction; once they stand, or it speaks, it is told."""
+    """Moving struts are published only once the compensator sends corrections; before, it would correct their lag."""
     machine = Machine(rig)
     hal, states = machine.start().hal, rig.seen["strut_states"]
 
@@ -166,14 +167,14 @@ def test_struts_that_move_are_told_only_to_a_compensator_that_follows(rig, speak
 
     seen = len(states)
     rig.until(told, "struts that move, with a compensator")
-    # Speeds are the change since the last message, over the time between their stamps.
+    # A velocity is the change since the last message, over the difference of the stamps.
     pairs = [(one, other) for one, other in pairwise(states) if other.velocity[0]]
     ratios = [(b.position[0] - a.position[0]) / (b.velocity[0] * (stamped(b) - stamped(a))) for a, b in pairs]
     assert np.median(ratios) == pytest.approx(1.0, abs=0.02)
 
 
 def test_while_the_machine_is_off_only_the_heart_beats(rig, monkeypatch):
-    """Its axes mean nothing before homing. At 100 Hz 50 beats last half a second; the rig's clock goes by 2 ms."""
+    """Axes mean nothing before homing, so nothing but the heartbeat is sent: 50 beats at 100 Hz last 0.5 s."""
     monkeypatch.setattr("hal_stand_in.time", rig.clock)
     machine = Machine(rig, rate=100.0).start(on=False)
     rig.until_status(OK, "machine off", NODE)
@@ -189,7 +190,7 @@ def test_while_the_machine_is_off_only_the_heart_beats(rig, monkeypatch):
 
 @pytest.mark.parametrize("value", [math.nan, 1e308])
 def test_an_axis_that_is_no_number_is_not_sent(rig, value):
-    """The struts still are, diagnostics name the pin, and it goes on when the pin is well again."""
+    """The struts are still published, diagnostics name the pin, and poses follow again when the pin is valid."""
     machine = Machine(rig).start()
     machine.until_sent()
     machine.hal["b"] = value
@@ -204,12 +205,14 @@ def test_an_axis_that_is_no_number_is_not_sent(rig, value):
     assert all(math.isfinite(m.pose.orientation.w) for m in machine.poses)
 
 
-# ---- back from a compensator ----
+# ---- from the compensator to LinuxCNC ----
 
 
 def test_corrections_of_a_real_compensator_arrive_stop_with_it_and_return(rig):
-    """At standstill, ramped in, the pins are what the compensator publishes, in inches. The pin ``stopped``, which
-    holds LinuxCNC's feed, is true until the compensator is received, while it refuses commands or sends nothing."""
+    """At standstill the pins equal the compensator's corrections, in inches.
+
+    The pin ``stopped``, which holds LinuxCNC's feed, is true until the compensator is received, while it refuses
+    commands, and while it sends nothing."""
     machine = Machine(rig, 0.0254, units="inch")
     hal = machine.hal
     rig.until(lambda: hal["heartbeat"], "a cycle")
@@ -243,12 +246,12 @@ def test_corrections_of_a_real_compensator_arrive_stop_with_it_and_return(rig):
     assert hal.corrections.any()
     rig.until(lambda: hal["stopped"] is False, "an active one")
     assert_never_steps(hal, 0.0254)
-    assert rig.set_parameter("compensator", "heartbeat_rate", 0.0).successful  # what is latched stays
+    assert rig.set_parameter("compensator", "heartbeat_rate", 0.0).successful  # the latched message stays
     rig.until(lambda: hal["stopped"] is True, "one that hangs")
 
 
 def test_bad_corrections_are_never_applied(rig, speak):
-    """Not finite, too large, too few, misnamed, or the answer to a command of long ago: counted, named, forgotten."""
+    """Corrections that are not finite, too large, too few, misnamed or too old are counted, named and ignored."""
     machine = Machine(rig).start()
     hal = machine.hal
     bad = [
@@ -261,7 +264,7 @@ def test_bad_corrections_are_never_applied(rig, speak):
         (([1e-6] * 6, rig.stamp(100.0)), "stamp_future"),
     ]
     for count, (arguments, reason) in enumerate(bad, start=1):
-        speak(*arguments)  # those of stamps of their own are five seconds off and more, however long this takes
+        speak(*arguments)  # corrections with other stamps are at least five seconds old, however long the test takes
         rig.until(lambda count=count: hal["rejected"] == count, f"refusal of {reason}")
         rig.until_status(ERROR, f"refusing corrections: {reason}", NODE)
     assert (hal["updates"], hal["age"], hal["status"]) == (0, 1e9, GuardStatus.WAITING)
@@ -272,7 +275,7 @@ def test_bad_corrections_are_never_applied(rig, speak):
 
 
 def test_two_that_correct_are_refused(rig):
-    """Whoever is the second: corrections return to zero, and both are named."""
+    """With a second publisher of corrections they return to zero, and both publishers are named."""
     machine = Machine(rig)
     rig.compensator()
     machine.start().until_status(GuardStatus.COMPENSATING)
@@ -287,7 +290,7 @@ def test_two_that_correct_are_refused(rig):
 
 
 def test_asks_a_compensator_that_refuses_to_start_anew(bench):
-    """Off, moved by hand by 20 mm and on again: more than the compensator lets a command jump (2 mm)."""
+    """After 20 mm of motion while off, commands are refused (limit 2 mm) until the bridge calls reset."""
     machine = Machine(bench)
     bench.compensator()
     machine.start().until_status(GuardStatus.COMPENSATING)
@@ -295,7 +298,7 @@ def test_asks_a_compensator_that_refuses_to_start_anew(bench):
     machine.until_status(GuardStatus.OFF)
     machine.place(near(HOME, (0.0, 0.0, 0.02)))
     machine.hal["machine-on"] = True
-    # As a step, or as struts that are not where they were told to be: whichever message comes first.
+    # refused as a step or as a following error, whichever message comes first
     bench.until(lambda: bench.values().get("refused", "0") != "0", "a refused command")
     bench.until(lambda: machine.hal["resets"] >= 1, "a reset")
     updates = machine.hal["updates"]
@@ -305,7 +308,7 @@ def test_asks_a_compensator_that_refuses_to_start_anew(bench):
     assert_never_steps(machine.hal)
 
 
-# ---- life ----
+# ---- activation, deactivation, end ----
 
 
 def test_pins_are_those_of_the_agreement(rig):
@@ -320,7 +323,7 @@ def test_pins_are_those_of_the_agreement(rig):
 
 
 def until_compensating(machine: Machine, speak: Any) -> None:
-    """Correct all struts by 50 µm until that is in."""
+    """Publish corrections of 50 µm until they are in force."""
 
     def there() -> bool:
         speak.steadily([50e-6] * 6)
@@ -345,7 +348,7 @@ def test_deactivating_ramps_out_and_the_heart_goes_on(rig, speak):
 
 @pytest.mark.parametrize(("ramp_rate", "left"), [(1e-3, 0.0), (10e-6, 0.05)])
 def test_end_ramps_out_what_is_quick(rig, speak, ramp_rate, left):
-    """50 µm: 0.05 s at 1 mm/s; at 10 µm/s they would take 5 s, so they stay (LinuxCNC's watchdog sees to them)."""
+    """At 1 mm/s 50 µm ramp out in 0.05 s; at 10 µm/s it would take 5 s, so they stay, for LinuxCNC's watchdog."""
     machine = Machine(rig, ramp_rate=1e-3, timeout=30.0).start()
     until_compensating(machine, speak)
     assert rig.set_parameter(NODE, "ramp_rate", ramp_rate).successful
@@ -372,7 +375,7 @@ class component:
 
 
 def test_a_signal_ends_the_process_in_order(isolated_ros, tmp_path):
-    """Exit code 0, HAL left: LinuxCNC ends its components by SIGTERM, and ``hal`` would make that an exception."""
+    """SIGTERM, by which LinuxCNC ends its components, ends the process with code 0 and leaves HAL."""
     (tmp_path / "hal.py").write_text(PROCESS_HAL)
     path = os.pathsep.join([str(tmp_path), str(CONFIG.parent), os.environ.get("PYTHONPATH", "")])
     command = [sys.executable, "-m", "hexapod_comp.linuxcnc.bridge"]
@@ -394,7 +397,7 @@ def test_a_signal_ends_the_process_in_order(isolated_ros, tmp_path):
 
 @pytest.fixture
 def packages(tmp_path, monkeypatch):
-    """Give a folder that stands for Debian's packages, and a Python that has no ``hal`` of its own."""
+    """Provide a folder in place of Debian's packages, and a Python without ``hal``."""
     monkeypatch.setattr(hal_component, "DEBIAN_PACKAGES", tmp_path)
     for name in ("hal", "_hal"):
         monkeypatch.delitem(sys.modules, name, raising=False)
@@ -423,7 +426,7 @@ def test_why_the_module_does_not_load(packages, files, problem):
 
 
 def test_found_in_debians_folder_without_leaving_a_trace(packages):
-    """Neither the folder on the path, where an old NumPy lies, nor hal's own handling of SIGTERM."""
+    """Afterwards the folder, which has an old NumPy, is not on the path, nor does hal's SIGTERM handler stay."""
     (packages / "hal.py").write_text("import signal\nsignal.signal(signal.SIGTERM, signal.default_int_handler)\n")
     path, handler = list(sys.path), signal.getsignal(signal.SIGTERM)
     assert load_module().__file__ == str(packages / "hal.py")
@@ -458,8 +461,8 @@ EVENT = st.tuples(
 @given(st.lists(EVENT, max_size=60), st.sampled_from(["zero", "hold"]), st.floats(1e-6, 1.0))
 @example([(0.1, [0.0] * 5 + [math.nan], True)], "zero", 1e-3)
 def test_never_too_fast_too_far_or_not_a_number(events, on_loss, ramp_rate):
-    """Any corrections at any times, with the clock standing, jumping, going back, or not being one; what is refused
-    changes nothing: not even the age, so that a compensator that sends nonsense counts as lost."""
+    """Outputs keep limit and ramp for any corrections and any clock. A refused correction changes nothing, not even the
+    age, so a compensator that sends only invalid ones counts as lost."""
     subject, now = CorrectionGuard(RULES | {"on_loss": on_loss, "ramp_rate": ramp_rate}), 100.0
     before, updated_at = list(subject.output), -math.inf
     for pause, correction, enabled in events:
@@ -482,12 +485,12 @@ def test_never_too_fast_too_far_or_not_a_number(events, on_loss, ramp_rate):
 
 
 class Loop:
-    """A guard in a loop of 1 kHz whose compensator, while it is alive, asks for the same correction every cycle."""
+    """A guard in a loop of 1 kHz whose compensator, while alive, asks for the same correction in every cycle."""
 
     def __init__(self, on_loss: str = "zero") -> None:
         self.guard, self.now = CorrectionGuard(RULES | {"on_loss": on_loss}), 100.0
         self.alive, self.enabled, self.target = True, True, TARGET
-        self.run(1)  # the first cycle has no time behind it
+        self.run(1)  # the first cycle has no duration
 
     def run(self, cycles: int) -> list[list[float]]:
         """Return the outputs of some cycles."""
@@ -501,11 +504,11 @@ class Loop:
 
 
 def test_corrections_ramp_in_and_out_in_proportion():
-    """100 µm at 1 µm a cycle: 100 cycles there and 100 back, on the way the same share of all six targets."""
+    """100 µm at 1 µm per cycle take 100 cycles in and 100 out; all six targets have the same share at any time."""
     loop = Loop()
     shares = np.arange(1, 101) / 100.0
     np.testing.assert_allclose(loop.run(100), np.outer(shares, TARGET), rtol=1e-9, atol=SLACK)
-    for share, status in ((1.05, GuardStatus.COMPENSATING), (1.5, GuardStatus.RAMPING)):  # one that moves on by 5 µm
+    for share, status in ((1.05, GuardStatus.COMPENSATING), (1.5, GuardStatus.RAMPING)):  # the target moves by 5 µm
         loop.target = [share * value for value in TARGET]
         loop.run(1)
         assert loop.guard.status is status
@@ -523,8 +526,8 @@ def test_corrections_ramp_in_and_out_in_proportion():
 
 @pytest.mark.parametrize(("on_loss", "status"), [("zero", GuardStatus.WAITING), ("hold", GuardStatus.HOLDING)])
 def test_a_compensator_that_is_lost_half_way_and_comes_back(on_loss, status):
-    """Corrections stay at the last target for 0.1 s, then return to zero or stay; another target is reached from there
-    at 1 µm a cycle."""
+    """Corrections stay at the last target for 0.1 s, then return to zero or stay; a new target is approached from there
+    at 1 µm per cycle."""
     loop = Loop(on_loss)
     silent = CorrectionGuard(loop.guard._rules)
     silent.update(0.0, True)
@@ -556,7 +559,7 @@ def geometry() -> HexapodGeometry:
 
 @pytest.fixture(scope="module")
 def ini() -> configparser.ConfigParser:
-    parser = configparser.ConfigParser(strict=False)  # HALFILE comes several times
+    parser = configparser.ConfigParser(strict=False)  # the file has several HALFILE
     parser.read(LINUXCNC / "hexapod.inc", encoding="utf-8")
     return parser
 
@@ -565,7 +568,7 @@ def ini() -> configparser.ConfigParser:
 
 
 def test_genhexkins_has_the_nominal_joints(geometry: HexapodGeometry) -> None:
-    """To the picometre that the file's digits give: what is corrected is the difference to nominal lengths."""
+    """Within a picometre, the digits of the file, since corrections are differences to nominal lengths."""
     setp = dict(re.findall(r"^setp genhexkins\.(\S+) (\S+)$", (LINUXCNC / "genhexkins.hal").read_text(), re.MULTILINE))
     assert float(setp.pop("screw-lead")) == 0.0
     for body, joints in (("base", geometry.base_joints), ("platform", geometry.platform_joints)):
@@ -575,7 +578,7 @@ def test_genhexkins_has_the_nominal_joints(geometry: HexapodGeometry) -> None:
 
 
 def test_home_is_the_geometrys_home(geometry: HexapodGeometry, ini: configparser.ConfigParser) -> None:
-    """Home's lengths are Table 2's first row to its last digit, and the geometry's to the nanometre."""
+    """Home's lengths equal Table 2's first row to its last digit, and the geometry's to a nanometre."""
     legs = geometry.home.position + geometry.platform_joints @ geometry.home.rotation.T - geometry.base_joints
     for n in range(6):
         joint = ini[f"JOINT_{n}"]
@@ -589,7 +592,7 @@ def test_home_is_the_geometrys_home(geometry: HexapodGeometry, ini: configparser
 
 
 def test_limits_are_the_geometrys(geometry: HexapodGeometry, ini: configparser.ConfigParser) -> None:
-    """LinuxCNC stops where the compensator would refuse."""
+    """LinuxCNC's limits equal those at which the compensator refuses."""
     for n in range(6):
         joint = ini[f"JOINT_{n}"]
         stroke = [float(joint[key]) * 1e-3 for key in ("MIN_LIMIT", "MAX_LIMIT")]
@@ -599,7 +602,7 @@ def test_limits_are_the_geometrys(geometry: HexapodGeometry, ini: configparser.C
 
 
 def test_bridge_and_realtime_chain_have_the_same_limits(ini: configparser.ConfigParser) -> None:
-    """One in metres, one in millimetres."""
+    """One file has them in metres, the other in millimetres."""
     section = ini["HEXAPOD_COMP"]
     bridge = dict(re.findall(r"-p (\w+):=(\S+)", section["BRIDGE"]))
     assert float(bridge["limit"]) == pytest.approx(float(section["LIMIT"]) * 1e-3)
@@ -610,7 +613,7 @@ def test_bridge_and_realtime_chain_have_the_same_limits(ini: configparser.Config
 
 @pytest.mark.parametrize(("name", "least"), [("hexapod.hal", 20), ("bridge.hal", 2), ("machine.hal", 1)])
 def test_struts_are_wired_alike(name: str, least: int) -> None:
-    """What is said of strut 1 is said of the others: lines that name one number are there with each of the six."""
+    """A line that contains the number of one strut exists for each of the six."""
     number = re.compile(r"(?<=[._-])[0-5](?=[. ]|-[a-z]|$)")
     other = re.compile("#|loadrt|$|.*(comp-missing.in|iocontrol)")
     lines = [line for line in (LINUXCNC / name).read_text().splitlines() if not other.match(line)]
@@ -625,7 +628,7 @@ def test_struts_are_wired_alike(name: str, least: int) -> None:
 
 
 def lengths(geometry: HexapodGeometry, axes: list[float], tool_length: float = 0.0) -> np.ndarray:
-    """Return the strut lengths that genhexkins gives for axes in m and degrees (genhexkins.c), m."""
+    """Return the strut lengths of genhexkins, m, for axes in m and degrees, by its source code."""
     turn = Rotation.from_euler("ZYX", axes[5:2:-1], degrees=True).as_matrix()
     up = np.array([0.0, 0.0, tool_length])
     base, platform = geometry.base_joints + up, geometry.platform_joints + up
@@ -636,7 +639,7 @@ TILTED = [0.02, -0.03, 0.42, 6.0, -5.0, 4.0]
 
 
 def machine_component(geometry: HexapodGeometry, truth: MachineModel, metres: float, tool_length: float) -> StandInHal:
-    """Return the pins after one cycle at a tilted pose, of lengths that genhexkins gives for it."""
+    """Return the pins after one cycle at a tilted pose with the lengths of genhexkins."""
     hal = StandInHal()
     units = {1e-3: "mm", 0.0254: "inch"}[metres]
     component = MachineComponent(RealMachine(geometry, truth), units, "hexapod_machine", hal)
@@ -654,7 +657,7 @@ def machine_component(geometry: HexapodGeometry, truth: MachineModel, metres: fl
 
 @pytest.mark.parametrize("tool_length", [0.0, 0.05])
 def test_a_machine_that_is_off_as_a_whole(geometry: HexapodGeometry, tool_length: float) -> None:
-    """A moved base takes the tool along; a moved platform joint pattern leaves the tool behind, in its own frame."""
+    """A moved base moves the tool with it; moved platform joints move the tool the other way, in its own frame."""
     moved, left = np.array([100e-6, -50e-6, 30e-6]), np.array([20e-6, 40e-6, -60e-6])
     truth = MachineModel("paper", base_deviation=np.tile(moved, (6, 1)), platform_deviation=np.tile(left, (6, 1)))
     hal = machine_component(geometry, truth, 1e-3, tool_length)
@@ -667,7 +670,7 @@ def test_a_machine_that_is_off_as_a_whole(geometry: HexapodGeometry, tool_length
 def test_true_pose_in_inches(geometry: HexapodGeometry) -> None:
     truth = MachineModel("paper", base_deviation=np.tile([0.0, 0.0, 127e-6], (6, 1)))
     hal = machine_component(geometry, truth, 0.0254, 0.0)
-    assert hal["error-z"] == pytest.approx(0.005, abs=1e-7)  # 127 µm
+    assert hal["error-z"] == pytest.approx(0.005, abs=1e-7)  # inches: 127 µm
     wanted = [*np.array(TILTED[:3]) / 0.0254 + [0.0, 0.0, 0.005], *TILTED[3:]]
     np.testing.assert_allclose([hal[f"true-{axis}"] for axis in "xyzabc"], wanted, atol=1e-6)
 
@@ -680,11 +683,11 @@ def test_a_wrong_option_and_a_missing_truth_end_it(capsys: pytest.CaptureFixture
     assert "nowhere.yaml" in capsys.readouterr().err
 
 
-# A dead process's component
+# Components of dead processes
 
 
 def test_only_dead_components_are_found() -> None:
-    """The listing is that of halcmd 2.9; the dead process was one a moment ago."""
+    """The listing has the form of halcmd 2.9; the dead process has just ended."""
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     listing = f"""Loaded HAL Components:

@@ -1,6 +1,6 @@
 """The compensation in LinuxCNC's own servo thread: hexapod_rt, compiled from an export, in the shipped configuration.
 
-Truth and judgement as in test_linuxcnc.py: a hidden machine behind the drives, recorded in every servo cycle.
+As in test_linuxcnc.py, a hidden machine behind the drives is evaluated from records of every servo cycle.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ pytestmark = [
 
 __all__ = ["calibrated"]  # the fixture
 
-# The circle at 6 m/min, 100 mm/s
+# the circle at 6 m/min = 100 mm/s
 FAST = """G21 G90 G94
 G1 X60 Y0 Z400 F6000
 G3 X60 Y0 I-60 J0
@@ -56,7 +56,7 @@ M2
 
 @pytest.fixture(scope="module")
 def controller(calibrated: Calibrated, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Linuxcnc]:
-    """Give a LinuxCNC that is on and homed, with the fitted model in its servo thread; compensation is off."""
+    """Provide a LinuxCNC that is on and homed, with the fitted model in its servo thread and compensation off."""
     folder = tmp_path_factory.mktemp("rt")
     assert cli.main(["export", "--model", calibrated.model_file, "--c", str(folder)]) == 0
     words = ["halcompile", "--install", "hexapod_rt.comp"]
@@ -74,7 +74,7 @@ def controller(calibrated: Calibrated, tmp_path_factory: pytest.TempPathFactory)
 
 @pytest.mark.parametrize("speed", ["slow", "fast"])
 def test_the_error_goes_away_at_every_feed(controller: Linuxcnc, calibrated: Calibrated, speed: str) -> None:
-    """Bar: what the bridge leaves, 0.92 µm, on the circle and the tilted moves; and no worse at 6 m/min."""
+    """The error is at most the bridge's, 0.92 µm, on the circle and the tilted moves, and no larger at 6 m/min."""
     program = {"slow": (), "fast": (FAST,)}[speed]
     controller.enable(False)
     without = run_program(controller, *program)
@@ -90,7 +90,7 @@ def test_the_error_goes_away_at_every_feed(controller: Linuxcnc, calibrated: Cal
 
 
 def test_jogging_tool_change_abort_and_emergency_stop(controller: Linuxcnc, calibrated: Calibrated) -> None:
-    """After each the corrections are those of where the machine stands; never a step, never a following error."""
+    """After each, the corrections are those of the present pose; none steps, and there is no following error."""
     controller.enable(True)
     steps = {
         "jog": lambda: controller.ask("jog", 0, 20.0, 2.0),
@@ -111,7 +111,7 @@ def test_jogging_tool_change_abort_and_emergency_stop(controller: Linuxcnc, cali
 
 
 def assert_where_it_stands(controller: Linuxcnc, calibrated: Calibrated, name: str) -> None:
-    """Corrections at rest are what Python answers for the pose that the nominal lengths have, to halcmd's digits."""
+    """Check that corrections at rest equal Python's for the pose of the nominal lengths, to halcmd's digits."""
     geometry = load_geometry(CONFIG / "paper.yaml")
     corrections = np.array(controller.get(*(f"comp-correction-{n}" for n in range(6))))
     pose = solve_pose(geometry, (controller.struts() - corrections) * 1e-3, geometry.home)

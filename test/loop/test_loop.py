@@ -1,9 +1,9 @@
-"""Compensator and strut drive together: does the tool go where it was told? And what ``run`` and ``demo`` say of it.
+"""Compensator and strut drive together bring the tool to its command. The reports of ``run`` and ``demo``.
 
-The truth is the virtual machine's true tool pose. What may remain when the model is the true one follows
-from the drive alone: every motor stands on a step, so each strut is off by at most half a step δ, and the
-tool by at most Σ|J⁻¹|·δ, row by row. J comes from central differences of closed-form strut lengths, not
-from the package. The reversal bands, ticks and Newton steps add 1e-9 m, which is allowed on top.
+The truth is the virtual machine's true tool pose. With the true model only the drive's error remains: every motor is on
+a step, so each strut is wrong by at most half a step δ, and the tool by at most Σ|J⁻¹|·δ, row by row. J comes from
+central differences of closed-form strut lengths, not from the package. Reversal bands, ticks and Newton steps add 1e-9
+m.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ from hexapod_comp.pose import Pose, rotation_from_angles
 from hexapod_comp.ros.messages import message_pose
 from hexapod_comp.workspace.reach import machine_box
 
-STEP = ENCODER = 0.1e-6  # motor step of a fine drive, the shipped default, and encoder count, m
+STEP = ENCODER = 0.1e-6  # m; motor step of a fine drive (the default) and count of an encoder
 NOISE = 0.05e-6  # standard deviation of an encoder reading, m
-REST = 1e-9  # what neither drive nor encoder explains, m and rad
+REST = 1e-9  # m and rad; tolerance beyond drive and encoder
 RATE, FEED = 250.0, 0.1  # commands per second, Hz, and largest tool speed, m/s
 
 TRUE_MODEL = "paper_machine.yaml"
@@ -51,7 +51,7 @@ TARGETS = [table_poses()[index] for index in (1, 3)]
 
 
 def visit(rig: Rig, geometry: HexapodGeometry, **compensator: object) -> list[Pose]:
-    """Start both nodes, go from home to each target, rest, and return where the tool really stood."""
+    """Start both nodes, move from home to each target, rest, and return the tool's true poses."""
     rig.drive(truth_file=TRUE_MODEL, step=STEP, encoder_resolution=ENCODER, encoder_noise=NOISE, max_acceleration=10.0)
     rig.compensator(feedback_timeout=10.0, **compensator)
     rig.until(lambda: rig.values().get("pose_estimated_from") == "strut_states", "feedback")
@@ -69,15 +69,15 @@ def visit(rig: Rig, geometry: HexapodGeometry, **compensator: object) -> list[Po
 
 
 def tool_bound(pose: Pose, strut_error: float) -> np.ndarray:
-    """Return the largest tool displacement, m and rad, shape (6,), that strut errors up to a bound cause."""
+    """Return the largest tool displacement, m and rad, (6,), for strut errors up to a bound, m."""
     jacobian = central_difference(lambda twist: closed_form_lengths(moved(pose, twist)), np.zeros(6))
     return np.abs(np.linalg.inv(jacobian)).sum(axis=1) * strut_error + REST
 
 
 @pytest.mark.parametrize("enabled", [True, False])
 def test_only_quantisation_stands_between_the_model_and_the_tool(rig: Rig, enabled: bool) -> None:
-    """With the true model the tool is where it was told; without compensation more than 50 times the bound off. The
-    estimate is the truth but for half an encoder count and noise, within 6σ."""
+    """With the true model the tool's error is within the bound; without compensation it is over 50 times the bound. The
+    estimate equals the truth to half an encoder count plus 6σ of noise."""
     geometry = load_geometry(CONFIG / "paper.yaml")
     found = visit(rig, geometry, model_file=TRUE_MODEL, enable_compensation=enabled)
     for target, true in zip(TARGETS, found, strict=True):
@@ -92,7 +92,7 @@ def test_only_quantisation_stands_between_the_model_and_the_tool(rig: Rig, enabl
             assert (np.abs(twist_between(found[-1], message_pose(message))) <= bound).all()
 
 
-# ---- what run says ----
+# ---- the report of run ----
 
 TURNED_WORK = Pose(np.array([0.03, -0.02, 0.35]), rotation_from_angles(np.radians([4.0, -7.0, 90.0])))
 TURNED_TOOL = Pose(np.array([0.01, 0.02, 0.05]), rotation_from_angles(np.radians([10.0, 5.0, -60.0])))
@@ -102,7 +102,7 @@ OFF = np.array([30e-6, -40e-6, 0.0])  # in the work frame: 50 µm
 
 @pytest.fixture
 def result(monkeypatch: pytest.MonkeyPatch) -> SessionResult:
-    """Return what a loop would tell of one pose: it hears and answers in ``base``, the tool ends up 50 µm off."""
+    """Return the result of a session with one pose in ``base``, after which the tool is 50 µm off."""
     told: list[Pose] = []
 
     def run_session(client: object, geometry: object, targets: list[Pose], *rest: object) -> SessionResult:
@@ -126,19 +126,19 @@ def test_json_says_the_frame_and_gives_back_the_users_own_numbers(result: Sessio
     assert content["frame"] == "work"
     (pose,) = content["poses"]
     given = {"x_mm": 12.0, "y_mm": -34.0, "z_mm": 56.0, "alpha_deg": 1.0, "beta_deg": -2.0, "gamma_deg": 3.0}
-    assert pose["commanded"] == pytest.approx(given, abs=1e-9)  # some roundings of 1e-13 mm, a thousandfold
+    assert pose["commanded"] == pytest.approx(given, abs=1e-9)  # a few roundings of 1e-13 mm
     assert pose["estimated"] == pytest.approx(given, abs=1e-9)
     assert pose["true"] == pytest.approx(given | {"x_mm": 12.030, "y_mm": -34.040}, abs=1e-9)
     assert pose["error_with"]["position_um"] == pytest.approx(50.0, abs=1e-6)
 
 
-# The datum: one rigid motion of everything that the tool does.
+# The datum: one rigid motion of all tool poses
 
 DATUM = Pose(np.array([90e-6, -40e-6, 10e-6]), rotation_from_angles(np.array([2e-4, -1e-4, 3e-4])))
 
 
 def shifted(count: int = 8) -> SessionResult:
-    """Return poses that a machine meets but for its datum, with compensation, and without it also 20 µm."""
+    """Return true poses that differ from the targets by a datum; without compensation by 20 µm of noise as well."""
     rng = np.random.default_rng(1)
     targets = [Pose(place, np.eye(3)) for place in rng.uniform(-0.1, 0.1, (count, 3))]
 
@@ -153,20 +153,20 @@ def shifted(count: int = 8) -> SessionResult:
 
 
 def test_a_datum_is_aligned() -> None:
-    """Shifted and turned by 100 µm and 0.4 mrad alone: nothing is left; 20 µm of noise without compensation stay."""
+    """Alignment removes a datum of 100 µm and 0.4 mrad completely; 20 µm of noise without compensation remain."""
     errors = shifted().errors()
     assert list(errors) == [ALIGNED, AS_IT_IS]
     assert rms(errors[AS_IT_IS][1]) == pytest.approx(np.linalg.norm(DATUM.position), rel=0.3)
     before, left = errors[ALIGNED]
     assert left.max() < 1e-12
-    assert rms(before) == pytest.approx(2e-5 * np.sqrt(3.0 - 6.0 / 8.0), rel=0.4)  # six of 24 numbers are the datum's
+    assert rms(before) == pytest.approx(2e-5 * np.sqrt(3.0 - 6.0 / 8.0), rel=0.4)  # the datum takes six of 24 numbers
     table = error_table(errors).splitlines()
     assert len(table) == 3
     assert "datum aligned" in table[1]
 
 
 def test_too_few_poses_are_not_aligned() -> None:
-    """Five poses are fifteen numbers, of which a datum takes six: what is left would flatter."""
+    """Five poses are fifteen numbers, of which a datum takes six: the error left would look too small."""
     few, line = shifted(5), shifted(8)
     for record in line.poses:
         record.target = Pose([record.target.position[0], 0.0, 0.0], np.eye(3))
@@ -187,13 +187,13 @@ def test_a_busy_computer_is_named() -> None:
 
 
 def test_the_picture_of_a_run_needs_no_truth(tmp_path: Path) -> None:
-    """What nobody saw is not drawn, and nothing breaks: an attached machine tells no true pose."""
+    """Without true poses, as of an attached machine, a picture is drawn without them."""
     save(session_figure(SessionResult([PoseRecord(Pose.identity())]), "nothing seen"), tmp_path / "run.png")
     assert (tmp_path / "run.png").stat().st_size > 1_000
 
 
 def test_a_busy_computer_is_named_when_an_answer_does_not_come(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The session ends with an error then, and there is no report."""
+    """If a session ends with an error there is no report, so the error message names the busy computer."""
 
     def run_session(*_: object) -> SessionResult:
         raise NoAnswerError("no answer to a command within 5 s")
@@ -206,23 +206,23 @@ def test_a_busy_computer_is_named_when_an_answer_does_not_come(monkeypatch: pyte
         session.run_poses(paper_geometry(), (), [GIVEN], 100.0, False)
 
 
-# ---- the story of the demonstration ----
+# ---- the demonstration ----
 
 
 def test_the_box_is_about_this_machines_home(tmp_path: Path) -> None:
-    """Or as near to it as the ends of the machine's own largest box allow."""
+    """The box is centred at home, or as near to home as the machine's largest box allows."""
     for machine in machines().values():
         geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
         box = story.demo_place(geometry).box
         home = machine.tips(np.array([machine.home]), np.eye(3)[None])[0]
         largest, middle = machine_box(geometry).box, box.mean(axis=0)
-        low, high = np.abs(box - largest) < 1e-6  # where the boxes end together
+        low, high = np.abs(box - largest) < 1e-6  # faces that both boxes share
         assert (np.isclose(middle, home, atol=1e-9) | (low & (middle > home)) | (high & (middle < home))).all()
         assert ((home >= box[0]) & (home <= box[1])).all()
 
 
 def test_a_tool_that_cannot_be_level_stays_as_at_home() -> None:
-    """A spindle whose frame looks down, in a work frame that looks up: the box's corners are within the limits."""
+    """A tool whose frame points down keeps home's attitude, so that the box's corners are within the limits."""
     paper = load_geometry("paper")
     geometry = replace(paper, tool=Pose([0.0, 0.0, 0.1], rotation_from_angles(np.radians([180.0, 0.0, 0.0]))))
     place = story.demo_place(geometry)
@@ -243,7 +243,7 @@ def test_a_warm_machine_has_struts_longer_by_steels_growth() -> None:
 @long_test
 @pytest.mark.timeout(300)
 def test_the_whole_story_on_a_foreign_machine(tmp_path: Path) -> None:
-    """Turned tool and work frames, every kind of error that ``random`` has."""
+    """The demonstration passes on a machine with turned frames and with every kind of error of ``random``."""
     file = machines()["framed"].write(tmp_path / "machine.yaml")
     words = ["--machine", file, "--truth", "random:5", "--seed", 2, "--pictures", tmp_path / "out"]
     with contextlib.redirect_stdout(io.StringIO()) as out:
@@ -256,6 +256,6 @@ def test_the_whole_story_on_a_foreign_machine(tmp_path: Path) -> None:
     assert max(left[title] for title in titles[1::2]) <= told["promised_m"] <= story.GOAL
     assert left["calibrated"] < 0.1 * left["as built"]
     assert min(left[title] for title in titles[2::2]) > 2.0 * left["calibrated"]
-    for chapter in told["chapters"][1::2]:  # sixteen stops scatter by a tenth, and the drives' steps are 0.1 µm
+    for chapter in told["chapters"][1::2]:  # sixteen stops scatter by 10 %, and the drives' steps are 0.1 µm
         assert chapter["rms_m"] == pytest.approx(left[chapter["title"]], rel=0.4, abs=0.1e-6)
     assert (tmp_path / "out" / "demo.png").stat().st_size > 20_000

@@ -1,4 +1,4 @@
-"""The nodes as operating-system processes: start, the loop between them, every way to end, a log that nobody reads."""
+"""The nodes as processes: their start, the loop between them, every way to end, and a log that is not read."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from hexapod_comp.ros.client import LISTENER_QOS, LoopClient, Sent
 from hexapod_comp.ros.interface import PROGRAM as COMPENSATOR
 from hexapod_comp.ros.process import ENDED_WITHIN
 
-STOP_WITHIN = 2.0  # from the signal to the end of the process, s
+STOP_WITHIN = 2.0  # s; from the signal to the end of the process
 
 
 @pytest.fixture(scope="module")
 def running(isolated_ros) -> Iterator[list[LoopClient | NodeProcess]]:
-    """Give what `pair` has started and no test has ended yet: client, compensator, strut drive."""
+    """Provide what `pair` has started and no test has ended yet: client, compensator, strut drive."""
     made: list[LoopClient | NodeProcess] = []
     yield made
     end(made)
@@ -48,8 +48,8 @@ def end(made: list[LoopClient | NodeProcess]) -> None:
 
 @pytest.fixture
 def pair(running) -> tuple[NodeProcess, NodeProcess]:
-    """Compensator and strut drive, connected with each other and with the client; anew where a test ended one."""
-    # The struts start from where they are measured; at this rate the correction is in with the second command.
+    """Provide connected compensator, strut drive and client, restarted after a test ended one of them."""
+    # The struts start at their measured lengths; at this rate the correction is complete at the second command.
     if not running or any(node.exit_code() is not None for node in running[1:]):
         end(running)
         running.append(LoopClient())
@@ -76,7 +76,7 @@ def answered(entry: Sent) -> bool:
 
 
 def said(client: LoopClient) -> list[str]:
-    """Return the list to which the messages of the compensator's statuses are appended from now on."""
+    """Return the list to which messages of the compensator's statuses are appended from now on."""
     messages: list[str] = []
 
     def listen(array: DiagnosticArray) -> None:
@@ -87,7 +87,7 @@ def said(client: LoopClient) -> list[str]:
 
 
 def assert_ends_well(node: NodeProcess, *signals: signal.Signals) -> None:
-    """Send signals one after the other; the process ends in time, with 0 and without a traceback."""
+    """Send signals in turn; check that the process ends in time with code 0 and without a traceback."""
     began = time.monotonic()
     for number in signals:
         node.send(number)
@@ -99,7 +99,7 @@ def assert_ends_well(node: NodeProcess, *signals: signal.Signals) -> None:
 
 
 def run_both(*arguments: str) -> list[tuple[int, str]]:
-    """Run both nodes at once, as a user would, and return exit code and stderr of each when they have ended."""
+    """Run both nodes at once, as a user would; return exit code and stderr of each after they have ended."""
     modules = [f"hexapod_comp.ros.{name}" for name in ("compensator", "strut_drive")]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     started = [subprocess.Popen([sys.executable, "-m", module, *arguments], **pipes) for module in modules]
@@ -110,11 +110,11 @@ def run_both(*arguments: str) -> list[tuple[int, str]]:
             process.kill()
 
 
-# The first tests leave the nodes running for the next, each of the later ones ends at least one.
+# The first tests leave the nodes running for the next tests; each later test ends at least one node.
 
 
 def test_a_refused_command_is_said_with_its_reason(client, pair):
-    """At once, not when an answer is overdue: half a metre up is beyond the struts."""
+    """The refusal of a command half a metre up is reported at once, not only when an answer is overdue."""
     ask(client, HOME)
     entry = client.send(near(HOME, (0.0, 0.0, 0.5)))
     with pytest.raises(NoAnswerError, match=r"a command was refused: strut_\d: nominal length .* outside the stroke"):
@@ -122,7 +122,7 @@ def test_a_refused_command_is_said_with_its_reason(client, pair):
 
 
 def test_nodes_receive_by_udp_only(client, pair):
-    """A process that is killed in another's shared-memory port stalls it for seconds; nobody opens one here."""
+    """A process killed in another's shared-memory port stalls it for seconds, so no node may open such a port."""
     # Fast DDS keeps each port of its shared-memory transport in /dev/shm/fastrtps_port….
     ask(client, HOME)
     for node in pair:
@@ -132,7 +132,7 @@ def test_nodes_receive_by_udp_only(client, pair):
 
 
 def dropped(pid: int) -> int:
-    """Return how many datagrams found a process's UDP sockets full: the last column of /proc/net/udp."""
+    """Return how many datagrams were dropped at a process's full UDP sockets: the last column of /proc/net/udp."""
     links = [os.readlink(link) for link in Path(f"/proc/{pid}/fd").iterdir() if link.is_symlink()]
     own = {link[len("socket:[") : -1] for link in links if link.startswith("socket:[")}
     rows = [line.split() for line in Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]]
@@ -140,9 +140,9 @@ def dropped(pid: int) -> int:
 
 
 def test_a_command_for_which_a_socket_had_no_room_is_repeated_at_once(client, pair):
-    """A stopped process's socket is full of readings after a second; it goes on when the next command has been lost."""
-    # Fast DDS repeats what was lost when the writer's heartbeat tells of it: by itself every 3 s, when a command would
-    # be too old to be accepted. No later command brings one earlier here.
+    """A stopped process's socket is full of readings and loses a command, which must be repeated at once."""
+    # Fast DDS repeats lost messages after a heartbeat of the writer, by default every 3 s: too late for a command. No
+    # later command brings a heartbeat earlier here.
     compensator, _ = pair
     ask(client, HOME)
     compensator.send(signal.SIGSTOP)
@@ -155,15 +155,15 @@ def test_a_command_for_which_a_socket_had_no_room_is_repeated_at_once(client, pa
 
 
 def test_loop_between_processes(client, pair):
-    """A command comes back as struts near the closed form, the tool goes there, the estimate says so."""
-    # In three commands, so that every strut has a direction of motion: the first alone has none to go by.
+    """A command's answer is near the closed form, the tool moves there, and the estimate agrees."""
+    # Three commands, since at the first no strut has a direction of motion yet
     pose = near(HOME, (0.0005, -0.0003, 0.0008))
     accepted, refused = client.counted()
     for share in (0.2, 0.6, 1.0):
         entry = ask(client, near(HOME, (0.0005 * share, -0.0003 * share, 0.0008 * share)))
     np.testing.assert_allclose(entry.command - entry.correction, closed_form_lengths(pose), rtol=0.0, atol=1e-12)
     client.wait(client.settled(), 5.0, "the tool to rest")
-    # 0.1 µm steps, 0.05 µm noise of the encoders, J⁻¹ below 3: a fraction of a micrometre; uncorrected 100 µm.
+    # 0.1 µm steps, 0.05 µm noise and J⁻¹ below 3 give a fraction of a micrometre; without correction it is 100 µm
     assert np.abs(client.true_pose.position - pose.position).max() < 0.5e-6
     assert np.abs(client.estimate.position - pose.position).max() < 2e-6
     assert client.counted() == (accepted + 3, refused)
@@ -173,7 +173,7 @@ def test_loop_between_processes(client, pair):
 
 
 def test_signals_end_both_with_0(client, pair):
-    """A double SIGINT is what ``ros2 launch`` sends. The last thing said arrives."""
+    """Both nodes end with code 0, also after a double SIGINT as from ``ros2 launch``; the last status is received."""
     ask(client, HOME)
     states = said(client)
     client.wait(lambda: bool(states), 5.0, "a status")
@@ -183,7 +183,7 @@ def test_signals_end_both_with_0(client, pair):
 
 
 def test_compensator_survives_the_end_of_the_drive(client, pair):
-    """kill -9 leaves no good-bye: the compensator goes on, says so, takes a new drive, and ends when told."""
+    """After kill -9 of the drive the compensator continues, reports it, accepts a new drive, and ends on a signal."""
     compensator, drive = pair
     states = said(client)
 
@@ -199,16 +199,17 @@ def test_compensator_survives_the_end_of_the_drive(client, pair):
     try:
         client.wait(lambda: goes_on("running"), 20.0, "the new drive to be heard")
         again.send(signal.SIGKILL)
-        assert_ends_well(compensator, signal.SIGINT)  # without waiting for the dead to acknowledge
+        assert_ends_well(compensator, signal.SIGINT)  # without waiting for acknowledgements of the dead process
     finally:
         again.stop()
 
 
 def test_a_compensator_restarted_under_a_stream_waits_for_the_struts(client, pair):
-    """kill -9, and the controller streams on by 120 mm: the successor never commands more than a step from the struts.
+    """A restarted compensator never commands more than a step of 2 mm from the struts, while commands move on by 120
+    mm.
 
-    It hears the controller before it hears the drive: by itself now and then, here always, since the drive is stopped
-    until its first answer or refusal. The step allowed is 2 mm.
+    It must receive commands before readings. This happens by chance at times; here the drive is stopped until the first
+    answer or refusal.
     """
     compensator, drive = pair
     published, came = [], []
@@ -218,7 +219,7 @@ def test_a_compensator_restarted_under_a_stream_waits_for_the_struts(client, pai
         came.append(time.monotonic())
 
     client.node.create_subscription(JointState, "strut_commands", listen, LISTENER_QOS)
-    heights = iter(np.clip(np.arange(0.0, 60.0, 4e-4), 0.0, 0.12))  # 100 mm/s at 250 Hz; then it stays up there
+    heights = iter(np.clip(np.arange(0.0, 60.0, 4e-4), 0.0, 0.12))  # 100 mm/s at 250 Hz, then constant
 
     def higher() -> Pose:
         return near(HOME, (0.0, 0.0, next(heights)))
@@ -232,7 +233,7 @@ def test_a_compensator_restarted_under_a_stream_waits_for_the_struts(client, pai
 
     stream(lambda: len(published) > 50)
     compensator.send(signal.SIGKILL)
-    stream(lambda: compensator.exit_code() is not None and time.monotonic() > came[-1] + 0.2)  # its last answers are in
+    stream(lambda: compensator.exit_code() is not None and time.monotonic() > came[-1] + 0.2)  # its answers have come
     drive.send(signal.SIGSTOP)
     before, last = len(published), published[-1]
     client.diagnostics = {}
@@ -303,7 +304,7 @@ def test_help_lists_every_parameter_and_the_topics(name, capsys):
     ids=["-p without --ros-args", "ROS 1", "option", "shortened", "forged", "behind --", "no value", "unknown to ROS"],
 )
 def test_an_argument_that_nobody_reads_ends_with_2_and_is_named(arguments, capsys):
-    """Before, all but the last two started the node with its defaults."""
+    """Unknown arguments end a node with code 2 and are named, in place of a start with defaults."""
     assert COMPENSATOR.refusal(arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -314,7 +315,7 @@ def test_an_argument_that_nobody_reads_ends_with_2_and_is_named(arguments, capsy
 
 
 def test_nodes_end_when_their_parent_is_killed(isolated_ros):
-    """kill -9 of a demo must not leave a machine running that nobody sees."""
+    """kill -9 of a demonstration must not leave a machine running."""
     script = (
         "from hexapod_comp.loop.processes import NodeProcess\n"
         "import time\n"
@@ -332,7 +333,7 @@ def test_nodes_end_when_their_parent_is_killed(isolated_ros):
 
 
 def runs(pid: int) -> bool:
-    """Return whether a process is alive; one that has ended but that nobody has waited for is not."""
+    """Return whether a process is running; a zombie is not."""
     try:
         with open(f"/proc/{pid}/stat") as stat:
             return stat.read().rsplit(")", 1)[1].split()[0] != "Z"
@@ -354,15 +355,15 @@ def test_the_users_own_fast_dds_profile_stays(monkeypatch, variable):
 ROOT = Path(__file__).resolve().parents[2]
 
 GONE_WITHIN = 5.0
-"""From a signal to the end of a process, s, on a machine under heavy load: alone it is 0.2 s."""
+"""Longest time from a signal to the end of a process on a busy computer, s; on an idle one it is 0.2 s."""
 
 
 HEARS_SIGINT = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-"""The background jobs of a shell, these tests perhaps, ignore it, and so do their children."""
+"""Line that restores SIGINT, which a shell's background jobs, perhaps these tests, and their children ignore."""
 
 
 def script(text: str, folder: Path) -> subprocess.Popen[str]:
-    """Start a program of ours."""
+    """Start a Python program."""
     environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'test'}"}
     command = [sys.executable, "-c", HEARS_SIGINT + textwrap.dedent(text)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
@@ -399,14 +400,14 @@ sys.exit(process.run(Hanging, Program("hanging", "Hangs.", ())))
 @pytest.mark.parametrize(
     ("hangs", "code", "said"),
     [
-        ("ctypes.PyDLL(None).sleep(60)", 1, "in destroy_node"),  # as DDS does now and then: with Python's lock
+        ("ctypes.PyDLL(None).sleep(60)", 1, "in destroy_node"),  # as DDS does at times, holding Python's lock
         ("threading.Event().wait(60)", 1, "in destroy_node"),
-        ("threading.Thread(target=threading.Event().wait, args=(60,)).start()", 0, ""),  # hangs the end of Python
+        ("threading.Thread(target=threading.Event().wait, args=(60,)).start()", 0, ""),  # this blocks the end of Python
     ],
     ids=["holding Python's lock", "waiting", "a thread that never ends"],
 )
 def test_an_end_that_hangs_is_cut_short_and_says_where(isolated_ros, tmp_path, hangs, code, said):
-    """One compensator in 390 did not end: a signal only sets a flag that nobody looks at any more."""
+    """One compensator in 390 did not end, as a signal only sets a flag; now it is cut short and its place logged."""
     made = script(HANGING.format(hangs=hangs), tmp_path)
     try:
         assert "alive\n" in [made.stdout.readline() for _ in range(3)]  # in any order
@@ -418,17 +419,17 @@ def test_an_end_that_hangs_is_cut_short_and_says_where(isolated_ros, tmp_path, h
         assert said in rest
     finally:
         made.kill()
-    assert ENDED_WITHIN < 5.0  # after which ros2 launch asks again, and then kills
+    assert ENDED_WITHIN < 5.0  # after 5 s ros2 launch sends another signal, and then kills
 
 
 def test_a_signal_while_modules_load_ends_a_program_without_a_traceback(tmp_path: Path):
-    """Loading takes seconds on a busy computer; here it takes for ever, in small steps as there.
+    """Loading takes seconds on a busy computer; here it never ends, in small steps as in reality.
 
-    In one long wait a signal would be lost that came just before it: Python looks at it between two steps only.
+    Python handles signals between steps, so in one long wait a signal just before it would be lost.
     """
     (tmp_path / "endless.py").write_text("import time\nprint('loading', flush=True)\nwhile True: time.sleep(0.01)\n")
     program = "from hexapod_comp.ros import start; start('endless')"
-    process = script(program, tmp_path)  # where `endless` is
+    process = script(program, tmp_path)  # the folder with `endless`
     assert process.stdout.readline() == "loading\n"
     process.send_signal(signal.SIGTERM)
     rest, _ = process.communicate(timeout=GONE_WITHIN)
@@ -436,7 +437,7 @@ def test_a_signal_while_modules_load_ends_a_program_without_a_traceback(tmp_path
 
 
 def test_a_signal_within_anothers_handler_does_not_wait_for_it():
-    """``ros2 launch`` and its terminal send one each. At every line that Python runs for the first comes a second."""
+    """``ros2 launch`` and its terminal send one signal each: here the second comes at every line of the handler."""
     program = """
 import signal, sys
 from hexapod_comp.ros import received_signals
@@ -456,7 +457,7 @@ print(*sorted(set(heard)))
 
 
 def test_a_node_loads_no_scipy():
-    """40 MB a node, and half a second of its start: what needs SciPy is loaded where it is used."""
+    """SciPy takes 40 MB and half a second of a node's start, so it is loaded only where it is used."""
     program = """
 import sys
 import hexapod_comp.ros.compensator
@@ -476,11 +477,11 @@ print(*sorted(name for name in sys.modules if name.partition(".")[0] in ("scipy"
     assert (done.returncode, done.stdout) == (0, "\n"), done.stderr
 
 
-# ---- streams and topics that cannot be had ----
+# ---- streams and topics that are not available ----
 
 
 def test_closed_streams_are_opened_again() -> None:
-    """rclpy's executor switches faulthandler on, which raises without a stderr: the node ended after "ready"."""
+    """rclpy's executor enables faulthandler, which raises an error without stderr: the node ended after "ready"."""
     program = (
         "import os, sys\n"
         "from hexapod_comp.ros import open_streams\n"
@@ -496,7 +497,7 @@ def test_closed_streams_are_opened_again() -> None:
 
 
 def test_a_hang_up_ends_a_node_as_other_signals_do_unless_it_is_ignored() -> None:
-    """As nohup has it."""
+    """SIGHUP ends a node, unless it is ignored as under nohup."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
         heard = received_signals()
@@ -513,7 +514,7 @@ def test_a_hang_up_ends_a_node_as_other_signals_do_unless_it_is_ignored() -> Non
 
 
 def test_a_topic_that_cannot_be_opened_is_said_and_leaves_nothing_open(rig, monkeypatch) -> None:
-    """The node's goodbye had hidden the reason behind an AttributeError. It may be configured once more."""
+    """The reason is reported (an AttributeError had hidden it), and the node may be configured again."""
     node = rig.add(LinuxcncBridgeNode, False, {}, hal=StandInHal())
 
     def ends() -> list[int]:
@@ -534,7 +535,7 @@ def test_a_topic_that_cannot_be_opened_is_said_and_leaves_nothing_open(rig, monk
     assert not node.unconfigured
 
 
-# ---- a log that nobody reads ----
+# ---- a log that is not read ----
 
 RELAYED = """
 import os, sys, time
@@ -552,7 +553,7 @@ with LogRelay():
 
 
 def relayed(body: str, **streams: object) -> subprocess.Popen[bytes]:
-    """Run a few lines within a LogRelay in a process of its own."""
+    """Run a few lines within a LogRelay in a separate process."""
     return subprocess.Popen([sys.executable, "-c", RELAYED.format(body=body)], **streams)
 
 
@@ -565,7 +566,7 @@ def test_all_lines_arrive_in_order() -> None:
 
 
 def test_a_reader_that_does_not_read_stops_nobody() -> None:
-    """16 MB into a pipe that takes 64 kB: without the relay the process would wait for ever."""
+    """16 MB go to a pipe of 64 kB; without the relay the process would wait for ever."""
     reading, writing = os.pipe()
     body = "for i in range(16384): write(2, 'x' * 1023 + '\\n')"
     try:

@@ -1,6 +1,6 @@
-"""The error field of 001, a table of errors over outside numbers, and the box in which a model was measured.
+"""The error field of Mou & King, a table of errors over external quantities, and the measured box of a model.
 
-Truth: 001's formula, SciPy's interpolation, frames by hand, and machines of the zoo.
+The truth is Mou & King's formula, SciPy's interpolation, frames by hand, and machines of the zoo.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ FORWARD = np.ones(3)
 
 
 def empty_lines(grid):
-    """Return three families that were not measured."""
+    """Return three families of lines without polynomials."""
     return [np.zeros((2, len(grid[a]), len(grid[b]), 6, 0)) for a, b in CROSS_AXES]
 
 
 def inside(rng):
-    """Return a point of the uneven grid's box."""
+    """Return a random point of the uneven grid's box."""
     return np.array([rng.uniform(nodes[0], nodes[-1]) for nodes in UNEVEN_GRID])
 
 
 def paper_weights(p, q, corners):
-    """Return W_1 … W_4 of 001 for the point (p, q): the corner opposite to i is k = Mod(i + 2).
+    """Return Mou & King's W_1 … W_4 for the point (p, q); the corner opposite to i is k = Mod(i + 2).
 
-    The denominators |P_1 − P_4| and |P_1 − P_2| say how the corners are numbered: 1 → 2 along the second
-    axis, 1 → 4 along the first.
+    Their denominators |P_1 − P_4| and |P_1 − P_2| define the numbering: 1 → 2 along the second axis, 1 → 4 along the
+    first.
     """
     area = abs(corners[1][0] - corners[4][0]) * abs(corners[1][1] - corners[2][1])
     opposite = {1: 3, 2: 4, 3: 1, 4: 2}
@@ -55,10 +55,10 @@ def paper_weights(p, q, corners):
 @fixed
 @given(seeds, st.booleans())
 def test_equals_the_papers_formula(seed, on_a_line):
-    """Truth: 001, W_xi, W_yi, W_zi and Δx, Δy, Δz, written out here over the four corners; np.polyval.
+    """The truth is Mou & King's W_xi, W_yi, W_zi and Δx, Δy, Δz, written here over the four corners, and np.polyval.
 
-    The paper's lines carry one component each, here they carry six; the three families add up; an unknown direction
-    has the mean of both. On a grid line only that line weighs, whichever cell is asked. Tolerance: 1e-14 of some 1e-4.
+    Their lines carry one component each, here they carry six; the three families add up; an unknown direction has the
+    mean of both. On a grid line only this line has a weight, in either cell. Tolerance: 1e-14 of 1e-4.
     """
     rng = np.random.default_rng(seed)
     field = random_field(rng)
@@ -86,7 +86,7 @@ def test_equals_the_papers_formula(seed, on_a_line):
 @fixed
 @given(seeds)
 def test_outside_holds_the_boundary_value_and_says_so(seed):
-    """Truth: the value at the nearest point of the box, bit for bit."""
+    """The truth is the value at the nearest point of the box, bit for bit."""
     rng = np.random.default_rng(seed)
     field = random_field(rng)
     low, high = field.box
@@ -102,7 +102,7 @@ def test_outside_holds_the_boundary_value_and_says_so(seed):
 
 
 def _family(values, axis):
-    """Return families of zeros but one, which is as given."""
+    """Return three families of which only one, the given one, is not zero."""
     return [values if a == axis else lines for a, lines in enumerate(empty_lines(UNEVEN_GRID))]
 
 
@@ -137,7 +137,7 @@ def random_table(seed: int = 1, size: float = 50e-6, beyond: str = "hold") -> Ou
 
 
 def flexure(beyond: str = "hold") -> OutsideTable:
-    """Return a table of a sag alone, 10 µm at 0° to 40 µm at 90°."""
+    """Return a table of a sag of 10 µm at an elevation of 0° and 40 µm at 90°."""
     sag = np.outer([10e-6, 40e-6], [0.0, 0.0, -1.0])
     return OutsideTable(("elevation",), ("deg",), (np.array([0.0, np.pi / 2]),), sag, np.zeros_like(sag), beyond=beyond)
 
@@ -146,7 +146,7 @@ def flexure(beyond: str = "hold") -> OutsideTable:
 
 
 def test_between_nodes_it_is_bilinear_and_beyond_them_held() -> None:
-    """SciPy's grid interpolation, clipped; at the nodes the very numbers."""
+    """The truth is SciPy's grid interpolation at the clipped place; at the nodes the values are exact."""
     table, rng = random_table(), np.random.default_rng(2)
     values = np.hstack([table.displacement, table.rotation]).reshape(len(ELEVATION), len(ROTATION), 6)
     reference = RegularGridInterpolator(table.nodes, values)
@@ -160,7 +160,7 @@ def test_between_nodes_it_is_bilinear_and_beyond_them_held() -> None:
 
 
 def test_a_number_that_cannot_be_is_refused() -> None:
-    """45 is degrees; 2 rad is further from 90° than a quarter of 90°, though 1.9 is held."""
+    """45 is refused as degrees. Beyond 90° a value is held up to a quarter of the table's range: 1.9 rad, not 2 rad."""
     compensator = Compensator(paper_geometry(), MachineModel("paper", outside=random_table()))
     compensator.set_outside({"elevation": 1.9, "rotation": 0.0, "azimuth": 1e9})
     assert compensator.model.outside.held(compensator.outside).startswith("elevation 108.862 deg")
@@ -180,7 +180,7 @@ def test_a_table_that_refuses_and_a_correction_above_its_limit_keep_the_last_num
     with pytest.raises(OutsideTableError, match=r"elevation 91\.6732 deg: the table covers elevation 0 to 90 deg"):
         compensator.set_outside({"elevation": 1.6})
     assert compensator.outside == HERE
-    compensator.set_outside({"elevation": 1.570797})  # 90° as a sender may round it: 0.7 µrad more
+    compensator.set_outside({"elevation": 1.570797})  # 90° as a sender may round it: 0.7 µrad too much
     assert not compensator.model.outside.held(compensator.outside)
     tight = replace(paper_geometry(), limits=replace(paper_geometry().limits, correction=20e-6))
     compensator = Compensator(tight, MachineModel("paper", outside=flexure()))
@@ -199,9 +199,9 @@ def goes(model: MachineModel, geometry: HexapodGeometry, numbers: dict[str, floa
 
 @pytest.mark.parametrize("name", machine_names())
 def test_it_moves_the_measured_point_as_it_says(name: str, tmp_path: Path) -> None:
-    """actual = commanded ∘ error: nominal struts leave the table's displacement at the point, and turn about it.
+    """actual = commanded ∘ error: with nominal struts the measured point has the table's displacement and rotation.
 
-    To rounding of the forward kinematics; whatever the pose, since the table knows none.
+    It holds at any pose, to rounding of the forward kinematics.
     """
     geometry, point = load_geometry(machines()[name].write(tmp_path / "machine.yaml")), np.array([0.01, -0.02, 0.05])
     model = MachineModel(geometry.name, field=replace(no_field(), probe=point), outside=random_table())
@@ -210,7 +210,7 @@ def test_it_moves_the_measured_point_as_it_says(name: str, tmp_path: Path) -> No
         rotation = geometry.home.rotation @ Rotation.from_rotvec(turn).as_matrix()
         pose = Pose(geometry.home.position + np.array(shift), rotation)
         struts = distances(geometry, pose)
-        if geometry.screw_lead.any():  # turning screws are another test's
+        if geometry.screw_lead.any():  # turning screws have another test
             struts = RealMachine(geometry, MachineModel(geometry.name)).commands_for(pose)[0]
         actual = goes(model, geometry, HERE, struts)
         moved = actual.position + actual.rotation @ point - pose.position - pose.rotation @ point
@@ -220,7 +220,7 @@ def test_it_moves_the_measured_point_as_it_says(name: str, tmp_path: Path) -> No
 
 
 def test_a_field_and_the_table_add_up() -> None:
-    """Wherever the field is measured, and whichever of its families is: the table adds the same everywhere."""
+    """The table adds the same error everywhere in the field's box, whichever families of lines the field has."""
     rng, table = np.random.default_rng(5), random_table()
     error = table.evaluate(HERE)
     whole = random_field(rng)
@@ -235,7 +235,7 @@ def test_a_field_and_the_table_add_up() -> None:
 
 
 def test_nothing_steps_when_a_number_becomes_known() -> None:
-    """Between commands of one pose no strut is faster than the ramp, 1 mm/s over 2 ms; it ends higher by the sag."""
+    """A new quantity moves no strut faster than the ramp, 1 mm/s over 2 ms; the tool ends higher by the sag."""
     geometry = paper_geometry()
     compensator = Compensator(geometry, MachineModel("paper", outside=flexure()), ramp_rate=1e-3)
     tool = geometry.tool_pose(geometry.home)
@@ -258,7 +258,7 @@ def test_another_model_keeps_the_numbers_and_a_drift_stands_beside_them() -> Non
     assert compensator.estimate(struts)[2] - height == pytest.approx(7e-6 - 40e-6, abs=1e-12)
     compensator.set_outside({"elevation": 0.0})
     assert compensator.estimate(struts)[2] - height == pytest.approx(7e-6 - 10e-6, abs=1e-12)
-    with pytest.raises(ModelError, match="is the unit right"):  # a model whose table the present number cannot be in
+    with pytest.raises(ModelError, match="is the unit right"):  # a model whose table excludes the present value
         compensator.set_model(MachineModel("paper", outside=replace(flexure(), nodes=(np.array([5.0, 6.0]),))))
 
 
@@ -269,14 +269,14 @@ HEADER = "rotation_deg,elevation_deg,x_um,y_um,z_um,rx_urad,ry_arcsec,rz_urad"
 
 
 def test_a_table_is_read_from_csv(tmp_path: Path) -> None:
-    """Rows in any order, units by the column names, the axes in the order of their columns; one axis or two."""
+    """Rows may have any order; column names give units and order of the axes; there may be one axis or two."""
     file = tmp_path / "table.csv"
     rows = [f"{r},{e},{r + e},{r},{e},1,{e},3" for e in (90, 0, 45) for r in (10, -10)]
     file.write_text("\n".join([HEADER, *rows]))
     table = load_outside(file)
     assert (table.names, table.units) == (("rotation", "elevation"), ("deg", "deg"))
     np.testing.assert_array_equal(table.nodes[1], np.radians([0.0, 45.0, 90.0]))
-    # x + y is a linear function of both numbers, so the table holds it everywhere
+    # x + y is linear in both quantities, so the table has it everywhere
     error = table.evaluate({"elevation": np.radians(33.0), "rotation": np.radians(7.0)})
     np.testing.assert_allclose(error[:4], [40e-6, 7e-6, 33e-6, 1e-6], rtol=1e-12)
     assert error[4] == pytest.approx(np.radians(33.0 / 3600.0))
@@ -310,7 +310,7 @@ SIDES = np.array([[-0.1, -0.05, 0.3], [0.1, 0.05, 0.5]])
 
 
 def test_a_tilted_tool_is_inside_where_its_point_is() -> None:
-    """The point is 0.2 m above the platform: tilted by 0.3 rad about x it goes 0.2·sin 0.3 along −y, at the edge."""
+    """The measured point is 0.2 m above the platform: a tilt of 0.3 rad about x moves it by 0.2·sin 0.3 along −y."""
     region = Region(SIDES, np.array([0.0, 0.0, 0.2]))
     tilted = Rotation.from_rotvec([0.3, 0.0, 0.0]).as_matrix()
     edge = np.array([0.0, 0.05 + 0.2 * np.sin(0.3), 0.4 - 0.2 * np.cos(0.3)])
@@ -322,7 +322,7 @@ def test_a_tilted_tool_is_inside_where_its_point_is() -> None:
 
 
 def test_the_tools_box_follows_tool_and_work_frame() -> None:
-    """Measured 0.1 m below a tip, in base: the tip's box is higher by that. In a frame turned by 90° x and y change."""
+    """Measured 0.1 m below the tip, the box is 0.1 m higher for the tip; a frame turned by 90° swaps x and y."""
     base = Region(SIDES, np.array([0.0, 0.0, 0.05]))
     turned = Pose.from_angles([0.2, 0.0, 0.1], np.radians([0.0, 0.0, 90.0]))
     geometry = replace(small.paper(), tool=Pose([0.0, 0.0, 0.15], np.eye(3)), work=turned)

@@ -1,4 +1,4 @@
-"""Geometry files: the paper's machine, a general one in inches, named tools and frames; what is refused or doubted."""
+"""Geometry files: the paper's machine, a general machine in inches, named tools and frames; refusals and doubts."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from hexapod_comp.pose import Pose
 
 PAPER_TEXT = PAPER_FILE.read_text(encoding="utf-8")
 
-# A 6-6 machine in inches: no two joints in one place, two of them off their plane, everything optional given.
+# A 6-6 machine in inches with every optional key; no two joints coincide, and two are off their plane
 GENERAL = """
 format: hexapod_comp/geometry
 version: 1
@@ -62,10 +62,10 @@ limits:
 
 
 def test_the_papers_joints():
-    """Truth: the joints worked by hand from a = 300, b = 572, d = 243 mm, to 1 µm.
+    """The truth is the joints by hand from a = 300, b = 572, d = 243 mm, to 1 µm.
 
-    √3/6 = 0.2886751: X_B1 = 0.2886751·(2·572 + 243) = 400.392, Y_B1 = 121.5; X_B2 = −0.2886751·329 =
-    −94.974, Y_B2 = 407.5; X_B3 = −0.2886751·1058 = −305.418, Y_B3 = 286; 4, 5, 6 mirror 3, 2, 1. Platform
+    √3/6 = 0.2886751: X_B1 = 0.2886751·(2·572 + 243) = 400.392, Y_B1 = 121.5; X_B2 = −0.2886751·329 = −94.974, Y_B2 =
+    407.5; X_B3 = −0.2886751·1058 = −305.418, Y_B3 = 286; joints 4, 5, 6 mirror 3, 2, 1. The platform's joints have the
     radius 300/√3 = 173.205 at 60°, 180°, −60°.
     """
     geometry = paper_geometry()
@@ -83,7 +83,7 @@ def test_the_papers_joints():
 
 
 def test_a_general_machine_in_inches():
-    """Truth: 25.4 mm to the inch; axes are made unit vectors; one cone angle serves all; 12 m/min are 0.2 m/s."""
+    """An inch is 25.4 mm; axes become unit vectors; one cone angle counts for all joints; 12 m/min are 0.2 m/s."""
     geometry = parse_geometry(GENERAL)
     np.testing.assert_allclose(geometry.base_joints[1], np.array([-8, 18, 0.5]) * 0.0254, rtol=1e-15)
     np.testing.assert_allclose(geometry.platform_joints[4], np.array([4, -9, 1]) * 0.0254, rtol=1e-15)
@@ -104,7 +104,7 @@ def test_a_general_machine_in_inches():
     assert limits.speed == pytest.approx(0.2, rel=1e-15)
 
 
-# Refused, naming file, key and value.
+# Refusals, which name file, key and value
 
 FIFTH_JOINT = ", [20, -2, 0]]"
 
@@ -127,7 +127,7 @@ FIFTH_JOINT = ", [20, -2, 0]]"
         ("hexapod_comp/geometry", "hexapod_comp/model", ["format", "geometry", "model"]),
         ("[0, 2, 0]", "[0, 0, 0]", ["base.joint_axes[0]", "zero vector"]),
         ("position_in: [0, 0, 20]", "position_in: [0, 0, 90]", ["home", "stroke"]),
-        # 000, Table 2: at 400 mm all struts are 509.192 mm long
+        # Song et al., Table 2: at 400 mm all struts are 509.192 mm long
         ("[330, 880]", "[330, 509]", ["breaks a limit: strut_1: nominal length 509.19"]),
         ("version: 1", "version: 1\nscrew: {lead_mm: 5}", ["base.joint_axes: are needed"]),
     ],
@@ -141,14 +141,14 @@ def test_refused(old, new, said):
 
 
 def test_struts_at_home_are_the_cones_axes_where_the_file_gives_none():
-    """A home turned by degrees breaks no cone of a ten-thousandth of a degree."""
+    """A home turned by degrees breaks no cone of 0.0001° about the struts at home."""
     skewed, narrow = skewed_geometry(), np.full(6, 2e-6)
     limits = replace(skewed.limits, base_cone=narrow, platform_cone=narrow)
     replace(skewed, limits=limits, base_cone_axes=None, platform_cone_axes=None)
 
 
 def test_clearance():
-    """Optional; never negative; not more than there is at home: 243 mm between base joints 2 and 3."""
+    """Clearance is optional, not negative, and not above that at home: 243 mm between base joints 2 and 3."""
     assert parse_geometry(PAPER_TEXT).limits.clearance == 0.0
     text = PAPER_TEXT.replace("  step_mm: 2", "  clearance_mm: {}\n  step_mm: 2")
     assert parse_geometry(text.format(60)).limits.clearance == 0.06
@@ -167,12 +167,12 @@ def test_dimensions_of_no_machine(a, b, d):
         replace(paper, platform_joints=np.zeros((6, 3)))
 
 
-# ---- text, path, shipped name ----
+# ---- from text, path and shipped name ----
 
 
 @pytest.mark.parametrize("name", ["paper", "paper.yaml"])
 def test_a_shipped_machine_goes_by_its_name(name, tmp_path, monkeypatch):
-    """From any folder, also where an output folder has the name."""
+    """The name finds the shipped machine from any folder, even if a folder there has the same name."""
     (tmp_path / name).mkdir()
     monkeypatch.chdir(tmp_path)
     assert load_geometry(name).name == "paper"
@@ -184,7 +184,7 @@ ROUNDING = 1e-14  # m; a few products of numbers below one
 
 @pytest.mark.parametrize("name", ["framed", "hanging", "inches", "mirror"])
 def test_poses_are_those_of_the_tool_and_frame_in_use(name: str, tmp_path: Path) -> None:
-    """Truth: the zoo's own frames, multiplied there."""
+    """The truth is the zoo's own frames, multiplied there."""
     machine = with_frames(name)
     geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
     assert list(geometry.tools) == ["tool", "probe", "stub"]
@@ -213,12 +213,12 @@ def test_a_geometry_with_tools_can_be_copied_replaced_and_sent_elsewhere() -> No
         "kernel_joints",
         "limit_numbers",
     ):
-        assert getattr(geometry, name) is getattr(shipped, name)  # axes made unit vectors twice may lose a bit
+        assert getattr(geometry, name) is getattr(shipped, name)  # axes normalised twice may differ in a bit
     for other in (pickle.loads(pickle.dumps(geometry)), copy.deepcopy(geometry), replace(geometry)):
         assert (other.tool_name, other.work_name) == ("probe", "fixture")
         assert list(other.tools) == list(geometry.tools)
     moved = replace(geometry, tool=Pose(np.ones(3), np.eye(3)))
-    assert moved.using("tool").using("probe").tool is moved.tool  # the one in use is the one by its name
+    assert moved.using("tool").using("probe").tool is moved.tool  # a name given to the used tool returns this tool
     with pytest.raises(FrameError, match=r"machine example_6_6 has no tool 'prob'; it has tool, probe$"):
         geometry.using(tool="prob")
     with pytest.raises(FrameError, match=r"no work frame ''; it has base, work, fixture$"):
@@ -257,7 +257,7 @@ WIDE = Limits(np.tile([0.01, 3.0], (6, 1)), np.full(6, np.pi), np.full(6, np.pi)
 
 
 def example(**changes: object) -> HexapodGeometry:
-    """Return the 6-6 example with limits so wide that mistakes of all kinds come through."""
+    """Return the 6-6 example with limits so wide that no mistake breaks them."""
     return replace(load_geometry("example_6_6"), limits=WIDE, **changes)  # type: ignore[arg-type]
 
 
@@ -268,7 +268,7 @@ def test_shipped_machines_are_right(name: str):
 
 @pytest.mark.parametrize("name", machines())
 def test_foreign_machines_are_right(name: str, tmp_path: Path):
-    """6-6 uneven, hanging, with turned frames, in inches."""
+    """Correct machines (6-6 uneven, hanging, with turned frames, in inches) raise no doubt."""
     assert doubts(load_geometry(machines()[name].write(tmp_path / "machine.yaml"))) == ()
 
 
@@ -286,14 +286,14 @@ def test_a_turned_or_mirrored_home_and_a_wrong_unit_are_noticed():
     for turn in (-100.0, 60.0, 175.0):
         (doubt,) = doubts(example(home=Pose.from_angles(home.position, np.radians([0.0, 0.0, turn]))))
         found = float(doubt.partition("turned by ")[2].partition("°")[0])
-        assert found == pytest.approx(turn, abs=10.0)  # the 6-6's platform is no exact copy of its base
+        assert found == pytest.approx(turn, abs=10.0)  # the 6-6's platform is not an exact copy of its base
     (doubt,) = doubts(example(home=Pose(home.position * [1.0, 1.0, -1.0], home.rotation)))
     assert "the wrong sign" in doubt
     assert [text.split(" ")[0] for text in joint_doubts(base * 25.4, base * 0.5 + [0, 0, 9.0])] == ["base.joints"]
 
 
 def test_a_home_that_breaks_a_limit_says_what_may_be_wrong(tmp_path: Path):
-    """As a user meets it: the platform's y has the wrong sign, and the machine is nearly singular so."""
+    """With the wrong sign of the platform's y the paper's machine is nearly singular at home; the message says so."""
     text = (CONFIG / "example_6_6.yaml").read_text(encoding="utf-8")
     before, after = text.split("platform:", 1)
     joints = load_geometry("example_6_6").platform_joints * [1.0, -1.0, 1.0] * 1e3
@@ -304,7 +304,7 @@ def test_a_home_that_breaks_a_limit_says_what_may_be_wrong(tmp_path: Path):
 
 
 def test_twist_is_that_of_a_machine_that_says_its_axes():
-    """Axes across the struts at home, alike at both ends, given to the geometry itself: its own code's twist."""
+    """Machines whose file has no axes get the same twist as those with axes across the struts at home."""
     bare = replace(load_geometry("paper"), limits=WIDE)
     neutral = np.asarray(bare.base_cone_axes)
     across = np.cross(neutral, np.eye(3)[np.abs(neutral).argmin(axis=1)])

@@ -1,7 +1,7 @@
 """Kinematics against the paper's tables, closed forms, finite differences, SciPy and closure; assembly modes.
 
-Modes: by the pose that made the lengths, and by a multi-start of Newton, whose starts are not those of the code under
-test.
+The truth for modes is the pose from which the lengths were computed, and Newton from other random starts than the
+code's.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ PAPER = paper_geometry()
 IDEAL = Structure.of(PAPER)
 HOME = PAPER.home
 MACHINES = {"paper": PAPER, "general": general_machine(), "3-2-1": three_two_one_machine()}
-# ±10 µm on every coordinate of every joint, the tolerance that 000 works with
+# ±10 µm on every coordinate of every joint, Song et al.'s tolerance
 DEVIATION = np.random.default_rng(10).uniform(-10e-6, 10e-6, (2, 6, 3))
 
 REAL = IDEAL.moved(*DEVIATION)
@@ -58,7 +58,7 @@ machines = pytest.mark.parametrize("machine", MACHINES.values(), ids=MACHINES.ke
 
 
 def test_table_1_gives_table_2_to_the_last_printed_digit() -> None:
-    """000, Tables 1 and 2: 60 lengths, printed to 0.001 mm with trailing zeros dropped."""
+    """Song et al., Tables 1 and 2: 60 lengths, printed to 0.001 mm without trailing zeros."""
     ours = [[f"{length * 1e3:.3f}" for length in strut_lengths(IDEAL, pose)] for pose in table_poses()]
     printed = [[f"{length * 1e3:.3f}" for length in row] for row in table_lengths()]
     assert ours == printed
@@ -76,7 +76,7 @@ def test_table_1_gives_table_2_to_the_last_printed_digit() -> None:
     ],
 )
 def test_round_trip_from_home(structure: Structure, home: Pose, count: int, reach: float, tilt_deg: float) -> None:
-    """Closure, every pose from the same guess; 1e-13 m also where lengths reach 1.5 m and the condition number 20."""
+    """Every pose is found from home, to 1e-13 m even with lengths of 1.5 m and condition numbers of 20."""
     positions, rotations = poses_about(home, count, seed=1, reach=reach, tilt_deg=tilt_deg)
     found = solve_poses(structure, strut_lengths_batch(structure, positions, rotations), home)
     turns = found.rotations @ rotations.transpose(0, 2, 1)
@@ -93,7 +93,7 @@ def test_round_trip_from_home(structure: Structure, home: Pose, count: int, reac
 
 @machines
 def test_jacobian_against_central_differences(machine: HexapodGeometry) -> None:
-    """See :func:`helpers.central_difference` for the step; 1e-9 is twenty times its error."""
+    """1e-9 is twenty times the error of :func:`helpers.central_difference`, which describes the step."""
     structure = Structure.of(machine)
     for position, rotation in zip(*poses_about(machine.home, 20, seed=4, tilt_deg=15.0), strict=True):
         pose = Pose(position, rotation)
@@ -111,11 +111,11 @@ def test_jacobian_against_central_differences(machine: HexapodGeometry) -> None:
         (1e-9, 4e-16),  # rounding of the two rotations alone
         (1e-4, 4e-16),
         (0.3, 1e-15),
-        (3.0, 1e-14),  # … over the sine of the angle, 0.14
+        (3.0, 1e-14),  # divided by the sine of the angle, 0.14
     ],
 )
 def test_motions_between_poses_against_rotations_by_their_vectors(angle: float, tolerance: float) -> None:
-    """The turn comes back that made the second pose, and a point goes where it carries it, along turned axes."""
+    """The motion's rotation turns the first pose to the second, and moves a point with it, along turned axes."""
     rng = np.random.default_rng(21)
     (positions, rotations), point = poses_about(HOME, 40, seed=22), np.array([0.03, -0.02, 0.08])
     axes = Rotation.from_rotvec([0.4, -0.2, 0.7])
@@ -123,7 +123,7 @@ def test_motions_between_poses_against_rotations_by_their_vectors(angle: float, 
     vectors *= angle / np.linalg.norm(vectors, axis=1)[:, None]
     shifts = angle * rng.normal(size=(40, 3))
     arms, motions = rotations @ point, np.empty((6, 40))
-    # exp(ω)·a − a = sin θ·(k × a) + (1 − cos θ)·k × (k × a), without a difference of nearly equal numbers
+    # exp(ω)·a − a = sin θ·(k × a) + (1 − cos θ)·k × (k × a) has no difference of nearly equal numbers
     swing, axis = np.cross(vectors, arms) / angle, vectors / angle
     carried = shifts + np.sin(angle) * swing + 2.0 * np.sin(0.5 * angle) ** 2 * np.cross(axis, swing)
     turned = Rotation.from_rotvec(vectors).as_matrix() @ rotations
@@ -134,7 +134,7 @@ def test_motions_between_poses_against_rotations_by_their_vectors(angle: float, 
 
 @machines
 def test_condition_number_and_sign_against_linear_algebra(machine: HexapodGeometry) -> None:
-    """NumPy's inverse and determinant of the Jacobian, whose own test is above; 1e-11 covers κ²·1e-16."""
+    """The truth is NumPy's inverse and determinant of the Jacobian, which has its own test; 1e-11 covers κ²·1e-16."""
     structure = Structure.of(machine)
     unit = np.array([1.0, 1.0, 1.0, *[1.0 / structure.characteristic_length] * 3])
     for position, rotation in zip(*poses_about(machine.home, 50, seed=5, tilt_deg=15.0), strict=True):
@@ -153,7 +153,7 @@ def test_condition_number_and_sign_against_linear_algebra(machine: HexapodGeomet
 @machines
 @pytest.mark.parametrize("count", [0, 1, 8, 203])
 def test_batch_equals_single_bit_for_bit(machine: HexapodGeometry, count: int) -> None:
-    """Whatever lane a pose falls into, and on whatever branch; some rows fail on purpose."""
+    """Batch and single calls agree in every lane and branch; some rows fail on purpose."""
     structure = Structure.of(machine)
     positions, rotations = poses_about(machine.home, count, seed=6, tilt_deg=50.0)
     lengths = strut_lengths_batch(structure, positions, rotations)
@@ -190,7 +190,7 @@ def test_every_row_is_in_one_slice(
 
 @pytest.mark.parametrize("fails", ["caller", "helper"])
 def test_the_first_error_ends_a_shared_batch(monkeypatch: pytest.MonkeyPatch, fails: str) -> None:
-    """It is raised whoever meets it, and of what is left nobody begins anything: neither has to be waited for."""
+    """The first error of any thread ends a batch, and no thread begins another slice."""
     monkeypatch.setattr(kinematics, "ALONE", -1.0)
     caller, begun, failed = threading.get_ident(), [], threading.Event()
 
@@ -202,7 +202,7 @@ def test_the_first_error_ends_a_shared_batch(monkeypatch: pytest.MonkeyPatch, fa
             failed.set()
             raise ZeroDivisionError
         assert failed.wait(60.0)
-        time.sleep(0.01)  # the other one is on its way out
+        time.sleep(0.01)  # the other thread is about to end
 
     with pytest.raises(ZeroDivisionError):
         kinematics.over_chunks(run, 256 * 200, threads=2)
@@ -249,7 +249,7 @@ UNTOUCHED = {
 
 @pytest.mark.parametrize(("outcome", "spoil"), UNTOUCHED.values(), ids=UNTOUCHED.keys())
 def test_failure_leaves_the_guess_untouched(outcome: int, spoil) -> None:
-    """Kernel level: position and rotation keep every bit unless the outcome is OK."""
+    """The C function keeps every bit of position and rotation unless its outcome is OK."""
     lengths = strut_lengths(IDEAL, HOME)
     position, rotation = HOME.position.copy(), HOME.rotation.copy()
     spoil(lengths, position, rotation)
@@ -262,13 +262,13 @@ def test_failure_leaves_the_guess_untouched(outcome: int, spoil) -> None:
 
 # --- assembly modes ----------------------------------------------------------------------------------------
 
-CLOSED = 5e-13  # m; the closure at which the core's Newton ends
-# m and rad; a pose of condition number up to 1e4 comes back to 1e4 roundings of the lengths, with margin
+CLOSED = 5e-13  # m; closure at which the core's Newton ends
+# m and rad; at a condition number of 1e4 a pose has 1e4 roundings of the lengths, with a margin
 REGULAR = 1e-10
 
 
 def miss(pose: Pose, modes: list[Pose]) -> float:
-    """Distance of the nearest mode, largest of its differences in m and in rotation matrix elements."""
+    """Return the distance of the nearest mode: its largest difference in m or in elements of the rotation."""
     apart = [
         max(np.abs(pose.position - mode.position).max(), np.abs(pose.rotation - mode.rotation).max()) for mode in modes
     ]
@@ -276,12 +276,12 @@ def miss(pose: Pose, modes: list[Pose]) -> float:
 
 
 def high(tilt_deg: list[float]) -> Pose:
-    """Return the pose 400 mm over the middle of the base, at the paper's angles."""
+    """Return the pose 400 mm above the middle of the base, with the paper's angles in degrees."""
     return Pose.from_angles([0.0, 0.0, 0.4], np.deg2rad(tilt_deg))
 
 
 def random_machine(seed: int, planar: bool, deviation: float) -> tuple[Structure, np.ndarray]:
-    """A 6-3 machine with joints anywhere, and lengths that it can have."""
+    """Return a 6-3 machine with random joints, and lengths of one of its poses."""
     rng = np.random.default_rng(seed)
     base = rng.normal(0.0, 0.3, (6, 3)) * [1.0, 1.0, 0.0 if planar else 1.0]
     platform = np.repeat(rng.normal(0.0, 0.2, (3, 3)), 2, axis=0)
@@ -292,7 +292,7 @@ def random_machine(seed: int, planar: bool, deviation: float) -> tuple[Structure
 
 
 def multi_start(structure: Structure, lengths: np.ndarray, seed: int, count: int = 4000) -> list[Pose]:
-    """All poses that Newton reaches from thousands of random ones."""
+    """Return all poses that Newton finds from thousands of random starts."""
     positions = np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 3)) * lengths.max()
     rotations = Rotation.random(count, random_state=seed).as_matrix()
     outcomes, iterations = np.empty(count, np.intc), np.empty(count, np.intc)
@@ -309,7 +309,7 @@ def multi_start(structure: Structure, lengths: np.ndarray, seed: int, count: int
 @pytest.mark.parametrize(("planar", "deviation"), [(True, 0.0), (False, 0.0), (False, 1e-4)])
 @pytest.mark.parametrize("seed", range(3))
 def test_modes_are_those_a_multi_start_finds(seed: int, planar: bool, deviation: float) -> None:
-    """Of joints in pairs, and of joints that are a tenth of a millimetre apart."""
+    """The modes are the same for joints in pairs and for joints 0.1 mm apart."""
     structure, lengths = random_machine(seed, planar, deviation)
     modes, truth = assembly_modes(structure, lengths), multi_start(structure, lengths, seed)
     assert len(modes) == len(truth)
@@ -321,7 +321,7 @@ def test_modes_are_those_a_multi_start_finds(seed: int, planar: bool, deviation:
 @pytest.mark.parametrize("split", [0.0, 0.03], ids=["6-3", "6-6"])
 @pytest.mark.parametrize("deviation", [0.0, 5e-4])
 def test_every_workspace_pose_is_found_and_picked(split: float, deviation: float) -> None:
-    """Truth: the pose that made the lengths."""
+    """The truth is the pose from which the lengths were computed."""
     rng, platform = np.random.default_rng(3), IDEAL.platform_joints.copy()
     platform[::2, 0] += split
     real = replace(IDEAL, platform_joints=platform).moved(*rng.uniform(-deviation, deviation, (2, 6, 3)))
@@ -332,10 +332,10 @@ def test_every_workspace_pose_is_found_and_picked(split: float, deviation: float
 
 
 def test_what_has_no_mode() -> None:
-    """Lengths out of reach: flat in the base plane, centred, equal struts are shortest. What is no length. A rod."""
+    """Refused are lengths out of reach, lengths that are no numbers, and a machine that can turn with locked struts."""
     assert assembly_modes(IDEAL, distances(IDEAL, Pose.identity()) * (1.0 - 1e-3)) == []
     rod = np.zeros((6, 3))
-    rod[:, 0] = [-0.5, -0.3, -0.1, 0.1, 0.3, 0.5]  # everything can turn about it
+    rod[:, 0] = [-0.5, -0.3, -0.1, 0.1, 0.3, 0.5]  # all joints are on one line, about which the platform can turn
     swinging = replace(IDEAL, base_joints=rod)
     for machine, lengths, error, words in (
         (IDEAL, [0.45] * 3 + [np.nan] + [0.45] * 2, NotFiniteError, "strut_4"),
@@ -361,8 +361,8 @@ def test_no_mode_within_the_limits() -> None:
 
 
 def test_two_candidates_as_near_are_refused() -> None:
-    """Tilted by 80° about its axis of symmetry the paper's machine has two more modes, mirror images of each other and
-    so equally near to home; with the cones open nothing tells them apart."""
+    """At a tilt of 80° about its axis of symmetry the paper's machine has two more modes, mirror images at the same
+    distance from home, which nothing distinguishes with open cones."""
     limits = replace(PAPER.limits, base_cone=np.full(6, np.pi), platform_cone=np.full(6, np.pi))
     with pytest.raises(OtherAssemblyModeError, match="at similar distances from home"):
         working_mode(replace(PAPER, limits=limits), IDEAL, distances(IDEAL, high([0, 80, 0])))

@@ -1,9 +1,10 @@
-"""Every limit at its edge: a hair inside passes, a hair outside is refused and says what, where and how much.
+"""Every limit: a value 1e-9 inside passes, a value 1e-9 outside is refused with quantity, place and excess.
 
-Limits are asked in two ways, by what stops at the first breach and by what measures everything: both say the same.
+Limits are evaluated in two ways, by the check that stops at the first breach and by the one that measures all; both
+must agree.
 
-The limited quantities come from NumPy alone (distances between joints, angles by arctan2, condition number
-by the inverse matrix); limits are set a relative 1e-9 above and below them.
+The limited quantities come from NumPy alone: distances between joints, angles by arctan2, the condition number by the
+inverse matrix.
 """
 
 from __future__ import annotations
@@ -39,12 +40,12 @@ TILTED = Pose.from_angles([0.02, -0.03, 0.52], np.deg2rad([12.0, -9.0, 15.0]))
 
 
 def struts(pose: Pose) -> np.ndarray:
-    """Return the strut vectors in ``base``, shape (6, 3), m."""
+    """Return the strut vectors in ``base``, (6, 3), m."""
     return pose.position + PAPER.platform_joints @ pose.rotation.T - PAPER.base_joints
 
 
 def angles_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the angles of rows, by arctan2, which is exact where arccos is not."""
+    """Return the angles between rows by arctan2, which is accurate where arccos is not."""
     return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1))
 
 
@@ -60,14 +61,14 @@ def condition_by_inverse(pose: Pose) -> float:
 
 
 def least_distance(pose: Pose, base: np.ndarray) -> tuple[float, int]:
-    """Return the smallest distance of two struts that share no joint, m, and the first of the two."""
+    """Return the smallest distance of two struts that share no joint, m, and the index of the first of the two."""
     ends = pose.position + PAPER.platform_joints @ pose.rotation.T
     pairs = [(i, j) for i, j in combinations(range(6), 2) if i // 2 != j // 2]
     return min((segment_distance(base[i], ends[i], base[j], ends[j]), i) for i, j in pairs)
 
 
 def cone_angles(pose: Pose, body: str) -> np.ndarray:
-    """Return the struts' angles to their directions at home, each seen from the body that carries the joint."""
+    """Return the struts' angles to their directions at home, as seen from base or platform."""
     turns = (pose.rotation, HOME.rotation) if body == "platform" else (np.eye(3), np.eye(3))
     return angles_between(struts(pose) @ turns[0], struts(HOME) @ turns[1])
 
@@ -84,7 +85,7 @@ LENGTHS, MOVED = (
 )
 CLOSEST, NEAREST = least_distance(CROSSED, PAPER.base_joints)
 LIMITS = [
-    # Limit, value, sign of what is allowed beside it, strut, pose, model
+    # limit, value at its edge, sign of the allowed side, strut, pose, model
     *(("longest", LENGTHS[i], 1.0, i, TILTED, None) for i in range(6)),
     *(("shortest", np.linalg.norm(struts(LOW)[i]), -1.0, i, LOW, None) for i in range(6)),
     *((f"{b}_cone", cone_angles(TILTED, b)[i], 1.0, i, TILTED, None) for b in ("base", "platform") for i in range(6)),
@@ -98,7 +99,7 @@ LIMITS = [
 
 @pytest.mark.parametrize(("limit", "value", "side", "strut", "pose", "model"), LIMITS)
 def test_a_hair_inside_passes_and_a_hair_outside_is_refused(limit, value, side, strut, pose, model) -> None:
-    """Compensated values too: a strut that is 50 µm short is told 50 µm more, a base joint stands 0.9 mm aside."""
+    """Compensated values, too: a strut 50 µm short has a longer command, and a base joint is 0.9 mm aside."""
     for inside in (True, False):
         edge = value * (1.0 + side * (HAIR if inside else -HAIR))
         changes: dict[str, object] = {limit: edge}
@@ -126,7 +127,7 @@ def test_a_hair_inside_passes_and_a_hair_outside_is_refused(limit, value, side, 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_largest_step(way: float) -> None:
-    """At home all six struts lengthen alike along z; the first is named."""
+    """At home all six struts lengthen equally along z; the first is named."""
     z = HOME.position[2]
     flat = np.linalg.norm(struts(HOME)[0, :2])
     length = np.hypot(flat, z)
@@ -160,7 +161,7 @@ def test_compensated_steps_are_checked_too() -> None:
     assert caught.value.value == pytest.approx(step / 0.98, rel=1e-9)
 
 
-# --- both ways of asking -----------------------------------------------------------------------------------
+# --- both ways of evaluating limits ------------------------------------------------------------------------
 
 TOOL = Pose.from_angles([0.01, -0.02, 0.08], np.deg2rad([20.0, -10.0, 40.0]))
 WORK = Pose.from_angles([0.1, 0.05, 0.2], np.deg2rad([3.0, 5.0, -70.0]))
@@ -168,7 +169,7 @@ OVER = np.diag([1.0, -1.0, -1.0])  # Turns a machine upside down
 
 
 def tight(geometry: HexapodGeometry, clearance: float, **frames: object) -> HexapodGeometry:
-    """Return a machine whose every limit some poses about home break, and no few keep."""
+    """Return a machine whose every limit some poses near home break, and many keep."""
     lengths = strut_lengths(Structure.of(geometry), geometry.home)
     stroke = np.stack([lengths - 0.05, lengths + 0.05], axis=1)
     limits = Limits(stroke, np.full(6, 0.11), np.full(6, 0.26), 3.2, 80e-6, 1.0, 1.0, clearance)
@@ -191,7 +192,7 @@ MACHINES = {
 
 
 def compensators_refusal(machine: HexapodGeometry, model: MachineModel, tool: Pose) -> tuple[str, int | None] | None:
-    """Return reason and strut with which a fresh compensator refuses a tool pose, None where it does not."""
+    """Return reason and strut with which a new compensator refuses a tool pose; None if it accepts it."""
     try:
         Compensator(machine, model).correct(tool)
     except HexapodError as error:
@@ -203,7 +204,7 @@ def compensators_refusal(machine: HexapodGeometry, model: MachineModel, tool: Po
 @settings(fixed, max_examples=15)
 @given(seed=seeds)
 def test_check_reach_cold_start_and_compensator_agree(name: str, seed: int) -> None:
-    """A model with all errors, random tool poses: who refuses, refuses for a reason that the others know."""
+    """For random tool poses and models, each of the four refuses for a reason that ``check`` finds as well."""
     machine, rng = MACHINES[name], np.random.default_rng(seed)
     structure, model = Structure.of(machine), random_model(rng, machine.name)
     poses = [random_pose(rng, machine.home, 0.04, 12.0) for _ in range(4)]
@@ -214,7 +215,7 @@ def test_check_reach_cold_start_and_compensator_agree(name: str, seed: int) -> N
     for row, (pose, tool) in enumerate(zip(poses, told, strict=True)):
         breaches = {(b.limit, getattr(b.error, "strut", None)) for b in result.breaches if b.row == row}
         assert compensators_refusal(machine, model, tool) in (breaches or {None})
-        # Tool poses round on their way through the frames; the poses are random, none is at an edge.
+        # Tool poses are rounded in the frames; none of the random poses is at an edge.
         nominal = machine.refusal(pose.position, pose.rotation, strut_lengths(structure, pose))
         assert REASONS[reach[row]] == ("" if nominal is None else nominal.reason)
         if nominal is None or nominal.reason != "stroke":

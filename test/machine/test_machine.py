@@ -1,7 +1,7 @@
-"""The machine model run both ways: temperatures and parts that follow them late, directions of motion, load.
+"""The machine model forwards and backwards: temperatures, late parts, directions of motion, load.
 
-Truth: closures, closed forms, integration of the lag by SciPy, and the minimum of the energy of six springs and a
-weight, which SciPy finds without knowing of forces.
+The truth is closures, closed forms, SciPy's integration of the lag, and the minimum of the energy of six springs and a
+weight, which SciPy finds without forces.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ GEOMETRIES = {"paper": paper_geometry(), "skewed": skewed_geometry()}
 
 
 def assert_same_pose(found, truth, position=1e-13, angle=1e-12):
-    """Compare within the issue's bar: 1e-13 m and 1e-12 rad."""
+    """Compare two poses within 1e-13 m and 1e-12 rad."""
     assert np.abs(found.position - truth.position).max() <= position
     turn = Rotation.from_matrix(found.rotation @ truth.rotation.T)
     assert turn.magnitude() <= angle
@@ -67,13 +67,13 @@ def moving(machine, pose):
     return motion
 
 
-# Forwards and backwards.
+# Forwards and backwards
 
 
 @fixed
 @given(seeds)
 def test_model_pose_times_its_error_is_the_target(seed):
-    """Truth: q ∘ E(q) = p (DESIGN), put together here from the field's value with SciPy's rotations.
+    """The truth is q ∘ E(q) = p, composed here from the field's value with SciPy's rotations.
 
     E moves the measured point by d and turns the platform by exp(ω) about it. Tolerance: a few roundings.
     """
@@ -95,7 +95,7 @@ def test_model_pose_times_its_error_is_the_target(seed):
 
 @pytest.mark.parametrize("body", ["base", "platform"])
 def test_a_deviation_is_a_moved_joint(body):
-    """Truth: the distance to the joint where it really is; the other five struts stay as they were."""
+    """The strut's length is the distance to the joint's real place; the other five struts do not change."""
     geometry = GEOMETRIES["skewed"]
     deviation = np.zeros((6, 3))
     deviation[2] = [120e-6, -80e-6, 50e-6]
@@ -110,7 +110,7 @@ def test_a_deviation_is_a_moved_joint(body):
 
 
 def test_a_field_too_steep_to_undo_is_refused():
-    """Truth: a field of slope 2.5 sends the fixed point from one side of the box to the other for ever."""
+    """A field of slope 2.5 is refused: the fixed-point iteration jumps between the sides of the box for ever."""
     lines = [np.zeros((2, 4 if a == 0 else 3, 3, 6, 2)) for a in (1, 0, 0)]
     lines[0][:, :, :, 0, 1] = 0.5
     model = MachineModel("paper", field=GridField(UNEVEN_GRID, tuple(lines)))
@@ -118,14 +118,14 @@ def test_a_field_too_steep_to_undo_is_refused():
         RealMachine(GEOMETRIES["paper"], model).commands_for(Pose([0.01, 0.0, 0.4], np.eye(3)), MotionState())
 
 
-# Temperatures.
+# Temperatures
 
 
 @fixed
 @given(seeds, st.floats(-20.0, 60.0))
 def test_uniform_growth_scales_the_machine(seed, temperature):
-    """Truth: similar triangles. When base, platform and struts all grow by 1 + g, so does the position of
-    the platform, and it turns by nothing. Offsets and deviations belong to the parts and grow with them.
+    """By similar triangles, growth of base, platform and struts by 1 + g scales the platform's position by 1 + g,
+    without a rotation. Offsets and deviations belong to the parts and grow with them.
     """
     rng = np.random.default_rng(seed)
     geometry = GEOMETRIES["skewed"]
@@ -152,14 +152,14 @@ def test_bad_temperatures_are_refused():
     for name, value, message in (
         ("strut_7", 20.0, "strut_1.*platform.*strut_7"),
         ("base", math.nan, "base.*-40…120.*nan"),
-        ("platform", 293.15, "platform.*120.*293.15"),  # somebody sends kelvin
+        ("platform", 293.15, "platform.*120.*293.15"),  # kelvin in place of °C
     ):
         with pytest.raises(ModelError, match=message):
             temperatures.set(name, value)
         assert not temperatures.values
 
 
-# What no model can be.
+# Impossible models
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ THRESHOLD = 2e-6
 
 
 def follow(value, threshold, low, sense, index):
-    """Take one of the nine values, and none of the others; return its direction."""
+    """Follow one of the nine values without the others; return its direction."""
     values = np.full(9, np.nan)
     values[index] = value
     follow_nine(values, threshold, threshold, low, sense)
@@ -196,9 +196,9 @@ FAR = 0.5 + 1e-3
 @pytest.mark.parametrize(
     ("threshold", "values", "senses"),
     [
-        # From the farthest point 1.9 µm back is noise, 2.1 µm back a reversal; the way back again counts as far
+        # 1.9 µm back from the furthest point is noise, 2.1 µm is a reversal, and likewise for the next reversal
         pytest.param(THRESHOLD, [0.5, FAR, FAR - 1.9e-6, FAR - 2.1e-6, FAR - 0.3e-6, FAR], [0, 1, 1, -1, -1, 1]),
-        # Steps far below the threshold add up; after more than half of it the direction is known
+        # Steps far below the threshold add up: after more than half of it the direction is known
         pytest.param(THRESHOLD, [0.5 + 0.3e-6 * step for step in range(6)], [0, 0, 0, 0, 1, 1], id="creeping"),
         pytest.param(0.0, [0.5, 0.6, 0.6, 0.59, 0.59, 0.7], [0, 1, 1, -1, -1, 1], id="no threshold"),
         pytest.param(THRESHOLD, [math.nan, 0.5, 0.6, math.nan, 0.6 - 1e-6, 0.6 - 3e-6], [0, 0, 1, 1, 1, -1], id="NaN"),
@@ -206,7 +206,7 @@ FAR = 0.5 + 1e-3
 )
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_a_direction_turns_at_the_threshold(threshold, values, senses, way):
-    """Truth: the definition."""
+    """The truth is the definition of the reversal threshold."""
     state = MotionState()
     found = [follow(way * value, threshold, state.low, state.sense, 4) for value in values]
     assert found == [way * sense for sense in senses]
@@ -230,7 +230,7 @@ VALUES = np.array([20.0, 20.4, 20.4, 21.5, 23.0, 22.1])
 
 
 def integrated(constant: float) -> np.ndarray:
-    """Return the lag's output minus its input at TIMES by integrating τ F' = s − F, s straight between readings."""
+    """Return the lag's output minus its input at TIMES by integrating τ F' = s − F, with s linear between readings."""
     flow = solve_ivp(
         lambda t, f: (np.interp(t, TIMES, VALUES) - f) / constant,
         (TIMES[0], TIMES[-1]), [VALUES[0]], t_eval=TIMES, rtol=1e-10, atol=1e-12, max_step=0.5,
@@ -240,13 +240,13 @@ def integrated(constant: float) -> np.ndarray:
 
 @pytest.mark.parametrize("constant", [10.0, 300.0, 1e5])
 def test_a_lag_is_the_solution_of_its_equation(constant: float):
-    """The integration's own error is some 1e-9 K."""
+    """The integration has 1e-9 K of error."""
     found = thermal_lags(TIMES, VALUES[:, None], [constant])[:, 0, 0]
     np.testing.assert_allclose(found, integrated(constant), atol=1e-7)
 
 
 def test_readings_one_by_one_and_all_at_once_in_any_order():
-    """What a compensator carries is what a fit works out, to rounding."""
+    """A compensator's update reading by reading equals a fit's evaluation of all readings, to rounding."""
     constants, temperatures = (100.0, 1000.0), Temperatures()
     behind = []
     for time, value in zip(TIMES, VALUES, strict=True):
@@ -258,7 +258,7 @@ def test_readings_one_by_one_and_all_at_once_in_any_order():
 
 
 def warming_model(**changes) -> MachineModel:
-    """Return a model with two time constants, all parts by the base's thermometer."""
+    """Return a model with two time constants whose parts all follow the base's thermometer."""
     expansion = 1e-6 * np.arange(16.0).reshape(8, 2)
     values = {"time_constants": (600.0, 7200.0), "expansion": expansion, "thermometer": "base"} | changes
     struts = StrutErrors(expansion=np.full(6, 11e-6))
@@ -267,7 +267,7 @@ def warming_model(**changes) -> MachineModel:
 
 
 def test_a_machine_grows_by_one_thermometer_and_what_is_behind_it():
-    """Growth of strut 3: 11 ppm/K of 2 K, less 4 and 5 ppm/K of 1 and 1.5 K: 10.5 ppm; the base: 20 − 12 − 19.5."""
+    """Strut 3 grows by 11 ppm/K of 2 K, less 4 and 5 ppm/K of 1 and 1.5 K: 10.5 ppm; the base by 20 − 12 − 19.5 ppm."""
     read = dict(zip(PARTS, [99.0] * 6 + [22.0, 50.0], strict=True))
     behind = {part: Lag(np.nan, np.nan, [-1.0, -1.5] if part == "base" else [0.0, 0.0]) for part in PARTS}
     warm = RealMachine(paper(), warming_model(), Temperatures(read, behind))
@@ -275,11 +275,13 @@ def test_a_machine_grows_by_one_thermometer_and_what_is_behind_it():
     nominal = paper().kernel_joints[0]
     np.testing.assert_allclose(warm.structure.base_joints - nominal, -11.5e-6 * nominal, atol=1e-15)
     own = RealMachine(paper(), warming_model(thermometer=""), Temperatures({"strut_3": 24.0, "base": 22.0}))
-    assert own.growth[2] == pytest.approx(44e-6)  # its own reading; at rest
+    assert own.growth[2] == pytest.approx(44e-6)  # from its own thermometer, at rest
 
 
 def test_stations_driven_together_go_where_each_goes_alone():
-    """Four in a row, the middle two alike: to the bit. The third is then told a length that no pose has, and named."""
+    """Four stations driven together, two of them equal, give each station's own result bit for bit.
+
+    A third station whose length no pose has is named in the error."""
     temperatures, humidity = np.full((4, 8), 20.0), np.full(4, np.nan)
     temperatures[1:3, 6], temperatures[3, 2] = 23.0, 25.0
     around = Surroundings(temperatures, np.full(4, np.nan), humidity, np.tile(NO_LOAD, (4, 1)))
@@ -301,7 +303,7 @@ def test_stations_driven_together_go_where_each_goes_alone():
 
 
 def test_a_restart_does_not_know_what_was_before_and_says_for_how_long():
-    """Three time constants of the slowest, 7200 s, from the first reading of the thermometer that counts."""
+    """The lags are uncertain for 7200 s, three slowest time constants, after the thermometer's first reading."""
     late_growth, temperatures = warming_model().late_growth, Temperatures()
     temperatures.follow("base", 21.0, math.nan, ())
     with pytest.raises(ModelError, match="time of the temperature of base"):
@@ -317,7 +319,7 @@ def test_a_restart_does_not_know_what_was_before_and_says_for_how_long():
 
 
 def test_whatever_acts_on_the_machine_tells_places_apart():
-    """One number of a place at a time is another; only what leaves the machine as it is may be merged."""
+    """Stations that differ in any influence on the machine are kept apart; only others may be merged."""
     swelling = StrutErrors(expansion=np.full(6, 11e-6), moisture=np.full(6, 1e-4))
     load = Load(stiffness=np.full(6, 2e7), mass=20.0)
     bending = RealMachine(paper(), replace(warming_model(), struts=swelling, load=load))
@@ -330,7 +332,7 @@ def test_whatever_acts_on_the_machine_tells_places_apart():
     rows[1 + np.arange(len(usual)), np.arange(len(usual))] += 0.25
     around = Surroundings(rows[:, :8], np.full(len(rows), np.nan), rows[:, 8], rows[:, 9:])
     assert len(set(around.machines(bending))) == len(rows)
-    assert len(set(around.machines(growing))) == 9  # no strut gives or swells: temperatures alone
+    assert len(set(around.machines(growing))) == 9  # without compliance and swelling only temperatures matter
     assert len(set(around.machines(rigid))) == 1
     again = Surroundings(*(np.concatenate([part, part]) for part in vars(around).values()))
     machines = again.machines(bending)
@@ -350,7 +352,7 @@ def lowest_energy(
     geometry: HexapodGeometry, lengths: np.ndarray, stiffness: np.ndarray, mass: float, centre: np.ndarray,
     gravity: np.ndarray, start: Pose,
 ) -> Pose:  # fmt: skip
-    """Return where a platform on six springs comes to rest: its energy's gradient, by central differences, is zero."""
+    """Return the pose of a platform on six springs at which the energy's gradient, by central differences, is zero."""
 
     def pose(x: np.ndarray) -> Pose:
         return Pose(start.position + x[:3], Rotation.from_rotvec(x[3:]).as_matrix() @ start.rotation)
@@ -368,7 +370,7 @@ def lowest_energy(
 
 @pytest.mark.parametrize("name", [*machine_names(), "pivoting"])
 def test_it_rests_where_the_energy_is_least(name: str, tmp_path: Path) -> None:
-    """Uneven struts, a mass off the middle, gravity from aside. The differences' rounding is worth 1 nm and 10 nrad."""
+    """For uneven struts, a mass off the middle and tilted gravity both agree to 1 nm and 10 nrad, the rounding."""
     if name == "pivoting":
         geometry = three_two_one_machine()
     else:
@@ -388,7 +390,7 @@ def test_it_rests_where_the_energy_is_least(name: str, tmp_path: Path) -> None:
 
 
 def test_a_hanging_machine_is_commanded_shorter() -> None:
-    """The paper's machine turned upside down: every strut pulls, by the same forces."""
+    """Turned upside down, the paper's machine has struts that pull, with the same forces."""
     standing = paper_geometry()
     over = np.diag([1.0, -1.0, -1.0])
     hanging = replace(
@@ -398,7 +400,7 @@ def test_a_hanging_machine_is_commanded_shorter() -> None:
     pushed, pulled = (loaded(g).commands_for(g.home)[0] - distances(g, g.home) for g in (standing, hanging))
     assert (pushed > 1e-6).all()
     np.testing.assert_allclose(pulled, -pushed, rtol=1e-9)
-    # Lost motion: a strut that pushes is shorter by half of it, so it is told to be longer, and the other way round.
+    # Lost motion: a pushing strut is shorter by half of it, so its command is longer, and conversely.
     for geometry, sign in ((standing, 1.0), (hanging, -1.0)):
         with_play = loaded(geometry, lost_motion=4e-6 * np.arange(1.0, 7.0)).commands_for(geometry.home)[0]
         added = with_play - loaded(geometry).commands_for(geometry.home)[0]
@@ -408,9 +410,10 @@ def test_a_hanging_machine_is_commanded_shorter() -> None:
 @fixed
 @given(seeds)
 def test_forwards_undoes_backwards(seed: int) -> None:
-    """Closure within 1e-13 m and 1e-12 rad: all blocks and terms, uneven temperatures, any gravity and a wrench.
+    """With all terms, uneven temperatures, any gravity and a wrench, forwards undoes backwards to 1e-13 m and 1e-12
+    rad.
 
-    The model is no small matter: uncompensated, the same pose is missed by 10 µm at the least.
+    Without compensation the pose would be missed by at least 10 µm.
     """
     rng = np.random.default_rng(seed)
     geometry = skewed_geometry(lead=0.01 * float(rng.integers(2)))
@@ -434,7 +437,7 @@ def test_forwards_undoes_backwards(seed: int) -> None:
 
 
 def test_a_tool_weighs_like_a_wrench_in_its_centre() -> None:
-    """8 kg at a place of a platform that is level are a force and a torque about its origin."""
+    """8 kg at a point of a level platform act as a force and a torque about its origin."""
     geometry, centre = skewed_geometry(), np.array([0.03, -0.02, 0.12])
     weight = np.array([0.0, 0.0, -8.0 * G])
     level = Pose(geometry.home.position, np.eye(3))
@@ -450,7 +453,7 @@ def test_a_tool_weighs_like_a_wrench_in_its_centre() -> None:
 
 
 def settled(compensator: Compensator, start: float = 0.0) -> np.ndarray:
-    """Command home until nothing ramps any more; return the commands, none of which may step by more than the ramp."""
+    """Command home until the ramp has ended; check that no command steps by more than the ramp; return the commands."""
     home, last = compensator.geometry.tool_pose(compensator.geometry.home), compensator.command.copy()
     for n in range(1, 400):
         compensator.correct(home, start + 0.02 * n)
@@ -462,7 +465,7 @@ def settled(compensator: Compensator, start: float = 0.0) -> np.ndarray:
 
 
 def test_what_acts_ramps_in_and_no_direction_turns() -> None:
-    """A change of gravity, force or tool is taken up by 1 mm/s, and ends at what a machine so loaded needs."""
+    """A change of gravity, force or tool ramps in at 1 mm/s, and ends at the commands of a machine with this load."""
     geometry = replace(skewed_geometry(), tools={"heavy": Pose.identity()}, payloads={"heavy": Payload(20.0)})
     model = MachineModel("skewed", load=Load(stiffness=np.full(6, 1e6), mass=30.0), reversal_threshold=1e-7)
     compensator = Compensator(geometry, model)
@@ -476,7 +479,7 @@ def test_what_acts_ramps_in_and_no_direction_turns() -> None:
     compensator.set_tool("heavy")
     np.testing.assert_array_equal(settled(compensator, 20.0), loaded_commands(geometry.using("heavy"), model, tilted))
     np.testing.assert_array_equal(compensator.motion.sense, sense)
-    compensator.set_load(tilted)  # the same again is no change
+    compensator.set_load(tilted)  # the same load is no change
     assert seen == [("load", tilted.numbers()), ("tool", "heavy")]
     with pytest.raises(ModelError, match=r"gravity: must be three numbers of magnitude 9…10.6 m/s²"):
         compensator.set_load(Loading((0.0, 0.0, 1e3)))
@@ -510,7 +513,7 @@ def test_a_load_that_no_machine_has_is_refused() -> None:
 
 
 def test_tools_have_mass_and_centre(tmp_path: Path) -> None:
-    """The geometry file states them with units, in platform; a mass without its centre is refused."""
+    """The geometry file has masses and centres of tools with units; a mass without its centre is refused."""
     text = (
         machines()["paper"].write(tmp_path / "machine.yaml").read_text()
         + "tools:\n  heavy: {position_mm: [0, 0, 50], mass_kg: 12, centre_mm: [1, 2, 30]}\n"

@@ -1,4 +1,4 @@
-"""Model files: what is written comes back, what is read means what it says, what is in doubt is refused."""
+"""Model files: written models read back, files mean what their keys say, doubtful files are refused."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ DIGEST = "0123456789abcdef" * 4
 ORIGIN = ModelOrigin("2026-01-31", (("laser x.csv", DIGEST), ("ballbar.csv", "f" * 64)), 4.2e-6, "Größe: 4 µm")
 ROOT = Path(__file__).parents[2]
 
-# Written by hand; every number is checked below.
+# Written by hand; every number is checked below
 BY_HAND = f"""
 format: hexapod_comp/model
 version: 1
@@ -101,12 +101,12 @@ def there_and_back(model, folder, geometry):
     return load_model(folder / "there.yaml", geometry)
 
 
-# There and back.
+# Written and read back
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_model_comes_back(tmp_path, seed):
-    """Truth: the model saved. One rounding per number, 2.2e-16, where no decimal in the unit hits it."""
+    """The truth is the model that was saved, with one rounding per number, 2.2e-16."""
     rng = np.random.default_rng(seed)
     box = np.sort(rng.uniform(-1.0, 1.0, (2, 3)), axis=0)
     nodes = np.radians([0.0, 20.0, 90.0]), np.radians([-90.0, 45.0])
@@ -120,7 +120,7 @@ def test_a_model_comes_back(tmp_path, seed):
     once = there_and_back(model, tmp_path, SKEWED)
     assert_equal(once, model, relative=2.3e-16)
     first = (tmp_path / "there.yaml").read_text(encoding="utf-8")
-    assert_equal(there_and_back(once, tmp_path, SKEWED), once)  # from the first reading on everything is exact
+    assert_equal(there_and_back(once, tmp_path, SKEWED), once)  # a second time all numbers are exact
     assert (tmp_path / "there.yaml").read_text(encoding="utf-8") == first
     keys = [line.split(":")[0] for line in first.splitlines() if line[0] not in " -"]
     opening = "format version closed machine name date sources region held_out_residual_um note reversal_threshold_um"
@@ -148,7 +148,7 @@ def test_fields_come_back(tmp_path, field):
 
 
 def test_the_papers_field_is_sparse_and_equal_directions_are_said_once():
-    """A 1-D laser's lines carry one component each; where forward is backward, one line says both."""
+    """A 1-D laser's lines carry one component each; if forward equals backward, one line has both."""
     lines = _families(3, 0, 0)
     lines[0][:, :, :, 0] = np.random.default_rng(1).normal(size=lines[0][:, :, :, 0].shape) * 1e-5
     lines[0][1, 0, 0] = lines[0][0, 0, 0]
@@ -159,7 +159,7 @@ def test_the_papers_field_is_sparse_and_equal_directions_are_said_once():
 
 
 def test_round_numbers_stay_round_and_nothing_is_written_of_an_ideal_block():
-    """Truth: what a person would write. 0.35 m are 350 mm, not 349.99999999999994."""
+    """The truth is the text that a person would write: 0.35 m is 350 mm, not 349.99999999999994."""
     struts = StrutErrors(offset=np.full(6, 12.3e-6), pitch=np.arange(6) / 1e6, sine=np.full(6, 1e-7))
     grid = (np.array([-0.2, 0.1]), np.array([-0.15, 0.3]), np.array([0.35, 0.55]))
     lines = tuple(np.zeros((2, 2, 2, 6, 0)) for _ in range(3))
@@ -177,11 +177,11 @@ def test_round_numbers_stay_round_and_nothing_is_written_of_an_ideal_block():
     assert not {"structure", "thermal", "load", "outside", "region"} & set(yaml.safe_load(text))
 
 
-# Reading.
+# Reading
 
 
 def test_a_file_written_by_hand(tmp_path):
-    """Truth: the numbers in BY_HAND, times their units. What is left out, or short, is filled up with zeros."""
+    """The truth is the numbers in BY_HAND times their units; missing or short lists are filled with zeros."""
     model = load(tmp_path, BY_HAND)
     date = "2026-01-31T12:30:00+01:00"
     assert_equal(model.origin, ModelOrigin(date, (("laser.csv", DIGEST),), 4.2e-6), relative=3e-16)
@@ -226,7 +226,7 @@ def test_a_file_written_by_hand(tmp_path):
     np.testing.assert_array_equal(field.lines[2], truth)
 
 
-# Refused, naming file, key and value.
+# Refusals, which name file, key and value
 
 
 @pytest.mark.parametrize(
@@ -263,7 +263,7 @@ def test_a_file_written_by_hand(tmp_path):
         ("at: [1, 1]", "at: [1, 2]", ["field.lines[4].at", "0…1 and 0…1", "[1, 2]"]),
         ("at: [1, 1]", "at: [1.0, 1]", ["field.lines[4].at", "indices", "[1.0, 1]"]),
         ("at: [1, 1]", "at: [1]", ["field.lines[4].at", "two node indices", "[1]"]),
-        # Largest on −1…1: of 60u mm at its end; 40 + 40 − 40u² mm in the middle, below its coefficients' sum.
+        # Largest value on −1…1: of 60u mm at an end; of 40 + 40 − 40u² mm in the middle, below its coefficients' sum
         ("dz_um: [1, 2, 3]", "dz_mm: [0, 60]", ["field.lines_z.dz", "±50 mm", "unit", "0.06"]),
         ("dz_um: [1, 2, 3]", "dz_mm: [80, 0, -40]", ["field.lines_z.dz", "±50 mm", "0.08"]),
         ("rx_urad: [7]", "rx_rad: [-0.2]", ["field.lines_z.rx", "±100 mrad", "0.2"]),
@@ -289,14 +289,14 @@ def test_refused(tmp_path, old, new, said):
 
 
 def test_many_nodes_with_few_lines_take_no_memory(tmp_path):
-    """20,000 nodes both ways would be 100 GB of coefficients; the missing lines are found first."""
+    """20,000 nodes in each direction would need 100 GB of coefficients, but the missing lines are found first."""
     nodes = "[" + ", ".join(str(n) for n in range(20_000)) + "]"
     text = BY_HAND.replace("grid_x_mm: [-200, 200]", f"grid_x_mm: {nodes}").replace("y_in: [-8, 8]", f"y_mm: {nodes}")
     with pytest.raises(InputFileError, match="is missing"):
         load(tmp_path, text)
 
 
-# Writing.
+# Writing
 
 
 def test_a_model_without_provenance_is_not_written(tmp_path):
@@ -313,14 +313,14 @@ def test_a_model_without_provenance_is_not_written(tmp_path):
 
 
 def test_names_of_every_kind_come_back():
-    """Text that YAML would take for something else stays text."""
+    """Names that YAML would read as something else stay text."""
     for word in ("no", "1.5", "null", "2026-01-31", "a: b", "- x", "#1", "0400", "é µ 漢", "'", '"', "!x", "&a", "*b"):
         model = MachineModel("paper", word, origin=ModelOrigin("2026-01-31", ((word, DIGEST),), None, word))
         assert_equal(parse_model(model_text(model), "paper"), model)
 
 
 def test_a_file_cut_off_anywhere_is_refused():
-    """Every block is optional, so a beginning of a file may read well; thirty places, line ends among them."""
+    """Every block is optional, so a file cut off at thirty places, some at line ends, might read without an error."""
     text = model_text(replace(random_model(np.random.default_rng(5), "paper"), origin=ORIGIN))
     ends = [number for number, letter in enumerate(text[:-1]) if letter == "\n"]
     places = {*np.linspace(1, len(text) - 2, 18, dtype=int), *np.random.default_rng(6).choice(ends, 12), ends[-1]}
@@ -332,11 +332,11 @@ def test_a_file_cut_off_anywhere_is_refused():
     assert accepted == []
 
 
-# What the documentation says.
+# The documentation
 
 
 def test_the_documented_table_and_example_are_the_programs():
-    """Where they are not: put what `terms_text` returns under "All terms". Every key of the example is known."""
+    """If this fails: put the result of `terms_text` under "All terms". The example has only known keys."""
     page = (ROOT / "doc" / "model_file.md").read_text(encoding="utf-8")
     assert page.endswith("\n\n" + terms_text())
     text = page.split("```yaml\n")[1].split("```")[0]
@@ -346,34 +346,36 @@ def test_the_documented_table_and_example_are_the_programs():
         text = re.sub(rf"{key} +#.*", f"{key} {zeros}", text)
     text = re.sub(r"late_struts_ppm_per_K: +#.*", "late_struts_ppm_per_K: " + str(np.zeros((6, 2)).tolist()), text)
     text = text.replace("at: [0, 2]", "at: [0, 0]")
-    with pytest.raises(InputFileError, match=r"the forward line along x at \[0, 1\] is missing"):  # one is shown of 18
+    with pytest.raises(
+        InputFileError, match=r"the forward line along x at \[0, 1\] is missing"
+    ):  # the example shows one of 18 lines
         parse_model(text, "paper")
 
 
-# Shipped models.
+# Shipped models
 
 
 def test_the_ideal_model_has_no_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ideal").write_text("no model")
     assert_equal(load_model("ideal", SKEWED), MachineModel("skewed"))
-    with pytest.raises(InputFileError):  # a path means the file
+    with pytest.raises(InputFileError):  # a path is not taken as a name
         load_model(tmp_path / "ideal", SKEWED)
 
 
 def test_shipped_files_are_what_the_tool_makes(tmp_path):
-    """To the last digit or one beside it: another processor may round the laser lines differently."""
+    """The last digit may differ by one, as another processor may round the laser lines differently."""
     tool.main(["--out", str(tmp_path)])
     for name in ("paper_machine.yaml", "paper_lines_model.yaml"):
         shipped, fresh = (yaml.safe_load((at / name).read_text("utf-8")) for at in (ROOT / "config", tmp_path))
         for content in (shipped, fresh):
-            for key in ("note", "sources", "held_out_residual_um"):  # this is the next test's
+            for key in ("note", "sources", "held_out_residual_um"):  # checked by the next test
                 content.pop(key, None)
         assert_equal(fresh, shipped, absolute=1.01e-4)
 
 
 def test_lines_model_is_worth_what_its_file_says():
-    """On the same held-out points; the paper's own figure, about 70 %, is reached on its own metric."""
+    """The figures are those at the same held-out points; in the paper's own measure about 70 % is removed."""
     geometry = load_geometry("paper")
     truth, lines = (load_model(name, geometry) for name in ("paper_machine", "paper_lines_model"))
     found = evaluate_model(RealMachine(geometry, truth), lines, tool.BOX)

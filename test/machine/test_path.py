@@ -1,4 +1,4 @@
-"""Straight motions of least time, moves and milling: closed forms, limits by finite differences, ways by geometry."""
+"""Straight motions of least time, moves and milling: closed forms, limits by finite differences, geometry of paths."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def machine_of(name: str, folder: Path) -> HexapodGeometry:
 
 
 def lengths(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Return strut lengths of tool poses in work by vectors alone, shape (N, 6)."""
+    """Return strut lengths of tool poses in work by vectors alone, (N, 6)."""
     turned = geometry.work.rotation @ rotations @ geometry.tool.rotation.T
     tips = geometry.work.position + positions @ geometry.work.rotation.T
     joints = tips[:, None] + np.einsum("nij,kj->nki", turned, geometry.platform_joints - geometry.tool.position)
@@ -38,7 +38,7 @@ def lengths(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndar
 
 
 def random_targets(geometry: HexapodGeometry, count: int, seed: int) -> list[Pose]:
-    """Return poses around home, 0.1 mm to 50 mm and up to 9° apart."""
+    """Return poses 0.1 mm to 50 mm and up to 9° from home."""
     rng, home = np.random.default_rng(seed), geometry.tool_pose(geometry.home)
     result = []
     for size in 10.0 ** rng.uniform(-3.0, 0.0, count):
@@ -50,7 +50,7 @@ def random_targets(geometry: HexapodGeometry, count: int, seed: int) -> list[Pos
 def shares(
     geometry: HexapodGeometry, path: tuple[np.ndarray, np.ndarray], rate: float, rates: StrutRates
 ) -> list[float]:
-    """Return the largest speed, acceleration and jerk sent, from rest to rest, as shares of those allowed."""
+    """Return the largest speed, acceleration and jerk of a motion from rest to rest, over the allowed ones."""
     sent = lengths(geometry, *path)
     sent = np.concatenate([np.repeat(sent[:1], 3, axis=0), sent, np.repeat(sent[-1:], 3, axis=0)])
     allowed = rates.speed, rates.acceleration, rates.jerk
@@ -60,7 +60,7 @@ def shares(
 
 
 def seven_phases(way: float, rates: StrutRates) -> float:
-    """Return the least time of one axis from rest to rest: ramps of jerk and of acceleration and a coast."""
+    """Return the least time of one axis from rest to rest: ramps of jerk and acceleration, and a coast."""
     v, a, j = rates.speed, rates.acceleration, rates.jerk
     if math.isinf(j):
         return way / v + v / a if way >= v * v / a else 2.0 * math.sqrt(way / a)
@@ -75,7 +75,7 @@ def seven_phases(way: float, rates: StrutRates) -> float:
 @pytest.mark.parametrize("jerk", [math.inf, 40.0, 4.0])
 @pytest.mark.parametrize("rise", [0.0001, 0.01, -0.06])
 def test_straight_up_all_struts_are_one_axis(rise: float, jerk: float) -> None:
-    """Over the middle of the paper's machine all struts are alike: the optimum in their length is in the textbooks."""
+    """Above the middle of the paper's machine all struts move alike: the optimum is the textbook's for one axis."""
     geometry, rates = paper_geometry(), replace(RATES, jerk=jerk)
     home = Pose(np.array([0.0, 0.0, geometry.home.position[2]]), geometry.home.rotation)
     start = geometry.tool_pose(home)
@@ -130,7 +130,7 @@ def test_a_stop_keeps_every_limit_stays_on_the_way_and_is_never_later_than_the_e
 
 
 def test_a_stop_from_full_speed_is_early() -> None:
-    """In the middle of a long way: at most three times as long as by the largest acceleration throughout."""
+    """A stop in the middle of a long path takes at most three times as long as with the largest acceleration alone."""
     geometry = paper_geometry()
     home = geometry.tool_pose(geometry.home)
     (motion,) = plan_motion(geometry, [home, Pose(home.position + np.array([0.0, 0.0, 0.15]), home.rotation)], RATES)
@@ -147,7 +147,7 @@ def test_a_program_rests_at_each_way_point_and_skips_equal_ones() -> None:
 
 
 def test_rates_are_a_share_of_the_machines_limits() -> None:
-    """The step of 2 mm limits below 125 Hz; without acceleration and jerk in the file they follow from times."""
+    """The step of 2 mm limits the speed below 125 Hz; acceleration and jerk that the file lacks follow from times."""
     geometry = paper_geometry()
     assert StrutRates.of(geometry, 50.0, 1.0).speed == pytest.approx(0.1)
     rates = StrutRates.of(geometry, 250.0, 0.8)
@@ -188,7 +188,7 @@ def test_what_makes_no_motion_is_refused() -> None:
 
 @pytest.mark.parametrize("name", ["paper", "inches", *LONG])
 def test_a_program_keeps_every_limit_passes_its_poses_and_is_never_ahead(name: str, tmp_path: Path) -> None:
-    """Poses of a random walk at times of which some leave the struts too little: truth is differentiation here."""
+    """The program is a random walk with some times too short for the struts; the truth is differentiation here."""
     geometry, rate = machine_of(name, tmp_path), 1000.0
     poses = random_targets(geometry, 23, 6)
     times = np.cumsum([0.0, *np.random.default_rng(24).uniform(0.02, 2.0, len(poses) - 1)])
@@ -205,7 +205,7 @@ def test_a_program_keeps_every_limit_passes_its_poses_and_is_never_ahead(name: s
 
 
 def test_a_slow_program_keeps_its_own_time() -> None:
-    """A sine of 0.1 mm, 2 s long, needs no more than its start and its end to gather and to lose speed."""
+    """A sine of 0.1 mm over 2 s takes only longer by its acceleration at the start and its braking at the end."""
     geometry, (home, *_) = paper_geometry(), random_targets(paper_geometry(), 1, 2)
     times = np.linspace(0.0, 2.0, 41)
     poses = [
@@ -228,16 +228,17 @@ def with_start(start: Pose, path: trajectory.Path) -> tuple[np.ndarray, np.ndarr
 
 
 def tool_targets(geometry: HexapodGeometry) -> list[Pose]:
-    """Return Table 1 of 000 as tool poses."""
+    """Return Table 1 of Song et al. as tool poses."""
     return [geometry.work.inverse() @ pose @ geometry.tool for pose in table_poses()]
 
 
 @MACHINES
 @pytest.mark.parametrize(("rate", "acceleration"), [(20.0, 0.0), (250.0, 0.0), (1000.0, 0.0), (250.0, 1.0), (1e3, 1.0)])
 def test_moves_keep_steps_speeds_and_accelerations(geometry: HexapodGeometry, rate: float, acceleration: float) -> None:
-    """By finite differences: at 20 Hz the step of 2 mm limits, above 125 Hz the speed, or the acceleration where it is
-    limited. 0.8 of a limit are meant to be used, less the coarse count of poses; of an acceleration a third where moves
-    are short."""
+    """By finite differences: at 20 Hz the step of 2 mm limits, above 125 Hz the speed, or the acceleration if limited.
+
+    Moves use 0.8 of a limit, less the rounding of the number of poses, and a third of the acceleration in short
+    moves."""
     limits = replace(geometry.limits, acceleration=acceleration)
     for start, end in pairwise(tool_targets(geometry)):
         path = move(replace(geometry, limits=limits), start, end, rate)
@@ -252,7 +253,7 @@ def test_moves_keep_steps_speeds_and_accelerations(geometry: HexapodGeometry, ra
 
 @MACHINES
 def test_a_move_is_straight_and_turns_along_the_shortest_arc(geometry: HexapodGeometry) -> None:
-    """Against scipy's Slerp at the share of the straight line; ends exactly at the end."""
+    """The truth is scipy's Slerp at the share of the straight line; the end pose is exact."""
     rng = np.random.default_rng(5)
     start, end = (random_pose(rng, tool_targets(geometry)[0], tilt=25.0) for _ in range(2))
     path = move(geometry, start, end, 250.0)
@@ -267,7 +268,7 @@ def test_a_move_is_straight_and_turns_along_the_shortest_arc(geometry: HexapodGe
 
 
 def test_circle_has_its_radius_plane_and_feed() -> None:
-    """In the tilted centre's own frame: distance 25 mm, z zero, closed, from rest to rest at the feed at most."""
+    """In the tilted centre's frame the circle has a radius of 25 mm, z = 0, and at most the feed; it starts and ends at rest."""
     centre = Pose.from_angles([0.01, 0.02, 0.4], np.deg2rad([8.0, -6.0, 20.0]))
     path = circle(centre, 0.025, feed=0.05, rate=250.0)
     local = (path.positions - centre.position) @ centre.rotation
@@ -290,7 +291,7 @@ def figure_of_eight(count: int = 400) -> np.ndarray:
 
 
 def test_the_foot_of_a_point_is_the_nearest_place_of_what_was_just_commanded() -> None:
-    """Beside a dense sampling of the last legs; where the path crosses itself the other branch does not count."""
+    """The truth is a dense sampling of the last legs; where the path crosses itself only this branch counts."""
     corners, rng = figure_of_eight(), np.random.default_rng(4)
     sent = rng.integers(0, len(corners) + 3, 200)
     newest = np.clip(sent, 1, len(corners) - 1)
@@ -305,7 +306,7 @@ def test_the_foot_of_a_point_is_the_nearest_place_of_what_was_just_commanded() -
 
 
 def test_a_track_is_moved_back_onto_its_path() -> None:
-    """A tool that runs late on a path which stands 150 µm and 0.3 mrad off: the path's own motion takes it back."""
+    """A tool that is late on a path displaced by 150 µm and 0.3 mrad: the known motion maps the track onto the path."""
     corners = figure_of_eight()
     sent = np.arange(10, len(corners))
     turn, shift = Rotation.from_rotvec([1e-4, -2e-4, 2e-4]), np.array([1e-4, -1e-4, 5e-5])

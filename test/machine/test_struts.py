@@ -24,7 +24,7 @@ COMMANDS = np.linspace(0.35, 0.65, 61)
 
 
 def machine_of(struts, growth=0.0):
-    """Return a machine whose screws cannot turn, and whose struts have grown."""
+    """Return a machine whose screws do not turn, and whose struts have grown."""
     machine = RealMachine(PAPER, MachineModel("paper", struts=struts))
     machine.growth[:] = growth
     return machine
@@ -39,11 +39,11 @@ def command_for_length(machine, strut, wanted, sense=0.0, shift=0.0):
 
 
 def on_strut_4(value):
-    """Return six values of which only strut 4 (index 3) has one."""
+    """Return six values that are zero except for strut 4 (index 3)."""
     return np.where(np.arange(6) == 3, value, 0.0)
 
 
-# One term at a time. Truth: the closed form beside each; tolerance: two roundings of half a metre, 2e-16.
+# One term at a time; the truth is the closed form beside each, with two roundings of half a metre, 2e-16
 
 
 WAVES = StrutErrors(
@@ -69,15 +69,15 @@ def waves(c):
 )
 def test_each_term_by_its_closed_form(struts, truth):
     for command in COMMANDS:
-        # sin(2πc/T) near c/T = 160 carries the argument's rounding: 1e-13 of 3 µm.
+        # sin(2πc/T) near c/T = 160 has the rounding of its argument: 1e-13 of 3 µm
         assert length(struts, command, strut=3) == pytest.approx(command + truth(command), abs=3e-16)
         assert length(struts, command, strut=0) == command
 
 
 def test_maps_are_natural_splines_and_lost_motion_lags_behind():
-    """Truth: SciPy's B-splines, another algorithm; a nut with play b(c) stands half of it behind, −s·b(c)/2.
+    """The truth is SciPy's B-splines; a nut with backlash b(c) lags half of it behind, −s·b(c)/2.
 
-    Tolerance: 1e-12 of 50 µm; outside the knots the end values hold. A fit weights the knots by the same spline.
+    Tolerance: 1e-12 of 50 µm. Beyond the knots the end values hold. A fit weights the knots by the same spline.
     """
     drawn = random_struts(np.random.default_rng(11))
     knots, maps = drawn.map_knots, np.stack([drawn.map_values, drawn.map_backlash])
@@ -95,13 +95,13 @@ def test_maps_are_natural_splines_and_lost_motion_lags_behind():
     assert StrutErrors(map_knots=knots, map_values=maps[0]).map_backlash.shape == (6, 5)
 
 
-# There and back.
+# Forwards and backwards
 
 
 @fixed
 @given(seeds, st.floats(0.25, 0.75), st.sampled_from([-1.0, 0.0, 1.0]), st.floats(-5e-3, 5e-3))
 def test_command_and_length_undo_each_other(seed, command, sense, shift):
-    """Truth: the inverse of a function. Tolerance: three roundings of half a metre."""
+    """Command and length are inverse functions, to three roundings of half a metre."""
     struts = random_struts(np.random.default_rng(seed))
     machine = machine_of(struts, growth=3e-4)
     for strut in range(6):
@@ -115,7 +115,7 @@ def test_command_and_length_undo_each_other(seed, command, sense, shift):
 @example(period=0.0005, offset=0.01, phase=0.0, at=0.5)
 @given(st.floats(0.0005, 0.05), st.floats(-0.01, 0.01), st.floats(0.0, 6.283), st.floats(0.3, 0.8))
 def test_undone_also_where_the_error_is_as_steep_as_allowed(period, offset, phase, at):
-    """Truth: the inverse of a function, at the slope up to which StrutErrors accepts a wave."""
+    """They are inverse also at the largest slope of a wave that StrutErrors accepts."""
     amplitude = 0.999 * STEEPEST_ERROR * period / (2.0 * np.pi)
     struts = StrutErrors(
         offset=np.full(6, offset),
@@ -128,7 +128,7 @@ def test_undone_also_where_the_error_is_as_steep_as_allowed(period, offset, phas
     assert actual_length(machine.state, 0, command, 0.0, 0.0) == pytest.approx(at, abs=1e-15)
 
 
-# What no strut can be.
+# Impossible struts
 
 
 @pytest.mark.parametrize(
@@ -152,15 +152,15 @@ def test_refused(bad, message):
         StrutErrors(**bad)
 
 
-# Rotation of the screws.
+# Rotation of the screws
 
 
 def genhexkins_correction(lead, base_axis, platform_axis, strut, rotation):
-    """Return what LinuxCNC adds to a strut's length for its screw's rotation.
+    """Return the length that LinuxCNC adds to a strut for its screw's rotation.
 
-    Written from StrutLengthCorrection in src/emc/kinematics/genhexkins.c of LinuxCNC/linuxcnc (read at
-    commit 032ef12c): with u along the strut from base to platform, nb2 = nb1 × u, nb3 = unit(u × nb2),
-    na2 = unit(R·na0 × u), correction = lead·asin(nb3·na2)/2π; genhexKinematicsInverse adds it to the length.
+    Written from StrutLengthCorrection in src/emc/kinematics/genhexkins.c of LinuxCNC/linuxcnc (read at commit
+    032ef12c): with u along the strut from base to platform, nb2 = nb1 × u, nb3 = unit(u × nb2), na2 = unit(R·na0 × u),
+    correction = lead·asin(nb3·na2)/2π; genhexKinematicsInverse adds it to the length.
     """
     u = strut / np.linalg.norm(strut)
     nb3 = np.cross(u, np.cross(base_axis, u))
@@ -174,7 +174,7 @@ def struts_at(geometry, pose):
 
 
 def shifts(geometry, pose):
-    """Return what the model adds to the six commands of an otherwise ideal machine at a pose."""
+    """Return the shifts of the six commands of a machine whose only error is the screws' rotation, at a pose."""
     commands, _, _ = RealMachine(geometry, MachineModel(geometry.name)).commands_for(pose, MotionState())
     return commands - np.linalg.norm(struts_at(geometry, pose), axis=1)
 
@@ -182,7 +182,7 @@ def shifts(geometry, pose):
 @fixed
 @given(seeds)
 def test_sine_of_the_twist_is_genhexkins(seed):
-    """Truth: genhexkins' formula, for arbitrary axes. Tolerance: axes nearly along the strut lose digits."""
+    """The truth is genhexkins' formula for arbitrary axes; axes nearly along the strut lose digits."""
     rng = np.random.default_rng(seed)
     geometry = skewed_geometry()
     pose = random_pose(rng, geometry.home)
@@ -197,7 +197,7 @@ def test_sine_of_the_twist_is_genhexkins(seed):
 @pytest.mark.parametrize("strut", range(6))
 @pytest.mark.parametrize("body", ["base_axes", "platform_axes"])
 def test_an_axis_has_no_direction(body, strut):
-    """Truth: an axle is the same line whichever way its vector points, so the command must not change."""
+    """Reversing the vector of an axle must not change the command."""
     geometry = skewed_geometry(0.01)
     axes = getattr(geometry, body).copy()
     axes[strut] *= -1.0
@@ -209,10 +209,10 @@ def test_an_axis_has_no_direction(body, strut):
 
 
 def test_correction_does_not_jump_at_the_arctangents_cut():
-    """Truth: continuity. With axes 170° apart at home, a sweep of ±60° crosses 180° on the way.
+    """With axes 170° apart at home, a sweep of ±60° crosses 180°, and the command must be continuous.
 
-    Every step of 0.5° of platform rotation turns a screw by less than 1°, so no step of the command may
-    exceed lead·1/360; a lost turn would be the whole lead.
+    Each step of 0.5° turns a screw by less than 1°, so a command may step by at most lead·1/360; a jump would be the
+    lead.
     """
     lead = 0.01
     geometry = skewed_geometry(lead)
