@@ -1,4 +1,4 @@
-"""What the tests of the nodes share: the package's bench with this project's usual machine, poses and files."""
+"""Common parts of the node tests: the package's bench with this project's usual machine, poses and files."""
 
 from __future__ import annotations
 
@@ -41,19 +41,19 @@ __all__ = ["BEST_EFFORT", "RELIABLE", "SENT", "TRANSITIONS", "Answer"]
 CONFIG = Path(__file__).resolve().parents[1] / "config"
 
 AT_ONCE = 1e-6
-"""A wait that is over, s."""
+"""A waiting time that has passed at once, s."""
 
 READ_MODEL, READ_GEOMETRY = lru_cache(8)(Source.model), lru_cache(8)(Source.geometry)
-"""The shipped files are made into models and machines once for all tests, not once a node."""
+"""Loaders that read each shipped model and machine once for all tests, instead of once per node."""
 
 HOME = Pose([0.0, 0.0, 0.4], np.eye(3))
 """Home of the paper's machine."""
 
 
 class Bench(BareBench):
-    """A bench whose compensators have the virtual machine's model unless another is given.
+    """A bench whose compensators have the virtual machine's model by default.
 
-    Their machine has no feedback unless a test gives some, and need not wait for it unless a test says so.
+    They start without feedback unless a test gives feedback or requires it.
     """
 
     def compensator(self, start: bool = True, **parameters: object) -> CompensatorNode:
@@ -68,10 +68,10 @@ class Bench(BareBench):
 
 
 class FakeTime:
-    """Stands for the module ``time``: a clock of the test's own."""
+    """A stand-in for the module ``time``, with a clock of the test's own."""
 
     def __init__(self) -> None:
-        self.passed, self.set_by = 0, 0  # ns; the second: how far the system's clock was set
+        self.passed, self.set_by = 0, 0  # ns; `set_by`: by how much the system clock was set
         self._began, self._steady = time.time_ns(), time.monotonic_ns()
         self.perf_counter = self.monotonic
 
@@ -92,7 +92,7 @@ class FakeTime:
 
 
 class Voice:
-    """A publisher of the rig: of a node's name, with sequence numbers of its own."""
+    """A publisher of the rig with a node's name and its own sequence numbers."""
 
     def __init__(self, rig: Rig, topic: str, kind: type, name: str) -> None:
         self.rig, self.topic_name, self.kind, self.name, self.number = rig, "/" + topic.lstrip("/"), kind, name, 0
@@ -114,7 +114,7 @@ class Voice:
 
 
 class Stranger:
-    """A node beside those under test, of a name, that publishes and subscribes."""
+    """A node with a given name beside those under test, which publishes and subscribes."""
 
     def __init__(self, rig: Rig, name: str) -> None:
         self._rig, self._name = rig, name
@@ -145,7 +145,7 @@ class Stranger:
 
 
 class Messages(list[Any]):
-    """What was published on a topic, oldest first; a message is read from its bytes when it is looked at."""
+    """The messages of a topic, oldest first; a message is deserialised when it is read."""
 
     def add(self, data: bytes, kind: type) -> None:
         self.append((data, kind))
@@ -163,14 +163,14 @@ class Messages(list[Any]):
 
 
 class Rig(Bench):
-    """A bench without DDS, threads and waiting: nodes are called with messages directly, on a clock of the rig's own.
+    """A bench without DDS, threads and waiting: the rig calls nodes with messages, on its own clock.
 
-    What a node publishes is kept in ``seen`` and handed to the other nodes; timers and alarms ring when the clock,
-    which :meth:`until` and :meth:`step` advance, has got there. Jobs for the process beside a node are done at once.
+    Published messages are kept in ``seen`` and passed to the other nodes. Timers and alarms fire when :meth:`until` and
+    :meth:`step` have advanced the clock so far. Jobs for the process beside a node are done at once.
     """
 
     TRANSPORT, TICK = 2e-4, 2e-3
-    """How long a message travels, and the longest step of the clock, s."""
+    """Travel time of a message and longest step of the clock, s."""
 
     def __init__(self, context: Any, capture: Any, patch: pytest.MonkeyPatch) -> None:
         self.context, self.namespace, self._capture, self._log = context, "", capture, ""
@@ -188,7 +188,7 @@ class Rig(Bench):
                 rig._alarms.append(self)
                 super().__init__(*arguments)
 
-        class AtOnce:  # instead of a thread
+        class AtOnce:  # in place of a thread
             def __init__(self, *_: object) -> None:
                 self.shutdown = lambda **_: None
 
@@ -200,7 +200,7 @@ class Rig(Bench):
                     future.set_exception(error)
                 return future
 
-        class Process(worker._Process):  # none, but what it is asked and answers is pickled as ever
+        class Process(worker._Process):  # in place of a process; requests and answers are still pickled
             def exchange(self, request: Any, within: float | None) -> Any:
                 self.jobs = getattr(self, "jobs", None) or Jobs()
                 return pickle.loads(pickle.dumps(self.jobs.do(*pickle.loads(pickle.dumps(request)))))
@@ -249,7 +249,7 @@ class Rig(Bench):
         for node in self.nodes:
             node.destroy_node()
 
-    # ---- who publishes what ----
+    # ---- publishers and subscribers ----
 
     def speakers(self, topic: str) -> list[str]:
         """Return the full name of each publisher's node."""
@@ -257,7 +257,7 @@ class Rig(Bench):
         return ours + [voice.name for voice in self.voices if voice.topic_name == topic]
 
     def audience(self, topic: str, listeners: bool = True) -> int:
-        """Return how many subscribe to a topic: nodes, and what the test listens to."""
+        """Return the number of subscribers of a topic: nodes and the test's own."""
         nodes = sum(end.topic_name == topic for node in self.nodes for end in node.subscriptions)
         return nodes + listeners * sum(name == topic for name, _ in self.listeners)
 
@@ -288,7 +288,7 @@ class Rig(Bench):
         self.route(name, data, self._numbers[publisher])
 
     def route(self, topic: str, data: bytes, number: int | None) -> None:
-        """Hand a message to the nodes that hear it, after those that came before."""
+        """Deliver a message to the subscribed nodes, after earlier messages."""
         for node in self.nodes:
             self._waiting += [(end, (data, number)) for end in node.subscriptions if end.topic_name == topic]
         self._handle()
@@ -310,7 +310,7 @@ class Rig(Bench):
     # ---- time ----
 
     def step(self, seconds: float) -> None:
-        """Let time pass: what is due on the way is called in its turn."""
+        """Advance the clock; call what is due on the way in the order of time."""
         end = self.clock.passed + round(seconds * 1e9)
         while self.clock.passed < end:
             self.clock.passed = min(end, self.clock.passed + round(self.TICK * 1e9))
@@ -362,8 +362,8 @@ class Rig(Bench):
 def closed_form_lengths(pose: Pose, a: float = 0.3, b: float = 0.572, d: float = 0.243) -> np.ndarray:
     """Return the paper machine's nominal strut lengths, m, from plane geometry, not from the package.
 
-    The corners of an equiangular hexagon with sides b and d in turn lie on a circle of radius
-    √((b² + bd + d²)/3), here with a side d across +x; the platform is an equilateral triangle of side a.
+    The corners of an equiangular hexagon with sides b and d in turn lie on a circle of radius √((b² + bd + d²)/3), here
+    with a side d across +x. The platform is an equilateral triangle of side a.
     """
     radius = np.sqrt((b * b + b * d + d * d) / 3.0)
     half = np.arcsin(d / (2.0 * radius))
@@ -376,13 +376,13 @@ def closed_form_lengths(pose: Pose, a: float = 0.3, b: float = 0.572, d: float =
 
 
 def near(pose: Pose, shift: tuple[float, float, float] = (0.0, 0.0, 0.0), tilt_deg: float = 0.0) -> Pose:
-    """Return a pose shifted by metres along the base axes and tilted about its own x axis."""
+    """Return a pose shifted along the base axes, m, and tilted about its own x axis."""
     turn = Rotation.from_euler("X", tilt_deg, degrees=True).as_matrix()
     return Pose(pose.position + shift, pose.rotation @ turn)
 
 
 def geometry_file(folder: Path, limits: dict[str, object] | None = None, **sections: object) -> str:
-    """Write the shipped geometry with other limits or sections into a folder and return its path."""
+    """Write the shipped geometry with other limits or sections into a folder; return its path."""
     data = yaml.safe_load((CONFIG / "paper.yaml").read_text(encoding="utf-8"))
     data["limits"].update(limits or {})
     data.update(sections)
@@ -392,7 +392,7 @@ def geometry_file(folder: Path, limits: dict[str, object] | None = None, **secti
 
 
 def model_file(folder: Path, name: str = "model.yaml", **sections: object) -> str:
-    """Write a small model of the paper's machine into a folder and return its path."""
+    """Write a small model of the paper's machine into a folder; return its path."""
     data = {"format": "hexapod_comp/model", "version": 1, "machine": "paper", "name": "written by a test"}
     data.update({"date": "2026-01-31", "sources": []})
     data.update(sections)

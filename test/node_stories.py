@@ -1,7 +1,7 @@
-"""Stories of a node: what comes to it and what it answers, step by step, as rows of a table.
+"""Stories of a node: its inputs and the expected outputs, step by step, as rows of a table.
 
 A story is a list of steps, each called with the rig. Places are millimetres from the paper machine's home; its struts
-may go 2 mm from one command to the next, and 250 mm/s.
+may change by 2 mm per command and by 250 mm/s.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ __all__ = ["ERROR", "OK", "WARN"]
 Step = Callable[[Rig], object]
 
 NEVER = {"start_without_feedback_after": 0.0}
-"""The default, which the rig changes: a start waits for the struts."""
+"""The node's default, which the rig changes: a start waits for the struts."""
 
 FED = {"command_timeout": 0.0, "feedback_timeout": 60.0}
-"""Neither commands nor readings grow old."""
+"""Parameters with which neither commands nor readings become too old."""
 
 
 def place(x: float = 0.0, y: float = 0.0, z: float = 0.0, tilt: float = 0.0) -> Pose:
@@ -40,11 +40,11 @@ def play(rig: Rig, steps: Iterable[Step]) -> None:
         step(rig)
 
 
-# ---- what comes ----
+# ---- inputs ----
 
 
 def ask(x: float = 0.0, y: float = 0.0, z: float = 0.0, tilt: float = 0.0, frame: str = "base") -> Step:
-    """Send a command, which must be answered."""
+    """Send a command, and wait for its answer."""
     return lambda rig: rig.ask(place(x, y, z, tilt), frame)
 
 
@@ -62,7 +62,7 @@ def send(
     later: float | None = 0.0,
     **fields: Any,
 ) -> Step:
-    """Send a command, stamped so many seconds from now (None: not at all); `fields`: ``y_m``, m, ``q``, ``sec``."""
+    """Send a command stamped `later` s from now (None: without a stamp); `fields`: ``y_m``, m, ``q``, ``sec``."""
 
     def step(rig: Rig) -> None:
         message = pose_message(place(x, y, z, tilt), frame)
@@ -83,7 +83,7 @@ def send(
 
 
 def lengths_at(rig: Rig, z: float | None, off: dict[int, float] | None) -> np.ndarray:
-    """Return the struts at a height above home, or where they were told last (None); `off`: strut to m."""
+    """Return the strut lengths at a height above home, or the last commands (None); `off`: change of a strut, m."""
     told = rig.seen["strut_commands"][-1].position if z is None else closed_form_lengths(place(z=z))
     lengths = np.array(told)
     for strut, way in (off or {}).items():
@@ -97,7 +97,7 @@ def feed(
     later: float = 0.0,
     names: tuple[str, ...] = STRUT_NAMES,
 ) -> Step:
-    """Measure the struts: see :func:`lengths_at`."""
+    """Publish measured struts; arguments as of :func:`lengths_at`."""
 
     def step(rig: Rig) -> None:
         rig.feed(lengths_at(rig, z, off), tuple(names), later)
@@ -107,7 +107,7 @@ def feed(
 
 
 def tell(z: float | None = 0.0, off: dict[int, float] | None = None, later: float | None = None) -> Step:
-    """Send strut commands to a drive: see :func:`lengths_at`; without a stamp unless `later` is given, s."""
+    """Send strut commands to a drive, arguments as of :func:`lengths_at`; `later`: stamp from now, s (None: none)."""
 
     def step(rig: Rig) -> None:
         message = JointState(name=list(STRUT_NAMES), position=lengths_at(rig, z, off).tolist(), velocity=[0.0] * 6)
@@ -137,7 +137,7 @@ KINDS = {
 
 
 def joins(topic: str, name: str = "stranger") -> Step:
-    """Let another node, or another one of the witness's name, publish on a topic too."""
+    """Let a second node, or one with the witness's name, publish on a topic too."""
 
     def step(rig: Rig) -> None:
         rig.other = Stranger(rig, name).create_publisher(KINDS[topic], topic, RELIABLE)  # type: ignore[attr-defined]
@@ -146,12 +146,12 @@ def joins(topic: str, name: str = "stranger") -> Step:
 
 
 def other(message: Callable[[Rig], Any]) -> Step:
-    """Let that other node publish a message."""
+    """Let the second node publish a message."""
     return lambda rig: rig.other.publish(message(rig))  # type: ignore[attr-defined]
 
 
 def leaves(rig: Rig) -> None:
-    """Let it go."""
+    """Destroy the second node."""
     rig.other.close()  # type: ignore[attr-defined]
 
 
@@ -163,11 +163,11 @@ def struts(z: float = 0.0) -> Callable[[Rig], Any]:
     return lambda rig: JointState(name=list(STRUT_NAMES), position=closed_form_lengths(place(z=z)).tolist())
 
 
-# ---- what is done ----
+# ---- actions ----
 
 
 def change(*transitions: str, node: str = "compensator") -> Step:
-    """Ask for lifecycle transitions, all of which must go well."""
+    """Request lifecycle transitions, which must all succeed."""
 
     def step(rig: Rig) -> None:
         assert all(rig.change(transition, node) for transition in transitions)
@@ -176,12 +176,12 @@ def change(*transitions: str, node: str = "compensator") -> Step:
 
 
 def reset(rig: Rig) -> None:
-    """Call ``~/reset`` until the machine stands."""
+    """Call ``~/reset`` until it succeeds, that is, until the machine stands."""
     rig.until(lambda: rig.trigger("reset").success, "the machine to stand")
 
 
 def setting(name: str, value: object, node: str = "compensator") -> Step:
-    """Set a parameter, which must be allowed."""
+    """Set a parameter, which must succeed."""
 
     def step(rig: Rig) -> None:
         answer = rig.set_parameter(node, name, value)
@@ -194,11 +194,11 @@ def passes(seconds: float) -> Step:
     return lambda rig: rig.step(seconds)
 
 
-# ---- what it says ----
+# ---- outputs ----
 
 
 def says(level: bytes, text: str, node: str = "compensator", log: str = "", end: str = "", **values: str) -> Step:
-    """Wait for a status whose message begins so; its values are those given, or contain them where they are words."""
+    """Wait for a status whose message begins with `text` and whose values equal (texts: contain) the given ones."""
 
     def step(rig: Rig) -> None:
         found = rig.until_status(level, text, node)
@@ -212,18 +212,18 @@ def says(level: bytes, text: str, node: str = "compensator", log: str = "", end:
 
 
 def shows(node: str = "compensator", **values: str) -> Step:
-    """Wait until the diagnostics show these values."""
+    """Wait until the diagnostics have these values."""
     wanted = {key.replace("__", "."): value for key, value in values.items()}
     return lambda rig: rig.until(lambda: wanted.items() <= rig.values(node).items(), f"{wanted}")
 
 
 def refuses(reason: str, text: str = "", **values: str) -> Step:
-    """Wait for the status of a refused command, whose refusal contains a text."""
+    """Wait for the status of a refused command with a reason, whose text contains `text`."""
     return says(ERROR, f"refusing commands: {reason}", last_refusal=text, **values)
 
 
 def seen(**counts: int) -> Step:
-    """Check how many messages of topics there were."""
+    """Check the number of messages on topics."""
 
     def step(rig: Rig) -> None:
         assert {topic: len(rig.seen[topic]) for topic in counts} == counts

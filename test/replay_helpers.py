@@ -1,7 +1,7 @@
-"""What the tests of recordings share: a compensator that keeps its journal as the node does, and writing bags.
+"""Common parts of the replay tests: a compensator that keeps its journal like the node, and the writing of bags.
 
-The bags are written by rosbags, the way ``ros2 bag record`` does: MCAP or sqlite3, with metadata.yaml, message
-definitions and the offered QoS. No ROS in here.
+rosbags writes the bags like ``ros2 bag record``: MCAP or sqlite3, with metadata.yaml, message definitions and the
+offered QoS. No ROS is needed.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ KINDS = {
 FOREVER = QosTime(9223372036, 854775807)
 
 BEGAN = 1_795_000_000_000_000_000
-"""When recordings made here begin, ns."""
+"""Begin of the recordings, ns."""
 
 UP_SINCE = 4321.0987
-"""Their first command came when the computer had been up for so long, s."""
+"""Time since the computer's start at the first command, s."""
 
 MILLISECOND = 1_000_000
 
 Messages = list[tuple[int, str, str, bytes]]
-"""The recorder's time, ns; topic; type; serialized message."""
+"""Messages as (recorder's time, ns; topic; type; serialised message)."""
 
 
 def qos(kept: bool = False) -> Qos:
-    """Return a QoS as publishers offer it: reliable, kept for late subscribers or not."""
+    """Return a publisher's QoS: reliable, latched for late subscribers or not."""
     durability = QosDurability.TRANSIENT_LOCAL if kept else QosDurability.VOLATILE
     times = (FOREVER, FOREVER)
     return Qos(
@@ -66,7 +66,7 @@ def qos(kept: bool = False) -> Qos:
 def write_bag(
     folder: Path, messages: Messages, storage: str = "mcap", compression: CompressionMode = CompressionMode.NONE
 ) -> Path:
-    """Write a bag into a new folder and return it."""
+    """Write a bag into a new folder; return the folder."""
     writer = Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()])
     writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
@@ -80,12 +80,12 @@ def write_bag(
 
 
 def serialized(kind: str, message: Any) -> bytes:
-    """Return a message as it travels."""
+    """Return a message in serialised form."""
     return bytes(STORE.serialize_cdr(message, kind))
 
 
 class RecordedMachine:
-    """A compensator and its journal, with all messages that a replay reads or counts: what a recorder has seen."""
+    """A compensator and its journal, with all messages that a recorder gets and a replay reads or counts."""
 
     def __init__(
         self,
@@ -139,9 +139,9 @@ class RecordedMachine:
         self.keep_text("compensator/journal", self.journal.page(self.elapsed))
 
     def send(self, pose: Pose, frame: str = "base", stamped: bool = True) -> bool:
-        """Send one command a millisecond after the last; return whether it was answered.
+        """Send one command 1 ms after the last; return whether it was answered.
 
-        A command that is not `stamped` is answered with the time at which it came.
+        The answer to a command that is not `stamped` has the time of receipt.
         """
         self.now += MILLISECOND
         stamp, received = self.now if stamped else 0, UP_SINCE + (self.now - BEGAN) * 1e-9
@@ -157,13 +157,13 @@ class RecordedMachine:
         return True
 
     def wave(self, count: int, start: int = 0) -> None:
-        """Send so many commands along a wave that turns every strut's direction round."""
+        """Send a number of commands along a wave that reverses every strut's direction."""
         for n in range(start, start + count):
             self.send(wave_pose(n))
 
 
 def wave_pose(n: int) -> Pose:
-    """Return the pose number `n` of a smooth motion of some millimetres and a degree about home."""
+    """Return pose number `n` of a smooth motion of some millimetres and one degree about home."""
     phase = 0.02 * n
     position = np.array([0.004 * np.sin(phase), 0.003 * np.sin(1.3 * phase), 0.4 + 0.002 * np.sin(0.7 * phase)])
     return Pose(position, Rotation.from_euler("XYZ", [0.02 * np.sin(phase), 0.0, 0.01 * np.sin(phase)]).as_matrix())

@@ -268,7 +268,7 @@ def test_a_move_is_straight_and_turns_along_the_shortest_arc(geometry: HexapodGe
 
 
 def test_circle_has_its_radius_plane_and_feed() -> None:
-    """In the tilted centre's frame the circle has a radius of 25 mm, z = 0, and at most the feed; it starts and ends at rest."""
+    """In the tilted centre's frame the circle has a radius of 25 mm, z = 0, at most the feed, and ends at rest."""
     centre = Pose.from_angles([0.01, 0.02, 0.4], np.deg2rad([8.0, -6.0, 20.0]))
     path = circle(centre, 0.025, feed=0.05, rate=250.0)
     local = (path.positions - centre.position) @ centre.rotation

@@ -1,4 +1,4 @@
-"""Campaigns that list their runs: files there and back, their readings in order, and what is refused."""
+"""Campaigns that list their runs: written and read back, the order of their readings, and refusals."""
 
 import re
 from dataclasses import replace
@@ -23,12 +23,12 @@ RUNS = (
 
 
 def listed() -> Campaign:
-    """Return a campaign of three runs."""
+    """Return a campaign of three listed runs."""
     return Campaign(BOX, 0.1, 0.1, None, 0, cycles=2, runs=RUNS)
 
 
 def test_a_written_campaign_reads_back(tmp_path: Path) -> None:
-    """Commands of the machine after a file are those before it, to a picometre; noise and box too."""
+    """A campaign read back gives the same commands to a picometre, the same noise and the same box."""
     path = tmp_path / "planned.yaml"
     path.write_text(campaign_text(listed(), ["planned", "for a test"]))
     read = load_campaign(path)
@@ -40,18 +40,18 @@ def test_a_written_campaign_reads_back(tmp_path: Path) -> None:
 
 
 def test_readings_come_in_measuring_order() -> None:
-    """Two cycles of five points both ways under six channels, three under one, two poses under three."""
+    """Two cycles of five points in both directions with six channels, three with one channel, two poses with three."""
     m = template(listed(), small.paper())
     assert [run.name for run in m.runs] == ["backwards", "diagonal", "poses"]
     assert np.bincount(m.run).tolist() == [2 * 2 * 5 * 6, 2 * 2 * 3, 2 * 3]
     assert [CHANNELS[c] for c in m.channel[m.run == 2]][:3] == ["position_x", "position_y", "position_z"]
     x = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)[0][m.station, 0]
-    assert x[0] == pytest.approx(-0.1)  # forward is towards positive x, whichever way the file lists the ends
+    assert x[0] == pytest.approx(-0.1)  # forward is towards positive x, whichever end is listed first
     assert m.direction[0] == 1
 
 
 def test_alternate_stops_are_read_once(tmp_path: Path) -> None:
-    """Of five places the first, third and fifth on the way there, the others on the way back; from a file too."""
+    """Of five stops the first, third and fifth are read forward, the others backward; also from a file."""
     run = replace(RUNS[1], positions=np.linspace(*BOX, 5), rotations=np.tile(np.eye(3), (5, 1, 1)), alternate=True)
     path = tmp_path / "planned.yaml"
     path.write_text(campaign_text(replace(listed(), cycles=1, runs=(run,))))
@@ -73,7 +73,7 @@ def test_alternate_stops_are_read_once(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_runs(tmp_path: Path, change: tuple[str, str], complaint: str) -> None:
-    """File, key and value are named."""
+    """The message names file, key and value."""
     text = campaign_text(listed())
     assert change[0] in text
     path = tmp_path / "wrong.yaml"
@@ -94,7 +94,7 @@ runs:
 
 
 def test_short_forms_of_instruments(tmp_path: Path) -> None:
-    """A circle there and back keeps its radius in its plane, from z to x; touches theirs; tilts reach their largest."""
+    """A circle stays in its plane with its radius, forward and back; touches and tilts have theirs."""
     path = tmp_path / "instruments.yaml"
     path.write_text(INSTRUMENTS)
     m = template(load_campaign(path), small.paper())

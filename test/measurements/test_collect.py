@@ -1,6 +1,6 @@
-"""Collecting a campaign: the file holds what was seen, whatever happens on the way, and mistakes are found at once.
+"""``collect``: the file holds what was observed, also after interruptions, and mistakes are found at once.
 
-Truth: a stand-in whose tool is where a closed form says; the machine's model run forwards; mistakes by construction.
+The truth is a stand-in whose tool is at a closed-form place, the machine's model run forwards, and known mistakes.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.instruments import LiveFlaws, LiveInstrument, measure
 from hexapod_comp.virtual.named import find_model
 
-SHIFT = np.array([30e-6, -20e-6, 10e-6])  # How far the stand-in's tool is off along x, y, z of the base, m
-TURN = np.array([40e-6, 10e-6, -25e-6])  # And turned, rad
+SHIFT = np.array([30e-6, -20e-6, 10e-6])  # displacement of the stand-in's tool along x, y, z of the base, m
+TURN = np.array([40e-6, 10e-6, -25e-6])  # and its rotation, rad
 
 
 def wrong(commanded: Pose) -> Pose:
@@ -39,12 +39,12 @@ def wrong(commanded: Pose) -> Pose:
 
 
 class StandIn:
-    """Goes where it is sent, but for its error; `blind` counts observations that read nothing, `killed_at` ends it."""
+    """A stand-in that moves to each pose with its error; observations in `blind` fail, `killed_at` ends it."""
 
     def __init__(self, geometry: HexapodGeometry, seen: Callable[[Pose], Pose] = wrong, killed_at: int = -1) -> None:
         self.geometry, self.seen, self.killed_at = geometry, seen, killed_at
         self.went: list[Pose] = []
-        self.blind: set[int] = set()  # observations, by number
+        self.blind: set[int] = set()  # numbers of observations
         self.observed = 0
 
     def move(self, pose: Pose) -> None:
@@ -67,7 +67,7 @@ def machine_of(name: str, folder: Path) -> HexapodGeometry:
 
 
 def small(geometry: HexapodGeometry, **more: object) -> Campaign:
-    """Return a campaign about home: lines of a 5-D laser and eight poses of a tracker."""
+    """Return a campaign near home: lines of a 5-D laser and eight poses of a tracker."""
     home = geometry.tool_pose(geometry.home)
     box = home.position + np.array([[-0.01, -0.01, -0.01], [0.01, 0.01, 0.01]])
     kept = {"cell": 0.02, "step": 0.01, "diagonals": 0, "poses": 8, "level": home.rotation, **more}
@@ -75,7 +75,7 @@ def small(geometry: HexapodGeometry, **more: object) -> Campaign:
 
 
 def test_the_file_holds_what_was_seen(tmp_path: Path) -> None:
-    """Every channel is the projection of one displacement and one turn; struts, times, temperatures as measured."""
+    """Each channel is the projection of one displacement and rotation; struts, times, temperatures are as read."""
     geometry, path = machine_of("inches", tmp_path), tmp_path / "out.csv"
     campaign, machine = small(geometry), StandIn(geometry)
     done = collect(campaign, geometry, machine, path)
@@ -108,7 +108,7 @@ def test_where_a_limit_forbids_it_a_pass_begins_at_its_first_point(tmp_path: Pat
 
 
 def test_a_killed_run_goes_on_where_it_stopped_wherever_that_was(tmp_path: Path) -> None:
-    """Killed after one of its moves, with every stop saved: the file comes out the same, to the last bit."""
+    """A run killed after any move, with every stop saved, continues to the same file, to the last bit."""
     geometry, campaign = load_geometry("paper"), small(load_geometry("paper"), step=0.02)
     whole = tmp_path / "whole.csv"
     machine = StandIn(geometry)
@@ -133,8 +133,8 @@ def test_a_killed_run_goes_on_where_it_stopped_wherever_that_was(tmp_path: Path)
 
 
 def test_what_is_left_of_a_pass_is_reached_in_its_direction(tmp_path: Path) -> None:
-    """A run goes on within a pass, or at its last stop; the machine may stand anywhere: each stop is reached from the
-    side that its file states, by the two places before and at it."""
+    """A run continues within a pass or at its last stop, from any place of the machine: each stop is reached from the
+    direction in the file, over the place before it."""
     geometry, campaign = load_geometry("paper"), small(load_geometry("paper"), poses=0)
     first = StandIn(geometry)
     collect(campaign, geometry, first, tmp_path / "out.csv", going_on=lambda: first.observed < 5)
@@ -204,11 +204,11 @@ def test_a_file_of_another_campaign_is_refused_and_kept(tmp_path: Path) -> None:
 
 
 QUIET = LiveFlaws(length_noise=0.0, angle_noise=0.0, beam_slope=0.0, centre_off=0.0)
-STANDS = Pose.from_angles([2.0, -1.0, 0.5], [0.3, 1.0, 2.5])  # Where a tracker stands, in base, m and rad
+STANDS = Pose.from_angles([2.0, -1.0, 0.5], [0.3, 1.0, 2.5])  # place of the tracker in base, m and rad
 
 
 def campaign_of(geometry: HexapodGeometry, half: float = 0.02, **more: object) -> Campaign:
-    """Return a campaign in a small box about home: four lines a direction, or what is asked for."""
+    """Return a campaign in a small box near home, by default four lines per direction."""
     home = geometry.tool_pose(geometry.home)
     box = home.position + half * np.array([[-1.0] * 3, [1.0] * 3])
     kept = {"cell": 2.0 * half, "step": half / 2.0, "diagonals": 0, "poses": 0, "level": home.rotation, **more}
@@ -226,7 +226,7 @@ def live(geometry: HexapodGeometry, kind: str = "laser", flaws: LiveFlaws = QUIE
 
 
 def test_a_lasers_file_is_that_of_the_whole_campaign_measured_at_once(tmp_path: Path) -> None:
-    """Signs, zeros and channels are those of :func:`measure`; turns of 1e-4 rad are no vectors, to their square."""
+    """Signs, zeros and channels are those of :func:`measure`; rotations of 1e-4 rad add as vectors, to their square."""
     geometry = machine_of("hanging", tmp_path)
     campaign, truth = campaign_of(geometry, diagonals=4), find_model("random:3", geometry)
     still = replace(truth, struts=replace(truth.struts, backlash=np.zeros(6)))
@@ -250,7 +250,7 @@ def test_a_ball_bars_file_has_distances_from_any_zero(tmp_path: Path) -> None:
         machine.move(Pose(*pose))
         far.append(np.linalg.norm(machine.tool.position - centre) - 0.02)
     forward = np.array(far) - far[0]
-    backlash = 4e-5  # as drawn: each strut's direction differs from that of the pass in the campaign
+    backlash = 4e-5  # each strut's direction differs from the direction of the pass
     assert np.abs(read.value[:12] - forward).max() < backlash
     assert read.value[0] == 0.0
 
@@ -283,7 +283,7 @@ def turned(c: dict[str, float], angle: float = np.radians(15.0)) -> dict[str, fl
     return {"straightness_y": cos * y - sin * z, "straightness_z": sin * y + cos * z}
 
 
-# What a driver or a set-up may get wrong, as changes of the channels c that are published
+# Mistakes of a driver or a set-up, as changes of the published channels c
 WRONG = {
     "rotation_z reads with reversed sign": lambda c: {"rotation_z": -c["rotation_z"]},
     "rotation_y reads 5[67].* degrees read as rad": lambda c: in_unit(c, 57.29578),
@@ -319,7 +319,7 @@ def test_what_a_driver_gets_wrong_is_reported_on_the_first_line(text: str, tmp_p
 
 
 def test_a_run_whose_zero_was_lost_begins_anew_and_comes_out_the_same(tmp_path: Path) -> None:
-    """Broken beams told by NaN, and one that no driver tells of: what is read jumps."""
+    """Broken beams are reported by NaN; one that the driver does not report is noticed by a jump of the reading."""
     geometry, campaign = load_geometry("paper"), campaign_of(load_geometry("paper"))
     whole = collect(campaign, geometry, live(geometry), tmp_path / "whole.csv").measurements
     machine = live(geometry)
@@ -343,7 +343,7 @@ def test_a_run_whose_zero_was_lost_begins_anew_and_comes_out_the_same(tmp_path: 
 
 
 def test_a_tracker_that_stands_anywhere_reads_what_one_in_base_reads_up_to_a_motion(tmp_path: Path) -> None:
-    """The motion that is left between both files is one rigid motion: four stations cannot know it better."""
+    """Both files differ by one rigid motion, which four stations cannot determine better."""
     geometry = machine_of("hanging", tmp_path)
     campaign = campaign_of(geometry, instrument=None, poses=12, tilt=0.05)
     near = collect(campaign, geometry, live(geometry, "tracker"), tmp_path / "near.csv").measurements
@@ -376,7 +376,7 @@ def test_gravity_and_payload_stand_in_the_file(tmp_path: Path) -> None:
 
 
 def test_a_centre_that_is_known_to_5_mm_is_no_mistake_and_one_far_off_is_named(tmp_path: Path) -> None:
-    """12 places on a circle of 60 mm: about a socket 40 mm aside the bar would read up to 20 mm more at the next."""
+    """About a socket 40 mm aside, the bar at 12 places of a circle of 60 mm would read 20 mm more at the next."""
     geometry = load_geometry("paper")
     home = geometry.tool_pose(geometry.home)
     run = circle_run("circle", home.position, 0.06, 13, np.eye(3)[:2], home.rotation)

@@ -1,6 +1,6 @@
-"""Refractive index of air against published check values and another equation; readings corrected by counting fringes.
+"""Refractive index of air against published values and another equation; correction of readings in fringes.
 
-In the tables of papers the index is written as (n − 1)·10⁸, printed to a tenth.
+Papers print the index as (n − 1)·10⁸, to a tenth.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from hexapod_comp.measurements.air import VACUUM_WAVELENGTH, Air, ciddor_index, 
 @pytest.mark.parametrize(
     ("temperature", "pressure", "humidity", "wavelength_nm", "printed", "tolerance"),
     [
-        # Ciddor 1996, Table 1 (dry) and Table 3 (633 nm, 450 ppm CO₂), half of the printed digit
+        # Ciddor 1996, Table 1 (dry) and Table 3 (633 nm, 450 ppm CO₂), to half of the printed digit
         (20, 80e3, 0.0, 633, 21458.0, 0.05),
         (10, 100e3, 0.0, 633, 27774.7, 0.05),
         (20, 80e3, 0.75, 633, 21394.0, 0.05),
         (40, 120e3, 0.75, 633, 29941.8, 0.05),
         (50, 120e3, 1.0, 633, 28792.4, 0.05),
-        # NIST's Engineering Metrology Toolbox, printed to 0.1; its formula for saturation pressure (IAPWS) is another
+        # NIST's Engineering Metrology Toolbox, printed to 0.1; its saturation pressure (IAPWS) is another formula
         (5, 100e3, 0.0, 633, 28275.6, 0.1),
         (40, 110e3, 1.0, 1700, 27024.7, 0.1),
         (20, 101_325, 0.0, 300, 28658.1, 0.1),
@@ -38,7 +38,7 @@ def test_air_as_printed(
 workshop_air = st.builds(Air, st.floats(10.0, 35.0), st.floats(80e3, 120e3), st.floats(0.0, 1.0))
 
 
-# Readings: what a counter of fringes would show, made here from the optics, must come back as the true way.
+# Readings of a fringe counter, computed here from optics, must be corrected to the true displacement
 
 
 @fixed
@@ -49,10 +49,10 @@ workshop_air = st.builds(Air, st.floats(10.0, 35.0), st.floats(80e3, 120e3), st.
     sense=st.sampled_from([1.0, -1.0]),
 )
 def test_counted_fringes_give_the_way_back(way: float, assumed: float, now: Air, sense: float) -> None:
-    """Truth: fringes in a path of L, times the wavelength that it assumes.
+    """The counter shows fringes in a path of L times its assumed wavelength.
 
-    Towards the interferometer (sense −1) the counter runs backwards, and is shown reversed.
-    Tolerance: rounding of a metre.
+    Towards the interferometer (sense −1) it counts backwards, and its display is reversed. Tolerance: rounding of a
+    metre.
     """
     half_wave = VACUUM_WAVELENGTH / 2.0
     fringes = ciddor_index(now) * sense * way / half_wave

@@ -1,6 +1,6 @@
-"""Figures of ISO 230-2, -4 and -6: examples worked out by hand, formula by formula; which standard judges which run.
+"""Figures of ISO 230-2, -4 and -6 for examples calculated by hand; the standard that evaluates each run.
 
-No published readings with all figures could be quoted freely: the examples are ours, small enough for a pencil; in µm.
+No published readings with all figures may be quoted freely, so the examples are ours; numbers are µm.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from hexapod_comp.measurements.readings import BACKWARD, FORWARD, Reading
 from hexapod_comp.measurements.runs import assemble
 from hexapod_comp.pose import Pose
 
-TARGETS = np.array([0.004, 0.103, 0.196, 0.305, 0.398, 0.501])  # Six targets, m, unevenly spaced
-# Five readings of which two lie c below a mean, one on it, two c above it: their mean is that mean, and
-# s² = (c² + c² + 0 + c² + c²)/(5 − 1) = c², so s = c. Which cycle has which differs from target to target.
+TARGETS = np.array([0.004, 0.103, 0.196, 0.305, 0.398, 0.501])  # m, unevenly spaced
+# Of five readings two lie c below the mean, one on it, two c above it. So this is their mean, and
+# s² = (c² + c² + 0 + c² + c²)/(5 − 1) = c², s = c. The order of the cycles differs from target to target.
 #
 #   target            1     2     3     4     5     6
 #   mean ↑            0     2     5     3    −1     1
@@ -41,7 +41,7 @@ TARGETS = np.array([0.004, 0.103, 0.196, 0.305, 0.398, 0.501])  # Six targets, m
 #
 UP = np.array(
     [
-        # cycle 1, 2, …: one row each
+        # one row per cycle
         [-0.5, 3.0, 5.0, 3.5, -3.0, 0.5],
         [0.5, 1.0, 4.0, 2.5, 1.0, 1.5],
         [0.0, 2.0, 6.0, 3.0, -1.0, 1.0],
@@ -59,7 +59,7 @@ DOWN = np.array(
     ]
 )
 MICROMETRE = 1e-6
-EXACT = {"abs": 1e-18}  # The numbers are exact in decimal; what is left is rounding of 10 µm
+EXACT = {"abs": 1e-18}  # decimal numbers are exact except for rounding of 10 µm
 
 
 @pytest.fixture(scope="module")
@@ -68,16 +68,16 @@ def example() -> PositioningTest:
 
 
 def um(*values: float) -> object:
-    """Return what figures in m must be near to, from µm."""
+    """Return pytest's approximation of figures in m, given in µm."""
     return pytest.approx([v * MICROMETRE for v in values], **EXACT)
 
 
 def test_figures_of_each_target(example: PositioningTest) -> None:
     """Target 5 ↑: (−3 + 1 − 1 − 3 + 1)/5 = −1; from it −2, 2, 0, −2, 2, and (4 + 4 + 0 + 4 + 4)/4 = 4: s is 2.
 
-    Repeatability: four times s; and the largest of 2s↑ + 2s↓ + |B|, R↑, R↓ at each target.
-    1: 1 + 1 + 3 = 5.    2: 2 + 2 + 2 = 6.      3: 2 + 1 + 4 = 7.
-    4: 1 + 3 + 5 = 9.    5: 4 + 0.5 + 2 = 6.5, less than R↑ = 8: 8.    6: 1 + 1 + 3 = 5.
+    Repeatability: four times s; bidirectional the largest of 2s↑ + 2s↓ + |B|, R↑, R↓ at each target. 1: 1 + 1 + 3 = 5.
+    2: 2 + 2 + 2 = 6.      3: 2 + 1 + 4 = 7. 4: 1 + 3 + 5 = 9.    5: 4 + 0.5 + 2 = 6.5, less than R↑ = 8: 8.    6: 1 + 1
+    + 3 = 5.
     """
     assert example.mean[0].tolist() == um(0, 2, 5, 3, -1, 1)
     assert example.mean[1].tolist() == um(3, 4, 9, 8, 1, 4)
@@ -110,7 +110,7 @@ def notes(targets: object, deviations: np.ndarray) -> str:
 
 
 def test_notes_on_the_plan() -> None:
-    """The standard: five cycles, five targets per metre and at least five, travels to 2 m, uneven spacing."""
+    """The standard asks for five cycles, five targets per metre and at least five, up to 2 m, and uneven spacing."""
     deviations = np.array([UP, DOWN]) * MICROMETRE
     assert "2 cycles; the standard asks for 5" in notes(TARGETS, deviations[:, :2])
     assert "4 targets over 301 mm; the standard asks for 5" in notes(TARGETS[:4], deviations[:, :, :4])
@@ -120,10 +120,10 @@ def test_notes_on_the_plan() -> None:
 
 
 def test_swapped_directions_are_flagged() -> None:
-    """Play makes Bᵢ negative; the same readings with the directions exchanged are noticed.
+    """Backlash makes Bᵢ negative; readings with exchanged directions get a note.
 
-    A reversal of +0.1 µm at every target is chance, where the mean of six has a standard error of
-    √(2·6.75/5)/6 = 0.27 µm.
+    A reversal of +0.1 µm at every target is chance, since the mean of six has a standard error of √(2·6.75/5)/6 = 0.27
+    µm.
     """
     assert "swapped" in notes(TARGETS, np.array([DOWN, UP]) * MICROMETRE)
     assert "swapped" not in notes(TARGETS, np.array([UP, UP - 0.1]) * MICROMETRE)
@@ -131,7 +131,7 @@ def test_swapped_directions_are_flagged() -> None:
 
 
 def test_report(example: PositioningTest) -> None:
-    """Truth: the figures worked out above, in µm."""
+    """The truth is the figures calculated above, in µm."""
     lines = report(example).splitlines()
     assert lines[6].split() == ["305.0000", "3.000", "8.000", "0.500", "1.500", "2.000", "6.000", "-5.000", "9.000"]
     assert [line.split()[-1] for line in lines[14:17]] == ["7.000", "5.000", "-3.167"]
@@ -139,10 +139,10 @@ def test_report(example: PositioningTest) -> None:
 
 
 RADIUS = 0.1
-EIGHTHS = np.radians(45.0 * np.arange(8))  # Where a circle is read: 0°, 45°, …, 315°
-# A circle in which one axis goes 2 µm too far on both sides, the other as much too little
+EIGHTHS = np.radians(45.0 * np.arange(8))  # angles of the readings: 0°, 45°, …, 315°
+# A circle on which one axis goes 2 µm too far on both sides, and the other axis 2 µm too little
 OVAL = np.array([2, 0, -2, 0, 2, 0, -2, 0]) * 1e-6
-# Shifting a centre by some µm changes radii by (µm)²/(0.1 m), about 0.01 nm, beside what the pencil has
+# Moving a centre by some µm changes radii by (µm)²/(0.1 m), about 0.01 nm, beside the calculation by hand
 NEAR = {"abs": 1e-10}
 
 
@@ -156,11 +156,11 @@ def near(figures: dict[str, float]) -> dict[str, object]:
 
 
 def test_an_oval_larger_one_way_than_the_other() -> None:
-    """↺ 3 µm and ↻ 1 µm too large. No centre is better for an oval than its own, by symmetry: a shift lifts one end of
-    each axis by what it lowers the other.
+    """The path is 3 µm too large in ↺ and 1 µm in ↻. By symmetry the oval's own centre is the best: moving it lifts one
+    end of each axis as much as it lowers the other.
 
-    G ↺ = 2 − (−2) = 4, G ↻ the same. Both paths: from −2 + 1 = −1 to 2 + 3 = 5, so G(b) = 6.
-    F ↺ from −2 + 3 = 1 to 2 + 3 = 5; F ↻ from −2 + 1 = −1 to 2 + 1 = 3. D = (3 + 1)/2 = 2.
+    G ↺ = 2 − (−2) = 4, G ↻ the same. Both paths: from −2 + 1 = −1 to 2 + 3 = 5, so G(b) = 6. F ↺ from −2 + 3 = 1 to 2 +
+    3 = 5; F ↻ from −2 + 1 = −1 to 2 + 1 = 3. D = (3 + 1)/2 = 2.
     """
     test = both_ways(OVAL + 3e-6, OVAL + 1e-6)
     of_radius = {"F_max_ccw": 5, "F_min_ccw": 1, "F_max_cw": 3, "F_min_cw": -1, "D": 2}
@@ -231,7 +231,7 @@ DIAGONALS = "".join(
 
 
 def test_each_standard_under_its_name(tmp_path: Path) -> None:
-    """E: from 0, the first mean forward, to 2·rise + reversal, the last backward; B the reversal, at every target."""
+    """E goes from 0, the first mean forward, to 2·rise + reversal, the last backward; B is the reversal everywhere."""
     rows = line("x", (-50, 0, 450), (50, 0, 450), 1, 2) + DIAGONALS + line("f", (-50, -50, 450), (50, 50, 450), 3, 1)
     judged = judge(read_measurements(measured(tmp_path, rows), load_geometry(config_file("paper"))))
     found = standards_json(judged)
@@ -247,9 +247,9 @@ def test_each_standard_under_its_name(tmp_path: Path) -> None:
 
 
 def ball_bar(ball: tuple[float, float, float], zero: str = "known") -> str:
-    """Return a file of a ball bar on a circle of 50 mm about (10, 20, 450): ↺ 3 µm and ↻ 1 µm larger than commanded.
+    """Return a file of a ball bar on a circle of 50 mm about (10, 20, 450), 3 µm larger in ↺ and 1 µm in ↻.
 
-    What it reads is the distance of two points, the commanded one moved outwards by so much, and the ball.
+    The bar reads the distance from the ball to the commanded point moved outwards by this much.
     """
     rows = "run,direction,cycle,x_mm,y_mm,z_mm,channel,value,unit,centre_x_mm,centre_y_mm,centre_z_mm,zero\n"
     for sense, larger, cycle in ((1, 3e-3, 1), (-1, 1e-3, 2)):
@@ -264,9 +264,10 @@ def ball_bar(ball: tuple[float, float, float], zero: str = "known") -> str:
 
 @pytest.mark.parametrize("ball", [(10.0, 20.0, 450.0), (10.3, 19.6, 450.0)])
 def test_circles_of_a_ball_bar(tmp_path: Path, ball: tuple[float, float, float]) -> None:
-    """Each path is round, so G is 0; both lie between circles 3 − 1 = 2 µm apart; 3, 1 and on average 2 µm too large.
+    """Each path is round, so G is 0; both lie between circles 3 − 1 = 2 µm apart; they are 3, 1, on average 2 µm too
+    large.
 
-    The ball may stand half a millimetre off. Places in the file are rounded to 1 nm.
+    The ball may be 0.5 mm off. Places in the file are rounded to 1 nm.
     """
     (tmp_path / "c.csv").write_text(ball_bar(ball))
     paper = load_geometry(config_file("paper"))
@@ -282,7 +283,7 @@ def test_circles_of_a_ball_bar(tmp_path: Path, ball: tuple[float, float, float])
 
 
 def test_lengths_that_are_no_circle_are_left_out(tmp_path: Path) -> None:
-    """A point off the circle, and a station a metre away."""
+    """A run is no circle with a point off the circle, or with a station a metre away."""
     paper = load_geometry(config_file("paper"))
     for old, new in ((",60.0,20.0,450.0,", ",61.0,20.0,450.0,"), (",10,20,450,known", ",10,20,1450,known")):
         text = ball_bar((10.0, 20.0, 450.0))
@@ -292,7 +293,7 @@ def test_lengths_that_are_no_circle_are_left_out(tmp_path: Path) -> None:
 
 
 def test_axes_are_those_of_the_work_frame(tmp_path: Path) -> None:
-    """On a machine whose work frame is turned in its base, a line along its x is no diagonal."""
+    """On a machine whose work frame is turned in its base, a line along x of work is no diagonal."""
     framed = load_geometry(machines()["framed"].write(tmp_path / "framed.yaml"))
     start = framed.tool_pose(Pose(framed.home.position, framed.home.rotation)).position
     readings = [
@@ -307,7 +308,7 @@ def test_axes_are_those_of_the_work_frame(tmp_path: Path) -> None:
 
 
 def test_figures_need_no_reach(tmp_path: Path) -> None:
-    """A line half a metre above what the struts allow: a fit cannot use it, its figures are what they are."""
+    """A line half a metre above the stroke has figures, although a fit cannot use it."""
     path, paper = measured(tmp_path, line("x", (-50, 0, 950), (50, 0, 950), 1, 2)), load_geometry(config_file("paper"))
     with pytest.raises(InputFileError, match="out of the machine's reach"):
         read_measurements(path, paper)

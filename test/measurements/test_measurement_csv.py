@@ -1,4 +1,4 @@
-"""Tidy and wide CSV files of measurements: what comes in is what stood there, and every complaint says where."""
+"""Tidy and wide CSV files of measurements: values are read exactly, and messages state file, line and column."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def read(folder: Path, rows: str, header: str = HEADER) -> MeasurementSet:
     ],
 )
 def test_units(tmp_path: Path, channel: str, value: str, unit: str, si: float) -> None:
-    """Truth: the definitions; powers of ten exactly."""
+    """The truth is the units' definitions; powers of ten are exact."""
     rows = f"a,forward,-10,0,400,{channel},{value},{unit}\na,forward,10,0,400,{channel},0,{unit}\n"
     found = read(tmp_path, rows)
     assert found.value[0] == pytest.approx(si, rel=1e-15, abs=0.0)
@@ -57,7 +57,7 @@ def test_units(tmp_path: Path, channel: str, value: str, unit: str, si: float) -
 
 @pytest.mark.parametrize(("axis", "turns"), [("x", ("x", "y", "z")), ("y", ("y", "x", "z")), ("z", ("z", "x", "y"))])
 def test_roll_pitch_and_yaw(tmp_path: Path, axis: str, turns: tuple[str, ...]) -> None:
-    """Roll is about the line; on horizontal lines yaw is about z; on vertical ones pitch is about x."""
+    """Roll is about the line; yaw is about z on horizontal lines; pitch is about x on vertical lines."""
     ends = {"x": ("-1,0,400", "1,0,400"), "y": ("0,-1,400", "0,1,400"), "z": ("0,0,400", "0,0,401")}[axis]
     rows = "".join(f"a,forward,{end},{c},1,urad\n" for end in ends for c in ("roll", "pitch", "yaw"))
     found = read(tmp_path, rows)
@@ -65,7 +65,7 @@ def test_roll_pitch_and_yaw(tmp_path: Path, axis: str, turns: tuple[str, ...]) -
 
 
 def test_positions_and_quaternions_are_absolute_in_the_work_frame(tmp_path: Path) -> None:
-    """Truth: the measured pose composed from a known error. Work frame and tool are tilted."""
+    """The truth is a measured pose composed from a known error, with tilted work frame and tool."""
     work = Pose.from_angles([0.02, -0.01, 0.03], np.deg2rad([5.0, -8.0, 30.0]))
     tool = Pose.from_angles([0.01, 0.02, -0.05], np.deg2rad([4.0, 3.0, -20.0]))
     geometry = geometry_with(work, tool)
@@ -85,7 +85,7 @@ def test_positions_and_quaternions_are_absolute_in_the_work_frame(tmp_path: Path
 
 
 def test_the_measured_point_may_be_another_than_the_tools_tip(tmp_path: Path) -> None:
-    """A reflector 100 mm beside the tip, on a tool turned 30° about z: it stands at 86.603, 50 mm."""
+    """A reflector 100 mm beside the tip, on a tool turned by 30° about z, is at (86.603, 50) mm."""
     header = HEADER.replace("z_mm", "z_mm,alpha_deg,beta_deg,gamma_deg")
     rows = "t,,0,0,400,0,0,30,position_x,86.60254037844386,mm\nt,,0,0,400,0,0,30,position_y,50.001,mm\n"
     found = read_measurements(written(tmp_path, rows, header), paper_geometry(), probe=np.array([0.1, 0.0, 0.0]))
@@ -93,7 +93,7 @@ def test_the_measured_point_may_be_another_than_the_tools_tip(tmp_path: Path) ->
 
 
 def test_temperatures(tmp_path: Path) -> None:
-    """One column is the air and the whole machine; a strut's own column says otherwise; none is 20 °C."""
+    """One column is for air and machine; a strut's own column overrides it; without a column it is 20 °C."""
     header = f"{HEADER},temperature_degC,strut_2_degC"
     found = read(tmp_path, LINE.replace("um\n", "um,21.5,23\n"), header)
     np.testing.assert_array_equal(found.stations.temperatures[0], [21.5, 23, *[21.5] * 6])
@@ -104,9 +104,9 @@ AIR = f"{HEADER},temperature_degC,pressure_kPa,humidity_percent,instrument_index
 
 
 def test_readings_are_corrected_for_the_air_once_and_only_where_the_file_asks(tmp_path: Path) -> None:
-    """Truth: n − 1 = 26824.4e-8 (dry air, 20 °C, 100 kPa; table of the issue), to its last digit: 0.1e-8 of 0.4 m.
+    """n − 1 = 26824.4e-8 (dry air, 20 °C, 100 kPa; a published table), to its last digit: 0.1e-8 of 0.4 m.
 
-    An instrument that divides by 1 shows 0.4 m · n for a perfect 0.4 m; a straightness grows alike.
+    An instrument that divides by 1 shows 0.4 m · n for an exact 0.4 m; a straightness grows by the same factor.
     """
     n = 1.000268244
     shown = (0.4 * n - 0.4) * 1e6
@@ -177,7 +177,7 @@ BOX = np.array([[-0.1016, -0.1, 0.4], [0.1, 0.1, 0.56]])
 
 
 def instruments() -> Campaign:
-    """Return a circle of a ball bar and two faces of a square, whose runs share a slope."""
+    """Return a circle of a ball bar, and two faces of a square whose runs share a slope."""
     ends = np.array([[-0.1, 0.0, 0.45], [0.1, 0.0, 0.45]])
     faces = [line_run(f"face {n}", "straightness", ends + np.array([0.0, 0.01 * n, 0.0]), 3, np.eye(3)) for n in (0, 1)]
     circle = circle_run("circle", ends.mean(axis=0), 0.05, 5, np.eye(3)[:2], np.eye(3))
@@ -199,7 +199,7 @@ def assert_same(found: MeasurementSet, expected: MeasurementSet, tilted: float =
     "campaign", [Campaign(BOX, 0.1, 0.1, "6-D", 4, cycles=2, poses=7, tilt=0.1), instruments()], ids=["6-D", "others"]
 )
 def test_round_trip_of_everything(tmp_path: Path, campaign: Campaign) -> None:
-    """Values exact; tilted rotations come back through degrees with 12 decimals: half of 1e-12° is 0.9e-14."""
+    """Values are exact; tilted rotations pass through degrees with 12 decimals: half of 1e-12° is 0.9e-14 rad."""
     rng, plan = np.random.default_rng(2), template(campaign, paper_geometry(), 2)
     expected, count = plan.with_values(rng.normal(0.0, 1e-5, len(plan))), len(plan.stations)
     stations = replace(
@@ -259,7 +259,7 @@ def wide(folder: Path, columns: str, rows: str = "0,0,0,0,0,0,1,0,16,0,0,0,1,25.
 
 
 def test_wide_files(tmp_path: Path) -> None:
-    """25.4 − 25.39 mm in x, 406.4 − 400 mm in z; what was not used is said."""
+    """25.4 − 25.39 mm in x and 406.4 − 400 mm in z are read; unused columns are named in a note."""
     found = wide(tmp_path, WIDE_COLUMNS)
     np.testing.assert_allclose(found.value, [10e-6, 0, 6.4e-3, 0, 0, 0], atol=1e-15)
     np.testing.assert_array_equal(found.uncertainty, [*[20e-6] * 3, *[np.nan] * 3])
@@ -312,7 +312,7 @@ def export(folder: Path, columns: str = EXPORT_COLUMNS, content: bytes = EXPORT)
 
 
 def test_a_trackers_export(tmp_path: Path) -> None:
-    """U of 28 and 56 µm with k = 2.8 are 10 and 20 µm; 20 s lie between the rows, over midnight."""
+    """U of 28 and 56 µm with k = 2.8 are 10 and 20 µm; rows over midnight are 20 s apart."""
     found = export(tmp_path)
     np.testing.assert_allclose(found.value, [10e-6, 0, 0, 0, 0, 20e-6], atol=1e-15)
     np.testing.assert_allclose(found.uncertainty, [*[10e-6] * 3, *[20e-6] * 3], rtol=1e-12)
@@ -330,7 +330,7 @@ def test_a_trackers_export(tmp_path: Path) -> None:
 
 
 def test_commanded_poses_in_a_file_of_their_own(tmp_path: Path) -> None:
-    """By name in any order; or row by row."""
+    """Commanded poses in a second file are matched by name in any order, or row by row."""
     (tmp_path / "poses.csv").write_text("name,x_mm,y_mm,z_mm\nB,10,0,400\nspare,0,0,0\nA,0,0,399\n")
     named = EXPORT_COLUMNS.replace("{position: [cx, cy, cz], unit: mm}", "{file: poses.csv, name: name}")
     np.testing.assert_allclose(export(tmp_path, named).value, [10e-6, 0, 1e-3, 0, 0, 20e-6], atol=1e-15)
@@ -372,8 +372,8 @@ def position_rms_mm(found: MeasurementSet) -> float:
     [("108_calibration_poses", "jugglebot_columns", 108, 11.10), ("grid180", "jugglebot_grid_columns", 100, 9.71)],
 )
 def test_jugglebot_before_calibration(name: str, columns: str, poses: int, rms: float) -> None:
-    """Truth: the figures of the data's README. 11.10 there is cross-validated: its six zero lengths come from five
-    sixths of the poses, here from all (11.05)."""
+    """The truth is the figures of the data's README. Its 11.10 is cross-validated, with six zero lengths from five
+    sixths of the poses; here they come from all poses (11.05)."""
     geometry = load_geometry(config_file("jugglebot"))
     found = read_measurements(JUGGLEBOT / f"{name}.csv", geometry, config_file(columns))
     assert len(found) == 6 * poses
@@ -381,9 +381,9 @@ def test_jugglebot_before_calibration(name: str, columns: str, poses: int, rms: 
 
 
 def test_jugglebot_commands_are_the_leg_readings(tmp_path: Path) -> None:
-    """Truth: leg lengths and a least-squares forward kinematics written out here, from the README's own numbers.
+    """The truth is leg lengths and a least-squares forward kinematics written here from the README's own numbers.
 
-    With the lengths of the home pose at reading zero the machine is 55.28 mm off, nearly all of it upwards.
+    If home's lengths are taken at reading zero, the machine is 55.28 mm off, nearly all of it upwards.
     """
     geometry = load_geometry(config_file("jugglebot"))
     text = config_file("jugglebot_columns").read_text().replace("zero: measured", "zero: home")

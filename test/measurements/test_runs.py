@@ -1,7 +1,7 @@
-"""Readings gathered: lines, stations, which way the machine came, sets that become one, and w of displaced poses.
+"""Assembly of readings: lines, stations, directions of motion, joined sets, and the vector w of each channel.
 
-The truth is what the readings say themselves, and closed-form strut lengths from the paper's two hexagons
-(plane geometry, written down here), not the package's kinematics.
+The truth is the readings themselves, and closed-form strut lengths from the paper's two hexagons (plane geometry,
+written here), not the package's kinematics.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def geometry_with(work: Pose | None = None, tool: Pose | None = None) -> Hexapod
 
 
 def test_w_is_what_a_displaced_pose_shows() -> None:
-    """Truth: the probe's place and the tool's attitude before and after a small displacement, in the work frame.
+    """The truth is the probe's place and the tool's attitude before and after a small displacement, in the work frame.
 
     Rotations compose to first order only, so 1e-6 rad leave up to 1e-12; measured 2e-13.
     """
@@ -80,7 +80,7 @@ SECOND = HEADER + (
 
 
 def lengths_at(points: np.ndarray) -> np.ndarray:
-    """Return the paper machine's strut lengths of level poses, (n, 6) m: 001's sides of 300, 572 and 243 mm."""
+    """Return the paper machine's strut lengths of level poses, (n, 6) m, from sides of 300, 572 and 243 mm."""
     radius = np.sqrt((0.572**2 + 0.572 * 0.243 + 0.243**2) / 3.0)
     half = np.arcsin(0.243 / (2.0 * radius))
     corners = np.deg2rad([0.0, 120.0, 120.0, 240.0, 240.0, 360.0]) + half * np.array([1, -1, 1, -1, 1, -1])
@@ -92,12 +92,12 @@ def lengths_at(points: np.ndarray) -> np.ndarray:
 
 
 def at(*points: tuple[float, float, float]) -> list[Pose]:
-    """Return level poses at points in mm."""
+    """Return level poses at points given in mm."""
     return [Pose((np.array(point) * 1e-3).round(9), LEVEL) for point in points]
 
 
 def tracked(poses: list[Pose], channels: tuple[str, ...] = ("position_x",), run: str = "tracker") -> MeasurementSet:
-    """Return a set of poses that were measured one after the other, each in some channels."""
+    """Return a set of poses measured one after the other, each in some channels."""
     readings = [
         Reading(run, 1, FROM_PREVIOUS, pose, channel, 1e-6 * n, source=FileLine("test", n))
         for n, pose in enumerate(poses)
@@ -113,7 +113,7 @@ def file_of(folder: Path, name: str, text: str) -> Path:
 
 
 def test_runs_of_equal_names_stay_apart(tmp_path: Path) -> None:
-    """Another day's line of the same name has its own zero: three runs and not two."""
+    """A line of another day with the same name has its own zero, so three runs stay three."""
     paths = [file_of(tmp_path, name, text) for name, text in (("a.csv", FIRST), ("b.csv", SECOND))]
     together = read_measurements(paths, PAPER)
     assert [run.name for run in together.runs] == ["x line [a.csv]", "tracker", "x line [b.csv]"]
@@ -125,7 +125,7 @@ def test_runs_of_equal_names_stay_apart(tmp_path: Path) -> None:
 
 
 def test_sets_of_different_points_are_refused() -> None:
-    """A reflector that sits elsewhere reads other errors: the model file has one probe only."""
+    """A reflector at another place reads other errors, and a model file has only one measured point."""
     one = tracked(at((0, 0, 400)))
     moved = replace(one, probe=one.probe + np.array([0.0, 0.0, 1e-6]))
     with pytest.raises(InputFileError, match="different measured points cannot be fitted together"):
@@ -134,7 +134,7 @@ def test_sets_of_different_points_are_refused() -> None:
 
 
 def test_one_door_for_tidy_and_wide_files(tmp_path: Path) -> None:
-    """The same readings as rows of one channel and as rows of one pose; wide files become a run each."""
+    """Rows of one channel and rows of one pose give the same readings; a wide file becomes one run."""
     columns = file_of(
         tmp_path,
         "columns.yaml",
@@ -152,7 +152,7 @@ def test_one_door_for_tidy_and_wide_files(tmp_path: Path) -> None:
 
 
 def test_directions_of_a_sequence_follow_from_the_row_before() -> None:
-    """Axes from the commanded positions, struts from closed-form lengths; the first row's is not known."""
+    """Axes follow from the commanded positions, struts from closed-form lengths; the first row has no direction."""
     points = np.array([[0, 0, 400], [10, 0, 400], [10, -20, 430], [0, 0, 400], [0, 0, 380]]) * 1e-3
     found = tracked(at(*(points * 1e3)))
     assert list(found.station) == [0, 1, 2, 3, 4]
@@ -163,7 +163,7 @@ def test_directions_of_a_sequence_follow_from_the_row_before() -> None:
 
 
 def test_a_strut_that_turns_on_the_way_has_the_direction_in_which_it_arrives() -> None:
-    """From one side of the point below its base joint to the other it becomes shorter, then longer by less."""
+    """On the way across the point below its base joint the strut becomes shorter, then longer by less."""
     joint = PAPER.base_joints[0, :2] - PAPER.platform_joints[0, :2]
     across = np.array([-joint[1], joint[0]]) / np.linalg.norm(joint)
     first, last = ((share * joint + way * across) * 1e3 for share, way in ((0.2, -0.06), (0.2, 0.03)))
@@ -174,7 +174,7 @@ def test_a_strut_that_turns_on_the_way_has_the_direction_in_which_it_arrives() -
 
 
 def test_strut_readings_tell_directions_even_where_the_pose_stands_still() -> None:
-    """Encoders 1 µm longer at the same pose: struts out, axes nowhere. Closer than 1 nm is the same command."""
+    """Encoders 1 µm longer at the same pose are struts that extend, without a motion of the axes; 1 nm is no motion."""
     pose = at((0, 0, 400))[0]
     struts = lengths_at(pose.position[None])[0]
     told = [struts, struts + 1e-6, struts + 1e-6 + 1e-10]
@@ -187,8 +187,9 @@ def test_strut_readings_tell_directions_even_where_the_pose_stands_still() -> No
 
 
 def test_directions_of_a_line_are_those_of_its_axis() -> None:
-    """Forward is along the first axis that moves, whichever end is read first; unknown is neither.
-    Forward rows that run backward, and vice versa, are noted."""
+    """Forward is along the first axis that moves, whichever end is read first; unknown is neither direction.
+
+    Forward rows that run backward, and backward rows that run forward, get a note."""
     poses = at((50, 0, 400), (-50, 0, 500))
     readings = [
         Reading("diagonal", 1, direction, pose, "linear", 0.0)
@@ -208,7 +209,7 @@ def test_directions_of_a_line_are_those_of_its_axis() -> None:
 
 
 def test_repeated_passes_share_stations_and_temperatures_part_them() -> None:
-    """Two cycles over three places, both ways: six stations. The same with another temperature: two more."""
+    """Two cycles over three places in both directions are six stations; at another temperature there are six more."""
     plan = Campaign(np.array([[-0.1, -0.1, 0.4], [0.1, 0.1, 0.6]]), 0.2, 0.1, "1-D", 0, cycles=2)
     found = template(plan, PAPER)
     assert len(found) == 2 * 2 * 3 * 12
@@ -243,7 +244,7 @@ def test_what_no_machine_or_instrument_does_is_refused(change: dict[str, object]
 
 
 def went(machine: Machine, tips: np.ndarray, written: np.ndarray, counted_from: float | None = 0.0) -> list[Reading]:
-    """Return readings of a level tool whose file has other places, with the lengths that the struts went to or none."""
+    """Return readings of a level tool with wrong places in the file, with or without commanded strut lengths."""
     rotations = np.tile(machine.level(), (len(tips), 1, 1))
     lengths = machine.lengths(machine.platforms(tips), rotations)
     commands = [None if counted_from is None else tuple(row - counted_from) for row in lengths]
@@ -267,7 +268,7 @@ def in_box(machine: Machine) -> np.ndarray:
     ],
 )
 def test_what_poses_may_mean_is_named(name, change, way: str, counted_from: float | None, tmp_path: Path) -> None:
-    """With the lengths that were commanded, and without."""
+    """The wrong machine or frame is named, with and without commanded strut lengths."""
     machine = machines()[name]
     geometry, tips = load_geometry(machine.write(tmp_path / "machine.yaml")), in_box(machine)
     with pytest.raises(InputFileError, match=f"are refused; none would be .*{way}"):
@@ -278,7 +279,7 @@ def test_what_poses_may_mean_is_named(name, change, way: str, counted_from: floa
 def test_strut_lengths_that_do_not_belong_to_the_pose_are_refused(
     counted_from: float, fine: bool, tmp_path: Path
 ) -> None:
-    """2 % of the shortest, 596.16 mm, are 11.92 mm; a control that counts from where struts are in is off by more."""
+    """2 % of the shortest strut, 596.16 mm, are 11.92 mm; a control with another zero of lengths is off by more."""
     machine = machines()["inches"]
     geometry, tips = load_geometry(machine.write(tmp_path / "machine.yaml")), in_box(machine)
     readings = went(machine, tips, tips, counted_from)

@@ -1,6 +1,6 @@
-"""The package's metadata and dependencies as the source really has them, and the package as pip and colcon install it.
+"""The package's metadata and dependencies compared with the source, and the package as pip and colcon install it.
 
-``make test-packaging`` runs these tests, in a step of their own: they build a wheel and a workspace, and type-check.
+``make test-packaging`` runs these tests separately, since they build a wheel and a workspace, and type-check.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from hexapod_comp.formats.paths import config_file
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "hexapod_comp"
 
-# Import name → key in rosdep's python.yaml and name on PyPI, where the three differ. ROS packages are
-# imported under their own name, which is also their key.
+# Import name → key in rosdep's python.yaml and name on PyPI, if the three differ. ROS packages have the same name for
+# import and as a key.
 PYTHON3 = ("cffi", "hypothesis", "jinja2", "matplotlib", "numpy", "packaging", "pytest", "scipy", "tqdm", "yaml")
 ROSDEP_KEYS = {name: f"python3-{name}" for name in PYTHON3}
 PYPI_NAMES = {"yaml": "pyyaml"}
-# setuptools runs setup.py wherever that is read, mpl_toolkits comes with matplotlib, markupsafe with jinja2, apsw
-# and lz4 with rosbags, websockets with viser, hal and linuxcnc with LinuxCNC, benchmarks are the source tree's; the
-# others are optional extras, what only `pytest -n` needs, and benchmark tools.
+# Not dependencies: setuptools, which runs setup.py; packages that come with another one (mpl_toolkits: matplotlib,
+# markupsafe: jinja2, apsw and lz4: rosbags, websockets: viser, hal and linuxcnc: LinuxCNC); benchmarks, part of the
+# source tree; optional extras, `pytest -n` and benchmark tools.
 COMING_WITH = {"setuptools", "mpl_toolkits", "markupsafe", "apsw", "lz4", "websockets", "hal", "linuxcnc", "benchmarks"}
 EXEMPT = COMING_WITH | {"xdist", "argcomplete", "plotly", "distributed", "rosbags", "mujoco", "pinocchio", "viser"}
 
 
 def _pins(path: Path, here: dict[str, str]) -> dict[str, str]:
-    """Return the versions that a file of requirements pins for a version of Python, by normalised name."""
+    """Return the versions that a requirements file pins for a version of Python, by normalised name."""
     text = re.sub(r" \\\n +--hash=\S+", "", path.read_text(encoding="utf-8"))
     pins = [Requirement(line) for line in text.splitlines() if line and not line.startswith("#")]
     pins = [pin for pin in pins if pin.marker is None or pin.marker.evaluate(here)]
@@ -55,9 +55,9 @@ def _pins(path: Path, here: dict[str, str]) -> dict[str, str]:
 
 @pytest.mark.parametrize("version", ["3.10", "3.14"])
 def test_constraints_pin_all_that_make_installs(version: str, monkeypatch: pytest.MonkeyPatch):
-    """One exact version for each requirement, which it satisfies; after a change of setup.py: ``make constraints``.
+    """Each requirement has one exact version that satisfies it; after a change of setup.py: ``make constraints``.
 
-    Locked files are the constraints with hashes; setuptools, which then builds this package, is there.
+    The locked files are the constraints with hashes, and contain setuptools, which builds this package.
     """
     monkeypatch.chdir(ROOT)
     here = {"python_version": version, "python_full_version": f"{version}.0", "sys_platform": "linux"}
@@ -77,7 +77,7 @@ def test_constraints_pin_all_that_make_installs(version: str, monkeypatch: pytes
 
 
 def test_the_stable_abi_is_what_pythons_own_header_declares(tmp_path: Path):
-    """A compiler refuses a function that two headers declare in two ways."""
+    """A compiler refuses a function that two headers declare differently."""
     if not Path(sysconfig.get_path("include"), "Python.h").is_file():
         pytest.skip("this Python came without its headers")
     own = ROOT / "hexapod_comp" / "core" / "stable_abi" / "Python.h"
@@ -91,7 +91,7 @@ def test_the_stable_abi_is_what_pythons_own_header_declares(tmp_path: Path):
 def test_pip_asks_for_a_compiler_where_none_is_and_setup_py_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Neither the machine's nor PyPI's: PATH leads to an empty folder, no variable names one. One sentence then."""
+    """Without any compiler pip asks for ``ziglang``, and setup.py without it prints what to install."""
     assert "ziglang" not in building.compiler_from_pypi()  # this machine's compiler has built the core under test
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -104,8 +104,8 @@ def test_pip_asks_for_a_compiler_where_none_is_and_setup_py_says_what_to_install
     assert all(word in done.stderr for word in ("apt-get install gcc", "pip install ziglang", "CC="))
 
 
-# Keys that `rosdep resolve --os ubuntu:noble` knows: from ros/rosdistro, rosdep/base.yaml and rosdep/python.yaml at
-# 8468e88 (2026-08-22); and packages of ROS 2 Jazzy, from jazzy/distribution.yaml of the same commit.
+# Keys that `rosdep resolve --os ubuntu:noble` knows, from ros/rosdistro, rosdep/base.yaml and rosdep/python.yaml at
+# 8468e88 (2026-08-22), and packages of ROS 2 Jazzy, from jazzy/distribution.yaml of the same commit
 PYTHON = "argcomplete cffi colcon-common-extensions hypothesis jinja2 matplotlib mypy numpy packaging pytest "
 PYTHON += "pytest-timeout scipy tqdm yaml"
 NOBLE = {"g++-static", *(f"python3-{name}" for name in PYTHON.split())}
@@ -114,9 +114,9 @@ ROS += "rcl_interfaces rclpy rmw_dds_common rosgraph_msgs sensor_msgs std_msgs s
 JAZZY = {*ROS.split(), "visualization_msgs"}
 
 
-@pytest.mark.filterwarnings("ignore:.*parse_:DeprecationWarning")  # catkin_pkg under a newer pyparsing
+@pytest.mark.filterwarnings("ignore:.*parse_:DeprecationWarning")  # catkin_pkg with a newer pyparsing
 def test_every_dependency_is_a_key_of_rosdep_or_a_package_of_jazzy():
-    """Read as rosdep, colcon and bloom do, and without conditions: every distribution gets the same."""
+    """Dependencies are read as rosdep, colcon and bloom read them, and have no conditions."""
     package = importlib.import_module("catkin_pkg.package").parse_package(ROOT / "package.xml")
     named = [*package.buildtool_depends, *package.build_depends, *package.exec_depends, *package.test_depends]
     assert {dependency.name for dependency in named} <= NOBLE | JAZZY
@@ -125,7 +125,7 @@ def test_every_dependency_is_a_key_of_rosdep_or_a_package_of_jazzy():
 
 
 def _setup_arguments() -> dict:
-    """Return what setup.py, run in the current folder, tells setuptools."""
+    """Return the arguments of setup() when setup.py runs in the current folder."""
     with mock.patch("setuptools.setup") as setup:
         runpy.run_path("setup.py")
     return setup.call_args.kwargs
@@ -143,7 +143,7 @@ def test_a_file_of_the_user_wins_over_a_shipped_one(tmp_path: Path, monkeypatch:
 def test_package_xml_lists_what_the_source_imports():
     listed = _package_xml("exec_depend")
     needed = {ROSDEP_KEYS.get(name, name) for folder in (PACKAGE, ROOT / "launch") for name in _imports(folder)}
-    needed.remove("python3-pytest")  # the test kit runs under pytest, or not at all
+    needed.remove("python3-pytest")  # the test kit runs only under pytest
     assert needed <= listed
     assert {key for key in listed if key.startswith("python3-")} <= needed
 
@@ -152,8 +152,8 @@ def test_package_xml_lists_what_the_source_imports():
 def test_a_core_that_was_not_built_is_named_in_one_line_that_tells_how(program: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(ROOT)
     lines = [line.split(" = ") for line in _setup_arguments()["entry_points"]["console_scripts"]]
-    module, function = dict(lines)[program].split(":")  # started as the script that pip writes does
-    script = "import sys; sys.modules['hexapod_comp.core._core'] = None\n"  # what makes it find no compiled core
+    module, function = dict(lines)[program].split(":")  # started like pip's script
+    script = "import sys; sys.modules['hexapod_comp.core._core'] = None\n"  # so that the compiled core is not found
     script += f"from {module} import {function}; sys.exit({function}())"
     words = ["ik", "--pose", "0,0,400"] if program == "hexapod_comp" else []
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
@@ -186,7 +186,7 @@ def _package_xml(tag: str) -> set[str]:
 
 
 def _imports(folder: Path) -> set[str]:
-    """Return the third-party top-level names that the Python files of a folder import, anywhere in them."""
+    """Return the third-party top-level names that the Python files of a folder import anywhere."""
     folders = ("test", "tools")
     own = {"hexapod_comp", "data", "examples", *(path.stem for name in folders for path in (ROOT / name).rglob("*.py"))}
     names = {name for path in folder.rglob("*.py") for name in _imported_names(ast.parse(path.read_bytes()))}
@@ -227,7 +227,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build the source archive, and the wheel from that archive: what it lacks, the wheel lacks too."""
+    """Build the source archive, and from it the wheel, so that a file missing in the archive is missing in both."""
     folder = tmp_path_factory.mktemp("archives")
     source = folder / "checkout"
     shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(".git*", ".venv*", ".*_cache", *MADE))
@@ -242,7 +242,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def site_packages(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Install the wheel by pip alone; return where its modules are."""
+    """Install the wheel by pip alone; return the folder of its modules."""
     target = tmp_path_factory.mktemp("prefix")
     options = ["--no-deps", "--no-index", "--ignore-installed", "--prefix", str(target)]
     subprocess.run([sys.executable, "-m", "pip", "install", "-q", *options, str(wheel)], check=True)
@@ -250,7 +250,7 @@ def site_packages(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 def test_a_client_passes_a_strict_type_check(site_packages: Path, tmp_path: Path):
-    """Against what the wheel installs: its types reach whoever imports it, and none of them is unknown."""
+    """The types of the wheel reach a client's type check, and none of them is unknown."""
     client = tmp_path / "client.py"
     shutil.copy2(ROOT / "test" / "data" / "client.py", client)
     with client.open("a", encoding="utf-8") as stream:
@@ -261,14 +261,14 @@ def test_a_client_passes_a_strict_type_check(site_packages: Path, tmp_path: Path
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     revealed, wrong, found = done.stdout.strip().splitlines()
     assert "HexapodGeometry" in revealed
-    assert 'incompatible type "int"' in wrong  # the deliberate fault is seen, and no other
+    assert 'incompatible type "int"' in wrong  # the only error is the deliberate one
     assert found.startswith("Found 1 error in 1 file")
 
 
 def test_the_wheel_runs_and_says_what_it_is(wheel: Path, site_packages: Path, tmp_path: Path):
-    """The command, its version, its configuration files, its types."""
+    """Command, version, configuration files and types are in the wheel."""
     environment = os.environ | {"PYTHONPATH": str(site_packages)}
-    command = [sys.executable, "-m", "hexapod_comp", "--version"]  # which it reads beside its configuration files
+    command = [sys.executable, "-m", "hexapod_comp", "--version"]  # the version is read beside the configuration files
     output = subprocess.check_output(command, env=environment, cwd=tmp_path, text=True, timeout=60)
     assert output == f"hexapod_comp {VERSION}\n"
     assert (site_packages / "hexapod_comp" / "py.typed").is_file()
@@ -279,7 +279,7 @@ def test_the_wheel_runs_and_says_what_it_is(wheel: Path, site_packages: Path, tm
 
 
 def test_the_source_archive_carries_all_that_its_checks_need(wheel: Path):
-    """``make test`` and ``make docs`` run in it: everything that git has, but the folders of hosting sites."""
+    """``make test`` and ``make docs`` run in it: it has every file of git except folders of hosting sites."""
     (archive,) = wheel.parent.glob("*.tar.gz")
     with tarfile.open(archive) as opened:
         held = {name.partition("/")[2] for name in opened.getnames()}
@@ -301,15 +301,15 @@ def test_every_module_is_installed_and_ros_finds_executables_and_what_is_shared(
         "ament_index/resource_index/packages/hexapod_comp",
         "hexapod_comp/package.xml",
         "hexapod_comp/launch/machine.launch.py",
-        "hexapod_comp/config/own/deep.yaml",  # a subfolder, put there by the fixture
+        "hexapod_comp/config/own/deep.yaml",  # the fixture adds this subfolder
     ):
         assert (installed / "share" / name).is_file(), name
 
 
 def test_a_sourced_workspace_has_the_command_which_finds_its_own_config(installed: Path, tmp_path: Path):
-    """colcon puts it into lib/, where ``ros2 run`` looks; the hook that colcon.pkg names puts that on PATH."""
+    """colcon installs it into lib/, where ``ros2 run`` looks; the hook of colcon.pkg adds lib/ to PATH."""
     prefix = tmp_path / "install"
-    prefix.symlink_to(installed.parent)  # colcon's scripts for sh know no spaces
+    prefix.symlink_to(installed.parent)  # colcon's scripts for sh do not support spaces
     script = f". {prefix}/local_setup.sh; command -v hexapod_comp; command -v compensator"
     environment = {"PATH": os.environ["PATH"], "COLCON_CURRENT_PREFIX": str(prefix)}
     found = subprocess.check_output(["sh", "-c", script], env=environment, cwd=tmp_path, text=True, timeout=60)
@@ -320,6 +320,6 @@ def test_a_sourced_workspace_has_the_command_which_finds_its_own_config(installe
     found = subprocess.check_output([sys.executable, "-c", code], env=environment, cwd=tmp_path, text=True)
     share = installed / "share" / "hexapod_comp" / "config"
     assert found.strip() == f"{share / 'paper.yaml'} {share / 'own' / 'deep.yaml'}"
-    # Through the interpreter: a first line with a space in its path, as here perhaps, is beyond the kernel.
+    # Through the interpreter, since the kernel refuses a first line whose path has a space, as this one may.
     command = [sys.executable, installed / "lib" / "hexapod_comp" / "hexapod_comp", "--help"]
     assert subprocess.check_output(command, env=environment, cwd=tmp_path, timeout=60)

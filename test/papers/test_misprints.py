@@ -1,7 +1,7 @@
-"""The misprints of Song, Mou and King: each formula as printed and as mended, on the poses of their Table 1.
+"""The misprints of Song, Mou and King: each formula as printed and corrected, on the poses of their Table 1.
 
-Truth: the mended formulas close the loops of the paper's own drawing (its Figure 3) to rounding, and give its Table 2.
-The figures that come of the printed ones are those that stand in section 21 of doc/theory.md.
+The corrected formulas close the loops of the paper's own drawing (its Figure 3) to rounding, and give its Table 2. The
+errors of the printed formulas are the figures in section 21 of doc/theory.md.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from examples.papers.misprints import (
 
 ROOT = Path(__file__).resolve().parents[2]
 CASES = cases()
-ROUNDING = 1e-11  # mm or degrees: some hundred roundings of squares of 600 mm, divided by lengths of 300 mm
-# How section 21 says it, and the other parts of it that a test below computes
+ROUNDING = 1e-11  # mm or degrees: about a hundred roundings of squares of 600 mm, divided by lengths of 300 mm
+# The texts in section 21, with other figures of it that a test below computes
 IN_THE_TEXT = {
     "Y_p2": "off by 172 mm",
     "Y_T3": "off by 595 mm",
@@ -53,7 +53,7 @@ def section() -> str:
 
 
 def test_the_poses_are_the_papers_machine():
-    """Its drawing: an equilateral top of side a; the printed matrix is SciPy's; the lengths are Table 2's."""
+    """The drawing has an equilateral top of side a; the printed matrix is SciPy's; the lengths are Table 2's."""
     for at, printed in zip(CASES, table_lengths() * 1e3, strict=True):
         sides = np.linalg.norm(at.top - np.roll(at.top, 1, axis=0), axis=1)
         np.testing.assert_allclose(sides, A, rtol=0, atol=ROUNDING)
@@ -66,7 +66,7 @@ def test_the_poses_are_the_papers_machine():
 @pytest.mark.parametrize("misprint", MISPRINTS, ids=lambda misprint: misprint.name)
 def test_a_printed_formula_is_off_by_what_the_documentation_says_and_the_mended_one_is_exact(misprint, section: str):
     off, left = misprint.worst()
-    assert left < (ROUNDING if misprint.unit in ("mm", "°") else 1e3 * ROUNDING)  # others are µm
+    assert left < (ROUNDING if misprint.unit in ("mm", "°") else 1e3 * ROUNDING)  # other units are µm
     assert off > 1.0
     words = IN_THE_TEXT.get(misprint.name, "")
     assert words in section
@@ -110,7 +110,7 @@ def test_all_17_angles_of_table_3_to_the_last_digit_and_gamma_goes_into_beta(sec
     for cell, value, angle in zip(printed, tanh, right, strict=True):
         assert not angle or f"{value:.6g}" == cell
     np.testing.assert_allclose([printed_angles(at.top) for at in CASES], right.reshape(10, 3), rtol=0, atol=ROUNDING)
-    # With the right γ in it, row 5 would have 9.99938: about one axis tanh makes tanh(tan α) of α.
+    # With the right γ row 5 would have 9.99938, since about one axis tanh turns α into tanh(tan α)
     assert printed[13] == "9.99937"
     assert f"{np.degrees(np.tanh(np.tan(np.radians(10.0)))):.5f}" == "9.99938"
     assert "tanh in place of arctan" in section

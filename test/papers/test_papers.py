@@ -1,6 +1,6 @@
-"""The comparison with the papers: that it says of a number what is so, and that it would notice what is not.
+"""The comparison with the papers: its verdicts on numbers are right, and wrong numbers are noticed.
 
-Truth: the papers' tables (test/data has Tables 1 and 2 from another copy), closed forms, and drawn machines.
+The truth is the papers' tables (test/data has Tables 1 and 2 from another copy), closed forms, and drawn machines.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def test_shipped_tables_are_those_of_the_other_copy():
     for row, pose in zip(values(1), table_poses(), strict=True):
         np.testing.assert_allclose(row[3:] * 1e-3, pose.position, atol=1e-15)
         np.testing.assert_allclose(np.radians(row[:3]), pose.angles(), atol=1e-15)
-    changes = values(4) - values(2)  # the seeds' README: within −6…+2 µm
+    changes = values(4) - values(2)  # by Table 2 and 4: within −6…+2 µm
     np.testing.assert_allclose([changes.min(), changes.max()], [-6e-3, 2e-3], atol=1e-9)
 
 
@@ -80,7 +80,7 @@ def test_tables_2_and_3(run):
 
 
 def test_another_machine_does_not_meet_table_2(run):
-    """A tenth of a millimetre more on one joint is seen, and the verdict is a fault of ours, not of the paper."""
+    """A joint displaced by 0.1 mm is noticed, as an error of ours and not of the paper."""
     base = PAPER.base_joints.copy()
     base[0, 0] += 1e-4
     other = song_mou_king.simulate(replace(PAPER, base_joints=base), machines=1)
@@ -95,7 +95,7 @@ def test_table_5_is_the_ideal_structure_on_table_4(run):
     assert (as_described.verdicts == WRONG).sum() == 58
     assert np.abs(as_described.differences[:, 3:]).max() == pytest.approx(4.71e-3)
     assert (as_made.verdicts == MET).all()
-    # With arctan the two angles of 10° would be off, by 6e-4 degrees.
+    # With arctan the two angles of 10° would differ by 6e-4 degrees
     arctan = np.abs(song_mou_king._rows(song_mou_king._solved(run, values(4) * 1e-3)) - values(5))
     assert (arctan[[4, 6], [1, 2]] > 5e-4).all()
 
@@ -110,7 +110,7 @@ def test_table_4_is_possible_and_hardly_probable(run):
 
 
 def test_a_probability_is_the_share_of_machines_drawn():
-    """400 machines of the exact model, none of it linear: within three standard deviations of a share."""
+    """The truth is 400 drawn machines of the exact model, within three standard deviations of a share."""
     bounds = ImperfectionBounds(joint=10 * MICRON, strut_offset=10 * MICRON)
     changes = assess(PAPER, table_poses()[4:5], bounds, 1, 400).strut_changes[:, 0] * 1e6
     share = ((changes > -12.0) & (changes < 9.0)).all(axis=1).mean()
@@ -125,7 +125,7 @@ def test_the_rest_of_the_paper(run):
 
 
 def test_printed_weights_reproduce_what_is_bilinear():
-    """1, y, z and y·z at the corners, weighted, are 1, y, z and y·z at the tool: so bilinear weights are defined."""
+    """Weighted values of 1, y, z, y·z at the corners give these functions at the tool: so weights are bilinear."""
     rng = np.random.default_rng(2)
     low, high = np.array([-0.1, 0.3]), np.array([0.05, 0.45])
     corners = np.array([low, [low[0], high[1]], high, [high[0], low[1]]])
@@ -150,18 +150,18 @@ def test_ranking_and_iteration():
     study = daake.study(cells=16)
     exhibit = daake.ranking(study)
     (table,) = exhibit.tables
-    np.testing.assert_array_equal(table.verdicts[1] == MET, [False, True, False, True])  # "≈ 0"
+    np.testing.assert_array_equal(table.verdicts[1] == MET, [False, True, False, True])  # printed as "≈ 0"
     assert table.printed[1][1] == "≈ 0"
     assert (np.delete(table.verdicts, 1, axis=0) == OPEN).all()
     assert verdict(exhibit, "translation min") == MET  # 22.4/20 = 7.84/7
-    assert verdict(exhibit, "translation max") == OPEN  # 34.4/20 and 10.85/7: over which poses is not printed
+    assert verdict(exhibit, "translation max") == OPEN  # 34.4/20 and 10.85/7 differ: the poses are not printed
     assert WRONG not in set(exhibit.verdicts())
     assert set(daake.iteration(study).verdicts()) == {MET}
 
 
 @pytest.mark.parametrize(("given", "code"), [(WRONG, 0), (MISSED, 1)])
 def test_the_program(given: str, code: int, run, tmp_path: Path, monkeypatch, capsys):
-    """The exit code is about what can be met; the three modules themselves are tried above."""
+    """The exit code concerns only numbers that can be met; other tests cover the three modules."""
     small = Paper("A", "Title", (song_mou_king.table_2(run), Exhibit("S", "", (), (Statement("x", "1", "2", given),))))
     for module in (song_mou_king, mou_king, daake):
         monkeypatch.setattr(module, "paper", lambda *_: small)

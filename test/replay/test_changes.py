@@ -1,6 +1,6 @@
-"""Each change that a journal may hold, tools and frames among them: its entry, its snapshot, and the bits of a replay.
+"""Each change that a journal may hold, tools and frames included: its entry, its snapshot, and the bits of a replay.
 
-The truth is the compensator that was recorded; its arithmetic is other tests'."""
+The truth is the compensator that was recorded; other tests cover its arithmetic."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ CHANGES: dict[str, list[tuple[tuple[Any, ...], dict[str, Any]]]] = {
     "tool": [(("tool",), {"name": "tool"})],
     "reset": [((None,), {"measured": None}), (([0.5] * 6,), {"measured": [0.5] * 6})],
 }
-"""By their names: the setter's arguments, and what the entry says."""
+"""By name of the change: the setter's arguments, and the journal's entry."""
 
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a model that every one of them moves."""
+    """Return a model that every change of :data:`CHANGES` affects."""
     known = load_model(CONFIG / "paper_machine.yaml", load_geometry("paper"))
     sag = np.outer([10e-6, 40e-6], [0.1, 0.0, -1.0])
     table = OutsideTable(("elevation",), ("rad",), (np.array([0.0, 1.5]),), sag, 0.2 * sag)
@@ -81,7 +81,7 @@ def test_a_change_is_written_restored_and_replayed(what: str, model: Path, tmp_p
     machine.wave(10)
     for n, (arguments, _) in enumerate(CHANGES[what]):
         getattr(machine.compensator, SETTERS[what])(*arguments)
-        machine.wave(1, count - 1)  # where it is: there the first command with another tool must be
+        machine.wave(1, count - 1)  # the first command with another tool must be where the struts are
         if what == "reset":
             machine.compensator.reset()
         machine.wave(20, count)
@@ -96,7 +96,7 @@ TEXT = "std_msgs/msg/String"
 
 
 def recorded(folder: Path) -> RecordedMachine:
-    """Return 600 commands through all frames with three tools, one after the other, and a refused tool and command."""
+    """Return 600 commands in all frames with three tools in turn, and a refused tool and a refused command."""
     machine = with_frames("framed")
     model = Errors.drawn(machine, 5).write(folder / "model.yaml", machine)
     run = RecordedMachine("", model, machine.write(folder / "machine.yaml"))
@@ -105,7 +105,7 @@ def recorded(folder: Path) -> RecordedMachine:
     for n in range(600):
         if n in tools:
             core.set_tool(tools[n])
-            assert n == 0 or not run.send(Pose(core.platform.position, core.platform.rotation))  # not where the tool is
+            assert n == 0 or not run.send(Pose(core.platform.position, core.platform.rotation))  # refused: elsewhere
             place(run, n - 1 if n else 0, frames[n % 3])  # where the struts are
         place(run, n, frames[n % 3])
         if n % 20 == 19:
@@ -114,14 +114,14 @@ def recorded(folder: Path) -> RecordedMachine:
 
 
 def place(run: RecordedMachine, n: int, frame: str) -> None:
-    """Command pose `n` of a wave about home to the tool in use, in a frame."""
+    """Command pose `n` of a wave near home to the tool in use, in a frame."""
     geometry, wave = run.compensator.geometry, wave_pose(n)
     home = Pose(geometry.home.position + wave.position - wave_pose(0).position, geometry.home.rotation @ wave.rotation)
     assert run.send(geometry.using(work=frame).tool_pose(home), frame)
 
 
 def test_tools_and_frames_come_back_bit_for_bit(tmp_path: Path) -> None:
-    """Positions are seen from the base: the platform's way is one smooth wave, whatever frame and tool it has."""
+    """In base the platform follows one smooth wave, with any frame and tool."""
     run = recorded(tmp_path)
     recording = read_recording(write_bag(tmp_path / "bag", run.messages))
     result = replay_recording(recording)
@@ -139,7 +139,7 @@ def test_tools_and_frames_come_back_bit_for_bit(tmp_path: Path) -> None:
 
 
 def test_another_machine_must_have_the_tools_and_frames(tmp_path: Path) -> None:
-    """What cannot be: said of each command, or of the tool at once; never a command in another frame."""
+    """Unknown frames are reported for each command, an unknown tool at once; no command is taken in another frame."""
     run = recorded(tmp_path)
     recording = read_recording(write_bag(tmp_path / "bag", run.messages))
     plain = with_frames("framed")
@@ -157,7 +157,7 @@ def test_another_machine_must_have_the_tools_and_frames(tmp_path: Path) -> None:
 
 
 def older(messages: Messages) -> Messages:
-    """Return messages as they were before there were tools: version 4 of the journal, and nothing of them in it."""
+    """Return messages of the journal's version 4, which had no tools."""
     changed = []
     for time, topic, kind, raw in messages:
         if kind == TEXT:

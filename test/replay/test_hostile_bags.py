@@ -1,7 +1,7 @@
-"""Recordings from strangers: what lies about them, around them and in their journal is refused in words, at once.
+"""Recordings from strangers: false metadata, special files and false journals are refused with a message, at once.
 
-Truth: nothing of this is what a recorder writes. What a replay makes of a journal that it does not refuse is not judged
-here: only that it comes to an end without a traceback.
+No recorder writes such files. If a journal is not refused, the test checks only that its replay ends without a
+traceback.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ ALIASES = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     ],
 )
 def test_metadata_that_stand_for_more_than_they_say(bag: Path, content: str | None, said: str) -> None:
-    """A kilobyte of references was expanded without end, 200 MB were read."""
+    """A kilobyte of YAML references was expanded without end, and 200 MB were read, before they were refused."""
     file = bag / "metadata.yaml"
     if content is None:
         os.truncate(file, 1 << 40)  # sparse
@@ -83,7 +83,7 @@ def test_metadata_that_stand_for_more_than_they_say(bag: Path, content: str | No
 
 @pytest.mark.parametrize("place", ["metadata.yaml", "run.mcap", "alone.mcap"])
 def test_nothing_is_waited_for_in_a_fifo(bag: Path, place: str) -> None:
-    """As the metadata, as the storage, beside it; or given by itself."""
+    """A FIFO as metadata, as storage, beside them, or given by itself is refused without waiting."""
     file = bag / place
     file.unlink(missing_ok=True)
     os.mkfifo(file)
@@ -92,7 +92,7 @@ def test_nothing_is_waited_for_in_a_fifo(bag: Path, place: str) -> None:
 
 
 def test_any_value_in_any_place_of_the_journal(machine: RecordedMachine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Read, replayed as it was and with another model, and shown; or refused in words."""
+    """It is read, replayed with its own and another model, and shown; or refused with a message."""
     ends = {JOURNAL: "/journal", FILES: "/files"}
     texts = [
         (name, time, STORE.deserialize_cdr(raw, kind).data)
@@ -110,7 +110,7 @@ def test_any_value_in_any_place_of_the_journal(machine: RecordedMachine, monkeyp
         report.shown(), list(rows_of(report))
         what_if(recording, machine.geometry, MachineModel(machine.geometry.name))
 
-    monkeypatch.setattr(Source, "geometry", lambda source: machine.geometry)  # both take most of the time
+    monkeypatch.setattr(Source, "geometry", lambda source: machine.geometry)  # reading both takes most of the time
     monkeypatch.setattr(Source, "model", lambda source, name: machine.compensator.model)
     replayed(texts)
     read = 0

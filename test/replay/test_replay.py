@@ -1,7 +1,7 @@
-"""Recordings and their replay without ROS: what comes back, what is lost, and what a bag may not be.
+"""Recordings and their replay without ROS: what is replayed, what is lost, and which bags are refused.
 
-The recordings are made by a compensator that keeps its journal as the node does; the truth is the numbers that
-it gave while it was recorded. Damage is done to the messages, or to the bytes of the bag, by the test.
+A compensator that keeps its journal like the node makes the recordings; the truth is the numbers that it computed. The
+tests damage messages, or bytes of the bag.
 """
 
 from __future__ import annotations
@@ -59,13 +59,13 @@ from hexapod_comp.replay import storage
 from hexapod_comp.replay.bag import Recording, read_recording
 from hexapod_comp.replay.replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Replay, replay_recording
 
-FAR = Pose([0.2, 0.0, 0.4], np.eye(3))  # from home, struts would change by some 90 mm in one command: refused
+FAR = Pose([0.2, 0.0, 0.4], np.eye(3))  # refused: struts would change by 90 mm in one command
 
 JOINT_STATE, TEXT = "sensor_msgs/msg/JointState", "std_msgs/msg/String"
 
 
 def warm_model(folder: Path) -> Path:
-    """Write the shipped machine's model with growth added, so that temperatures and humidity matter."""
+    """Write the shipped machine's model with growth, so that temperatures and humidity have an effect."""
     model = load_model(CONFIG / "paper_machine.yaml", load_geometry(CONFIG / "paper.yaml"))
     struts = replace(model.struts, expansion=np.full(6, 11e-6), moisture=np.full(6, 2e-4))
     save_model(replace(model, struts=struts, base_expansion=12e-6), folder / "warm.yaml")
@@ -73,7 +73,7 @@ def warm_model(folder: Path) -> Path:
 
 
 def full_run(folder: Path, namespace: str = "") -> RecordedMachine:
-    """Return a run of 1,200 commands in which everything happens, a page every 20 ms, a snapshot every 100 ms."""
+    """Return a run of 1,200 commands with all kinds of events, a page every 20 ms, a snapshot every 100 ms."""
     machine = RecordedMachine(namespace, warm_model(folder))
     core = machine.compensator
     happenings: dict[int, Callable[[], object]] = {
@@ -107,7 +107,7 @@ def opened(bag: Path, namespace: str | None = None) -> tuple[Recording, Replay]:
 
 
 def counted(result: Replay) -> dict[int, int]:
-    """Return how often each outcome is there."""
+    """Return the number of commands of each outcome."""
     values, counts = np.unique(result.outcome, return_counts=True)
     return dict(zip(values.tolist(), counts.tolist(), strict=True))
 
@@ -118,12 +118,12 @@ def of_topic(messages: Messages, ending: str) -> list[int]:
 
 
 def without(messages: Messages, *numbers: int) -> Messages:
-    """Return messages without some."""
+    """Return messages without some of them."""
     return [message for n, message in enumerate(messages) if n not in numbers]
 
 
 def call(*arguments: object) -> int:
-    """Run the verb as the command line does, errors apart."""
+    """Call the verb like the command line, except that errors are raised."""
     args = make_parser().parse_args(["replay", *map(str, arguments)])
     return running.replay(args).finish(args)
 
@@ -133,7 +133,7 @@ def call(*arguments: object) -> int:
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_everything_comes_back_bit_for_bit(run, tmp_path, storage):
-    """The truth is what the compensator gave while it was recorded, not what the bag says."""
+    """The truth is the compensator's answers during the recording, not the answers in the bag."""
     bag = write_bag(tmp_path / "run", run.messages, storage)
     recording, result = opened(bag)
     assert counted(result) == {IDENTICAL: 1200}
@@ -148,7 +148,7 @@ def test_everything_comes_back_bit_for_bit(run, tmp_path, storage):
 
 
 def altered(messages: Messages, number: int, change: Callable[[dict], None]) -> Messages:
-    """Return messages with the content of a page of the journal changed."""
+    """Return messages with changed content of one page of the journal."""
     messages, place = list(messages), of_topic(messages, "journal")[number]
     time, topic, kind, raw = messages[place]
     page = json.loads(STORE.deserialize_cdr(raw, kind).data)
@@ -159,7 +159,7 @@ def altered(messages: Messages, number: int, change: Callable[[dict], None]) -> 
 
 @pytest.mark.parametrize(("kind", "name"), [(0, "command"), (1, "correction")])
 def test_replay_sees_a_difference_of_one_bit(run, tmp_path, capsys, kind, name):
-    """One number is moved to its neighbouring float; nothing else may be called different."""
+    """One number is changed to its neighbouring float; no other number may be reported as different."""
 
     def move(page: dict) -> None:
         answers = np.frombuffer(base64.b64decode(page["answers"]), COMMAND).copy()
@@ -167,7 +167,7 @@ def test_replay_sees_a_difference_of_one_bit(run, tmp_path, capsys, kind, name):
         answers["lengths"][7, kind, 3] = np.nextafter(value, 1.0)
         page["answers"] = base64.b64encode(answers.tobytes()).decode()
 
-    bag = write_bag(tmp_path / "run", altered(run.messages, 36, move))  # page 0 is empty, each other has 20 answers
+    bag = write_bag(tmp_path / "run", altered(run.messages, 36, move))  # page 0 is empty, others have 20 answers
     recording, result = opened(bag)
     assert counted(result) == {IDENTICAL: 1199, DIFFERENT: 1}
     assert result.outcome[707] == DIFFERENT
@@ -180,7 +180,7 @@ def test_replay_sees_a_difference_of_one_bit(run, tmp_path, capsys, kind, name):
 
 
 def test_a_change_that_the_journal_hides_is_found(run, tmp_path):
-    """A temperature of the journal is altered by 1 K: from there on until the next snapshot answers differ."""
+    """A temperature in the journal is changed by 1 K: all answers until the next snapshot differ."""
 
     def warm(page: dict) -> None:
         (entry,) = [entry for entry in page["entries"] if entry.get("name") == "strut_1"]
@@ -194,7 +194,7 @@ def test_a_change_that_the_journal_hides_is_found(run, tmp_path):
 
 
 def test_stamps_need_not_tell_commands_apart(tmp_path):
-    """Commands without stamp, twice under one stamp, twice the same, refused ones between; order is all there is."""
+    """Commands without stamps, with equal stamps, equal commands, refused ones: their order identifies them."""
     machine = RecordedMachine()
     for n in range(60):
         machine.send(wave_pose(n), stamped=n % 2 == 0)
@@ -210,7 +210,7 @@ def test_stamps_need_not_tell_commands_apart(tmp_path):
 
 
 def test_a_node_that_is_restarted_begins_anew(tmp_path):
-    """Two lives of a node in one bag: counts begin at zero again, and so does its state."""
+    """A bag may hold two lives of a node: counts and state begin again with the second."""
     first, second = RecordedMachine(), RecordedMachine()
     first.wave(120)
     first.page()
@@ -224,7 +224,7 @@ def test_a_node_that_is_restarted_begins_anew(tmp_path):
 
 
 def test_snapshot_takes_another_compensator_to_the_same_place():
-    """After a snapshot both give the same bits, in the middle of a ramp too."""
+    """After a snapshot both compensators give the same bits, also in the middle of a ramp."""
     one = RecordedMachine()
     one.compensator.set_temperature("platform", 25.0)
     one.wave(50)
@@ -245,14 +245,14 @@ def test_snapshot_takes_another_compensator_to_the_same_place():
     ):
         with pytest.raises(ModelError, match=complaint):
             other.restore(whole | change)
-    for name in whole.keys() - {"lags", "tool"}:  # earlier releases had none
+    for name in whole.keys() - {"lags", "tool"}:  # earlier releases had neither
         with pytest.raises(ModelError, match=rf"snapshot\.{name}: is missing"):
             other.restore({key: value for key, value in whole.items() if key != name})
     assert repr(other.snapshot()) == before, "what is refused changes nothing"
 
 
 def test_journal_stays_short_when_something_goes_wrong_very_often():
-    """Refused first commands reset each time; refused commands may come at a kilohertz."""
+    """Refused first commands reset each time, and commands may be refused at 1 kHz; the journal must stay short."""
     machine = RecordedMachine()
     for _ in range(300):
         machine.compensator.reset(np.full(6, 0.5))
@@ -263,11 +263,11 @@ def test_journal_stays_short_when_something_goes_wrong_very_often():
     assert page.refused_more == 300 - REFUSALS_PER_PAGE
 
 
-# ---- what a recorder may lose ----
+# ---- losses of a recorder ----
 
 
 def test_recording_that_begins_in_motion_is_replayed_from_its_first_snapshot(run, tmp_path):
-    """A recorder that comes late gets pages from before, and the next snapshot after a while; at rest it needs none."""
+    """A late recorder gets earlier pages and, after a while, the next snapshot; of a machine at rest it needs none."""
     first = of_topic(run.messages, "journal")[22]
     kept = run.messages[of_topic(run.messages, "files")[4]]
     recording, result = opened(write_bag(tmp_path / "run", [kept, *run.messages[first:]]))
@@ -288,9 +288,9 @@ def test_recording_that_begins_in_motion_is_replayed_from_its_first_snapshot(run
     [([3], 2), ([5], 5), ([24, 51], 1 + 4), ([59, 60], 0)],
 )
 def test_what_the_recorder_has_lost_is_never_called_a_difference(run, tmp_path, capsys, lost, silent):
-    """What is compared is identical; what lies between a lost page and the next snapshot is counted, not judged."""
-    # Page 0 is empty, each other holds 20 answers; every fifth, and page 0, closes with a snapshot. So after the loss
-    # of page 3 pages 4 and 5 are `silent`.
+    """Commands between a lost page and the next snapshot are counted but not compared; all others are identical."""
+    # Page 0 is empty, each other page holds 20 answers; page 0 and every fifth page end with a snapshot. So after the
+    # loss of page 3, pages 4 and 5 are `silent`.
     pages = of_topic(run.messages, "journal")
     messages = without(run.messages, *(pages[n] for n in lost))
     bag = write_bag(tmp_path / "run", messages)
@@ -309,7 +309,7 @@ def test_what_the_recorder_has_lost_is_never_called_a_difference(run, tmp_path, 
 
 
 def test_a_journal_without_its_end_is_noticed(run, tmp_path, capsys):
-    """The node is killed: what it took since its last page is on the topic, and not in the journal."""
+    """If the node is killed, commands since its last page are on the topic but not in the journal."""
     last = of_topic(run.messages, "journal")[-1]
     bag = write_bag(tmp_path / "run", without(run.messages, last))
     assert counted(opened(bag)[1]) == {IDENTICAL: 1180}
@@ -318,7 +318,7 @@ def test_a_journal_without_its_end_is_noticed(run, tmp_path, capsys):
 
 
 def test_pages_that_come_twice_or_late_do_no_harm(run, tmp_path):
-    """A recorder that joins twice is given old pages again; two recordings may have been put together."""
+    """A recorder that joins twice gets old pages again, and two recordings may have been merged."""
     pages = of_topic(run.messages, "journal")
     messages = list(run.messages)
     messages += [(BEGAN + 5_000 * MILLISECOND, *run.messages[n][1:]) for n in pages[-10:]]
@@ -329,7 +329,7 @@ def test_pages_that_come_twice_or_late_do_no_harm(run, tmp_path):
 
 
 def test_the_journal_is_enough_and_other_topics_do_not_disturb(run, tmp_path):
-    """Without commands and answers, with measured struts in another order, with a topic of a type nobody knows."""
+    """The replay works without commands and answers, with struts in another order, and with a topic of unknown type."""
     messages = [message for message in run.messages if "compensator/" in message[1]]
     names = [f"strut_{n}" for n in (6, 5, 4, 3, 2, 1)]
     for n, broken in enumerate((False, True)):
@@ -345,7 +345,7 @@ def test_the_journal_is_enough_and_other_topics_do_not_disturb(run, tmp_path):
 
 
 def test_folder_of_a_killed_recorder_is_read_without_metadata(run, tmp_path):
-    """Only metadata.yaml is missing, and the bag is split in two files."""
+    """Only metadata.yaml is missing, and the bag is split into two files."""
     folder = tmp_path / "run"
     folder.mkdir()
     for name, part in (("a", run.messages[:700]), ("b", run.messages[700:])):
@@ -357,7 +357,7 @@ def test_folder_of_a_killed_recorder_is_read_without_metadata(run, tmp_path):
 
 
 def test_bag_of_an_older_recorder(run, tmp_path):
-    """Until ROS 2 Humble sqlite bags had no message definitions, and no tables about themselves."""
+    """Until ROS 2 Humble sqlite bags had neither message definitions nor tables about themselves."""
     (file,) = write_bag(tmp_path / "run", run.messages, "sqlite3").glob("*.db3")
     with contextlib.closing(sqlite3.connect(file)) as database, database:
         for table in ("schema", "metadata", "message_definitions"):
@@ -380,8 +380,8 @@ def offset_model(folder: Path, offset_um: float) -> Path:
 
 
 def test_another_model_shows_what_it_would_have_corrected(tmp_path, capsys):
-    """Recorded without a model, so with corrections of zero; struts too long by 30 µm are told 30 µm less."""
-    # A difference of lengths below a metre is exact to 1e-16 m.
+    """The recording has no model and corrections of zero; struts too long by 30 µm are commanded 30 µm shorter."""
+    # a difference of lengths below a metre is exact to 1e-16 m
     machine = RecordedMachine(model=offset_model(tmp_path, 0.0))
     machine.wave(200)
     machine.page()
@@ -404,7 +404,7 @@ def test_another_model_shows_what_it_would_have_corrected(tmp_path, capsys):
 
 
 def test_bag_without_files_asks_for_them(tmp_path, capsys):
-    """Geometry and model in use are known by their hash only; the user has them."""
+    """A bag has only the hashes of geometry and model, so the user must give the files."""
     machine = RecordedMachine()
     machine.wave(40)
     machine.page()
@@ -420,7 +420,7 @@ def test_bag_without_files_asks_for_them(tmp_path, capsys):
     assert "corrections differ" in capsys.readouterr().out
 
 
-# ---- what the verb writes ----
+# ---- the verb's output ----
 
 
 def test_verb_writes_report_pictures_and_json(run, tmp_path, capsys):
@@ -440,7 +440,7 @@ def test_verb_writes_report_pictures_and_json(run, tmp_path, capsys):
 
 
 def retyped(messages: Messages, topic: str) -> Messages:
-    """Return the first messages, those of a topic with another type."""
+    """Return the first messages, with another type for one topic."""
     return [
         (time, name, "std_msgs/msg/Header" if name.endswith(topic) else kind, raw)
         for time, name, kind, raw in messages[:10]
@@ -470,13 +470,13 @@ UNUSABLE: dict[str, Callable[[Messages], Messages]] = {
 
 @pytest.mark.parametrize("what", UNUSABLE)
 def test_bags_that_cannot_be_used(run, tmp_path, what):
-    """Nothing to compare: recorded in motion, and shorter than from one snapshot to the next, or without any."""
+    """Nothing can be compared in a recording in motion without a snapshot, or without any page."""
     with pytest.raises(InputFileError, match=what):
         call(write_bag(tmp_path / "run", UNUSABLE[what](run.messages)))
 
 
 def test_one_of_several_machines_is_chosen(run, tmp_path):
-    """Answers of the other machine are none of its own."""
+    """Answers of another machine do not count."""
     both = [*run.messages, *((time, f"/shop/mill{topic}", kind, raw) for time, topic, kind, raw in run.messages[:600])]
     bag = write_bag(tmp_path / "both", both)
     recording, result = opened(bag, "/")
@@ -496,7 +496,7 @@ def test_paths_that_are_no_bag(tmp_path, name, message):
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_damaged_files_end_in_a_clear_error(run, tmp_path, storage):
-    """Cut anywhere, or with bytes altered anywhere: an error that names the file, or what can still be read."""
+    """A bag cut off or altered at any place gives an error with the file's name, or what is still readable."""
     bag = write_bag(tmp_path / "run", run.messages[:400], storage)
     (file,) = bag.glob("run.[md][cb]*")
     whole, draw = file.read_bytes(), np.random.default_rng(5)
@@ -509,7 +509,7 @@ def test_damaged_files_end_in_a_clear_error(run, tmp_path, storage):
                 damaged[place] = draw.integers(256)
         target = tmp_path / f"{case}{file.suffix}"
         target.write_bytes(damaged)
-        with contextlib.suppress(HexapodError):  # nothing else may be raised
+        with contextlib.suppress(HexapodError):  # no other error may be raised
             opened(target)
         if case % 2 and storage == "mcap" and len(damaged):
             with pytest.raises(InputFileError, match="recorder is killed"):
@@ -517,13 +517,13 @@ def test_damaged_files_end_in_a_clear_error(run, tmp_path, storage):
 
 
 def page_text(**changes: object) -> str:
-    """Return an empty page with changes."""
+    """Return the text of an empty page with changes."""
     content = {"journal": FORMAT, "session": "x", "number": 1, "begins": 0, "answers": "", "entries": []}
     return json.dumps({**content, "refused_more": 0, "snapshot": None, **changes})
 
 
 def test_messages_that_are_damaged_are_named(run, tmp_path):
-    """A message cut short, a page that is no JSON, of another version, or without its numbers."""
+    """A message is damaged if it is cut off, or if its page is no JSON, has another version, or lacks its numbers."""
     pages = [
         ("{", "not JSON"),
         ('{"journal": 9}', "must be of version 4 or 5, not 9"),
@@ -580,7 +580,7 @@ def test_compressed_bags_come_back_bit_for_bit(run, tmp_path, storage, mode):
     ],
 )
 def test_bag_that_unpacks_to_too_much_is_refused(run, tmp_path, monkeypatch, kind, mode, bound, message):
-    """A text of 8 MB of blanks packs into some hundred bytes; the bounds are lowered, to test fast."""
+    """8 MB of blanks are packed into some hundred bytes; the bounds are lowered for speed."""
     blanks = serialized(TEXT, TYPES[TEXT](" " * 8 * MEGABYTE))
     messages = [*run.messages[:50], (BEGAN, "/compensator/journal", TEXT, blanks)]
     bag = write_bag(tmp_path / "run", messages, kind, mode)
@@ -590,7 +590,7 @@ def test_bag_that_unpacks_to_too_much_is_refused(run, tmp_path, monkeypatch, kin
     monkeypatch.setattr(storage.Allowance, "charge", lambda self, n: (unpacked.append(n), charge(self, n)))
     with pytest.raises(InputFileError, match=message):
         read_recording(bag)
-    assert sum(unpacked) <= 4 * MEGABYTE or mode == CompressionMode.FILE  # files go to the disk first
+    assert sum(unpacked) <= 4 * MEGABYTE or mode == CompressionMode.FILE  # whole files are unpacked to the disk first
 
 
 def test_chunks_packed_by_lz4_are_bounded_too(monkeypatch):
@@ -621,7 +621,7 @@ def test_tables_that_compute_what_they_hold_are_refused(run, tmp_path, statement
 def test_the_distance_to_the_path_is_given_as_it_is_and_with_the_datum_aligned(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A tool that is 5 ms late on a path that stands 100 µm and 0.4 mrad off, and nothing else: the motion is known."""
+    """The truth is a known motion: a tool 5 ms late on a path displaced by 100 µm and 0.4 mrad."""
     datum = Pose.from_angles([60e-6, -70e-6, 40e-6], np.array([2e-4, -2e-4, 3e-4]))
     machine = RecordedMachine()
     for n in range(1200):
@@ -635,7 +635,7 @@ def test_the_distance_to_the_path_is_given_as_it_is_and_with_the_datum_aligned(
     found = json.loads(capsys.readouterr().out)["distance_to_path"]
     assert list(found) == ["tool_pose_true"]
     raw, aligned = found["tool_pose_true"]["as_it_is"], found["tool_pose_true"]["datum_aligned"]
-    assert 20e-6 < raw["rms_m"] < raw["max_m"] < 500e-6  # across the path; 0.4 mrad at 0.4 m are 160 µm more
+    assert 20e-6 < raw["rms_m"] < raw["max_m"] < 500e-6  # across the path; 0.4 mrad at 0.4 m add 160 µm
     assert aligned["max_m"] < 1e-7
     assert main(["replay", bag]) == 0
     (said,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("distance of tool_pose_true"))
