@@ -645,16 +645,13 @@ def _divergence(difference: np.ndarray, right: np.ndarray, wrong: np.ndarray) ->
 def plan_report(plan: Plan) -> str:
     """Return the report of a plan."""
     m = plan.measurements
-    head = (
-        f"machine {m.geometry.name}: {len(m)} readings of {len(m.runs)} runs at {len(m.stations)} stations, "
-        f"{plan.space.size} parameters"
-    )
+    counts = f"{len(m)} readings of {len(m.runs)} runs at {len(m.stations)} stations"
+    head = f"machine {m.geometry.name}: {counts}, {plan.space.size} parameters"
     expected = expected_text(plan.level, plan.tilted, plan.observability)
     counted = [f"{expected}\n  {stops_text(plan.stops)}"] if expected else []
     seen = observability_text(plan.observability, plan.unseen_errors)
     elsewhere = [f"the expected error holds for the loads of the readings; {plan.elsewhere}"] if plan.elsewhere else []
-    parts = [head, *counted, seen, *elsewhere]
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join([head, *counted, seen, *elsewhere]) + "\n"
 
 
 def plan_json(plan: Plan) -> dict:

@@ -162,9 +162,5 @@ def evaluation_json(evaluation: ModelEvaluation) -> dict[str, Any]:
     return {**error, **promised, "mean_displacement_error_along_lines": along}
 
 
-Worth, worth, worth_text, worth_json = (
-    ModelEvaluation,
-    evaluate_model,
-    evaluation_text,
-    evaluation_json,
-)  # for one version
+Worth, worth = ModelEvaluation, evaluate_model  # former names, kept for one version
+worth_text, worth_json = evaluation_text, evaluation_json

@@ -35,7 +35,7 @@ from ..machine.temperatures import (
 from ..measurements.readings import KINDS, MeasurementSet
 from .assumptions import ASSUMED
 from .blocks.block import Linkage
-from .blocks.growth import growth_causes, growth_columns, growth_root
+from .blocks.growth import growth_causes, growth_root, per_growth
 from .estimator import Estimation, Posterior, Solution, physical_covariance, solve
 from .parameters import TOLERANCES, ParameterSpace
 from .sensitivity import predict
@@ -205,8 +205,9 @@ def _nominal_fit(estimation: Estimation) -> Posterior:
 def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
     """Return the derivatives of the cells' values by the relative growth of each part, shape (C, 8), m or rad."""
     space, cells, stations = estimation.space, estimation.cells, estimation.measurements.stations
-    columns = growth_columns(Linkage(predict(space, x, stations), space.probe, stations))[cells.station]
-    return np.einsum("ci,cip->cp", cells.directions, columns)
+    linkage = Linkage(predict(space, x, stations), space.probe, stations)
+    columns = linkage.per_length @ per_growth(linkage)
+    return np.einsum("ci,cip->cp", cells.directions, columns[cells.station])
 
 
 def _late_columns(estimation: Estimation, x: np.ndarray, constants: np.ndarray, size: float) -> np.ndarray:
@@ -368,14 +369,14 @@ def _uncertainty(
     rows = problem.rows.using(posterior.used, over)
     stations, block, step = estimation.measurements.stations, space.block("late"), 0.02
     if block is not None and constants:
-        growth, per_growth = solution.x[block.part].reshape(len(PARTS), -1), _per_growth(estimation, solution.x)
+        growth, per_part = solution.x[block.part].reshape(len(PARTS), -1), _per_growth(estimation, solution.x)
         for k, constant in enumerate(constants):
             shorter, longer = (
                 growth_causes(space.settings, stations, [constant.value * math.exp(way)])[:, :, 1]
                 for way in (-step, step)
             )
             slope = ((longer - shorter) / (2.0 * step))[estimation.cells.station]
-            effect = estimation.free_of_nuisance((per_growth * slope) @ growth[:, k : k + 1])[:, 0]
+            effect = estimation.free_of_nuisance((per_part * slope) @ growth[:, k : k + 1])[:, 0]
             moved = space.physical(posterior.covariance @ rows.transposed_times(over * effect))
             covariance += min(constant.deviation, 1.0) ** 2 * np.outer(moved, moved)
     if space.settings.thermometer and block is None and np.ptp(stations.times) > 0.0:

@@ -27,11 +27,6 @@ def per_growth(linkage: Linkage) -> np.ndarray:
     return np.concatenate([struts, np.stack(along, axis=2)], axis=2)
 
 
-def growth_columns(linkage: Linkage) -> np.ndarray:
-    """Return the derivative of e by the relative growth of struts 1-6, base, platform, (M, 6, 8), m and rad."""
-    return linkage.per_length @ per_growth(linkage)
-
-
 def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence[float] | np.ndarray) -> np.ndarray:
     """Return each part's temperature above 20 °C, then its lag by each of K time constants, (M, 8, 1 + K), K."""
     sensors = LateGrowth(thermometer=settings.thermometer)
