@@ -122,11 +122,24 @@ def check_node(words: list[str]) -> None:
 
 def topics_of(name: str) -> set[str]:
     """Return topics and services of a node from its help."""
-    found = set()
-    for line in NODES[name].TOPICS.splitlines():
-        names = re.sub(r"^(in|out|ask)?\s+", "", line).partition("  ")[0]
-        found |= {"/" + topic.strip().replace("~", name).lstrip("/") for topic in names.split(", ")}
-    return found
+    lines = re.findall(r"^(?:in |out|ask|   )  ([~\w/]+(?:, [~\w/]+)*)", NODES[name].TOPICS, re.MULTILINE)
+    return {absolute(topic, name) for line in lines for topic in line.split(", ")}
+
+
+def absolute(topic: str, node: str) -> str:
+    return "/" + topic.replace("~", node).lstrip("/")
+
+
+def test_the_page_of_the_nodes_has_the_topics_of_their_help():
+    """The bridge has a page of its own; /diagnostics, which every node has, is in the table where its row says more."""
+    table = (ROOT / "doc" / "nodes.md").read_text(encoding="utf-8").partition("|---|")[2].partition("\n\n")[0]
+    found, node = {name: {"/diagnostics"} for name in NODES}, ""
+    for row in table.splitlines()[1:]:
+        _, first, topics, *_ = row.split("|")
+        node = first.split()[0] if first.strip() else node
+        found[node] |= {absolute(topic, node) for topic in re.findall(r"`(.+?)`", topics)}
+    for name in NODES.keys() - {"linuxcnc_bridge"}:
+        assert found[name] == topics_of(name), name
 
 
 def check_ros(words: list[str]) -> None:

@@ -75,7 +75,7 @@ SENSOR_QOS = profile(10, reliable=False)
 # Rare messages that must not be lost: diagnostics, markers, requests for moves
 EVENT_QOS = profile(10)
 
-# A state that late subscribers must receive too
+# States that late subscribers must receive too
 LATCHED_QOS = profile(1, latched=True)
 
 # QoS policies of a topic that a user may override by parameters; subscriptions have no lifespan
@@ -202,8 +202,8 @@ def log_problem(folder: str = "") -> str:
 class CallbackGuard:
     """Wrapper around all callbacks of a node, which catches, counts and logs every exception that they raise.
 
-    No message, timer, event or request may end the node of a running machine. No other code has expected an exception
-    that is caught here, so the status shows an error for a second. A service's wrapper also sends a refusal as answer:
+    No message, timer, event or request may end the node of a running machine. An exception that is caught here was
+    handled nowhere else, so the status shows an error for one second. A service's wrapper also answers with a refusal:
     rclpy raises, for instance, when a client requests a transition that is not allowed in the present state.
     """
 
@@ -225,7 +225,7 @@ class CallbackGuard:
         def guarded(*arguments: Any, **keywords: Any) -> Any:
             try:
                 return callback(*arguments, **keywords)
-            except Exception as error:  # of any kind: this is the guard's purpose
+            except Exception as error:  # all exceptions are caught: this is the guard's purpose
                 self.caught(what, error)
                 return otherwise
 
@@ -238,7 +238,7 @@ class CallbackGuard:
             self.request = name
             try:
                 return callback(request, response)
-            except Exception as error:  # of any kind: rclpy's own errors, and Python's where rclpy checks nothing
+            except Exception as error:  # all exceptions: rclpy's own, and Python's where rclpy checks nothing
                 text, refusal = printable(str(error), LONGEST_TEXT), kind.Response()
                 self._requests.add(name, text, time.monotonic())
                 self._log_warning(name, f"{name} refused: {text}")
@@ -304,7 +304,7 @@ class MachineNode(LifecycleNode):
 
     @property
     def unconfigured(self) -> bool:
-        """Whether the node may be configured."""
+        """Whether the node is in the lifecycle state `unconfigured`."""
         return lifecycle_state(self)[0] == State.PRIMARY_STATE_UNCONFIGURED
 
     @property
@@ -506,7 +506,7 @@ class MachineNode(LifecycleNode):
         return sender
 
     def _when_matched(self, topic: str, events: type, make: Callable[..., Any], callback: Callable[[], None]) -> Any:
-        """Make a publisher or subscription, with `callback` for its counterparts coming or going if rmw supports it."""
+        """Call `make` for a publisher or subscription that calls back when a peer comes or goes, if rmw supports it."""
         try:
             guarded = self.guard.around(f"matching of {topic}", lambda _: callback())
             return make(event_callbacks=events(matched=guarded))

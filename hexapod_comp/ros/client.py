@@ -46,7 +46,7 @@ class Sent:
     message: PoseStamped
     answered_at: float = float("nan")  # monotonic time, s; NaN while unanswered
     command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # strut lengths, m; NaN while unanswered
-    correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # of the struts, m; NaN while unanswered
+    correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # strut corrections, m; NaN as above
 
 
 class LoopClient(RosSession):
@@ -239,7 +239,7 @@ class MoveState:
     state: str  # idle, planning, moving, settling, arrived, stopped
     text: str
     share: float  # completed share of the move's duration, 0 to 1
-    time_left: float  # s
+    time_left: float  # time to the end of the motion, s
     stopped_by: str  # cause of the stop; empty: the move was not stopped
     request: int  # stamp of the message that requested the move, ns
     refused_request: int  # stamp of the newest refused message, ns

@@ -35,7 +35,7 @@ from .messages import message_pose, nanoseconds_of, pose_message, pose_numbers, 
 MEDIAN_TO_SIGMA = 1.4826
 # Standard deviation of a median of n readings, times √n, divided by the standard deviation of one reading
 OF_A_MEDIAN = math.sqrt(math.pi / 2.0)
-REPEATS = 2  # A move that was refused for late commands or a restarted node is requested again this many times
+REPEATS = 2  # A move that ended by a refused command or a restarted mover is requested again up to this many times
 LEAST_SAMPLES = 3  # Least number of readings in a median
 PATIENCE = 2.0  # If fewer than half of a stop's readings arrive within this time, s, the beam counts as broken
 ANSWERED_WITHIN = 60.0  # Longest wait for a service's answer, s; the compensator gives up a model after 30 s
@@ -67,7 +67,8 @@ class WatchedMachine(Machine):
         self._frame_id, self._confirm = "base" if tracker_frame == KNOWN else "", confirm
         self._poses, self._struts = list[tuple[Pose, float]](), list[np.ndarray]()
         self._read, self._zero_lost = list[tuple[list[float], float]](), False
-        self._own, self._wants_pose = tuple[str, ...](), True  # channels taken from `readings`; poses are needed
+        # channels that the present run takes from `readings`, and whether it needs poses too
+        self._own, self._wants_pose = tuple[str, ...](), True
         self._temperatures: dict[str, float] = {}  # newest temperature of each part, °C
         self._gravity: tuple[float, ...] | None = None
         super().__init__(namespace)
@@ -91,7 +92,7 @@ class WatchedMachine(Machine):
             self._problem = f"{self._topic}: frame_id must be {self._frame_id}, not {shorten(frame_id)}"
             return
         if not all(map(math.isfinite, pose_numbers(message))):
-            return  # the tracker's beam is broken
+            return  # NaN: the tracker's beam is broken
         try:
             self._poses.append((message_pose(message), nanoseconds_of(message.header.stamp) * 1e-9))
         except HexapodError as error:
@@ -290,7 +291,7 @@ class AdaptedMachine(WatchedMachine):
             raise CommandError("reload", f"the compensator did not load {wanted}: {answer.message}")
 
     def refuse_unreadable(self, path: Path) -> None:
-        """Raise a CommandError, before anything is measured, if the compensator would refuse a file in this folder.
+        """Raise a CommandError if the compensator would refuse to read `path`, the model file that is to be written.
 
         A folder that the compensator knows by a relative name cannot be checked here: the reload may refuse the file.
         """

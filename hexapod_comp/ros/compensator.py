@@ -195,7 +195,7 @@ class CompensatorNode(CompensatorState):
     # ---- a reading ----
 
     def _on_states(self, data: bytes, sample: Sample) -> None:
-        """Check measured struts, track them and estimate the pose; also while inactive, for the start's position."""
+        """Check and track measured struts and estimate the pose; also while inactive: a start needs the struts."""
         now, track, instrument = sample.now, self.track, self.instrument
         try:
             self.measuring.check(sample)
@@ -295,7 +295,7 @@ class Pacing:
         self._wait_for_struts(now, wait)
 
     def add(self, message: bytes, now: float) -> None:
-        """Add a command to waiting ones; a full queue is refused as a whole first."""
+        """Add a command to the queue; first drop the others if `catch_up_within` is 0, or refuse them if it is full."""
         if not self._longest:
             self._node.dropped += len(self.waiting)
             self.waiting.clear()
@@ -312,7 +312,7 @@ class Pacing:
         self._alarm.close()
 
     def _enqueue(self, message: bytes, now: float) -> None:
-        # stored time: time of arrival minus all time in which the node was not scheduled
+        # stored time of arrival, s: without the time in which the node was not scheduled
         self.waiting.append((now - self._stood_still, message))
         self._node.waited += 1
 

@@ -38,7 +38,7 @@ def wait_for_description(arguments: Sequence[str]) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Wait for the URDF, then run the program named by the first argument in this process, with the others."""
+    """Wait for the URDF; then replace this process by the program named in the first argument, with the others."""
     program, *arguments = sys.argv[1:] if argv is None else argv
     try:
         text = wait_for_description([program, *arguments])

@@ -49,7 +49,7 @@ class MessageField(NamedTuple):
 # How units are displayed if this differs from their form in keys
 UNITS = {"um": "µm", "urad": "µrad", "deg": "°", "mm_s": "mm/s", "degC": "°C", "percent": "%"}
 
-# Digits after the decimal point by unit: lengths to a nanometre; numbers without a known unit have nine
+# Digits after the decimal point, by unit; numbers with any other unit have nine digits
 DIGITS = {"mm": 6, "um": 3, "deg": 6, "urad": 3, "mm_s": 3, "degC": 2, "percent": 1, "s": 6, "m": 9, "rad": 9}
 
 

@@ -71,9 +71,9 @@ class StrutInput(PoseInput):
         self._structure, self._reader = Structure.of(compensator.geometry), StrutReader(names)
 
     def read(self, data: bytes, sample: Sample) -> None:  # type: ignore[override]
-        """Read a command's bytes into a sample; set no values if all lengths are NaN, as before ros2_control is active.
+        """Read a command's bytes into a sample; without values if all lengths are NaN, as ros2_control sends at first.
 
-        Raises a KinematicsError if no pose near the last command, nor near home, has these lengths.
+        Raises a KinematicsError if no pose near the last command or near home has these lengths.
         """
         message = read_message(data, JointState)
         sample.stamp, sample.frame_id = command_stamp(message.header.stamp), self._frame_id
@@ -153,7 +153,7 @@ class Loads:
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._compensator = node, node.compensator
-        self._gravity: tuple[float, ...] | None = None  # as published; None: use the parameter's, or else the model's
+        self._gravity: tuple[float, ...] | None = None  # as published, m/s²; None: that of parameter or model is used
         self._wrench = Loading().wrench
         self._numbers: dict[str, float] = {}  # newest published external quantities; those in use: compensator.outside
         self._table = Guard()  # refuses commands while a quantity is outside a table that refuses to extrapolate
@@ -192,7 +192,7 @@ class Loads:
                 self._node.ignore("outside", error, self._node.bad_feedback, "outside")
 
     def stale(self, now: float) -> str:
-        """Return the names of the topics that were published before, but not for ``outside_timeout``, joined."""
+        """Return the topics that were published before, but not for ``outside_timeout``, as a text."""
         timeout = self._node.options["outside_timeout"]
         return ", ".join(name for name, topic in self._topics.items() if topic.stale(now, timeout))
 
@@ -304,7 +304,7 @@ class PoseInstrument:
             self._node.log_warning("drift", self._node.drift_problem)
 
     def add_struts(self, struts: Sequence[float], made: float) -> None:
-        """Add strut lengths, m, at the monotonic time `made`, s, between which readings are interpolated."""
+        """Store strut lengths, m, of the monotonic time `made`, s, for comparison with the instrument's readings."""
         for error in self.fusion.add_struts(struts, made):
             self._reject(error)
 

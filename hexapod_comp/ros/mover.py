@@ -130,7 +130,7 @@ class MoverNode(MachineNode):
         self._request = self._refused_request = 0  # stamps, ns
         self._refusal, self._ready_shown = "", False
         self._resumed = 0  # how often the present move was planned anew after a delay
-        self._target: Request | None = None  # of the present move; None for a program, which cannot be planned anew
+        self._target: Request | None = None  # the present move's; None for a program, which cannot be planned anew
         self._moves = 0  # number of moves for which planning has begun
         self._clear()
 
@@ -153,7 +153,7 @@ class MoverNode(MachineNode):
         self._path: Path | None = None
         self._index = 0
         self._pending: Request | None = None  # request that is planned as soon as the machine stands
-        self._stamp = 0  # of the last command, ns
+        self._stamp = 0  # stamp of the last command, ns
         self._sent: deque[np.ndarray] = deque()  # tool positions commanded within the last LAG, m
         self._near_at = 0.0  # monotonic time, s, when the tool was last close enough to the command (_is_behind)
         self._unanswered: deque[tuple[int, float, Pose]] = deque()  # stamp, ns, monotonic time of sending, s, and pose
@@ -272,8 +272,8 @@ class MoverNode(MachineNode):
         def request() -> Request:
             frame = self._frame(message.header.frame_id)
             if len(message.joint_names) != 1 or len(message.points) < 2:
-                found = f"{len(message.joint_names)} and {len(message.points)}"
-                raise CommandError("program", f"a program names one joint and has at least 2 points, not {found}")
+                found = f"{len(message.joint_names)} joints and {len(message.points)} points"
+                raise CommandError("program", f"a program must have one joint and at least 2 points, not {found}")
             poses, times = [], []
             for n, point in enumerate(message.points):
                 if len(point.transforms) != 1:
@@ -548,7 +548,7 @@ class MoverNode(MachineNode):
         return {"state": self._state, "moves": str(self._moves), "tool": self._tool}
 
     def _refused(self) -> None:
-        """After an unanswered command, resume from the last answered pose; stop if that cannot succeed or was tried."""
+        """After an unanswered command, plan anew from the last answered pose, RESUMED times at most; else stop."""
         status = self._compensator_status
         message, alive = status.get("message", ""), self.count_publishers(self.resolve_topic_name("strut_commands"))
         under_way, answered, target = self._state in UNDER_WAY, self._answered, self._target

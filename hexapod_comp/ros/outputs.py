@@ -29,7 +29,7 @@ REPEATED_AFTER = 1.0
 # Largest stamp of a ROS message, ns: ~/validity gives no later time
 LAST_STAMP = 2**31 * 10**9 - 1
 
-# Of the journal: none of its pages may be lost, and late subscribers need the last snapshot
+# QoS of the journal: none of its pages may be lost, and late subscribers need the last snapshot
 JOURNAL_QOS = profile(10, latched=True)
 
 
@@ -114,12 +114,13 @@ class Outputs:
             self._validities.publish(self._validity)
 
     def _show(self) -> None:
-        """Publish markers and URDF joints of the machine, if there are subscribers; without corrections at first."""
+        """Publish markers and URDF joints of the machine, if there are subscribers."""
         if not self._node.active:
             return
         now, pose = self._node.get_clock().now().to_msg(), self._compensator.platform_estimate
         geometry = self._compensator.geometry
         if self._markers.get_subscription_count():
+            # there are no corrections before the first command
             correction = np.zeros(6) if np.isnan(self._compensator.nominal).any() else self._compensator.correction
             self._markers.publish(machine_markers(geometry, *pose, correction, self._frame, now))
         if self._joints is not None and self._joints.get_subscription_count():

@@ -34,7 +34,7 @@ class ParameterError(HexapodError):
 
 
 class Taken(Enum):
-    """The time at which a node applies a parameter's new value."""
+    """The occasion at which a node applies a parameter's new value."""
 
     ALWAYS = "at any time"
     RELOAD = "at configure and at ~/reload_model"

@@ -33,7 +33,7 @@ SPIN_PERIOD = 0.1
 
 ENDED_WITHIN = 4.0  # Longest time from a signal to the end of the process, s; usually it is a fraction of a second
 STREAMS = (1, 2)  # stdout and stderr: RCUTILS_LOGGING_USE_STDOUT selects the one to which ROS writes its log
-BUFFER_SIZE = 1 << 20  # Size of the log's pipe, byte: thousands of lines; the largest size for unprivileged users
+BUFFER_SIZE = 1 << 20  # Size of the log's pipe, byte: thousands of lines; Linux allows unprivileged users no more
 LEAVING_WITHIN = 0.5  # Longest wait at the end for the last log lines to be read, s
 
 # Options of a node that offers no services and publishes no log
@@ -182,7 +182,7 @@ AnySession = TypeVar("AnySession", bound="RosSession")
 
 
 class RosSession:
-    """One node with its own ROS context and executor, for programs other than nodes; it handles no signals."""
+    """A node with its own ROS context and executor, for programs that talk to nodes; it leaves signals to them."""
 
     def __init__(self, name: str, namespace: str = "", arguments: Sequence[str] = (), **options: Any) -> None:
         open_streams()

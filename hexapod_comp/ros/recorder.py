@@ -48,7 +48,7 @@ CHECK_PERIOD, CHECK_AFTER = 1.0, 16_000_000
 
 
 class BagWriter:
-    """A bag into which messages are written; it stops before its disk is too full to close the bag."""
+    """A bag into which messages are written until its disk has just enough space left to close the bag."""
 
     def __init__(self, folder: str | Path) -> None:
         self.counts: dict[str, int] = {}

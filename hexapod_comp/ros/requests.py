@@ -203,7 +203,7 @@ class TravelReports:
     def _begin(self) -> None:
         node, compensator = self._node, self._node.compensator
         names = {frame_id: name for name, frame_id in node.ids.items()}
-        work = names.get(node.frame_id, WORK)  # before the first command the frame `work`
+        work = names.get(node.frame_id, WORK)  # there is no frame_id before the first command
         if np.isfinite(compensator.nominal).all():
             platform = compensator.platform
         elif node.feedback.count:
@@ -254,7 +254,7 @@ class PredictedError:
         self._worker.ask("predict", asked, self._publish, self._failed, node.files.worker_machine())
 
     def _publish(self, result: dict[str, Any]) -> None:
-        """Publish both errors, unless the real machine cannot reach the pose and an error is missing."""
+        """Publish each predicted error; an error is missing if the real machine cannot reach the pose."""
         self._node.prediction_problem = ""
         for name, publisher in self._topics.items():
             if (error := result[name]) is not None and np.isfinite(error[0]).all():

@@ -116,7 +116,7 @@ class Bench:
         for topic, (kind, qos) in WATCHED.items():
             self.witness.create_subscription(kind, topic, self.seen[topic].append, qos)
         self._publishers: dict[str, Any] = {}
-        for topic in SENT.keys() - {"strut_commands", "strut_setpoints"}:  # a test that needs these adds them
+        for topic in SENT.keys() - {"strut_commands", "strut_setpoints"}:  # drive() or a test adds these publishers
             self.add_publisher(topic)
         self._clients: dict[str, Any] = {}
 
@@ -335,7 +335,11 @@ class Bench:
         self.publish("humidity", RelativeHumidity(relative_humidity=humidity))
         self.barrier()
 
-    speak, hush, moisten = add_publisher, remove_publisher, publish_humidity  # their names in 0.2, for one version
+    speak, hush, moisten = (
+        add_publisher,
+        remove_publisher,
+        publish_humidity,
+    )  # names of version 0.2, kept for one version
 
     def now(self) -> Any:
         return self.witness.get_clock().now().to_msg()

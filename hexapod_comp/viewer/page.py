@@ -58,9 +58,9 @@ class View:
 
     platform: Pose | None = None  # ``pose_platform_in_base`` from ``tool_pose_estimate``
     commanded: Pose | None = None  # ``pose_platform_in_base`` from the commanded struts without corrections
-    corrections: np.ndarray | None = None  # of the struts, shape (6,), m
+    corrections: np.ndarray | None = None  # strut corrections, shape (6,), m
     measured: np.ndarray | None = None  # measured struts, shape (6,), m
-    predicted: WatchedError | None = None  # without compensation, from ``~/predicted_error``
+    predicted: WatchedError | None = None  # error without compensation, from ``~/predicted_error``
     left: WatchedError | None = None  # residual error, by ``tool_pose_estimate``
     seen: WatchedError | None = None  # residual error, by ``tool_pose_true``
     delays: Sequence[float] = ()  # times from a command's stamp to the arrival of its strut command here, s
@@ -323,7 +323,7 @@ def _error(error: WatchedError | None) -> tuple[str, str, str] | None:
 
 
 def _outline(joints: np.ndarray) -> np.ndarray:
-    """Return the sides of a closed line through the joints, shape (6, 2, 3)."""
+    """Return the six segments of a closed line through the joints, shape (6, 2, 3), m."""
     return np.stack([joints, np.roll(joints, -1, axis=0)], axis=1)
 
 

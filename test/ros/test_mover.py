@@ -211,7 +211,7 @@ BAD_REQUESTS = [
     ("move_to", pose_message(HOME, "base"), "finite"),
     ("move_to", bad_quaternion(), "quaternion"),
     ("program", program((HOME, 0.0)), "at least 2 points, not 1 and 1"),
-    ("program", program((HOME, 0.0), (UP, 1.0), joints=2), "names one joint"),
+    ("program", program((HOME, 0.0), (UP, 1.0), joints=2), "must have one joint"),
     ("program", program((HOME, 1.0), (UP, 1.0)), "must be later than 1 s, that of the point before, not 1 s"),
 ]
 BAD_REQUESTS[2][1].pose.position.x = math.nan
