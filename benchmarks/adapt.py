@@ -1,4 +1,4 @@
-"""A machine that moves and calibrates itself: how its parts keep what they promise, on all machines of the tests' zoo.
+"""Benchmark of planned motions and of unattended calibration and repair, on all machines of test/foreign_machines.py.
 
 Usage: python -m benchmarks.adapt [--part moves|unattended] [--moves 1000] [--machines 4] [--first 1]
 
@@ -17,7 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when NumPy is loaded
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # must be set before NumPy is imported
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -37,14 +37,14 @@ from hexapod_comp.upkeep.loop import Adaptation, Task
 from hexapod_comp.virtual.named import imagine
 from hexapod_comp.virtual.watched import Instrument, VirtualMachine
 
-RATE = 1000.0  # at which what is sent is differentiated, Hz
-RATES = StrutRates(0.1, 1.0, 20.0)  # of every strut
-OPTIMUM, KEPT = 1.02, 1.0 + 1e-3  # the bars: times toppra's optimum, and times a limit
-GRID = 1000  # sections on which toppra looks for it
+RATE = 1000.0  # sampling rate of the sent commands, which are differentiated, Hz
+RATES = StrutRates(0.1, 1.0, 20.0)  # largest speed, acceleration and jerk of every strut, m/s, m/s², m/s³
+OPTIMUM, KEPT = 1.02, 1.0 + 1e-3  # bars: time divided by toppra's optimum; speed, acceleration or jerk by its limit
+GRID = 1000  # number of path sections for toppra's optimum
 
 
 def struts(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Return strut lengths of tool poses in work by vectors alone, shape (N, 6), m."""
+    """Return the strut lengths of tool poses in work, shape (N, 6), m, by vector arithmetic without the core."""
     turned = geometry.work.rotation @ rotations @ geometry.tool.rotation.T
     tips = geometry.work.position + positions @ geometry.work.rotation.T
     joints = tips[:, None] + np.einsum("nij,kj->nki", turned, geometry.platform_joints - geometry.tool.position)
@@ -52,7 +52,7 @@ def struts(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarr
 
 
 def share_of_limits(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> float:
-    """Return the largest speed, acceleration or jerk of a strut, by differences, over its limit."""
+    """Return the largest ratio of a strut's speed, acceleration or jerk, by differences, to its limit."""
     lengths, worst = struts(geometry, positions, rotations), 0.0
     for order, limit in enumerate((RATES.speed, RATES.acceleration, RATES.jerk), start=1):
         if len(lengths) > order:
@@ -61,15 +61,15 @@ def share_of_limits(geometry: HexapodGeometry, positions: np.ndarray, rotations:
 
 
 def optimum(motion: Motion) -> float:
-    """Return the least time of a leg under limits of speed and acceleration, s, as toppra finds it."""
+    """Return the least duration, s, of a motion's leg with limits of speed and acceleration, computed by toppra."""
     import toppra
     from toppra import algorithm, constraint
 
     s = np.linspace(0.0, 1.0, GRID + 1)
     lengths = motion.leg.struts(s)[0]
-    way = float(np.ptp(lengths, axis=0).max())  # in which toppra counts: its solver's tolerances are absolute
-    path = toppra.SplineInterpolator(s, lengths / way)
-    speed, acceleration = (np.tile([-most, most], (6, 1)) / way for most in (RATES.speed, RATES.acceleration))
+    scale = float(np.ptp(lengths, axis=0).max())  # unit of length for toppra, whose solver has absolute tolerances
+    path = toppra.SplineInterpolator(s, lengths / scale)
+    speed, acceleration = (np.tile([-most, most], (6, 1)) / scale for most in (RATES.speed, RATES.acceleration))
     limits = [
         constraint.JointVelocityConstraint(speed),
         constraint.JointAccelerationConstraint(acceleration, constraint.DiscretizationType.Interpolation),
@@ -81,7 +81,7 @@ def optimum(motion: Motion) -> float:
 
 
 def targets(geometry: HexapodGeometry, rng: np.random.Generator) -> Iterator[tuple[Pose, Pose]]:
-    """Yield random moves about home, of all sizes, that the machine's limits allow at their ends."""
+    """Yield random moves near home, of very different sizes, whose two ends are within the machine's limits."""
     home = geometry.tool_pose(geometry.home)
     while True:
         size = 10.0 ** rng.uniform(-4.0, 0.0)
@@ -99,10 +99,10 @@ def targets(geometry: HexapodGeometry, rng: np.random.Generator) -> Iterator[tup
 
 
 def judged(geometry: HexapodGeometry, count: int, seed: int) -> np.ndarray:
-    """Plan, sample, differentiate and stop a machine's moves; return a row for each.
+    """Plan, sample, differentiate and stop random moves of a machine; return a row of six numbers for each move.
 
-    Time over toppra's optimum, and over that without a limit of jerk; the largest share of a limit, and that of the
-    move when it is stopped; the duration of the stop, and the processor's time of the plan, s.
+    Duration without jerk limit over toppra's optimum; duration with over without jerk limit; largest ratio to a limit
+    of the move, and of the stopped move; duration of the stop, s; processor time of planning, s.
     """
     rng, found, jerkless = np.random.default_rng([seed, 30]), [], replace(RATES, jerk=np.inf)
     for (start, end), _ in zip(targets(geometry, rng), range(count), strict=False):
@@ -123,11 +123,11 @@ def judged(geometry: HexapodGeometry, count: int, seed: int) -> np.ndarray:
 
 
 def moves(args: argparse.Namespace) -> bool:
-    """Print a row for each machine; return whether the bars are met."""
+    """Run the part "moves": print a row for each machine; return whether the bars are met."""
     try:
         import toppra  # noqa: F401
     except ImportError:
-        print("part moves is held against toppra, which is not here: pip install '.[bench]'", file=sys.stderr)
+        print("part moves needs toppra, which is not installed: pip install '.[bench]'", file=sys.stderr)
         sys.exit(2)
     names = [*machines()]
     each = -(-args.moves // len(names))
@@ -143,34 +143,34 @@ def moves(args: argparse.Namespace) -> bool:
     return table.met
 
 
-GOAL, KNOCK = 3e-6, 20e-6  # m
-NAMED, FALSE, REPAIRED = 0.95, 0.05, 1.5  # the bars: shares of machines, and times of what was left before
+GOAL, KNOCK = 3e-6, 20e-6  # wanted error of the calibration, and change of a strut's length by a collision, m
+NAMED, FALSE, REPAIRED = 0.95, 0.05, 1.5  # bars: share named, share of false alarms, error after repair over before
 FAULTS = Instrument(wild=0.01, broken=0.02)
-LAST_KILL = 80  # Loop and node are killed before so many stops
+LAST_KILL = 80  # the loop and the node are each killed once before this stop
 
 
 class Killed(BaseException):
-    """What ends the loop at once, as SIGKILL would."""
+    """Exception that ends the loop at once, like SIGKILL."""
 
 
 @dataclass
 class Adapted:
-    """What became of a machine; sizes in µm."""
+    """Result for one machine; errors in µm RMS."""
 
     state: str
     text: str
     stops: int
-    kept: bool = True  # what the model leaves is no more than it promised, and than the goal
-    left: float = np.nan
-    alarm: bool = False  # though nothing had changed
-    named: bool = False
-    knocked: float = np.nan  # what is left then,
-    repaired: float = np.nan  # and after the repair
-    seconds: float = 0.0  # of the processor
+    kept: bool = True  # whether the error is at most the promised error and at most the goal
+    left: float = np.nan  # error after the calibration
+    alarm: bool = False  # whether the guard raised an alarm although nothing had changed
+    named: bool = False  # whether the guard named the strut that was changed
+    knocked: float = np.nan  # error after the change of a strut
+    repaired: float = np.nan  # error after the repair
+    seconds: float = 0.0  # processor time, s
 
 
 def adapted(name: str, seed: int, folder: Path) -> Adapted:
-    """Calibrate a machine with everything that goes wrong, check it, knock it, and have it repaired."""
+    """Calibrate a machine with outliers, broken beams and killed processes; check, change and repair it."""
     began, rng = time.process_time(), np.random.default_rng([seed, 31])
     geometry, _ = of_zoo(name)
     place = demo_place(geometry)
@@ -218,7 +218,7 @@ def adapted(name: str, seed: int, folder: Path) -> Adapted:
 
 
 def unattended(args: argparse.Namespace) -> bool:
-    """Print a row for each machine; return whether the bars are met."""
+    """Run the part "unattended": print a row for each machine; return whether the bars are met."""
     print(f"goal {GOAL * 1e6:g} µm (95 %, datum aligned); sizes in µm RMS\n")
     columns = ["machine", "seed", "ended", "stops", "left", "kept", "false alarm", "knocked", "named", "repaired", "s"]
     table, names, found = Table(columns), list(machines()), list[Adapted]()
@@ -253,14 +253,14 @@ PARTS = {
     "unattended": unattended,
     "moves": moves,
 }
-"""By name: a part prints what it finds and returns whether its bars are met."""
+"""Parts of the benchmark by name; each prints its results and returns whether its bars are met."""
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--part", choices=PARTS, action="append", help="only this; may be repeated")
-    parser.add_argument("--moves", type=int, default=1000, help="moves in all (default 1000)")
-    parser.add_argument("--machines", type=int, default=4, help="that are adapted (default 4)")
+    parser.add_argument("--part", choices=PARTS, action="append", help="run only this part; may be repeated")
+    parser.add_argument("--moves", type=int, default=1000, help="moves of all machines together (default 1000)")
+    parser.add_argument("--machines", type=int, default=4, help="number of machines of the part unattended (default 4)")
     parser.add_argument("--first", type=int, default=1, help="seed of the first machine (default 1)")
     args = parser.parse_args()
     met = []

@@ -1,11 +1,11 @@
-"""The core in C: the same bits under every compiler and instruction set that is here, and what a command takes.
+"""The core in C: whether all compilers and instruction sets give the same bits, and the time of a command.
 
-What ``test/core/driver.c`` prints under other compilers (Debian packages: clang, gcc-i686-linux-gnu,
-gcc-arm-linux-gnueabihf, qemu-user; PyPI: ziglang) and sanitizers is compared with gcc's: no C library's sine or
-exponential is in it. Then one thread times commands and estimates, and LinuxCNC's genhexkins on the same poses in turn.
+The output of ``test/core/driver.c`` with other compilers (Debian packages: clang, gcc-i686-linux-gnu,
+gcc-arm-linux-gnueabihf, qemu-user; PyPI: ziglang) and with sanitizers is compared with that of gcc; the core uses no
+sine or exponential of a C library. Then one thread times commands, estimates, and LinuxCNC's genhexkins in turn.
 
-Run ``python -m benchmarks.c_core [--only bits|times]``. Exits 1 when a bit differs, a sanitizer complains or a bar is
-missed, 2 without gcc.
+Run ``python -m benchmarks.c_core [--only bits|times]``. Exit code 1: a bit differs, a sanitizer reports an error or a
+bar is missed; 2: gcc is missing.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ DRIVER = Path(__file__).resolve().parents[1] / "test" / "core" / "driver.c"
 SOURCES = Path(core.__file__).parent
 STRICT = ["-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic"]
 SANITIZED = ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-# Bars: of the whole model's command, µs; beside genhexkins' inverse; of a warm estimate, µs
+# Bars: time of a command with all blocks, µs; this time over that of genhexkins' inverse; time of a warm estimate, µs
 LARGEST_US, LARGEST_RATIO, LARGEST_ESTIMATE_US = 1.5, 8.0, 1.5
 POSES = 500
-INNER = 20  # Times that the poses are run through between two readings of the clock
+INNER = 20  # Number of passes over the poses between two readings of the clock
 
 
 # ---- the same bits ----
@@ -56,16 +56,16 @@ INNER = 20  # Times that the poses are run through between two readings of the c
 
 @dataclass(frozen=True)
 class Build:
-    """A way to compile the driver: compiler and words, what runs it, the processor it needs."""
+    """A way to compile and run the driver."""
 
     name: str
-    words: list[str]
-    runs: tuple[str, ...] = ()
-    needs: str = ""
+    words: list[str]  # compiler and its options
+    runs: tuple[str, ...] = ()  # emulator that runs the program; empty: none
+    needs: str = ""  # required flag of the processor in /proc/cpuinfo
 
 
 def builds() -> list[Build]:
-    """Return the ways; the first one is what the others are compared with."""
+    """Return all builds; the outputs of the others are compared with the output of the first."""
     zig = [sys.executable, "-m", "ziglang", "cc"] if importlib.util.find_spec("ziglang") else ["zig", "cc"]
     return [
         Build("gcc -O3", ["gcc", "-O3"]),
@@ -83,7 +83,7 @@ def builds() -> list[Build]:
 
 
 def printed(build: Build, folder: Path, commands: int) -> str:
-    """Compile the driver in a folder with an export; return what it prints."""
+    """Compile the driver in a folder that holds an exported core, run it, and return its output."""
     flags = [*(flag for flag in FLAGS if flag != "-O3"), *STRICT, f"-I{folder}", f"-I{SOURCES}"]
     words = [*build.words, *flags, str(DRIVER)]  # which includes the core
     made = subprocess.run([*words, "-lm", "-o", str(folder / "driver")], capture_output=True, text=True)
@@ -96,7 +96,7 @@ def printed(build: Build, folder: Path, commands: int) -> str:
 
 
 def missing(build: Build) -> str:
-    """Return what is not here that a build needs, or nothing."""
+    """Return the program or processor flag that a build needs and that is missing; "" if none is missing."""
     for word in (build.words[0], *build.runs):
         if shutil.which(word) is None:
             return word
@@ -107,12 +107,12 @@ def missing(build: Build) -> str:
 
 
 def bits(commands: int) -> list[str]:
-    """Print a line for each build; return what differs."""
+    """Print a line for each build; return a text for each build whose output differs."""
     geometry = load_geometry("paper")
     expected, failed = "", []
     for build in builds():
         if lacks := missing(build):
-            print(f"{build.name:22} not tried: no {lacks} here")
+            print(f"{build.name:22} not tried: {lacks} is missing")
             continue
         with tempfile.TemporaryDirectory() as name:
             write_c(Path(name), geometry, load_model("paper_machine", geometry), ("", ""))
@@ -130,11 +130,11 @@ def bits(commands: int) -> list[str]:
     return failed
 
 
-# ---- what it takes ----
+# ---- times ----
 
 
 def commands(geometry: HexapodGeometry) -> list[tuple[float, ...]]:
-    """Return tool poses as messages have them: a circle of 10 mm about home, tilted by ±3°, there and back."""
+    """Return tool poses (x, y, z, quaternion): half a circle of 10 mm about home with tilts of ±3°, there and back."""
     angles = np.linspace(0.0, np.pi, POSES // 2)
     turns = Rotation.from_euler("xyz", np.deg2rad(3.0) * np.column_stack([np.sin(angles), np.cos(angles), angles]))
     circle = np.column_stack([np.sin(angles), np.cos(angles), 0.2 * np.sin(2.0 * angles)])
@@ -151,9 +151,9 @@ def cardan(geometry: HexapodGeometry) -> HexapodGeometry:
 
 
 def compensators(geometry: HexapodGeometry) -> dict[str, Compensator]:
-    """Return one compensator per block; first the ideal machine's, last the whole model's.
+    """Return one compensator for each block of the model; the first has no errors, the last has all blocks.
 
-    A table over outside numbers is not among them: an export has none.
+    A table over external quantities is not included, since an export has none.
     """
     whole, ideal = load_model("paper_machine", geometry), MachineModel(geometry.name)
     errors, knots = whole.struts, np.linspace(0.42, 0.62, 21)
@@ -188,7 +188,7 @@ def compensators(geometry: HexapodGeometry) -> dict[str, Compensator]:
 
 
 class Timed:
-    """A model's exported core, with the loops of c_core.c around it."""
+    """The exported core of a model, compiled together with the timing loops of c_core.c."""
 
     def __init__(self, compensator: Compensator) -> None:
         with tempfile.TemporaryDirectory() as name:
@@ -204,7 +204,7 @@ class Timed:
         self.warm = np.array([compensator.temperatures.values.get(name, 20.0) for name in Temperatures.NAMES])
 
     def run(self, function: str, rounds: int, *more: Any) -> float:
-        """Return what a function of the library returns of so many rounds of the poses."""
+        """Return the result (a time, s) of a function of c_core.c for a number of rounds over the poses."""
         arrays = [array.ctypes.data_as(ctypes.c_void_p) for array in (self.poses, self.warm)]
         call = getattr(self.library, function)
         result = call(ctypes.c_long(len(self.poses)), ctypes.c_long(rounds), *arrays, *more)
@@ -214,7 +214,7 @@ class Timed:
 
 
 def genhexkins_inverse(poses: np.ndarray) -> Callable[[], float]:
-    """Return a function that returns what genhexkins' inverse takes for a pose, s; NaN where there is none."""
+    """Return a function that measures the time of genhexkins' inverse for a pose, s; NaN if genhexkins is missing."""
     geometry = load_geometry("paper")
     try:
         module = Genhexkins(Structure.of(geometry))
@@ -230,7 +230,7 @@ def genhexkins_inverse(poses: np.ndarray) -> Callable[[], float]:
 
 
 def times(rounds: int) -> tuple[str, list[str]]:
-    """Return a table of what a command and a warm estimate take, medians of rounds in turn, and the bars missed."""
+    """Return a table of the times of a command and of a warm estimate (medians of rounds in turn), and missed bars."""
     everybody = {name: Timed(one) for name, one in compensators(load_geometry("paper")).items()}
     whole = everybody["all of them"]
     beside, count = genhexkins_inverse(whole.poses), len(whole.poses)
@@ -256,8 +256,8 @@ def times(rounds: int) -> tuple[str, list[str]]:
 
 
 def spread(single: int) -> str:
-    """Return how single commands of the whole model spread by the clock on the wall."""
-    geometry, bins = load_geometry("paper"), np.zeros(4000, np.int64)  # of 10 ns
+    """Return a text on the distribution of the times of single commands with all blocks, by wall clock."""
+    geometry, bins = load_geometry("paper"), np.zeros(4000, np.int64)  # bins of 10 ns
     whole = Timed(Compensator(geometry, load_model("paper_machine", geometry)))
     largest = whole.run("each_command", max(1, single // len(whole.poses)), bins.ctypes.data_as(ctypes.c_void_p))
     median, tail = np.searchsorted(np.cumsum(bins) / bins.sum(), (0.5, 0.9999)) * 0.01
@@ -267,10 +267,10 @@ def spread(single: int) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.c_core", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--only", choices=("bits", "times"), help="one part alone (default: both)")
-    parser.add_argument("--commands", type=int, default=20_000, help="of which the bits are compared (default 20000)")
+    parser.add_argument("--only", choices=("bits", "times"), help="run one part only (default: both)")
+    parser.add_argument("--commands", type=int, default=20_000, help="commands to compare bitwise (default 20000)")
     parser.add_argument("--single", type=int, default=10_000_000, help="single commands to time (default 10 million)")
-    parser.add_argument("--rounds", type=int, default=15, help="of times in turn (default 15)")
+    parser.add_argument("--rounds", type=int, default=15, help="number of rounds of the times (default 15)")
     args = parser.parse_args()
     if shutil.which("gcc") is None:
         return cannot_run("no gcc")

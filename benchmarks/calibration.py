@@ -1,4 +1,4 @@
-"""How much error calibration removes: virtual machines measured, fitted, and judged at points not used in the fit.
+"""How much error calibration removes: virtual machines are measured, fitted and checked at points outside the fit.
 
 Usage: python -m benchmarks.calibration [--machines 20] [--first 1] [--workers 2] [--case NAME ...] [--kind ABDG];
 campaigns, kinds and bars: doc/benchmarks.md.
@@ -43,13 +43,13 @@ def one(**changes: object) -> Campaign:
     return replace(load_campaign(CONFIG / "campaign_1d.yaml"), **changes)
 
 
-# Without any laser line.
+# Campaigns without laser lines.
 
-CORNERS = np.array([[1, 1, 1], [-1, 1, -1], [-1, -1, 1], [1, -1, -1]])  # four corners of a box of half sides 1
+CORNERS = np.array([[1, 1, 1], [-1, 1, -1], [-1, -1, 1], [1, -1, -1]])  # four corners of a box from −1 to 1
 
 
 def circles(box: np.ndarray, points: int = 37) -> list[CampaignRun]:
-    """Return 15 circles of 100 mm: about five places, in three planes each; level ones at five heights."""
+    """Return 15 circles of 100 mm radius: about five places in three planes each, level circles at five heights."""
     runs, middle = [], box.mean(axis=0)
     places = np.vstack([np.zeros(3), [1.0, 1.0, 0.0] * CORNERS])
     for n, (place, height) in enumerate(zip(places, np.linspace(-0.09, 0.09, 5), strict=True), start=1):
@@ -61,14 +61,14 @@ def circles(box: np.ndarray, points: int = 37) -> list[CampaignRun]:
 
 
 def r_tests(box: np.ndarray, points: int = 41) -> list[CampaignRun]:
-    """Return R-tests at four places, tilted up to 10°."""
+    """Return R-tests at four places of a box, with tilts up to 10°."""
     places = (box.mean(axis=0) + 0.3 * CORNERS * np.ptp(box, axis=0)).round(6)
     turned = tilts(points, TILT)
     return [CampaignRun(f"R-test {n}", "r_test", np.tile(p, (points, 1)), turned) for n, p in enumerate(places, 1)]
 
 
 def stations(box: np.ndarray, points: int = 400) -> list[CampaignRun]:
-    """Return level points of a box, seen from four stations: three around it, one above."""
+    """Return random level points of a box, measured from four stations: three around the box, one above it."""
     positions = np.random.default_rng(0).uniform(box[0], box[1], (points, 3)).round(6)
     places = ([0.7, 0.6, 0.1], [-0.6, 0.7, 0.2], [-0.7, -0.6, 0.3], [0.1, -0.1, 1.3])
     level = np.tile(np.eye(3), (points, 1, 1))
@@ -79,19 +79,19 @@ def stations(box: np.ndarray, points: int = 400) -> list[CampaignRun]:
 
 
 def listed(*parts: Callable[[np.ndarray], list[CampaignRun]]) -> Callable[[], Campaign]:
-    """Return what makes a campaign of such runs, in the box of the shipped ones."""
+    """Return a function that makes a campaign of the given runs, in the box of the shipped campaigns."""
     return lambda: one(instrument=None, diagonals=0, runs=tuple(run for part in parts for run in part(one().box)))
 
 
 @dataclass(frozen=True)
 class Case:
-    """Which campaign on which kind of machine, what share of which figure must go, and what may be left of position."""
+    """A campaign on a kind of machine, with its bars."""
 
     name: str
-    machine: str
+    machine: str  # kind of machine: A, B, D or G, see truth_of
     campaign: Callable[[], Campaign]
-    bars: dict[str, float]  # by figure: position, tilted, rotation, or the metric of Mou & King 1998, paper
-    most: tuple[float, float] = (np.inf, np.inf)  # RMS and largest error vector that may be left, m
+    bars: dict[str, float]  # removed share of each figure: position, tilted, rotation, or paper (Mou & King's measure)
+    most: tuple[float, float] = (np.inf, np.inf)  # bars of the remaining position error: RMS and largest, m
 
 
 CASES = (
@@ -125,12 +125,12 @@ def truth_of(geometry: HexapodGeometry, kind: str, seed: int, box: np.ndarray) -
 
 @dataclass(frozen=True)
 class Machine:
-    """One machine measured, fitted and judged, m and rad."""
+    """Result for one machine, m and rad."""
 
-    figures: dict[str, tuple[float, float]]  # without and with the model
-    expected: dict[str, tuple[float, float]]  # the interval of 95 % that the fit promises
-    largest: float
-    seconds: float
+    figures: dict[str, tuple[float, float]]  # error without and with the model
+    expected: dict[str, tuple[float, float]]  # 95 % interval of the error that the fit predicts
+    largest: float  # largest position error with the model
+    seconds: float  # time of the fit, s
 
 
 def one_machine(number: int, seed: int) -> Machine:
@@ -166,7 +166,7 @@ COLUMNS += ["inside", "s"]
 
 
 def show(found: drawn.Table, case: Case, machines: list[Machine], figure: str) -> None:
-    """Print a figure's row: RMS over the machines, for the paper's metric the mean."""
+    """Print the row of a figure: its RMS over the machines, or its mean for the paper's measure."""
     both = np.array([m.figures[figure] for m in machines])
     before, after = both.mean(axis=0) if figure == "paper" else np.sqrt((both**2).mean(axis=0))
     removed, least = 1.0 - after / before, (1.0 - both[:, 1] / both[:, 0]).min()
@@ -183,8 +183,8 @@ def show(found: drawn.Table, case: Case, machines: list[Machine], figure: str) -
 
 def main() -> int:
     parser = drawn.options(__doc__, 20)
-    parser.add_argument("--case", action="append", help="only cases whose name starts so; may be repeated")
-    parser.add_argument("--kind", help="only these kinds of machine, such as AB")
+    parser.add_argument("--case", action="append", help="run only cases whose name begins so; may be repeated")
+    parser.add_argument("--kind", help="run only these kinds of machine, for example AB")
     args = parser.parse_args()
     chosen = [
         n

@@ -1,4 +1,4 @@
-"""How long a fit of scheme joint takes: the shipped 5-D campaign on the paper's machine, read more and more finely.
+"""The time of a fit of scheme joint: the shipped 5-D campaign on the paper's machine, with more and more readings.
 
 Usage: python -m benchmarks.calibration_speed [--dense 1.3 14]
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when NumPy is loaded, as by the command line
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # must be set before NumPy is imported, as the command line does
 
 import argparse
 import subprocess
@@ -32,7 +32,7 @@ CONFIG = Path(__file__).resolve().parents[1] / "config"
 
 
 def timed(dense: float) -> list[str]:
-    """Return the row of a fit with readings so many times as dense."""
+    """Return the table's row for a fit with `dense` times as many readings per length of line."""
     geometry = load_geometry(CONFIG / "paper.yaml")
     campaign = load_campaign(CONFIG / "campaign_5d.yaml")
     campaign = replace(campaign, step=campaign.step / dense)
@@ -48,7 +48,7 @@ def timed(dense: float) -> list[str]:
 
 
 def command(readings: MeasurementSet) -> tuple[float, float]:
-    """Return what the command ``fit`` takes of processors and by the clock, s."""
+    """Return the processor time and the wall clock time of the command ``fit``, s."""
     with TemporaryDirectory() as folder:
         write_measurements(readings, f"{folder}/readings.csv")
         words = ["fit", f"{folder}/readings.csv", "--lead-mm", "10", "--out", f"{folder}/model.yaml"]
@@ -62,9 +62,9 @@ def command(readings: MeasurementSet) -> tuple[float, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--dense", type=float, nargs="+", default=[1.3, 14], help="times as many readings")
+    parser.add_argument("--dense", type=float, nargs="+", default=[1.3, 14], help="factors on the density of readings")
     args = parser.parse_args()
-    timed(1)  # compiled and loaded
+    timed(1)  # first run: imports and caches are not timed
     columns = ["readings", "parameters", "steps", "fit: processors, s", "clock, s", "expected, µm"]
     print(table([*columns, "command: processors, s", "clock, s"], map(timed, args.dense), texts=0))
 

@@ -1,7 +1,7 @@
-"""What ``collect`` reports of readings that were taken wrongly, and whether it ever accuses those taken rightly.
+"""Whether ``collect`` reports set-up mistakes of an instrument, and never reports correct readings.
 
-Usage: python -m benchmarks.collect [--machines 60] [--workers 2] [--case NAME ...]; see doc/benchmarks.md. Exits 1 when
-a mistake is not reported, or right readings are accused.
+Usage: python -m benchmarks.collect [--machines 60] [--workers 2] [--case NAME ...]; see doc/benchmarks.md. Exit code 1:
+a mistake was not reported, or correct readings were reported as a mistake.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from hexapod_comp.virtual.instruments import LiveFlaws, LiveInstrument
 from hexapod_comp.virtual.named import find_model
 
 DESIGNS = ("paper", "example_6_6", "positioning_unit", "jugglebot")
-LENGTH_MAP, FIELD = 50e-6, (100e-6, 500e-6)  # Errors that no model contains, RMS, m, m and rad
-ASIDE = Pose.from_angles([2.0, -1.0, 0.5], [0.3, 1.0, 2.5])  # Where a tracker stands that stands anywhere
-FIRST_POSES = 6
+LENGTH_MAP, FIELD = 50e-6, (100e-6, 500e-6)  # RMS of errors outside any model: struts, m; field, m and rad
+ASIDE = Pose.from_angles([2.0, -1.0, 0.5], [0.3, 1.0, 2.5])  # Pose of the free tracker in base
+FIRST_POSES = 6  # Number of poses within which a mistake of a tracker must be reported
 Readings = dict[str, float]
 Change = Callable[[Readings], Readings]
 
 
 def scaled(kinds: Collection[str], scale: float, read: Readings) -> Readings:
-    """Return readings with those of some kinds scaled."""
+    """Return readings in which the channels of the given kinds are multiplied by `scale`."""
     return {name: value * scale if name.partition("_")[0] in kinds else value for name, value in read.items()}
 
 
 def exchanged(one: int, other: int, read: Readings) -> Readings:
-    """Return readings with two channels exchanged, by their numbers."""
+    """Return readings with two channels, given by their numbers, exchanged."""
     names = list(read)
     order = names.copy()
     order[one], order[other] = names[other], names[one]
@@ -52,20 +52,20 @@ def exchanged(one: int, other: int, read: Readings) -> Readings:
 
 
 def turned(angle: float, read: Readings) -> Readings:
-    """Return readings of optics that are turned about the line."""
+    """Return readings of straightness optics that are turned about the line by an angle, rad."""
     (one, a), (other, b) = [(name, value) for name, value in read.items() if name.startswith("straightness")]
     c, s = np.cos(angle), np.sin(angle)
     return {**read, one: float(c * a - s * b), other: float(s * a + c * b)}
 
 
 def aside(arm: float, read: Readings) -> Readings:
-    """Return readings of a reflector that is beside the tool's tip, m."""
+    """Return readings of a reflector at a distance `arm`, m, from the tool's tip."""
     about = next(name for name in read if name.startswith("rotation"))
     return {**read, "linear": read["linear"] + arm * read[about]}
 
 
 def slanting(slope: float, read: Readings) -> Readings:
-    """Return readings of a beam that is not along the line."""
+    """Return readings of a beam that has a slope relative to the line."""
     across = next(name for name in read if name.startswith("straightness"))
     return {**read, across: read[across] + slope * read["linear"]}
 
@@ -112,7 +112,7 @@ OF_KNOWN = {
 
 @dataclass(frozen=True)
 class Case:
-    """An instrument and the mistakes that are made with it."""
+    """An instrument with the set-up mistakes that are tried on it."""
 
     name: str
     kind: str
@@ -131,7 +131,7 @@ CASES = (
 
 
 class Wrong(LiveMachine):
-    """A machine whose readings are changed."""
+    """A machine whose readings are changed by a set-up mistake."""
 
     change: Callable | None = None
 
@@ -146,7 +146,7 @@ class Wrong(LiveMachine):
 
 
 def truth_of(geometry: HexapodGeometry, seed: int) -> MachineModel:
-    """Return hidden errors; of every second machine some that no model contains."""
+    """Return a machine's hidden errors. Machines with an even seed also have errors that no model contains."""
     truth = find_model(f"random:{seed}", geometry)
     if seed % 2:
         return truth
@@ -156,7 +156,7 @@ def truth_of(geometry: HexapodGeometry, seed: int) -> MachineModel:
 
 
 def campaign_of(case: Case, geometry: HexapodGeometry) -> Campaign:
-    """Return what the instrument measures about home, in a tenth of the machine."""
+    """Return the campaign of a case: near home, in a box of a tenth of the machine's size."""
     home = geometry.tool_pose(geometry.home)
     half = 0.1 * geometry.characteristic_length
     box = home.position + half * np.array([[-1.0] * 3, [1.0] * 3])
@@ -170,7 +170,7 @@ def campaign_of(case: Case, geometry: HexapodGeometry) -> Campaign:
 
 
 def outcomes(number: int, seed: int) -> Counter[str]:
-    """Return what was accused rightly or wrongly, or not reported, by its name, of a case by its number."""
+    """Return counts of reported, late and unreported mistakes, and of wrongly reported readings, for a case."""
     case = CASES[number]
     geometry = load_geometry(DESIGNS[seed % len(DESIGNS)])
     truth, campaign, counts = truth_of(geometry, seed), campaign_of(case, geometry), Counter[str]()
@@ -200,7 +200,7 @@ def outcomes(number: int, seed: int) -> Counter[str]:
 def main() -> int:
     parser = drawn.options(__doc__, 60)
     names = [case.name for case in CASES]
-    parser.add_argument("--case", choices=names, action="append", help="this instrument only (default: all)")
+    parser.add_argument("--case", choices=names, action="append", help="run this instrument only (default: all)")
     args = parser.parse_args()
     table = drawn.Table(["instrument", "machines", "mistakes made", "reported at once", "right readings accused"])
     for number, results in drawn.results(outcomes, [names.index(name) for name in args.case or names], args):

@@ -1,4 +1,4 @@
-"""What the benchmarks share that judge many drawn machines: the zoo, options, one process a core, results by case."""
+"""Shared code of benchmarks on many random machines: foreign machines, options, parallel processes, tables."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ from . import table
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
 from foreign_machines import Machine, machines
 
-BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])  # that the paper's machine is measured in, m
+BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])  # measured box of the paper's machine, m
 Case = TypeVar("Case")
 Result = TypeVar("Result")
 
 
 def of_zoo(name: str) -> tuple[HexapodGeometry, Machine]:
-    """Return a machine of test/foreign_machines.py, its geometry read from a file as users have it."""
+    """Return a machine of test/foreign_machines.py and its geometry, which is read from a geometry file."""
     machine = machines()[name]
     with TemporaryDirectory() as folder:
         return load_geometry(machine.write(Path(folder) / "geometry.yaml")), machine
 
 
-# A calibration is only tried honestly on errors that are not made of its own terms: sums of sine waves in space
-FIELD_WAVES = 6  # Waves added up in each component of a field
-FIELD_NODES, FIELD_POWERS = 17, 12  # Lines of a wavy field along y and z, and coefficients along x
+# Errors for testing a calibration must not consist of the calibration's own terms: here they are sine waves in space
+FIELD_WAVES = 6  # Number of waves in each component of a wavy field
+FIELD_NODES, FIELD_POWERS = 17, 12  # Number of lines of a wavy field along y and z; of coefficients along x
 
 
 def with_wavy_field(
@@ -52,7 +52,7 @@ def with_wavy_field(
     rotation: float = 30e-6,
     waves: tuple[float, float] = (0.4, 0.8),
 ) -> MachineModel:
-    """Return a model with a smooth pose error in space, the same in both directions of motion."""
+    """Return a copy of a model with a smooth pose error in space, equal in both directions of motion."""
     rng = seeded(seed, "field")
     vectors = rng.standard_normal((6, FIELD_WAVES, 3))
     vectors *= 2.0 * np.pi / (np.linalg.norm(vectors, axis=2) * rng.uniform(*waves, (6, FIELD_WAVES)))[..., None]
@@ -78,7 +78,7 @@ def with_wavy_field(
 
 
 def options(doc: str | None, machines: int, first: int = 1, of: str = "case") -> argparse.ArgumentParser:
-    """Return the parser of a benchmark: how many machines, the seed of the first, and how many processes."""
+    """Return a parser with the options for number of machines, seed of the first machine and number of processes."""
     parser = argparse.ArgumentParser(description=(doc or "").splitlines()[0])
     parser.add_argument("--machines", type=int, default=machines, help=f"machines of each {of} (default {machines})")
     parser.add_argument("--first", type=int, default=first, help=f"seed of the first machine (default {first})")
@@ -87,8 +87,8 @@ def options(doc: str | None, machines: int, first: int = 1, of: str = "case") ->
 
 
 def each(run: Callable[..., Result], tasks: Sequence[tuple], workers: int) -> Iterator[Result]:
-    """Yield what comes of each task in its order, one process a core, with the progress."""
-    # A library's own threads would only be in each other's way.
+    """Yield the results of the tasks in their order; run them in `workers` processes and show the progress."""
+    # One thread per process: threads of a library would compete for the same cores.
     os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
     pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
     with pool, tqdm(total=len(tasks), disable=None) as bar:
@@ -100,7 +100,7 @@ def each(run: Callable[..., Result], tasks: Sequence[tuple], workers: int) -> It
 def results(
     of_machine: Callable[[Case, int], Result], cases: Sequence[Case], args: argparse.Namespace
 ) -> Iterator[tuple[Case, list[Result]]]:
-    """Yield each case with what came of its machines, as soon as all of them are done."""
+    """Yield each case with the results of its machines as soon as all its machines are done."""
     seeds = range(args.first, args.first + args.machines)
     found = each(of_machine, [(case, seed) for case in cases for seed in seeds], args.workers)
     for case in cases:
@@ -108,7 +108,7 @@ def results(
 
 
 class Table:
-    """A table in Markdown that is printed row by row, above the progress; `met`: whether all bars are."""
+    """A Markdown table that is printed row by row above the progress bar; `met` is False after a missed bar."""
 
     def __init__(self, columns: Sequence[str], texts: int = 1) -> None:
         self.met = True
@@ -125,5 +125,5 @@ def show(text: str) -> None:
 
 
 def verdict(bar: float, met: bool) -> str:
-    """Return a bar, a share, and whether it is met."""
+    """Return a text with a bar (a share) and whether it is met."""
     return f"{bar:.0%} {'met' if met else 'MISSED'}"

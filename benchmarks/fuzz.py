@@ -1,12 +1,12 @@
-"""Fuzzing at nightly size: the tests of ``test/fuzz`` with more cases, others for every seed; or the core.
+"""Long fuzzing: the tests of ``test/fuzz`` with more cases, different for every seed; or the C core.
 
     python -m benchmarks.fuzz [--cases N] [--seed N] [--jobs N] [-k WORD]
     python -m benchmarks.fuzz --core [--seconds 600]
 
-``-k any_content`` sends N messages of any bytes to each node, as processes, over DDS. Hypothesis shrinks and prints a
-case that fails. ``--core`` compiles ``test/core/fuzz.c`` by clang, once for each entry, under libFuzzer with
-sanitizers; what it found lies in out/fuzz-core, and is tried first the next time. Exits 1 where something breaks, 2
-without clang.
+``-k any_content`` sends N messages of random bytes over DDS to each node, which runs as a process. Hypothesis shrinks
+and prints a failing case. ``--core`` compiles ``test/core/fuzz.c`` with clang, once for each entry, for libFuzzer with
+sanitizers; the inputs that it finds are kept in out/fuzz-core and tried first in the next run. Exit code 1: a test or
+an entry failed; 2: clang is missing.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import load_model
 
 ROOT = Path(__file__).resolve().parents[1]
-NOT_CASES = (" accepted", " messages")  # Endings of counts of what was accepted, and of what a node's case consists of
+NOT_CASES = (" accepted", " messages")  # Suffixes of counts that are not numbers of cases
 ENTRIES = ("command", "estimate", "model")
 SANITIZERS = ["-g", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
 
 
 def tests(args: argparse.Namespace) -> list[str]:
-    """Run the tests and print a table of what was run; return the files that failed."""
+    """Run the tests and print a table with the number of cases; return the test files that failed."""
     began, counts, failed = time.monotonic(), Counter[str](), []
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "HEXAPOD_FUZZ_CASES": str(args.cases), "HEXAPOD_FUZZ_COUNTS": folder}
-        environment.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: more threads only wait for each other
+        environment.setdefault("OPENBLAS_NUM_THREADS", "1")  # one thread is fastest for small matrices
         command = [sys.executable, "-m", "pytest", "-q", "--tb=short", "-p", "no:cacheprovider", "-o", "timeout=0"]
         command += [f"--hypothesis-seed={args.seed}", *(["-k", args.k] if args.k else [])]
 
         def run(file: Path) -> None:
-            """Run one file's tests in a process of its own; print what it prints when it is done."""
+            """Run the tests of one file in its own process, and print its last line, or all its output if it failed."""
             done = subprocess.run([*command, str(file)], cwd=ROOT, env=environment, capture_output=True, check=False)
-            passed = done.returncode in (0, 5)  # 5: -k left none
+            passed = done.returncode in (0, 5)  # 5: -k selected no test
             said = (done.stdout + done.stderr).decode("utf-8", "replace").strip()
             print(f"== {file.name}\n{said.splitlines()[-1] if passed else said}", flush=True)
             if not passed:
@@ -68,7 +68,7 @@ def tests(args: argparse.Namespace) -> list[str]:
 
 
 def core_entries(seconds: int) -> list[str]:
-    """Run each entry of the core at low priority; return those that broke."""
+    """Run the fuzzer of each entry of the core at low priority; return the entries that failed."""
     geometry, sources, broken = load_geometry("paper"), Path(core.__file__).parent, []
     for entry in ENTRIES:
         folder = ROOT / "out" / "fuzz-core" / entry
@@ -92,16 +92,16 @@ def core_entries(seconds: int) -> list[str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", type=int, default=100_000, metavar="N", help="about how many (default 100000)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of all that is random (default 0)")
+    parser.add_argument("--cases", type=int, default=100_000, metavar="N", help="approximate number (default 100000)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all random numbers (default 0)")
     cores = os.cpu_count() or 1
     parser.add_argument("--jobs", type=int, default=cores, metavar="N", help="processes (default: as many as cores)")
     parser.add_argument("-k", default="", metavar="WORD", help="only tests with this word in their name")
-    parser.add_argument("--core", action="store_true", help="the core under libFuzzer instead")
-    parser.add_argument("--seconds", type=int, default=600, help="for each entry of the core (default 600)")
+    parser.add_argument("--core", action="store_true", help="fuzz the core with libFuzzer instead of the tests")
+    parser.add_argument("--seconds", type=int, default=600, help="time for each entry of the core, s (default 600)")
     args = parser.parse_args()
     if args.core and shutil.which("clang") is None:
-        return cannot_run("no clang here (Debian: apt install clang)")
+        return cannot_run("clang is missing (Debian: apt install clang)")
     failed = core_entries(args.seconds) if args.core else tests(args)
     print(f"FAILED: {', '.join(failed)}" if failed else "all passed")
     return 1 if failed else 0

@@ -1,7 +1,7 @@
-"""LinuxCNC's own compiled hexapod kinematics, as Debian's linuxcnc-uspace installs it, without LinuxCNC.
+"""LinuxCNC's compiled hexapod kinematics, genhexkins, from Debian's package linuxcnc-uspace, run without LinuxCNC.
 
-The module is loaded beside a small stand-in for the HAL, genhexkins.c, and gets the paper's machine by its pins, in mm
-and degrees.
+The module is loaded together with a small replacement of the HAL, genhexkins.c. Its pins receive the paper's machine in
+mm and degrees.
 """
 
 from __future__ import annotations
@@ -21,36 +21,36 @@ from scipy.spatial.transform import Rotation
 from hexapod_comp.machine.kinematics import Structure
 
 NAME = "LinuxCNC genhexkins"
-# Where Debian puts it; another one by the environment variable GENHEXKINS
+# Path of the module in Debian; the environment variable GENHEXKINS gives another path
 MODULE = Path("/usr/lib/linuxcnc/modules/genhexkins.so")
 MM = 1e-3
-# Its own default: it ends when every strut was right to this, mm, before the last step. Its steps shrink by a
-# constant factor each, so its answers are about as good as this; ours converges quadratically.
+# genhexkins' default: its iteration ends if every strut's error before the last step was below this, mm. The errors
+# shrink by a constant factor per step, so this is about its accuracy; the package's iteration converges quadratically.
 CRITERION = 1e-9
-ANY_ERROR = 1e9  # Its default refuses a guess whose struts are off by 500 mm altogether; here it may try
+ANY_ERROR = 1e9  # Limit of the summed strut errors of a guess, mm; genhexkins' default of 500 mm would refuse guesses
 POSE, STRUTS = 9, 6
 
 
 class NotHere(Exception):
-    """There is no module to compare with; says why."""
+    """Error: genhexkins cannot be loaded, with the reason."""
 
 
 @functools.cache
 def _load() -> tuple[ctypes.CDLL, ctypes.CDLL]:
-    """Return stand-in and module, loaded once per process."""
+    """Load the replacement of the HAL and the module once per process, and return both."""
     path = Path(os.environ.get("GENHEXKINS", MODULE))
     if not path.is_file():
-        raise NotHere(f"{NAME}: no {path}; on Debian: apt-get install linuxcnc-uspace")
+        raise NotHere(f"{NAME}: {path} is missing; on Debian: apt-get install linuxcnc-uspace")
     compiler = shutil.which("cc")
     if compiler is None:
-        raise NotHere(f"{NAME}: no C compiler (cc) for the stand-in for its HAL")
+        raise NotHere(f"{NAME}: no C compiler (cc) for the replacement of the HAL")
     with tempfile.TemporaryDirectory() as folder:
         library, source = Path(folder) / "stand_in.so", Path(__file__).with_suffix(".c")
         done = subprocess.run(
             [compiler, "-O2", "-shared", "-fPIC", "-o", library, source], capture_output=True, text=True, check=False
         )
         if done.returncode:
-            raise NotHere(f"{NAME}: the stand-in for its HAL does not compile: {done.stderr.strip()}")
+            raise NotHere(f"{NAME}: the replacement of the HAL does not compile: {done.stderr.strip()}")
         stand_in = ctypes.CDLL(str(library), ctypes.RTLD_GLOBAL)
         try:
             module = ctypes.CDLL(str(path))
@@ -64,7 +64,7 @@ def _load() -> tuple[ctypes.CDLL, ctypes.CDLL]:
 
 
 def emc_poses(positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Return poses (N, 3), m, and (N, 3, 3) as LinuxCNC has them: x y z, mm, a b c, degrees, u v w; (N, 9)."""
+    """Return poses, (N, 3), m, and (N, 3, 3), in LinuxCNC's form (N, 9): x y z, mm, a b c, degrees, u v w (zero)."""
     poses = np.zeros((len(positions), POSE))
     poses[:, :3] = positions / MM
     poses[:, 3:6] = Rotation.from_matrix(rotations).as_euler("xyz", degrees=True)  # R = Rz(c)·Ry(b)·Rx(a)
@@ -72,12 +72,12 @@ def emc_poses(positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
 
 
 def si_poses(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions, m, and rotations of LinuxCNC's poses."""
+    """Return positions, m, and rotation matrices of poses in LinuxCNC's form."""
     return poses[:, :3] * MM, Rotation.from_euler("xyz", poses[:, 3:6], degrees=True).as_matrix()
 
 
 class Genhexkins:
-    """The module with a machine's joints on its pins."""
+    """The module genhexkins with the joint positions of a machine on its pins."""
 
     def __init__(self, structure: Structure) -> None:
         self.stand_in, self.module = _load()
@@ -97,7 +97,7 @@ class Genhexkins:
         ctypes.c_double.from_address(address).value = value
 
     def forward(self, lengths: np.ndarray, guesses: np.ndarray, poses: np.ndarray, codes: np.ndarray) -> float:
-        """Solve (N, 6) lengths, mm, from guesses (N, 9) or (1, 9) into `poses`, `codes`; return the time it took, s."""
+        """Solve (N, 6) lengths, mm, from guesses (N, 9) or (1, 9); write `poses` and `codes`; return the time, s."""
         step = POSE if len(guesses) > 1 else 0
         return self.stand_in.forward_many(
             self.module.kinematicsForward,
@@ -110,20 +110,20 @@ class Genhexkins:
         )
 
     def inverse(self, poses: np.ndarray, lengths: np.ndarray, codes: np.ndarray) -> float:
-        """Write the lengths, mm, of (N, 9) poses; return the time it took, s."""
+        """Write the strut lengths, mm, of (N, 9) poses into `lengths`; return the time, s."""
         count = ctypes.c_long(len(poses))
         arrays = pointer(poses), pointer(lengths), pointer(codes)
         return self.stand_in.inverse_many(self.module.kinematicsInverse, count, *arrays)
 
     def one_call(self, inverse: bool) -> Callable[..., int]:
-        """Return a function of the module for single calls from Python, with addresses."""
+        """Return the module's function for single calls from Python, whose arguments are addresses."""
         function = self.module.kinematicsInverse if inverse else self.module.kinematicsForward
         function.argtypes = [ctypes.c_void_p] * 4
         return function
 
     @staticmethod
     def addresses(given: np.ndarray, found: np.ndarray, flags: np.ndarray) -> list[tuple[int, int, int, int]]:
-        """Return the four arguments of one call per row, ready: looking them up is not counted."""
+        """Return the four addresses for the call of each row in advance, so that a timed call does not compute them."""
         rows = zip(given, found, strict=True)
         return [(row.ctypes.data, to.ctypes.data, flags.ctypes.data, flags.ctypes.data + 8) for row, to in rows]
 

@@ -1,1 +1,1 @@
-"""Programs that use the package; run from the source tree by ``python -m examples.NAME``."""
+"""Example programs that use the package; run one from the source tree with ``python -m examples.NAME``."""

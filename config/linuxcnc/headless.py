@@ -1,8 +1,8 @@
 #!/usr/bin/python3
-"""LinuxCNC without a screen: switch on, home, run a program if one is given, stay until Ctrl-C.
+"""LinuxCNC without a screen: switch on, home, then run a program and end, or without a program stay until Ctrl-C.
 
-The program is [DISPLAY]PROGRAM of the ini file, or the variable HEXAPOD_PROGRAM; with a program LinuxCNC ends when the
-program has. Messages for the operator are printed. For one's own steering, see LinuxCNC's Python interface.
+The variable HEXAPOD_PROGRAM, or [DISPLAY]PROGRAM of the ini file, names the program. LinuxCNC's messages for the
+operator are printed. To control LinuxCNC in another way, use its Python interface as this file does.
 """
 
 import os
@@ -13,11 +13,11 @@ import time
 import linuxcnc
 
 JOINTS = 6
-PATIENCE = 60.0
+TIMEOUT = 60.0  # longest wait for LinuxCNC to be on, homed or running, s
 
 
 class Stopped(Exception):
-    """Somebody has asked for the end."""
+    """SIGINT, SIGTERM or SIGHUP was received."""
 
 
 def stop(*_):
@@ -25,58 +25,58 @@ def stop(*_):
 
 
 class Screen:
-    """What an operator does first."""
+    """The first steps of an operator: switch on, home, run a program, read messages."""
 
     def __init__(self):
         self.command, self.stat, self.errors = linuxcnc.command(), linuxcnc.stat(), linuxcnc.error_channel()
 
-    def say(self):
-        """Print what LinuxCNC tells its operator."""
+    def print_messages(self):
+        """Print the messages that LinuxCNC has for its operator."""
         while message := self.errors.poll():
             print(message[1].strip(), flush=True)
 
-    def until(self, condition, what, patience=PATIENCE):
-        """Wait for a condition on linuxcnc.stat()."""
-        end = time.monotonic() + patience
+    def wait_until(self, condition, what, timeout=TIMEOUT):
+        """Wait until a condition on linuxcnc.stat() is true; RuntimeError after the timeout, s."""
+        end = time.monotonic() + timeout
         self.stat.poll()
         while not condition(self.stat):
             if time.monotonic() > end:
-                raise RuntimeError(f"not {what} within {patience:g} s")
+                raise RuntimeError(f"LinuxCNC is not {what} after {timeout:g} s")
             time.sleep(0.05)
-            self.say()
+            self.print_messages()
             self.stat.poll()
 
     def prepare(self):
-        """Switch on and home."""
+        """Switch LinuxCNC on and home all joints."""
         self.command.state(linuxcnc.STATE_ESTOP_RESET)
         self.command.wait_complete()
         self.command.state(linuxcnc.STATE_ON)
         self.command.wait_complete()
-        self.until(lambda stat: stat.enabled, "on")
+        self.wait_until(lambda stat: stat.enabled, "on")
         self.command.mode(linuxcnc.MODE_MANUAL)
         self.command.wait_complete()
         self.command.home(-1)
-        self.until(lambda stat: all(stat.homed[:JOINTS]) and stat.inpos, "homed")
+        self.wait_until(lambda stat: all(stat.homed[:JOINTS]) and stat.inpos, "homed")
         print("on and homed", flush=True)
 
     def run(self, path):
-        """Run a program to its end; return whether it came there."""
+        """Run a program; return whether LinuxCNC is still on at its end."""
         self.command.mode(linuxcnc.MODE_AUTO)
         self.command.wait_complete()
         self.command.program_open(os.path.abspath(path))
         self.command.auto(linuxcnc.AUTO_RUN, 0)
-        self.until(lambda stat: stat.interp_state != linuxcnc.INTERP_IDLE, f"running {path}")
+        self.wait_until(lambda stat: stat.interp_state != linuxcnc.INTERP_IDLE, f"running {path}")
         print(f"running {path}", flush=True)
-        self.until(lambda stat: stat.interp_state == linuxcnc.INTERP_IDLE and stat.inpos, "done", float("inf"))
-        self.say()
+        self.wait_until(lambda stat: stat.interp_state == linuxcnc.INTERP_IDLE and stat.inpos, "done", float("inf"))
+        self.print_messages()
         print("done" if self.stat.enabled else "stopped: LinuxCNC is off", flush=True)
         return self.stat.enabled
 
     def stay(self):
-        """Print messages for ever."""
+        """Print LinuxCNC's messages until a signal raises Stopped."""
         while True:
             time.sleep(0.2)
-            self.say()
+            self.print_messages()
 
 
 def main():
@@ -93,7 +93,7 @@ def main():
     except Stopped:
         return 0
     except (RuntimeError, linuxcnc.error) as error:
-        screen.say()
+        screen.print_messages()
         print(error, flush=True)
         return 1
 

@@ -1,1 +1,1 @@
-"""Every table and figure of the papers that this package comes from, computed and laid beside what they print."""
+"""Comparison of every table and figure of the papers behind this package with computed values."""

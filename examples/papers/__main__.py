@@ -1,8 +1,8 @@
-"""Lay every table and figure of the three papers beside what is computed: ``make papers``.
+"""Compare every table and figure of the three papers with computed values: ``make papers``.
 
-papers.html shows all of it in any browser, offline; papers.csv has a row for each printed number. Printed is what is
-met, by how much the rest differs (µm, thousandths of a degree), and why. Exit code: 0 every number that can be met is
-met, 1 one is not, 2 bad input.
+papers.html shows the comparison in any browser, offline; papers.csv has a row for each printed number. The report on
+the terminal says which numbers are met, by how much the others differ (µm, thousandths of a degree), and why. Exit code
+0: every number that can be met is met; 1: a number is not met; 2: bad input.
 
 Usage: python -m examples.papers [--out out] [--machines 50] [--seed 1]
 """
@@ -27,13 +27,13 @@ from .page import page_text
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write page and CSV, print the report."""
+    """Write papers.html and papers.csv, print the report, and return the exit code."""
     parser = argparse.ArgumentParser("python -m examples.papers", description=(__doc__ or "").splitlines()[0])
-    text = "folder for papers.html and papers.csv; made if it is missing (default out)"
+    text = "folder for papers.html and papers.csv; created if it does not exist (default out)"
     parser.add_argument("--out", type=Path, metavar="FOLDER", default=Path("out"), help=text)
-    text = "imperfect machines to draw for each pose of Tables 4 and 5 (default 50)"
+    text = "number of imperfect machines that are drawn for each pose of Tables 4 and 5 (default 50)"
     parser.add_argument("--machines", type=count, metavar="N", default=50, help=text)
-    parser.add_argument("--seed", type=seed, metavar="N", default=1, help="of all that is random (default 1)")
+    parser.add_argument("--seed", type=seed, metavar="N", default=1, help="seed of all random numbers (default 1)")
     args = parser.parse_args(arguments)
     try:
         make_folder(args.out)

@@ -1,6 +1,6 @@
-"""Printed numbers beside computed ones: which are met, by how much the others differ, and why; as text and as CSV rows.
+"""Comparison of printed with computed numbers, with verdicts and differences, as text and as CSV rows.
 
-The numbers stay in the units in which they are printed; every column names its own.
+The numbers are in the units of the papers; every column names its unit.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MET, WRONG, OPEN, MISSED, SHOWN = VERDICTS = ("met", "wrong in print", "cannot be met", "not met", "shown")
-"""Of a printed number: it is met; the right one is another, as the text beside it says; what would be needed for it is
-not printed; it could be met and is not, a fault of this package; the paper prints nothing to compare with."""
+"""Verdicts on a printed number. met: equal within rounding. wrong in print: the paper's number is wrong; the text gives
+the right one. cannot be met: the paper does not print the data to compute it. not met: a fault of this package. shown:
+computed only; the paper prints no number."""
 
 
 class Column(NamedTuple):
@@ -30,32 +31,32 @@ class Column(NamedTuple):
 
     name: str
     unit: str
-    difference_unit: str  # in which differences are shown
-    factor: float  # from the column's unit to that
-    digits: int  # after the point of a computed number
+    difference_unit: str  # unit in which differences are shown
+    factor: float  # number of difference units in one unit of the column
+    digits: int  # digits of a computed number after the decimal point
 
 
 def lengths_mm(*names: str) -> tuple[Column, ...]:
-    """Return columns in mm, with differences in µm."""
+    """Return columns of lengths in mm, with differences in µm."""
     return tuple(Column(name, "mm", "µm", 1e3, 5) for name in names)
 
 
 def angles_deg(*names: str) -> tuple[Column, ...]:
-    """Return columns in degrees, with differences in thousandths of one."""
+    """Return columns of angles in degrees, with differences in thousandths of a degree."""
     return tuple(Column(name, "°", "m°", 1e3, 6) for name in names)
 
 
 @dataclass(frozen=True)
 class NumberTable:
-    """A printed table beside its computed numbers: R rows, C columns."""
+    """A printed table with its computed numbers: R rows, C columns."""
 
     title: str
-    note: str  # what its computed numbers are
+    note: str  # how the computed numbers were obtained
     columns: tuple[Column, ...]
     rows: tuple[str, ...]
     printed: tuple[tuple[str, ...], ...]
     computed: np.ndarray  # (R, C), in the columns' units
-    verdicts: np.ndarray  # (R, C)
+    verdicts: np.ndarray  # (R, C), members of VERDICTS
 
     @property
     def differences(self) -> np.ndarray:
@@ -63,12 +64,12 @@ class NumberTable:
         return self.computed - numbers(self.printed)
 
     def difference_text(self, row: int, column: int) -> str:
-        """Return computed minus printed in the column's unit of difference, with its sign."""
+        """Return computed minus printed as text with its sign, in the column's unit of difference."""
         value = float(self.differences[row, column]) * self.columns[column].factor
         return f"{value:+.4f}" if abs(value) >= 5e-5 or value == 0.0 else f"{value:+.0e}"
 
     def summary(self) -> str:
-        """Return title, how many numbers are met, what the others are, and the largest differences."""
+        """Return a line with title, number of met numbers, verdicts on the other numbers, and largest differences."""
         met = self.verdicts == MET
         others = ", ".join(sorted(set(self.verdicts[~met].tolist())))
         rest = f", the others: {others}" if others else ""
@@ -79,27 +80,27 @@ class NumberTable:
 
 
 class Statement(NamedTuple):
-    """Something that a paper says, or shows, beside what is found."""
+    """A statement of a paper with the computed result."""
 
     what: str
     printed: str
     computed: str
     verdict: str
-    why: str = ""  # what explains a difference, or how it was found
+    why: str = ""  # cause of a difference, or how the result was computed
 
 
 @dataclass(frozen=True)
 class Exhibit:
-    """A table or figure of a paper."""
+    """A table or figure of a paper, with its comparison."""
 
     title: str
     text: str
     tables: tuple[NumberTable, ...] = ()
     statements: tuple[Statement, ...] = ()
-    figures: Mapping[str, Figure] = field(default_factory=dict)  # by what they show
+    figures: Mapping[str, Figure] = field(default_factory=dict)  # by title
 
     def verdicts(self) -> Iterator[str]:
-        """Yield the verdict of every number and statement."""
+        """Yield the verdict on every number and every statement."""
         for table in self.tables:
             yield from table.verdicts.ravel().tolist()
         yield from (statement.verdict for statement in self.statements)
@@ -107,45 +108,45 @@ class Exhibit:
 
 @dataclass(frozen=True)
 class Paper:
-    """A paper and everything of it that was computed."""
+    """A paper with the comparisons of all its tables and figures."""
 
-    short: str  # its authors
+    short: str  # authors
     title: str
     exhibits: tuple[Exhibit, ...]
 
     def count(self) -> Counter[str]:
-        """Return how often each verdict was given."""
+        """Return the number of numbers and statements for each verdict."""
         return Counter(verdict for exhibit in self.exhibits for verdict in exhibit.verdicts())
 
     def headline(self) -> str:
-        """Return how many numbers and statements got which verdict."""
+        """Return the number of numbers and statements for each verdict as text."""
         counted = self.count()
         return ", ".join(f"{counted[verdict]} {verdict}" for verdict in VERDICTS if counted[verdict])
 
 
 def judged(met: np.ndarray, otherwise: str | np.ndarray) -> np.ndarray:
-    """Return :data:`MET` where numbers are met, and another verdict on the others."""
+    """Return :data:`MET` for each number that is met, and `otherwise` for the others."""
     return np.where(met, MET, otherwise).astype(object)
 
 
 def within(met: bool) -> str:
-    """Return :data:`MET` or :data:`MISSED`."""
+    """Return :data:`MET` if a bound is met, else :data:`MISSED`."""
     return MET if met else MISSED
 
 
 def small(value: float) -> str:
-    """Return what rounding has left, as text."""
+    """Return a rounding error as text with one digit."""
     return f"{value:.0e}" if value else "0"
 
 
-# --- What is printed: the shipped files table1.csv to table5.csv of Song, Mou & King -----------------------------
+# --- The printed tables of Song, Mou & King: shipped files table1.csv to table5.csv ------------------------------
 
-SIGNIFICANT = 6  # Digits of their numbers. Zeros at the end are left out in print: 5 stands for 5.00000
+SIGNIFICANT = 6  # Significant digits of the printed numbers. The paper leaves out trailing zeros: 5 means 5.00000
 
 
 @cache
 def table(number: int) -> tuple[tuple[str, ...], ...]:
-    """Return the ten rows of Table 1 to 5 without their sequence numbers, each number as printed: mm and degrees."""
+    """Return the ten rows of Table `number` (1 to 5) without sequence numbers, as printed, in mm and degrees."""
     file = Table(config_file(f"table{number}.csv"))
     pose = ("alpha_deg", "beta_deg", "gamma_deg", "x_mm", "y_mm", "z_mm")
     names = [f"L{i}_mm" for i in range(1, 7)] if number in (2, 4) else pose
@@ -153,17 +154,17 @@ def table(number: int) -> tuple[tuple[str, ...], ...]:
 
 
 def numbers(printed: tuple[tuple[str, ...], ...]) -> np.ndarray:
-    """Return printed numbers, shape (R, C); "≈ 0" counts as 0."""
+    """Return the values of printed numbers, shape (R, C); "≈ 0" counts as 0."""
     return np.array([[float(cell.removeprefix("≈ ")) for cell in row] for row in printed])
 
 
 def values(number: int) -> np.ndarray:
-    """Return the numbers of a table, shape (10, 6), mm and degrees."""
+    """Return the numbers of Table `number` (1 to 5), shape (10, 6), mm and degrees."""
     return numbers(table(number))
 
 
 def roundings(printed: tuple[tuple[str, ...], ...]) -> np.ndarray:
-    """Return half of the last digit of printed numbers: what rounding allows, in their units."""
+    """Return the largest rounding error of each printed number, half a unit of its last digit, in its unit."""
     return np.array([[_rounding(Decimal(cell)) for cell in row] for row in printed])
 
 
@@ -173,11 +174,11 @@ def _rounding(number: Decimal) -> float:
     return 0.5 * 10.0 ** (number.adjusted() - SIGNIFICANT + 1 if abs(number) >= 1 else written)
 
 
-# --- As text and as rows -----------------------------------------------------------------------------------------
+# --- Text and CSV rows -------------------------------------------------------------------------------------------
 
 
 def report(papers: Sequence[Paper]) -> str:
-    """Return the report: what of each table and figure is met, by how much the rest differs, and why."""
+    """Return the report: the verdict on each table and figure, the differences, and their causes."""
     lines = []
     for paper in papers:
         lines += [f"{paper.short}: {paper.title}", paper.headline(), ""]
@@ -192,7 +193,7 @@ def report(papers: Sequence[Paper]) -> str:
 
 
 def records(papers: Sequence[Paper]) -> Iterator[dict[str, Any]]:
-    """Yield a row for each printed number and statement."""
+    """Yield a CSV row for each printed number and each statement."""
     for paper in papers:
         for exhibit in paper.exhibits:
             for one in exhibit.tables:

@@ -1,4 +1,4 @@
-"""V. Daake, Vetter, Böhm & Zirn: the ranked table, the shells of Figure 2, and the iteration of chapter 1."""
+"""Comparison with v. Daake, Vetter, Böhm & Zirn: the ranked Table 1, Figure 2 and the iteration of chapter 1."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from .comparing import MET, MISSED, OPEN, SHOWN, Column, Exhibit, NumberTable, P
 from .iteration import compared
 
 MACHINE, BUDGET = "positioning_unit", "error_budget"
-"""Shipped files: a unit of the kind, and the sizes of its errors as the paper states them."""
+"""Shipped files: a positioning unit of the paper's kind, and the sizes of its errors that the paper states."""
 
 TILTS = tuple(np.radians([-4.0, 0.0, 4.0]).tolist())
-"""About x and y, rad, over which the machine's workspace is classified."""
+"""Tilts about x and about y, rad, for which the machine's workspace is classified."""
 
-COMPARED = 20  # Random poses at which the iteration is compared to the exact solution
-PASSIVE = 1e-3  # The paper's bound of what the passive legs move, over the travel of the active one
+COMPARED = 20  # Number of random poses at which the iteration is compared with the exact solution
+PASSIVE = 1e-3  # The paper's bound for the movement of the passive legs divided by the travel of the active leg
 
-OVER_WHAT = "over which poses and struts each row was taken is not printed."
+OVER_WHAT = "the paper does not print the poses and struts over which each row was computed."
 
 COLUMNS = (
     Column("transl. max", "µm", "µm", 1.0, 2),
@@ -39,11 +39,11 @@ COLUMNS = (
 
 
 class PaperRow(NamedTuple):
-    """A row of Table 1, as printed; zeros where they print "≈ 0"."""
+    """A row of Table 1 as printed; "≈ 0" is written as 0."""
 
-    title: str  # of the row here; they print "quantization"
-    size: float  # the error's size in the text, µm
-    figures: tuple[float, ...]  # translation max, min, µm; rotation max, min, m°
+    title: str  # this package's name of the error type; the paper prints "quantization"
+    size: float  # size of the error in the paper's text, µm
+    figures: tuple[float, ...]  # largest and smallest translation, µm; largest and smallest rotation, m°
 
 
 TABLE_1 = (
@@ -55,14 +55,14 @@ TABLE_1 = (
 
 
 def study(cells: int = 30, progress: Callable[[int], object] = lambda poses: None) -> Study:
-    """Classify the shipped positioning unit; parameters as ``hexapod_comp classify`` has them."""
+    """Classify the errors of the shipped positioning unit, as ``hexapod_comp classify`` does."""
     geometry = load_geometry(MACHINE)
     reached = reaches(geometry, orientations(geometry, (TILTS, TILTS, (0.0,))), cells)
     return classify(geometry, load_budget(BUDGET), reached, progress=progress)
 
 
 def paper(cells: int = 30) -> Paper:
-    """Return everything of the paper, computed for the shipped positioning unit."""
+    """Return the comparison of the whole paper, computed for the shipped positioning unit."""
     case = study(cells)
     exhibits = (ranking(case), shells(case.geometry), iteration(case))
     return Paper(
@@ -73,7 +73,7 @@ def paper(cells: int = 30) -> Paper:
 
 
 def ranking(case: Study) -> Exhibit:
-    """Return Table 1 beside the unit's ranking, and what holds on any machine."""
+    """Return Table 1 with the unit's ranking, and statements that hold for any machine."""
     computed = {row.title: row for row in case.rows}
     names = tuple(row.title for row in TABLE_1)
     digits = np.array([row.figures for row in TABLE_1])
@@ -82,8 +82,8 @@ def ranking(case: Study) -> Exhibit:
     zero = digits == 0.0
     table = NumberTable(
         "Table 1: effects of error types on the tool",
-        "Computed: the shipped unit of that kind, with the errors that the paper states. The geometry of theirs is not "
-        "printed, and sixteen numbers do not fix it: only ≈ 0 can be met.",
+        "Computed: the shipped unit of this kind, with the errors that the paper states. The paper does not print the "
+        "geometry of its machine, and sixteen numbers do not determine it: only ≈ 0 can be met.",
         *(COLUMNS, names, cells, figures, judged(zero & (figures < 0.005), OPEN)),
     )
     statements = (_order({name: computed[name] for name in names}), *_scaling(computed))
@@ -91,7 +91,7 @@ def ranking(case: Study) -> Exhibit:
 
 
 def _order(rows: dict[str, RankingRow]) -> Statement:
-    """Compare the printed order of the rows with the computed one."""
+    """Compare the printed order of the rows with the computed order."""
     here = sorted(rows, key=lambda name: -rows[name].extremes[0].value)
     first = here[0] == next(iter(rows))
     return Statement(
@@ -99,13 +99,13 @@ def _order(rows: dict[str, RankingRow]) -> Statement:
         " > ".join(rows),
         " > ".join(here),
         MET if first and here == list(rows) else OPEN if first else MISSED,
-        "Screw pitch comes first on both. The two rows of joints and the quantisation lie close together, and which of "
-        "them leads depends on the geometry.",
+        "Screw pitch is first in both orders. The two rows of joints and the row of quantisation differ little; their "
+        "order depends on the geometry.",
     )
 
 
 def _scaling(computed: dict[str, RankingRow]) -> tuple[Statement, ...]:
-    """Say how figures of two errors of the same kind, screw pitch of 20 µm and quantisation of 7 µm, compare."""
+    """Compare the figures of two errors that both lengthen a strut: screw pitch of 20 µm and quantisation of 7 µm."""
     pitch, step = TABLE_1[0], TABLE_1[-1]
     statements = []
     for n, name in enumerate(FIGURES):
@@ -120,7 +120,7 @@ def _scaling(computed: dict[str, RankingRow]) -> tuple[Statement, ...]:
                 f"{printed:.3f}",
                 f"{here:.3f}",
                 MET if good and same else OPEN if good else MISSED,
-                f"Both lengthen one strut, by 20 and by 7 µm: {wanted:.3f} at one pose of any machine, to first order."
+                f"Both lengthen one strut, by 20 and 7 µm: a ratio of {wanted:.3f} at each pose, to first order."
                 + ("" if same else f" The printed ratio differs by {100 * (printed / wanted - 1):+.0f} %; {OVER_WHAT}"),
             )
         )
@@ -128,7 +128,7 @@ def _scaling(computed: dict[str, RankingRow]) -> tuple[Statement, ...]:
 
 
 def shells(geometry: HexapodGeometry) -> Exhibit:
-    """Return Figure 2: shells of the workspace, coloured by what one screw's pitch error does to the tool."""
+    """Return Figure 2: shells of the workspace, coloured by the tool's translation due to one screw's pitch error."""
     errors = load_budget(BUDGET).single_errors(geometry)
     first = errors.select((errors.kind == errors.kinds.index("screw pitch")) & errors.struts[:, 0])
     body = shell(reach(geometry), RINGS, SECTORS)
@@ -146,12 +146,12 @@ def shells(geometry: HexapodGeometry) -> Exhibit:
         "The machine's geometry is not printed.",
     )
     figures = {"Figure 2: shells of the workspace": shells_figure(geometry, layers, TRANSLATION, title)}
-    text = "A level tool; outer shells are cut open. hexapod_comp classify --pictures makes a page that turns."
+    text = "Level tool; outer shells are cut open. hexapod_comp classify --pictures writes a page with turning shells."
     return Exhibit("Figure 2: shells", text, (), (statement,), figures)
 
 
 def iteration(case: Study) -> Exhibit:
-    """Return the tangential iteration of chapter 1 beside the exact solution."""
+    """Return the comparison of the tangential iteration of chapter 1 with the exact solution."""
     agreement = compared(case.geometry, case.errors, case.reaches, COMPARED, seed=0)
     statements = (
         Statement(
@@ -159,16 +159,16 @@ def iteration(case: Study) -> Exhibit:
             "less than 0.1 %",
             f"at most {agreement.drift:.3%}",
             within(agreement.drift < PASSIVE),
-            f"The shipped unit, {COMPARED} random poses, every strut's errors.",
+            f"The shipped unit at {COMPARED} random poses, with the errors of every strut.",
         ),
         Statement(
             "end of the iteration beside the exact solution",
             "marginal errors",
             f"within {agreement.tangential:.1e} of the error type's largest effect",
             within(agreement.tangential < PASSIVE),
-            f"{agreement.effects} effects; legs that are off are corrected, as the paper describes. "
-            f"To first order alone it is {agreement.linear:.1e}.",
+            f"{agreement.effects} effects; legs of wrong length are corrected as the paper describes. "
+            f"The linear method differs by {agreement.linear:.1e}.",
         ),
     )
-    text = "A joint or leg travels to its wrong place in steps of 0.01 mm along tangents (their equations 1 to 4)."
+    text = "A joint or leg moves to its wrong place in steps of 0.01 mm along tangents (the paper's equations 1 to 4)."
     return Exhibit("Chapter 1: the iteration", text, (), statements)

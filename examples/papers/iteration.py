@@ -1,7 +1,7 @@
-"""The iteration of v. Daake et al. (chapter 1) beside the exact effects of single errors.
+"""The iteration of v. Daake et al. (chapter 1), compared with the exact effects of single errors.
 
-It shares nothing with the core: tangents to the motion that one active leg causes are followed in small steps. Each
-needs the motion relations of all legs, which virtual displacements of the tool give through the inverse kinematics.
+It uses no code of the core. In small steps it follows the tangent of the motion that one active leg causes. The motion
+relations of all legs are computed at each step from virtual displacements of the tool by the inverse kinematics.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from hexapod_comp.workspace.reach import Reach
 from hexapod_comp.workspace.study import random_poses
 
 STEP = 1e-5  # Travel of the active leg per step, m (v. Daake et al.: 0.01 mm)
-TOLERANCE = 1e-9  # ε: legs that are off by more, m, are corrected
-VIRTUAL = 1e-7  # Virtual displacement, m and rad: small beside any curvature, large beside rounding
-MOST_CORRECTIONS = 20  # A step that needs more does not converge
+TOLERANCE = 1e-9  # ε: a leg whose length error is larger than this, m, is corrected
+VIRTUAL = 1e-7  # Virtual displacement, m and rad: small enough for curvature, large enough for rounding errors
+MOST_CORRECTIONS = 20  # Largest number of corrections in one step
 
 
 @dataclass(frozen=True)
 class TangentialResult:
-    """Where the iteration ends at each of N poses."""
+    """Result of the iteration at each of N poses."""
 
-    # (N, 6): displacement of the tool and its rotation vector, actual minus nominal, along the axes of the work frame;
-    # m, rad. NaN where the legs could not be brought back within the tolerance
+    # (N, 6): displacement, m, and rotation vector, rad, of the tool, actual minus nominal, along the axes of the work
+    # frame. NaN if the length errors of the legs did not come below the tolerance
     vectors: np.ndarray
-    drift: np.ndarray  # (N,): largest length error of a passive leg that any step left before correction, m
+    drift: np.ndarray  # (N,): largest length error of a passive leg after a step, before its correction, m
     travel: np.ndarray  # (N,): travel of the active legs, m
-    steps: int  # How many steps
+    steps: int  # number of steps
     corrections: np.ndarray  # (N,): number of corrections
 
 
 @dataclass
 class _State:
-    """Tool tips (N, 3) and platform orientations (N, 3, 3) in ``base``, and the machine as it is in this step."""
+    """Tool tips (N, 3) and platform orientations (N, 3, 3) in ``base``, and the joint positions at this step."""
 
     base: np.ndarray
     platform: np.ndarray
@@ -50,28 +50,28 @@ class _State:
     rotations: np.ndarray
 
     def select(self, chosen: np.ndarray) -> _State:
-        """Return the same machine at some of the poses."""
+        """Return the state at the chosen poses only."""
         return _State(self.base, self.platform, self.tool, self.tips[chosen], self.rotations[chosen])
 
     def lengths(self, motions: np.ndarray | None = None) -> np.ndarray:
-        """Return the leg lengths, shape (N, 6), m, after motions (x, y, z, a, b, c) of the tool, shape (6,)."""
+        """Return the leg lengths, (N, 6), m, after a motion of the tool (translation, rotation vector), shape (6,)."""
         tips, rotations = self.moved(np.zeros(6) if motions is None else motions)
         arms = (self.platform - self.tool) @ np.swapaxes(rotations, 1, 2)
         return np.linalg.norm(tips[:, None] + arms - self.base, axis=2)
 
     def moved(self, motions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return tips and orientations after motions, shape (6,) or (N, 6), about the tips."""
+        """Return tips and orientations after motions (translation, rotation vector about the tip), (6,) or (N, 6)."""
         turns = Rotation.from_rotvec(motions[..., 3:]).as_matrix()
         return self.tips + motions[..., :3], turns @ self.rotations
 
     def motion_matrices(self) -> np.ndarray:
-        """Return V: leg lengths per virtual displacement of the tool, one after another (v. Daake et al., eq. 1–2)."""
+        """Return V: change of the leg lengths per virtual displacement of the tool (v. Daake et al., eq. 1–2)."""
         here = self.lengths()
         columns = [(self.lengths(VIRTUAL * axis) - here) / VIRTUAL for axis in np.eye(6)]
         return np.stack(columns, axis=2)
 
     def follow(self, change: np.ndarray) -> None:
-        """Move the tools along the tangents on which the legs change by this much, shape (N, 6)."""
+        """Move the tools along tangents so that the leg lengths change by `change`, shape (N, 6), m, to first order."""
         try:
             motions = np.linalg.solve(self.motion_matrices(), change[:, :, None])[:, :, 0]
         except np.linalg.LinAlgError:
@@ -88,7 +88,7 @@ def tangential_effects(
     step: float = STEP,
     tolerance: float = TOLERANCE,
 ) -> TangentialResult:
-    """Return the effect of one single error at some poses by the paper's iteration."""
+    """Return the effect of single error number `index` at poses of the platform, by the paper's iteration."""
     count, none = len(positions), np.zeros(len(positions))
     if errors.part[index] == TOOL:
         shifts = rotations @ errors.vector[index] @ geometry.work.rotation
@@ -99,14 +99,14 @@ def tangential_effects(
     return _walk(geometry.work.rotation, state, errors.struts[index], path, tolerance)
 
 
-# Leg lengths to hold, shape (N, 6), and the base and platform joints
+# Leg lengths to reach, shape (N, 6), base joints and platform joints at one step
 Waypoint = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _path(
     geometry: HexapodGeometry, errors: SingleErrors, index: int, nominal: np.ndarray, step: float
 ) -> list[Waypoint]:
-    """Return how the error grows from zero to its size, in equal steps at every pose."""
+    """Return the waypoints at which the error grows from zero to its size in equal steps."""
     part, struts, vector = errors.part[index], errors.struts[index], errors.vector[index]
     stretch, size, shift = np.zeros_like(nominal), float(np.linalg.norm(vector)), {}
     if part == LENGTH:
@@ -133,7 +133,7 @@ def _path(
 def _walk(
     work_rotation: np.ndarray, state: _State, struts: np.ndarray, path: list[Waypoint], tolerance: float
 ) -> TangentialResult:
-    """Follow a path with the active legs and return the tool's end."""
+    """Follow a path with the active legs `struts`, correct the passive legs, and return the final displacements."""
     start_tips, start_rotations = state.tips, state.rotations
     drift, travel = np.zeros((2, len(start_tips)))
     corrections = np.zeros(len(start_tips), dtype=int)
@@ -151,8 +151,7 @@ def _walk(
 
 
 def _correct(state: _State, target: np.ndarray, tolerance: float) -> np.ndarray:
-    """Correct the legs that are off by more than ε by the same algorithm; return the number of corrections, shape
-    (N,)."""
+    """Correct legs with a length error above the tolerance; return the number of corrections at each pose, (N,)."""
     counts, off = np.zeros(len(target), dtype=int), target - state.lengths()
     for _ in range(MOST_CORRECTIONS):
         poses = np.flatnonzero((np.abs(off) > tolerance).any(axis=1))
@@ -168,18 +167,19 @@ def _correct(state: _State, target: np.ndarray, tolerance: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How the three methods agree at random poses."""
+    """Agreement of the linear and the tangential method with the exact one at random poses."""
 
-    effects: int  # How many were compared
-    linear: float  # Largest difference to the exact displacement, over the largest exact one of the same error type
-    tangential: float  # Largest difference to the exact displacement, over the largest exact one of the same error type
-    drift: float  # Largest length error of a passive leg over the travel of the active one, for legs of wrong length
+    effects: int  # number of compared effects
+    # Largest difference from the exact displacement, divided by the largest exact displacement of the same error type
+    linear: float
+    tangential: float
+    drift: float  # largest length error of a passive leg divided by the travel of the active leg, for length errors
 
 
 def compared(
     geometry: HexapodGeometry, errors: SingleErrors, reaches: tuple[Reach, ...], count: int, seed: int
 ) -> Agreement:
-    """Compare the three methods at random poses of the workspace, all errors but the tool's."""
+    """Compare the three methods for all errors except the tool's at `count` random poses of the workspace."""
     moved = errors.select(errors.part != TOOL)
     positions, rotations = random_poses(reaches, count, seed)
     exact = effects(geometry, moved, positions, rotations, EXACT)[..., 0]

@@ -1,7 +1,7 @@
-"""The misprints in the formulas of Song, Mou & King: each as printed and as mended, on the poses of their Table 1.
+"""The misprints in the formulas of Song, Mou & King, as printed and as corrected, at the poses of the paper's Table 1.
 
-All of it by NumPy from the paper's own drawing (its Figure 3), in its letters, mm and degrees: nothing of the package
-is asked, so that a mended formula proves itself by closing the machine's loops.
+The formulas are computed with NumPy from the paper's drawing (its Figure 3), in its symbols, mm and degrees, without
+code of the package. A corrected formula is right if it closes the machine's kinematic loops.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ import numpy as np
 from .comparing import values
 
 A, B, D = 300.0, 572.0, 243.0
-"""Side of the platform's triangle, long and short sides of the base, mm; they follow from Table 2."""
+"""Side of the platform's triangle, long side and short side of the base, mm; they follow from Table 2."""
 
 S3 = np.sqrt(3.0)
 TOP = np.array([[np.cos(angle), np.sin(angle), 0.0] for angle in np.radians([60.0, 180.0, -60.0])]) * A / S3
 
-MENDS = ("Xp3", "4", "Yp3")  # What the second of the three combined equations needs
+CORRECTIONS = ("Xp3", "4", "Yp3")  # The three corrections that the second combined equation needs
 
 SIGNS = np.array([[1, 1, 1]] * 2 + [[-1, 1, 1]] + [[-1, -1, 1]] * 2 + [[1, -1, 1]], dtype=float)
-"""Of δX_B, δY_B and δZ_B as they are printed."""
+"""Signs of δX_B, δY_B and δZ_B for each strut, as printed."""
 
-DEVIATION = 0.01  # Error of a joint's coordinate with which formulas of the real structure are tried, mm
+DEVIATION = 0.01  # Error of a joint's coordinate for testing the formulas of the real structure, mm
 
 
 class Case(NamedTuple):
-    """A pose of Table 1: angles, °; rotation; top joints and what the paper calls L, p, h, X_p, Y_p, mm."""
+    """A pose of Table 1: angles, °; rotation matrix; top joints and the paper's L, p, h, X_p and Y_p, mm."""
 
     angles: np.ndarray
     rotation: np.ndarray
@@ -42,29 +42,30 @@ class Case(NamedTuple):
 
 
 class Misprint(NamedTuple):
-    """A misprint: the part that matters as printed and as it must be, and how far each is off at a :class:`Case`."""
+    """A misprint: the affected part of a formula as printed and as corrected, and the error of both at a Case."""
 
     name: str
     printed: str
-    mended: str
-    unit: str  # of what is off
-    off: Callable[[Case], float]
-    left: Callable[[Case], float]
+    corrected: str
+    unit: str  # unit of the errors
+    printed_error: Callable[[Case], float]
+    corrected_error: Callable[[Case], float]
 
     def worst(self) -> tuple[float, float]:
-        """Return how far the printed and the mended form are off at the worst of the ten poses."""
-        off, left = (max(abs(float(form(at))) for at in cases()) for form in (self.off, self.left))
-        return off, left
+        """Return the largest error over the ten poses of the printed form and of the corrected form."""
+        forms = self.printed_error, self.corrected_error
+        printed, corrected = (max(abs(float(form(at))) for at in cases()) for form in forms)
+        return printed, corrected
 
 
 def base_joints(b5: float = B - D) -> np.ndarray:
-    """Return the base joints, mm; `b5` is the bracket in X_B5."""
+    """Return the base joints, mm; `b5` is the expression in brackets in X_B5."""
     x = S3 / 6.0 * np.array([2 * B + D, -(B - D), -(B + 2 * D), -(B + 2 * D), -b5, 2 * B + D])
     return np.column_stack([x, np.array([D, B + D, B, -B, -(B + D), -D]) / 2.0, np.zeros(6)])
 
 
 def printed_rotation(alpha: float, beta: float, gamma: float) -> np.ndarray:
-    """Return the rotation as the paper prints it, entry by entry; angles in degrees."""
+    """Return the rotation matrix with the entries that the paper prints; angles in degrees."""
     (ca, cb, cg), (sa, sb, sg) = (f(np.radians([alpha, beta, gamma])) for f in (np.cos, np.sin))
     return np.array(
         [
@@ -76,7 +77,7 @@ def printed_rotation(alpha: float, beta: float, gamma: float) -> np.ndarray:
 
 
 def distances(top: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """Return the six distances between three top joints and six base joints, mm."""
+    """Return the six strut lengths between three top joints and six base joints, mm."""
     return np.linalg.norm(np.repeat(top, 2, axis=0) - base, axis=1)
 
 
@@ -96,12 +97,12 @@ def _case(angles: np.ndarray, position: np.ndarray) -> Case:
     return Case(angles, rotation, top, lengths, p, np.sqrt(lengths[::2] ** 2 - p**2), xp, yp)
 
 
-def second_equation(at: Case, *mends: str) -> float:
-    """Return what the second combined equation (joints 1 and 3) leaves, divided by a: mm."""
+def second_equation(at: Case, *corrections: str) -> float:
+    """Return the residual of the second combined equation (joints 1 and 3), divided by a, mm."""
     x, xp, yp, h2 = at.top[:, 0], at.xp, at.yp, at.h**2
-    subtracted = xp[2] if "Xp3" in mends else xp[0]
-    other = yp[2] if "Yp3" in mends else yp[1]
-    factor = 4.0 if "4" in mends else 1.0
+    subtracted = xp[2] if "Xp3" in corrections else xp[0]
+    other = yp[2] if "Yp3" in corrections else yp[1]
+    factor = 4.0 if "4" in corrections else 1.0
     root = np.sqrt((h2[0] - 4 * (x[0] - xp[0]) ** 2) * (h2[2] - factor * (x[2] - xp[2]) ** 2))
     linear = 2 * x[0] * (xp[0] - 3 * subtracted + S3 * (yp[0] - other))
     linear += 2 * x[2] * (-3 * xp[0] + xp[2] + S3 * (yp[0] - yp[2]))
@@ -110,7 +111,7 @@ def second_equation(at: Case, *mends: str) -> float:
 
 
 def equations_with_2(at: Case, k: int) -> float:
-    """Return what the first (joints 1 and 2, k = 0) or third (3 and 2, k = 2) leaves as printed: mm."""
+    """Return the residual, divided by a, mm, of the first (joints 1, 2; k = 0) or third equation (3, 2; k = 2)."""
     x, xp, yp, h2 = at.top[:, 0], at.xp, at.yp, at.h**2
     across = yp[0] - yp[1] if k == 0 else yp[1] - yp[2]
     root = np.sqrt((h2[k] - 4 * (x[k] - xp[k]) ** 2) * (h2[1] - (x[1] - xp[1]) ** 2))
@@ -120,18 +121,18 @@ def equations_with_2(at: Case, k: int) -> float:
 
 
 def fifth_length(at: Case, b5: float) -> float:
-    """Return L_5 with a bracket in X_B5, less the length that closes the loop, mm."""
+    """Return L_5, computed with `b5` in X_B5, minus the length that closes the loop, mm."""
     return float(distances(at.top, base_joints(b5))[4] - at.lengths[4])
 
 
 def last_lengths(at: Case, joint: int) -> float:
-    """Return how far L'_5 or L'_6 to a top joint is from the lengths that close the loops, mm: the worse one."""
+    """Return the larger error of L'_5 and L'_6, computed to top joint number `joint`, mm."""
     top = at.top[[0, 1, joint - 1]]
     return float(np.abs(distances(top, base_joints()) - at.lengths)[4:].max())
 
 
 def base_errors(at: Case, signs: np.ndarray) -> float:
-    """Return how much too long or short a strut gets by one error of its base joint, entered with a sign, µm."""
+    """Return the largest strut length error, µm, if an error of a base joint is entered with the given signs."""
     right, entered = base_joints(), base_joints()
     worst = 0.0
     for axis in range(3):
@@ -142,9 +143,9 @@ def base_errors(at: Case, signs: np.ndarray) -> float:
 
 
 def top_errors(at: Case, printed: bool) -> float:
-    """Return how much too long or short a strut gets by one error of its top joint, µm.
+    """Return the largest strut length error, µm, if an error of a top joint is entered as printed, or as corrected.
 
-    The printed form multiplies a/√3 + 2δ by a bracket, one coordinate at a time.
+    The printed form multiplies a/√3 + 2δ by an expression in brackets, for one coordinate at a time.
     """
     brackets = (at.top - _position(at)) / (A / S3)
     worst = 0.0
@@ -163,29 +164,29 @@ def _position(at: Case) -> np.ndarray:
 
 
 def y_t1(at: Case, sign: float) -> float:
-    """Return Y'_T1 less the joint's y, mm; `sign` is that of the last term."""
+    """Return Y'_T1 minus the joint's y, mm; `sign` is the sign of the last term."""
     return float(S3 * at.top[0, 0] + sign / B * (at.lengths[0] ** 2 - at.lengths[1] ** 2) - at.top[0, 1])
 
 
 def y_t2(at: Case, sign: float) -> float:
-    """Return Y'_T2 less the joint's y, mm."""
+    """Return Y'_T2 minus the joint's y, mm; `sign` is the sign of the term."""
     return float(sign / (2 * B) * (at.lengths[3] ** 2 - at.lengths[2] ** 2) - at.top[1, 1])
 
 
 def y_t3(at: Case, sign: float) -> float:
-    """Return Y_T3 less the joint's y, mm; `sign` is that of X_p3 and Y_p3."""
+    """Return Y_T3 minus the joint's y, mm; `sign` is the sign of the term with X_p3."""
     return float(-S3 * at.top[2, 0] + sign * (S3 * at.xp[2] + sign * at.yp[2]) - at.top[2, 1])
 
 
 def z_t2(at: Case, factor: float) -> float:
-    """Return Z'_T2 less the joint's z, mm; `factor` is that under the root."""
+    """Return Z'_T2 minus the joint's z, mm; `factor` is the factor under the root."""
     return float(np.sqrt(at.h[1] ** 2 - factor * (at.top[1, 0] - at.xp[1]) ** 2) - at.top[1, 2])
 
 
 def heights(at: Case, back: bool) -> float:
-    """Return Z'_T less the joints' z when the base joints stand 10, −4 and 7 µm high, µm.
+    """Return the largest error of Z'_T, µm, for base joints at heights of 10, −4 and 7 µm.
 
-    h' is measured from the mean height of two base joints; as printed, Z'_T does not go back to it.
+    h' is measured from the mean height of two base joints; the printed Z'_T omits this height (`back` adds it).
     """
     lifted = np.array([0.010, -0.004, 0.007])
     along = at.top - np.column_stack([at.xp, at.yp, lifted])
@@ -194,9 +195,9 @@ def heights(at: Case, back: bool) -> float:
 
 
 def printed_angles(top: np.ndarray, inverse: Callable[[float], float] = np.arctan, sign: float = -1.0) -> np.ndarray:
-    """Return α', β', γ' by the paper's formulas, °; γ' comes first and stands in the two others.
+    """Return α', β', γ' by the paper's formulas, °; the formulas of α' and β' contain γ'.
 
-    `inverse` is what is computed for arctan; `sign` is that of X'_T3 (Z'_T1 − Z'_T2), printed as 1.
+    `inverse` is the function used for arctan; `sign` is the sign of X'_T3 (Z'_T1 − Z'_T2), printed as +.
     """
     (x1, x2, x3), (y1, y2, y3), (z1, z2, z3) = top.T
     gamma = inverse((y1 - 2 * y2 + y3) / (S3 * (y1 - y3)))
@@ -209,7 +210,7 @@ def printed_angles(top: np.ndarray, inverse: Callable[[float], float] = np.arcta
 
 
 def alpha(at: Case, sign: float) -> float:
-    """Return α' less the pose's α, °."""
+    """Return α' minus the pose's α, °."""
     return float((printed_angles(at.top, sign=sign) - at.angles)[0])
 
 
@@ -236,12 +237,12 @@ MISPRINTS = (
         "X_p1 − 3 X_p3; h3² − 4 (X_T3 − X_p3)²; √3 (Y_p1 − Y_p3)",
         "mm",
         second_equation,
-        lambda at: second_equation(at, *MENDS),
+        lambda at: second_equation(at, *CORRECTIONS),
     ),
     Misprint(
-        *("the same, its third misprint alone", "√3 (Y_p1 − Y_p2) beside X_T1", "√3 (Y_p1 − Y_p3)", "mm"),
+        *("second combined equation, third misprint alone", "√3 (Y_p1 − Y_p2) beside X_T1", "√3 (Y_p1 − Y_p3)", "mm"),
         lambda at: second_equation(at, "Xp3", "4"),
-        lambda at: second_equation(at, *MENDS),
+        lambda at: second_equation(at, *CORRECTIONS),
     ),
     Misprint(
         "X′_B, Y′_B from joint 3 on",
@@ -285,4 +286,4 @@ MISPRINTS = (
         lambda at: alpha(at, -1.0),
     ),
 )
-"""In the paper's order."""
+"""All misprints, in the order of the paper."""

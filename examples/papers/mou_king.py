@@ -1,7 +1,7 @@
-"""Mou & King (1998): 1-D and 5-D schemes, strut length errors of Figures 3 and 4, the 70 %, the chain of Figure 5.
+"""Comparison with Mou & King (1998): 1-D and 5-D schemes, Figures 2 to 5, and the removal of 70 % of the error.
 
-Their readings are not printed, and their curves are pictures without numbers. So lasers read a virtual machine, the
-scheme is fitted to that, and what can be compared is: shapes, shares, and whether the formulas hold.
+The paper prints no readings, and its curves have no numbers. Therefore virtual lasers read a virtual machine, and the
+paper's scheme is fitted to these readings. Compared are shapes of curves, removed shares of the error, and formulas.
 """
 
 from __future__ import annotations
@@ -30,35 +30,35 @@ from .comparing import OPEN, SHOWN, WRONG, Exhibit, Paper, Statement, within
 from .pictures import weights_figure
 
 LINE_Y = 4 * INCH
-"""Where the line along x of Figures 3 and 4 stands, m: a measured one, off the middle, where mirrored struts would
-have the same curve."""
+"""y of the line along x of Figures 3 and 4, m. It is a measured line beside the middle: on the middle line mirrored
+struts would have the same curve."""
 
-TRUTH = "paper_machine"  # The virtual machine that is measured: a shipped model
-SAMPLES = 81  # Points along the line of Figures 3 and 4
-CLEAR = 20e-6  # Change of the readings along a line beside which 1 µm, or µrad, of noise is little, m or rad
-POINT = np.array([0.07, -0.03, 0.42])  # The tool position at which the chain of Figure 5 is followed, m
+TRUTH = "paper_machine"  # Shipped model with the errors of the virtual machine
+SAMPLES = 81  # Number of points along the line of Figures 3 and 4
+CLEAR = 20e-6  # Change of the readings along a line, m or rad, that is large compared with noise of 1 µm or 1 µrad
+POINT = np.array([0.07, -0.03, 0.42])  # Tool position for the computation of Figure 5, m
 
 
 @dataclass(frozen=True)
 class Scheme:
-    """One of the paper's two schemes, carried out on the virtual machine."""
+    """One of the paper's two schemes, applied to the virtual machine."""
 
     name: str  # 1-D or 5-D
     campaign: Campaign
     fit: LinesFit
-    smooth: LinesFit  # of the same machine with screws that have no waves
-    worth: ModelEvaluation  # at points that were not measured
+    smooth: LinesFit  # fit for the same machine without periodic screw errors
+    evaluation: ModelEvaluation  # errors before and after compensation, at points that were not measured
 
 
 def fitted(truth: RealMachine, name: str, seed: int = 1) -> tuple[Campaign, MeasurementSet, LinesFit]:
-    """Measure a virtual machine and fit the paper's polynomials; `name` is 1-D or 5-D."""
+    """Measure a virtual machine and fit the paper's polynomials; `name` is 1-D or 5-D, `seed` draws the noise."""
     campaign = load_campaign(f"campaign_{name[0]}d")
     measured = measure(template(campaign, truth.geometry, seed), campaign, truth, seed)
     return campaign, measured, fit_lines(measured, date="1998-03-19")
 
 
 def scheme(truth: RealMachine, name: str, seed: int = 1) -> Scheme:
-    """Carry out a scheme on a virtual machine: measure, fit, and judge; parameters as :func:`fitted` has them."""
+    """Measure a virtual machine, fit the polynomials and evaluate the model; parameters as in :func:`fitted`."""
     campaign, measured, fit = fitted(truth, name, seed)
     model = truth.model
     even = replace(model, struts=replace(model.struts, cosine=np.zeros(6), sine=np.zeros(6)))
@@ -67,7 +67,7 @@ def scheme(truth: RealMachine, name: str, seed: int = 1) -> Scheme:
 
 
 def paper(geometry: HexapodGeometry, seed: int = 1) -> Paper:
-    """Return everything of the paper, computed on the shipped virtual machine; the seed is the instruments'."""
+    """Return the comparison of the whole paper on the shipped virtual machine; `seed` draws the instruments' noise."""
     truth = RealMachine(geometry, load_model(TRUTH, geometry))
     schemes = tuple(scheme(truth, name, seed) for name in ("1-D", "5-D"))
     exhibits = (
@@ -83,7 +83,7 @@ def paper(geometry: HexapodGeometry, seed: int = 1) -> Paper:
 
 
 def measuring(schemes: tuple[Scheme, ...]) -> Exhibit:
-    """Return what was measured and how well the polynomials fit."""
+    """Return the comparison of the measured grid, and of the fit of the polynomials."""
     campaign = schemes[0].campaign
     size = " × ".join(f"{edge / INCH:.0f}" for edge in np.ptp(campaign.box, axis=0))
     cell, step = campaign.cell / INCH, campaign.step / INCH
@@ -95,7 +95,7 @@ def measuring(schemes: tuple[Scheme, ...]) -> Exhibit:
             "16 × 16 × 8 inches, 4 × 4 × 4 cubic spaces, every inch",
             f"{size} inches, cells of {cell:g} inches, every {step:g} inch: a grid of {grid} nodes",
             within(same),
-            "4 × 4 × 4 is read as inches: four cells of 2 inches in z would not be cubes.",
+            "4 × 4 × 4 is interpreted as inches: 4 × 4 × 4 cells of the 8 inches in z would not be cubes.",
         )
     ]
     for one in schemes:
@@ -104,7 +104,7 @@ def measuring(schemes: tuple[Scheme, ...]) -> Exhibit:
 
 
 def _quality(one: Scheme) -> tuple[Statement, ...]:
-    """Say how well the polynomials fit, with and without waves of the screws."""
+    """Compare R² of the polynomials, with and without periodic screw errors."""
     r2 = np.array([line.r2 for line in one.fit.lines])
     moved = np.array([line.r2 for line in one.smooth.lines if np.ptp(line.values) >= CLEAR])
     printed = "between 0.95 and 0.99 in all cases"
@@ -114,15 +114,15 @@ def _quality(one: Scheme) -> tuple[Statement, ...]:
             printed,
             f"{number(r2.min(), 2)} to {r2.max():.2f}; {(r2 >= 0.95).mean():.0%} of {len(r2)} at 0.95 or more",
             OPEN,
-            "R² depends on the machine, and their readings are not printed. The virtual machine's screws have waves of "
-            "4 µm, 10 mm long, which a polynomial over readings an inch apart takes for noise.",
+            "R² depends on the machine, and the paper's readings are not printed. The virtual machine's screws have "
+            "periodic errors of 4 µm every 10 mm, which are noise for a polynomial over readings an inch apart.",
         ),
         Statement(
-            f"the same without the waves, where readings change by {CLEAR * 1e6:g} µm or µrad along the line",
+            f"R² without periodic screw errors, on lines whose readings change by {CLEAR * 1e6:g} µm or µrad or more",
             printed,
             f"{moved.min():.2f} to {moved.max():.2f} ({len(moved)} lines)",
             within(moved.min() >= 0.95),
-            "Twenty times the laser's noise. Where a machine is right, noise is all that there is to fit.",
+            "This change is twenty times the laser's noise. On a line without errors only noise could be fitted.",
         ),
     )
 
@@ -130,8 +130,8 @@ def _quality(one: Scheme) -> tuple[Statement, ...]:
 def printed_weights(across: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return the four weights W_i by the paper's formula with k = ((i + 2 − 1) mod 4) + 1.
 
-    `across` are the tool's two coordinates across the lines, `low` and `high` the cell's corners, m; corner 1 is low,
-    low, then around: 2 low, high; 3 high, high; 4 high, low.
+    `across` holds the tool's two coordinates perpendicular to the lines, `low` and `high` the cell's limits, m. The
+    corners are 1 (low, low), 2 (low, high), 3 (high, high) and 4 (high, low).
     """
     corners = np.array([[low[0], low[1]], [low[0], high[1]], [high[0], high[1]], [high[0], low[1]]])
     opposite = np.roll(corners, 2, axis=0)
@@ -141,7 +141,7 @@ def printed_weights(across: np.ndarray, low: np.ndarray, high: np.ndarray) -> np
 def line_errors(field: GridField, axis: int, point: np.ndarray, way: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Return weights W_i and polynomial values f_i, m, of the four lines along an axis around a point, each (4,).
 
-    By the paper's formulas; `point` is in ``base``, m, `way` is 1 forward and −1 backward.
+    Computed by the paper's formulas; `point` is in ``base``, m; `way` is 1 for forward and −1 for backward.
     """
     cross = list(CROSS_AXES[axis])
     first = [min(int(np.searchsorted(field.grid[a], point[a], "right")) - 1, len(field.grid[a]) - 2) for a in cross]
@@ -155,12 +155,12 @@ def line_errors(field: GridField, axis: int, point: np.ndarray, way: int = 1) ->
 
 
 def printed_error(field: GridField, point: np.ndarray, way: int = 1) -> np.ndarray:
-    """Return Δx, Δy, Δz by the paper's formulas, shape (3,), m; parameters as :func:`line_errors` has them."""
+    """Return Δx, Δy, Δz by the paper's formulas, shape (3,), m; parameters as in :func:`line_errors`."""
     return np.array([np.dot(*line_errors(field, axis, point, way)) for axis in range(3)])
 
 
 def weights(field: GridField) -> Exhibit:
-    """Return the weights of Figure 2."""
+    """Return the comparison of Figure 2: the weights of four lines."""
     rng = np.random.default_rng(1)
     points = rng.uniform(field.box[0], field.box[1], (200, 3))
     sums = [line_errors(field, axis, point)[0] for point in points for axis in range(3)]
@@ -172,29 +172,29 @@ def weights(field: GridField) -> Exhibit:
     )
     statements = (
         Statement(
-            "k = Mod(i + 2)", "without its modulus", "modulus 4, corners counted from 1: the corner opposite", WRONG
+            "k = Mod(i + 2)", "modulus missing", "modulus 4, corners counted from 1: k is the opposite corner", WRONG
         ),
         Statement("the four weights add up to 1", "Σ W = 1 by their formula", f"within {off:.0e}", within(off < 1e-12)),
         Statement(
-            "Δx = Σ W_xi f_xi(P_x), and so for y and z",
+            "Δx = Σ W_xi f_xi(P_x), and the same for y and z",
             "formulas",
-            f"within {errors * 1e6:.0e} µm of the compiled field",
+            f"within {errors * 1e6:.0e} µm of the package's field",
             within(errors < 1e-15),
-            f"Their formulas evaluated one by one at {len(points)} random points, forward and backward.",
+            f"The paper's formulas were evaluated at {len(points)} random points, forward and backward.",
         ),
     )
     figures = {"Figure 2: each weight is the area opposite to its line": weights_figure()}
-    return Exhibit("Figure 2: weights", "How four lines around the tool are weighted.", (), statements, figures)
+    return Exhibit("Figure 2: weights", "Weights of the four lines around the tool.", (), statements, figures)
 
 
 def strut_errors(truth: RealMachine, one: Scheme, title: str) -> Exhibit:
-    """Return the length errors of the six struts along x, forward and backward (Figures 3 and 4)."""
+    """Return the length errors of the six struts on a line along x, forward and backward (Figures 3 and 4)."""
     geometry, model = truth.geometry, one.fit.model
     box = commanded_box(geometry, model)
     along, z = np.linspace(box[0, 0], box[1, 0], SAMPLES), float(box[:, 2].mean())
     predicted = strut_length_errors(geometry, model, along, LINE_Y, z) * 1e6
     real = strut_length_errors(geometry, truth.model, along, LINE_Y, z) * 1e6
-    real -= (real - predicted).mean(axis=1, keepdims=True)  # what lines say begins at zeros of their own
+    real -= (real - predicted).mean(axis=1, keepdims=True)  # each line has an unknown zero
     statements = tuple(
         Statement(
             name,
@@ -202,7 +202,8 @@ def strut_errors(truth: RealMachine, one: Scheme, title: str) -> Exhibit:
             f"forward {predicted[0, :, n].min():.1f} … {predicted[0, :, n].max():.1f} µm, "
             f"backward {predicted[1, :, n].min():.1f} … {predicted[1, :, n].max():.1f} µm",
             OPEN,
-            f"From the virtual machine's real curve, less its mean, RMS {rms((real - predicted)[..., n]):.1f} µm.",
+            f"Real curve of the virtual machine minus this curve, without the mean: RMS "
+            f"{rms((real - predicted)[..., n]):.1f} µm.",
         )
         for n, name in enumerate(STRUT_NAMES)
     )
@@ -211,40 +212,39 @@ def strut_errors(truth: RealMachine, one: Scheme, title: str) -> Exhibit:
     }
     text = (
         f"Strut length errors from {one.name} readings along x, (a) forward and (b) backward. The paper prints curves "
-        "of its own machine without numbers, and not its readings: shapes can be compared, digits cannot."
+        "of its own machine without numbers, and no readings. So only the shapes can be compared."
     )
     return Exhibit(f"{title}: strut length errors, {one.name} laser", text, (), statements, figures)
 
 
 def seventy(schemes: tuple[Scheme, ...]) -> Exhibit:
-    """Return the share of the displacement error that the schemes predict and remove."""
+    """Return the share of the displacement error that each scheme predicts and removes."""
     statements = []
     for one in schemes:
-        along = one.worth.paper
+        along = one.evaluation.paper
         share = 1.0 - along.after / along.before
-        space = [size.aligned.rms * 1e6 for size in (one.worth.before, one.worth.after)]
+        space = [size.aligned.rms * 1e6 for size in (one.evaluation.before, one.evaluation.after)]
         statements.append(
             Statement(
                 f"linear displacement error removed, {one.name}",
                 "an average of 70 %",
                 f"{share:.0%}: mean {along.before * 1e6:.1f} → {along.after * 1e6:.1f} µm along {along.lines} lines",
                 within(share >= 0.7),
-                f"{100.0 * share - 70.0:+.0f} points, on a virtual hexapod. Their measure, on lines that were not "
-                "measured. In space, which a line does not see, RMS with the datum aligned {:.1f} → {:.1f} µm.".format(
-                    *space
-                ),
+                f"{100.0 * share - 70.0:+.0f} percentage points, on a virtual hexapod. The paper's measure is computed "
+                "on lines that were not measured. The error in space (RMS, datum aligned) is "
+                "{:.1f} → {:.1f} µm.".format(*space),
             )
         )
     text = (
-        "What the paper concludes of the hexapod: 'improved by 70% without any significant cost on hardware "
-        "enhancement'. The evidence that it prints is of another machine: 'the linear displacement inaccuracy of the "
+        "The paper's conclusion for the hexapod: 'improved by 70% without any significant cost on hardware "
+        "enhancement'. The printed evidence is for another machine: 'the linear displacement inaccuracy of the "
         "vertical machining center could be predicted and compensated for with an average of 70% accuracy'."
     )
     return Exhibit("The 70 %", text, (), tuple(statements))
 
 
 def chain(truth: RealMachine, one: Scheme) -> Exhibit:
-    """Follow one tool position through the flowchart of Figure 5, by the paper's formulas alone."""
+    """Compute every box of the flowchart of Figure 5 for one tool position, with the paper's formulas only."""
 
     def passes(point: np.ndarray) -> Passes:
         return Passes.of_tool(truth.geometry, point[None], np.eye(3)[None], np.ones((1, 3)))
@@ -259,26 +259,26 @@ def chain(truth: RealMachine, one: Scheme) -> Exhibit:
     statements = (
         *_chain_steps(one.fit.model.field, error, ideal[0], actual[0]),
         Statement(
-            "left on a machine that is as the model says",
+            "remaining error of a machine that equals the model",
             "compensated",
-            f"{left * 1e9:.2f} nm; by this package's fixed point {exactly * 1e9:.0e} nm",
+            f"{left * 1e9:.2f} nm; with this package's fixed-point iteration {exactly * 1e9:.0e} nm",
             within(exactly < 1e-12 and left < 1e-3 * np.linalg.norm(error)),
-            f"−ΔL is the correction to first order: at most {np.abs(exact - corrected).max() * 1e9:.2f} nm a strut.",
+            f"−ΔL is the first-order correction; its error is at most {np.abs(exact - corrected).max() * 1e9:.2f} nm.",
         ),
         Statement(
-            "left on the virtual machine at this point",
+            "remaining error of the virtual machine at this point",
             "not given",
-            f"{before * 1e6:.1f} → {after * 1e6:.1f} µm as it is",
+            f"{before * 1e6:.1f} → {after * 1e6:.1f} µm, absolute",
             SHOWN,
-            "Lines do not see where the machine stands as a whole: see the 70 % for the measure that they can lower.",
+            "Lines do not show the position of the machine as a whole; 'The 70 %' has the measure that they show.",
         ),
     )
-    text = "One position through the flowchart, by the printed formulas: prediction, inverse kinematics, correction."
+    text = "The flowchart for one position, by the printed formulas: prediction, inverse kinematics, correction."
     return Exhibit("Figure 5: prediction and compensation", text, (), statements)
 
 
 def _chain_steps(field: GridField, error: np.ndarray, ideal: np.ndarray, actual: np.ndarray) -> Iterator[Statement]:
-    """Yield what stands in each box of the flowchart; lengths as `ideal` and `actual`, shape (6,), m."""
+    """Yield the value in each box of the flowchart; `ideal` and `actual` are strut lengths, shape (6,), m."""
     weights, values = line_errors(field, 0, POINT)
     for what, computed in (
         ("1. tool position, forward", f"({_mm(POINT)}) mm"),

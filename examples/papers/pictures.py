@@ -1,4 +1,4 @@
-"""Pictures that belong to the papers: the machine with its dimensions, and what random errors do to strut lengths."""
+"""Pictures for the papers: the machine with its dimensions, changes of strut lengths by random errors, and weights."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BINS = np.arange(-40.5, 41.0, 1.0)  # Edges of a histogram of changes of length,
 
 
 def configuration_figure(geometry: HexapodGeometry) -> Figure:
-    """Show the paper's machine with its three dimensions (Song et al., Figures 1 and 3)."""
+    """Draw the paper's machine with its three dimensions (Song et al., Figures 1 and 3)."""
     figure = Figure(figsize=(9, 4.4), layout="constrained")
     space: Any = figure.add_subplot(1, 2, 1, projection="3d")
     above = figure.add_subplot(1, 2, 2, title="from above")
@@ -28,7 +28,7 @@ def configuration_figure(geometry: HexapodGeometry) -> Figure:
     base, platform = geometry.base_joints * 1e3, geometry.platform_joints * 1e3
     for name, first, second in (("b", base[2], base[3]), ("d", base[1], base[2]), ("a", platform[0], platform[4])):
         x, y = 0.5 * (first + second)[:2]
-        along = np.degrees(np.arctan2(*(first - second)[1::-1]))  # the text stands beside its side, along it
+        along = np.degrees(np.arctan2(*(first - second)[1::-1]))  # the text is parallel to the side
         where = {"ha": "center", "va": "bottom", "rotation": along, "rotation_mode": "anchor", "size": "small"}
         above.text(x, y, f"{name} = {np.linalg.norm(first - second):g} mm", **where)
     above.margins(0.12)
@@ -36,7 +36,7 @@ def configuration_figure(geometry: HexapodGeometry) -> Figure:
 
 
 def changes_figure(drawn: np.ndarray, printed: np.ndarray) -> Figure:
-    """Show how strut lengths of machines drawn within ±10 µm differ from the ideal ones, and the printed ones do."""
+    """Draw histograms of real minus ideal strut lengths: machines drawn within ±10 µm, and the printed lengths."""
     figure = Figure(figsize=(8.0, 3.6), layout="constrained")
     axes = figure.subplots()
     for values, colour, name in (
@@ -51,7 +51,7 @@ def changes_figure(drawn: np.ndarray, printed: np.ndarray) -> Figure:
 
 
 def weights_figure() -> Figure:
-    """Draw the weights of the four lines around a tool: each the area of the rectangle opposite to it."""
+    """Draw the weights of the four lines around a tool: each weight is the area of the opposite rectangle."""
     figure = Figure(figsize=(4.8, 4.2), layout="constrained")
     axes = figure.subplots()
     y, z = 0.3, 0.4

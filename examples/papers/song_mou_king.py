@@ -1,4 +1,4 @@
-"""Song, Mou & King: Tables 1 to 5, the round trip of ideal and of real structures, their figures and misprints."""
+"""Comparison with Song, Mou & King: Tables 1 to 5, round trips of ideal and real structures, figures, misprints."""
 
 from __future__ import annotations
 
@@ -46,33 +46,33 @@ LENGTHS = lengths_mm("L1", "L2", "L3", "L4", "L5", "L6")
 POSES = (*angles_deg("α", "β", "γ"), *lengths_mm("X", "Y", "Z"))
 
 IDEAL_MM, REAL_MM = 1e-5, 1e-4
-"""The consistency that they state: about 0.01 µm for the ideal structure, about 0.1 µm for the real one."""
+"""Errors of a round trip that the paper states, mm: about 0.01 µm (ideal structure) and about 0.1 µm (real one)."""
 
-BOUND = 10e-6  # Of every error of the real structure, m
+BOUND = 10e-6  # Bound of every error of the real structure, m
 
 BOUNDS = ImperfectionBounds(joint=BOUND, strut_offset=BOUND)
 
 RANDOM_POSES, REAL_POSES = 1000, 200
-"""How many poses are tried beside the ten of Table 1, and how many of them on real structures."""
+"""Number of random poses in addition to Table 1, and number of these poses that are computed on real structures."""
 
 RANDOM_BOX, RANDOM_TILT = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]]), np.radians(10.0)
-"""Where: the box that Mou & King measured, m, with angles up to the largest of Table 1, rad."""
+"""Range of the random poses: the box that Mou & King measured, m, and the largest angle of Table 1, rad."""
 
-DRAWS = 200_000  # Machines drawn for a probability
+DRAWS = 200_000  # Number of machines that are drawn to estimate a probability
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """What the paper's own simulation is done with."""
+    """A repetition of the paper's simulation."""
 
     geometry: HexapodGeometry
-    poses: list[Pose]  # Table 1
-    lengths: np.ndarray  # (10, 6), exact, of the ideal structure, m
-    drawn: tuple[Assessment, ...]  # for each pose machines of its own: the errors have new values in each iteration
+    poses: list[Pose]  # the poses of Table 1
+    lengths: np.ndarray  # (10, 6): exact strut lengths of the ideal structure, m
+    drawn: tuple[Assessment, ...]  # random machines of each pose: as in the paper each pose has new errors
 
 
 def simulate(geometry: HexapodGeometry, machines: int = 50, seed: int = 1) -> Simulation:
-    """Repeat the paper's simulation: ten poses, at each of them machines drawn within ±10 µm, each with its seed."""
+    """Repeat the paper's simulation: at each of ten poses draw `machines` machines within ±10 µm, with new seeds."""
     rows = values(1)
     poses = [Pose.from_angles(row[3:] * 1e-3, np.radians(row[:3])) for row in rows]
     drawn = tuple(assess(geometry, [pose], BOUNDS, seed + n * machines, machines) for n, pose in enumerate(poses))
@@ -80,7 +80,7 @@ def simulate(geometry: HexapodGeometry, machines: int = 50, seed: int = 1) -> Si
 
 
 def paper(geometry: HexapodGeometry, machines: int = 50, seed: int = 1) -> Paper:
-    """Return everything of the paper, computed."""
+    """Return the comparison of the whole paper."""
     run = simulate(geometry, machines, seed)
     exhibits = (drawings(run), table_2(run), table_3(run), table_4(run), table_5(run), random_poses(run, seed), wrong())
     title = "Kinematic Performance Analysis of a Parallel-Chain Hexapod Machine"
@@ -88,7 +88,7 @@ def paper(geometry: HexapodGeometry, machines: int = 50, seed: int = 1) -> Paper
 
 
 def drawings(run: Simulation) -> Exhibit:
-    """Return the machine of Figures 1 and 3, the rotation of Figure 2 and the triangles of Figure 4."""
+    """Return the comparison of Figures 1 and 3 (machine), 2 (rotation matrix) and 4 (triangles)."""
     cases = misprints.cases()
     rotation = max(float(np.abs(pose.rotation - at.rotation).max()) for pose, at in zip(run.poses, cases, strict=True))
     heights = max(float(np.abs(np.hypot(at.h, at.p) - at.lengths[::2]).max()) for at in cases)
@@ -100,10 +100,10 @@ def drawings(run: Simulation) -> Exhibit:
             "letters",
             f"a = {a * 1e3:.3f}, b = {b * 1e3:.3f}, d = {d * 1e3:.3f} mm",
             SHOWN,
-            "Not printed as numbers. These three follow from Table 2, which they give to its last digit.",
+            "The paper does not print these numbers. They follow from Table 2 and reproduce it to the last digit.",
         ),
         Statement(
-            "Figure 2: the printed matrix beside Ry(β) Rx(α) Rz(γ)",
+            "Figure 2: the printed matrix minus Ry(β) Rx(α) Rz(γ)",
             "nine entries",
             f"within {small(rotation)}",
             within(rotation < 1e-15),
@@ -114,15 +114,15 @@ def drawings(run: Simulation) -> Exhibit:
             "p² + h² = L²",
             f"within {small(heights)} mm",
             within(heights < 1e-9),
-            "Of the six struts at the ten poses.",
+            "For the six struts at the ten poses.",
         ),
     )
     figures = {"The machine at home, with the dimensions of Figure 3": configuration_figure(run.geometry)}
-    return Exhibit("Figures 1 to 4: the machine", "Drawings, made anew from the geometry.", (), statements, figures)
+    return Exhibit("Figures 1 to 4: the machine", "Drawings, computed from the geometry.", (), statements, figures)
 
 
 def table_2(run: Simulation) -> Exhibit:
-    """Return Table 2: lengths of the ideal structure."""
+    """Return the comparison of Table 2: strut lengths of the ideal structure."""
     printed, computed = table(2), run.lengths * 1e3
     met = np.abs(computed - values(2)) <= roundings(printed)
     compared = NumberTable(
@@ -130,11 +130,11 @@ def table_2(run: Simulation) -> Exhibit:
         "Computed: the distances between the joints at the poses of Table 1.",
         *(LENGTHS, ROWS, printed, computed, judged(met, MISSED)),
     )
-    return Exhibit("Tables 1 and 2", "Ten commanded poses, and the lengths that they need.", (compared,))
+    return Exhibit("Tables 1 and 2", "Ten commanded poses and their strut lengths.", (compared,))
 
 
 def table_3(run: Simulation) -> Exhibit:
-    """Return Table 3: from the lengths back to the poses, as it should be and as it was made."""
+    """Return the comparison of Table 3, poses computed from lengths: the exact poses, and the paper's with tanh."""
     printed, truth = table(3), values(1)
     solved = _solved(run, run.lengths)
     exact, rounded, by_tanh = _rows(solved), _rows(_solved(run, values(2) * 1e-3)), _rows_by_tanh(run, solved)
@@ -144,19 +144,19 @@ def table_3(run: Simulation) -> Exhibit:
     tables = (
         NumberTable(
             "Table 3: predicted poses of the ideal structure",
-            "Computed: the loop closures solved for the exact lengths. They give Table 1 back. The angles printed as "
-            "4.99998° for 5° and 9.99937° or 9.99938° for 10° are wrong.",
+            "Computed: the loop closures solved for the exact lengths; the result is Table 1. The printed angles "
+            "4.99998° (for 5°) and 9.99937° or 9.99938° (for 10°) are wrong.",
             *(POSES, ROWS, printed, exact, judged(met, np.where(right, WRONG, MISSED))),
         ),
         NumberTable(
-            "Table 3 as its numbers say",
-            "Computed: the same top joints, but the angles by the paper's formulas with tanh in place of arctan, γ′ "
-            "going into β′ (9.99937° in row 5, where γ is not 0). So the table was made.",
+            "Table 3 as it was probably computed",
+            "Computed: the same top joints, but angles by the paper's formulas with tanh in place of arctan; γ′ enters "
+            "β′ (9.99937° in row 5, where γ is not 0). The result is the printed table.",
             *(POSES, ROWS, printed, by_tanh, judged(explained, MISSED)),
         ),
     )
     statements = _trip("from the exact lengths", exact - truth, IDEAL_MM), _rounded_trip(run, rounded - truth)
-    return Exhibit("Table 3: the round trip", "Lengths back to poses.", tables, statements)
+    return Exhibit("Table 3: the round trip", "Poses computed from strut lengths.", tables, statements)
 
 
 def _solved(run: Simulation, lengths: np.ndarray) -> list[Pose]:
@@ -164,24 +164,24 @@ def _solved(run: Simulation, lengths: np.ndarray) -> list[Pose]:
 
 
 def _rows(poses: list[Pose]) -> np.ndarray:
-    """Return poses as the paper prints them: °, mm."""
+    """Return poses in the units of the paper: α, β, γ in degrees, then x, y, z in mm."""
     return np.array([[*np.degrees(angles_from_rotation(pose.rotation)), *(pose.position * 1e3)] for pose in poses])
 
 
 def _rows_by_tanh(run: Simulation, poses: list[Pose]) -> np.ndarray:
-    """Return the same, but the angles by the paper's formulas with tanh in place of arctan."""
+    """Return poses as :func:`_rows` does, but with angles by the paper's formulas with tanh in place of arctan."""
     tops = [pose.position + run.geometry.platform_joints[::2] @ pose.rotation.T for pose in poses]
     angles = [misprints.printed_angles(top * 1e3, np.tanh) for top in tops]
     return np.column_stack([angles, [pose.position * 1e3 for pose in poses]])
 
 
 def _stated_angle(length: float) -> float:
-    """Return the angle, °, that moves a top joint of the paper's machine by so much, mm."""
+    """Return the angle, °, that moves a top joint of the paper's machine by `length`, mm."""
     return float(np.degrees(length / (misprints.A / misprints.S3)))
 
 
 def _trip(what: str, off: np.ndarray, stated: float) -> Statement:
-    """Return what a round trip leaves, beside the consistency that the paper states."""
+    """Compare the errors of a round trip with the error `stated` in the paper, mm."""
     place, angle = float(np.abs(off[:, 3:]).max()), float(np.abs(off[:, :3]).max())
     good = place <= stated and angle <= _stated_angle(stated)
     computed = f"{place * 1e3:.0e} µm, {angle:.0e}°"
@@ -189,10 +189,10 @@ def _trip(what: str, off: np.ndarray, stated: float) -> Statement:
 
 
 def _rounded_trip(run: Simulation, off: np.ndarray) -> Statement:
-    """Return what the rounding of Table 2 leaves of the poses, beside what it may leave."""
+    """Compare the pose errors caused by the rounding of Table 2 with their bounds."""
     share = 0.0
     for pose, row in zip(run.poses, off, strict=True):
-        allowed = np.abs(np.linalg.inv(jacobian(run.geometry, pose))).sum(axis=1) * 0.5e-3  # mm from 0.5 µm a strut
+        allowed = np.abs(np.linalg.inv(jacobian(run.geometry, pose))).sum(axis=1) * 0.5e-3  # mm, by 0.5 µm per strut
         share = max(share, float((np.abs(row[3:]) / allowed[:3]).max()))
     place, angle = float(np.abs(off[:, 3:]).max()), float(np.abs(off[:, :3]).max())
     return Statement(
@@ -200,12 +200,12 @@ def _rounded_trip(run: Simulation, off: np.ndarray) -> Statement:
         "rounded to 1 µm",
         f"{place * 1e3:.2f} µm, {angle:.1e}°",
         within(share <= 1.0 + 1e-6),
-        f"The poses are off by at most {share:.2f} of what the rounding of the lengths allows.",
+        f"The pose errors are at most {share:.2f} of the bound that follows from the rounding of the lengths.",
     )
 
 
 def table_4(run: Simulation) -> Exhibit:
-    """Return Table 4: lengths of the real structure, with new errors in each iteration."""
+    """Return the comparison of Table 4: strut lengths of the real structure, with new errors for each pose."""
     printed = table(4)
     real = np.array([one.real_lengths[0, 0] for one in run.drawn])
     changes = np.array([one.strut_changes[:, 0] for one in run.drawn])
@@ -213,35 +213,36 @@ def table_4(run: Simulation) -> Exhibit:
     bounds = np.array([change_bounds(run.geometry, pose) for pose in run.poses])
     compared = NumberTable(
         "Table 4: strut lengths of the real structure",
-        "Computed: one machine for each pose, drawn within ±10 µm on every joint coordinate and strut. The paper's "
-        "random numbers are not printed, so its digits cannot be met; the differences are those of two draws.",
+        "Computed: one machine for each pose, drawn within ±10 µm for every joint coordinate and strut. The paper does "
+        "not print its random numbers, so its digits cannot be met; the differences are those of two random draws.",
         *(LENGTHS, ROWS, printed, real * 1e3, judged(np.zeros((10, 6), dtype=bool), OPEN)),
     )
     statements = (
         Statement(
-            "Table 4 − Table 2 within what ±10 µm allow",
+            "Table 4 − Table 2 within the bounds for errors of ±10 µm",
             f"{shown.min():.1f} … {shown.max():.1f} µm",
             f"at most ±{bounds.min():.1f} to ±{bounds.max():.1f} µm, by strut and pose",
             within((np.abs(shown) <= bounds).all()),
-            "10 µm times (|u|₁ + |Rᵀu|₁ + 1): both joints in a corner of their cubes. All 60 changes lie within.",
+            "Bound: 10 µm times (|u|₁ + |Rᵀu|₁ + 1), with both joints in a corner of their cubes. All 60 changes are "
+            "within their bounds.",
         ),
         *_range_statements(run, changes * 1e6, shown),
     )
-    figures = {"Table 4 − Table 2: as printed, and of the machines drawn": changes_figure(changes * 1e6, shown)}
+    figures = {"Table 4 − Table 2: as printed, and for random machines": changes_figure(changes * 1e6, shown)}
     return Exhibit(
         "Table 4: imperfect machines", "The same poses on real structures.", (compared,), statements, figures
     )
 
 
 def change_bounds(geometry: HexapodGeometry, pose: Pose) -> np.ndarray:
-    """Return how much ±10 µm on joints and struts may change each strut's length at a pose, shape (6,), µm."""
+    """Return the largest change of each strut's length by ±10 µm on joints and struts at a pose, shape (6,), µm."""
     struts = pose.position + geometry.platform_joints @ pose.rotation.T - geometry.base_joints
     units = struts / np.linalg.norm(struts, axis=1)[:, None]
     return BOUND * 1e6 * (np.abs(units).sum(axis=1) + np.abs(units @ pose.rotation).sum(axis=1) + 1.0)
 
 
 def _range_statements(run: Simulation, changes: np.ndarray, shown: np.ndarray) -> tuple[Statement, ...]:
-    """Say how likely the printed range is."""
+    """Compare the printed changes with uniform errors: mean, scatter, and the probability of the printed range."""
     low, high = float(shown.min()), float(shown.max())
     chances = np.array([range_probability(run.geometry, pose, low, high) for pose in run.poses])
     power, wider = np.log10(chances).sum(), range_probability(run.geometry, run.poses[0], -6.0, 2.0)
@@ -251,17 +252,17 @@ def _range_statements(run: Simulation, changes: np.ndarray, shown: np.ndarray) -
             f"{shown.mean():.2f} and {shown.std():.2f} µm",
             f"{changes.mean():.2f} and {changes.std():.2f} µm over {changes.size} drawn",
             OPEN,
-            "Three uniform errors of ±10 µm act along a strut, so its length scatters by 10 µm. The printed changes "
-            "scatter by a sixth of that, and their mean is not zero: the errors behind Table 4 were not uniform "
-            "within ±10 µm.",
+            "Three uniform errors of ±10 µm act along a strut, so its length has a standard deviation of 10 µm. The "
+            "printed changes have a sixth of that, and their mean is not zero. So the errors of Table 4 were not "
+            "uniform within ±10 µm.",
         ),
         Statement(
             "all six changes of a row within the printed range",
             "in each of ten rows",
-            f"probability {chances.min():.5f} to {chances.max():.5f} a row, 10^{power:.0f} for ten",
+            f"probability {chances.min():.5f} to {chances.max():.5f} per row, 10^{power:.0f} for ten rows",
             OPEN,
-            f"Range {low:.1f} … {high:.1f} µm. For that between the rounded tables, −6 … +2 µm, it is {wider:.5f} at "
-            f"the first pose. {DRAWS} machines drawn for each pair of struts that share a joint.",
+            f"Range {low:.1f} … {high:.1f} µm. For the range of the rounded tables, −6 … +2 µm, the probability is "
+            f"{wider:.5f} at the first pose. {DRAWS} machines were drawn for each pair of struts that share a joint.",
         ),
         _one_machine(run, shown),
     )
@@ -270,7 +271,7 @@ def _range_statements(run: Simulation, changes: np.ndarray, shown: np.ndarray) -
 def range_probability(geometry: HexapodGeometry, pose: Pose, low: float, high: float, seed: int = 1) -> float:
     """Return the probability that uniform ±10 µm errors change all six lengths at a pose by low … high, µm.
 
-    The struts of a pair share their top joint alone, the pairs nothing: their probabilities multiply.
+    The two struts of a pair share a top joint. Different pairs share no error, so their probabilities multiply.
     """
     rng = np.random.default_rng(seed)
     parts = _change_matrix(geometry, pose)
@@ -284,9 +285,9 @@ def range_probability(geometry: HexapodGeometry, pose: Pose, low: float, high: f
 
 
 def _change_matrix(geometry: HexapodGeometry, pose: Pose) -> np.ndarray:
-    """Return how lengths follow 18 base, 9 top coordinates and 6 offsets, shape (6, 33).
+    """Return the derivatives of the lengths by 18 base coordinates, 9 top coordinates and 6 offsets, shape (6, 33).
 
-    To first order, which leaves out 10 µm squared over the strut's length: 0.0002 µm.
+    The neglected second order is (10 µm)² divided by the strut's length: 0.0002 µm.
     """
     struts = pose.position + geometry.platform_joints @ pose.rotation.T - geometry.base_joints
     units = struts / np.linalg.norm(struts, axis=1)[:, None]
@@ -300,7 +301,7 @@ def _change_matrix(geometry: HexapodGeometry, pose: Pose) -> np.ndarray:
 
 
 def _one_machine(run: Simulation, shown: np.ndarray) -> Statement:
-    """Say how near one machine for all ten rows comes to Table 4, and which errors one for each row needs."""
+    """Compute how well one machine fits all rows of Table 4, and which error bound one machine per row needs."""
     matrices = [_change_matrix(run.geometry, pose) for pose in run.poses]
     one, _ = _nearest(np.vstack(matrices), shown.ravel())
     needed = max(_least_bound(matrix, row) for matrix, row in zip(matrices, shown, strict=True))
@@ -309,13 +310,13 @@ def _one_machine(run: Simulation, shown: np.ndarray) -> Statement:
         "new ones in each iteration",
         f"one machine for all rows misses by {one:.2f} µm; one for each row meets it, with errors of ±{needed:.1f} µm",
         within(one > 0.5 and needed <= BOUND * 1e6),
-        "By linear programming. The errors did change from row to row, as the paper says; those that give a row are "
-        "not the only ones.",
+        "Computed by linear programming. The errors changed from row to row, as the paper says; the errors that give a "
+        "row are not unique.",
     )
 
 
 def _nearest(matrix: np.ndarray, changes: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the smallest largest miss that errors within ±10 µm leave of changes, µm, and those errors."""
+    """Return the errors within ±10 µm that minimise the largest deviation from `changes`, and that deviation, µm."""
     from scipy.optimize import linprog
 
     ones = np.ones((len(changes), 1))
@@ -327,7 +328,7 @@ def _nearest(matrix: np.ndarray, changes: np.ndarray) -> tuple[float, np.ndarray
 
 
 def _least_bound(matrix: np.ndarray, changes: np.ndarray) -> float:
-    """Return the smallest bound within which errors give changes as rounded in print, µm."""
+    """Return the smallest bound of errors, µm, that reproduce `changes` within the rounding of 0.5 µm."""
     from scipy.optimize import linprog
 
     size = matrix.shape[1]
@@ -339,7 +340,7 @@ def _least_bound(matrix: np.ndarray, changes: np.ndarray) -> float:
 
 
 def table_5(run: Simulation) -> Exhibit:
-    """Return Table 5: from the real lengths back to poses, by the real structure and by the ideal one."""
+    """Return the comparison of Table 5, poses computed from real lengths: by the real and by the ideal structure."""
     trip = max(float(one.round_trip[..., 0].max()) for one in run.drawn)
     off = values(5) - values(1)
     statements = (
@@ -348,56 +349,56 @@ def table_5(run: Simulation) -> Exhibit:
             "consistency of about 0.1 µm",
             f"{np.abs(off[:, 3:]).max() * 1e3:.1f} µm, {np.abs(off[:, :3]).max():.1e}°",
             WRONG,
-            "The printed numbers themselves say so.",
+            "Computed from the printed numbers alone.",
         ),
         Statement(
             f"round trip of {sum(len(one.seeds) for one in run.drawn)} machines, each at its pose",
             "about 0.1 µm",
             f"{trip * 1e6:.0e} µm",
             within(trip * 1e3 <= REAL_MM),
-            "Newton starts 1 mm off the pose.",
+            "Newton's method starts 1 mm from the pose.",
         ),
     )
     tables = _as_described(run), _as_made(run)
-    return Exhibit("Table 5: the round trip of real structures", "Both ways of reading it.", tables, statements)
+    return Exhibit("Table 5: the round trip of real structures", "Two interpretations.", tables, statements)
 
 
 def _as_described(run: Simulation) -> NumberTable:
-    """Return Table 5 beside the round trip through the real structures."""
+    """Compare Table 5 with the round trip through the real structures."""
     computed = _rows(_through_real(run))
     stated = np.maximum(roundings(table(5)), [_stated_angle(REAL_MM)] * 3 + [REAL_MM] * 3)
     closed = np.abs(computed - values(1)) <= 1e-9
     return NumberTable(
         "Table 5 as the paper describes it",
-        "Computed: the lengths that each pose's machine of Table 4 needs, back through that machine. The loop closures "
-        "solved as they are give Table 1 back.",
+        "Computed: the lengths of each pose's machine of Table 4, and from them the pose of the same machine. The "
+        "exact solution of the loop closures is Table 1.",
         *(POSES, ROWS, table(5), computed),
         judged(np.abs(computed - values(5)) <= stated, np.where(closed, WRONG, MISSED)),
     )
 
 
 def _as_made(run: Simulation) -> NumberTable:
-    """Return Table 5 beside what the ideal structure and tanh make of Table 4."""
+    """Compare Table 5 with the poses of the ideal structure for the lengths of Table 4, with angles by tanh."""
     computed = _rows_by_tanh(run, _solved(run, values(4) * 1e-3))
     met = np.abs(computed - values(5)) <= roundings(table(5)) + _rounding_of_4(run)
     return NumberTable(
-        "Table 5 as its numbers say",
-        "Computed: the lengths of Table 4, as printed, through the ideal structure, the angles with tanh as in Table "
-        "3. So the table was made: the errors of joints and struts were not taken out again.",
+        "Table 5 as it was probably computed",
+        "Computed: poses of the ideal structure for the printed lengths of Table 4, with angles by tanh as in Table 3. "
+        "The result is the printed table: it does not account for the errors of joints and struts.",
         *(POSES, ROWS, table(5), computed, judged(met, MISSED)),
     )
 
 
 def _through_real(run: Simulation) -> list[Pose]:
-    """Return where the first machine of each pose goes with the lengths that it needs there; Newton starts at home."""
+    """Return the pose of each pose's first machine for its own real lengths; Newton's method starts at home."""
     machines = [RealMachine(run.geometry, draw_model(run.geometry, BOUNDS, one.seeds[0])) for one in run.drawn]
     return [machine.pose_for(one.real_lengths[0, 0])[0] for machine, one in zip(machines, run.drawn, strict=True)]
 
 
 def _rounding_of_4(run: Simulation) -> np.ndarray:
-    """Return what the rounding of Table 4, 0.5 µm a strut, allows of each number of a pose, shape (10, 6), ° and mm.
+    """Return the largest pose errors by the rounding of Table 4, 0.5 µm per strut, shape (10, 6), ° and mm.
 
-    Angles to first order of small ones: each may change by the whole of the rotation's bound.
+    To first order each angle may change by the bound of the whole rotation.
     """
     allowed = []
     for pose in run.poses:
@@ -408,7 +409,7 @@ def _rounding_of_4(run: Simulation) -> np.ndarray:
 
 
 def random_poses(run: Simulation, seed: int = 1) -> Exhibit:
-    """Return the round trip at random poses, of the ideal structure and of machines with new errors at each."""
+    """Return the round trip at random poses: of the ideal structure, and of real structures with new errors at each."""
     rng = np.random.default_rng(seed)
     positions = rng.uniform(RANDOM_BOX[0], RANDOM_BOX[1], (RANDOM_POSES, 3))
     rotations = rotation_from_angles(rng.uniform(-RANDOM_TILT, RANDOM_TILT, (RANDOM_POSES, 3)))
@@ -420,42 +421,42 @@ def random_poses(run: Simulation, seed: int = 1) -> Exhibit:
         assess(run.geometry, [Pose(position, rotation)], BOUNDS, seed + n).round_trip[0, 0, 0]
         for n, (position, rotation) in enumerate(zip(positions[:REAL_POSES], rotations[:REAL_POSES], strict=True))
     ]
-    where = "anywhere in Mou & King's box of 16 × 16 × 8 inches, angles up to ±10°"
+    where = "in Mou & King's box of 16 × 16 × 8 inches, angles up to ±10°"
     statements = (
         Statement(
             f"ideal structure, {RANDOM_POSES} random poses",
             "about 0.01 µm",
             f"{place * 1e6:.0e} µm",
             within(place * 1e3 <= IDEAL_MM),
-            f"Poses {where}; Newton starts at home.",
+            f"Poses {where}; Newton's method starts at home.",
         ),
         Statement(
-            f"real structures, {len(trips)} random poses, new errors at each",
+            f"real structures, {len(trips)} random poses, new errors at each pose",
             "about 0.1 µm",
             f"{max(trips) * 1e6:.0e} µm",
             within(max(trips) * 1e3 <= REAL_MM),
         ),
     )
-    text = "Their poses were selected at random, ten of them. Here are more, in a larger space."
+    text = "The paper uses ten random poses. Here are more poses in a larger space."
     return Exhibit("Random poses", text, (), statements)
 
 
 def wrong() -> Exhibit:
-    """Return the misprints in the formulas, with what each would do."""
+    """Return the misprints in the formulas, with the error that each causes."""
     statements = []
     for misprint in misprints.MISPRINTS:
-        off, left = misprint.worst()
+        printed, corrected = misprint.worst()
         statements.append(
             Statement(
                 misprint.name,
                 misprint.printed,
-                misprint.mended,
-                WRONG if left < 1e-9 < off else MISSED,
-                f"As printed off by {off:.4g} {misprint.unit}, mended by {small(left)}.",
+                misprint.corrected,
+                WRONG if corrected < 1e-9 < printed else MISSED,
+                f"Error as printed {printed:.4g} {misprint.unit}, as corrected {small(corrected)}.",
             )
         )
     text = (
-        "Each formula was tried as printed and as mended on the ten poses of Table 1, by the paper's own drawing. "
-        "None of them is used here: the six loop closures need no mending."
+        "Each formula was evaluated as printed and as corrected at the ten poses of Table 1, with the paper's drawing. "
+        "The package uses none of them: it solves the six loop closures."
     )
     return Exhibit("Misprints in the formulas", text, (), tuple(statements))

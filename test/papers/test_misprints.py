@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from examples.papers.comparing import table
 from examples.papers.misprints import (
-    MENDS,
+    CORRECTIONS,
     MISPRINTS,
     A,
     B,
@@ -36,7 +36,7 @@ IN_THE_TEXT = {
     "Y_p2": "off by 172 mm",
     "Y_T3": "off by 595 mm",
     "second combined equation": "residual of 542 mm",
-    "the same, its third misprint alone": "without the last correction 378 mm",
+    "second combined equation, third misprint alone": "without the last correction 378 mm",
     "Y′_T1": "off by 113 mm",
     "Y′_T2": "off by 50 mm",
     "Z′_T2": "off by 93 mm",
@@ -76,8 +76,8 @@ def test_a_printed_formula_is_off_by_what_the_documentation_says_and_the_mended_
 
 
 def test_every_mend_of_the_closure_is_needed():
-    for missing in MENDS:
-        left = [name for name in MENDS if name != missing]
+    for missing in CORRECTIONS:
+        left = [name for name in CORRECTIONS if name != missing]
         assert max(abs(second_equation(at, *left)) for at in CASES) > 40.0, missing  # mm
     for k in (0, 2):
         assert max(abs(equations_with_2(at, k)) for at in CASES) < ROUNDING
