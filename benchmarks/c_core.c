@@ -1,4 +1,4 @@
-/* Loops around the C core and around LinuxCNC's inverse kinematics, timed in one thread; linked with an export. */
+/* Timing loops in one thread around the functions of the exported C core, with which this file is linked. */
 #define _POSIX_C_SOURCE 200809L
 
 #include <math.h>
@@ -7,7 +7,7 @@
 #include "hexapod_comp.h"
 #include "hexapod_model.h"
 
-#define BINS 4000 /* of 10 ns */
+#define BINS 4000 /* bins of 10 ns */
 
 static hc_time made(double seconds)
 {
@@ -17,7 +17,7 @@ static hc_time made(double seconds)
     return time;
 }
 
-/* Processor time of this thread, s: others on the machine do not count. */
+/* Return the processor time of this thread, s; other threads and processes are not counted. */
 static double seconds(void)
 {
     struct timespec now;

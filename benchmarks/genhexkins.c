@@ -1,5 +1,5 @@
-/* What LinuxCNC's compiled genhexkins.so needs of a HAL, so that it can be loaded without LinuxCNC, and loops
- * around its two functions, timed here so that no caller's cost counts against it.
+/* Replacement of the functions of LinuxCNC's HAL that genhexkins.so calls, so that it can be loaded without LinuxCNC;
+ * and timed loops around its two functions, so that the time of a caller in Python is not counted.
  *
  * Names and argument lists are LinuxCNC's public ones (2.9): src/hal/hal.h, src/rtapi/rtapi.h,
  * src/emc/kinematics/kinematics.h; a pose is EmcPose of src/emc/nml_intf/emcpos.h: x y z a b c u v w.

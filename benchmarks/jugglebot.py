@@ -1,7 +1,7 @@
-"""A real hexapod, judged on poses that the fit has not seen: motion-capture data of the project Jugglebot.
+"""Calibration of a real hexapod, checked on poses outside the fit: motion-capture data of the project Jugglebot.
 
-Usage: python -m benchmarks.jugglebot [--data FOLDER] [--workers 2]; see doc/benchmarks.md. The data lie in
-benchmarks/data/jugglebot, under the MIT licence. Exits 1 when a bar is missed, 2 without the data.
+Usage: python -m benchmarks.jugglebot [--data FOLDER] [--workers 2]; see doc/benchmarks.md. The data are in
+benchmarks/data/jugglebot, under the MIT licence. Exit code 1: a bar is missed; 2: the data are missing.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(__file__).parent / "data" / "jugglebot"
 FILES = ("108_calibration_poses.csv", "grid180.csv", "grid180_ff_correction.csv")
 FOLDS, SPLITS = 6, 5
-KNOWN = FitSettings(tracker_frame="known")  # the cameras were aligned with the machine; poses are judged as they are
-POSES_BAR, GRID_BAR = 1.08e-3, 0.96  # m: what an independent fit of 48 parameters reached; share of the error removed
+KNOWN = FitSettings(tracker_frame="known")  # the cameras' frame was aligned with the machine's
+POSES_BAR, GRID_BAR = 1.08e-3, 0.96  # bars: error of an independent fit of 48 parameters, m; removed share of the error
 
 
 def read(folder: Path, name: str, columns: str) -> MeasurementSet:
@@ -41,14 +41,14 @@ def read(folder: Path, name: str, columns: str) -> MeasurementSet:
 
 
 def position_squares(measured: MeasurementSet, errors: np.ndarray) -> np.ndarray:
-    """Return the squared 3-D position misfit of each station, m², under predicted errors (M, 6) of all stations."""
+    """Return the squared 3-D position residual of each station, m², with predicted errors (M, 6) of all stations."""
     position = measured.kind == KINDS.index("position")
     misfit = measured.value - (measured.directions() * errors[measured.station]).sum(axis=1)
     return np.bincount(measured.station[position], misfit[position] ** 2, len(measured.stations))
 
 
 def zeroed_without(measured: MeasurementSet, out: np.ndarray) -> MeasurementSet:
-    """Return a set whose legs are zeroed by the poses that stay in; the columns file's zeros are by all poses."""
+    """Return a set whose leg zeros are computed without the stations `out` (the columns file uses all poses)."""
     s = measured.stations
     errors = np.zeros((len(s), 6))
     for kind, first in (("position", 0), ("attitude", 3)):
@@ -62,10 +62,10 @@ def zeroed_without(measured: MeasurementSet, out: np.ndarray) -> MeasurementSet:
 
 
 def left_out(measured: MeasurementSet, out: np.ndarray, settings: FitSettings) -> np.ndarray:
-    """Fit without some stations; return their squared position misfits, m²."""
+    """Fit without the stations `out`; return the squared position residuals of these stations, m²."""
     is_out = np.isin(measured.station, out)
     fit = fit_model(measured.select(~is_out), settings)
-    # Everything that the parameters' meaning hangs on (knots, box) comes from the stations that were fitted.
+    # The knots and the box that define the parameters come from the fitted stations only.
     errors = predict(fit.space, fit.solution.x, measured.stations).errors
     return position_squares(measured, errors)[out]
 
@@ -96,7 +96,7 @@ def grid(folder: Path, workers: int) -> bool:
     own = read(folder, "grid180_ff_correction.csv", "jugglebot_grid_columns.yaml")
     count = len(measured.stations)
     raw, corrected = (rms(position_squares(m, np.zeros((len(m.stations), 6)))) for m in (measured, own))
-    # Which blocks help is decided once, with all poses; leaving one out hardly changes that.
+    # The blocks are selected once, with all poses: leaving out one pose hardly changes the selection.
     whole = fit_model(measured, KNOWN)
     kept = replace(KNOWN, blocks=tuple(block.name for block in whole.space.blocks))
     left = rms(np.concatenate([*each(left_out, [(measured, np.array([n]), kept) for n in range(count)], workers)]))
@@ -110,12 +110,12 @@ def grid(folder: Path, workers: int) -> bool:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the three files")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the three data files")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: all cores)")
     args = parser.parse_args(arguments)
     missing = [name for name in FILES if not (args.data / name).is_file()]
     if missing:
-        return cannot_run(f"{args.data} has no {', '.join(missing)}; name the folder of the data by --data")
+        return cannot_run(f"{args.data} has no {', '.join(missing)}; give the folder of the data with --data")
     met = [poses(args.data, args.workers), grid(args.data, args.workers)]
     return 0 if all(met) else 1
 

@@ -1,8 +1,8 @@
-"""Inverse and forward kinematics beside what else people use: times on the same poses, batches, and convergence.
+"""Inverse and forward kinematics compared with other software: times on the same poses, batches, and convergence.
 
 Run ``python -m benchmarks.kinematics [--only times|batches|convergence]``; doc/speed.md explains the tables. MuJoCo,
-Pinocchio and LinuxCNC are optional: a peer that is not installed is reported as missing. Exits 1 when a bar is missed,
-or somebody's numbers differ from ours; 2 where convergence alone is wanted and there is no genhexkins.
+Pinocchio and LinuxCNC are optional: software that is not installed is reported as missing. Exit code 1: a bar is
+missed, or results differ from the package's; 2: only convergence was requested and genhexkins is missing.
 """
 
 from __future__ import annotations
@@ -38,46 +38,46 @@ from .genhexkins import CRITERION, MM, POSE, STRUTS, Genhexkins, NotHere, emc_po
 OURS, THEIRS = "hexapod_comp", "LinuxCNC genhexkins"
 LOOSE = f"{THEIRS}, to 1e-8 m"
 INVERSE, WIDE, NEAR = "inverse", "forward", "forward, near"  # near: within 1 mm and 1° of home, as in a control cycle
-STEP_TOLERANCE = 1e-8  # Where the core's Newton stops, m and rad: the others get the same criterion
-# Largest difference of a peer's numbers to ours, m or rotation matrix entries; and of those told to end early
+STEP_TOLERANCE = 1e-8  # Step size at which the core's Newton iteration stops, and the others' criterion, m and rad
+# Largest difference from the package's results, m or rotation matrix entries; and with genhexkins' loose criterion
 TOLERANCE, LOOSE_TOLERANCE = 1e-9, 1e-6
-# How many times faster than genhexkins ours must be, with either of its criteria
+# Bars: genhexkins' time, with either criterion, divided by the package's time
 BARS = {(INVERSE, "batch"): 4.0, (WIDE, "batch"): 4.0, (NEAR, "batch"): 4.0, (WIDE, "single"): 1.3,
         (NEAR, "single"): 1.3}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Poses:
-    """The poses that everybody gets, and the machine."""
+    """The machine, and the poses that all software solves."""
 
     structure: Structure
     home: Pose
-    positions: np.ndarray  # of the platform in base, m, shape (N, 3)
+    positions: np.ndarray  # positions of the platform in base, m, shape (N, 3)
     rotations: np.ndarray  # (N, 3, 3)
-    lengths: np.ndarray  # of the struts there, m, (N, 6)
+    lengths: np.ndarray  # strut lengths at the poses, m, (N, 6)
 
     def first(self, count: int) -> Poses:
-        """Return the same with the first `count` poses only."""
+        """Return the machine with the first `count` poses only."""
         rows = self.positions[:count], self.rotations[:count], self.lengths[:count]
         return Poses(self.structure, self.home, *rows)
 
 
 @dataclass(frozen=True)
 class Contender:
-    """Somebody who does a task: one run over `poses` poses."""
+    """One implementation of a task, run over `poses` poses."""
 
     task: str
     name: str
-    shape: str  # single: one call from Python per pose; batch
+    shape: str  # "single": one call from Python per pose; "batch": one call for all poses
     poses: int
-    # Returns what it has found, (N, 6) lengths in m or (N, 12) poses as of :func:`joined`. With `numbers` it returns
-    # nothing or, when it knows better than its caller, the time it took, s
+    # Solves the poses and returns the results: (N, 6) lengths, m, or (N, 12) poses of :func:`joined`. If `numbers` is
+    # given, `numbers` returns the results, and `run` returns nothing or the time that it measured itself, s.
     run: Callable[[], Any]
     numbers: Callable[[], np.ndarray] | None = None
 
 
 def make_poses(count: int, shift: float = 0.05, turn: float = 30.0) -> Poses:
-    """Draw poses within ±`shift` m and ±`turn` degrees of α, β, γ about home; the same ones every time."""
+    """Draw poses within ±`shift`, m, and ±`turn`, degrees of α, β, γ, about home; every call draws the same poses."""
     geometry = load_geometry("paper")
     structure, rng = Structure.of(geometry), np.random.default_rng(1)
     positions = geometry.home.position + rng.uniform(-shift, shift, (count, 3))
@@ -88,15 +88,15 @@ def make_poses(count: int, shift: float = 0.05, turn: float = 30.0) -> Poses:
 
 
 def joined(positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Return poses as (N, 12), to compare them."""
+    """Return poses as one array, (N, 12), for comparison."""
     return np.hstack([positions, np.reshape(rotations, (len(positions), 9))])
 
 
-# ---- ours: the kernel and the checked call, on one thread ----
+# ---- the package: the C function and the checked Python call, on one thread ----
 
 
 def _rows(shape: str, *arrays: np.ndarray) -> list[list[Any]]:
-    """Return what the core needs of each pose alone, or of all at once: their number, and checked places."""
+    """Return the arguments of the C function, number of poses and pointers: one list per pose, or one for a batch."""
     count = len(arrays[0])
     parts = [slice(n, n + 1) for n in range(count)] if shape == "single" else [slice(count)]
     return [
@@ -174,7 +174,7 @@ def numpy_inverse(poses: Poses, shape: str) -> Contender:
 
 
 def numpy_newton(poses: Poses, wanted: np.ndarray) -> np.ndarray:
-    """Newton for (..., 6) lengths at once, as one would write it in NumPy: unit vectors, batched solve."""
+    """Solve the poses for lengths (..., 6), m, by Newton's method in plain NumPy; return them as of :func:`joined`."""
     position = np.broadcast_to(poses.home.position, (*wanted.shape[:-1], 3)).copy()
     rotation = np.broadcast_to(poses.home.rotation, (*wanted.shape[:-1], 3, 3)).copy()
     for _ in range(30):
@@ -199,7 +199,7 @@ def numpy_forward(poses: Poses, shape: str) -> Contender:
 
 
 def scipy_forward(poses: Poses) -> Contender:
-    """MINPACK's hybrid method on position and rotation vector, Jacobian by differences: fsolve's default."""
+    """Return SciPy's fsolve (MINPACK's hybrid method, Jacobian by differences) on position and rotation vector."""
 
     def misfit(x: np.ndarray, lengths: np.ndarray) -> np.ndarray:
         rotation = Rotation.from_rotvec(x[3:]).as_matrix()
@@ -217,7 +217,7 @@ def scipy_forward(poses: Poses) -> Contender:
 
 
 def mujoco_inverse(poses: Poses) -> Contender:
-    """Struts as spatial tendons from sites on the world to a free body's; kinematics and tendon stages only."""
+    """Return MuJoCo with struts as tendons between the world and a free body; only the needed stages are run."""
     import mujoco
 
     def sites(joints: np.ndarray, body: str) -> str:
@@ -247,7 +247,7 @@ def mujoco_inverse(poses: Poses) -> Contender:
 
 
 def pinocchio_inverse(poses: Poses) -> Contender:
-    """Frame placements of the six platform joints on a free-flyer; distances to the base joints by NumPy."""
+    """Return Pinocchio with platform joints as frames of a free-flyer; NumPy computes the distances to the base."""
     import pinocchio
 
     model = pinocchio.Model()
@@ -271,7 +271,7 @@ def pinocchio_inverse(poses: Poses) -> Contender:
 
 
 def linuxcnc(module: Genhexkins, task: str, poses: Poses, shape: str, criterion: float = CRITERION) -> Contender:
-    """Batches in C loops that time themselves; single calls from Python by ctypes, all addresses resolved before."""
+    """Return genhexkins: batches in C loops that time themselves, or single calls by ctypes with prepared addresses."""
     count, home = len(poses.lengths), emc_poses(poses.home.position[None], poses.home.rotation[None])
     inverse = task == INVERSE
     given = emc_poses(poses.positions, poses.rotations) if inverse else poses.lengths / MM
@@ -283,7 +283,7 @@ def linuxcnc(module: Genhexkins, task: str, poses: Poses, shape: str, criterion:
         module.set("convergence-criterion", criterion)
         return module.inverse(given, found, codes) if inverse else module.forward(given, home, found, codes)
 
-    def one_by_one(kept: tuple = (given, flags)) -> None:  # whose addresses are used
+    def one_by_one(kept: tuple = (given, flags)) -> None:  # keeps the arrays alive whose addresses the calls use
         if inverse:
             for call in calls:
                 one(*call)
@@ -297,9 +297,9 @@ def linuxcnc(module: Genhexkins, task: str, poses: Poses, shape: str, criterion:
 
 
 def second_solve(module: Genhexkins, poses: Poses) -> Contender:
-    """Time what each call spends on a second solution, from the first, for the pins of its display.
+    """Return genhexkins' time for the second solve in each call, which starts at the first solution and sets pins.
 
-    Started at the solution, both solutions of a call need one iteration: half the time is the second one's.
+    If the call itself starts at the solution, both solves need one iteration, so the second takes half the time.
     """
     count, lengths, told = len(poses.lengths), poses.lengths / MM, emc_poses(poses.positions, poses.rotations)
     found, codes = np.empty((count, POSE)), np.empty(count, np.int32)
@@ -312,7 +312,7 @@ def second_solve(module: Genhexkins, poses: Poses) -> Contender:
 
 
 def _solved(poses: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """Return poses for comparison; those that it did not solve hold NaN."""
+    """Return genhexkins' poses as of :func:`joined`, with NaN for poses that it did not solve."""
     return np.where(codes[:, None] == 0, joined(*si_poses(np.where(codes[:, None] == 0, poses, 0.0))), np.nan)
 
 
@@ -320,7 +320,7 @@ def _solved(poses: np.ndarray, codes: np.ndarray) -> np.ndarray:
 
 
 def contenders(singles: int, many: int) -> tuple[list[Contender], list[str]]:
-    """Return everybody who takes part, and why others do not."""
+    """Return all implementations that are installed, and a text for each missing one."""
     wide, near = (make_poses(max(singles, many), *reach) for reach in ((), (1e-3, 1.0)))
     single, near_single, wide, near = wide.first(singles), near.first(singles), wide.first(many), near.first(many)
     found = [
@@ -337,7 +337,7 @@ def contenders(singles: int, many: int) -> tuple[list[Contender], list[str]]:
         *our_forward(NEAR, near, "batch")[:1],
     ]
     missing = []
-    for package, make in {"mujoco": mujoco_inverse, "pin": pinocchio_inverse}.items():  # as pip knows them
+    for package, make in {"mujoco": mujoco_inverse, "pin": pinocchio_inverse}.items():  # names of the packages on PyPI
         try:
             found.append(make(single))
         except ImportError:
@@ -356,7 +356,7 @@ def contenders(singles: int, many: int) -> tuple[list[Contender], list[str]]:
 
 
 def times(singles: int, many: int, repeats: int) -> tuple[str, list[str]]:
-    """Run everybody in turn, so that a busy second hits all alike; return a table of medians, and the bars missed."""
+    """Run all implementations in turn, so that load hits all of them; return a table of medians, and missed bars."""
 
     def timed(one: Contender) -> float:
         start = time.thread_time()
@@ -388,14 +388,14 @@ def times(singles: int, many: int, repeats: int) -> tuple[str, list[str]]:
 # ---- batches on all cores ----
 
 SIZES = (1_000, 10_000, 20_000, 100_000, 1_000_000, 10_000_000)
-DISTINCT = 20_000  # Different poses; larger batches repeat them
-SECONDS = {INVERSE: 5e-8, WIDE: 5e-7}  # A pose's time, roughly, from which the number of rounds follows
-FEWEST, MOST = 7, 201  # Rounds of a size. An odd number has a median that was measured.
-SLOWER = 1.05  # Bar: the default's time beside one thread's; that is how well equal runs repeat
+DISTINCT = 20_000  # Number of different poses; larger batches repeat them
+SECONDS = {INVERSE: 5e-8, WIDE: 5e-7}  # Approximate time per pose, s, to choose the number of rounds
+FEWEST, MOST = 7, 201  # Smallest and largest number of rounds; an odd number has a median that was measured
+SLOWER = 1.05  # Bar: time with the default number of threads over time with one thread; equal runs repeat within 5 %
 
 
 def batches(most: int = SIZES[-1], seconds: float = 4.0) -> tuple[str, list[str]]:
-    """Time both tasks on sizes up to `most`, as users call them beside one thread; return table and problems."""
+    """Time both tasks on batches of up to `most` poses, by default and with one thread; return table and problems."""
     poses, rows, problems = make_poses(DISTINCT), [], []
     for task in SECONDS:
         for count in (size for size in SIZES if size <= most):
@@ -406,7 +406,7 @@ def batches(most: int = SIZES[-1], seconds: float = 4.0) -> tuple[str, list[str]
                 call = partial(solve_poses, poses.structure, poses.lengths[which], poses.home)
             call(1)
             rounds = int(np.clip(seconds / (2.0 * count * SECONDS[task]), FEWEST, MOST)) // 2 * 2 + 1
-            spent = np.empty((rounds, 2, 2))  # of one thread and the default, by the clock and of all processors
+            spent = np.empty((rounds, 2, 2))  # (one thread, default) × (wall clock, processor time), s
             for n in range(rounds):
                 for who in (0, 1) if n % 2 else (1, 0):
                     before = time.perf_counter(), time.process_time()
@@ -422,7 +422,7 @@ def batches(most: int = SIZES[-1], seconds: float = 4.0) -> tuple[str, list[str]
     return table(columns, rows), problems
 
 
-# ---- where forward kinematics converges, and what answers are worth; each pair is ours, then genhexkins' ----
+# ---- convergence of forward kinematics, and correctness of its answers; pairs are hexapod_comp, genhexkins ----
 
 YAWS = np.array([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 55.0, 60.0, 65.0, 70.0, 75.0, 80.0, 85.0])  # degrees
 
@@ -430,8 +430,8 @@ YAWS = np.array([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 55.0, 60.0, 65.0, 70.0, 75.0
 def answers(
     module: Genhexkins, structure: Structure, lengths: np.ndarray, positions: np.ndarray, rotations: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Solve from one guess each, ours and theirs; return where success was reported, positions (m) and rotations."""
-    count, places, turns = len(lengths), positions.copy(), rotations.copy()  # ours writes its answer there
+    """Solve with both programs from one guess per pose; return for each: reported success, positions (m), rotations."""
+    count, places, turns = len(lengths), positions.copy(), rotations.copy()  # the core writes its answers here
     outcomes, iterations, conditions = np.empty(count, np.intc), np.empty(count, np.intc), np.empty(count)
     limits = structure.characteristic_length, structure.home_sign, structure.max_condition
     codes, poses = module.solved(lengths, emc_poses(positions, rotations))
@@ -444,7 +444,7 @@ def answers(
 
 
 def convergence(yaws: np.ndarray, count: int = 300) -> list[list[float]]:
-    """Return for each yaw the shares that are solved from guesses 1 mm and 1 mrad away, to 1 nm and 1e-8 rad."""
+    """Return for each yaw both programs' shares of poses solved to 1 nm and 1e-8 rad from guesses 1 mm, 1 mrad away."""
     machine, rng = make_poses(1), np.random.default_rng(4)
     structure, home = machine.structure, machine.home
     module, rows = Genhexkins(structure), []
@@ -472,9 +472,9 @@ WORTH = (
 
 
 def honesty(count: int = 20_000) -> np.ndarray:
-    """Return the counts of :data:`WORTH`, (4, 2), when the guess is far: ±200 mm and ±90° about home.
+    """Return the counts of :data:`WORTH`, (4, 2), for guesses far from the solution: within ±200 mm and ±90° of home.
 
-    By NumPy's formulas and determinant; lengths differ by more than 1 nm.
+    NumPy checks the answers: a wrong length differs by more than 1 nm; the determinant shows the assembly mode.
     """
     machine, rng = make_poses(1), np.random.default_rng(5)
     structure, home = machine.structure, machine.home
@@ -486,18 +486,18 @@ def honesty(count: int = 20_000) -> np.ndarray:
     counts = []
     for ok, found, turns in answers(Genhexkins(structure), structure, lengths, guess, turned):
         finite = np.isfinite(found).all(axis=1) & np.isfinite(turns).all(axis=(1, 2))
-        told = ok & finite
-        arms, struts = numpy_struts(structure, found[told], turns[told])
-        open_loops = np.abs(np.linalg.norm(struts, axis=2) - lengths[told]).max(axis=1) > 1e-9
+        solved = ok & finite
+        arms, struts = numpy_struts(structure, found[solved], turns[solved])
+        open_loops = np.abs(np.linalg.norm(struts, axis=2) - lengths[solved]).max(axis=1) > 1e-9
         signs = np.sign(np.linalg.det(np.concatenate([struts, np.cross(arms, struts)], axis=2)))
         counts.append([ok.sum(), (ok & ~finite).sum(), open_loops.sum(), (signs != structure.home_sign).sum()])
     return np.array(counts).T
 
 
 def traps() -> list[tuple[str, str, str]]:
-    """Return what both answer at singular poses, started there, and when an encoder reads NaN.
+    """Return the answers of both programs at singular poses, started there, and if an encoder reads NaN.
 
-    What is left in the pose given as a guess matters: LinuxCNC starts its next call from that.
+    A NaN in the returned pose matters: LinuxCNC uses the returned pose as the guess of the next call.
     """
     machine = make_poses(1)
     structure, home = machine.structure, machine.home
@@ -517,7 +517,7 @@ def traps() -> list[tuple[str, str, str]]:
 
 
 def convergences() -> tuple[str, list[str]]:
-    """Return three tables, and whether ours misses a bar."""
+    """Return three tables, and the bars that hexapod_comp misses."""
     shares, worth = convergence(YAWS), honesty()
     pair = ["hexapod_comp", "genhexkins"]
     by_who = ([name, *(f"{100.0 * row[n]:.0f} %" for row in shares)] for n, name in enumerate(pair))
@@ -537,14 +537,14 @@ def convergences() -> tuple[str, list[str]]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parts = ("times", "batches", "convergence")
-    parser.add_argument("--only", choices=parts, action="append", help="this part; may be repeated (default: all)")
-    parser.add_argument("--batch", type=int, default=20_000, help="poses in a batch (default %(default)s)")
-    parser.add_argument("--single", type=int, default=500, help="poses one by one (default %(default)s)")
-    parser.add_argument("--repeats", type=int, default=15, help="runs of everybody (default %(default)s)")
+    parser.add_argument("--only", choices=parts, action="append", help="run this part; may be repeated (default: all)")
+    parser.add_argument("--batch", type=int, default=20_000, help="number of poses in a batch (default %(default)s)")
+    parser.add_argument("--single", type=int, default=500, help="poses solved by single calls (default %(default)s)")
+    parser.add_argument("--repeats", type=int, default=15, help="runs of each implementation (default %(default)s)")
     parser.add_argument(
-        "--most", type=int, default=SIZES[-1], help="largest of the batches, 3 GB (default %(default)s)"
+        "--most", type=int, default=SIZES[-1], help="poses in the largest batch, needs 3 GB (default %(default)s)"
     )
-    parser.add_argument("--seconds", type=float, default=4.0, help="for each of the sizes, about (default %(default)s)")
+    parser.add_argument("--seconds", type=float, default=4.0, help="time per batch size, about (default %(default)s)")
     options, problems = parser.parse_args(), []
     for part in options.only or parts:
         try:

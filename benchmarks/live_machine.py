@@ -1,4 +1,4 @@
-"""A machine with hidden errors that collect moves, read by a live instrument; its drives are on a command at once."""
+"""A virtual machine for tests of ``collect``: hidden errors, ideal drives, and a live instrument that reads it."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from hexapod_comp.virtual.instruments import TRACKER, LiveInstrument
 from hexapod_comp.virtual.machine import DriveParameters
 from hexapod_comp.virtual.watched import VirtualMachine
 
-SAMPLES = 9  # Readings of which an observation is the median
+SAMPLES = 9  # Number of readings whose median is an observation
 
 
 class LiveMachine(VirtualMachine):
-    """A virtual machine without compensation; an instrument reads where its tool really is."""
+    """A virtual machine without compensation, whose true tool pose an instrument reads."""
 
     instrument: LiveInstrument
 
     def __init__(self, geometry: HexapodGeometry, truth: MachineModel, instrument: LiveInstrument) -> None:
         super().__init__(geometry, truth, parameters=DriveParameters.ideal())
         self.instrument, self.observed = instrument, 0
-        self.broken: set[int] = set()  # observations before which the beam was broken, by number
-        self.silent: set[int] = set()  # observations that read nothing
+        self.broken: set[int] = set()  # numbers of the observations before which the beam was broken
+        self.silent: set[int] = set()  # numbers of the observations at which the instrument reads nothing
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
         if self.instrument.kind == TRACKER:

@@ -1,9 +1,9 @@
-"""The compensator against a do-nothing relay: rate and latency, side by side in one run.
+"""Rate and latency of the compensator compared with a relay node that computes nothing, in one run.
 
 Usage: python -m benchmarks.loop [--bouts 8] [--rounds 6] [--seconds 0.4] [--floor]
 
-Latencies of a bout are put together. A ratio is the compensator's figure divided by the relay's of the same bout; its
-median over the bouts is printed, with the quartiles.
+In each bout the rounds of both nodes alternate. A ratio is the compensator's figure divided by the relay's figure of
+the same bout; its median and quartiles over the bouts are printed.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from hexapod_comp.ros.process import RosSession
 
 from . import judged, table
 
-# Commands per second; 0 is flat out: the next one leaves when the last was answered
+# Commands per second; 0: flat out, each command is sent when the last one was answered
 RATES = (250.0, 500.0, 1000.0, 0.0)
-BAR_RATE, BAR_MEDIAN, BAR_P99 = 0.95, 1.10, 1.25
-GIVE_UP = 0.05  # An answer that takes longer, s, is not waited for
-START_WITHIN = 180.0  # The nodes may have to compile first, s
+BAR_RATE, BAR_MEDIAN, BAR_P99 = 0.95, 1.10, 1.25  # bars of the ratios
+GIVE_UP = 0.05  # Longest wait for an answer, s
+START_WITHIN = 180.0  # Longest wait for the start of the nodes, s
 OURS, RELAY = "ours", "relay"
 QUIET = "--log-level warn -r __ns:=/"
 ALONE = "-p marker_rate:=0.0 -p start_without_feedback_after:=0.1 -p model_file:=paper_machine.yaml"  # without struts
 
 
 class Line:
-    """Commands on a circle through home to a node, and the latencies of its answers, ns."""
+    """A client of one node: it commands poses on a circle through home and records the latencies of the answers, ns."""
 
     def __init__(self, node: rclpy.node.Node, namespace: str, radius: float = 1e-3, per_turn: float = 628.0) -> None:
         self.sent: dict[int, int] = {}
@@ -75,12 +75,12 @@ class Line:
 
 @dataclass(frozen=True)
 class Row:
-    """One rate; figures are answers per second, and median and 99th percentile of the latency, µs."""
+    """Results at one rate. Figures: answers per second, median and 99th percentile of the latency, µs."""
 
     rate_hz: float
-    ours: np.ndarray  # (3,), medians over the bouts
-    relay: np.ndarray
-    ratios: np.ndarray  # (3, 3), quartiles (25, 50, 75 %) of the bouts' ratios of ours to the relay's
+    ours: np.ndarray  # (3,): the compensator's figures, medians over the bouts
+    relay: np.ndarray  # (3,): the relay's figures, medians over the bouts
+    ratios: np.ndarray  # (3, 3): quartiles (25, 50, 75 %) over the bouts of the compensator's to the relay's figures
 
     @property
     def name(self) -> str:
@@ -89,7 +89,7 @@ class Row:
 
 @contextmanager
 def process(module: str, arguments: str, **options: Any) -> Iterator[subprocess.Popen]:
-    """Run a node with arguments of ROS until the block ends."""
+    """Run a node as a process, with ROS arguments, until the block ends."""
     child = subprocess.Popen([sys.executable, "-m", module, "--ros-args", *arguments.split()], **options)
     try:
         yield child
@@ -106,7 +106,7 @@ def one_round(
     patience: float = GIVE_UP,
     each_second: Callable[[float], object] = lambda elapsed: None,
 ) -> list[int]:
-    """Send commands for some seconds; return the latencies of the answers, ns."""
+    """Send commands to a node for some seconds; return the latencies of the answers, ns."""
     line.sent.clear()
     line.latencies = []
     start = due = time.perf_counter()
@@ -132,7 +132,7 @@ def one_round(
 
 
 def bout(session: RosSession, lines: dict[str, Line], rate: float, rounds: int, seconds: float) -> list[list[float]]:
-    """Return our figures and the relay's of some rounds in turn."""
+    """Run rounds of both nodes in turn; return the figures of the compensator, then those of the relay."""
     latencies: dict[str, list[int]] = {name: [] for name in lines}
     for number in range(rounds):
         for name in sorted(lines, reverse=bool(number % 2)):
@@ -144,7 +144,7 @@ def bout(session: RosSession, lines: dict[str, Line], rate: float, rounds: int, 
 
 
 def measure(bouts: int, rounds: int, seconds: float, floor: bool = False) -> list[Row]:
-    """Run everything and return one row per rate; `floor`: against the relay that does not even look at messages."""
+    """Run all bouts and return one row per rate; `floor`: use the relay that does not deserialise messages."""
     with ExitStack() as stack:
         stack.enter_context(PrivateDomain())
         stack.enter_context(process("hexapod_comp.ros.compensator", f"{QUIET}{OURS} {ALONE}"))
@@ -183,7 +183,7 @@ def report(rows: list[Row]) -> str:
 
 
 def problems(rows: list[Row]) -> list[str]:
-    """Return the rates at which the compensator misses a bar."""
+    """Return a text for each rate at which the compensator misses a bar."""
     found = []
     for r in rows:
         rate, median, p99 = r.ratios[1]
@@ -198,7 +198,7 @@ def main() -> int:
     parser.add_argument("--bouts", type=int, default=8)
     parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--seconds", type=float, default=0.4)
-    parser.add_argument("--floor", action="store_true", help="against the relay that passes bytes; no bars")
+    parser.add_argument("--floor", action="store_true", help="compare with the relay that forwards bytes; no bars")
     args = parser.parse_args()
     rows = measure(args.bouts, args.rounds, args.seconds, args.floor)
     print(report(rows))

@@ -1,8 +1,8 @@
-"""Is a mix-up in the readings named, also on machines that the model does not know?
+"""Whether a mistake in the readings is named, also on machines with errors that no model contains.
 
 Usage: python -m benchmarks.mixed_up [--machines 4] [--first 600] [--workers 2] [--kind NAME ...]; see doc/benchmarks.md
-Only blocks are chosen and causes are sought, nothing is fitted: what is written or not follows from them. Exits 1 when
-a cause is named of readings that were taken rightly.
+Only the selection of blocks and the search for mistakes are run, without the fit. Exit code 1: a mistake was named for
+correct readings.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hexapod_comp.calibration.mistakes import FAMILIES, family_of_run
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.measurements.readings import CHANNELS, MeasurementSet
 
-# What was done to readings, by the name that it should get; empty: nothing
+# Changes of the readings by the name of the mistake that should be reported; empty name: no change
 MADE = {
     "": lambda m: m,
     "rotation_x and rotation_y: exchanged": lambda m: exchanged(m, "rotation_x", "rotation_y"),
@@ -34,7 +34,7 @@ MADE = {
 
 
 def of_family(m: MeasurementSet, family: str) -> np.ndarray:
-    """Return which readings are of a family of runs, of any if empty, shape (N,)."""
+    """Return whether each reading belongs to a family of runs, shape (N,); an empty name stands for all families."""
     return np.ones(len(m), dtype=bool) if not family else family_of_run(m)[m.run] == FAMILIES.index(family)
 
 
@@ -50,7 +50,7 @@ def reversed_sign(m: MeasurementSet, channel: str, family: str) -> MeasurementSe
 
 
 def first_named(kind: str, seed: int) -> list[str]:
-    """Return the first cause that is named of a machine's readings, for each of what was done to them."""
+    """Return the first mistake that is named for a machine's readings, for each change of the readings."""
     readings = setting(kind, seed, ("5-D", 4))[-1]
     settings = FitSettings(blocks=KNOWN, lead=LEAD)
     return [next(iter(mixed_up(change(readings), settings)), "") for change in MADE.values()]
@@ -58,7 +58,7 @@ def first_named(kind: str, seed: int) -> list[str]:
 
 def main() -> int:
     parser = drawn.options(__doc__, 4, 600, "kind")
-    parser.add_argument("--kind", action="append", choices=(*OWN, *FOREIGN), help="only this; may be repeated")
+    parser.add_argument("--kind", action="append", choices=(*OWN, *FOREIGN), help="run this kind only; may be repeated")
     args = parser.parse_args()
     causes = [found for _, done in drawn.results(first_named, args.kind or (*OWN, *FOREIGN), args) for found in done]
     table = drawn.Table(["made", "machines", "named", "another named"])

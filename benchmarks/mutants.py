@@ -1,9 +1,9 @@
-"""How much the tests see: mutants of the package, each changed in one place, and whether a test fails.
+"""Mutation testing: the package is changed in one place at a time, and the tests must fail.
 
     python -m benchmarks.mutants [--count 300] [--seed 0] [--jobs 2] [--rooms ROOM ...] [--only N [N ...]]
 
-The tests are those that pass the line, by the coverage recorded in a run of all tests, the most specific ones first; of
-a line that none passes in its own process, those of the room. ``--only`` repeats mutants by their numbers.
+The tests that execute the changed line, by a recorded run of all tests, are run, the most specific first; without such
+tests, those of the line's room (a folder of the package). ``--only`` repeats mutants by their numbers.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from queue import SimpleQueue
 
-# What all tests import, loaded once: each mutant has a fork of this process.
+# Libraries of all tests are imported once here: each mutant is tested in a fork of this process.
 import hypothesis  # noqa: F401
 import pytest
 import scipy.optimize
@@ -36,19 +36,19 @@ from coverage import CoverageData
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "hexapod_comp"
 FOLDER = ROOT / "out" / "mutants"
-# Files and folders of what is judged by eye, or not ours
+# Files and folders that are not mutated: pictures and pages, which people check, and foreign code
 NOT_DRAWN = {"pictures.py", "page.py", "shell_page.py", "__main__.py", "stable_abi"}
-# Where a room's tests are whose lines no test passes in its own process: they are C, or nodes and commands run them
+# Tests of rooms whose lines no test executes in its own process: C code, nodes and commands
 TESTS = {
     "core": ["core", "machine", "compensation", "export", "workspace"],
     "ros": ["ros", "loop"],
     "cli": ["cli", "test_doc_commands.py"],
 }
 
-LONGEST = 120  # Time of a test with a mutant that waits, s
-BAR = 0.95
-LIMIT = 20.0  # Processor time of a test with a mutant, s
-FAILURES = ("FAILED", "ERROR")  # How the lines of pytest's summary begin that name a test
+LONGEST = 120  # Longest wall clock time of a test with a mutant, s
+BAR = 0.95  # share of mutants that must be killed
+LIMIT = 20.0  # Longest processor time of a test with a mutant, s
+FAILURES = ("FAILED", "ERROR")  # First words of the lines of pytest's summary that name a failed test
 
 SWAPS: dict[type, tuple[type, ...]] = {
     ast.Lt: (ast.LtE, ast.Gt), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.Lt), ast.GtE: (ast.Gt, ast.Lt),
@@ -58,15 +58,15 @@ SWAPS: dict[type, tuple[type, ...]] = {
     ast.BitAnd: (ast.BitOr,), ast.BitOr: (ast.BitAnd,), ast.USub: (ast.UAdd,),
 }  # fmt: skip
 
-Mutant = tuple[ast.AST, str, object]  # A node, the name of one of its fields, and what the field holds in the mutant
-CMutant = tuple[int, int, str]  # Beginning and end of what is replaced in a C file, and by what
+Mutant = tuple[ast.AST, str, object]  # A node, the name of one of its fields, and the field's value in the mutant
+CMutant = tuple[int, int, str]  # Start and end of the replaced text in a C file, and the new text
 
 C_SWAPS = {
     "<": ("<=", ">"), "<=": ("<", ">"), ">": (">=", "<"), ">=": (">", "<"), "==": ("!=",), "!=": ("==",),
     "&&": ("||",), "||": ("&&",), "+": ("-",), "-": ("+",), "*": ("/",), "/": ("*",), "+=": ("-=",), "-=": ("+=",),
 }  # fmt: skip
 
-# What changes in C: operators between spaces, numbers, and assignments on a line of their own
+# Changed places in C: operators between spaces, numbers, and assignments that fill a line
 C_PLACES = re.compile(
     r"(?<= )(?P<operator><=?|>=?|[=!]=|&&|\|\||[-+]=?|[*/])(?= )"
     r"|(?<![\w.\]])(?P<number>\d+\.\d+(?:e[-+]?\d+)?|\d+)(?![\w.])"
@@ -76,10 +76,10 @@ C_PLACES = re.compile(
 
 
 def c_mutants(text: str) -> Iterator[CMutant]:
-    """Yield all mutants of a C file; comments, texts, and lines of the preprocessor have none."""
+    """Yield all mutants of a C file; comments, string literals and preprocessor lines are not changed."""
     hidden = re.compile(r"/\*.*?\*/|//[^\n]*|\"(?:\\.|[^\"\n])*\"|^#(?:[^\n]*\\\n)*[^\n]*", re.DOTALL | re.MULTILINE)
     code = hidden.sub(lambda found: re.sub(r"[^\n]", "_", found[0]), text)
-    begin = code.find("{")  # before the first body stand declarations
+    begin = code.find("{")  # text before the first function body holds declarations only
     for found in C_PLACES.finditer(code, max(begin, 0)):
         kind = found.lastgroup or ""
         if kind == "statement":
@@ -92,7 +92,7 @@ def c_mutants(text: str) -> Iterator[CMutant]:
 
 
 def mutants(node: ast.AST) -> Iterator[Mutant]:
-    """Yield all mutants of a node and of what is in it; types, decorators and texts have none."""
+    """Yield all mutants of a node and of its child nodes; types, decorators and string literals are not changed."""
     if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
         return
     yield from changes(node)
@@ -104,7 +104,7 @@ def mutants(node: ast.AST) -> Iterator[Mutant]:
 
 
 def changes(node: ast.AST) -> Iterator[Mutant]:
-    """Yield the mutants that change one field of this very node."""
+    """Yield the mutants that change one field of this node, without its child nodes."""
     for swapped in SWAPS.get(type(getattr(node, "op", None)), ()):
         yield node, "op", swapped()
     if isinstance(node, ast.Compare):
@@ -123,14 +123,14 @@ def changes(node: ast.AST) -> Iterator[Mutant]:
         statements = getattr(node, field, None)
         for i, line in enumerate(statements if isinstance(statements, list) else ()):
             documents = isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant)
-            # Without a first `name = …` all would fail.
+            # An assignment to a name is not removed: every test would fail.
             local = isinstance(line, ast.Assign) and all(isinstance(target, ast.Name) for target in line.targets)
             if isinstance(line, ast.Expr | ast.Assign | ast.AugAssign | ast.Raise) and not documents and not local:
                 yield node, field, [*statements[:i], ast.copy_location(ast.Pass(), line), *statements[i + 1 :]]
 
 
 def describe(path: Path, mutant: Mutant | CMutant) -> str:
-    """Return file, line, what stands there, and what changes."""
+    """Return a text with file, line number, source line and change of a mutant."""
     if isinstance(mutant[0], int):
         text = path.read_text(encoding="utf-8")
         begin, end, new = mutant
@@ -152,7 +152,7 @@ def describe(path: Path, mutant: Mutant | CMutant) -> str:
 
 
 class ProcessorTime:
-    """Ends tests that take too long, by the processor's clock: others may be busy."""
+    """A pytest plugin that fails a test whose processor time exceeds a limit, s."""
 
     def __init__(self, limit: float) -> None:
         self.limit = limit
@@ -163,7 +163,7 @@ class ProcessorTime:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self) -> Iterator[None]:
-        """Let a test and its fixtures take so long."""
+        """Limit the processor time of a test with its fixtures."""
         signal.setitimer(signal.ITIMER_PROF, self.limit)
         try:
             return (yield)
@@ -172,7 +172,7 @@ class ProcessorTime:
 
 
 class Coverage:
-    """Which tests pass which lines of the package: recorded in a run of all tests, anew when a file has changed."""
+    """The tests that execute each line of the package, recorded in a run of all tests after a file has changed."""
 
     def __init__(self) -> None:
         recorded = FOLDER / "coverage"
@@ -181,7 +181,7 @@ class Coverage:
             recorded.unlink(missing_ok=True)
             command = ["pytest", "-q", "-n2", "--dist=loadfile", "--ignore=test/packaging", "--cov=hexapod_comp"]
             own = {"COVERAGE_FILE": str(recorded), "OPENBLAS_NUM_THREADS": "1"}
-            print("recording which tests pass which lines, minutes", flush=True)
+            print("recording which tests execute which lines; this takes minutes", flush=True)
             subprocess.run([sys.executable, "-m", *command, "--cov-context=test", "--cov-report="],
                            cwd=ROOT, env=os.environ | own, check=True, stdout=subprocess.DEVNULL)  # fmt: skip
         data = CoverageData(str(recorded))
@@ -196,7 +196,7 @@ class Coverage:
         self.passed = Counter(test for lines in self.tests.values() for tests in lines.values() for test in tests)
 
     def of(self, path: Path, first: int, last: int) -> list[str]:
-        """Return the tests that pass these lines, the most specific first, those of a file together."""
+        """Return the tests that execute lines `first` to `last`, the most specific first, grouped by test file."""
         lines = self.tests.get(str(path), {})
         found = set[str]().union(*(lines.get(line, ()) for line in range(first, last + 1)))
         by_file: dict[str, list[str]] = {}
@@ -206,7 +206,7 @@ class Coverage:
 
 
 class Copy:
-    """A copy of sources and tests with one mutant at a time."""
+    """A copy of the sources and the tests, in which one mutant at a time is tested."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -218,9 +218,9 @@ class Copy:
                 shutil.copy2(path, folder)
 
     def failure(self, tests: list[str]) -> str:
-        """Return what failed first, or "" where nothing does."""
+        """Return the first failure of the tests; "" if all tests pass."""
         arguments = ["-q", "-x", "--tb=no", "-p", "no:cacheprovider", "-o", f"timeout={LONGEST}", *tests]
-        # In a process of its own, which has the libraries but nothing of the project.
+        # In a forked process, which has the libraries imported but no module of the project.
         with tempfile.TemporaryFile("w+") as output:
             child = get_context("fork").Process(target=self._in_child, args=(arguments, output.fileno()))
             child.start()
@@ -242,7 +242,7 @@ class Copy:
         os._exit(int(code))
 
     def killed_by(self, path: Path, text: str, tests: list[str]) -> str:
-        """Put a mutant in its file's place, run the tests, or those of its room, and put the file back."""
+        """Write a mutant into the copy, run the tests (without any: those of its room), and restore the file."""
         place = self.folder / path.relative_to(ROOT)
         room = path.relative_to(PACKAGE).parts[0]
         known = [f"test/{one}" for one in TESTS.get(room, [room]) if (ROOT / "test" / one).exists()]
@@ -261,7 +261,7 @@ class Copy:
 
 
 def mutated(tree: ast.Module | str, mutant: Mutant | CMutant) -> str:
-    """Return the text of a mutant's file."""
+    """Return the text of the file with the mutant."""
     if isinstance(tree, str):
         begin, end, new = mutant
         return f"{tree[:begin]}{new}{tree[end:]}"  # type: ignore[index,misc]
@@ -275,7 +275,7 @@ def mutated(tree: ast.Module | str, mutant: Mutant | CMutant) -> str:
 
 
 def lines_of(tree: ast.Module | str, mutant: Mutant | CMutant) -> tuple[int, int]:
-    """Return the first and last line of the statement that a mutant changes; of C, which is not recorded, none."""
+    """Return the first and last line of the statement that a mutant changes; 0, 0 for C, which is not recorded."""
     if isinstance(tree, str):
         return 0, 0
     node, field, value = mutant
@@ -290,13 +290,13 @@ def lines_of(tree: ast.Module | str, mutant: Mutant | CMutant) -> tuple[int, int
 
 
 def main() -> int:
-    """Draw mutants, try them and say which survive."""
+    """Draw mutants, test them and print the killed and the surviving ones."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=300, metavar="N", help="how many mutants (default 300)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the draw (default 0)")
+    parser.add_argument("--count", type=int, default=300, metavar="N", help="number of mutants (default 300)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random choice (default 0)")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (default 2)")
-    parser.add_argument("--rooms", nargs="+", metavar="ROOM", help="of these rooms alone, as ros, cli or core")
-    parser.add_argument("--only", type=int, nargs="+", metavar="N", help="only the mutants of these numbers")
+    parser.add_argument("--rooms", nargs="+", metavar="ROOM", help="mutate these rooms only, as ros, cli or core")
+    parser.add_argument("--only", type=int, nargs="+", metavar="N", help="test only the mutants with these numbers")
     args = parser.parse_args()
     files = [path for path in sorted(PACKAGE.rglob("*.[cp]*")) if path.suffix in (".c", ".py")]
     files = [path for path in files if not NOT_DRAWN & set(path.relative_to(PACKAGE).parts)]

@@ -1,7 +1,7 @@
-"""Compensator and drive on two hosts: network namespaces, and a cable that is cut, loses frames or delays them.
+"""Compensator and drive on two simulated hosts (network namespaces) whose cable is cut, loses frames or delays them.
 
 Usage: python -m benchmarks.network [--rounds 3] [--seconds 5] [--seed 0] [--only cut,loss,delay,long_cut]; see
-doc/faults.md. Exits 2, with the reason, where namespaces are not permitted.
+doc/faults.md. Exit code 2, with the reason: network namespaces are not permitted here.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from .faults.kinds import Fault
 from .faults.record import Happened
 from .faults.rig import Rig
 
-# Set where this program runs again, in a namespace of its own: to ``cable``, or to the descriptor for orders
+# Variable for child processes of this program in a namespace: ``cable``, or the socket's descriptor for cable commands
 INSIDE = "HEXAPOD_COMP_NETWORK_BENCHMARK"
-OWN_NETWORK = ("unshare", "--map-root-user", "--net")  # A network namespace, in which we are root and may set it up
-APPEARS_WITHIN = 5.0  # A namespace that is not there after this long, s, will not be
-ALL_PROTOCOLS, OUTGOING, LONGEST_FRAME = 3, 4, 65_536  # ETH_P_ALL and PACKET_OUTGOING, our own frames, of Linux
+OWN_NETWORK = ("unshare", "--map-root-user", "--net")  # runs a command as root of a new network namespace
+APPEARS_WITHIN = 5.0  # Longest wait for a new namespace, s
+ALL_PROTOCOLS, OUTGOING, LONGEST_FRAME = 3, 4, 65_536  # Linux's ETH_P_ALL and PACKET_OUTGOING (own frames); bytes
 IPV4, UDP = 0x0800, 17
 
 
@@ -42,9 +42,9 @@ IPV4, UDP = 0x0800, 17
 
 
 class Cable:
-    """Carries frames between two interfaces of this network namespace.
+    """A cable: it forwards frames between two interfaces of this network namespace.
 
-    It obeys lines on a socket: ``delay SECONDS``, ``loss SHARE``, ``cut`` (all is lost) and ``mend``.
+    Lines on a socket change it: ``delay SECONDS``, ``loss SHARE``, ``cut`` (all frames are lost) and ``mend``.
     """
 
     def __init__(self, names: tuple[str, str], orders: socket.socket, seed: int) -> None:
@@ -59,7 +59,7 @@ class Cable:
         self.carried = self.lost = 0
 
     def run(self) -> None:
-        """Carry until whoever gives the orders hangs up."""
+        """Forward frames until the other end of the socket for commands is closed."""
         while True:
             wait = max(0.0, self._on_the_way[0][0] - time.monotonic()) if self._on_the_way else 1.0
             ready, _, _ = select.select([*self._ends, self._orders], [], [], wait)
@@ -95,9 +95,9 @@ class Cable:
 
 
 def without_udp_checksum(frame: bytes) -> bytes:
-    """Return a frame whose UDP checksum, if it has one, says that there is none.
+    """Return a frame whose UDP checksum, if it has one, is replaced by 0 (no checksum).
 
-    A virtual Ethernet leaves it to a hardware that is not there, so what we take off it is not valid yet.
+    A virtual Ethernet leaves the checksum to the hardware, which does not exist; so the checksum is not valid.
     """
     if len(frame) < 42 or struct.unpack_from("!H", frame, 12)[0] != IPV4 or frame[23] != UDP:
         return frame
@@ -110,7 +110,7 @@ def without_udp_checksum(frame: bytes) -> bytes:
 
 
 def refusal() -> str:
-    """Return why there cannot be network namespaces with virtual Ethernet here, or nothing if there can."""
+    """Return the reason why network namespaces with virtual Ethernet are impossible here; "" if they are possible."""
     script = "ip link add he0 type veth peer name hw0 && ip link set lo up"
     try:
         done = subprocess.run([*OWN_NETWORK, "sh", "-c", script], capture_output=True, text=True, check=False)
@@ -120,9 +120,9 @@ def refusal() -> str:
 
 
 def make_host(number: int) -> subprocess.Popen:
-    """Make a host with address 10.99.0.NUMBER in a namespace of ours; return a process that does nothing but keep it.
+    """Make a host with address 10.99.0.NUMBER in a new namespace; return the idle process that keeps the namespace.
 
-    The cable's end of its Ethernet is hwNUMBER.
+    The cable's end of its virtual Ethernet is the interface hwNUMBER.
     """
     holder = subprocess.Popen(["unshare", "--net", "sleep", "infinity"])
     give_up = time.monotonic() + APPEARS_WITHIN
@@ -147,7 +147,7 @@ def make_host(number: int) -> subprocess.Popen:
 
 
 def entering(host: subprocess.Popen) -> list[str]:
-    """Return the words before a command that make it run on a host."""
+    """Return the words to be put before a command so that it runs on a host."""
     return ["nsenter", f"--target={host.pid}", "--net", "--"]
 
 
@@ -161,15 +161,15 @@ def on_cable(order: str, fault: Fault, rig: Rig, happened: Happened) -> Iterator
 
 
 CABLE: list[socket.socket] = []
-# Cut for a second; one frame in twenty is lost; all take 50 ms; cut for so long that both sides forget each other. The
-# others last as long as is asked for, s.
+# Command of the cable and duration, s (0: --seconds): cut for 1 s; 5 % of the frames lost; delay of 50 ms; and a cut of
+# 13 s, after which both sides have dropped each other
 ORDERS = {"cut": ("cut", 1.0), "loss": ("loss 0.05", 0.0), "delay": ("delay 0.05", 0.0), "long_cut": ("cut", 13.0)}
 silent = partial(judge.silence, "feedback")
 judge.VISIBLE.update(cut=silent, long_cut=silent, loss=judge.nothing, delay=judge.nothing)
 
 
 def harness(args: argparse.Namespace, descriptor: int) -> int:
-    """Run the episodes, on the compensator's host; the drive's is entered with the words in the environment."""
+    """Run the episodes on the compensator's host; args.far holds the words that run a command on the drive's host."""
     cable = socket.socket(fileno=descriptor)
     CABLE.append(cable)
     os.environ.update(ROS_DOMAIN_ID="1", ROS_AUTOMATIC_DISCOVERY_RANGE="SUBNET")
@@ -195,7 +195,7 @@ def harness(args: argparse.Namespace, descriptor: int) -> int:
 
 
 def between_hosts(args: argparse.Namespace) -> int:
-    """Make the two hosts, run the harness on one of them, and carry frames until it ends."""
+    """Make two hosts, run the harness on the first host, and forward frames until the harness ends."""
     hosts = [make_host(number) for number in (1, 2)]
     ours, theirs = socket.socketpair()
     near, far = map(entering, hosts)
@@ -217,9 +217,9 @@ def between_hosts(args: argparse.Namespace) -> int:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=5.0, help="of loss and delay")
+    parser.add_argument("--seconds", type=float, default=5.0, help="duration of loss and delay, s")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default=",".join(ORDERS), help="kinds, with commas between")
+    parser.add_argument("--only", default=",".join(ORDERS), help="kinds of episode, separated by commas")
     parser.add_argument("--far", default="", help=argparse.SUPPRESS)
     args = parser.parse_args()
     role = os.environ.get(INSIDE, "")
@@ -228,7 +228,7 @@ def main() -> int:
     if role:
         return harness(args, int(role))
     if why_not := refusal():
-        return cannot_run(f"no network namespaces here: {why_not}")
+        return cannot_run(f"network namespaces are not possible here: {why_not}")
     command = [*OWN_NETWORK, sys.executable, "-m", "benchmarks.network", *sys.argv[1:]]
     return subprocess.run(command, env={**os.environ, INSIDE: "cable"}, check=False).returncode
 
