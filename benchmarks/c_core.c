@@ -41,7 +41,7 @@ static void begin(hc_state *state, const double *warm)
     }
 }
 
-/* Command `count` poses `rounds` times over, there and back; return the time, s, or -1 after a refusal. */
+/* Compute commands for `count` poses, `rounds` times; return the processor time, s, or -1 if a command was refused. */
 double commands_many(long count, long rounds, const double *poses, const double *warm)
 {
     hc_state state;
@@ -60,7 +60,7 @@ double commands_many(long count, long rounds, const double *poses, const double 
     return seconds() - begun;
 }
 
-/* Estimate as many poses from the struts of the last command, warm; return the time, s, or -1 after a refusal. */
+/* Compute a warm estimate from each command's struts; return the processor time, s, or -1 if a command was refused. */
 double estimates_many(long count, long rounds, const double *poses, const double *warm)
 {
     hc_state state;
@@ -82,7 +82,7 @@ double estimates_many(long count, long rounds, const double *poses, const double
     return spent;
 }
 
-/* What looking at the clock takes, s. */
+/* Return the time of one reading of the clock, s. */
 double clock_cost(long count)
 {
     const double begun = seconds();
@@ -94,7 +94,7 @@ double clock_cost(long count)
     return (last - begun) / (double)count;
 }
 
-/* Time every command by the clock on the wall, into bins of 10 ns; return the largest, s. */
+/* Measure the wall clock time of every command, count it in bins of 10 ns, and return the largest time, s. */
 double each_command(long count, long rounds, const double *poses, const double *warm, long *bins)
 {
     hc_state state;

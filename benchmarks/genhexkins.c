@@ -59,7 +59,7 @@ void *hal_malloc(long size) { return calloc(1, size); }
 void rtapi_print(const char *form, ...) {}
 void rtapi_print_msg(int level, const char *form, ...) {}
 
-/* Return where a pin's value is, or NULL. */
+/* Return the address of a pin's value, or NULL if there is no such pin. */
 void *pin_value(const char *name)
 {
     for (int i = 0; i < pin_count; i++)
@@ -68,7 +68,7 @@ void *pin_value(const char *name)
     return NULL;
 }
 
-/* Processor time of this thread: others on the machine do not count. */
+/* Return the processor time of this thread, s; other threads and processes are not counted. */
 static double seconds(void)
 {
     struct timespec now;
@@ -78,7 +78,7 @@ static double seconds(void)
 
 typedef int kinematics(const double *, double *, unsigned long *, unsigned long *);
 
-/* Solve `count` rows of joints from one guess or, when `step` is 9, from one each; return the time it took, s. */
+/* Solve `count` rows of joints from one guess or, if `step` is 9, from one guess per row; return the time, s. */
 double forward_many(kinematics *solve, long count, const double *joints, const double *guess, long step,
                     double *poses, int *codes)
 {
@@ -91,7 +91,7 @@ double forward_many(kinematics *solve, long count, const double *joints, const d
     return seconds() - begun;
 }
 
-/* Work out the joints of `count` poses; return the time it took, s. */
+/* Compute the joints of `count` poses; return the time, s. */
 double inverse_many(kinematics *solve, long count, const double *poses, double *joints, int *codes)
 {
     unsigned long forward = 0, inverse = 0;

@@ -1,6 +1,6 @@
-"""What proposed campaigns are worth: twenty goals on five machines, beside ``campaign_full`` evenly thinned.
+"""Accuracy of proposed campaigns: twenty goals on five machines, compared with an evenly thinned ``campaign_full``.
 
-Usage: python -m benchmarks.plan [--goals 20] [--no-fits]; see doc/benchmarks.md. Exits 1 when a bar is missed.
+Usage: python -m benchmarks.plan [--goals 20] [--no-fits]; see doc/benchmarks.md. Exit code 1: a bar is missed.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.virtual.instruments import measure
 
 LEAD = 0.01
-DEGREE = 4  # Of the field, which keeps twenty fits short
-TILT = np.radians(5.0)  # All five machines tilt so far in most of their box
+DEGREE = 4  # Degree of the field's polynomials: a low degree keeps twenty fits short
+TILT = np.radians(5.0)  # Tilt of the tool, rad, which all five machines reach in most of their box
 NAMES = ("paper", "framed", "hanging", "inches", "mirror")
 
-# Instruments, tilt, goal and readings; the last is more than anybody gets with so many
+# Instruments, tilt, rad, goal, m, and number of readings; the last goal is out of reach with its number of readings
 GOALS = (
     ("linear", 0.0, 3e-6, 400),
     ("5-D", 0.0, 2.5e-6, 600),
@@ -44,30 +44,30 @@ GOALS = (
 )
 
 COUNTED = {"linear": Times(0.0, 0.0, 1.0), "5-D": Times(0.0, 0.0, 5.0), "6-D": Times(0.0, 0.0, 6.0)}
-# A reading counts a second, and nothing else takes any time: plans and what they are compared with pay the same
+# A reading takes 1 s, all else takes no time: a plan and the thinned campaign are compared at equal numbers of readings
 COUNTED["tracker_6d"] = COUNTED["6-D"]
-# Bars: less expected error than thinned on the mean; seconds of a plan; achieved over expected, root mean
-# square over all goals; share of machines within the 95 % intervals, of the plan and of the fit
+# Bars: mean reduction of the expected error relative to the thinned campaign; time of a plan, s; achieved over expected
+# error, RMS over all goals; share of machines within the 95 % intervals of the plan and of the fit
 LESS, SECONDS, RATIO, INSIDE = 0.20, 30.0, (0.8, 1.25), 0.9
-DRAWS = 1000
+DRAWS = 1000  # number of machines that are drawn for a plan's 95 % interval
 
 
 @dataclass(frozen=True)
 class Row:
-    """One goal; errors in µm, RMS, of the worse of level and tilted."""
+    """Result of one goal. Errors are RMS, µm, of the level or the tilted tool, whichever is larger."""
 
     goal: Goal
     plan: Proposal
     seconds: float
     expected: float
     thinned: float
-    interval: tuple[float, float]  # of 95 %, by the plan
-    achieved: float | None = None
-    promised: tuple[float, float] | None = None  # by the fit
+    interval: tuple[float, float]  # 95 % interval of the error by the plan
+    achieved: float | None = None  # real error with the fitted model
+    promised: tuple[float, float] | None = None  # 95 % interval of the error by the fit
 
 
 def thinned(geometry: HexapodGeometry, goal: Goal, plan: Proposal) -> float:
-    """Return the expected error of campaign_full with the goal's instruments and no fewer readings, m."""
+    """Return the expected error, m, of a thinned campaign_full with the plan's instruments and as many readings."""
     lasers = [name for name in goal.instruments if not name.startswith("tracker")]
     cell = float(np.ptp(plan.campaign.box, axis=0).max()) / 4.0
     side = float(np.ptp(plan.campaign.box, axis=0).min())
@@ -94,7 +94,7 @@ def thinned(geometry: HexapodGeometry, goal: Goal, plan: Proposal) -> float:
 
 
 def _kept(every: MeasurementSet, number: np.ndarray, readings: int) -> MeasurementSet:
-    """Return every n-th station or run, evenly, with no fewer readings than wanted where there are so many."""
+    """Return evenly chosen stations or runs (`number` of each reading) that have at least `readings` readings."""
     distinct = np.unique(number)
     sizes = np.bincount(number)
     for count in range(1, len(distinct) + 1):
@@ -106,7 +106,7 @@ def _kept(every: MeasurementSet, number: np.ndarray, readings: int) -> Measureme
 
 
 def drawn(space: ParameterSpace, seed: int) -> MachineModel:
-    """Return a machine drawn from the prior; no nut leads its screw, so backlash has no sign."""
+    """Return a machine drawn from the prior, with positive backlash: a nut cannot lead its screw."""
     rng = np.random.default_rng(seed)
     x = space.physical(space.spread(space.start_tolerances()) * rng.standard_normal(space.size))
     block = space.block("backlash")
@@ -116,7 +116,7 @@ def drawn(space: ParameterSpace, seed: int) -> MachineModel:
 
 
 def achieved(campaign: Campaign, plan: Proposal, settings: FitSettings, seed: int) -> tuple[float, tuple[float, float]]:
-    """Return the error that a drawn machine has with the model fitted to its readings, and what the fit promises, m."""
+    """Return the error of a drawn machine with the model fitted to its readings, and the interval by the fit, m."""
     space = plan.space
     truth = RealMachine(space.geometry, drawn(space, seed))
     fit = fit_model(measure(template(campaign, space.geometry), campaign, truth, seed), settings)
@@ -137,7 +137,7 @@ def achieved(campaign: Campaign, plan: Proposal, settings: FitSettings, seed: in
 
 
 def between(plan: Proposal, campaign: Campaign) -> tuple[float, float]:
-    """Return between what the error lies with 95 % by the machines that the plan leaves possible, m."""
+    """Return the 95 % interval of the error, m, over machines drawn from the posterior that the plan predicts."""
     aim = Aim(plan.space, plan.goal)
     rows = np.concatenate(seen_by(plan.space, campaign, template(campaign, plan.space.geometry)))
     root = np.linalg.cholesky(np.linalg.inv(np.eye(plan.space.size) + rows.T @ rows))
@@ -192,7 +192,7 @@ def cells(row: Row) -> list[object]:
 
 
 def missed(rows: list[Row]) -> list[str]:
-    """Print what comes of all goals; return the bars that are missed."""
+    """Print the summary of all goals; return a text for each missed bar."""
     ratios = np.array([row.expected / row.thinned for row in rows])
     less, slow = 1.0 - float(np.exp(np.log(ratios).mean())), max(row.seconds for row in rows)
     print(f"less expected error than thinned: {less:.0%} on the mean, {1.0 - ratios.max():.0%} at least")
@@ -221,8 +221,8 @@ def missed(rows: list[Row]) -> list[str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--goals", type=int, default=20, help="how many, machine by machine (default 20)")
-    parser.add_argument("--no-fits", action="store_true", help="expected errors only")
+    parser.add_argument("--goals", type=int, default=20, help="number of goals (default 20)")
+    parser.add_argument("--no-fits", action="store_true", help="compute expected errors only, without fits")
     args = parser.parse_args()
     rows, table = list[Row](), Table(COLUMNS, texts=6)
     for name, number in [(name, number) for name in NAMES for number in range(len(GOALS))][: args.goals]:

@@ -1,10 +1,10 @@
-"""Machines that bend, with MuJoCo as the hidden truth: calibrated under one load, told others, or not told.
+"""Machines that deform, simulated in MuJoCo: calibrated under one load, used under other loads, stated or not.
 
 Usage: python -m benchmarks.plants [--machines 5] [--first 300] [--workers 2] [--off 0.1] [--case NAME ...]
                                    [--alike 0 0.5 0.75 0.95]
 
-Plants, fits and bars: doc/benchmarks.md. With ``--alike``: the readings with the spindle alone, fitted with other
-correlations of the six struts' stiffnesses, clearances, and frictions than the assumed one. Exits 2 without MuJoCo.
+Plants, fits and bars: doc/benchmarks.md. ``--alike`` fits the readings under the spindle's load with other correlations
+of the six struts' stiffnesses, clearances and frictions than the assumed one. Exit code 2: MuJoCo is missing.
 """
 
 from __future__ import annotations
@@ -44,53 +44,53 @@ KINDS = ("compliance", "clearance", "clearance and friction")
 INSTRUMENTS = ("5-D", "tracker")
 STATED, REFINED = "stated", "refined"
 CASES = tuple((kind, instrument) for kind in KINDS for instrument in INSTRUMENTS)
-# Of screws under weight the flanks in contact are chosen by the force, which the clearance is, not by the motion
+# No backlash by direction: under weight the force, not the motion, selects the screw's flank; this is the clearance
 ERRORS = replace(SMALL, joint=20e-6, strut_offset=20e-6, backlash=(0.0, 0.0))
 SPINDLE = Payload(10.0, (0.01, 0.0, 0.08))
 OTHERS = {"5 kg less": Payload(5.0, (0.0, 0.0, 0.06)), "10 kg more": Payload(20.0, (0.01, 0.0, 0.1))}
 MASS, STRUT_MASS = 20.0, 1.0
-# Lowest and highest of a strut, N/m; standard deviation of one beside another; a joint's beside the strut's
+# Range of a strut's stiffness, N/m; relative standard deviation between struts; a joint's stiffness over the strut's
 STIFFNESS, UNLIKE, JOINTS = (20e6, 60e6), 0.05, 10.0
-CLEARANCE, FRICTION = (1e-6, 6e-6), (0.2, 1.0)  # of six struts, m; of the bearings of a strut, N·m
+CLEARANCE, FRICTION = (1e-6, 6e-6), (0.2, 1.0)  # ranges of a strut's clearance, m, and bearing friction, N·m
 ELEVATIONS = np.radians([20.0, 50.0, 90.0])
-# Gravity at these, in base, m/s²
+# Gravity in base at these elevations, m/s²
 TURNED = [tuple(STANDARD_GRAVITY * np.array([0.6 * np.cos(e), 0.8 * np.cos(e), -np.sin(e)])) for e in ELEVATIONS]
 POSES, TILT, POINTS, CHECK = 600, np.radians(5.0), 50, 24
-AVERAGED = {"position": 3e-6}  # deviation of a tracker's position that stands near and averages for a second, m
-REMOVED, ELEVATED, KEPT, TIMES, NAMES = 0.97, 0.95, 0.93, 1.3, 0.90
+AVERAGED = {"position": 3e-6}  # standard deviation of a near tracker's position, averaged over one second, m
+REMOVED, ELEVATED, KEPT, TIMES, NAMES = 0.97, 0.95, 0.93, 1.3, 0.90  # bars, see row_of
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """What came of one way to fit; lengths in m."""
+    """Result of one kind of fit; errors in m."""
 
-    left: float  # at the load of the readings
-    high: float
-    told: dict[str, float]  # left with other payloads, told
-    untold: dict[str, float]  # and not told
-    elevated: float  # left at other elevations, told; RMS over all
-    others: list[bool]  # whether each of these told cases keeps the promise that the fit makes for it
-    refused: str
+    left: float  # error at the load of the readings
+    high: float  # upper end of the promised interval at the load of the readings
+    told: dict[str, float]  # error with other payloads that are stated to the model
+    untold: dict[str, float]  # error with other payloads that are not stated
+    elevated: float  # error at other elevations that are stated; RMS over all elevations
+    others: list[bool]  # whether the error at each stated load is within the interval that the fit promises
+    refused: str  # reason for a refusal of the fit; empty: none
 
 
 @dataclass(frozen=True)
 class Plant:
-    """One plant: its error before, its fits, and what ``verify`` says of payloads that nobody told."""
+    """Results of one plant; errors in m."""
 
     seed: int
     geometry: str
-    before: float
-    before_elevated: float  # at the elevations, RMS over all
+    before: float  # error without a model
+    before_elevated: float  # error without a model at the elevations, RMS over all elevations
     fits: dict[str, Fitted]
-    said: dict[str, str]
+    said: dict[str, str]  # answers of ``verify`` for payloads that are not stated
 
 
 class Bench:
-    """A plant to measure and to judge."""
+    """A plant with its campaign: it is measured, and models of it are checked."""
 
     def __init__(self, kind: str, instrument: str, seed: int) -> None:
         (geometry, machine), self.seed = drawn.of_zoo(GEOMETRIES[seed % len(GEOMETRIES)]), seed
-        self.geometry = replace(geometry, base_axes=foot_frames(geometry)[:, :, 1])  # as of MuJoCo's cardan joints
+        self.geometry = replace(geometry, base_axes=foot_frames(geometry)[:, :, 1])  # axes of MuJoCo's cardan joints
         sides, rng = 2.0 * np.array(machine.half), np.random.default_rng([seed, 31])
         cell, step = min(sides.max() / 2.0, sides.min()), sides.max() / 10.0
         tracker = instrument == "tracker"
@@ -105,7 +105,7 @@ class Bench:
             noise=tuple(AVERAGED.get(kind, sigma) for kind, sigma in DEFAULT_UNCERTAINTY.items()),
         )
         readings = (r._replace(source=FileLine("campaign", 0)) for r in campaign_readings(self.plan))
-        # The tracker's poses are approached one from the other, and the readings say so: what rubs is seen
+        # The tracker's poses are approached one from the other, and the readings state it: so they show friction
         self.laid = assemble(self.geometry, [r._replace(direction=FROM_PREVIOUS) if tracker else r for r in readings])
         self.checked_by = ("tracker_6d",) if tracker else ("linear", "rotation")
         stiffness = np.exp(rng.uniform(*np.log(STIFFNESS))) * (1.0 + UNLIKE * rng.standard_normal(6))
@@ -121,19 +121,19 @@ class Bench:
         self.model = draw_model(self.geometry, ERRORS, seed)
 
     def stated(self, off: float) -> Load:
-        """Return what an engineer states: one stiffness for all struts, off by a share, and the weight."""
+        """Return the load that an engineer states: weight, and one stiffness for all struts with a relative error."""
         wrong = 1.0 + off * np.random.default_rng([self.seed, 32]).standard_normal()
         return Load(np.full(6, wrong * self.physics.stiffness.mean()), mass=MASS + 3.0 * STRUT_MASS)
 
     def truth(self, payload: Payload, gravity: tuple[float, ...] | None = None, told: bool = True) -> PhysicalMachine:
-        """Return the plant under a load; where nobody tells of the payload, its geometry has the readings' one."""
+        """Return the plant under a load. If the payload is not stated, the geometry has the payload of the readings."""
         physics = replace(self.physics, payload=payload, gravity=gravity or self.physics.gravity)
         return PhysicalMachine(RealMachine(self.geometry.carrying(payload if told else SPINDLE), self.model), physics)
 
     def read(
         self, payload: Payload, seed: int, laid: MeasurementSet | None = None, told: bool = True
     ) -> MeasurementSet:
-        """Return what instruments read under a payload, which the readings name where it is told."""
+        """Return the readings under a payload; they name the payload if it is stated."""
         laid = self.laid if laid is None else laid
         loads = np.tile(load_row(payload), (len(laid.stations), 1))
         read = measure(
@@ -146,16 +146,16 @@ class Bench:
     def left(
         self, model: MachineModel | None, payload: Payload, gravity: tuple[float, ...] | None = None, told: bool = True
     ) -> float:
-        """Return the error of the tool under a load that the model is told, m."""
+        """Return the error of the tool under a load, m; the model knows the load if it is stated."""
         truth, loading = self.truth(payload, gravity, told), Loading.of(gravity)
         return held_out(truth, model, self.plan.box, POINTS, self.seed, loading=loading).aligned.rms
 
     def elevated(self, model: MachineModel | None) -> list[float]:
-        """Return the error of the tool with gravity turned to the elevations, which the model is told, m."""
+        """Return the error of the tool at each elevation, m; the model knows the direction of gravity."""
         return [self.left(model, SPINDLE, gravity) for gravity in TURNED]
 
     def judged(self, fit: ModelFit, untold: bool) -> Fitted:
-        """Return what a fit leaves under all loads; where wanted also where nobody tells."""
+        """Return the errors with a fit's model under all stated loads; with `untold` also under loads not stated."""
         told, not_told = (
             {
                 name: self.left(fit.model, payload, told=tell) if tell or untold else np.nan
@@ -173,11 +173,11 @@ class Bench:
         return Fitted(self.left(fit.model, SPINDLE), high, told, not_told, rms(elevated), others, fit.misfit)
 
     def said(self, fit: ModelFit) -> dict[str, str]:
-        """Return what ``verify`` says of payloads that nobody told."""
+        """Return the answers of ``verify`` for payloads that are not stated."""
         known, answers = fit.parameters, {}
         for n, (name, payload) in enumerate(OTHERS.items()):
             read, found = list[MeasurementSet](), None
-            # An undecided check is followed by another with twice as many readings, and all are judged together
+            # After an undecided check a second one with twice as many readings is added to the first
             while not found or (found.verdict == UNDECIDED and len(read) < 2):
                 laid = propose_check(known, CHECK * (1 + len(read)), self.checked_by)
                 read.append(self.read(payload, 1000 * self.seed + n + 500 * len(read), laid, told=False))
@@ -188,12 +188,12 @@ class Bench:
 
 
 def one_plant(case: tuple[str, str], seed: int, off: float = 0.1, alike: Sequence[float] = ()) -> Plant:
-    """Measure, fit and judge one plant, by default as `STATED` and as `REFINED`."""
+    """Measure and fit one plant, by default as `STATED` and as `REFINED`, and evaluate the models."""
     bench = Bench(*case, seed)
     settings = FitSettings(lead=LEAD, load=bench.stated(off).numbers())
     readings, fits, said = bench.read(SPINDLE, seed), dict[str, Fitted](), dict[str, str]()
     for value in alike:
-        object.__setattr__(ASSUMED, "alike", value)  # this process has no other use for it
+        object.__setattr__(ASSUMED, "alike", value)  # this process does nothing else with ASSUMED
         fits[f"alike {value:g}"] = bench.judged(fit_model(readings, settings), untold=False)
     if not alike:
         fit = fit_model(readings, settings)
@@ -208,7 +208,7 @@ COLUMNS += [*(f"{name}, told" for name in OTHERS), "not told", "removed, 20–90
 
 
 def row_of(case: str, fit: str, plants: list[Plant]) -> tuple[list[object], list[tuple[str, float, float, bool]]]:
-    """Return a row of plants fitted in one way, sizes RMS over them, and its bars: name, figure, bar, met."""
+    """Return a table row for plants fitted in one way, errors RMS over the plants, and bars: name, value, bar, met."""
     fits = [plant.fits[fit] for plant in plants]
     before, left = rms([plant.before for plant in plants]), rms([fitted.left for fitted in fits])
     told, untold = (
@@ -238,9 +238,9 @@ def row_of(case: str, fit: str, plants: list[Plant]) -> tuple[list[object], list
 
 def main() -> int:
     parser = drawn.options(__doc__, 5, 300, "case")
-    parser.add_argument("--off", type=float, default=0.1, help="1 σ of the stated stiffness, a share (default 0.1)")
-    parser.add_argument("--case", action="append", help="only cases whose name starts so; may be repeated")
-    parser.add_argument("--alike", type=float, nargs="+", default=(), help="correlations of struts to try")
+    parser.add_argument("--off", type=float, default=0.1, help="1 σ of the stated stiffness, relative (default 0.1)")
+    parser.add_argument("--case", action="append", help="only cases whose name begins so; may be repeated")
+    parser.add_argument("--alike", type=float, nargs="+", default=(), help="correlations between struts to try")
     args = parser.parse_args()
     try:
         find_mujoco()

@@ -1,11 +1,11 @@
-"""Does the fit keep what it promises, also on machines that its model does not know?
+"""Whether the error lies in the interval that the fit promises, also for machines with errors outside the model.
 
 Usage: python -m benchmarks.promise [--machines 12] [--first 100] [--workers 2] [--kind NAME ...] [--ablate]; kinds and
 bars: doc/benchmarks.md.
 
-With ``--ablate``: what the promise would be with the covariance believed more or less than ``jackknife_prior`` degrees
-of freedom, or a discrepancy counted by other margins than ``lack_margin``, and with how much the covariance is most
-likely believed. The tool's error over its expectation, squared, is Fisher's F with its freedom and that of the belief.
+``--ablate`` computes the intervals with other assumptions: other degrees of freedom of the covariance than
+``jackknife_prior``, and other margins of a discrepancy than ``lack_margin``. It also estimates the most likely degrees
+of freedom: (error / expected error)² has an F distribution with the error's and the covariance's degrees of freedom.
 """
 
 from __future__ import annotations
@@ -38,35 +38,35 @@ from hexapod_comp.virtual.instruments import measure, station_errors
 GEOMETRIES = ("paper", "offset", "framed", "hanging", "inches", "mirror")
 OWN = ("A", "B", "D", "G", "worn")
 FOREIGN = ("harmonics", "joints", "beams", "drift", "outliers", "friction", "all")
-PLANS = (("5-D", 4), ("5-D", 16), ("1-D", 16))  # Instrument on lines, and diagonals
-# Blocks that a fit may use: harmonics of the screws are withheld
+PLANS = (("5-D", 4), ("5-D", 16), ("1-D", 16))  # Instrument on the lines, and number of diagonals
+# Blocks that a fit may use: all except harmonics of the screws
 KNOWN = tuple(block for block in BLOCKS if block not in WAVES or WAVES[block] == 1)
-BAR, WIDTH_BAR = 0.95, 2.0
-# Degrees of freedom with which the covariance is believed, and margins of a discrepancy, for ``--ablate``
+BAR, WIDTH_BAR = 0.95, 2.0  # Bars: share of intervals that hold or are refused; median of upper end over error
+# Degrees of freedom of the covariance, and margins of a discrepancy, for ``--ablate``
 BELIEVED, MARGINS = (2.0, 3.0, 5.0, 8.0, 12.0, 24.0, 70.0, np.inf), (1.0, 1.5, 2.0)
-HARMONICS = {2: (0.5e-6, 2e-6), 3: (0.3e-6, 1e-6)}  # Lowest and highest amplitude by waves per turn, m
-# Amplitude, m, and wave, in direction cosines, of the error of a joint with its angle
+HARMONICS = {2: (0.5e-6, 2e-6), 3: (0.3e-6, 1e-6)}  # Lowest and highest amplitude, m, by waves per turn
+# Amplitude, m, of a joint's error that depends on its direction, and its wavelength in direction cosines
 JOINTS, JOINT_WAVE = 20e-6, 0.7
-# Amplitude of a lost motion by friction, by the sign of a strut's speed, and its wave along the strut, m
+# Amplitude, m, of a lost motion by friction, with the sign of a strut's speed, and its wavelength along the strut, m
 FRICTION, FRICTION_WAVE = 3e-6, 80e-3
-BEAM = 1.5e-3  # Standard deviation of a beam's direction across its line, rad
-DRIFT, EXPANSION = 0.5, (10e-6, 12e-6)  # Warming during the campaign, K, and expansion, 1/K
-WARMTH = np.array([1.0] * 6 + [0.6, 0.8])  # Share of it that struts, base and platform take
-# Sizes, m or rad, and share of gross errors, and by what one run's instrument slips, m
+BEAM = 1.5e-3  # Standard deviation of a beam's angle to its line, rad
+DRIFT, EXPANSION = 0.5, (10e-6, 12e-6)  # Warming during the campaign, K, and range of the expansion, 1/K
+WARMTH = np.array([1.0] * 6 + [0.6, 0.8])  # Shares of the warming of struts, base and platform
+# Range, m or rad, and share of gross errors; range of the shift when one run's instrument slips, m
 GROSS, GROSS_SHARE, SLIP = (5e-6, 100e-6), 0.01, (3e-6, 15e-6)
-POINTS = 500
+POINTS = 500  # Number of random points at which the error is computed
 
 
 @dataclass(frozen=True)
 class Hidden:
-    """What a machine of a foreign kind has beside its model."""
+    """Errors of a machine that no model contains."""
 
     geometry: HexapodGeometry
     joints: np.ndarray | None = None  # (2, 6, 4): directions and phases
     friction: np.ndarray | None = None  # (6,): phases
 
     def lengths(self, poses: Poses, senses: np.ndarray) -> np.ndarray:
-        """Return what each strut is longer at poses, (N, 6), m; `senses` (N, 9) are directions of motion."""
+        """Return the additional length of each strut at poses, (N, 6), m; `senses` (N, 9) are directions of motion."""
         positions, rotations = poses
         struts = positions[:, None] + self.geometry.platform_joints @ np.swapaxes(rotations, 1, 2)
         struts = struts - self.geometry.base_joints
@@ -83,7 +83,7 @@ class Hidden:
 
 
 def hidden_of(geometry: HexapodGeometry, kind: str, rng: np.random.Generator) -> Hidden:
-    """Draw what a machine of a kind has beside its model."""
+    """Draw the errors of a machine of a kind that no model contains."""
     directions = rng.standard_normal((2, 6, 3))
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)
     phases = rng.uniform(0.0, 2.0 * np.pi, (2, 6, 1))
@@ -93,7 +93,7 @@ def hidden_of(geometry: HexapodGeometry, kind: str, rng: np.random.Generator) ->
 
 
 def truth_of(geometry: HexapodGeometry, kind: str, box: np.ndarray, seed: int) -> MachineModel:
-    """Draw a machine of a kind, without what :class:`Hidden` adds."""
+    """Draw the model errors of a machine of a kind, without those of :class:`Hidden`."""
     model = calibration.truth_of(geometry, kind, seed, box)
     if kind in ("D", "G"):
         return model
@@ -108,7 +108,7 @@ def truth_of(geometry: HexapodGeometry, kind: str, box: np.ndarray, seed: int) -
 
 
 def with_harmonics(struts: StrutErrors, geometry: HexapodGeometry, rng: np.random.Generator) -> StrutErrors:
-    """Return struts whose screws err several times a turn as well, as a finely knotted map."""
+    """Return struts with harmonics of the periodic screw error, as a length map with many knots."""
     low, high = geometry.limits.stroke.min(), geometry.limits.stroke.max()
     knots = np.linspace(low, high, int((high - low) / LEAD * 3 * 12) + 1)
     values = np.zeros((6, len(knots)))
@@ -127,7 +127,7 @@ def readings_of(plan: Campaign, truth: RealMachine, hidden: Hidden, kind: str, s
 
 
 def carelessness(empty: MeasurementSet, real: MeasurementSet, truth: RealMachine, kind: str, seed: int) -> np.ndarray:
-    """Return what instruments read in addition that were used carelessly, on the machine as it really stands."""
+    """Return the errors of readings by careless use of the instruments, shape (N,), m or rad."""
     values, rng = np.zeros(len(empty)), np.random.default_rng([seed, 3])
     errors = station_errors(real, truth)
     if kind in ("beams", "all"):
@@ -140,7 +140,7 @@ def carelessness(empty: MeasurementSet, real: MeasurementSet, truth: RealMachine
 
 
 def beams_off(m: MeasurementSet, errors: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return what beams read that are not along their line, each run's in another direction."""
+    """Return the errors of readings by beams at an angle to their lines, with another random angle for each run."""
     off = rng.normal(0.0, BEAM, (len(m.runs), 3))
     axes = np.array([run.axis for run in m.runs])
     off -= (off * axes).sum(axis=1, keepdims=True) * axes
@@ -153,7 +153,7 @@ def beams_off(m: MeasurementSet, errors: np.ndarray, rng: np.random.Generator) -
 
 
 def drifted(m: MeasurementSet, truth: RealMachine, errors: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return what a machine reads in addition that warms up during the campaign, which nobody writes down."""
+    """Return the errors of readings by a machine that warms up during the campaign, without recorded temperatures."""
     warm = replace(m, stations=replace(m.stations, temperatures=m.stations.temperatures + WARMTH))
     per_kelvin = station_errors(warm, truth) - errors
     time = np.arange(len(m)) / len(m)
@@ -163,7 +163,7 @@ def drifted(m: MeasurementSet, truth: RealMachine, errors: np.ndarray, rng: np.r
 
 
 def gross(m: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
-    """Return gross errors of some readings, and of one run whose instrument slips."""
+    """Return gross errors of random readings, plus a shift in one run whose instrument slips."""
     values = rng.choice([-1.0, 1.0], len(m)) * rng.uniform(*GROSS, len(m)) * (rng.random(len(m)) < GROSS_SHARE)
     run = rng.integers(len(m.runs))
     members = np.flatnonzero((m.run == run) & (m.channel == m.channel[m.run == run][0]))
@@ -172,7 +172,7 @@ def gross(m: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
 
 
 def left(truth: RealMachine, hidden: Hidden, model: MachineModel, plan: Campaign, seed: int) -> float:
-    """Return the RMS error of the tool at random points, both ways, the datum aligned, m."""
+    """Return the RMS error of the tool at random points in both directions of motion, datum aligned, m."""
     passes = random_passes(truth.geometry, plan.box, POINTS, 0.0, np.random.default_rng([seed, 4]))
     trial = Trial(truth, passes)
     errors = trial.errors(trial.commands(model) + hidden.lengths(passes.poses, passes.senses()))
@@ -182,7 +182,7 @@ def left(truth: RealMachine, hidden: Hidden, model: MachineModel, plan: Campaign
 def setting(
     kind: str, seed: int, plan_of: tuple[str, int] | None = None
 ) -> tuple[Campaign, RealMachine, Hidden, MeasurementSet]:
-    """Return the campaign, one of the :data:`PLANS` or as given, the machine and the readings of a seed."""
+    """Return campaign (of :data:`PLANS`, or `plan_of`), machine, errors outside the model and readings of a seed."""
     geometry, machine = drawn.of_zoo(GEOMETRIES[seed % len(GEOMETRIES)])
     sides = 2.0 * np.array(machine.half)
     instrument, diagonals = plan_of or PLANS[seed // len(GEOMETRIES) % len(PLANS)]
@@ -194,19 +194,19 @@ def setting(
 
 @dataclass(frozen=True)
 class Outcome:
-    """One machine: what is left and was promised, m; why refused; for the ablation, its freedom, and other promises."""
+    """Result for one machine; errors in m."""
 
-    left: float
-    low: float
+    left: float  # real error with the model
+    low: float  # lower end of the promised interval
     expected: float
-    high: float
-    refused: str
-    freedom: float = np.nan  # of the tool's squared error by the covariance
-    others: tuple[float, ...] = ()  # upper ends for BELIEVED and MARGINS
+    high: float  # upper end of the promised interval
+    refused: str  # reason for a refusal of the fit; empty: none
+    freedom: float = np.nan  # degrees of freedom of the tool's squared error by the covariance
+    others: tuple[float, ...] = ()  # upper ends with the assumptions BELIEVED, then MARGINS
 
     @property
     def kept(self) -> bool:
-        """Whether the error lies in the promised interval."""
+        """Whether the error is in the promised interval."""
         return self.low <= self.left <= self.high
 
 
@@ -223,7 +223,7 @@ def one_machine(kind: str, seed: int) -> Outcome:
 
 
 def other_promises(fit: ModelFit) -> tuple[float, tuple[float, ...]]:
-    """Return the freedom of the tool's squared error by the covariance, and its upper ends for the ablation."""
+    """Return the degrees of freedom of the tool's squared error, and its upper ends with the other assumptions."""
     beyond, covariance = fit.unexplained, physical_covariance(fit.space, fit.solution.posterior)
     errors, part = box_errors(fit.space, fit.solution.x), beyond.displacement
     if errors is None:
@@ -237,7 +237,7 @@ def other_promises(fit: ModelFit) -> tuple[float, tuple[float, ...]]:
 
 
 def show_ablation(outcomes: list[Outcome]) -> None:
-    """Print how many promises other assumptions keep, how wide they are, and which belief is the most likely."""
+    """Print for other assumptions the share of kept promises and the width, and the most likely degrees of freedom."""
     judged = [o for o in outcomes if o.others and not o.refused]
     low, left_over, expected, freedom = np.array([(o.low, o.left, o.expected, o.freedom) for o in judged]).T
     found = drawn.Table(["assumption", "kept or refused", "upper end / left"], texts=0)
@@ -265,8 +265,8 @@ def show(found: drawn.Table, kind: str, outcomes: list[Outcome]) -> None:
 
 def main() -> int:
     parser = drawn.options(__doc__, 12, 100, "kind")
-    parser.add_argument("--kind", action="append", choices=(*OWN, *FOREIGN), help="only this; may be repeated")
-    parser.add_argument("--ablate", action="store_true", help="also other promises of the same fits")
+    parser.add_argument("--kind", action="append", choices=(*OWN, *FOREIGN), help="run this kind only; may be repeated")
+    parser.add_argument("--ablate", action="store_true", help="also compute intervals with other assumptions")
     args = parser.parse_args()
     kinds = [kind for kind in (*OWN, *FOREIGN) if not args.kind or kind in args.kind]
     found, every = drawn.Table(COLUMNS), []

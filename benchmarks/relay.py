@@ -1,7 +1,7 @@
-"""A node that does nothing: topics, message types, QoS and number of messages of the compensator, and no thought.
+"""A node with the compensator's topics, message types, QoS and number of messages that computes nothing.
 
-:mod:`benchmarks.loop` holds the compensator against it: doc/benchmarks.md. With the parameter ``serialized`` it neither
-parses what comes nor makes what goes: the same bytes go out each time, but for the stamp.
+:mod:`benchmarks.loop` compares the compensator with it: doc/benchmarks.md. With the parameter ``serialized`` it neither
+parses nor builds messages: it publishes the same bytes each time and copies only the stamp.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from hexapod_comp.ros.base import COMMAND_QOS, STATE_QOS, MachineNode
 from hexapod_comp.ros.parameters import Program, read_table
 from hexapod_comp.ros.process import run
 
-STAMP = slice(4, 12)  # Where a message's stamp stands among its bytes
-ESTIMATE_PERIOD = 0.02  # The compensator's, s
-PARAMETERS = read_table("serialized | false | | start | take and publish bytes")
+STAMP = slice(4, 12)  # Bytes of a serialised message that hold its stamp
+ESTIMATE_PERIOD = 0.02  # Period of the compensator's pose estimates, s
+PARAMETERS = read_table("serialized | false | | start | receive and publish bytes")
 
 
 class RelayNode(MachineNode):
-    """Answers every pose command with two strut messages, constant but for the stamp."""
+    """A node that answers every pose command with two strut messages that are constant except for their stamp."""
 
     def __init__(self) -> None:
         super().__init__("relay", PARAMETERS)
@@ -42,7 +42,7 @@ class RelayNode(MachineNode):
         callback = self._on_bytes if self._serialized else self._on_command
         topic = "tool_pose_command"
         self.create_subscription(PoseStamped, topic, callback, COMMAND_QOS, raw=self._serialized)
-        self.create_timer(ESTIMATE_PERIOD, self._tell_estimate)
+        self.create_timer(ESTIMATE_PERIOD, self._publish_estimate)
         return super().on_configure(state)
 
     def _on_command(self, message: PoseStamped) -> None:
@@ -59,7 +59,7 @@ class RelayNode(MachineNode):
         self._correction_pub.publish(stamped)
         self._answered = True
 
-    def _tell_estimate(self) -> None:
+    def _publish_estimate(self) -> None:
         if self._answered:
             self._answered = False
             self._estimate_pub.publish(self._estimate)

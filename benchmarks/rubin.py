@@ -1,8 +1,8 @@
-"""The tables by which Rubin Observatory corrects its hexapods, of M2 and of the camera, put through ours.
+"""Rubin Observatory's correction tables of its hexapods (M2 and camera), applied by this package's compensator.
 
-Usage: python -m benchmarks.rubin FOLDER [--config FOLDER]; see doc/benchmarks.md. At each node the compensator commands
-a pose, and the nominal machine with these strut lengths must stand off by what the table has there. Exits 1 when a node
-is missed by more than the bar, 2 without the data.
+Usage: python -m benchmarks.rubin FOLDER [--config FOLDER]; see doc/benchmarks.md. At each node of a table the
+compensator commands a pose; the nominal pose of these strut lengths must differ from it by the table's offset. Exit
+code 1: the difference at a node exceeds the bar; 2: the data are missing.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from .drawn import of_zoo
 TABLES = {"M2": "fitter/zd_m2.txt", "camera": "fitter/zd_camera.txt"}
 POLYNOMIALS = "MTHexapod/v7/laser_rotation_elevation_v23.yaml"
 COMPONENTS = ("x_um", "y_um", "z_um", "rx_deg", "ry_deg", "rz_deg")
-NODE_BAR = np.repeat([5e-13, np.radians(5e-13)], 3)  # half a unit of the sources' last digits, m and rad
-STEPS = ((5.0, 10.0), (2.5, 5.0), (1.0, 2.0))  # of tables over elevation and rotation, degrees
-PLACES = 2000  # at random between the nodes
+NODE_BAR = np.repeat([5e-13, np.radians(5e-13)], 3)  # bar: half a unit of the source's last digit, m and rad
+STEPS = ((5.0, 10.0), (2.5, 5.0), (1.0, 2.0))  # steps of tables in elevation and rotation, degrees
+PLACES = 2000  # number of random places between the nodes
 
 
 def table_of(folder: Path, names: Sequence[str], places: np.ndarray, offsets: np.ndarray) -> OutsideTable:
-    """Return a table of errors that our reader has made of a CSV file of corrections."""
+    """Write offsets to a CSV file of corrections and read it with the package; return the table of errors."""
     header = [*(f"{name}_deg" for name in names), *COMPONENTS]
     rows = np.hstack([places, offsets]).tolist()
     (folder / "table.csv").write_text(csv_text([header, *rows]), encoding="utf-8")
@@ -46,7 +46,7 @@ def table_of(folder: Path, names: Sequence[str], places: np.ndarray, offsets: np
 
 
 def commanded_offset(compensator: Compensator, place: np.ndarray) -> np.ndarray:
-    """Return by how much the commanded struts stand off the pose that is wanted, m and rad, after the ramp."""
+    """Return the commanded pose, after the ramp, minus the wanted pose: displacement, m, and rotation vector, rad."""
     geometry = compensator.geometry
     compensator.set_outside(dict(zip(compensator.model.outside.names, np.radians(place).tolist(), strict=True)))
     tool = geometry.tool_pose(geometry.home)
@@ -65,14 +65,14 @@ def si(offsets: np.ndarray) -> np.ndarray:
 
 
 def at_nodes(geometry: HexapodGeometry, table: OutsideTable, places: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Return the largest difference of each component between what is commanded at nodes and what the source has."""
+    """Return the largest difference of each component between commanded offsets and the source's, over the nodes."""
     compensator = Compensator(geometry, MachineModel(geometry.name, outside=table), ramp_rate=1.0)
     found = np.array([commanded_offset(compensator, place) for place in places])
     return np.abs(found - si(offsets)).max(axis=0)
 
 
 def between(table: OutsideTable, places: np.ndarray, offsets: np.ndarray) -> tuple[float, float, float]:
-    """Return what a table leaves at places beside its nodes: RMS and largest displacement, m, largest rotation, rad."""
+    """Return a table's residual at places between its nodes: RMS and largest displacement, m, largest rotation, rad."""
     numbers = [dict(zip(table.names, np.radians(place).tolist(), strict=True)) for place in places]
     rest = np.array([-table.evaluate(one) for one in numbers]) - si(offsets)
     lengths, angles = (np.linalg.norm(part, axis=1) for part in (rest[:, :3], rest[:, 3:]))
@@ -80,7 +80,7 @@ def between(table: OutsideTable, places: np.ndarray, offsets: np.ndarray) -> tup
 
 
 def report(name: str, missed: np.ndarray, rests: Sequence[tuple[str, tuple[float, float, float]]]) -> bool:
-    """Print a table's figures; return whether its nodes are met."""
+    """Print the figures of a table; return whether its nodes are within the bar."""
     met = bool((missed <= NODE_BAR).all())
     nodes = f"{missed[:3].max() * 1e6:.1e} µm and {missed[3:].max() * 1e6:.1e} µrad"
     print(f"{name}: nodes reproduced to {nodes}: {'PASSED' if met else 'FAILED'}")
@@ -90,13 +90,13 @@ def report(name: str, missed: np.ndarray, rests: Sequence[tuple[str, tuple[float
 
 
 def waves(places: np.ndarray) -> np.ndarray:
-    """Return constant, cosine and sine of zenith distances, degrees: what weight does to an elastic structure."""
+    """Return constant, cosine and sine of zenith distances, degrees: the forms of an elastic structure's sag."""
     angles = np.radians(places[:, 0])
     return np.column_stack([np.ones_like(angles), np.cos(angles), np.sin(angles)])
 
 
 def finite_elements(name: str, file: Path, geometry: HexapodGeometry, folder: Path) -> bool:
-    """Judge a table over zenith distance: whole, and with every other row left out."""
+    """Check a table over zenith distance: at its nodes, and with every second row left out."""
     rows = np.loadtxt(file)
     rows = rows[np.argsort(rows[:, 0])]
     places, offsets = rows[:, :1], rows[:, 1:]
@@ -116,7 +116,7 @@ def finite_elements(name: str, file: Path, geometry: HexapodGeometry, folder: Pa
 
 
 def laser_and_sky(name: str, coefficients: Sequence[Sequence], geometry: HexapodGeometry, folder: Path) -> bool:
-    """Judge polynomials over elevation and rotation, as tables of several steps."""
+    """Check polynomials over elevation and rotation, converted to tables with several steps."""
     powers = [np.array(one, dtype=float) for one in coefficients]
 
     def offsets(places: np.ndarray) -> np.ndarray:
@@ -144,10 +144,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     wanted += [] if args.config is None else [args.config / POLYNOMIALS]
     if missing := [str(path) for path in wanted if not path.is_file()]:
         sources = "github.com/lsst-ts/ts_mthexapod and github.com/lsst-ts/ts_config_mttcs"
-        return cannot_run(f"there is no {', '.join(missing)}; clone {sources}, and name the folders")
+        return cannot_run(f"{', '.join(missing)} is missing; clone {sources}, and give their folders")
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        geometry, _ = of_zoo("mirror")  # of the size of M2's, whose corrections may be as large as Rubin's
+        geometry, _ = of_zoo("mirror")  # a machine of the size of M2's hexapod
         geometry = replace(geometry, limits=replace(geometry.limits, correction=0.02))
         met = [finite_elements(name, args.folder / file, geometry, folder) for name, file in TABLES.items()]
         if args.config is not None:
