@@ -25,7 +25,7 @@ WAVE_AMPLITUDE = 10e-6  # standard deviation of the amplitudes' prior while peri
 # lead also if they differ by less than the share CLOSE of the detected lead
 AGREES, CLOSE = 6.0, 5e-3
 
-SHORTEST, LONGEST = 1e-3, 30e-3  # periods searched, m; a longer wave looks like a length map
+SHORTEST, LONGEST = 1e-3, 30e-3  # range of the periods searched, m; a longer wave is as smooth as a length map
 
 GRID_STEP = SHORTEST / 32.0
 """Step of strut length in the Fourier transforms, m; rounding to it costs 0.3 % of a wave of the shortest period."""
@@ -74,8 +74,8 @@ class ScrewLead:
 def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
     """Return the given and the detected lead of the screws; `problem` is linearised at the nominal machine.
 
-    More than MOST_READINGS readings are sampled first. All readings are searched if the sample shows no lead and no
-    lead is given.
+    If there are more than MOST_READINGS readings, a random sample is searched first. If the sample shows no lead, and
+    no lead is given, all readings are searched.
     """
     space, measurements = estimation.space, estimation.measurements
     given = float(space.periods[0]) if np.isfinite(space.periods).all() else None
@@ -231,7 +231,7 @@ class _Residuals:
 
 
 def _clipped(residuals: np.ndarray) -> np.ndarray:
-    """Return residuals limited to the size from which on Huber's weights are below 1."""
+    """Return residuals clipped at the size above which Huber's weights are below 1."""
     limit = ASSUMED.huber * MEDIAN_TO_SIGMA * np.median(np.abs(residuals))
     return np.clip(residuals, -limit, limit)
 
@@ -251,9 +251,10 @@ def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def _fundamental(residuals: _Residuals, spectrum: np.ndarray) -> Line:
-    """Return the fundamental of the strongest frequency f: f, f/2, f/3, …, the highest within `lead_odds` of the best.
+    """Return the line of which the strongest frequency f is a harmonic, one of f, f/2, f/3, ….
 
-    A fraction f/n is tried only where another of its harmonics exceeds three times the spectrum's median.
+    It is the highest frequency whose log odds are less than `lead_odds` below the best. A fraction f/n is tried only if
+    another of its harmonics exceeds three times the spectrum's median.
     """
     strongest = residuals.frequencies[spectrum.argmax()]
     lines = [residuals.line(strongest)]

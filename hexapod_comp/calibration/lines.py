@@ -3,8 +3,8 @@
 A laser's zero differs from line to line and is unknown; so is the slope of a straightness beam. Therefore displacements
 along a line, and rotations, are shifted until the mean of both directions is zero at home's coordinate along the line;
 each direction keeps half of the backlash. From straightness the least-squares line is subtracted. Some errors are not
-compensated: the position and bending of the planes through home (1-D readings), or the squareness of the axes and the
-twist of the planes (5-D readings).
+compensated: the position and bending of the planes through home, if only displacements along lines were read (1-D), or
+the squareness of the axes and the twist of the planes, if straightness, pitch and yaw were read as well (5-D).
 
 The field is the sum of three families of lines, along x, y and z. They cross in the grid's nodes and read the same
 errors there. So each component is fitted first to one family: a displacement to the lines along its own axis, a
@@ -103,7 +103,7 @@ def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datu
     groups = np.unique(np.stack([measurements.run, measurements.channel]), axis=1, return_inverse=True)[1].ravel()
     means = np.bincount(groups, measurements.value) / np.bincount(groups)
     left = measurements.value - means[groups]
-    if np.abs(left).max() <= LEAST_NOISE:  # refuse only if no kind of readings varies: this scheme needs no noise
+    if np.abs(left).max() <= LEAST_NOISE:  # this scheme accepts one kind of readings that never varies, but not all
         refuse_unmoved(measurements, left)
     note = (
         "Scheme lines (Mou & King 1998): polynomials along grid lines, their order chosen by adjusted R². Datum: the "
@@ -129,9 +129,8 @@ def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datu
         finite = {kind: [v for v in of_kind if np.isfinite(v)] for kind, of_kind in sorted(values.items())}
         return {kind: rms(of_kind) for kind, of_kind in finite.items() if of_kind}
 
-    misfit = measurements.misfit(spread("repeat_std"), MISFIT) or measurements.misfit(
-        spread("residual_std"), LINES_MISFIT
-    )
+    misfit = measurements.misfit(spread("repeat_std"), MISFIT)
+    misfit = misfit or measurements.misfit(spread("residual_std"), LINES_MISFIT)
     return LinesFit(model, measurements, tuple(fits), tuple(notes), held, misfit)
 
 
@@ -237,10 +236,7 @@ def _line_name(grid: Sequence[np.ndarray], axis: int, node: Sequence[int]) -> st
 
 
 def _check_complete(readings: Readings, grid: Sequence[np.ndarray]) -> None:
-    """Refuse a grid in which a line, a channel of a line or an end of a line was not measured.
-
-    A polynomial is not valid beyond its readings.
-    """
+    """Refuse a grid in which a line, a channel of a line, or an end of a line was not measured."""
     for axis in np.unique(readings.axis).tolist():
         family, cross = readings.select(readings.axis == axis), CROSS_AXES[axis]
         every = set(product(*(range(len(grid[a])) for a in cross)))

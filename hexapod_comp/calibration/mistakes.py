@@ -90,7 +90,7 @@ def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
             continue
         both = (m.channel == a) | (m.channel == b)
         common = [n for n in np.unique(family[both]) if {a, b} <= set(m.channel[family == n].tolist())]
-        # Exchanged in all runs, a straightness would be along its own line, which no instrument reads
+        # An exchange in all runs would put a straightness along its own line, which no instrument reads
         along_lines = CHANNELS[a].startswith("straightness") and (family[both] < 3).any()
         for name, where in [("", every)] * (not along_lines) + [(f"{FAMILIES[n]}, ", family == n) for n in common]:
             channel = np.where(both & where, a + b - m.channel, m.channel)

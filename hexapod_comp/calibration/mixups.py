@@ -51,7 +51,7 @@ FINALISTS = 6  # number of mistakes for which tolerances and noise are estimated
 LEAST_DETERMINED = 1.0  # a component is kept if its information from the readings exceeds the prior's by this factor
 MODE_ROUNDS = 3  # rounds in which tolerances and noise are estimated together with a common mode, or with new labels
 ONLY_CHANCE = 0.2
-"""Mean of max(0, r) for a reading with the right direction label, at most; r is its log likelihood ratio of reversal.
+"""Upper bound of the mean of max(0, r), where r is the log likelihood ratio of reversing a right direction label.
 
 For a backlash of m standard deviations the mean is 2m(φ(m) − mΦ(−m)), which is largest at m = 0.6."""
 
@@ -118,7 +118,7 @@ class _ModeFit(NamedTuple):
 
 
 class _Fitted:
-    """The linear problem of some readings by principal components, its posterior, and the mistakes compared with it."""
+    """The linear problem of readings in principal components, with its posterior; methods compare mistakes with it."""
 
     def __init__(self, estimation: Estimation, bases: dict[str, np.ndarray] | None = None) -> None:
         self.estimation, self.space = estimation, estimation.space
@@ -173,7 +173,7 @@ class _Fitted:
         return basis if len(basis) == size else np.eye(size)
 
     def _reduced(self, rows: np.ndarray) -> np.ndarray:
-        """Return rows of derivatives by the parameters as rows of derivatives by the components."""
+        """Convert rows of derivatives by the parameters to rows of derivatives by the components."""
         return np.hstack([rows[:, block.part] @ self._basis(n) for n, block in enumerate(self.space.blocks)])
 
     def _along(self, cells: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -232,7 +232,7 @@ class _Fitted:
         """
         in_file, rounds = (self.early, FEW_ROUNDS) if early else (self.posterior, ROUNDS)
         tried = solve(components, problem, components.first, SAME_UNITS, rounds)
-        # Probability densities scale with the unit of the values
+        # A probability density scales with the unit of its values (Jacobian)
         jacobian = float(problem.freedom[self.kinds] @ np.log(mistake.factor[self.kinds]))
         gain = log_evidence(problem, tried) + jacobian - log_evidence(self.problem, in_file) - mistake.choices
         # Noise before over noise after the correction, for the kind that improves most. If no kind improves, the
@@ -358,7 +358,9 @@ class _Fitted:
                 flipped = ~flipped
             try:
                 turned = flipped[group.ravel()]
-                twice = m.stations.select(np.tile(np.arange(len(m.stations)), 2))  # the second half moves oppositely
+                twice = m.stations.select(
+                    np.tile(np.arange(len(m.stations)), 2)
+                )  # the copies get the opposite direction
                 senses = twice.sense * np.repeat([1.0, -1.0], len(m.stations))[:, None]
                 station = m.station + len(m.stations) * turned
                 direction = np.where(turned, -m.direction, m.direction)
@@ -401,7 +403,7 @@ class _Fitted:
             by_run[np.arange(groups.shape[1]), groups[0]] = members
             runs = np.flatnonzero(by_run.any(axis=0))
             chosen = self._most_probable(gram, by_run[:, runs], family[runs])
-            if not what and 2.0 * chosen.sum() > len(runs):  # reversing the other runs differs by the sign of all
+            if not what and 2.0 * chosen.sum() > len(runs):  # reversing all other runs is the same up to one sign
                 chosen = 1.0 - chosen
             if any(len(np.unique(chosen[family[runs] == n])) > 1 for n in np.unique(family[runs])):
                 listed = [m.runs[n].name for n in runs[chosen > 0.0]]

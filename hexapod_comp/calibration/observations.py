@@ -129,7 +129,7 @@ class Lengths:
         known = 0 if self.known_zero else 1
         zero = Nuisance(self.members, (scale / np.linalg.norm(scale))[:, None][:, :known], np.ones(known))
         arms = self._arms()
-        size = float(np.linalg.norm(arms, axis=1).max()) or 1.0  # m: a turn counts as the way of the farthest centre
+        size = float(np.linalg.norm(arms, axis=1).max()) or 1.0  # m: rotations count as the farthest centre's motion
         nominal = np.linalg.norm(self.points - self.centres, axis=1)
         root = self._prior(arms / size)
         body, turn = np.zeros(6), np.eye(3)
@@ -160,7 +160,7 @@ class Lengths:
         return predicted, n, [zero, Nuisance(self.members, u, s**2 / (1.0 + s**2))]
 
     def _prior(self, arms: np.ndarray) -> np.ndarray:
-        """Return a root of the prior covariance of the body's shift and turn, (6, 6), m; the largest arm is 1 long."""
+        """Return a root of the prior covariance of the body's motion, (6, 6), m; the longest of `arms` has length 1."""
         n = self.points - self.centres
         n /= np.linalg.norm(n, axis=1, keepdims=True)
         columns = np.hstack([n, np.cross(arms, n)])
@@ -191,7 +191,9 @@ class Frame:
         readings and `scale` (n,) is one over their standard deviation.
         """
         centre = self.points.mean(axis=0)
-        size = float(np.linalg.norm(self.points - centre, axis=1).max()) or 1.0  # m: a turn counts as the farthest way
+        size = (
+            float(np.linalg.norm(self.points - centre, axis=1).max()) or 1.0
+        )  # m: rotations count as this point's motion
         shift, turn, attitude = np.zeros(3), np.eye(3), rotation_from_vector(errors[:, 3:])
         for _ in range(ROUNDS):
             away = self.points + errors[:, :3] - centre - shift
@@ -225,8 +227,7 @@ class Cells:
     along: np.ndarray  # (C,): Commanded coordinate along the line, m
     lever: np.ndarray  # (C,): Change of the cell's value by a rotation of its optical square, m per rad
     square: np.ndarray  # (C,): Number of the optical square and its axis that give the slope; -1: no shared slope
-    # (C,): Fold of cross-validation: a line's run, a ball bar's circle, or a scattered pose
-    fold: np.ndarray
+    fold: np.ndarray  # (C,): Fold of cross-validation: a line's run, a ball bar's circle, or a scattered pose
 
     @staticmethod
     def of(measurements: MeasurementSet) -> Cells:

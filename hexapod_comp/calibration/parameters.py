@@ -56,7 +56,7 @@ class FitSettings:
     field_degree : int
         Degree of the field's polynomials along the longest side of its box.
     strut_expansion, base_expansion, platform_expansion : float
-        Stated thermal expansion, 1/K. The fit estimates deviations from it if the temperatures changed enough.
+        Stated thermal expansion, 1/K. The fit estimates deviations from it if temperatures changed by 0.5 K or more.
     strut_moisture : float or None
         Stated growth of the struts from 0 to 100 % relative humidity, m/m; the fit estimates the deviation as for
         `strut_expansion`. None: the struts do not swell.
@@ -101,25 +101,21 @@ class FitSettings:
         unknown = set(self.blocks) - set(BLOCKS)
         if unknown:
             raise ModelError("blocks", f"must be of {', '.join(BLOCKS)}", sorted(unknown))
-        shortest, longest = LEADS[0], LEADS[1]
-        if self.lead is not None and not shortest <= self.lead <= longest:
-            allowed = f"{shortest * 1e3:g} mm to {longest * 1e3:g} mm"
-            raise ModelError("lead", f"must be {allowed}", self.lead * 1e3)
+        if self.lead is not None and not LEADS[0] <= self.lead <= LEADS[1]:
+            raise ModelError("lead", f"must be {LEADS[0] * 1e3:g} mm to {LEADS[1] * 1e3:g} mm", self.lead * 1e3)
         for name, value in self.tolerances:
             if not 0.0 < value < np.inf:
                 raise ModelError(f"tolerance of {name}", "must be finite and above zero", value)
-        bodies = "strut", "base", "platform"
-        growths = {f"{body}_expansion": (LARGEST_EXPANSION, 1e6, "ppm/K") for body in bodies}
+        growths = {f"{body}_expansion": (LARGEST_EXPANSION, 1e6, "ppm/K") for body in ("strut", "base", "platform")}
         growths["strut_moisture"] = LARGEST_MOISTURE, 1e4, "ppm per % of relative humidity"
         for name, (largest, factor, unit) in growths.items():
             value = getattr(self, name) or 0.0
             if not 0.0 <= value <= largest:
                 raise ModelError(name.replace("_", " "), f"must be 0…{largest * factor:g} {unit}", value * factor)
         if self.load:
-            Load.from_numbers(self.load)  # raises an error on invalid numbers
+            Load.from_numbers(self.load)  # validates them
         constants = self.time_constants or ()
-        # raises an error on invalid numbers
-        LateGrowth(tuple(constants), np.zeros((len(PARTS), len(constants))), self.thermometer)
+        LateGrowth(tuple(constants), np.zeros((len(PARTS), len(constants))), self.thermometer)  # validates them
         for name, given, most, unit in (("scale", self.scale, 1e-2, "m/m"), ("alignment", self.alignment, 0.1, "rad")):
             if given is not None and not 0.0 <= given <= most:
                 raise ModelError(name, f"must be 0…{most:g} {unit}", given)
@@ -131,7 +127,7 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class Extent:
-    """The region of a measurement set on which the parameters depend; a posterior file keeps it."""
+    """The region of a measurement set, from which the parameters are defined; a posterior file stores it."""
 
     commands: np.ndarray  # (2,): lowest and highest strut command, m
     box: np.ndarray  # (2, 3): corners of the commanded positions of the measured point in base, m: the field's region

@@ -80,7 +80,7 @@ class FirstOrder:
 
     places: np.ndarray  # (N, 3)
     columns: np.ndarray  # (N, 6, 1 + size): displacement and rotation vector, then their derivatives
-    # RMS displacement, m, and rotation, rad, by struts whose lost motion may be at either end: no parameter has them
+    # RMS displacement, m, and rotation, rad, by lost motions that may be at either end: no parameter describes them
     unsettled: tuple[float, float] = (0.0, 0.0)
 
     @staticmethod
@@ -103,10 +103,6 @@ class FirstOrder:
     def slopes(self) -> np.ndarray:
         """The derivatives of the errors by the parameters, shape (N, 6, size)."""
         return self.columns[:, :, 1:]
-
-    def select(self, chosen: np.ndarray | slice) -> FirstOrder:
-        """Return the errors at some of the places."""
-        return FirstOrder(self.places[chosen], self.columns[chosen], self.unsettled)
 
     def datum(self) -> Datum:
         """Return the rigid motion that best explains the displacements (least squares), and the mean rotation."""
@@ -227,7 +223,7 @@ class ErrorPredictor:
         return FirstOrder(geometry.tool_poses(positions, rotations)[0], columns)
 
     def _held_motion(self, tips: np.ndarray) -> np.ndarray:
-        """Return the rigid motion from the model that holds the datum to the most probable machine, (N, 6), at tips."""
+        """Return the motion of tips (N, 3) from the model that holds the datum to the most probable machine, (N, 6)."""
         if self._fitted is None or self._fitted.held is None:
             return np.zeros((len(tips), 6))
         geometry, held = self._machine.geometry, self._fitted.held
@@ -242,7 +238,7 @@ class ErrorPredictor:
         places = np.stack(np.meshgrid(*(np.linspace(low, high, 3) for low, high in region.box.T)), axis=-1)
         errors = self._errors(region.poses(places.reshape(-1, 3), level))
         reached = np.isfinite(errors.columns).all(axis=(1, 2))
-        return errors.select(reached).datum() if reached.sum() >= 3 else None
+        return FirstOrder(errors.places[reached], errors.columns[reached]).datum() if reached.sum() >= 3 else None
 
 
 def _joined(parts: list[PredictedError]) -> PredictedError:
@@ -313,10 +309,7 @@ def box_errors(
 
 
 def about_other_loads(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, beyond: Unexplained) -> str:
-    """Return a note on the predicted tool error with no tool, a heavier tool, and gravity turned by 90°.
-
-    It is empty if the stiffness of a strut is not stated.
-    """
+    """Return a note on the tool error with no tool, a heavier tool, and other gravity; empty without stiffness."""
     load, (mass, *centre, _, _, _) = stated_load(space.settings), space.loads[0]
     if not load.stiffness.all():
         return ""
@@ -358,18 +351,13 @@ def expected_error(
         before = [float(np.sqrt((part**2).sum(axis=1).mean())) for part in parts]
     else:
         before = [float(np.sqrt((square * prior).sum())) for square in squares]
-    sizes = [_sizes(square, drawn) for square in squares]
+    sizes = [np.sqrt(np.maximum(np.einsum("id,id->d", drawn, square @ drawn), 0.0)) for square in squares]  # RMS, (D,)
     return ToolError(
         float(np.hypot(before[0], beyond.displacement.stops)),
         *beyond.promised(sizes[0], errors.places),
         float(np.hypot(before[1], beyond.rotation.stops)),
         *beyond.promised_rotation(sizes[1]),
     )
-
-
-def _sizes(square: np.ndarray, drawn: np.ndarray) -> np.ndarray:
-    """Return the RMS error, (D,), of each drawn parameter vector (size, D), with M = `square`, (size, size)."""
-    return np.sqrt(np.maximum(np.einsum("id,id->d", drawn, square @ drawn), 0.0))
 
 
 def _drawn(covariance: np.ndarray) -> np.ndarray:
@@ -414,7 +402,7 @@ class Observability:
 
 
 def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, tilt: float = 0.0) -> Observability:
-    """Return which parameters the readings of a linear problem determine; `tilt`, rad, is only passed on.
+    """Return which parameters the readings of a linear problem determine; `tilt`, rad, is stored in the result.
 
     The observability indices are functions of the singular values: O1 (Borm and Menq: geometric mean over √readings),
     O2 (Driels and Pathre: smallest/largest), O3 (Nahvi: smallest), O4 (Nahvi and Hollerbach: smallest²/largest).

@@ -166,7 +166,7 @@ def _parsed(
     covariance[np.tril_indices(n)] = array("covariance", n * (n + 1) // 2)
     covariance += np.tril(covariance, -1).T
     variances = np.diag(covariance)
-    largest = (1.0 + 1e-6) * np.sqrt(np.maximum(np.outer(variances, variances), 0.0))  # but for rounding
+    largest = (1.0 + 1e-6) * np.sqrt(np.maximum(np.outer(variances, variances), 0.0))  # a tolerance for rounding
     if (variances < 0.0).any() or (np.abs(covariance) > largest).any():
         raise InputFileError(path, "covariance", "must be a covariance: no correlation is larger than one")
     if head.get("kinds") != list(KINDS):

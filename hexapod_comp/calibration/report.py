@@ -101,11 +101,9 @@ def fit_report(fit: ModelFit) -> str:
     m, doubts = fit.measurements, (*fit.refusals, *fit.doubts)
     kept = ", ".join(block.name for block in fit.space.blocks)
     settled = "settled after" if fit.solution.change < SETTLED else "NOT settled after"
-    headline = (
-        f"machine {m.geometry.name}: {len(m)} readings of {len(m.runs)} runs at {len(m.stations)} stations\n"
-        f"scheme joint: {fit.space.size} parameters ({kept}), {settled} {fit.solution.steps} steps"
-        + (f"\nscrew lead: {fit.lead}" if fit.lead is not None else "")
-    )
+    headline = f"machine {m.geometry.name}: {len(m)} readings of {len(m.runs)} runs at {len(m.stations)} stations\n"
+    headline += f"scheme joint: {fit.space.size} parameters ({kept}), {settled} {fit.solution.steps} steps"
+    headline += "" if fit.lead is None else f"\nscrew lead: {fit.lead}"
     families = list(dict.fromkeys(c.part for c in fit.chi_squares))
     known = {(c.kind, c.part): number(c.value, 3) for c in fit.chi_squares}
     by_family = [(c.kind, *(known.get((c.kind, part), "") for part in families)) for c in fit.channels]
@@ -118,13 +116,15 @@ def fit_report(fit: ModelFit) -> str:
         expected_text(fit.level, fit.tilted, fit.observability),
         fit.held.report(),
         "\n".join(f"note: {note}" for note in fit.notes),
-        "residuals; held out: a line or a pose at a time, noise included\n" + table(fit.channels, CHANNELS),
+        "residuals; held out: errors of a line or pose that was left out of the fit, with its noise\n"
+        + table(fit.channels, CHANNELS),
     ]
     if families:
-        parts.append("χ²/freedom by lines and direction; 1: as stated\n" + aligned(("channel", *families), by_family))
+        table_of_families = aligned(("channel", *families), by_family)
+        parts.append(f"χ² per degree of freedom, by lines and direction; 1: noise as stated\n{table_of_families}")
     if len(fit.chi_squares_of_runs) > 1:
         parts.append("runs with the largest χ²\n" + table(fit.chi_squares_of_runs[:MOST_RUNS], RUNS))
-    blocks = "blocks; evidence: logarithm of the Bayes factor with the block to without it\n"
+    blocks = "blocks; evidence: log Bayes factor of the fit with the block over the fit without it\n"
     parts += [
         blocks + table(fit.decisions, DECISIONS),
         observability_text(fit.observability, fit.unseen_errors),
@@ -176,7 +176,7 @@ def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ..
     if seen.indices:
         lines.append("observability indices: " + ", ".join(f"{k} {v:.3g}" for k, v in seen.indices.items()))
     if seen.unseen:
-        lines.append("not seen (left near nominal): " + ", ".join(seen.unseen))
+        lines.append("not observable (kept near nominal): " + ", ".join(seen.unseen))
     if unseen_errors:
         lines.append(f"machine errors that the readings do not show: {listed(unseen_errors)}")
     return "\n".join(lines)

@@ -39,11 +39,11 @@ class Slopes:
         self._designs = [block.design(self._linkage, whitened) for block in space.blocks]
 
     def columns(self, components: np.ndarray) -> np.ndarray:
-        """Return the indices of the parameters that change any of some components, of the six, of an error."""
+        """Return the indices of the parameters that change at least one of the given error components, 0…5."""
         return np.concatenate([block.part.start + block.moving(components) for block in self._blocks])
 
     def write(self, rows: np.ndarray, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> None:
-        """Write to `rows` the derivatives of errors at stations `at`, (n,), along directions (n, 6); see `columns`."""
+        """Write derivatives of errors at stations `at`, (n,), along directions (n, 6), in the order of `columns`."""
         errors, stop = self._linkage.errors(at, directions, components), 0
         for design in self._designs:
             values = design(errors)
@@ -61,6 +61,6 @@ def derivatives(space: ParameterSpace, prediction: Prediction, stations: Station
 
 
 def carried(motions: np.ndarray, arms: np.ndarray) -> np.ndarray:
-    """Return small motions (N or 1, 6, K) of a body, given at one point, at points that are arms (N, 3), m, away."""
+    """Return small motions (N or 1, 6, K) of a body at points that lie `arms`, (N, 3), m, from their own points."""
     displacements = motions[:, :3] + np.cross(motions[:, 3:], arms[:, :, None], axis=1)
     return np.concatenate([displacements, np.broadcast_to(motions[:, 3:], displacements.shape)], axis=1)

@@ -40,7 +40,7 @@ from .estimator import Estimation, Posterior, Solution, physical_covariance, sol
 from .parameters import TOLERANCES, ParameterSpace
 from .sensitivity import predict
 
-BIN = 60.0  # readings of a sensor within this time are averaged, s: twice the time constant of its filter
+BIN = 60.0  # readings of a sensor within this time are averaged, s: twice the default filter's time constant
 
 SEEN_SHARE = 0.5
 """A parameter counts as determined if more than this share of it comes from the readings."""
@@ -111,10 +111,7 @@ def _stairs(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
 
 
 class _Course:
-    """An uninterrupted record of sensors, averaged in bins, along the eigenvectors of the process's covariance.
-
-    The constant level is projected out.
-    """
+    """A record of sensors, averaged in bins, along the eigenvectors of the process's covariance, without its level."""
 
     def __init__(self, times: np.ndarray, values: np.ndarray, width: float) -> None:
         bins = max(1, round(float(times[-1] - times[0]) / width))
@@ -187,7 +184,7 @@ def estimate_time_constants(
     best, gain = scan.best(1)
     if gain < ASSUMED.clear_evidence:
         return ()
-    # Without the first constant the noise was estimated too large, which hides a second one: scan with the right noise.
+    # Without the first constant the estimated noise was too large, which hides a second one: scan with smaller noise.
     with_best = ParameterSpace(measurements, replace(settings, time_constants=tuple(grid[list(best)].tolist())))
     fit = _nominal_fit(Estimation(measurements, with_best))
     scan = _Scan(estimation, grid, replace(fit, tolerances=fit.tolerances[:-1]))
@@ -211,10 +208,7 @@ def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
 
 
 def _late_columns(estimation: Estimation, x: np.ndarray, constants: np.ndarray, size: float) -> np.ndarray:
-    """Return the cells' change by delayed growth of `size`, 1/K, for each time constant and part, (C, K·8).
-
-    It is over the stated noise, with nuisance parameters projected out.
-    """
+    """Return the cells' change by delayed growth of `size`, 1/K, over the noise, nuisance projected out, (C, K·8)."""
     lag = growth_causes(estimation.space.settings, estimation.measurements.stations, constants)
     lag = lag[estimation.cells.station, :, 1:]
     columns = (_per_growth(estimation, x)[:, :, None] * lag).transpose(0, 2, 1) @ (size * growth_root(1))

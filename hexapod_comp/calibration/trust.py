@@ -148,10 +148,7 @@ class Residuals:
 
 
 def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexplained:
-    """Return the errors that the covariance of a converged fit does not contain.
-
-    `averaged` is the factor on the tool's error that allows for blocks wrongly left out (model averaging).
-    """
+    """Return the errors that a fit's covariance does not contain; `averaged` allows for blocks wrongly left out."""
     ratio, freedom = variance_ratio(r)
     clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - 2.0 * ndtr(-ASSUMED.clear)) / freedom
     factor = np.sqrt(ratio) if clear else 1.0
@@ -190,7 +187,7 @@ def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
 
 
 def variance_ratio(r: Residuals) -> tuple[float, float]:
-    """Return the ratio of observed to expected squared changes of the tool as folds are left out, and its freedom.
+    """Return observed over expected squared changes of the tool as folds are left out, and degrees of freedom.
 
     The sum over folds is approximately χ² distributed; its degrees of freedom follow from its variance (Satterthwaite).
     Of G folds at most G − 1 are independent.
@@ -293,7 +290,7 @@ def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
 
 
 def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
-    """Return the lack of fit of one kind of readings; until the last line its variances are over the stated noise's."""
+    """Return the lack of fit of one kind of readings; all variances before the last line are over the stated one."""
     m, estimated = r.estimation.measurements, float(r.solution.posterior.noise[kind] ** 2)
     readings, cells = int((m.kind == kind).sum()), int((r.estimation.cells.kind == kind).sum())
     # Pure error: variance of the readings about their cell's mean, over the stated noise

@@ -60,20 +60,12 @@ class RigidMotion:
         return way if way > ASSUMED.surely * np.sqrt(len(self.motion)) * error else 0.0
 
 
-@dataclass(frozen=True)
-class Judgement:
-    """Comparison of check readings with a model and with the promise of its fit."""
-
-    found: float  # RMS displacement error of the tool without the noise of the readings, m
-    excess: float  # sum of squared residuals over its limit for a kept promise; above 1: the promise is broken
-    rigid: RigidMotion
-
-
-def judge(fitted: FittedParameters, readings: MeasurementSet, promised: float) -> Judgement:
+def compare(fitted: FittedParameters, readings: MeasurementSet, promised: float) -> tuple[float, bool, RigidMotion]:
     """Compare the tool's measured positions with a model that promises an RMS error of at most `promised`, m.
 
-    A rigid motion of all positions is fitted first, because the promise is for an aligned datum. If the promise is just
-    kept, the residuals have the variance promised²/3 + noise², and the sum of their squares has a χ² distribution.
+    Return the RMS displacement error without the readings' noise, m, whether the promise is kept, and a rigid motion of
+    all positions. The motion is fitted first, because the promise is for an aligned datum. If the promise is just kept,
+    the residuals have the variance promised²/3 + noise², and the sum of their squares has a χ² distribution.
     """
     chosen, space = readings.select(np.array(KINDS)[readings.kind] == "position"), fitted.space
     errors, directions = predict(space, fitted.x, chosen.stations).errors[chosen.station], chosen.directions()
@@ -88,4 +80,4 @@ def judge(fitted: FittedParameters, readings: MeasurementSet, promised: float) -
     limit = float(chdtri(freedom, BEYOND)) * (promised**2 / 3.0 + noise)
     variance = max(noise, float(np.mean(residuals**2)))
     error = np.sqrt(variance * np.linalg.inv(rigid.T @ rigid).diagonal().max())
-    return Judgement(float(found), float(residuals @ residuals) / limit, RigidMotion(motion, float(error)))
+    return float(found), bool(residuals @ residuals <= limit), RigidMotion(motion, float(error))

@@ -45,7 +45,7 @@ from ..measurements.campaign import Campaign, campaign_text, load_campaign
 from ..measurements.collect import MeasuredMachine, SetUpError, collect
 from ..measurements.files import read_measurements
 from ..measurements.readings import UNKNOWN, MeasurementSet
-from .checks import LEAST_READ, RigidMotion, check_run, judge
+from .checks import LEAST_READ, RigidMotion, check_run, compare
 from .journal import ENDED, IN_USE, JOURNAL, Event, Journal
 from .observer import MedianObserver
 
@@ -451,24 +451,24 @@ class Adaptation:
             problem = f"{usable} of {len(run.positions)} readings of {name} are usable, and a check needs {LEAST_READ}"
             raise CommandError("instrument", f"{problem}; the instrument read nothing at {len(missing)} places")
         verification, fitted = self._verified(model, measured)
-        judged = judge(fitted, measured, promised)
-        kept = verification.verdict == VALID if np.isnan(promised) else judged.excess <= 1.0
+        found, kept, rigid = compare(fitted, measured, promised)
+        kept = verification.verdict == VALID if np.isnan(promised) else kept
         spoilt = not kept and verification.verdict != VALID and verification.candidates[0].family == READING
         good = kept and not (verification.verdict == NAMED and verification.candidates[0].family in SUDDEN_CHANGES)
         first = next((e for e in self.events if e["event"] == "checked" and e["model"] == model), None)
-        before = judged.rigid if first is None else RigidMotion(np.array(first["stands_m"]), first["stands_error_m"])
+        before = rigid if first is None else RigidMotion(np.array(first["stands_m"]), first["stands_error_m"])
         write_text(self._folder / f"{name}.report.txt", verification_report(verification))
         self._record(
             "checked",
-            stands_m=judged.rigid.motion.tolist(),
-            stands_error_m=judged.rigid.error,
-            moved_m=judged.rigid.moved(before),
+            stands_m=rigid.motion.tolist(),
+            stands_error_m=rigid.error,
+            moved_m=rigid.moved(before),
             number=number,
             readings=name,
             model=model,
             good=good,
             spoilt=spoilt,
-            found_m=None if np.isnan(promised) else judged.found,
+            found_m=None if np.isnan(promised) else found,
             promised_m=None if np.isnan(promised) else promised,
             missing=list(missing),
             verdict=verification.verdict,

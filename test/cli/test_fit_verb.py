@@ -102,7 +102,7 @@ def test_fit_reports_all_its_sections(done: Calibration) -> None:
         "tilted 10°: ",
         "Do not trust this model with a tilted tool",
         "observability indices: O1 ",
-        "not seen (left near nominal): base 1",
+        "not observable (kept near nominal): base 1",
         "ISO 230-6:2002, body diagonals, both directions",
         "On the virtual machine, without → with the model",
         "metric of Mou & King, mean |displacement error|",
